@@ -14,7 +14,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from accerl_lerobot.demos.writing import simulators
+from accerl_lerobot.demos.record import simulators
 
 PARENT = """
 import multiprocessing, os, signal, subprocess, sys, time

@@ -162,7 +162,7 @@ def test_a_run_that_was_left_goes_on_as_if_it_had_not(
 ):
     """Rollouts, world model and success model included."""
     learn = learning(validate_every=8, held_out=0.5)
-    chosen: dict[str, Any] = {"model": model, "start_at_reset_prob": 0.5, "window": 4, "max_gap": 2.0}
+    chosen: dict[str, Any] = {"model": model, "window": 4, "max_gap": 2.0}
     chosen["min_real_episodes"] = 2
     if model != "oracle":
         chosen |= {"path": str(world_model), "learn": learn}
@@ -195,15 +195,14 @@ def test_a_run_that_was_left_goes_on_as_if_it_had_not(
 def test_rollouts_of_a_model_that_is_trained_are_compared(tiny_checkpoint: Path, world_model: Path):
     learn = learning(validate_every=8, held_out=0.5)
     config = imagining(
-        tiny_checkpoint, path=str(world_model), learn=learn, episodes=24, start_at_reset_prob=0.5,
+        tiny_checkpoint, path=str(world_model), learn=learn, episodes=24,
         window=4, min_real_episodes=2, max_gap=2.0,
     )  # fmt: skip
     history, batches, engine = run_locally(config)
     imagined = [s for batch in batches for s in batch if s.source == IMAGINED]
     assert len(batches) == 12 and imagined
-    # A rollout starts anywhere in the sixteen env steps, and goes on to their end or a success.
-    assert {s.origin.decision + len(s) for s in imagined if not s.success} == {4}
-    assert {s.origin.decision for s in imagined} > {0}
+    # A rollout goes on to the end of the sixteen env steps, or a success.
+    assert {len(s) for s in imagined if not s.success} == {4}
     assert all(s.terminated for s in imagined)
     last = history[-1].imagination
     assert last["promoted"] >= 1 and last["success_real"] == last["success_real"], "not NaN"

@@ -26,7 +26,7 @@ from rich.table import Table
 
 from accerl_lerobot.bench import as_table, host, ranged, spread
 from accerl_lerobot.config.ranges import Positive, Range, Repeats, Section
-from accerl_lerobot.demos.writing import simulators
+from accerl_lerobot.demos.record import simulators
 from accerl_lerobot.envs import EnvConfig, LiberoConfig, MetaWorldConfig, make_world
 from accerl_lerobot.envs.libero_tasks import load_libero
 from accerl_lerobot.envs.metaworld import import_mujoco

@@ -24,11 +24,12 @@ from accerl_lerobot.checkpoint.safety import Origin, check_folder
 from accerl_lerobot.config.parsing import decode, drop_consents, read_recipe
 from accerl_lerobot.config.ranges import DatasetName, NewFolder, Range, Section, Steps
 from accerl_lerobot.console import Console
-from accerl_lerobot.demos.expert import Episode
-from accerl_lerobot.demos.record import features, frames
-from accerl_lerobot.demos.writing import (
+from accerl_lerobot.demos.record import (
+    Episode,
     appearing,
     check_free,
+    features,
+    frames,
     in_order,
     new_dataset,
     simulators,

@@ -3,7 +3,7 @@
 
 Same arguments, same result, but that a new policy of images reads no ``observation.environment_state``, which
 a real robot does not have. π0-FAST's action tokeniser, whose newest code LeRobot would fetch and run, is
-read by `policies.pi0` instead. ``--code_revision=COMMIT`` has code from the Hub run, of this commit only.
+read by `policies.vla` instead. ``--code_revision=COMMIT`` has code from the Hub run, of this commit only.
 
 The dataset's items are kept in memory where they take less than 4 GiB and are not transformed at random:
 LeRobot 0.6.1 decodes every image of an action chunk to read the chunk's actions, 3.8 ms an item for a chunk
@@ -83,7 +83,7 @@ def main() -> None:
     """Runs ``lerobot-train`` on the command line's arguments."""
     from lerobot.scripts import lerobot_train
 
-    from accerl_lerobot.policies.pi0 import data_only
+    from accerl_lerobot.policies.vla import data_only
 
     def given(prefix: str) -> str | None:
         return next((a.removeprefix(prefix) for a in sys.argv[1:] if a.startswith(prefix)), None)

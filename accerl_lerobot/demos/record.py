@@ -7,12 +7,18 @@ dataset, so the content does not depend on how many processes worked on it.
 
 from __future__ import annotations
 
+import collections
+import concurrent.futures
 import importlib.metadata
 import json
 import logging
 import math
+import multiprocessing
+import shutil
+import signal
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -22,19 +28,15 @@ import draccus
 import numpy as np
 from rich.progress import Progress
 
+from accerl_lerobot import guardian
+from accerl_lerobot.config.parsing import imported
 from accerl_lerobot.config.ranges import DatasetName, NewFolder, Range, Section, Seed, Share
-from accerl_lerobot.demos.expert import Episode, make_expert, play
-from accerl_lerobot.demos.writing import (
-    appearing,
-    check_free,
-    in_order,
-    new_dataset,
-    simulators,
-)
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.envs.base import EnvConfig, World, WorldSpec
-from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import ENVIRONMENT_STATE, REWARD, SUCCESS
+from accerl_lerobot.envs.metaworld import MetaWorld, expert_name, import_mujoco
+from accerl_lerobot.envs.simulated import SimulatedWorld
+from accerl_lerobot.errors import InputError, check_absent, expanded
+from accerl_lerobot.experience import ENVIRONMENT_STATE, REWARD, SUCCESS, Observation
 from accerl_lerobot.seeds import demo_seed
 
 SIDECAR = Path("meta") / "accerl_demos.json"
@@ -46,6 +48,227 @@ _MAX_TRIES = 50
 _VERSIONS = {name: name for name in ("lerobot", "metaworld", "robosuite", "mujoco", "numpy")}
 _VERSIONS |= {"libero": "hf-libero"}
 """Module → distribution."""
+
+
+# An episode.
+
+Expert = Callable[[], np.ndarray]
+"""Gives the next action for the state its world is in."""
+
+_DRIFT_MEMORY = 0.9
+_DRIFT_SCALE = 0.5
+_DRIFT_FROM = 60
+
+
+@dataclass(kw_only=True)
+class Episode:
+    """One recorded episode; every array has one row per env step."""
+
+    observations: dict[str, np.ndarray]
+    """Before each step, under LeRobot's names."""
+    actions: np.ndarray
+    """float32 (T, A), as executed: noise included, clipped to the world's bounds."""
+    rewards: np.ndarray
+    """float32 (T,)."""
+    task: str
+    """The instruction text."""
+    done: bool
+    """True if the last step ended the episode."""
+    success_at: int
+    """Index of the first step after which the task was achieved; -1 for never."""
+    seed: int
+
+    @property
+    def success(self) -> bool:
+        return self.success_at >= 0
+
+    def __len__(self) -> int:
+        return len(self.rewards)
+
+
+def make_expert(config: EnvConfig, world: World, task: str) -> Expert:
+    """The scripted expert of `task`, reading the simulator's own state."""
+    if config.expert is None:
+        names = ", ".join(name for name, kind in config.get_known_choices().items() if kind.expert)
+        raise InputError("env.type", config.type, f"scripted experts exist for: {names}")
+    expert: Expert = imported(config.expert)(world, task)
+    return expert
+
+
+def play(
+    world: World, expert: Expert, *, task: str, seed: int, noise: float, push: float, fail: bool
+) -> Episode:
+    """Plays one episode to its end; equal arguments give equal episodes.
+
+    Args:
+        world: Reset here with `seed`.
+        expert: Reads `world`.
+        task: Name of the task.
+        seed: Of the world and of the noise.
+        noise: Standard deviation of the Gaussian added to each action.
+        push: Largest length of the constant vector that is added to what the expert wants.
+        fail: If true, actions are a random drift from a random early step on.
+    """
+    rng = np.random.default_rng((seed, 1))
+    low, high = world.spec.action_low, world.spec.action_high
+    pushed = _push(world.spec.action_dim, push, seed)
+    drift_from = int(rng.integers(0, _DRIFT_FROM)) if fail else world.spec.max_steps
+    drift: np.ndarray = np.zeros(world.spec.action_dim)
+    observation: Observation | None = world.reset(seed, task)
+    done, success_at = False, -1
+    seen: list[Observation] = []
+    actions: list[np.ndarray] = []
+    rewards: list[float] = []
+    while not done:
+        if len(actions) < drift_from:
+            wanted = np.clip(np.asarray(expert(), np.float64), low, high) + pushed
+        else:
+            drift = _DRIFT_MEMORY * drift + _DRIFT_SCALE * rng.standard_normal(len(drift))
+            wanted = np.clip(drift, low, high)
+        action = wanted + noise * rng.standard_normal(len(wanted))
+        action = np.clip(action, low, high).astype(np.float32)
+        result = world.step_chunk(action[None])
+        assert observation is not None
+        seen.append(observation)
+        actions.append(action)
+        rewards.append(result.rewards[0])
+        if result.success and success_at < 0:
+            success_at = len(actions) - 1
+        observation, done = result.observation, result.done
+    return Episode(
+        observations={key: np.stack([row[key] for row in seen]) for key in seen[0] if key != "task"},
+        actions=np.stack(actions),
+        rewards=np.asarray(rewards, np.float32),
+        task=str(seen[0]["task"]),
+        done=done,
+        success_at=success_at,
+        seed=seed,
+    )
+
+
+def _push(size: int, longest: float, seed: int) -> np.ndarray:
+    """In any direction, and of any length up to the longest."""
+    rng = np.random.default_rng((seed, 2))
+    direction = rng.standard_normal(size)
+    pushed: np.ndarray = longest * rng.random() * direction / np.linalg.norm(direction)
+    return pushed
+
+
+def metaworld_expert(world: World, task: str) -> Expert:
+    """MetaWorld's own policy for the task."""
+    import_mujoco()
+    from metaworld import policies
+
+    assert isinstance(world, MetaWorld)
+    policy = getattr(policies, expert_name(task))()
+    return lambda: policy.get_action(world.raw_observation)
+
+
+def simulated_expert(world: World, task: str) -> Expert:
+    """Holds the action that solves the episode."""
+    assert isinstance(world, SimulatedWorld)
+    return lambda: world.solution
+
+
+# A dataset, from simulated episodes: several processes simulate, the parent writes, in order.
+
+
+def check_free(root: str, prefix: str = "") -> Path:
+    """The folder of a dataset that is to be written; an existing one is refused."""
+    folder = expanded(root, f"{prefix}root")
+    check_absent(folder, f"{prefix}root")
+    return folder
+
+
+@contextmanager
+def appearing(root: Path) -> Iterator[Path]:
+    """A folder to be filled, which becomes `root` when the context is left, or goes if there was an error."""
+    partial = root.with_name(f"{root.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    guardian.remove(partial)
+    try:
+        yield partial
+        partial.rename(root)
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+
+
+@contextmanager
+def simulators(
+    processes: int, start: Callable[..., None], *arguments: Any
+) -> Iterator[concurrent.futures.ProcessPoolExecutor]:
+    """So many processes, each made ready by `start`; an error inside ends them at once."""
+    context = multiprocessing.get_context("spawn")
+    before = set(multiprocessing.active_children())
+    with concurrent.futures.ProcessPoolExecutor(
+        processes, context, initializer=_ready, initargs=(start, *arguments)
+    ) as pool:
+        try:
+            yield pool
+        except BaseException:
+            for process in set(multiprocessing.active_children()) - before:
+                process.kill()
+            raise
+
+
+def _ready(start: Callable[..., None], *arguments: Any) -> None:
+    """Makes a process ready; Ctrl-C on the terminal is for its parent, which ends it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    start(*arguments)
+
+
+def in_order[Item, Result](
+    pool: concurrent.futures.Executor, work: Callable[[Item], Result], items: Iterable[Item], ahead: int
+) -> Iterator[Result]:
+    """Results of `work`, in the order of `items`, with at most `ahead` finished ones waiting in memory.
+
+    The first are already under way when this returns.
+    """
+    left = iter(items)
+    waiting = collections.deque(pool.submit(work, item) for _, item in zip(range(ahead), left, strict=False))
+    return _drained(pool, work, left, waiting)
+
+
+def _drained[Item, Result](
+    pool: concurrent.futures.Executor,
+    work: Callable[[Item], Result],
+    left: Iterator[Item],
+    waiting: collections.deque[concurrent.futures.Future[Result]],
+) -> Iterator[Result]:
+    while waiting:
+        result = waiting.popleft().result()
+        for item in left:
+            waiting.append(pool.submit(work, item))
+            break
+        yield result
+
+
+@contextmanager
+def new_dataset(
+    root: Path, repo_id: str, fps: int, robot_type: str, features: dict[str, Any]
+) -> Iterator[Any]:
+    """A LeRobotDataset to be filled; complete when the context has been left."""
+    from datasets.utils.logging import disable_progress_bar
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    disable_progress_bar()  # one per episode would bury ours
+    dataset = LeRobotDataset.create(
+        repo_id,
+        fps=fps,
+        features=features,
+        root=root,
+        robot_type=robot_type,
+        use_videos=False,
+        video_backend="pyav",  # unused, but the default probes for FFmpeg and complains at length
+    )
+    yield dataset
+    dataset.finalize()
+    # The pictures are inside the parquet files; LeRobot leaves the folders they were collected in.
+    shutil.rmtree(root / "images", ignore_errors=True)
+
+
+# Demonstrations.
 
 
 @dataclass(frozen=True, kw_only=True)

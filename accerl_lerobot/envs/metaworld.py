@@ -250,7 +250,7 @@ STEP_LIMIT = 500
 class MetaWorldConfig(EnvConfig):
     """Which MetaWorld tasks, seen how."""
 
-    expert = "accerl_lerobot.demos.expert:metaworld_expert"
+    expert = "accerl_lerobot.demos.record:metaworld_expert"
     world = "accerl_lerobot.envs.metaworld:MetaWorld"
 
     task: str = "drawer-open-v3"

@@ -30,7 +30,7 @@ class SimulatedConfig(EnvConfig):
     within `tolerance` of each other in every dimension.
     """
 
-    expert = "accerl_lerobot.demos.expert:simulated_expert"
+    expert = "accerl_lerobot.demos.record:simulated_expert"
     world = "accerl_lerobot.envs.simulated:SimulatedWorld"
 
     task: str = "match"

@@ -165,14 +165,14 @@ def loader(load: Load | None) -> Load:
 
 
 POLICIES: dict[str, tuple[str, tuple[str, ...]]] = {
-    "smolvla": ("accerl_lerobot.policies.smolvla:SmolVLA", ("flow",)),
+    "smolvla": ("accerl_lerobot.policies.vla:SmolVLA", ("flow",)),
     "act": ("accerl_lerobot.policies.gaussian:ACT", ("gaussian",)),
     "gaussian_actor": ("accerl_lerobot.policies.gaussian:GaussianActor", ("gaussian",)),
     "diffusion": ("accerl_lerobot.policies.diffusion:Diffusion", ("diffusion",)),
-    "pi0": ("accerl_lerobot.policies.pi0:Pi0", ("flow",)),
-    "pi05": ("accerl_lerobot.policies.pi0:Pi05", ("flow",)),
-    "pi0_fast": ("accerl_lerobot.policies.pi0:Pi0Fast", ("tokens",)),
-    "smolvla_bins": ("accerl_lerobot.policies.smolvla:SmolVLABins", ("tokens",)),
+    "pi0": ("accerl_lerobot.policies.vla:Pi0", ("flow",)),
+    "pi05": ("accerl_lerobot.policies.vla:Pi05", ("flow",)),
+    "pi0_fast": ("accerl_lerobot.policies.vla:Pi0Fast", ("tokens",)),
+    "smolvla_bins": ("accerl_lerobot.policies.vla:SmolVLABins", ("tokens",)),
 }
 """LeRobot policy type → its model, and the families that suit it, the default one first."""
 FAMILIES = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ from accerl_lerobot.report.read import (
     unreadable,
 )
 from accerl_lerobot.timeline import ROLES, STATES
+from accerl_lerobot.world_model.config import OnlineLearnConfig
 from accerl_lerobot.world_model.metrics import dataset_rows, has_several, per_dataset
 
 RECENT_S = 120.0
@@ -112,7 +113,7 @@ CHECKS = {
     "false_success_idle": ("false_success", "rollouts imagined without actions, taken for successes"),
     "recall": ("recall", "successes that are imagined as such"),
 }
-"""Check of a world model → the recipe's field with its threshold, and its meaning."""
+"""Check of a world model → the field of `ValidationConfig` with its threshold, and its meaning."""
 
 
 Table = tuple[str, Sequence[str], Sequence[Sequence[str]]]
@@ -317,12 +318,13 @@ def _imagination(run: Run) -> Section:
     real, imagined = (newest(rollout, f"replay_{kind}trained_decisions") or 0.0 for kind in ("", "imagined_"))
     if real + imagined:
         text += f" {percent(imagined / (real + imagined))} of the decisions learned from were imagined."
-    thresholds, checks = (settings.get("learn") or {}).get("validation") or {}, []
+    checks = []
     for name, (threshold, _) in CHECKS.items():
-        value, bound = newest(rollout, f"imagination_check_{name}"), thresholds.get(threshold)
-        if value is not None and bound is not None and threshold == "false_success":
+        value = newest(rollout, f"imagination_check_{name}")
+        bound = getattr(OnlineLearnConfig.validation, threshold)
+        if value is not None and threshold == "false_success":
             checks.append((name, value, f"at most {bound}", value <= bound))
-        elif value is not None and bound is not None:
+        elif value is not None:
             checks.append((name, value, f"above {bound}", value > bound))
     caption = "a recorded episode above, and what the world model imagined with the same actions below. The "
     caption += "frame at the end is green for a success and red for a failure."
@@ -480,17 +482,16 @@ def estimates(depths: Sequence[Record], key: str, name: str, colour: int) -> Ser
 
 
 def _loss_charts(run: Run) -> list[Chart]:
-    """Training losses as lines, and the same on held-out windows as points."""
+    """Training losses."""
     names = dict.fromkeys(name for record in run.records.get("world_model", []) for name in record)
     parts = [name for name in names if name not in ("kind", "step", "loss", "grad_norm")] or ["loss"]
     charts = []
     for kind, metrics in (("world_model", parts), ("success_model", ["loss", "accuracy"])):
-        learned, held_out = (run.records.get(f"{kind}{suffix}", []) for suffix in ("", "_held_out"))
-        series = []
-        for i, name in enumerate(metrics):
-            label, x, y = name.replace("_", " "), column(held_out, "step"), column(held_out, name)
-            series.append(line(label, column(learned, "step"), column(learned, name), i))
-            series.append(replace(line(f"{label}, held out", x, y, i), points=True))
+        rows = run.records.get(kind, [])
+        steps = column(rows, "step")
+        series = [
+            line(name.replace("_", " "), steps, column(rows, name), i) for i, name in enumerate(metrics)
+        ]
         charts.append(Chart(kind.replace("_", " ").capitalize(), "", "gradient steps", series, bottom=0))
     return charts
 

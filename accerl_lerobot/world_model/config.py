@@ -139,9 +139,6 @@ class LearnConfig(Section, section="world_model.learn"):
     """Chunks per window. From its second chunk on, the model is trained on its own prediction as input."""
     anchors: Annotated[int, Range("[0, 10000]")] = 15
     """The anchor lies up to so many chunks back, as far as imagined rollouts will go."""
-    validate_every: Steps = 250
-    """Gradient steps of the pre-training between losses on held-out windows; 0: never. Does not change what
-    is learned."""
 
     def lr_at(self, step: int) -> float:
         """Learning rate of a step, counted from 0; constant beyond `steps`."""
@@ -169,8 +166,6 @@ class SuccessLearnConfig(Section, section="world_model.success"):
     """Episodes that are replayed at a time."""
     refresh_every: Annotated[int, Range("[1, 1000000]")] = 50
     """Gradient steps until other episodes are replayed."""
-    validate_every: Steps = 50
-    """Gradient steps of the pre-training between losses on held-out pairs; 0: never."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -243,8 +238,6 @@ class ModelKind:
     """True if it is built from the world model in ``imagination.path``."""
     learns: bool = False
     """True if that world model can be trained on during a run."""
-    needs_history: bool = False
-    """True if it can start only where all actions since the reset are known, see `ActionHistory`."""
     min_rollouts: int = 1
     """Imagined rollouts that it must have at the same time, at least."""
 
@@ -263,7 +256,6 @@ MODELS = {
         make=f"{_REGISTRY}:oracle",
         what="a simulator, put where a rollout starts: the best there can be.",
         needs_path=False,
-        needs_history=True,
     ),
 }
 """The world models that ``imagination.model`` can name. A new one is a class and an entry here."""
@@ -322,9 +314,6 @@ class ImaginationConfig(Section, section="imagination"):
     """
     rollouts: Annotated[int, Range("[1, 100000]")] = 32
     """Imagined rollouts at a time, as one batch."""
-    start_at_reset_prob: Share = 0.0
-    """Share of rollouts that start where an episode began; the others start anywhere. The later one starts,
-    the less of it is imagined, and the truer is how it ends."""
     learn: OnlineLearnConfig = field(default_factory=OnlineLearnConfig)
 
     samples_per_insert: ClassVar[float] = 2.0
@@ -332,20 +321,19 @@ class ImaginationConfig(Section, section="imagination"):
     max_uncertainty: ClassVar[float] = 2.0
     """A rollout ends before a prediction with a higher uncertainty, where 1 is the 95th percentile on
     training data."""
-    memory: ClassVar[int] = 4096
-    """Newest real decisions that rollouts start at."""
+    memory: ClassVar[int] = 256
+    """Newest real episodes at whose resets rollouts start."""
     max_gap: ClassVar[float] = 0.5
     """The kill switch: largest difference of the success rates, imagined less real.
 
-    Rollouts from resets are compared with real episodes of the same time; where `start_at_reset_prob` is 0,
-    rollouts are compared with the episodes they start in. A world model that is promoted later gets another
-    chance. With `start_at_reset_prob`, nothing is compared any more once all real episodes have been played.
+    Rollouts are compared with real episodes of the same time, so nothing is compared any more once all real
+    episodes have been played. A world model that is promoted later gets another chance.
     """
     window: ClassVar[int] = 100
     """Imagined rollouts over which the gap is measured. When as many in a row end at once because the model
     is too uncertain, nothing is imagined any more either."""
     min_real_episodes: ClassVar[int] = 16
-    """Real episodes required before the gap is evaluated, with `start_at_reset_prob`."""
+    """Real episodes required before the gap is evaluated."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

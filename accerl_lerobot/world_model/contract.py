@@ -26,7 +26,6 @@ import torch
 from torch import Tensor, nn
 
 from accerl_lerobot.checkpoint.safety import brief
-from accerl_lerobot.checkpoint.snapshot import kind
 from accerl_lerobot.config.parsing import imported
 from accerl_lerobot.errors import InputError
 
@@ -119,16 +118,11 @@ class Context(NamedTuple):
     """float32 (B, S), the robot's state where that sum begins."""
 
 
-@kind
-class ActionHistory(NamedTuple):
-    """Reset and actions that lead to where a rollout starts, for models that replay them."""
+class Reset(NamedTuple):
+    """Arguments of the `World.reset` at which a rollout starts, for models that repeat it."""
 
     task: str
-    """Argument of `World.reset`."""
     seed: int
-    """Argument of `World.reset`."""
-    actions: np.ndarray
-    """float32 (t, A), executed since."""
 
 
 class WorldModel(ABC):
@@ -137,15 +131,13 @@ class WorldModel(ABC):
     spec: WorldModelSpec
 
     @abstractmethod
-    def begin(
-        self, context: Context, tasks: Sequence[str], histories: Sequence[ActionHistory | None] | None = None
-    ) -> State:
+    def begin(self, context: Context, tasks: Sequence[str], resets: Sequence[Reset] | None = None) -> State:
         """Starts B rollouts.
 
         Args:
             context: last real observations.
             tasks: B instructions.
-            histories: actions since the reset, where they are known.
+            resets: of the environment, if the rollouts start there.
         """
 
     @abstractmethod

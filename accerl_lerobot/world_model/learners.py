@@ -15,7 +15,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,7 +23,7 @@ import torch
 from accerl_lerobot.checkpoint.snapshot import kind
 from accerl_lerobot.checkpoint.tensors import copied, optimizer_state, restore_optimizer
 from accerl_lerobot.world_model.config import LearnConfig, SuccessLearnConfig
-from accerl_lerobot.world_model.contract import LearnableWorldModel, WorldModel, WorldModelSpec
+from accerl_lerobot.world_model.contract import LearnableWorldModel, WorldModel
 from accerl_lerobot.world_model.data import Episode, Windows, WindowStart, cut_windows, window_starts
 from accerl_lerobot.world_model.metrics import shuffle_across_groups
 from accerl_lerobot.world_model.rollout_eval import replay
@@ -36,8 +36,6 @@ from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import (
 
 STATISTICS_WINDOWS = 2048
 """Windows from which normalisation statistics are taken."""
-HELD_OUT_SAMPLES = 64
-"""Held-out windows, and pairs of frames, on which losses are taken."""
 EASY = 0.1
 """How often a failure of P(success) = 0 is drawn, beside one of P(success) = 1."""
 
@@ -80,7 +78,11 @@ class Learner:
 
     def windows(self, episodes: Sequence[Episode], at: Sequence[WindowStart]) -> Windows:
         """Cuts windows, with anchors as far back as rollouts will go."""
-        windows = _windows(episodes, at, self.model.spec, self.config, self.rng)
+        spec, config = self.model.spec, self.config
+        back = self.rng.integers(config.anchors + 1, size=len(at)).tolist()
+        windows = cut_windows(
+            episodes, at, chunk=spec.chunk, context=spec.context, chunks=config.chunks, anchors=back
+        )
         if self._shuffle:
             donors = shuffle_across_groups(len(windows), windows.episode.tolist(), self.rng)
             windows = replace(windows, actions=windows.actions[donors])
@@ -136,34 +138,6 @@ class Learner:
                 served.copy_(now)
 
 
-class HeldOutLoss:
-    """Loss on held-out windows, always the same ones with the same noise, and with their true actions.
-
-    It has random draws of its own, so it does not change the training.
-    """
-
-    def __init__(
-        self, episodes: Sequence[Episode], spec: WorldModelSpec, config: LearnConfig, seed: int
-    ) -> None:
-        at, rng = window_starts(episodes), np.random.default_rng((seed, 9))
-        chosen = rng.choice(len(at), min(HELD_OUT_SAMPLES, len(at)), replace=False)
-        self._windows = _windows(episodes, [at[i] for i in chosen], spec, config, rng)
-        self._seed = seed
-
-    @torch.no_grad()
-    def __call__(self, model: LearnableWorldModel) -> dict[str, float]:
-        """The metrics of `Learner.step` without ``grad_norm``."""
-        loss, metrics = model.loss(self._windows, torch.Generator().manual_seed(self._seed))
-        return metrics | {"loss": loss.item()}
-
-
-class HeldOut(NamedTuple):
-    """Episodes on which losses are taken during the training, and what receives these."""
-
-    episodes: Sequence[Episode]
-    on_losses: OnStep
-
-
 def train_from_scratch(
     model: LearnableWorldModel,
     episodes: Sequence[Episode],
@@ -172,38 +146,15 @@ def train_from_scratch(
     *,
     shuffle: bool = False,
     on_step: OnStep = lambda step, metrics: None,
-    held_out: HeldOut | None = None,
 ) -> Learner:
-    """Fits the statistics of a new model and trains it.
-
-    Losses on `held_out` are taken every `LearnConfig.validate_every` steps, see `HeldOutLoss`.
-    """
+    """Fits the statistics of a new model and trains it."""
     at = window_starts(episodes)
     learner = Learner(model, config, seed, shuffle)
     model.fit_statistics(learner.draw(episodes, at, min(STATISTICS_WINDOWS, 4 * len(at))))
     learner.serving.load_state_dict(model.state_dict())
-    held_out_loss = None
-    if config.validate_every and held_out is not None and window_starts(held_out.episodes):
-        held_out_loss = HeldOutLoss(held_out.episodes, model.spec, config, seed)
     for step in range(1, config.steps + 1):
         on_step(step, learner.step(learner.draw(episodes, at)))
-        if held_out is not None and held_out_loss is not None and step % config.validate_every == 0:
-            held_out.on_losses(step, held_out_loss(learner.serving))
     return learner
-
-
-def _windows(
-    episodes: Sequence[Episode],
-    at: Sequence[WindowStart],
-    spec: WorldModelSpec,
-    config: LearnConfig,
-    rng: np.random.Generator,
-) -> Windows:
-    """Cuts windows with anchors at random distances."""
-    back = rng.integers(config.anchors + 1, size=len(at)).tolist()
-    return cut_windows(
-        episodes, at, chunk=spec.chunk, context=spec.context, chunks=config.chunks, anchors=back
-    )
 
 
 # The success model.
@@ -366,8 +317,15 @@ class SuccessLearner:
                 self._imagined = ImaginedPairs.imagine(examples, world, self.model, *sizes, self.rng)
             parts.append(self._imagined.sample(imagined, self.rng))
         self._count += 1
-        pairs = tuple(np.concatenate(x) for x in zip(*parts, strict=True))
-        loss, metrics = _success_loss(self.model, pairs, self._generator)
+        before, after, success, progress = (np.concatenate(x) for x in zip(*parts, strict=True))
+        device = self.model.out.weight.device
+        loss, metrics = self.model.loss(
+            as_floats(before, device),
+            as_floats(after, device),
+            torch.from_numpy(success.astype(np.float32)).to(device),
+            torch.from_numpy(progress.astype(np.float32)).to(device),
+            self._generator,
+        )
         self._optimizer.zero_grad(set_to_none=True)
         loss.backward()
         norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), 1.0)
@@ -398,35 +356,6 @@ class SuccessLearner:
         restore_optimizer(self._optimizer, state["optimizer"])
 
 
-def held_out_success_metrics(
-    model: SuccessPairsRewardModel, examples: Examples, seed: int
-) -> dict[str, float]:
-    """``loss``, ``accuracy`` and ``progress`` on held-out recorded pairs, always the same ones.
-
-    The model keeps its mode, and no random number of the training is drawn.
-    """
-    pairs, training = examples.sample(HELD_OUT_SAMPLES, np.random.default_rng((seed, 9))), model.training
-    model.eval()  # without augmentation
-    with torch.no_grad():
-        _, metrics = _success_loss(model, pairs, None)
-    model.train(training)
-    return metrics
-
-
 def new_success_model(chunk: int) -> SuccessPairsRewardModel:
     """Builds an untrained one on the CPU."""
     return SuccessPairsRewardModel(SuccessPairsConfig(chunk=chunk, device="cpu"))
-
-
-def _success_loss(
-    model: SuccessPairsRewardModel, pairs: Pairs, generator: torch.Generator | None
-) -> tuple[torch.Tensor, dict[str, float]]:
-    before, after, success, progress = pairs
-    device = model.out.weight.device
-    return model.loss(
-        as_floats(before, device),
-        as_floats(after, device),
-        torch.from_numpy(success.astype(np.float32)).to(device),
-        torch.from_numpy(progress.astype(np.float32)).to(device),
-        generator,
-    )

@@ -23,10 +23,10 @@ from torch.nn import functional
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.config import NetworkConfig, PixelModelConfig
 from accerl_lerobot.world_model.contract import (
-    ActionHistory,
     Context,
     LearnableWorldModel,
     Prediction,
+    Reset,
     State,
     WorldModelSpec,
 )
@@ -84,9 +84,7 @@ class PixelWorldModel(LearnableWorldModel):
         change = float(np.sqrt(np.square(frames[:, 1] - frames[:, 0]).mean()))
         self.change.fill_(max(change, 1e-3))
 
-    def begin(
-        self, context: Context, tasks: Sequence[str], histories: Sequence[ActionHistory | None] | None = None
-    ) -> State:
+    def begin(self, context: Context, tasks: Sequence[str], resets: Sequence[Reset] | None = None) -> State:
         state = {name: x.to(self.change.device) for name, x in context._asdict().items()}
         return state | {"anchor": state["frames"][:, -1]}
 

@@ -6,7 +6,7 @@
   validation.json  results
   preview.mp4      real, predicted, and predicted with another episode's actions; of a policy's episodes
                    preview_online.mp4
-  metrics.jsonl    training and held-out losses
+  metrics.jsonl    training losses
 """
 
 from __future__ import annotations
@@ -42,9 +42,7 @@ from accerl_lerobot.world_model.data import (
 )
 from accerl_lerobot.world_model.learners import (
     Examples,
-    HeldOut,
     SuccessLearner,
-    held_out_success_metrics,
     new_success_model,
     train_from_scratch,
 )
@@ -132,7 +130,7 @@ def pretrain(run: WorldModelRun, directory: Path, console: Console) -> dict[str,
     all_held_out = [episode for part in held_out.values() for episode in part]
     spec = replace(spec, tasks=_tasks(run.env, every))
     started = time.monotonic()
-    serving, success = _train(run, spec, (learn, all_held_out), device, directory, console)
+    serving, success = _train(run, spec, learn, device, directory, console)
     seconds = time.monotonic() - started
     save_world_model(directory / "world_model", serving, None, [part.source for part in parts.values()])
     # The threshold is chosen on the policy's failures, where there are any, as demonstrations fail otherwise.
@@ -153,15 +151,14 @@ def pretrain(run: WorldModelRun, directory: Path, console: Console) -> dict[str,
 def _train(
     run: WorldModelRun,
     spec: WorldModelSpec,
-    episodes: tuple[Sequence[Episode], Sequence[Episode]],
+    learn: Sequence[Episode],
     device: torch.device,
     directory: Path,
     console: Console,
 ) -> tuple[LearnableWorldModel, SuccessPairsRewardModel]:
-    """Trains a world model and a success model on the first episodes; on the others losses are taken."""
+    """Trains a world model and a success model."""
     config, seed = run.world_model, run.seed
-    learn, held_out = episodes
-    examples, others = (Examples(part, config.chunk) for part in episodes)
+    examples = Examples(learn, config.chunk)
     torch.manual_seed(seed)
     # Both networks are initialised on the CPU, so alike on every device.
     model = new_learnable(spec, config.model).to(device)
@@ -171,42 +168,25 @@ def _train(
             log.write(json.dumps({"kind": kind, "step": step} | metrics) + "\n")
 
         with console.stage("world model", total=config.learn.steps) as stage:
-            suffix = ""
 
             def on_step(step: int, metrics: dict[str, float]) -> None:
-                stage.update(step, _status(metrics) + suffix)
+                stage.update(step, " ".join(f"{k} {v:.3f}" for k, v in [*metrics.items()][:2]))
                 if step % LOG_EVERY == 0:
                     record("world_model", step, metrics)
 
-            def on_held_out(step: int, metrics: dict[str, float]) -> None:
-                nonlocal suffix
-                suffix = f", held out {_status(metrics)}"
-                record("world_model_held_out", step, metrics)
-
             serving = train_from_scratch(
-                model, learn, config.learn, seed, shuffle=config.shuffle_actions,
-                on_step=on_step, held_out=HeldOut(held_out, on_held_out),
-            ).serving  # fmt: skip
+                model, learn, config.learn, seed, shuffle=config.shuffle_actions, on_step=on_step
+            ).serving
         fit_uncertainty_scale(serving, learn, config.validation, seed)
         success = new_success_model(config.chunk).to(device)
         learner = SuccessLearner(success, config.success, seed)
         with console.stage("success model", total=config.success.steps) as stage:
-            suffix, every = "", config.success.validate_every
             for step in range(1, config.success.steps + 1):
                 metrics = learner.step(examples, serving)
                 if step % LOG_EVERY == 0:
                     record("success_model", step, metrics)
-                if every and step % every == 0:
-                    held_out_metrics = held_out_success_metrics(success, others, seed)
-                    suffix = f", held out {held_out_metrics['loss']:.3f}"
-                    record("success_model_held_out", step, held_out_metrics)
-                stage.update(step, f"loss {metrics['loss']:.3f}{suffix}")
+                stage.update(step, f"loss {metrics['loss']:.3f}")
     return serving, success.eval()
-
-
-def _status(metrics: dict[str, float]) -> str:
-    """The first two metrics; those of our own model are ``image`` and ``state``."""
-    return " ".join(f"{name} {value:.3f}" for name, value in [*metrics.items()][:2])
 
 
 def _split(

@@ -26,11 +26,11 @@ from accerl_lerobot.experience import TASK
 from accerl_lerobot.policies.loading import resolve_device
 from accerl_lerobot.world_model.config import ImaginationConfig
 from accerl_lerobot.world_model.contract import (
-    ActionHistory,
     BuildInputs,
     Context,
     LearnableWorldModel,
     Prediction,
+    Reset,
     State,
     WorldModel,
     WorldModelSpec,
@@ -134,9 +134,7 @@ class CopyModel(WorldModel):
     def __init__(self, spec: WorldModelSpec) -> None:
         self.spec = replace(spec, provides=spec.provides - {"uncertainty"})
 
-    def begin(
-        self, context: Context, tasks: Sequence[str], histories: Sequence[ActionHistory | None] | None = None
-    ) -> State:
+    def begin(self, context: Context, tasks: Sequence[str], resets: Sequence[Reset] | None = None) -> State:
         return {"frames": context.frames[:, -1], "robot": context.robot[:, -1]}
 
     def step(self, state: State, actions: Tensor, seeds: Sequence[int]) -> Prediction:
@@ -150,10 +148,8 @@ class ShuffledModel(WorldModel):
     def __init__(self, model: WorldModel) -> None:
         self.model, self.spec = model, model.spec
 
-    def begin(
-        self, context: Context, tasks: Sequence[str], histories: Sequence[ActionHistory | None] | None = None
-    ) -> State:
-        return self.model.begin(context, tasks, histories)
+    def begin(self, context: Context, tasks: Sequence[str], resets: Sequence[Reset] | None = None) -> State:
+        return self.model.begin(context, tasks, resets)
 
     def step(self, state: State, actions: Tensor, seeds: Sequence[int]) -> Prediction:
         """See the base class.
@@ -174,7 +170,7 @@ def learned_part(model: WorldModel) -> LearnableWorldModel:
 
 
 class OracleModel(WorldModel):
-    """Simulators that are put where a rollout starts, by replaying its history.
+    """Simulators that are put where a rollout starts: at a reset.
 
     A state holds the actions since the reset, so it can be continued more than once; a simulator that is
     already there just goes on. At most `simulators` are kept.
@@ -188,27 +184,20 @@ class OracleModel(WorldModel):
         self._made = 0
         self.tasks: list[str] = []
 
-    def begin(
-        self, context: Context, tasks: Sequence[str], histories: Sequence[ActionHistory | None] | None = None
-    ) -> State:
+    def begin(self, context: Context, tasks: Sequence[str], resets: Sequence[Reset] | None = None) -> State:
         """See the base class.
 
         Raises:
-            ValueError: a history is not known.
+            ValueError: the resets are not known.
         """
-        if histories is None or any(h is None for h in histories):
-            raise ValueError("an oracle needs the history of every start")
-        known = [h for h in histories if h is not None]
-        self.tasks += sorted({h.task for h in known} - set(self.tasks))
-        longest = max(len(h.actions) for h in known)
-        played = np.zeros((len(known), longest, self.spec.action_dim), np.float32)
-        for row, h in zip(played, known, strict=True):
-            row[: len(h.actions)] = h.actions
+        if resets is None:
+            raise ValueError("an oracle needs the reset of every start")
+        self.tasks += sorted({reset.task for reset in resets} - set(self.tasks))
         return {
-            "task": torch.tensor([self.tasks.index(h.task) for h in known]),
-            "seed": torch.tensor([h.seed for h in known]),
-            "count": torch.tensor([len(h.actions) for h in known]),
-            "played": torch.from_numpy(played),
+            "task": torch.tensor([self.tasks.index(reset.task) for reset in resets]),
+            "seed": torch.tensor([reset.seed for reset in resets]),
+            "count": torch.zeros(len(resets), dtype=torch.long),
+            "played": torch.zeros(len(resets), 0, self.spec.action_dim),
         }
 
     def step(self, state: State, actions: Tensor, seeds: Sequence[int]) -> Prediction:

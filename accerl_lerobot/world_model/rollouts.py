@@ -1,14 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Imagined rollouts: the policy acts, and a world model predicts what it observes.
 
-A rollout starts at a real observation. Its segment is like any other, but for its source: a success ends it,
-the environment's time limit ends it, and where the model becomes too uncertain, V of its last observation
+A rollout starts where a real episode began. Its segment is like any other, but for its source: a success ends
+it, the environment's time limit ends it, and where the model becomes too uncertain, V of its last observation
 stands for the rest. Nothing that follows a success is imagined.
 
 No process is known here: the caller asks for `requests`, has them decided, and hands the decisions to
 `advance`.
-
-Start states of imagined rollouts: real observations, drawn at resets or anywhere.
 
 Shapes: see `contract.py`; T decisions of a segment.
 """
@@ -32,15 +30,15 @@ from accerl_lerobot.experience import IMAGINED, Decision, Observation, Origin, R
 from accerl_lerobot.rollout.segments import SegmentBuilder
 from accerl_lerobot.world_model.config import IMAGINATION, ImaginationConfig
 from accerl_lerobot.world_model.contract import (
-    ActionHistory,
     Context,
     Prediction,
+    Reset,
     State,
     WorldModel,
     WorldModelSpec,
     replace_rows,
 )
-from accerl_lerobot.world_model.data import executed_actions, model_arrays, policy_observation
+from accerl_lerobot.world_model.data import model_arrays, policy_observation
 from accerl_lerobot.world_model.registry import (
     ImaginationModels,
     OracleModel,
@@ -54,169 +52,53 @@ if TYPE_CHECKING:
     from accerl_lerobot.world_model.online import Promotion
 
 
-EpisodeName = tuple[str, int]
-"""Task and seed."""
-MAX_UNFINISHED = 1024
-"""Episodes that may go on in another segment; of more, such as those of a worker that died, the oldest are
-dropped."""
-
-
 @kind
 @dataclass(frozen=True, kw_only=True)
 class Start:
-    """A real observation, and what led there."""
+    """The first observation of a real episode."""
 
     frames: np.ndarray
-    """uint8 (L, V, H, W, 3), of the model's size, the newest last."""
+    """uint8 (V, H, W, 3), of the model's size."""
     robot: np.ndarray
-    """float32 (L, S)."""
-    actions: np.ndarray
-    """float32 (L − 1, K, A), executed between these."""
-    commanded_sum: np.ndarray
-    """float32 (A,), see `Context`."""
-    initial_state: np.ndarray
-    """float32 (S,), see `Context`."""
+    """float32 (S,)."""
     task: str
     """The instruction."""
     origin: Origin
-    history: ActionHistory | None
-    """None: the segment began in mid-episode, and what came before is not known."""
-    achieved: bool | None
-    """True if the real episode achieved the task; None: not known, or not yet."""
-
-
-@kind
-class _Lead(NamedTuple):
-    """Summary of the observations before a segment, which may begin in mid-episode."""
-
-    decision: int
-    """The segment's first."""
-    commanded_sum: np.ndarray
-    initial_state: np.ndarray
 
 
 class StartPool:
-    """The newest real decisions; `ImaginationConfig` says how many, and where rollouts start."""
+    """Resets of the newest real episodes."""
 
-    def __init__(self, spec: WorldModelSpec, config: ImaginationConfig) -> None:
-        self.spec, self.config = spec, config
-        self._held: deque[_Held] = deque()
-        self._leads: dict[EpisodeName, _Lead] = {}
-        """Leads to the next segment of episodes that have not ended; the oldest first."""
-        self._outcomes: dict[EpisodeName, bool] = {}
-        """Outcomes of episodes that have ended, and of which something is held."""
-        self._count = 0
+    def __init__(self, spec: WorldModelSpec, memory: int) -> None:
+        self._spec = spec
+        self.held: deque[Start] = deque(maxlen=memory)
 
     def __len__(self) -> int:
-        """Decisions to start at."""
-        return self._count
+        return len(self.held)
 
     def add(self, segment: Segment) -> None:
-        """Takes a real segment; the oldest ones leave."""
-        held = _Held(segment, self.spec)
-        self._link(held)
-        usable = not self.config.kind.needs_history and len(segment) >= self.spec.context
-        if not segment.origin.decision or usable:
-            self._held.append(held)
-            self._count += len(segment)
-        names = [held.name for held in self._held]
-        if (segment.terminated or segment.truncated) and held.name in names:
-            self._outcomes[held.name] = segment.terminated and segment.success
-        while self._held and self._count - len(self._held[0].segment) >= self.config.memory:
-            gone = self._held.popleft()
-            self._count -= len(gone.segment)
-            names.pop(0)
-            if gone.name not in names:
-                self._outcomes.pop(gone.name, None)
-
-    def state(self) -> dict[str, Any]:
-        """All that `restore` needs; see `snapshot`."""
-        held = [(held.segment, held.lead) for held in self._held]
-        return {"held": held, "leads": dict(self._leads), "outcomes": dict(self._outcomes)}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Continues from a `state`."""
-        self._held.extend(_Held(segment, self.spec, lead) for segment, lead in state["held"])
-        self._leads.update(state["leads"])
-        self._count = sum(len(held.segment) for held in self._held)
-        self._outcomes = state["outcomes"]
-
-    def _link(self, held: _Held) -> None:
-        """Sets the segment's lead, and keeps the lead to the next one."""
-        segment, name = held.segment, held.name
-        lead = self._leads.pop(name, None)
-        if lead is not None and lead.decision == segment.origin.decision:
-            held.lead = lead
-        if segment.terminated or segment.truncated:
+        """Takes a real segment, if its episode begins with it; the oldest ones leave."""
+        if segment.origin.decision:
             return
-        total = held.lead.commanded_sum + executed_actions(segment.actions, segment.steps).sum(0)
-        self._leads[name] = _Lead(segment.origin.decision + len(segment), total, held.lead.initial_state)
-        if len(self._leads) > MAX_UNFINISHED:
-            self._leads.pop(next(iter(self._leads)))
+        first = {name: rows[:1] for name, rows in segment.observations.items()}
+        frames, robot = model_arrays(first, self._spec)
+        self.held.append(Start(frames=frames[0], robot=robot[0], task=segment.task, origin=segment.origin))
 
     def draw(self, count: int, rng: np.random.Generator) -> list[Start]:
-        """Draws starts, with repetition.
+        """Draws starts, with repetition; there must be some."""
+        return [self.held[i] for i in rng.integers(len(self.held), size=count)]
 
-        Raises:
-            ValueError: there are none yet.
-        """
-        if not self._count:
-            raise ValueError("no real experience to start from yet")
-        lengths = np.array([len(h.segment) for h in self._held])
-        allowed = np.concatenate([h.allowed for h in self._held])
-        weights = allowed / max(1, allowed.sum())
-        first = np.concatenate([h.first for h in self._held])
-        if first.any():
-            reset = self.config.start_at_reset_prob
-            weights = reset * first / first.sum() + (1 - reset) * weights
-        drawn = rng.choice(self._count, size=count, p=weights / weights.sum())
-        ends = np.cumsum(lengths)
-        of = np.searchsorted(ends, drawn, side="right")
-        return [
-            self._start(self._held[s], int(i - ends[s] + lengths[s])) for s, i in zip(of, drawn, strict=True)
-        ]
-
-    def _start(self, held: _Held, t: int) -> Start:
-        segment, spec = held.segment, self.spec
-        context = [max(0, t - back) for back in range(spec.context - 1, -1, -1)]
-        history, actions = None, executed_actions(segment.actions[:t], segment.steps[:t])
-        if not segment.origin.decision:
-            history = ActionHistory(segment.origin.task, segment.origin.seed, actions)
-        return Start(
-            frames=held.frames[context],
-            robot=held.robot[context],
-            actions=_chunks_before(segment, t, spec.context),
-            commanded_sum=held.lead.commanded_sum + actions.sum(0),
-            initial_state=held.lead.initial_state,
-            task=segment.task,
-            origin=segment.origin._replace(decision=segment.origin.decision + t),
-            history=history,
-            achieved=self._outcomes.get(held.name),
+    def context(self, starts: Sequence[Start]) -> Context:
+        """A world model's context: nothing has moved before a reset, and no action was executed."""
+        b, spec = len(starts), self._spec
+        frames, robot = (np.stack([getattr(start, name) for start in starts]) for name in ("frames", "robot"))
+        return Context(
+            frames=torch.from_numpy(np.repeat(frames[:, None], spec.context, 1)),
+            robot=torch.from_numpy(np.repeat(robot[:, None], spec.context, 1)),
+            actions=torch.zeros(b, spec.context - 1, spec.chunk, spec.action_dim),
+            commanded_sum=torch.zeros(b, spec.action_dim),
+            initial_state=torch.from_numpy(robot),
         )
-
-
-def _chunks_before(segment: Segment, t: int, context: int) -> np.ndarray:
-    """Chunks of the decisions before the t-th, zero before the segment began."""
-    chunks = np.zeros((context - 1, *segment.actions.shape[1:]), np.float32)
-    known = min(t, context - 1)
-    if known:
-        chunks[-known:] = segment.actions[t - known : t]
-    return chunks
-
-
-class _Held:
-    """A segment as arrays of the model; without a `lead` its episode begins with it, as far as is known."""
-
-    def __init__(self, segment: Segment, spec: WorldModelSpec, lead: _Lead | None = None) -> None:
-        self.segment, self.name = segment, segment.origin[:2]
-        self.first = segment.origin.decision + np.arange(len(segment)) == 0
-        self.frames, self.robot = model_arrays(segment.observations, spec)
-        nothing = np.zeros(spec.action_dim, np.float32)
-        self.lead = lead or _Lead(segment.origin.decision, nothing, self.robot[0])
-        # In mid-episode, the context of the first decisions of a segment is not known.
-        self.allowed = np.ones(len(segment), bool)
-        if segment.origin.decision:
-            self.allowed[: spec.context - 1] = False
 
 
 @kind
@@ -314,8 +196,6 @@ class _Row:
     start: Start
     frames: np.ndarray
     """uint8 (V, H, W, 3), the newest."""
-    ends_at: int
-    """Decisions after which the time limit ends it."""
     depth: int = 0
 
 
@@ -346,10 +226,7 @@ class Imagination:
         sources: Sequence[Source] = (),
     ) -> None:
         self.config, self.counters = config, ImaginationCounters()
-        # True if some rollouts are whole episodes, which can be compared with real ones of the same time.
-        self._compares_whole = config.start_at_reset_prob > 0
-        outcomes = config.min_real_episodes if self._compares_whole else config.window
-        self.switch = KillSwitch(config.max_gap, config.window, outcomes)
+        self.switch = KillSwitch(config.max_gap, config.window, config.min_real_episodes)
         self.version = 0
         self.awaits_model = config.learns
         """True if no model has passed validation yet."""
@@ -357,7 +234,7 @@ class Imagination:
         self._success = None if "success" in models.model.spec.provides else models.success
         self._sources = tuple(sources)
         self._run, self._on_segment = run, on_segment
-        self._starts = StartPool(models.model.spec, config)
+        self._starts = StartPool(models.model.spec, config.memory)
         self._rng = np.random.default_rng((run.seed, 3))
         self._rows: list[_Row | None] = [None] * config.rollouts
         self._state: State | None = None
@@ -372,7 +249,7 @@ class Imagination:
     def remember(self, segment: Segment) -> None:
         """Lets rollouts start in a real segment."""
         self._starts.add(segment)
-        if self._compares_whole and self.on and (segment.terminated or segment.truncated):
+        if self.on and (segment.terminated or segment.truncated):
             self.switch.add_real(segment.terminated and segment.success)
 
     def swap(self, promotion: Promotion) -> None:
@@ -398,7 +275,7 @@ class Imagination:
             "counters": replace(self.counters),
             "switch": self.switch.state(),
             "version": (self.version, self.awaits_model),
-            "starts": self._starts.state(),
+            "starts": list(self._starts.held),
             "rng": self._rng,
             "rows": rows,
             "model_state": self._state,
@@ -412,7 +289,7 @@ class Imagination:
         self.counters, self._rng = state["counters"], state["rng"]
         self.switch.restore(state["switch"])
         self.version, self.awaits_model = state["version"]
-        self._starts.restore(state["starts"])
+        self._starts.held.extend(state["starts"])
         self._sequence, self._uncertain_in_a_row = state["sequence"]
         if state["promoted"] is not None and self._success is not None:
             model, success, self._success.config.threshold = state["promoted"]
@@ -503,22 +380,13 @@ class Imagination:
         }
 
     def _end_if_over(self, i: int, row: _Row, achieved: bool, done: bool) -> None:
-        late = row.depth >= row.ends_at
+        late = row.depth >= self._limit
         done = done and not late
         if achieved or late or done:
             self.counters.successes += achieved
-            self._compare(row.start, achieved)
+            self.switch.add_imagined(achieved)
             terminated = achieved or done or (late and self._run.time_limit_fails)
             self._end(i, row, terminated=terminated, truncated=late, success=achieved)
-
-    def _compare(self, start: Start, achieved: bool) -> None:
-        """Reports an ended rollout to the kill switch; `remember` reports real episodes."""
-        if self._compares_whole:
-            if not start.origin.decision:
-                self.switch.add_imagined(achieved)
-        elif start.achieved is not None:
-            self.switch.add_imagined(achieved)
-            self.switch.add_real(start.achieved)
 
     def _end(
         self, i: int, row: _Row, *, terminated: bool, truncated: bool = False, success: bool = False
@@ -539,21 +407,15 @@ class Imagination:
         if not rows:
             return
         starts = self._starts.draw(len(rows), self._rng)
-        parts = [np.stack([getattr(s, part) for s in starts]) for part in Context._fields]
-        state = self._model.begin(
-            Context(*(torch.from_numpy(part) for part in parts)),
-            [s.task for s in starts],
-            [s.history for s in starts],
-        )
+        resets = [Reset(*start.origin[:2]) for start in starts]
+        state = self._model.begin(self._starts.context(starts), [start.task for start in starts], resets)
         self._state = state if self._state is None else replace_rows(self._state, rows, state)
         for i, start in zip(rows, starts, strict=True):
-            frames = start.frames[-1]
-            observation = self._observation(frames, start.robot[-1], start.task)
+            observation = self._observation(start.frames, start.robot, start.task)
             self._rows[i] = _Row(
                 builder=SegmentBuilder(observation, self._limit, start.origin, IMAGINED),
                 start=start,
-                frames=frames,
-                ends_at=max(1, self._limit - start.origin.decision),
+                frames=start.frames,
             )
 
     def _success_probability(self, prediction: Prediction, frames: np.ndarray) -> np.ndarray:

@@ -19,7 +19,7 @@ from accerl_lerobot.envs import make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.world_model.config import NetworkConfig, PixelModelConfig, WorldModelConfig
-from accerl_lerobot.world_model.contract import ActionHistory, Context, Prediction, State, WorldModel
+from accerl_lerobot.world_model.contract import Context, Prediction, Reset, State, WorldModel
 from accerl_lerobot.world_model.learners import new_success_model
 from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.pretrain import world_spec
@@ -58,9 +58,7 @@ class Knowing(WorldModel):
 
     spec = SPEC
 
-    def begin(
-        self, context: Context, tasks: Sequence[str], histories: Sequence[ActionHistory | None] | None = None
-    ) -> State:
+    def begin(self, context: Context, tasks: Sequence[str], resets: Sequence[Reset] | None = None) -> State:
         assert not context.commanded_sum.any() and torch.equal(context.initial_state, context.robot[:, -1])
         return {"robot": context.robot[:, -1], "frames": context.frames[:, -1]}
 

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from accerl_lerobot.demos.expert import Episode, make_expert, play
-from accerl_lerobot.demos.record import DemosConfig, record_demos
+from accerl_lerobot.demos.record import DemosConfig, Episode, make_expert, play, record_demos
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.envs.libero import LiberoConfig
 from accerl_lerobot.errors import InputError

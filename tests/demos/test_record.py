@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from accerl_lerobot.demos.expert import make_expert, play
-from accerl_lerobot.demos.record import SIDECAR, DemosConfig, record_demos
+from accerl_lerobot.demos.record import SIDECAR, DemosConfig, make_expert, play, record_demos
 from accerl_lerobot.envs import EnvConfig, LeRobotEnvConfig, MetaWorldConfig, SimulatedConfig, make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.seeds import demo_seed

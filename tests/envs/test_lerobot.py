@@ -119,7 +119,7 @@ def test_stock_lerobot_sees_our_world(plugin):
 
 
 def test_the_expert_succeeds_through_the_plugin(plugin):
-    from accerl_lerobot.demos.expert import make_expert
+    from accerl_lerobot.demos.record import make_expert
     from accerl_lerobot.envs.lerobot_plugin import AccerlEnv
 
     config = MetaWorldConfig(task="handle-press-v3")

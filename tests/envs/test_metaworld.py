@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from accerl_lerobot.demos.expert import make_expert
+from accerl_lerobot.demos.record import make_expert
 from accerl_lerobot.envs import MetaWorld, MetaWorldConfig, make_world
 from accerl_lerobot.envs import metaworld as gl
 from accerl_lerobot.envs.metaworld import all_tasks, description, expert_name, groups
@@ -155,7 +155,7 @@ def test_a_missing_opengl_names_the_package(headless: pytest.MonkeyPatch):
 
 def test_the_package_is_light_to_import():
     code = (
-        "import sys, accerl_lerobot.envs, accerl_lerobot.demos.expert\n"
+        "import sys, accerl_lerobot.envs, accerl_lerobot.demos.record\n"
         "heavy = {'torch', 'lerobot', 'mujoco', 'metaworld', 'gymnasium', 'ray'} & set(sys.modules)\n"
         "assert not heavy, heavy"
     )

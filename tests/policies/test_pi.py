@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from accerl_lerobot.policies import flow
-from accerl_lerobot.policies import pi0 as pi0_fast
+from accerl_lerobot.policies import vla as pi0_fast
 from accerl_lerobot.policies.adapter import LeRobotAdapter, stack_observations
 from accerl_lerobot.policies.config import FlowSamplerConfig, PolicyConfig, TokenSamplerConfig
 from accerl_lerobot.policies.saving import save_pretrained

@@ -20,7 +20,7 @@ from typing import Any
 import pytest
 
 from accerl_lerobot.checkpoint.layout import BACKBONE, FAST
-from accerl_lerobot.policies.pi0 import data_only
+from accerl_lerobot.policies.vla import data_only
 from tests.policies.checkpoints import write_policy
 
 PALIGEMMA = "google/paligemma-3b-pt-224"

@@ -155,7 +155,6 @@ def write_world_model(folder: Path, *, passed: bool = True, finished: bool = Tru
         {"kind": "world_model", "step": step, "image": 1 / step, "state": 0.1, "image_imagined": 1.1 / step}
         for step in range(20, 420, 20)
     ]
-    losses += [{"kind": "world_model_held_out", "step": step, "image": 2 / step} for step in (200, 400)]
     (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in losses))
     if finished:
         depths = [

@@ -15,10 +15,10 @@ from torch import Tensor, nn
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.config import LearnableModelConfig
 from accerl_lerobot.world_model.contract import (
-    ActionHistory,
     Context,
     LearnableWorldModel,
     Prediction,
+    Reset,
     State,
     WorldModelSpec,
 )
@@ -58,9 +58,7 @@ class LinearWorldModel(LearnableWorldModel):
         moved = windows.state[:, now + 1] - windows.state[:, now]
         self.scale.copy_(torch.from_numpy(moved.std(0)).clamp(min=1e-3))
 
-    def begin(
-        self, context: Context, tasks: Sequence[str], histories: Sequence[ActionHistory | None] | None = None
-    ) -> State:
+    def begin(self, context: Context, tasks: Sequence[str], resets: Sequence[Reset] | None = None) -> State:
         """See the base class."""
         seen = {"frames": context.frames[:, -1], "robot": context.robot[:, -1]}
         return {name: tensor.to(self.scale.device) for name, tensor in seen.items()}

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -182,51 +181,10 @@ def test_the_validation_is_on_episodes_that_were_not_learned_from(
     monkeypatch.setattr(pretrain, "train_from_scratch", spy("learnt", 1, pretrain.train_from_scratch))
     monkeypatch.setattr(evaluate, "validate", spy("tried", 1, evaluate.validate))
     monkeypatch.setattr(pretrain.SuccessLearner, "step", spy("success", 1, pretrain.SuccessLearner.step))
-    monkeypatch.setattr(learners.HeldOutLoss, "__init__", spy("looked at", 1, learners.HeldOutLoss.__init__))
-    monkeypatch.setattr(
-        pretrain, "held_out_success_metrics", spy("pairs", 1, pretrain.held_out_success_metrics)
-    )
-    more = ["--online.repo_id=a/b", f"--online.root={rollouts}", "--world_model.success.validate_every=5"]
+    more = ["--online.repo_id=a/b", f"--online.root={rollouts}"]
     cli.main([*arguments(demos, tmp_path / "out"), *more])
     assert set(seen["learnt"]) == set(seen["success"]) and len(set(seen["learnt"] + seen["tried"])) == 14
     assert not set(seen["learnt"]) & set(seen["tried"])
-    assert set(seen["looked at"]) == set(seen["pairs"]) == set(seen["tried"])
-
-
-@pytest.mark.slow
-def test_held_out_losses_are_told_and_change_nothing(
-    demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setattr(console, "PLAIN_EVERY_S", -1.0)
-    logged: dict[str, list[dict[str, Any]]] = {}
-    for name, world, success in (("with", 10, 4), ("without", 0, 0)):
-        every = [
-            f"--world_model.{of}.validate_every={n}" for of, n in (("learn", world), ("success", success))
-        ]
-        cli.main([*arguments(demos, tmp_path / name), *every])
-        lines = (tmp_path / name / "metrics.jsonl").read_text().splitlines()
-        logged[name] = [json.loads(line) for line in lines]
-    err = capsys.readouterr().err
-    assert re.search(r"world model 10/25 \(40%\) · \S+ left · image \S+ state \S+\n", err)
-    assert re.search(
-        r"world model 11/25 \(44%\) · \S+ left · image \S+ state \S+, held out image \S+ state \S+\n", err
-    )
-    assert re.search(r"success model 3/10 \(30%\) · \S+ left · loss \S+\n", err)
-    assert re.search(r"success model 4/10 \(40%\) · \S+ left · loss \S+, held out \S+\n", err)
-    steps = [(record["kind"], record["step"]) for record in logged["with"]]
-    assert steps == [
-        ("world_model_held_out", 10), ("world_model", 20), ("world_model_held_out", 20),
-        ("success_model_held_out", 4), ("success_model_held_out", 8),
-    ]  # fmt: skip
-    assert logged["without"] == [logged["with"][1]]
-    text = (Path(__file__).parents[2] / "docs" / "metrics.md").read_text()
-    explained = text.split("## `accerl world-model`")[1].split("\n## ")[0]
-    for record in logged["with"]:
-        assert all(f"`{name}`" in explained for name in record), record
-        assert all(value >= 0 for name, value in record.items() if name != "kind")
-    for file in ("model.safetensors", "success_model/model.safetensors"):
-        one, other = ((tmp_path / name / "world_model" / file).read_bytes() for name in ("with", "without"))
-        assert one == other
 
 
 @pytest.mark.parametrize("shuffled", [False, True])

@@ -20,7 +20,7 @@ from accerl_lerobot.config.help import help_text
 from accerl_lerobot.engine.config import RunConfig, parse
 from accerl_lerobot.envs import SimulatedWorld, World, make_world
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import IMAGINED
+from accerl_lerobot.experience import IMAGINED, Segment
 from accerl_lerobot.world_model.config import (
     MODELS,
     ImaginationConfig,
@@ -29,10 +29,10 @@ from accerl_lerobot.world_model.config import (
     PixelModelConfig,
 )
 from accerl_lerobot.world_model.contract import (
-    ActionHistory,
     BuildInputs,
     Context,
     Prediction,
+    Reset,
     State,
     WorldModel,
 )
@@ -40,7 +40,7 @@ from accerl_lerobot.world_model.data import model_arrays
 from accerl_lerobot.world_model.learners import new_success_model
 from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.registry import CopyModel, OracleModel, ShuffledModel, make_models
-from accerl_lerobot.world_model.rollouts import Imagination, RolloutSettings, Start, StartPool
+from accerl_lerobot.world_model.rollouts import Start, StartPool
 from accerl_lerobot.world_model.store import save_world_model
 from tests.test_imagination import imagining, run_locally
 from tests.world_model import real_segments as real
@@ -48,20 +48,34 @@ from tests.world_model.real_segments import SPEC, WORLD, real_episode
 
 
 def begun(model: WorldModel, starts: list[Start]) -> State:
-    parts = [np.stack([getattr(s, part) for s in starts]) for part in Context._fields]
-    return model.begin(
-        Context(*(torch.from_numpy(part) for part in parts)),
-        [s.task for s in starts],
-        [s.history for s in starts],
-    )
+    resets = [Reset(*start.origin[:2]) for start in starts]
+    return model.begin(StartPool(SPEC, 1).context(starts), [start.task for start in starts], resets)
 
 
-def starts_of(*seeds: int, solve_at: int = 99) -> tuple[list[Start], dict[int, object]]:
-    pool = StartPool(SPEC, ImaginationConfig())
+def starts_of(*seeds: int, solve_at: int = 99) -> tuple[list[Start], dict[int, Segment]]:
+    pool = StartPool(SPEC, 100)
     segments = {seed: real_episode(seed, solve_at=solve_at)[0] for seed in seeds}
     for segment in segments.values():
         pool.add(segment)
-    return pool.draw(12, np.random.default_rng(0)), segments  # type: ignore[return-value]
+    return pool.draw(12, np.random.default_rng(0)), segments
+
+
+def test_starts_are_the_resets_of_the_newest_episodes():
+    pool = StartPool(SPEC, 2)
+    first, second = real_episode(5, length=2)
+    pool.add(second)
+    assert not len(pool), "its beginning is in another segment"
+    for segment in (real_episode(3)[0], real_episode(4)[0], first):
+        pool.add(segment)
+    starts = pool.draw(50, np.random.default_rng(0))
+    assert len(pool) == 2 and {start.origin for start in starts} == {("match", 4, 0), ("match", 5, 0)}
+    [start] = [start for start in pool.held if start.origin.seed == 5]
+    frames, robot = model_arrays(first.observations, SPEC)
+    assert np.array_equal(start.frames, frames[0]) and np.array_equal(start.robot, robot[0])
+    context = pool.context([start])
+    assert (context.frames.numpy() == frames[0]).all() and context.frames.shape[1] == SPEC.context
+    assert not context.actions.any() and not context.commanded_sum.any()
+    assert np.array_equal(context.initial_state[0], robot[0])
 
 
 @pytest.mark.parametrize("simulators", [1, 3, 12])
@@ -77,18 +91,14 @@ def test_the_oracle_repeats_what_happened(simulators: int):
     starts, segments = starts_of(1, 2, solve_at=2)
     state = begun(oracle, starts)
     for depth in range(2):
-        at = [s.origin.decision + depth for s in starts]
         of = [segments[s.origin.seed] for s in starts]
-        rows = [i for i in range(len(starts)) if at[i] < len(of[i])]  # until the episode had ended
-        starts = [starts[i] for i in rows]
-        state = {k: v[rows] for k, v in state.items()}
-        actions = np.stack([of[i].actions[at[i]] for i in rows])
-        rollout = oracle.step(state, torch.from_numpy(actions), list(range(len(rows))))
-        for n, i in enumerate(rows):
-            frames, robot = model_arrays(of[i].observations, SPEC)
-            assert np.array_equal(rollout.frames[n].numpy(), frames[at[i] + 1])
-            assert np.array_equal(rollout.robot[n].numpy(), robot[at[i] + 1])
-            assert bool(rollout.success[n]) is (at[i] + 1 == len(of[i]) and of[i].success)
+        actions = np.stack([segment.actions[depth] for segment in of])
+        rollout = oracle.step(state, torch.from_numpy(actions), list(range(len(starts))))
+        for i, segment in enumerate(of):
+            frames, robot = model_arrays(segment.observations, SPEC)
+            assert np.array_equal(rollout.frames[i].numpy(), frames[depth + 1])
+            assert np.array_equal(rollout.robot[i].numpy(), robot[depth + 1])
+            assert bool(rollout.success[i]) is (depth + 1 == len(segment) and segment.success)
         state = rollout.state
     assert 1 <= len(made) <= simulators
     oracle.close()
@@ -100,7 +110,7 @@ def test_a_simulator_that_is_there_goes_on(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(SimulatedWorld, "reset", lambda *a: resets.append(1) or reset(*a))
     oracle = OracleModel(SPEC, lambda: make_world(WORLD), 4)
     starts, _ = starts_of(1)
-    start = next(s for s in starts if s.origin.decision == 0)
+    start = starts[0]
     resets.clear()
     state = begun(oracle, [start])
     actions = torch.zeros(1, 4, 2)
@@ -111,21 +121,14 @@ def test_a_simulator_that_is_there_goes_on(monkeypatch: pytest.MonkeyPatch):
     assert len(resets) == 2 and torch.equal(again.frames, first.frames)
 
 
-def test_an_oracle_must_know_what_led_to_a_start():
-    starts, _ = starts_of(1)
-    oracle = OracleModel(SPEC, lambda: make_world(WORLD), 1)
-    with pytest.raises(ValueError, match="history of every start"):
-        oracle.begin(Context(*torch.zeros(5, 1)), ["go"], [None])
-
-
 def test_a_copy_never_changes():
     starts, _ = starts_of(1, 2)
     copy = CopyModel(SPEC)
     state = begun(copy, starts)
     for _ in range(2):
         rollout = copy.step(state, torch.randn(12, 4, 2), [0] * 12)
-        assert np.array_equal(rollout.frames.numpy(), np.stack([s.frames[-1] for s in starts]))
-        assert np.array_equal(rollout.robot.numpy(), np.stack([s.robot[-1] for s in starts]))
+        assert np.array_equal(rollout.frames.numpy(), np.stack([s.frames for s in starts]))
+        assert np.array_equal(rollout.robot.numpy(), np.stack([s.robot for s in starts]))
         assert rollout.uncertainty.isnan().all() and rollout.success is None
         state = rollout.state
 
@@ -146,9 +149,7 @@ class Snow(WorldModel):
     def __init__(self, means: BuildInputs) -> None:
         self.spec = replace(means.spec, provides=means.spec.provides | {"success"})
 
-    def begin(
-        self, context: Context, tasks: Sequence[str], histories: Sequence[ActionHistory | None] | None = None
-    ) -> State:
+    def begin(self, context: Context, tasks: Sequence[str], resets: Sequence[Reset] | None = None) -> State:
         return {"robot": context.robot[:, -1]}
 
     def step(self, state: State, actions: Tensor, seeds: Sequence[int]) -> Prediction:
@@ -237,8 +238,8 @@ def test_entries_of_the_table_are_true(name: str, made: type, tmp_path: Path):
     frames = torch.zeros(1, real.SPEC.context, 1, 16, 16, 3, dtype=torch.uint8)
     robot, actions = torch.zeros(1, real.SPEC.context, 4), torch.zeros(1, real.SPEC.context - 1, real.K, 2)
     context = Context(frames, robot, actions, commanded_sum=torch.zeros(1, 2), initial_state=robot[:, 0])
-    with pytest.raises(ValueError, match="history") if kind.needs_history else nullcontext():
-        model.begin(context, ["match"], [None])
+    with pytest.raises(ValueError, match="reset of every") if name == "oracle" else nullcontext():
+        model.begin(context, ["match"])
     if kind.min_rollouts > 1:
         with pytest.raises(ValueError, match="single rollout"):
             model.step({}, torch.zeros(kind.min_rollouts - 1, real.K, 2), [0])
@@ -249,18 +250,3 @@ def test_rollouts_with_other_actions_are_never_alone():
     ImaginationConfig(share=0.5, path="x", model="shuffled", rollouts=2)
     with pytest.raises(InputError, match=r"^imagination\.rollouts=1: use at least 2: shuffled needs them"):
         ImaginationConfig(share=0.5, path="x", model="shuffled", rollouts=1)
-
-
-@pytest.mark.parametrize("whole", [True, False])
-@pytest.mark.usefixtures("snow")
-def test_rollouts_start_only_where_their_model_can(whole: bool, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setitem(MODELS, "snow", replace(SNOW, needs_history=whole))
-    config = ImaginationConfig(share=0.5, model="snow", rollouts=2)
-    world = make_world(real.WORLD)
-    models = make_models(config, real.WORLD, world.spec, real.K, "cpu")
-    world.close()
-    settings = RolloutSettings(decision_cost=0.0, time_limit_fails=True, seed=0)
-    rollouts = Imagination(models, world.spec, config, settings, print)
-    _, later = real.real_episode(1, length=2)
-    rollouts.remember(later)  # what came before is not known
-    assert len(rollouts.requests()) == (0 if whole else 2)

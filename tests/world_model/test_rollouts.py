@@ -19,7 +19,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, REAL, Decision, Request, Segment
 from accerl_lerobot.world_model import rollouts
 from accerl_lerobot.world_model.config import ImaginationConfig, OnlineLearnConfig
-from accerl_lerobot.world_model.contract import ActionHistory, Context, Prediction, State, WorldModel
+from accerl_lerobot.world_model.contract import Context, Prediction, Reset, State, WorldModel
 from accerl_lerobot.world_model.online import Promotion
 from accerl_lerobot.world_model.registry import (
     ImaginationModels,
@@ -48,9 +48,7 @@ class Counting(WorldModel):
     def to(self, device: object) -> Counting:
         return self
 
-    def begin(
-        self, context: Context, tasks: Sequence[str], histories: Sequence[ActionHistory | None] | None = None
-    ) -> State:
+    def begin(self, context: Context, tasks: Sequence[str], resets: Sequence[Reset] | None = None) -> State:
         return {"frames": torch.zeros_like(context.frames[:, -1]), "robot": context.robot[:, -1]}
 
     def step(self, state: State, actions: Tensor, seeds: Sequence[int]) -> Prediction:
@@ -92,7 +90,7 @@ def imagination(
 ) -> tuple[Imagination, list[Segment]]:
     kind = "oracle" if isinstance(model, OracleModel) else "learned"
     fields: dict[str, Any] = {
-        "share": 0.5, "path": "x", "rollouts": 4, "start_at_reset_prob": 0.0, "model": kind,
+        "share": 0.5, "path": "x", "rollouts": 4, "model": kind,
         "learn": OnlineLearnConfig(steps_per_episode=0),
     }  # fmt: skip
     constants = {name: config.pop(name) for name in CONSTANTS if name in config}
@@ -126,11 +124,11 @@ def test_a_rollout_is_a_segment_like_any_other(bright: Any):
     play(batch, 3)
     assert len(made) == 4 and len({s.key for s in made}) == 4
     for segment in made:
-        t = segment.origin.decision
+        assert segment.origin.decision == 0
         assert (segment.source, segment.world_version) == (IMAGINED, 9) and segment.origin[:2] == ("match", 3)
         assert segment.task == real.task and real.source == REAL
-        assert np.array_equal(segment.observations[CAMERA][0], real.observations[CAMERA][t])
-        state = real.observations["observation.state"][t]
+        assert np.array_equal(segment.observations[CAMERA][0], real.observations[CAMERA][0])
+        state = real.observations["observation.state"][0]
         assert np.allclose(segment.observations["observation.state"][0], state)
         assert np.allclose(segment.observations["observation.state"][1], state + 1)
         assert (segment.observations[CAMERA][1] == 40).all()
@@ -153,7 +151,7 @@ def test_a_rollout_ends_at_the_time_limit(bright: Any, fails: bool):
     batch, made = imagination(Counting(), bright, fails=fails, rollouts=16)
     batch.remember(real_episode(3)[0])  # 4 decisions of 4 steps are all there is time for
     play(batch, 4, size=0.5)
-    assert {s.origin.decision: len(s) for s in made} == {0: 4, 1: 3, 2: 2, 3: 1}
+    assert {(s.origin.decision, len(s)) for s in made} == {(0, 4)}
     for segment in made:
         assert (segment.terminated, segment.truncated) == (fails, not fails) and not segment.success
 
@@ -198,15 +196,11 @@ def test_ended_rollouts_start_anew_beside_the_others():
             r.explore for r in requests
         )
         batch.advance([decided(chunk) for chunk in rng.uniform(-1.2, 1.2, (8, K, 2))])
-    assert len(made) > 20 and {len(s) for s in made} >= {1, 2, 3}
+    assert len(made) > 20 and {len(s) for s in made} == {3, 4}
     for segment in made:
         # The very same actions after the very same beginning, in the real world.
         world = make_world(WORLD)
-        start = segment.origin
-        [real] = real_episode(start.seed, solve_at=2)
-        world.reset(start.seed, "match")
-        for t in range(start.decision):
-            world.step_chunk(real.actions[t])
+        world.reset(segment.origin.seed, "match")
         assert (np.abs(segment.actions) <= 1).all()
         for t, actions in enumerate(segment.actions):
             result = world.step_chunk(actions)
@@ -217,27 +211,6 @@ def test_ended_rollouts_start_anew_beside_the_others():
         assert segment.success is result.success
 
 
-def test_rollouts_that_succeed_too_often_are_switched_off_until_a_promotion(bright: Any):
-    batch, _ = imagination(
-        Counting(),
-        bright,
-        rollouts=4,
-        window=4,
-        min_real_episodes=4,
-        world=ENDLESS,
-    )
-    for seed in range(8):
-        batch.remember(real_episode(seed)[0])  # failures, all of them
-    rounds = 0
-    while batch.requests():
-        play(batch, 1)
-        rounds += 1
-        assert rounds < 50
-    assert batch.switch.tripped and batch.metrics()["on"] == 0 and batch.metrics()["success"] > 0.5
-    batch.swap(promotion(Counting(), bright, 12))
-    assert len(batch.requests()) == 4 and batch.version == 12 and batch.metrics()["on"] == 1
-
-
 def test_rollouts_from_resets_are_compared_with_real_episodes(bright: Any):
     batch, made = imagination(
         Counting(),
@@ -245,7 +218,6 @@ def test_rollouts_from_resets_are_compared_with_real_episodes(bright: Any):
         rollouts=4,
         window=4,
         min_real_episodes=3,
-        start_at_reset_prob=1.0,
         world=ENDLESS,
     )
     for seed in range(4):
@@ -269,7 +241,7 @@ def test_a_model_that_is_trained_is_used_once_it_has_passed(bright: Any):
 
 
 def test_unfinished_rollouts_are_dropped_when_a_model_is_promoted(bright: Any):
-    batch, made = imagination(Counting(), bright, start_at_reset_prob=1.0, world=SHORT)
+    batch, made = imagination(Counting(), bright, world=SHORT)
     batch.remember(real_episode(3)[0])
     play(batch, 1, 0.1)
     batch.swap(promotion(Counting(), bright, 12))

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from accerl_lerobot.evaluation import GAP
 from accerl_lerobot.world_model.config import SuccessLearnConfig, ValidationConfig
-from accerl_lerobot.world_model.contract import ActionHistory, Context, Prediction, State, WorldModel
+from accerl_lerobot.world_model.contract import Context, Prediction, Reset, State, WorldModel
 from accerl_lerobot.world_model.data import Episode
 from accerl_lerobot.world_model.learners import Examples, SuccessLearner, new_success_model
 from accerl_lerobot.world_model.rollout_eval import match_cut_lengths, predict
@@ -38,9 +38,7 @@ class Deterministic(WorldModel):
         self.spec, self.kind = SPEC, kind
         self.calls: list[int] = []
 
-    def begin(
-        self, context: Context, tasks: Sequence[str], histories: Sequence[ActionHistory | None] | None = None
-    ) -> State:
+    def begin(self, context: Context, tasks: Sequence[str], resets: Sequence[Reset] | None = None) -> State:
         assert len(tasks) == len(context.frames)
         return {"frames": context.frames[:, -1], "robot": context.robot[:, -1]}
 
