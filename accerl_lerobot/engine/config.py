@@ -215,9 +215,6 @@ class RunConfig(Section):
         if self.inference.workers > self.rollout.workers:
             remedy = f"use at most rollout.workers, {self.rollout.workers}, or some have nobody to answer"
             raise InputError("inference.workers", self.inference.workers, remedy)
-        if self.trainer.cpu_offload and self.policy.device == "cpu":
-            remedy = "policy.device=cpu has everything there already; leave the field out"
-            raise InputError("trainer.cpu_offload", True, remedy)
         batch, imagination = self.trainer.batch_decisions, self.imagination
         if self.trainer.updates:
             # `engine.imagination` checks that a whole imagined rollout fits too.

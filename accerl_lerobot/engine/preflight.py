@@ -99,14 +99,11 @@ def check_start(config: RunConfig) -> int:
     if config.policy.path is None and not config.sft.steps:
         remedy = "give a LeRobot checkpoint, or sft.steps > 0 to make one; recipes/quickstart.yaml does"
         raise InputError("policy.path", None, remedy)
-    device = resolve_device(config.policy.device).type
+    resolve_device(config.policy.device)  # refuses one that is not there
     if config.trainer.ranks > 1 and config.policy.device != "cpu" and config.launch.address is None:
         import torch
 
         config.trainer.gpu_shares(torch.cuda.device_count(), others=1)
-    if config.trainer.cpu_offload and device == "cpu":
-        remedy = "there is no GPU here, and the CPU's memory has everything already; leave the field out"
-        raise InputError("trainer.cpu_offload", True, remedy)
     check_wandb(config.wandb)
     policy = policy_to_be(config)
     check_weights_fit(config)

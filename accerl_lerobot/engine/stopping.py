@@ -29,7 +29,7 @@ LOCK = ".lock"
 CHANGEABLE = (
     "resume", "output_dir", "evaluation", "launch", "wandb", "save_every_updates", "save_every_s",
     "save_keep", "trainer.updates", "trainer.num_threads", "trainer.ranks", "trainer.sharding",
-    "trainer.cpu_offload", "trainer.activation_checkpointing", "trainer.rank_timeout_s",
+    "trainer.activation_checkpointing", "trainer.rank_timeout_s",
     "rollout.max_restarts", "inference",
     "imagination.discover_packages_path",
 )  # fmt: skip

@@ -72,8 +72,6 @@ class TrainerConfig(Section, section="trainer"):
     zero2: its part of weights, gradients and optimiser state, and all weights from an update's forward pass
     to the end of its backward pass. zero3: its part, and all weights of one block at a time (PyTorch's
     FSDP2)."""
-    cpu_offload: bool = False
-    """With zero2 or zero3 on GPUs: a rank's part stays in the memory of the CPU, where the optimiser runs."""
     activation_checkpointing: bool = False
     """Repeated blocks of the network, a transformer's layers for instance, forget what they computed and
     compute it again for the gradient: less memory, about a third more work."""
@@ -93,9 +91,6 @@ class TrainerConfig(Section, section="trainer"):
                 f"use at most trainer.batch_decisions, {self.batch_decisions}: each rank needs a decision"
             )
             raise InputError("trainer.ranks", self.ranks, remedy)
-        if self.cpu_offload and not self.zero:
-            remedy = f"trainer.sharding={self.sharding} keeps everything on the device; use zero2 or zero3"
-            raise InputError("trainer.cpu_offload", True, remedy)
 
     @property
     def zero(self) -> bool:

@@ -71,7 +71,7 @@ class Group(Ranks):
     ) -> None:
         self.rank, self.size = rank, size
         timeout = timedelta(seconds=timeout_s)
-        # What is gathered lies on the CPU, and so does what is offloaded.
+        # What is gathered lies on the CPU.
         backend = "gloo" if device.type == "cpu" else f"cpu:gloo,{device.type}:nccl"
         dist.init_process_group(backend, store=store, rank=rank, world_size=size, timeout=timeout)
 

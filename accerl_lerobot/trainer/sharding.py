@@ -36,7 +36,7 @@ def arrange(adapter: PolicyAdapter, config: TrainerConfig) -> None:
         config: which of the two.
 
     Raises:
-        InputError: the policy has no block that can forget, or there is nothing to offload from.
+        InputError: the policy has no block that can forget.
     """
     if not (config.zero or config.activation_checkpointing):
         return
@@ -56,21 +56,13 @@ def arrange(adapter: PolicyAdapter, config: TrainerConfig) -> None:
 def _share_out(adapter: PolicyAdapter, blocks: Sequence[nn.Module], config: TrainerConfig) -> None:
     import torch.distributed as dist
     from torch.distributed.device_mesh import init_device_mesh
-    from torch.distributed.fsdp import (
-        CPUOffloadPolicy,
-        OffloadPolicy,
-        fully_shard,
-        register_fsdp_forward_method,
-    )
+    from torch.distributed.fsdp import fully_shard, register_fsdp_forward_method
 
-    if config.cpu_offload and adapter.device.type == "cpu":
-        raise InputError("trainer.cpu_offload", True, "the policy is on the CPU already; leave the field out")
     if Evaluation not in torch.utils._pytree.SUPPORTED_NODES:
         torch.export.register_dataclass(Evaluation)  # so that FSDP finds the tensors of which gradients begin
     options: dict[str, Any] = {
         "mesh": init_device_mesh(adapter.device.type, (dist.get_world_size(),)),
         "reshard_after_forward": config.sharding == "zero3",
-        "offload_policy": CPUOffloadPolicy() if config.cpu_offload else OffloadPolicy(),
     }
     for block in blocks:
         fully_shard(block, **options)

@@ -216,12 +216,6 @@ def test_a_policy_without_blocks_cannot_forget():
         arrange(LinearAdapter(), TrainerConfig(activation_checkpointing=True))
 
 
-def test_there_is_nothing_to_offload_from_on_a_cpu():
-    config = TrainerConfig(ranks=2, sharding="zero2", cpu_offload=True)
-    with pytest.raises(InputError, match=r"trainer\.cpu_offload=True: the policy is on the CPU already"):
-        arrange(LinearAdapter(), config)
-
-
 # ---- what is refused when a run is parsed
 
 
@@ -230,8 +224,6 @@ def test_there_is_nothing_to_offload_from_on_a_cpu():
     [
         ({"ranks": 2}, r"trainer\.sharding='none': say how the 2 ranks share"),
         ({"sharding": "zero3"}, r"trainer\.sharding='zero3': there is one rank"),
-        ({"ranks": 2, "sharding": "ddp", "cpu_offload": True}, r"trainer\.cpu_offload=True: .*=ddp keeps"),
-        ({"cpu_offload": True}, r"trainer\.cpu_offload=True: trainer\.sharding=none keeps"),
         ({"ranks": 9, "sharding": "ddp", "batch_decisions": 8}, r"trainer\.ranks=9: use at most .*, 8"),
     ],
 )
@@ -240,14 +232,9 @@ def test_what_cannot_be_shared_is_refused(fields: dict[str, Any], says: str):
         TrainerConfig(**fields)
 
 
-def test_ranks_want_workers_and_offloading_wants_a_gpu():
-    trainer = TrainerConfig(ranks=2, sharding="zero2", cpu_offload=True)
+def test_ranks_want_workers():
     with pytest.raises(InputError, match=r"trainer\.ranks=2: launch\.engine=local is one process"):
-        RunConfig(trainer=trainer, launch=LaunchConfig(engine="local"))
-    with pytest.raises(
-        InputError, match=r"trainer\.cpu_offload=True: policy\.device=cpu has everything there"
-    ):
-        RunConfig(trainer=trainer, policy=PolicyConfig(device="cpu"))
+        RunConfig(trainer=TrainerConfig(ranks=2, sharding="zero2"), launch=LaunchConfig(engine="local"))
 
 
 # ---- GPUs
