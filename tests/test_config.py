@@ -123,7 +123,7 @@ MISTAKES: list[tuple[list[str], str]] = [
     (["--env.task=[a]"], "env.task=['a']: use text"),
     (
         ["--algorithm.type=gippo"],
-        "algorithm.type='gippo': did you mean gipo? Otherwise use one of chunk_critic, gipo, ppo, "
+        "algorithm.type='gippo': did you mean gipo? Otherwise use one of awr, chunk_critic, gipo, ppo, "
         "self_imitation",
     ),
     (["--env.type=mujoco"], "env.type='mujoco': use one of gym, lerobot, libero, metaworld, simulated"),

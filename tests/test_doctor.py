@@ -67,7 +67,7 @@ class TestRecipe:
         assert cli.main(["doctor", str(QUICKSTART), "--env.type=x"]) == 1
         out = capsys.readouterr().out
         assert out.startswith(
-            "FAIL  recipe     env.type='x': use one of lerobot, libero, metaworld, simulated"
+            "FAIL  recipe     env.type='x': use one of gym, lerobot, libero, metaworld, simulated"
         )
         assert "ok    python" in out and "1 of 2 checks failed" in out
 

@@ -84,9 +84,8 @@ def test_the_asynchronous_engine(light: None, tmp_path: Path) -> None:
     assert asked < first + int(rows["replay"].times[-1] - rows["replay"].times[0]) < ended
 
 
-@pytest.mark.parametrize("recorded", [True, False])
-def test_the_engine_in_one_process_is_one_row(tiny_checkpoint: Path, tmp_path: Path, recorded: bool) -> None:
-    launch = LaunchConfig(engine="local", timeline=recorded)
+def test_the_engine_in_one_process_is_one_row(tiny_checkpoint: Path, tmp_path: Path) -> None:
+    launch = LaunchConfig(engine="local")
     engine = LocalEngine(tiny_run(tiny_checkpoint, output_dir=str(tmp_path), launch=launch), ("match",))
     try:
         engine.train()
@@ -94,9 +93,8 @@ def test_the_engine_in_one_process_is_one_row(tiny_checkpoint: Path, tmp_path: P
         engine.save(tmp_path / "saved")
     finally:
         engine.close()
-    assert (tmp_path / "episodes.jsonl").stat().st_size and (tmp_path / TIMELINE).exists() is recorded
-    if recorded:
-        timeline = read_timeline(tmp_path)
-        adds_up(timeline)
-        assert [row.worker for row in timeline.rows] == ["local"]
-        assert timeline.shares()["local"].keys() == {"recovery", "compute", "wait_in", "checkpoint"}
+    assert (tmp_path / "episodes.jsonl").stat().st_size
+    timeline = read_timeline(tmp_path)
+    adds_up(timeline)
+    assert [row.worker for row in timeline.rows] == ["local"]
+    assert timeline.shares()["local"].keys() == {"recovery", "compute", "wait_in", "checkpoint"}
