@@ -11,6 +11,7 @@ from typing import Any
 from accerl_lerobot.algorithms import AlgorithmConfig, RatioConfig
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig
 from accerl_lerobot.engine.loop import Engine, Progress
+from accerl_lerobot.engine.run import make_engine
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.policies.config import PolicyConfig
@@ -76,3 +77,13 @@ def drive(engine: Engine) -> list[Progress]:
         if progress.done:
             break
     return history
+
+
+def trained(config: RunConfig, tasks: tuple[str, ...]) -> list[dict[str, float]]:
+    """The metrics of all updates of a run, from making its engine to closing it."""
+    running = make_engine(config, tasks, history=1)
+    try:
+        running.train()
+        return [update for progress in drive(running) for update in progress.updates]
+    finally:
+        running.close()

@@ -420,7 +420,7 @@ def train(config: RunConfig) -> TrainResult:
 
 
 def resume(directory: str | Path, changes: Mapping[str, Any] | None = None) -> TrainResult:
-    """Goes on with a run that was stopped, from its last whole checkpoint."""
+    """Resumes a run that was stopped, from its last complete checkpoint."""
     recipe = Path(directory) / CONFIG
     config = load_config(recipe, {**(changes or {}), "resume": True})
     return _result(*start(config, Console(), recipe))

@@ -9,7 +9,6 @@ Importing this file loads no Gymnasium; making the world does.
 from __future__ import annotations
 
 import functools
-import json
 import math
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
@@ -69,26 +68,16 @@ class GymConfig(EnvConfig):
             remedy = "use a name of Gymnasium's registry, and env.discover_packages_path for its package"
             raise InputError("env.id", self.id, remedy)
 
-    @property
+    @functools.cached_property
     def state_size(self) -> int:
-        """See the base class."""
+        """See the base class; only the environment knows, so it is made to ask."""
         if not self.environment_state:
             return 0
-        from accerl_lerobot.config.parsing import encode
-
-        return _state_size(json.dumps(encode(self), sort_keys=True))
-
-
-@functools.cache
-def _state_size(config: str) -> int:
-    """Length of ``observation.environment_state`` of a `GymConfig`, which only its environment knows."""
-    from accerl_lerobot.config.parsing import decode
-
-    world = GymWorld(decode(GymConfig, json.loads(config)))
-    try:
-        return len(world.reset(0, world.spec.tasks[0])[ENVIRONMENT_STATE])
-    finally:
-        world.close()
+        world = GymWorld(self)
+        try:
+            return len(world.reset(0, world.spec.tasks[0])[ENVIRONMENT_STATE])
+        finally:
+            world.close()
 
 
 class GymWorld(EpisodeWorld):

@@ -79,7 +79,8 @@ class LeRobotWorld(EpisodeWorld):
         from lerobot.utils.import_utils import register_third_party_plugins
 
         self.config = config
-        register_third_party_plugins()
+        if config.name not in LeRobotConfig.get_known_choices():
+            register_third_party_plugins()
         known = LeRobotConfig.get_known_choices()
         if config.name not in known:
             raise InputError("env.name", config.name, f"LeRobot has: {', '.join(known)}")

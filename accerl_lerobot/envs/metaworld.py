@@ -242,7 +242,6 @@ RAW_DIM = 39
 """Numbers of MetaWorld's own observation."""
 ACTION_DIM = 4
 FPS = 80
-STEP_LIMIT = 500
 
 
 @EnvConfig.register_subclass("metaworld")

@@ -14,9 +14,8 @@ import pytest
 from accerl_lerobot.algorithms import AlgorithmConfig
 from accerl_lerobot.config.parsing import parse
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig
-from accerl_lerobot.engine.run import make_engine
 from accerl_lerobot.errors import InputError
-from tests.runs import drive, tiny_run
+from tests.runs import tiny_run, trained
 
 PACKAGE, NAME = "tests.algorithms.own_algorithm", "own_reinforce"
 NAMED = [f"--algorithm.discover_packages_path={PACKAGE}", f"--algorithm.type={NAME}"]
@@ -52,11 +51,6 @@ def test_it_trains(engine: Literal["local", "ray"], tiny_checkpoint: Path):
     algorithm = parse(RunConfig, [*NAMED, "--algorithm.scale=0.5"]).algorithm
     config = tiny_run(tiny_checkpoint, algorithm=algorithm)
     config = replace(config, launch=LaunchConfig(engine=engine, stall_s=120))
-    running = make_engine(config, ("match",), history=1)
-    try:
-        running.train()
-        made = [update for progress in drive(running) for update in progress.updates]
-    finally:
-        running.close()
+    made = trained(config, ("match",))
     assert len(made) == 12 and made[-1]["skipped"] == 0
     assert any(update["policy_loss"] != 0 for update in made)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -15,10 +16,9 @@ import pytest
 
 from accerl_lerobot.config.parsing import parse
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig
-from accerl_lerobot.engine.run import make_engine
 from accerl_lerobot.envs import GymConfig, GymWorld, make_world
 from accerl_lerobot.errors import InputError
-from tests.runs import drive, replacing, tiny_run
+from tests.runs import replacing, tiny_run, trained
 
 PACKAGE = Path(__file__).parents[1] / "packages" / "lerobot_env_reach"
 GYM = [
@@ -102,12 +102,7 @@ def test_a_file_alone_imports_no_package(tmp_path: Path):
 
 def test_it_trains(tiny_checkpoint: Path):
     run = replace(tiny_run(tiny_checkpoint, env=config()), launch=LaunchConfig(engine="local"))
-    running = make_engine(run, ("reach/Reach-v0",), history=1)
-    try:
-        running.train()
-        made = [update for progress in drive(running) for update in progress.updates]
-    finally:
-        running.close()
+    made = trained(run, ("reach/Reach-v0",))
     assert len(made) == 12 and made[-1]["skipped"] == 0
 
 
@@ -116,7 +111,8 @@ def test_the_installed_package_is_found_by_every_process(tiny_checkpoint: Path, 
     """As `env.type=gym` in a run on Ray, and as LeRobot's plugin ``reach``, which only pip has announced."""
     site = tmp_path / "site"
     pip = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--no-index"]
-    subprocess.run([*pip, f"--target={site}", str(PACKAGE)], check=True)
+    source = shutil.copytree(PACKAGE, tmp_path / "source")  # pip builds within it
+    subprocess.run([*pip, f"--target={site}", str(source)], check=True)
     path = os.pathsep.join([str(site), *filter(None, [os.environ.get("PYTHONPATH")])])
     accerl = [sys.executable, "-m", "accerl_lerobot.cli"]
     run = [
