@@ -10,9 +10,10 @@ import platform
 import tempfile
 import time
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from rich.table import Table
 
@@ -44,6 +45,10 @@ class BenchPolicyConfig(Section):
     tuning: TuningConfig = field(default_factory=lambda: TuningConfig(mode="expert"))
     device: Device = "auto"
     """cpu, cuda, or auto."""
+    imitates: bool = False
+    """Learn by LeRobot's imitation loss, as off-policy algorithms do, instead of by a likelihood ratio."""
+    memory_only: bool = False
+    """Estimate the memory as ``accerl doctor`` does, and run nothing: for policies too large to run here."""
     repeats: Repeats = 3
     """Times each part is measured after a first one that does not count."""
 
@@ -54,20 +59,37 @@ def bench_policy(config: BenchPolicyConfig) -> dict[str, Any]:
     Returns:
         ``parameters`` (all, trained), ``seconds`` (build; then median, min, max of decide_one, decide, score
         and update), ``memory_gb`` after each stage, ``mismatch`` at equal weights (mean and largest
-        |Δ log-prob| of a decision in nats, share of chunk ratios outside 1 ± 0.2), ``config`` and ``host``.
+        |Δ log-prob| of a decision in nats, share of chunk ratios outside 1 ± 0.2), ``config``,
+        ``host``, and ``estimate``, the bytes of `footprint.PolicyMemory`. With ``memory_only`` neither seconds,
+        memory nor mismatch.
     """
     import numpy as np
     import torch
 
     from accerl_lerobot.experience import TASK, Request
     from accerl_lerobot.policies.adapter import stack_observations
+    from accerl_lerobot.policies.guard import Unfilled
     from accerl_lerobot.policies.loading import resolve_device
+    from accerl_lerobot.trainer.footprint import policy_memory
 
-    device = resolve_device(config.device, "device")
+    device = resolve_device("cpu" if config.memory_only else config.device, "device")
     memory = Memory(device)
     started = time.perf_counter()
-    with tempfile.TemporaryDirectory() as directory:
+    with tempfile.TemporaryDirectory() as directory, Unfilled() if config.memory_only else nullcontext():
         adapter = _adapter(config, device, Path(directory))
+    trainable = adapter.trainable()
+    sizes = {"all": adapter.policy.parameters(), "trained": trainable.values()}
+    result = {
+        "config": asdict(config),
+        "parameters": {name: sum(p.numel() for p in tensors) for name, tensors in sizes.items()},
+        "host": {
+            "device": device_name(device),
+            "machine": platform.machine(),
+            "threads": torch.get_num_threads(),
+        },
+    }
+    if config.memory_only:
+        return result | {"estimate": policy_memory(adapter, imitates=config.imitates)._asdict()}
     built = time.perf_counter() - started
     memory.note("built")
     requests = [
@@ -83,6 +105,7 @@ def bench_policy(config: BenchPolicyConfig) -> dict[str, Any]:
     latent = {k: torch.from_numpy(np.stack([d.latent[k] for d in decisions])) for k in names}
     old = torch.stack([torch.from_numpy(d.log_prob) for d in decisions]).to(device)
     observations = stack_observations(requests)
+    chunks = torch.from_numpy(np.stack([d.chunk for d in decisions])).to(device)
 
     def score() -> Any:
         with torch.no_grad():
@@ -91,11 +114,15 @@ def bench_policy(config: BenchPolicyConfig) -> dict[str, Any]:
     scored = timed(score, config.repeats, device)
     change = (score() - old).sum(1)
     gap, ratio = change.abs(), change.exp()
-    trainable = adapter.trainable()
     optimizer = torch.optim.AdamW(trainable.values(), lr=1e-6)
 
     def update() -> None:
         optimizer.zero_grad(set_to_none=True)
+        if config.imitates:
+            with adapter.autocast():
+                adapter.family.imitation_loss(adapter.encode(*observations), chunks).mean().backward()
+            optimizer.step()
+            return
         evaluation = adapter.evaluate(*observations, latent)
         ratio = (evaluation.log_prob - old).sum(1).clamp(-1, 1).exp()
         (ratio.mean() + (evaluation.value - 1).square().mean()).backward()
@@ -103,32 +130,36 @@ def bench_policy(config: BenchPolicyConfig) -> dict[str, Any]:
 
     updated = timed(update, config.repeats, device)
     memory.note("updated")
-    sizes = {"all": adapter.policy.parameters(), "trained": trainable.values()}
     clipped = ((ratio > 1.2) | (ratio < 0.8)).float().mean()
-    threads, machine = torch.get_num_threads(), platform.machine()
-    return {
-        "config": asdict(config),
-        "parameters": {name: sum(p.numel() for p in tensors) for name, tensors in sizes.items()},
+    return result | {
         "seconds": {"build": built, "decide_one": one, "decide": many, "score": scored, "update": updated},
         "memory_gb": memory.notes,
         "mismatch": {"mean": float(gap.mean()), "max": float(gap.max()), "clip": float(clipped)},
-        "host": {"device": device_name(device), "machine": machine, "threads": threads},
+        "estimate": policy_memory(adapter, imitates=config.imitates)._asdict(),
     }
 
 
 def table(result: dict[str, Any]) -> Table:
     """`result` for people."""
+    from accerl_lerobot.trainer.footprint import PolicyMemory
+
     config, parameters, batch = result["config"], result["parameters"], result["config"]["batch"]
     millions = [f"{parameters[which] / 1e6:,.0f} M" for which in ("all", "trained")]
     title = f"{config['type']} {config['precision']}, {config['tuning']['mode']}: {millions[0]} parameters, "
     title += f"{millions[1]} trained, on {result['host']['device']}"
-    rows = [("build", f"{result['seconds']['build']:.1f}", "")]
-    for name, count in (("decide_one", 1), ("decide", batch), ("score", batch), ("update", batch)):
-        seconds = result["seconds"][name]
-        rows.append((f"{name} ({count})", ranged(seconds, ".3f"), f"{count / seconds['median']:.1f}"))
-    rows += [(f"memory, {stage}", f"{size:.1f} GB", "") for stage, size in result["memory_gb"].items()]
-    gap = result["mismatch"]
-    rows.append(("mismatch at equal weights", f"{gap['mean']:.1e} nats, at most {gap['max']:.1e}", ""))
+    rows = []
+    if "seconds" in result:
+        rows.append(("build", f"{result['seconds']['build']:.1f}", ""))
+        for name, count in (("decide_one", 1), ("decide", batch), ("score", batch), ("update", batch)):
+            seconds = result["seconds"][name]
+            rows.append((f"{name} ({count})", ranged(seconds, ".3f"), f"{count / seconds['median']:.1f}"))
+        rows += [(f"memory, {stage}", f"{size:.1f} GB", "") for stage, size in result["memory_gb"].items()]
+        gap = result["mismatch"]
+        rows.append(("mismatch at equal weights", f"{gap['mean']:.1e} nats, at most {gap['max']:.1e}", ""))
+    memory = PolicyMemory(**result["estimate"])
+    shown = {"estimate, weights": memory.weights, "weights, gradients, Adam": memory.trainer(0)}
+    shown |= {"for a decision acted": memory.acting, "for a decision learnt from": memory.learning}
+    rows += [(name, f"{size / 2**30:.2f} GiB", "") for name, size in shown.items()]
     return as_table(title, ("part", "seconds (range)", "decisions/s"), rows)
 
 
@@ -159,6 +190,8 @@ def _adapter(config: BenchPolicyConfig, device: Any, directory: Path) -> Any:
 
 class _RandomInputs:
     """Replaces LeRobot's processors: a preprocessed batch of random content, the same each time."""
+
+    rename_map: ClassVar[dict[str, str]] = {}
 
     def __init__(self, config: BenchPolicyConfig, device: Any) -> None:
         self.config, self.device = config, device

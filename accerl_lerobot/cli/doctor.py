@@ -19,6 +19,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -43,6 +44,8 @@ of one task with its renderers."""
 DISK_GIB = 2.0
 """Space that demonstrations, checkpoints and videos of a run may need."""
 RENDER_TIMEOUT_S = 120
+USABLE = 0.9
+"""Share of a GPU's memory that tensors can have: CUDA, its libraries and fragmentation take the rest."""
 
 DRAW = """
 import time
@@ -84,7 +87,7 @@ def main(arguments: list[str]) -> int:
     config, history, checks = _resolve(arguments) if arguments else (None, 1, [])
     checks += [*pulled(arguments), *machine(config, history)]
     if config is not None:
-        checks += [*pace(config), *imagination_checks(config), *placement(config)]
+        checks += [*pace(config), *imagination_checks(config), *placement(config), *policy_fits(config)]
     for check in checks:
         sys.stdout.write(f"{check.status:5} {check.name:10} {check.text}\n")
     failed = sum(check.status == FAIL for check in checks)
@@ -270,6 +273,65 @@ def placement(config: RunConfig) -> Iterator[Check]:
         yield from [Check("placement", OK, row) for row in check_placement(config)]
     except InputError as error:
         yield Check("placement", FAIL, str(error))
+
+
+def policy_fits(config: RunConfig) -> Iterator[Check]:
+    """The memory of a given policy where it learns and acts, against that of its device."""
+    from accerl_lerobot.algorithms import RatioConfig
+    from accerl_lerobot.policies.loading import rehearsed, resolve_device
+    from accerl_lerobot.trainer.footprint import PolicyMemory, policy_memory
+    from accerl_lerobot.trainer.off_policy import POLICY_BATCH
+
+    if config.policy.path is None or not config.trainer.updates:
+        return
+    trainer, ratio = config.trainer, isinstance(config.algorithm, RatioConfig)
+    try:
+        device = resolve_device(config.policy.device)
+        measure = partial(policy_memory, imitates=not ratio, checkpointing=trainer.activation_checkpointing)
+        memory = PolicyMemory(*rehearsed(config.policy, measure))
+    except InputError as error:
+        yield Check("policy", FAIL, str(error))
+        return
+    batch = math.ceil(trainer.batch_decisions / trainer.ranks) if ratio else POLICY_BATCH
+    decisions = min(batch, trainer.micro_batch)
+    copies = (
+        4 if ratio and trainer.probe_every else 3
+    )  # the gradient, Adam's moments, weights to compare with
+    kept = memory.trainer(0, copies) / (trainer.ranks if trainer.zero else 1)
+    acting = memory.replica(config.inference.max_batch)
+    room, replicas, place = _device_room(config, device)
+    need = kept + decisions * memory.learning + replicas * acting
+    text = (
+        f"trainer {_gib(kept)} and {_gib(memory.learning)} for each of {decisions} decisions, "
+        f"inference {_gib(acting)}; {_gib(need)} of {_gib(room)} on {place}"
+    )
+    if need <= room:
+        yield Check("policy", OK, text)
+        return
+    fitting = int((room - kept - replicas * acting) / memory.learning)
+    remedy = f"use --trainer.micro_batch={fitting}" if fitting > 0 else "use policy.tuning.mode=lora"
+    if not trainer.activation_checkpointing:
+        remedy += ", or --trainer.activation_checkpointing=true"
+    yield Check("policy", WARN, f"{text}: {remedy}")
+
+
+def _device_room(config: RunConfig, device: Any) -> tuple[float, int, str]:
+    """Bytes that a rank and the inference replicas beside it may take, how many these are, and of what."""
+    import torch
+
+    others = config.inference.workers if config.launch.engine != "local" else 0
+    if device.type == "cpu":
+        rest = sum(memory_parts_gib(config).values())
+        return ((_memory_gib() or math.inf) - rest) * GIB, others, "this machine"
+    gpus = torch.cuda.device_count()
+    rank, other = config.trainer.gpu_shares(gpus, others)
+    beside = int((1 - rank) / other + 1e-6) if other else 0
+    smallest = min(torch.cuda.get_device_properties(i).total_memory for i in range(gpus))
+    return USABLE * smallest, min(others, beside), "a GPU"
+
+
+def _gib(size: float) -> str:
+    return f"{size / GIB:.2g} GiB" if size < 10 * GIB else f"{size / GIB:.0f} GiB"
 
 
 def memory_estimate_gib(config: RunConfig, history: int = 1) -> float:

@@ -258,6 +258,7 @@ class FlowFamily(Family):
     def __init__(self, model: FlowModel, sampler: FlowSamplerConfig) -> None:
         super().__init__()
         self.model, self.sampler, self.shape = model, sampler, model.shape
+        self.entropy = entropy(model.shape, sampler)
 
     def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
         n, size = self.shape.num_steps, (self.shape.chunk_size, self.shape.padded_dim)
@@ -268,8 +269,7 @@ class FlowFamily(Family):
 
     def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> Score:
         logp = log_prob(encoded.context.velocity, latent, self.shape, self.sampler)
-        constant = entropy(self.shape, self.sampler)
-        return Score(log_prob=logp, entropy=logp.new_full((len(logp),), constant))
+        return Score(log_prob=logp, entropy=logp.new_full((len(logp),), self.entropy))
 
     def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
         return difference(self.model, batch, encoded)
@@ -279,7 +279,10 @@ class FlowFamily(Family):
         target = chunk.new_zeros(len(chunk), self.shape.chunk_size, self.shape.padded_dim)
         self._executed_part(target).copy_(chunk)
         noise = torch.randn_like(target)
-        t = torch.distributions.Beta(1.5, 1.0).sample((len(chunk),)).to(chunk) * 0.999 + 0.001
+        t = (
+            torch.distributions.Beta(1.5, 1.0, validate_args=False).sample((len(chunk),)).to(chunk) * 0.999
+            + 0.001
+        )
         mixed = t[:, None, None] * noise + (1 - t[:, None, None]) * target
         error = (encoded.context.velocity(mixed, t) - (noise - target)).square()
         return self._executed_part(error).mean((1, 2))

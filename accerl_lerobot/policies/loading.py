@@ -12,6 +12,7 @@ import json
 import logging
 import shutil
 import string
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -167,6 +168,16 @@ def policy_sizes(config: PolicyConfig) -> Sizes:
         InputError: there is no checkpoint any more.
     """
     return _rehearsed[_key(config, _checkpoint_folder(config))]
+
+
+def rehearsed[T](config: PolicyConfig, task: Callable[[LeRobotAdapter], T]) -> T:
+    """Result, which JSON can hold, of `task` with the policy of `rehearsed_config`, in a child process too.
+
+    Raises:
+        InputError: see `rehearsed_config`, which has been called.
+    """
+    there, origin = replace(config, device="cpu"), Origin("policy.path", config.path)
+    return rehearse(lambda: task(_load(there, rehearsal=True)), _checkpoint_folder(config), origin)
 
 
 def _key(config: PolicyConfig, folder: Path) -> str:

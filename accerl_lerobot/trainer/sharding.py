@@ -12,7 +12,7 @@ to the adapter as a whole.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import Any
@@ -40,17 +40,26 @@ def arrange(adapter: PolicyAdapter, config: TrainerConfig) -> None:
     """
     if not (config.zero or config.activation_checkpointing):
         return
-    seen = Watch(adapter)
+    seen = Watch(adapter, partial(adapter.evaluate, *adapter.example()))
     if config.activation_checkpointing:
-        forgetful = [block for block in seen.blocks if list(block.children())]
-        if not forgetful:
-            remedy = "no block of this policy can be computed again by itself; leave the field out"
-            raise InputError("trainer.activation_checkpointing", True, remedy)
-        for block in forgetful:
-            # FSDP's hooks stand around this, at the module's call: weights are there when it is repeated.
-            block.forward = partial(checkpoint, block.forward, use_reentrant=False)
+        forget(seen)
     if config.zero:
         _share_out(adapter, seen.blocks, config)
+
+
+def forget(seen: Watch) -> None:
+    """Makes blocks compute again for the gradient what they computed before.
+
+    Raises:
+        InputError: see `arrange`.
+    """
+    forgetful = [block for block in seen.blocks if list(block.children())]
+    if not forgetful:
+        remedy = "no block of this policy can be computed again by itself; leave the field out"
+        raise InputError("trainer.activation_checkpointing", True, remedy)
+    for block in forgetful:
+        # FSDP's hooks stand around this, at the module's call: weights are there when it is repeated.
+        block.forward = partial(checkpoint, block.forward, use_reentrant=False)
 
 
 def _share_out(adapter: PolicyAdapter, blocks: Sequence[nn.Module], config: TrainerConfig) -> None:
@@ -117,12 +126,13 @@ class Watch(TorchFunctionMode):
 
     Args:
         adapter: what is watched.
+        evaluate: runs its network once.
 
     Attributes:
         blocks: see the top of this file; none within another.
     """
 
-    def __init__(self, adapter: PolicyAdapter) -> None:
+    def __init__(self, adapter: PolicyAdapter, evaluate: Callable[[], object]) -> None:
         super().__init__()
         self._called: set[nn.Module] = set()
         self._leaky: set[nn.Module] = set()
@@ -130,13 +140,12 @@ class Watch(TorchFunctionMode):
         self._stack: list[nn.Module] = []
         self._around: dict[Tensor, set[nn.Module]] = {}
         """The modules whose calls enclose every use of a parameter."""
-        arguments = adapter.example()
         hooks = [h for m in adapter.modules() for h in (
             m.register_forward_pre_hook(self._enter, with_kwargs=True), m.register_forward_hook(self._leave)
         )]  # fmt: skip
         try:
             with torch.no_grad(), self:
-                adapter.evaluate(*arguments)
+                evaluate()
         finally:
             for hook in hooks:
                 hook.remove()

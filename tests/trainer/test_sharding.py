@@ -172,10 +172,14 @@ def test_a_trainer_alone_gets_what_it_gives():
 # ---- blocks
 
 
+def watch(adapter: LinearAdapter) -> Watch:
+    return Watch(adapter, lambda: adapter.evaluate(*adapter.example()))
+
+
 def test_blocks_are_layers_whose_weights_are_used_inside_their_own_call_only():
     adapter = sharded.LayeredAdapter()
     names = {module: name for name, module in adapter.named_modules()}
-    found = [names[block] for block in Watch(adapter).blocks]
+    found = [names[block] for block in watch(adapter).blocks]
     assert found == [
         "layers.0",
         "layers.1",
@@ -190,7 +194,7 @@ def test_blocks_are_layers_whose_weights_are_used_inside_their_own_call_only():
 
 def test_watching_leaves_nothing_behind():
     adapter, other = sharded.LayeredAdapter(), sharded.LayeredAdapter()
-    Watch(adapter)
+    watch(adapter)
     assert all(not m._forward_hooks and not m._forward_pre_hooks for m in adapter.modules())
     assert all(torch.equal(p, q) for p, q in zip(adapter.parameters(), other.parameters(), strict=True))
 

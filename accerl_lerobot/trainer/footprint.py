@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Memory that a policy takes where it lives, for ``accerl doctor``: from its sizes, and from one decision.
+
+Weights, gradients and Adam's moments follow from the numbers of parameters. What a decision adds depends on
+images, denoising steps, precision and tuning mode, so one decision is made and prepared for its gradient
+while every tensor is counted. Networks of more than `FAKED_FROM` parameters compute with PyTorch's fake
+tensors, which have shapes and no data: π0 needs no 14 GiB to be measured.
+"""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Iterator
+from contextlib import nullcontext
+from functools import partial
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves, tree_map_only
+
+from accerl_lerobot.policies.adapter import LeRobotAdapter, example_requests, stack_observations
+from accerl_lerobot.trainer.sharding import Watch, forget
+
+FAKED_FROM = 10**9
+"""SmolVLA cannot be faked: its image encoder indexes by a mask, and a shape does not say how many places are
+True."""
+FLOAT32 = 4
+
+
+class PolicyMemory(NamedTuple):
+    """Bytes."""
+
+    weights: int
+    """All parameters, in float32 whatever ``policy.precision``."""
+    trained: int
+    """Those that are trained, the critic's included."""
+    acting: int
+    """Highest memory of a decision while it is made."""
+    learning: int
+    """Memory of a decision that waits for its gradient."""
+
+    def trainer(self, decisions: int, copies: int = 3) -> int:
+        """A rank that learns from `decisions` at a time.
+
+        Args:
+            copies: of the trained weights; the gradient and Adam's two moments.
+        """
+        return self.weights + copies * self.trained + decisions * self.learning
+
+    def replica(self, decisions: int) -> int:
+        """An inference replica that decides `decisions` at a time."""
+        return self.weights + decisions * self.acting
+
+
+class Counter(TorchDispatchMode):
+    """Bytes of the tensors that are made under it and still live.
+
+    Attributes:
+        now: of this moment.
+        peak: the most so far.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.now = self.peak = 0
+        self._live: set[int] = set()
+
+    def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        for tensor in tree_leaves((args, kwargs)):  # what is there already, such as weights, costs nothing
+            self._add(tensor, counted=False)
+        result = function(*args, **(kwargs or {}))
+        for tensor in tree_leaves(result):
+            self._add(tensor, counted=True)
+        return result
+
+    def _add(self, tensor: Any, *, counted: bool) -> None:
+        if not isinstance(tensor, Tensor):
+            return
+        storage = tensor.untyped_storage()
+        key, size = storage._cdata, storage.nbytes() if counted else 0
+        if key not in self._live:
+            self._live.add(key)
+            self.now += size
+            self.peak = max(self.peak, self.now)
+            weakref.finalize(storage, self._freed, key, size)
+
+    def _freed(self, key: int, size: int) -> None:
+        self._live.discard(key)
+        self.now -= size
+
+
+def policy_memory(adapter: LeRobotAdapter, *, imitates: bool, checkpointing: bool = False) -> PolicyMemory:
+    """Measures an adapter on the CPU, which is of no use afterwards.
+
+    Args:
+        imitates: learns by `Family.imitation_loss`, as off-policy algorithms do, not by a likelihood ratio.
+        checkpointing: ``trainer.activation_checkpointing``.
+    """
+    from torch._subclasses.fake_tensor import FakeTensorMode
+
+    weights, trained = (
+        FLOAT32 * sum(p.numel() for p in parameters)
+        for parameters in (adapter.policy.parameters(), adapter.trainable().values())
+    )
+    requests = example_requests(adapter.policy.config, adapter.processing.rename_map)[:1]
+    batch = adapter.processing.prepare(*stack_observations(requests))
+    mode: Any = nullcontext()
+    if weights > FLOAT32 * FAKED_FROM:
+        mode = FakeTensorMode(allow_non_fake_inputs=True)
+        batch = tree_map_only(Tensor, mode.from_tensor, batch)
+        _fake(adapter, mode)
+    with mode:
+        with torch.no_grad(), adapter.autocast(), Counter() as acting:
+            action = adapter.family.act(adapter.model.encode(batch), requests)
+
+        def learn() -> Any:
+            with adapter.autocast():
+                encoded = adapter.model.encode(batch)
+                if imitates:
+                    return adapter.family.imitation_loss(encoded, action.chunk)
+                score = adapter.family.score(encoded, action.latent)
+            return score.log_prob, adapter.value_head(encoded.features, encoded.mask)
+
+        if checkpointing:
+            forget(Watch(adapter, learn))
+        with Counter() as learning:
+            kept = learn()
+    found = PolicyMemory(weights, trained, acting.peak, learning.now)
+    del kept
+    return found
+
+
+def _fake(adapter: LeRobotAdapter, mode: Any) -> None:
+    """Replaces all weights by fake ones of the same shapes; what is tied stays tied."""
+    fakes: dict[int, Any] = {}
+
+    def fake(tensor: Tensor) -> Tensor:
+        if id(tensor) not in fakes:
+            made = mode.from_tensor(tensor.detach())
+            parameter = partial(nn.Parameter, requires_grad=tensor.requires_grad)
+            fakes[id(tensor)] = parameter(made) if isinstance(tensor, nn.Parameter) else made
+        return fakes[id(tensor)]
+
+    with mode:
+        for named in _tensors(adapter):
+            named.update({name: fake(tensor) for name, tensor in named.items() if tensor is not None})
+
+
+def _tensors(adapter: LeRobotAdapter) -> Iterator[dict[str, Any]]:
+    for root in (adapter.policy, adapter.family, adapter.value_head):
+        for module in root.modules():
+            yield from (module._parameters, module._buffers)

@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Memory of a policy: counted by hand, with real and with fake tensors, and against what a process takes."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from accerl_lerobot.policies.adapter import LeRobotAdapter
+from accerl_lerobot.policies.config import PolicyConfig, TuningConfig
+from accerl_lerobot.policies.loading import load_adapter
+from accerl_lerobot.trainer import footprint
+from accerl_lerobot.trainer.footprint import Counter, PolicyMemory, policy_memory
+from tests.policies.checkpoints import write_act
+from tests.policies.tiny_pi import small, write_pi
+
+MIB = 2**20
+
+
+def test_tensors_are_counted_while_they_live():
+    x = torch.ones(100, 10)
+    with Counter() as counter:
+        y = x @ torch.ones(10, 20)
+        assert (counter.now, counter.peak) == (8000, 8800)  # the (10, 20) matrix is gone
+        y.view(-1)[3:].add_(1)  # views and what is done in place take nothing
+        x.mul_(2)
+        assert counter.now == 8000
+        z = y.relu()
+        assert (counter.now, counter.peak) == (16_000, 16_000)
+        del y
+        assert (counter.now, counter.peak) == (8000, 16_000)
+    del z
+    assert counter.now == 0
+
+
+def test_what_waits_for_the_gradient_is_what_autograd_keeps():
+    weight = torch.ones(10, 20, requires_grad=True)
+    x = torch.ones(100, 10)
+    with Counter() as counter:
+        kept = (x @ weight).sigmoid().sum()  # sigmoid keeps its result, 8,000 bytes; the sum has 4
+    assert counter.now == 8004
+    del kept
+
+
+@pytest.fixture
+def act(tmp_path: Path) -> LeRobotAdapter:
+    return load_adapter(PolicyConfig(path=str(write_act(tmp_path / "act")), device="cpu"))
+
+
+def pi0(folder: Path, **tuning: str) -> LeRobotAdapter:
+    path = folder if folder.exists() else write_pi(folder, "pi0")
+    return load_adapter(PolicyConfig(path=str(path), device="cpu", tuning=TuningConfig(**tuning)))
+
+
+@pytest.mark.parametrize("imitates", [False, True])
+def test_fake_tensors_take_what_real_ones_take(
+    tmp_path: Path, imitates: bool, monkeypatch: pytest.MonkeyPatch
+):
+    with small():
+        real = policy_memory(pi0(tmp_path / "pi0"), imitates=imitates)
+        monkeypatch.setattr(footprint, "FAKED_FROM", 0)
+        fake = policy_memory(pi0(tmp_path / "pi0"), imitates=imitates)
+    assert fake[:2] == real[:2]
+    assert fake.acting == pytest.approx(real.acting, rel=0.02)
+    assert fake.learning == pytest.approx(real.learning, rel=0.02)
+
+
+def test_less_is_kept_by_imitation_by_few_trained_weights_and_by_blocks_that_forget(tmp_path: Path):
+    with small():
+        full, expert = (pi0(tmp_path / "pi0", mode=mode) for mode in ("full", "expert"))
+        whole = policy_memory(full, imitates=False)
+        assert policy_memory(full, imitates=True).learning < whole.learning
+        found = policy_memory(expert, imitates=False)
+        assert found.trained < whole.trained < whole.weights  # some, such as embeddings, no action depends on
+        assert found.weights == whole.weights and found.learning < whole.learning
+        forgetting = policy_memory(pi0(tmp_path / "pi0", mode="full"), imitates=False, checkpointing=True)
+        assert forgetting.learning < whole.learning
+
+
+def test_a_decision_of_act_is_the_difference_between_batches(act: LeRobotAdapter):
+    memory = policy_memory(act, imitates=False)
+    observations, tasks, latent = act.example()
+    kept = []
+    for rows in (1, 2):
+        some = {name: array[:rows] for name, array in observations.items()}
+        with Counter() as counter:
+            evaluation = act.evaluate(some, tasks[:rows], {k: v[:rows] for k, v in latent.items()})
+        kept.append(counter.now)
+        del evaluation
+    assert memory.learning == pytest.approx(kept[1] - kept[0], rel=0.1)
+
+
+def test_sums_are_those_of_the_parts():
+    memory = PolicyMemory(weights=1000, trained=100, acting=10, learning=50)
+    assert memory.trainer(8) == 1000 + 3 * 100 + 8 * 50
+    assert memory.replica(4) == 1040
+
+
+PROCESS = """
+import json, sys
+from pathlib import Path
+import torch
+from accerl_lerobot.trainer.footprint import policy_memory
+from tests.trainer.test_footprint import published, resident
+adapter, observations, latent = published(Path(sys.argv[1]))
+base = resident()
+adapter.evaluate(*observations, latent).log_prob.sum().backward()
+taken = resident(peak=True) - base
+adapter.zero_grad(set_to_none=True)
+print(json.dumps([taken, policy_memory(adapter, imitates=False)]))
+"""
+DECISIONS = 2
+
+
+def published(folder: Path) -> tuple[LeRobotAdapter, tuple, dict]:
+    """SmolVLA of its published size, and two decisions."""
+    import numpy as np
+
+    from accerl_lerobot.bench.policy import STATE, BenchPolicyConfig, _adapter
+    from accerl_lerobot.experience import TASK, Request
+    from accerl_lerobot.policies.adapter import stack_observations
+
+    adapter = _adapter(BenchPolicyConfig(), torch.device("cpu"), folder)
+    requests = [
+        Request(observation={STATE: np.full(1, i, np.float32), TASK: "do it"}, noise_seed=i)
+        for i in range(DECISIONS)
+    ]
+    latents = [decision.latent for decision in adapter.decide(requests, 0)]
+    latent = {k: torch.from_numpy(np.stack([one[k] for one in latents])) for k in latents[0]}
+    return adapter, stack_observations(requests), latent
+
+
+def resident(*, peak: bool = False) -> int:
+    """Bytes of this process in memory now, or the most since the last question about now."""
+    if not peak:
+        Path("/proc/self/clear_refs").write_text("5")
+    status = Path("/proc/self/status").read_text()
+    return int(status.split("VmHWM:" if peak else "VmRSS:")[1].split()[0]) * 1024
+
+
+@pytest.mark.slow
+def test_a_process_takes_what_was_estimated_at_published_size(tmp_path: Path):
+    """SmolVLA, 450 M parameters, 100 M of them trained: gradients and what two decisions keep for them."""
+    done = subprocess.run(
+        [sys.executable, "-c", PROCESS, str(tmp_path)], capture_output=True, text=True, check=True
+    )
+    taken, found = json.loads(done.stdout.splitlines()[-1])
+    memory = PolicyMemory(*found)
+    assert memory.weights > 1600 * MIB
+    # Gradients appear as what was kept for them goes, so not all of both is there at once.
+    most = memory.trained + DECISIONS * memory.learning
+    assert 0.8 * DECISIONS * memory.learning < taken < 1.15 * most
