@@ -16,6 +16,7 @@ from benchmarks.batching import BenchBatchingConfig
 from benchmarks.efficiency import BenchEfficiencyConfig
 from benchmarks.faults import BenchFaultsConfig
 from benchmarks.few_shot import BenchFewShotConfig
+from benchmarks.gpu import BenchGpuConfig
 from benchmarks.lag import BenchLagConfig
 from benchmarks.ranking import BenchRankingConfig
 from benchmarks.replay import BenchReplayConfig
@@ -41,6 +42,7 @@ CONFIGS: dict[str, type[Any]] = {
     "transport": BenchTransportConfig,
     "weights": BenchWeightsConfig,
     "world_model": BenchWorldModelConfig,
+    "gpu": BenchGpuConfig,
 }
 """Module with a function ``bench_NAME`` and a ``table`` of what it returns → its fields."""
 

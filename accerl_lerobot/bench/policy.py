@@ -59,9 +59,9 @@ def bench_policy(config: BenchPolicyConfig) -> dict[str, Any]:
     Returns:
         ``parameters`` (all, trained), ``seconds`` (build; then median, min, max of decide_one, decide, score
         and update), ``memory_gb`` after each stage, ``mismatch`` at equal weights (mean and largest
-        |Δ log-prob| of a decision in nats, share of chunk ratios outside 1 ± 0.2), ``config``,
-        ``host``, and ``estimate``, the bytes of `footprint.PolicyMemory`. With ``memory_only`` neither seconds,
-        memory nor mismatch.
+        |Δ log-prob| of a decision in nats, share of chunk ratios outside 1 ± 0.2), ``estimate``, the bytes of
+        `footprint.PolicyMemory`, ``config`` and ``host``. Seconds, memory and mismatch are absent with
+        ``memory_only``.
     """
     import numpy as np
     import torch
