@@ -158,7 +158,7 @@ def table(result: dict[str, Any]) -> Table:
         rows.append(("mismatch at equal weights", f"{gap['mean']:.1e} nats, at most {gap['max']:.1e}", ""))
     memory = PolicyMemory(**result["estimate"])
     shown = {"estimate, weights": memory.weights, "weights, gradients, Adam": memory.trainer(0)}
-    shown |= {"for a decision acted": memory.acting, "for a decision learnt from": memory.learning}
+    shown |= {"for each decision to make": memory.acting, "for each to learn from": memory.learning}
     rows += [(name, f"{size / 2**30:.2f} GiB", "") for name, size in shown.items()]
     return as_table(title, ("part", "seconds (range)", "decisions/s"), rows)
 

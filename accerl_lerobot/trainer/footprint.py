@@ -2,8 +2,8 @@
 """Memory that a policy takes where it lives, for ``accerl doctor``: from its sizes, and from one decision.
 
 Weights, gradients and Adam's moments follow from the numbers of parameters. What a decision adds depends on
-images, denoising steps, precision and tuning mode, so one decision is made and prepared for its gradient
-while every tensor is counted. Networks of more than `FAKED_FROM` parameters compute with PyTorch's fake
+images, denoising steps, precision and tuning mode, so a decision is made, and one and two are prepared for
+their gradient, while every tensor is counted. Networks of more than `FAKED_FROM` parameters compute with PyTorch's fake
 tensors, which have shapes and no data: π0 needs no 14 GiB to be measured.
 """
 
@@ -21,6 +21,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map_only
 
 from accerl_lerobot.policies.adapter import LeRobotAdapter, example_requests, stack_observations
+from accerl_lerobot.policies.family import Action
 from accerl_lerobot.trainer.sharding import Watch, forget
 
 FAKED_FROM = 10**9
@@ -36,10 +37,12 @@ class PolicyMemory(NamedTuple):
     """All parameters, in float32 whatever ``policy.precision``."""
     trained: int
     """Those that are trained, the critic's included."""
+    shared: int
+    """Memory of a batch that waits for its gradient, whatever its size; copies of weights in bf16."""
     acting: int
     """Highest memory of a decision while it is made."""
     learning: int
-    """Memory of a decision that waits for its gradient."""
+    """Further memory for each of its decisions."""
 
     def trainer(self, decisions: int, copies: int = 3) -> int:
         """A rank that learns from `decisions` at a time.
@@ -47,7 +50,7 @@ class PolicyMemory(NamedTuple):
         Args:
             copies: of the trained weights; the gradient and Adam's two moments.
         """
-        return self.weights + copies * self.trained + decisions * self.learning
+        return self.weights + copies * self.trained + self.shared + decisions * self.learning
 
     def replica(self, decisions: int) -> int:
         """An inference replica that decides `decisions` at a time."""
@@ -104,32 +107,40 @@ def policy_memory(adapter: LeRobotAdapter, *, imitates: bool, checkpointing: boo
         FLOAT32 * sum(p.numel() for p in parameters)
         for parameters in (adapter.policy.parameters(), adapter.trainable().values())
     )
-    requests = example_requests(adapter.policy.config, adapter.processing.rename_map)[:1]
+    requests = example_requests(adapter.policy.config, adapter.processing.rename_map)
     batch = adapter.processing.prepare(*stack_observations(requests))
     mode: Any = nullcontext()
     if weights > FLOAT32 * FAKED_FROM:
         mode = FakeTensorMode(allow_non_fake_inputs=True)
         batch = tree_map_only(Tensor, mode.from_tensor, batch)
         _fake(adapter, mode)
+    one = tree_map_only(Tensor, lambda tensor: tensor[:1], batch)
     with mode:
         with torch.no_grad(), adapter.autocast(), Counter() as acting:
-            action = adapter.family.act(adapter.model.encode(batch), requests)
-
-        def learn() -> Any:
-            with adapter.autocast():
-                encoded = adapter.model.encode(batch)
-                if imitates:
-                    return adapter.family.imitation_loss(encoded, action.chunk)
-                score = adapter.family.score(encoded, action.latent)
-            return score.log_prob, adapter.value_head(encoded.features, encoded.mask)
-
+            action = adapter.family.act(adapter.model.encode(one), requests[:1])
+        learn = partial(_prepare_gradient, adapter, action, imitates)
         if checkpointing:
-            forget(Watch(adapter, learn))
-        with Counter() as learning:
-            kept = learn()
-    found = PolicyMemory(weights, trained, acting.peak, learning.now)
-    del kept
-    return found
+            forget(Watch(adapter, partial(learn, one)))
+        kept = []
+        for rows in (one, batch):
+            with Counter() as learning:
+                waiting = learn(rows)
+            kept.append(learning.now)
+            del waiting
+    learning_each = kept[1] - kept[0]
+    return PolicyMemory(weights, trained, max(0, kept[0] - learning_each), acting.peak, learning_each)
+
+
+def _prepare_gradient(adapter: LeRobotAdapter, action: Action, imitates: bool, batch: dict[str, Any]) -> Any:
+    """The forward pass of an update, and all that it keeps."""
+    rows = max(len(value) for value in batch.values() if isinstance(value, Tensor))
+    with adapter.autocast():
+        encoded = adapter.model.encode(batch)
+        if imitates:
+            return adapter.family.imitation_loss(encoded, action.chunk.expand(rows, -1, -1))
+        latent = {name: tensor.expand(rows, *tensor.shape[1:]) for name, tensor in action.latent.items()}
+        score = adapter.family.score(encoded, latent)
+    return score.log_prob, adapter.value_head(encoded.features, encoded.mask)
 
 
 def _fake(adapter: LeRobotAdapter, mode: Any) -> None:
