@@ -3,6 +3,7 @@
 # make quickstart   install what is missing, run recipes/quickstart.yaml
 # make test         install what is missing, run the tests but for the slow ones
 # make test-all     install what is missing, run all tests, as .ci/run does
+# make docs         install what is missing, build the documentation into build/site
 # ARGS adds arguments: make quickstart ARGS="--seed=1", make test ARGS="tests/replay -x -n 0"
 
 SHELL := /bin/bash
@@ -17,12 +18,13 @@ endef
 export LIST_INSTALLED
 
 .DEFAULT_GOAL := help
-.PHONY: help setup quickstart test test-all check audit lint format-check types format
+.PHONY: help setup quickstart test test-all docs check audit lint format-check types format
 
 help:
 	@echo "make quickstart  demonstrations, SFT, asynchronous RL and evaluation on one MetaWorld task"
 	@echo "make test        the tests but for the slow ones: a few minutes"
 	@echo "make test-all    all tests, as continuous integration runs them"
+	@echo "make docs        the documentation as a site in build/site; a broken link is an error"
 	@echo "make check       lint, formatting and types"
 	@echo "make audit       known vulnerabilities of what is installed; asks the Python package index"
 	@echo "make format      rewrite the code as 'make check' wants it"
@@ -47,6 +49,9 @@ test: setup
 
 test-all: setup
 	.venv/bin/python -m pytest -n 2 --dist loadfile $(ARGS)
+
+docs: setup
+	.venv/bin/python -m mkdocs build --strict
 
 check: lint format-check types
 
