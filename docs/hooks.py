@@ -27,7 +27,8 @@ def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
 def options() -> str:
     """A chapter for each verb. A section that several verbs read stands with the first of them."""
     seen: set[tuple[str, type]] = set()
-    chapters = []
+    chapters = ["\n| verb | use |\n|---|---|"]
+    chapters += [f"| `accerl {verb}` | {use} |" for verb, use in VERBS.items()]
     for verb, config_class in CONFIGS.items():
         if ("", config_class) in seen:
             continue
