@@ -4,6 +4,7 @@
 # make test         install what is missing, run the tests but for the slow ones
 # make test-all     install what is missing, run all tests, as .ci/run does
 # make gpu-check    install what is missing, measure what needs a GPU
+# make docs         install what is missing, build the documentation into build/site
 # ARGS adds arguments: make quickstart ARGS="--seed=1", make test ARGS="tests/replay -x -n 0"
 
 SHELL := /bin/bash
@@ -18,13 +19,14 @@ endef
 export LIST_INSTALLED
 
 .DEFAULT_GOAL := help
-.PHONY: help setup quickstart test test-all gpu-check check audit lint format-check types format
+.PHONY: help setup quickstart test test-all gpu-check docs check audit lint format-check types format
 
 help:
 	@echo "make quickstart  demonstrations, SFT, asynchronous RL and evaluation on one MetaWorld task"
 	@echo "make test        the tests but for the slow ones: a few minutes"
 	@echo "make test-all    all tests, as continuous integration runs them"
 	@echo "make gpu-check   likelihood, speed, memory and a short run on this machine's GPU; JSON and a table"
+	@echo "make docs        the documentation as a site in build/site; a broken link is an error"
 	@echo "make check       lint, formatting and types"
 	@echo "make audit       known vulnerabilities of what is installed; asks the Python package index"
 	@echo "make format      rewrite the code as 'make check' wants it"
@@ -52,6 +54,9 @@ test-all: setup
 
 gpu-check: setup
 	.venv/bin/python -m benchmarks gpu $(ARGS)
+
+docs: setup
+	.venv/bin/python -m mkdocs build --strict
 
 check: lint format-check types
 

@@ -146,7 +146,7 @@ def test_folders_below_tests_are_packages() -> None:
 def test_the_top_level_is_the_agreed_one() -> None:
     folders = {"accerl_lerobot", "benchmarks", "recipes", "datasets", "tests", "docs", ".ci"}
     files = {"pyproject.toml", "README.md", "LICENSE", "Makefile", ".gitignore", ".python-version"}
-    files |= {"CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md"}
+    files |= {"CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "mkdocs.yml"}
     assert {p.relative_to(ROOT).parts[0] for p in tracked()} <= folders | files
 
 

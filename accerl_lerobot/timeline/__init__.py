@@ -10,7 +10,7 @@ calendar time at which a process began is noted too.
 kept. A part's first line has the totals before it, so those are exact although older parts are gone. Nothing
 is overwritten: a killed process leaves at worst half an entry, which is not read.
 
-The states of a worker, which is in exactly one at any time; see ``docs/performance.md``.
+The states of a worker, which is in exactly one at any time; see ``docs/metrics.md``.
 """
 
 from __future__ import annotations
