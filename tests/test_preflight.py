@@ -19,7 +19,7 @@ from accerl_lerobot.envs import SimulatedConfig, make_world
 from accerl_lerobot.envs.base import WorldSpec
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.features import Features, check_features, env_features, policy_features
-from tests.policies.checkpoints import write_act, write_diffusion, write_gaussian_actor
+from tests.policies.checkpoints import write_act, write_diffusion
 
 ROOT = Path(__file__).parents[1]
 TINY = ["--dataset.repo_id=accerl/metaworld_tiny", f"--dataset.root={ROOT / 'datasets' / 'metaworld_tiny'}"]
@@ -109,7 +109,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     return lines[0]
 
 
-@pytest.mark.parametrize("write", [write_act, write_diffusion, write_gaussian_actor])
+@pytest.mark.parametrize("write", [write_act, write_diffusion])
 def test_checkpoints_of_another_image_size(write: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """By policies that do not resize: LeRobot takes any picture, and what comes of it is nobody's guess."""
     path, out = write(tmp_path / "policy", image=48), tmp_path / "out"

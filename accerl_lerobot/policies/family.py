@@ -112,11 +112,6 @@ class Family(nn.Module, ABC):
         """
         raise NotImplementedError
 
-    @property
-    @abstractmethod
-    def actions(self) -> int | None:
-        """See `adapter.PolicyAdapter.actions`."""
-
     def factors(self, latent: dict[str, Tensor]) -> Tensor | None:
         return None
 
@@ -133,23 +128,6 @@ def normal_log_prob(x: Tensor, mean: Tensor, std: Tensor) -> Tensor:
 def normal_entropy(std: Tensor) -> Tensor:
     """Differential entropy of N(·, std²) in nats, of each entry."""
     return torch.log(std) + LOG_SQRT_2PI + 0.5
-
-
-class BoundedStd:
-    """A std between two bounds above 0 from a layer's output, by a sigmoid between their logarithms."""
-
-    def __init__(self, low: float, high: float) -> None:
-        self.low, self.high = math.log(low), math.log(high)
-
-    def __call__(self, raw: Tensor) -> Tensor:
-        """The std, of the shape of `raw`, in fp32."""
-        return torch.exp(self.low + (self.high - self.low) * torch.sigmoid(raw.float()))
-
-    def start(self, layer: nn.Linear, std: float) -> None:
-        """Makes the layer's std equal to `std`, between the bounds, whatever its input."""
-        share = (math.log(std) - self.low) / (self.high - self.low)
-        nn.init.zeros_(layer.weight)
-        nn.init.constant_(layer.bias, math.log(share / (1 - share)))
 
 
 def pooled(features: Tensor, weights: Tensor) -> Tensor:

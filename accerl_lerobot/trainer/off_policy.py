@@ -26,7 +26,6 @@ from accerl_lerobot.trainer.batch import MAX_NONFINITE, NonFiniteError
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.memory import Memory
 from accerl_lerobot.trainer.probe import CRITIC
-from accerl_lerobot.trainer.sharding import arrange
 
 POLICY_BATCH = 64
 """Rows of one step of the policy."""
@@ -36,8 +35,6 @@ class OffPolicyUpdate:
     """Has the methods of `update.Update`, and stands in its place. As it is, imitates successful episodes.
 
     Args:
-        adapter: the policy.
-        algorithm: the objective.
         config: the optimiser; ``batch_decisions`` of new experience make one update.
 
     Raises:
@@ -51,7 +48,6 @@ class OffPolicyUpdate:
         if not adapter.family.imitates:
             remedy = "needs a policy that explores by flow or gaussian; use gipo"
             raise InputError("algorithm.type", algorithm.type, remedy)
-        arrange(adapter, config)
         self.adapter, self.config = adapter, config
         self.policy_steps = algorithm.policy_steps
         self.memory = Memory(algorithm.memory, algorithm.gamma, self.n_step)
@@ -120,7 +116,7 @@ class OffPolicyUpdate:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Goes on from what `state` gave; the adapter has its weights already."""
+        """Resume from `state`; the adapter has its weights already."""
         self.version = state["version"]
         self.skipped, self._skipped_in_a_row = state["skipped"]
         self._schedule_updates, self._owed = state["schedule_updates"], dict(state["owed"])

@@ -14,46 +14,25 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
-from torch.utils.checkpoint import checkpoint
 
 from accerl_lerobot.checkpoint.tensors import in_parts
-from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.adapter import Evaluation, PolicyAdapter
 from accerl_lerobot.trainer.config import TrainerConfig
 
 
 def arrange(adapter: PolicyAdapter, config: TrainerConfig) -> None:
-    """Prepares an adapter for `trainer.sharding` and `trainer.activation_checkpointing`, in place.
+    """Shares an adapter's weights out, in place, where each rank keeps its part of them.
 
     Args:
         adapter: on every rank with the same weights; called before anybody takes hold of its parameters.
-        config: which of the two.
-
-    Raises:
-        InputError: the policy has no block that can forget.
     """
-    if not (config.zero or config.activation_checkpointing):
+    if not config.zero:
         return
-    seen = Watch(adapter)
-    if config.activation_checkpointing:
-        forgetful = [block for block in seen.blocks if list(block.children())]
-        if not forgetful:
-            remedy = "no block of this policy can be computed again by itself; leave the field out"
-            raise InputError("trainer.activation_checkpointing", True, remedy)
-        for block in forgetful:
-            # FSDP's hooks stand around this, at the module's call: weights are there when it is repeated.
-            block.forward = partial(checkpoint, block.forward, use_reentrant=False)
-    if config.zero:
-        _share_out(adapter, seen.blocks, config)
-
-
-def _share_out(adapter: PolicyAdapter, blocks: Sequence[nn.Module], config: TrainerConfig) -> None:
     import torch.distributed as dist
     from torch.distributed.device_mesh import init_device_mesh
     from torch.distributed.fsdp import fully_shard, register_fsdp_forward_method
@@ -64,7 +43,7 @@ def _share_out(adapter: PolicyAdapter, blocks: Sequence[nn.Module], config: Trai
         "mesh": init_device_mesh(adapter.device.type, (dist.get_world_size(),)),
         "reshard_after_forward": config.sharding == "zero3",
     }
-    for block in blocks:
+    for block in Watch(adapter).blocks:
         fully_shard(block, **options)
     fully_shard(adapter, **options)
     for name in ("evaluate", "values"):
@@ -72,7 +51,7 @@ def _share_out(adapter: PolicyAdapter, blocks: Sequence[nn.Module], config: Trai
 
 
 def synchronise(adapter: PolicyAdapter, now: bool) -> None:
-    """True if the next backward pass ends with gradients averaged over ranks, or adds to those kept back."""
+    """Have the next backward pass average gradients over ranks, or, if not `now`, keep them back."""
     if hasattr(adapter, "set_requires_gradient_sync"):
         adapter.set_requires_gradient_sync(now)
 
@@ -81,13 +60,7 @@ def synchronise(adapter: PolicyAdapter, now: bool) -> None:
 def swapped_in(
     adapter: PolicyAdapter, live: Sequence[nn.Parameter], tensors: Sequence[Tensor]
 ) -> Iterator[None]:
-    """Parameters have other values inside, and their own again afterwards, whatever happens.
-
-    Args:
-        adapter: whose they are.
-        live: its parameters.
-        tensors: like them.
-    """
+    """Parameters have other values inside, and their own again afterwards, whatever happens."""
     sharded = any(map(in_parts, live))
     own = [p.detach().clone() if sharded else p.data for p in live]
     try:
@@ -114,9 +87,6 @@ def _put(
 
 class Watch(TorchFunctionMode):
     """Which modules one evaluation calls, and where it uses which parameter.
-
-    Args:
-        adapter: what is watched.
 
     Attributes:
         blocks: see the top of this file; none within another.
@@ -177,8 +147,7 @@ class Watch(TorchFunctionMode):
     def _is_block(self, module: nn.Module) -> bool:
         """Called, of more than vectors, and no weight of it is used or held anywhere else."""
         parameters = list(module.parameters())
-        # Gradients that come by way of a cache pass by a module's output, where FSDP waits for them; and what
-        # is computed again would be put there again.
+        # Gradients that come by way of a cache pass by a module's output, where FSDP waits for them.
         if module not in self._called or module in self._leaky or all(p.dim() < 2 for p in parameters):
             return False
         inside = set(module.modules())

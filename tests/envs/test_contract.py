@@ -21,7 +21,7 @@ from accerl_lerobot.envs import (
 from accerl_lerobot.errors import InputError
 
 CASES: dict[str, EnvConfig] = {
-    "metaworld": MetaWorldConfig(task="drawer-open-v3", max_steps=25, reward="dense"),
+    "metaworld": MetaWorldConfig(task="drawer-open-v3", max_steps=25),
     "simulated": SimulatedConfig(max_steps=25, reward="dense", hold=7),
     "pusht": LeRobotEnvConfig(name="pusht", max_steps=25, reward="env", task="Push the T onto its mark"),
 }
