@@ -29,9 +29,7 @@ LOCK = ".lock"
 CHANGEABLE = (
     "resume", "output_dir", "evaluation", "launch", "wandb", "save_every_updates", "save_every_s",
     "save_keep", "trainer.updates", "trainer.num_threads", "trainer.ranks", "trainer.sharding",
-    "trainer.rank_timeout_s",
-    "rollout.max_restarts", "inference",
-    "imagination.discover_packages_path",
+    "trainer.rank_timeout_s", "inference", "imagination.discover_packages_path",
 )  # fmt: skip
 """Fields and sections that may change when a run is resumed: what is learned, and from what, stays."""
 LONGEST_PAUSE_S = 8.0
