@@ -135,16 +135,6 @@ def test_planned_episodes_run_without_training_and_are_not_learned_from(tiny_che
     assert [bool(r.frames) for r in sorted(results, key=lambda r: r.plan.index)] == [True] + [False] * 8
 
 
-def test_an_episode_cannot_be_planned_twice_while_it_has_no_result(tiny_checkpoint: Path):
-    engine = LocalEngine(tiny_run(tiny_checkpoint), ("match",))
-    engine.plan(evaluation_plans(("match",), 2, "test"))
-    with pytest.raises(ValueError, match="episode 0 of 'test' is planned twice"):
-        engine.plan(evaluation_plans(("match",), 1, "test"))
-    collect(engine, "test", 2)
-    engine.plan(evaluation_plans(("match",), 1, "test"))
-    engine.close()
-
-
 def test_closing_does_not_hide_why_it_is_called(tiny_checkpoint: Path, caplog: pytest.LogCaptureFixture):
     engine = LocalEngine(tiny_run(tiny_checkpoint), ("match",))
 

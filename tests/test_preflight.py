@@ -11,12 +11,10 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 
 from accerl_lerobot import cli
 from accerl_lerobot.envs import SimulatedConfig, make_world
-from accerl_lerobot.envs.base import WorldSpec
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.features import Features, check_features, env_features, policy_features
 from tests.policies.checkpoints import write_act, write_diffusion
@@ -158,18 +156,6 @@ def test_a_dataset_of_another_environment(
     assert line in refused(capsys, *first, *arguments) and not out.exists()
 
 
-def test_a_dataset_of_another_rate(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    pytest.importorskip("metaworld")
-    root = Path(shutil.copytree(TINY[1].split("=", 1)[1], tmp_path / "slow"))
-    info = root / "meta" / "info.json"
-    info.write_text(info.read_text().replace('"fps": 80', '"fps": 20'))
-    told = [TINY[0], f"--dataset.root={root}", *TINY_ENV, "--sft.steps=1", ACT]
-    for verb in ("train", "sft"):
-        line = refused(capsys, verb, *told, f"--output_dir={tmp_path / 'out'}")
-        assert "recorded at 20 Hz, but the environment runs at 80 Hz" in line
-    assert not (tmp_path / "out").exists()
-
-
 QUICK = ["train", str(ROOT / "recipes" / "quickstart.yaml")]
 NO_GPU = "no CUDA device here; use cpu or auto"
 
@@ -240,8 +226,3 @@ def test_a_simulator_that_is_not_installed(
     for verb, more in (("train", [*sft, f"--output_dir={out}"]), ("demos", [f"--demos.root={out}"])):
         assert refused(capsys, verb, *env, *more) == line
         assert not out.exists()
-
-
-def test_an_environment_has_the_texts_of_its_tasks():
-    spec: WorldSpec = make_world(SimulatedConfig(task="mirror,match")).spec
-    assert spec.instructions == ("Mirror the target", "Match the target") and np.isfinite(spec.fps)

@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 
 from accerl_lerobot.checkpoint.layout import saved_version
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine import run, stopping
-from accerl_lerobot.engine.config import LaunchConfig, RunConfig, parse
+from accerl_lerobot.engine.config import LaunchConfig, RunConfig
 from accerl_lerobot.engine.loop import Engine, Progress, Saved
 from accerl_lerobot.engine.stopping import WorkerError
 from accerl_lerobot.envs import MetaWorldConfig, SimulatedConfig
@@ -124,12 +123,6 @@ def test_checkpoints_load_again(finished: Finished):
         weights.append(load_adapter(policy).export_trainable())
     assert weights[0].keys() == weights[1].keys()
     assert any((weights[0][k] != weights[1][k]).any() for k in weights[0])
-
-
-def test_the_config_reloads_to_an_equal_one(finished: Finished):
-    file = finished.directory / "config.yaml"
-    assert parse(RunConfig, [f"--config_path={file}"]) == finished.config
-    assert yaml.safe_load(file.read_text())["trainer"]["updates"] == 12
 
 
 def test_without_a_name_the_folder_is_named_after_the_time(

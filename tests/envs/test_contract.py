@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -155,14 +154,3 @@ def test_stepping_before_a_reset_is_refused(case: Case):
     with pytest.raises(RuntimeError, match="reset"):
         fresh.step_chunk(case.actions(1))
     fresh.close()
-
-
-def test_configs_survive_the_command_line(case: Case):
-    draccus = pytest.importorskip("draccus")
-    assert draccus.decode(EnvConfig, draccus.encode(case.config, EnvConfig)) == case.config
-
-
-@pytest.mark.parametrize("config", CASES.values(), ids=CASES)
-def test_zero_steps_are_refused(config: EnvConfig):
-    with pytest.raises(InputError, match="env.max_steps=0"):
-        dataclasses.replace(config, max_steps=0)
