@@ -89,9 +89,6 @@ class Model(ABC):
 class Family(nn.Module, ABC):
     """One way of acting at random with a known density; may own parameters, which are trained."""
 
-    imitates: ClassVar[bool] = False
-    """True if it has an `imitation_loss`."""
-
     @abstractmethod
     def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
         """Samples; where a request does not explore, LeRobot's own sampler."""
@@ -107,8 +104,7 @@ class Family(nn.Module, ABC):
     def imitation_loss(self, encoded: Encoded, chunk: Tensor) -> Tensor:
         """LeRobot's training loss (B,) on chunks (B, K, A) of as many actions as are executed, normalised.
 
-        Raises:
-            NotImplementedError: see `imitates`.
+        `engine.preflight` refuses off-policy algorithms for a family without it.
         """
         raise NotImplementedError
 

@@ -166,8 +166,6 @@ def difference(model: FlowModel, batch: dict[str, Tensor], encoded: Encoded) -> 
 class FlowFamily(Family):
     """Flow policies explored by noise in their denoising steps; the functions above do the work."""
 
-    imitates = True
-
     def __init__(self, model: FlowModel, sampler: FlowSamplerConfig) -> None:
         super().__init__()
         self.model, self.sampler, self.shape = model, sampler, model.shape

@@ -89,8 +89,6 @@ class StdHead(nn.Module):
 class GaussianFamily(Family):
     """Policies explored by noise around the chunk they predict."""
 
-    imitates = True
-
     def __init__(self, model: GaussianModel, sampler: GaussianSamplerConfig) -> None:
         super().__init__()
         self.model, self.sampler = model, sampler

@@ -17,7 +17,6 @@ from torch import Tensor
 from accerl_lerobot.algorithms import OffPolicyConfig
 from accerl_lerobot.algorithms.objective import lag_metrics
 from accerl_lerobot.checkpoint.tensors import optimizer_state, restore_optimizer
-from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.family import Encoded
@@ -36,18 +35,12 @@ class OffPolicyUpdate:
 
     Args:
         config: the optimiser; ``batch_decisions`` of new experience make one update.
-
-    Raises:
-        InputError: the policy cannot be trained to imitate a chunk.
     """
 
     n_step = 1
     """Decisions after which a target bootstraps."""
 
     def __init__(self, adapter: LeRobotAdapter, algorithm: OffPolicyConfig, config: TrainerConfig) -> None:
-        if not adapter.family.imitates:
-            remedy = "needs a policy that explores by flow or gaussian; use gipo"
-            raise InputError("algorithm.type", algorithm.type, remedy)
         self.adapter, self.config = adapter, config
         self.policy_steps = algorithm.policy_steps
         self.memory = Memory(algorithm.memory, algorithm.gamma, self.n_step)
