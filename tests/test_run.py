@@ -195,7 +195,7 @@ def _succeeded(plan: EpisodePlan) -> EpisodeResult:
 def scripted(monkeypatch: pytest.MonkeyPatch, config: RunConfig) -> Scripted:
     engine = Scripted(config)
     monkeypatch.setattr(run, "make_engine", lambda *_: engine)
-    monkeypatch.setattr(run, "check_policy", lambda config, **_: 1)
+    monkeypatch.setattr(run, "check_policy", lambda config, spec, **_: 1)
     return engine
 
 
@@ -233,7 +233,7 @@ def losing(monkeypatch: pytest.MonkeyPatch, config: RunConfig, lost_at: list[int
         return engine
 
     monkeypatch.setattr(run, "make_engine", make)
-    monkeypatch.setattr(run, "check_policy", lambda config, **_: 1)
+    monkeypatch.setattr(run, "check_policy", lambda config, spec, **_: 1)
     monkeypatch.setattr(stopping, "pause_s", lambda times: 0.01 * times)
     return made
 
