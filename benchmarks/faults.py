@@ -187,7 +187,7 @@ class Start:
         """
         chosen = [
             f"--trainer.updates={ENDLESS}",
-            "--trainer.schedule=constant",
+            "--trainer.final_lr_share=1",
             "--evaluation.before=false",
             "--evaluation.every_updates=0",
             "--evaluation.videos=0",
@@ -203,7 +203,7 @@ class Start:
         if self._module is TRAIN:
             return []
         wait = f"--trainer.rank_timeout_s={self._stall_s}"
-        return ["--trainer.ranks=2", "--trainer.sharding=ddp", wait]
+        return ["--trainer.ranks=2", wait]
 
     def _policy(self, console: Console) -> list[str]:
         """Arguments that name it, after a run that has made it."""

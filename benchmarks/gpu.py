@@ -75,7 +75,7 @@ def bench_gpu(config: BenchGpuConfig) -> dict[str, Any]:
         console.say(f"SmolVLA of its published size, {precision} …")
         result["policies"][precision] = bench_policy(replace(measured, precision=precision))
     gpus = torch.cuda.device_count()
-    for sharding, ranks in (("none", 1), ("zero2", 2)):
+    for sharding, ranks in (("ddp", 1), ("zero2", 2)):
         if config.device != "cpu" and ranks > gpus:
             result["runs"][sharding] = f"not run: {ranks} ranks need {ranks} GPUs, there are {gpus}"
             continue

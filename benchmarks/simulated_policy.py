@@ -58,10 +58,6 @@ class SimulatedAdapter(PolicyAdapter):
         self.gain = nn.Parameter(torch.zeros(1))
         self.value_head = nn.Linear(1, 1)
 
-    @property
-    def actions(self) -> int | None:
-        return self.config.chunk
-
     def decide(self, requests: Sequence[Request], version: int) -> list[Decision]:
         c = self.config
         time.sleep((c.decide_ms + c.decide_each_ms * len(requests)) / 1000)

@@ -118,7 +118,7 @@ def write_examples(scratch: Path) -> dict[str, Path]:
     from accerl_lerobot.world_model.store import Source, save_world_model
     from accerl_lerobot.world_model.success_plugin.configuration_success_pairs import SuccessPairsConfig
     from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
-    from tests.policies.checkpoints import write_gaussian_actor
+    from tests.policies.checkpoints import write_act
 
     spec = WorldModelSpec(
         cameras=("observation.images.front",), image_size=(8, 8), state_dim=2, action_dim=2, chunk=2, fps=10,
@@ -129,7 +129,7 @@ def write_examples(scratch: Path) -> dict[str, Path]:
     success = SuccessPairsRewardModel(SuccessPairsConfig(chunk=2, channels=(8,), hidden=8, device="cpu"))
     source = Source(repo_id="a/b", fingerprint="0", learnt=(0, 1), held_out=(2,))
     save_world_model(scratch / "world_model", world, success, [source])
-    config = PolicyConfig(path=str(write_gaussian_actor(scratch / "made")), device="cpu")
+    config = PolicyConfig(path=str(write_act(scratch / "made")), device="cpu")
     save_pretrained(load_adapter(config), scratch / "policy", config)
     shutil.copytree(DATASET, scratch / "dataset")
     return {name: scratch / name for name in ("world_model", "policy", "dataset")}

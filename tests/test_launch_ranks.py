@@ -117,7 +117,7 @@ def test_a_rank_that_hangs_is_named(story: Story):
 
 def test_one_rank_goes_on_from_what_two_have_saved(story: Story):
     updates = story.version + 4
-    trainer = replace(TWO, updates=updates, ranks=1, sharding="none")
+    trainer = replace(TWO, updates=updates, ranks=1)
     config = replace(story.config, trainer=trainer)
     state = story.saved / TRAINING_STATE
     (state / STEP).write_text(json.dumps({"step": story.version}))

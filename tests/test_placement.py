@@ -53,11 +53,10 @@ def run(
     **placement: str,
 ) -> RunConfig:
     """A run of so many workers, its roles placed as the other keywords say."""
-    sharding = "zero2" if ranks > 1 else "none"
     return tiny_run(
         Path("nowhere"),
         policy=PolicyConfig(path="nowhere", device=device),
-        trainer=TrainerConfig(updates=1, batch_decisions=16, ranks=ranks, sharding=sharding),
+        trainer=TrainerConfig(updates=1, batch_decisions=16, ranks=ranks),
         inference=InferenceConfig(workers=services),
         rollout=RolloutConfig(workers=max(rollouts, services), worlds=1, segment_length=3),
         imagination=ImaginationConfig(share=0.5 if imagining else 0.0, model="oracle"),
@@ -87,11 +86,6 @@ def test_nothing_said_all_is_here_and_shares_what_is_left_of_the_gpus(gpus: floa
 
 def test_a_policy_on_the_cpu_leaves_gpus_alone():
     assert {gpus for _, gpus in where(plan_workers(cluster((8, 4)), run(device="cpu"))).values()} == {0.0}
-
-
-def test_ranks_that_do_not_fit_are_refused_as_on_one_machine():
-    with pytest.raises(InputError, match=r"trainer\.ranks=4: .* 4 ranks on 3 GPUs leave 1 without"):
-        plan_workers(cluster((8, 3)), run(ranks=4))
 
 
 def test_roles_whose_nodes_overlap_may_not_fit():
@@ -234,7 +228,7 @@ def test_a_run_that_does_not_fit_does_not_begin(tmp_path: Path, monkeypatch: pyt
     """Not even with what comes before its workers."""
     machine = replace(cluster((8, 1))[0], name="this machine")
     monkeypatch.setattr(placement, "this_machine", lambda: machine)
-    trainer = TrainerConfig(updates=1, batch_decisions=16, ranks=2, sharding="zero2")
+    trainer = TrainerConfig(updates=1, batch_decisions=16, ranks=2)
     config = tiny_run(Path("nowhere"), trainer=trainer, policy=PolicyConfig(path="nowhere"))
     with pytest.raises(InputError, match=r"trainer\.ranks=2: .* 2 ranks on 1 GPUs leave 1 without"):
         execute(config, tmp_path, Console())

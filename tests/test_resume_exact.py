@@ -32,7 +32,7 @@ GROUPS: dict[str, Any] = {
 }
 CASES: dict[str, dict[str, Any]] = {
     "plain": {},
-    "weights held back": {"trainer": {"hold_back": 3, "probe_every": 4}},
+    "probed": {"trainer": {"probe_every": 4}},
     "groups": GROUPS,
     "chunk critic": {
         "env": SimulatedConfig(max_steps=16, environment_state=True),

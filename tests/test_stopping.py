@@ -1,14 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""SIGTERM and Ctrl-C: noted, heeded at once where nothing is to be saved, and seen in C."""
+"""SIGTERM and Ctrl-C: noted, heeded at once where nothing is to be saved, and seen in C; resuming."""
 
 from __future__ import annotations
 
 import os
 import signal
+from pathlib import Path
 
 import pytest
 
-from accerl_lerobot.engine.stopping import Stopping, arrived, deferred
+from accerl_lerobot.engine.config import RunConfig
+from accerl_lerobot.engine.stopping import Stopping, arrived, continued, deferred
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.policies.config import PolicyConfig, TuningConfig
 
 
 def test_a_signal_is_noted_first_and_interrupts_when_it_comes_again():
@@ -51,3 +55,14 @@ def test_a_signal_is_seen_though_no_handler_of_python_runs():
         assert arrived() and arrived()
     with Stopping():
         assert not arrived(), "that was before"
+
+
+def test_low_rank_adapters_need_the_policy_that_they_adapt(tmp_path: Path):
+    checkpoint = tmp_path / "checkpoints" / "000001"
+    for path, found in ((str(tmp_path), True), ("alice/start", True), (str(tmp_path / "gone"), False)):
+        config = RunConfig(policy=PolicyConfig(path=path, tuning=TuningConfig(mode="lora")))
+        if found:
+            assert continued(config, tmp_path, checkpoint).policy.path == path
+            continue
+        with pytest.raises(InputError, match=r"^policy\.path=.*gone': the policy that this run began from"):
+            continued(config, tmp_path, checkpoint)

@@ -23,7 +23,6 @@ from accerl_lerobot.algorithms.contract import (
     OffPolicyConfig,
     RatioConfig,
     SelfImitationConfig,
-    check_level,
 )
 from accerl_lerobot.algorithms.losses import AWRConfig, GIPOConfig, PPOConfig
 from accerl_lerobot.algorithms.objective import LossOutput
@@ -40,5 +39,4 @@ __all__ = [
     "PPOConfig",
     "RatioConfig",
     "SelfImitationConfig",
-    "check_level",
 ]

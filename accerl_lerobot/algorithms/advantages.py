@@ -52,7 +52,6 @@ def gae(
         bootstrap_value: (S,), V of the observation after the last decision; ignored where `terminated`.
         terminated: bool (S,), the episode is over. False for truncated and for cut segments.
         lengths: int (S,), 1 to T.
-        gamma: discount per decision.
         lam: λ per decision.
 
     Returns:
@@ -104,7 +103,6 @@ def normalise(x: Tensor, moments: Tensor, mask: Tensor | None = None) -> Tensor:
     """(x − mean) / (std + `STD_EPSILON`), same shape and dtype as `x`; 0 at padding.
 
     Args:
-        x: any shape.
         moments: (3,), from `moments`, summed over everything that is compared with each other.
         mask: bool, same shape as `x`, or None.
     """

@@ -12,14 +12,13 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 import draccus
 
 from accerl_lerobot.config.ranges import NonNegative, Range, Section, Share
-from accerl_lerobot.errors import InputError
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from accerl_lerobot.algorithms.objective import LossOutput
 
-Level = Literal["token", "action", "chunk"]
+Level = Literal["token", "chunk"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,9 +56,9 @@ class RatioConfig(AlgorithmConfig):
     advantage: Literal["gae", "group"] = "gae"
     """``gae``: from the critic. ``group``: relative to other episodes from the same start, stamped on
     segments by the rollout worker; V is not used then, and `value_coef` may as well be 0."""
-    level: Level = "action"
-    """Extent of one importance ratio: each log-prob factor (``token``), those of one ``action`` of the
-    chunk, or the whole ``chunk``. A flow or Gaussian policy has one factor per action."""
+    level: Level = "token"
+    """Extent of one importance ratio: each log-prob factor, a token or, of a flow or Gaussian policy, an
+    action (``token``), or the whole ``chunk``."""
     value_coef: NonNegative = 0.5
     """Weight of the critic's regression error."""
     kl_coef: NonNegative = 0.0
@@ -95,17 +94,6 @@ class SelfImitationConfig(OffPolicyConfig):
     """
 
 
-def check_level(level: Level, actions: int | None) -> None:
-    """Refuses a ratio per action for a policy whose factors do not align with actions.
-
-    Raises:
-        InputError: as above.
-    """
-    if level == "action" and actions is None:
-        remedy = "use token or chunk; this policy's log-prob factors do not belong to single actions"
-        raise InputError("algorithm.level", level, remedy)
-
-
 @dataclass(frozen=True, kw_only=True)
 class LossInputs:
     """One batch of decisions, re-scored by the current policy."""
@@ -114,12 +102,6 @@ class LossInputs:
     """(N, L), log π of the stored latents under the current weights; carries gradient."""
     log_prob_old: Tensor
     """(N, L), log μ as the behaviour policy stored it."""
-    actions: int | None
-    """Into how many equal groups of consecutive factors, one per action of the chunk, the L fall.
-
-    L itself for a flow or Gaussian policy, K for a head with A tokens for each of K actions; None if they do
-    not align with actions, as with compressed tokens: level ``action`` is refused then.
-    """
     advantage: Tensor
     """(N,), normalised over the batch by the caller, or relative to a group of episodes."""
     value: Tensor
@@ -151,5 +133,3 @@ class LossInputs:
             shape = (n,) if name in flat else (n, width)
             if tensor is not None and tuple(tensor.shape) != shape:
                 raise ValueError(f"{name} has shape {tuple(tensor.shape)}, not {shape}")
-        if self.actions is not None and (self.actions < 1 or width % self.actions):
-            raise ValueError(f"{width} factors do not fall into {self.actions} equal groups")

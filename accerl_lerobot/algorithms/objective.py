@@ -8,12 +8,11 @@ All ratios are handled as logs of shape (N, F), F ratios per decision:
 
     level       one ratio covers                      F
     token       one log-prob factor                   L
-    action      the factors of one action             `LossInputs.actions`
     chunk       all factors of a decision             1
 
-At level ``chunk`` ρ is the exact density ratio of the decision; its variance grows with L. At the finer
-levels every ratio is of its own factors alone and all of them share the decision's advantage: lower
-variance, and an approximation off-policy. Losses average over ratios, so at equal weights the gradient is
+At level ``chunk`` ρ is the exact density ratio of the decision; its variance grows with L. At level ``token``
+every ratio is of its own factor alone and all of them share the decision's advantage: lower variance, and an
+approximation off-policy. Losses average over ratios, so at equal weights the gradient is
 1/F of that at level ``chunk``. `Samples.metrics` and `lag_metrics` make the numbers that ``docs/metrics.md``
 explains.
 
@@ -26,7 +25,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from accerl_lerobot.algorithms.contract import Level, LossInputs, RatioConfig, check_level
+from accerl_lerobot.algorithms.contract import Level, LossInputs, RatioConfig
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -60,35 +59,23 @@ def at_level(x: Tensor, inputs: LossInputs, level: Level) -> Tensor:
 
     Args:
         x: (N, L).
-        inputs: says which factors count and which of them belong together.
-        level: what one ratio covers.
 
     Returns:
         (N, F). Factors that do not count add 0 and get no gradient, even where they are NaN.
-
-    Raises:
-        InputError: level ``action``, and the factors do not align with actions.
     """
     if inputs.factors is not None:
         x = x.masked_fill(~inputs.factors, 0.0)
-    return _grouped(x, level, inputs.actions).sum(dim=-1)
+    return x.sum(dim=-1, keepdim=True) if level == "chunk" else x
 
 
-def present(factors: Tensor, level: Level, actions: int | None) -> Tensor:
+def present(factors: Tensor, level: Level) -> Tensor:
     """bool (N, F), the ratios that cover at least one existing factor; `factors` is bool (N, L)."""
-    return _grouped(factors, level, actions).any(dim=-1)
+    return factors.any(dim=-1, keepdim=True) if level == "chunk" else factors
 
 
 def present_in(inputs: LossInputs, level: Level) -> Tensor | None:
     """bool (N, F), the ratios that count; None: all."""
-    return None if inputs.factors is None else present(inputs.factors, level, inputs.actions)
-
-
-def _grouped(x: Tensor, level: Level, actions: int | None) -> Tensor:
-    """(N, F, factors of one ratio) from (N, L)."""
-    check_level(level, actions)
-    groups = {"token": x.shape[-1], "action": actions or 1, "chunk": 1}[level]
-    return x.unflatten(-1, (groups, -1))
+    return None if inputs.factors is None else present(inputs.factors, level)
 
 
 def ratio(log_ratio: Tensor) -> Tensor:
@@ -270,8 +257,6 @@ def assemble(
     """Adds the shared terms to a policy loss and measures the batch.
 
     Args:
-        inputs: the batch.
-        config: the shared coefficients.
         policy_loss: (), with gradient.
         log_ratio: (N, F), log π/μ with gradient, from `at_level`.
         weight: (N, F), how much of each sample's gradient the algorithm keeps, ω.

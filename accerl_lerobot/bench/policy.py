@@ -38,8 +38,6 @@ class BenchPolicyConfig(Section):
     """Decisions made together, and learned from together."""
     num_steps: Annotated[int, Range("[1, 10000]")] | None = None
     """Denoising steps; None: the published 10."""
-    stochastic: Literal["last", "all"] = "last"
-    """Which denoising steps are random; see ``policy.sampler.stochastic``."""
     precision: Literal["fp32", "bf16"] = "fp32"
     """fp32 or bf16; see ``policy.precision``."""
     tuning: TuningConfig = field(default_factory=lambda: TuningConfig(mode="expert"))
@@ -180,7 +178,7 @@ def _adapter(config: BenchPolicyConfig, device: Any, directory: Path) -> Any:
         settings = replace(settings, **{str(steps_field(settings)): config.num_steps})
     policy = get_policy_class(config.type)(settings).to(device)
     model = imported(POLICIES[config.type][0])(policy)
-    family = FlowFamily(model, FlowSamplerConfig(stochastic=config.stochastic, noise_level=0.2))
+    family = FlowFamily(model, FlowSamplerConfig(noise_level=0.2))
     inputs: Any = _RandomInputs(config, device)
     critic = ValueHead(model.width)
     adapter = LeRobotAdapter(policy, inputs, model, family, critic, config.precision)

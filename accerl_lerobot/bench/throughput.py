@@ -158,7 +158,7 @@ def bench_throughput(config: BenchThroughputConfig) -> dict[str, Any]:
     from accerl_lerobot.engine.preflight import check_policy, check_world
 
     console = Console()
-    fixed = ["--sft.steps=0", "--trainer.updates=1000000", "--trainer.schedule=constant"]
+    fixed = ["--sft.steps=0", "--trainer.updates=1000000", "--trainer.final_lr_share=1"]
     named = [f"--config_path={config.recipe}", f"--policy.path={config.policy_path}"]
     run: RunConfig = parse(RunConfig, named + fixed)
     for schedule in config.schedules:  # a recipe that one of them does not allow is refused

@@ -41,9 +41,7 @@ CANDIDATES = 10
 """Checkpoints of which the best on held-out episodes is used."""
 LOG_EVERY = 25
 """Optimiser steps between two lines of progress."""
-NO_SFT = {
-    "gaussian_actor": "only LeRobot's SAC trains it, lerobot-train does not; give a checkpoint as policy.path"
-}
+NO_SFT = {"gaussian_actor": "only LeRobot's SAC trains it, lerobot-train does not; use act"}
 """LeRobot policy types that ``lerobot-train`` cannot fine-tune → why, and what to do."""
 
 

@@ -204,14 +204,14 @@ class RunConfig(Section):
                 f"use more than trainer.hold_back, {self.trainer.hold_back}, or all is thrown away as too old"
             )
             raise InputError("replay.max_lag", self.replay.max_lag, remedy)
-        for name, count in (
-            ("inference.workers", self.inference.workers),
-            ("trainer.ranks", self.trainer.ranks),
+        for name, value, only in (
+            ("inference.workers", self.inference.workers, 1),
+            ("trainer.ranks", self.trainer.ranks, 1),
+            ("trainer.hold_back", self.trainer.hold_back, 0),
         ):
-            if count > 1 and self.launch.engine == "local":
-                raise InputError(
-                    name, count, "launch.engine=local is one process; use launch.engine=ray, or 1"
-                )
+            if value > only and self.launch.engine == "local":
+                remedy = f"launch.engine=local is one process; use launch.engine=ray, or {only}"
+                raise InputError(name, value, remedy)
         if self.inference.workers > self.rollout.workers:
             remedy = f"use at most rollout.workers, {self.rollout.workers}, or some have nobody to answer"
             raise InputError("inference.workers", self.inference.workers, remedy)
@@ -271,9 +271,6 @@ def check_chunk(policy: dict[str, Any]) -> None:
 
     Args:
         policy: fields of a LeRobot policy config; LeRobot itself checks the others, see `preflight`.
-
-    Raises:
-        InputError: a size is not a whole number above 0, or more is executed than predicted.
     """
     for name in ("chunk_size", "n_action_steps", "num_steps", "max_state_dim", "max_action_dim"):
         check(Annotated[int, Range("[1, 10000]")], policy.get(name, 1), f"sft.policy.{name}")

@@ -76,7 +76,6 @@ class RayEngine(Engine):
 
     Args:
         config: the run; its ``policy.path`` must be set.
-        tasks: the training tasks.
         history: env steps that an observation holds, the policy's ``n_obs_steps``.
         state: the ``training_state`` to resume from, without the episodes under way; None: begin.
         load: makes the policy's adapter, in the processes that have one; None: of LeRobot's checkpoint.

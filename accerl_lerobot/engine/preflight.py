@@ -55,7 +55,7 @@ SLACK_BYTES = 128 * 2**20
 
 
 def check_world(env: EnvConfig) -> WorldSpec:
-    """Build and resets an environment once, so that what is wrong with it shows before anything long."""
+    """Build and reset an environment once, so that what is wrong with it shows before anything long."""
     world = make_world(env)
     try:
         world.reset(0, world.spec.tasks[0])
@@ -64,21 +64,17 @@ def check_world(env: EnvConfig) -> WorldSpec:
         world.close()
 
 
-def check_policy(config: RunConfig, spec: WorldSpec | None = None, *, own: bool = False) -> int:
+def check_policy(config: RunConfig, spec: WorldSpec, *, own: bool = False) -> int:
     """Refuse a checkpoint that does not fit the environment; returns its ``n_obs_steps``.
 
     Args:
-        config: with ``policy.path``.
-        spec: of the environment; None: it is built to see.
         own: the run has written this checkpoint itself, or has tried its files already.
     """
     from accerl_lerobot.policies.loading import load_lerobot_config, rehearsed_config
 
     policy = (load_lerobot_config if own else rehearsed_config)(config.policy)
-    offered = env_features(spec or check_world(config.env))
-    check_features(
-        policy_features(policy), offered, config.policy.rename_map, "policy.path", config.policy.path
-    )
+    needed, offered, renames = policy_features(policy), env_features(spec), config.policy.rename_map
+    check_features(needed, offered, renames, "policy.path", config.policy.path)
     return int(policy.n_obs_steps)
 
 
@@ -86,9 +82,8 @@ def check_start(config: RunConfig) -> int:
     """Refuse a run that could not begin or whose outcome could not be used; what can be is checked here.
 
     Raises:
-        InputError: no policy, dataset or device; parts that do not fit each other, see `check_features`; more
-            ranks than GPUs, or no GPU to offload from; too little memory; no login to wandb; too little disk
-            space; also what `check_sft_policy` raises.
+        InputError: no policy, dataset or device; parts that do not fit each other, see `check_features`; too
+            little memory; no login to wandb; too little disk space; also what `check_sft_policy` raises.
     """
     from accerl_lerobot.demos.dataset_files import open_metadata
     from accerl_lerobot.policies.loading import resolve_device
@@ -100,10 +95,6 @@ def check_start(config: RunConfig) -> int:
         remedy = "give a LeRobot checkpoint, or sft.steps > 0 to make one; recipes/quickstart.yaml does"
         raise InputError("policy.path", None, remedy)
     resolve_device(config.policy.device)  # refuses one that is not there
-    if config.trainer.ranks > 1 and config.policy.device != "cpu" and config.launch.address is None:
-        import torch
-
-        config.trainer.gpu_shares(torch.cuda.device_count(), others=1)
     check_wandb(config.wandb)
     policy = policy_to_be(config)
     check_weights_fit(config)
@@ -276,7 +267,7 @@ def policy_gib(config: RunConfig) -> float:
     copies = 3  # the gradient and Adam's two moments
     if isinstance(algorithm, RatioConfig) and trainer.probe_every:
         copies += 1  # of older weights
-    processes = 2 if trainer.hold_back else 1
+    processes = 1
     if config.launch.engine != "local":
         processes, copies = trainer.ranks + config.inference.workers, copies + 2  # two sets are published
     return 4 * (sizes.policy * processes + sizes.trained * copies) / 2**30
@@ -327,9 +318,8 @@ def policy_to_be(config: RunConfig) -> Any:
             raise InputError("sft.init_path", start.path, said + error.remedy) from error
     policy_config = check_sft_policy(config.sft)
     kind = check_type(config.sft.policy["type"], "sft.policy.type", "RL needs a likelihood: ")
-    sampler = sampler_config(config.policy, kind)
+    sampler_config(config.policy, kind)
     override(policy_config, config.policy)
-    sampler.override(policy_config)
     check_observations(policy_config, "sft.policy.n_obs_steps")
     return policy_config
 
@@ -431,7 +421,6 @@ def lag_limits(config: RunConfig) -> tuple[int, int]:
             replay,
             batch_decisions=trainer.batch_decisions,
             in_flight=under_way(config),
-            publish_every=trainer.publish_every,
             pickup=ahead + trainer.hold_back,
             prefetch=ahead,
         )

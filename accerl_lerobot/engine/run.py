@@ -177,7 +177,7 @@ def make_engine(
         from accerl_lerobot.policies.teacher import WithTeacher
 
         size, algorithm = history * config.env.state_size, config.algorithm
-        load = WithTeacher(loader(load), size, algorithm.teacher_episodes, algorithm.teacher_noise)
+        load = WithTeacher(loader(load), size, algorithm.teacher_episodes)
     if isinstance(config.algorithm, OffPolicyConfig) and (dataset := demonstrations_of(config)) is not None:
         from accerl_lerobot.trainer.demonstrations import WithDemonstrations
 
@@ -244,9 +244,7 @@ def execute(
     """Do all phases and return the summary, which is also in ``summary.json``.
 
     Args:
-        config: the run.
         directory: its folder; empty, if it is a new one.
-        console: progress for people.
         wanted: the checkpoint to resume from, where the run has been begun before; see
             `checkpoint.newest_whole`.
         load: makes the policy's adapter, and may be given a path of its own; None: of LeRobot's checkpoint.
@@ -261,14 +259,14 @@ def execute(
         check_start(config)
     text = yaml.safe_dump(encode(replace(config, resume=False)), sort_keys=False)
     write_atomically(directory / CONFIG, text)
-    tasks = check_world(config.env).tasks
+    spec = check_world(config.env)
     check_placement(replace(config, output_dir=str(directory)))
     if checkpoint is None:
         _check_imagination(config, resuming=False)
         config = _warm_started(config, directory, console)
     else:
         go_back_to(checkpoint)
-        config = continued(config, directory, checkpoint, console)
+        config = continued(config, directory, checkpoint)
         if load is None:
             check_start(config)
         _check_imagination(config, resuming=True)
@@ -287,18 +285,18 @@ def execute(
         recovery = Recovery(config.launch.max_restarts)
         while True:
             # A run, or what is left of it, by one set of workers.
-            history = 1 if load is not None else check_policy(config, own=True)
+            history = 1 if load is not None else check_policy(config, spec, own=True)
             state = None if checkpoint is None else checkpoint / TRAINING_STATE
             try:
                 try:
                     with console.stage("starting workers"), stop.at_once():
-                        engine = make_engine(config, tasks, history, state, load, session)
+                        engine = make_engine(config, spec.tasks, history, state, load, session)
                 except KeyboardInterrupt:
                     raise_if_stopped(stop, directory)
                     raise
                 with contextlib.closing(engine):
                     outputs = Outputs(directory, console, log)
-                    return Loop(config, outputs, engine, tasks, times, stop).run(state)
+                    return Loop(config, outputs, engine, spec.tasks, times, stop).run(state)
             except Exception as error:
                 lost = "" if session is None else session.lost  # whatever error that has led to
                 loss = WorkerError(lost) if lost else error
@@ -309,7 +307,7 @@ def execute(
                 checkpoint = recovery.next(directory / CHECKPOINTS, console, loss, times.furthest)
                 raise_if_stopped(stop, directory)
                 go_back_to(checkpoint)
-                config = continued(config, directory, checkpoint, console)
+                config = continued(config, directory, checkpoint)
 
 
 def _warm_started(config: RunConfig, directory: Path, console: Console) -> RunConfig:

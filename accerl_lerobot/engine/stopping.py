@@ -29,14 +29,11 @@ LOCK = ".lock"
 CHANGEABLE = (
     "resume", "output_dir", "evaluation", "launch", "wandb", "save_every_updates", "save_every_s",
     "save_keep", "trainer.updates", "trainer.num_threads", "trainer.ranks", "trainer.sharding",
-    "trainer.activation_checkpointing", "trainer.rank_timeout_s",
-    "rollout.max_restarts", "inference",
+    "trainer.activation_checkpointing", "trainer.rank_timeout_s", "inference",
     "imagination.discover_packages_path",
 )  # fmt: skip
 """Fields and sections that may change when a run is resumed: what is learned, and from what, stays."""
 LONGEST_PAUSE_S = 8.0
-BASE = "base"
-"""Folder of the policy that a run began from, where that had to be reconstructed."""
 WARM_START = "warm_start.json"
 """File with the path of the policy that came of a run's own demonstrations and SFT."""
 _pipe: tuple[int, int] | None = None
@@ -305,34 +302,33 @@ def checkpoint_of(directory: Path, wanted: str, console: Console) -> Path | None
     return path
 
 
-def continued(config: RunConfig, directory: Path, checkpoint: Path, console: Console) -> RunConfig:
-    """The run from its checkpoint on, which holds everything, whatever has become of its start."""
+def continued(config: RunConfig, directory: Path, checkpoint: Path) -> RunConfig:
+    """The run from its checkpoint on.
+
+    Raises:
+        InputError: it has low-rank adapters, and the policy that it began from is not here any more.
+    """
     from accerl_lerobot.checkpoint.layout import PRETRAINED
 
     if config.policy.tuning.mode != "lora":
         return improving(config, checkpoint / PRETRAINED)
     # A checkpoint has low-rank adapters merged; apart from what they adapt they are in the training state.
-    start = _start(config, directory)
-    if start is None:
-        start = str(directory / BASE)
-        if not Path(start).is_dir():
-            from accerl_lerobot.policies.loading import reconstruct_base
+    path, note = config.policy.path, directory / WARM_START
+    if path is None and note.is_file():
+        path = str(directory / json.loads(note.read_text())["policy"])
+    if path is None or not _is_here(path):
+        remedy = "the policy that this run began from is gone, and its low-rank adapters are of no other; "
+        remedy += f"put it back, or begin a new run with --policy.path={checkpoint / PRETRAINED}"
+        raise InputError("policy.path", path, remedy)
+    return improving(config, path)
 
-            with console.stage("the policy it began from is not here: reconstructing it, up to rounding"):
-                reconstruct_base(config.policy, checkpoint, directory / BASE)
-    return improving(config, start)
 
-
-def _start(config: RunConfig, directory: Path) -> str | None:
-    """The policy that a run began from, a folder or Hub id; None if it is not here any more."""
+def _is_here(path: str) -> bool:
+    """True for a folder of this machine that exists, and for a Hub id."""
     from accerl_lerobot.checkpoint.layout import AWAY
 
-    path, note = config.policy.path, directory / WARM_START
-    if path is None:
-        made = directory / json.loads(note.read_text())["policy"] if note.is_file() else None
-        return str(made) if made is not None and made.is_dir() else None
     on_the_hub = not path.startswith((".", "/", "~", f"{AWAY}/")) and path.count("/") <= 1
-    return path if on_the_hub or Path(path).expanduser().is_dir() else None
+    return on_the_hub or Path(path).expanduser().is_dir()
 
 
 def improving(config: RunConfig, path: Path | str) -> RunConfig:

@@ -83,9 +83,6 @@ class GymConfig(EnvConfig):
 class GymWorld(EpisodeWorld):
     """One Gymnasium environment.
 
-    Args:
-        config: which one.
-
     Raises:
         InputError: Gymnasium does not know it or refuses its arguments; an observation that `config` names is
             missing or has another shape; actions are not a vector with bounds.
@@ -125,14 +122,12 @@ class GymWorld(EpisodeWorld):
         self._raw, _ = self._env.reset(seed=seed)
 
     def render(self, height: int, width: int) -> np.ndarray:
-        """See the base class."""
         frame = self._env.render() if self._env.render_mode == "rgb_array" else None
         if frame is None:  # a film shows what the policy sees
             frame = next(iter(self._pictures.values()), np.zeros((height, width, 3), np.uint8))
         return resized(frame, height, width)
 
     def close(self) -> None:
-        """See the base class."""
         self._env.close()
         self._done = True
 

@@ -81,7 +81,6 @@ class LiberoConfig(EnvConfig):
 
     @property
     def state_size(self) -> int:
-        """See the base class."""
         if not self.environment_state:
             return 0
         return ROBOT_NUMBERS + MAX_OBJECTS * OBJECT_NUMBERS + 1 + len(task_code(self.tasks, self.tasks[0]))

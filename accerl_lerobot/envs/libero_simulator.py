@@ -67,11 +67,6 @@ class Simulator:
     """One task: LIBERO's scene, with robosuite's operational space controller in a loop of our own.
 
     What a policy sees is one simulation step old, as in robosuite, whose sensors read within a step.
-
-    Args:
-        task: ``suite/number``.
-        rendering: see `LiberoConfig`.
-        assets: folder of meshes; see there too.
     """
 
     def __init__(self, task: str, rendering: Literal["stock", "fast"], assets: str) -> None:

@@ -263,8 +263,6 @@ class MetaWorldConfig(EnvConfig):
     """Episode limit in env steps; reaching it truncates."""
     lighting: Literal["cheap", "default"] = "cheap"
     """``cheap`` (no shadows, reflections or multisampling: ten times faster in software) or ``default``."""
-    reward: Literal["success", "dense"] = "success"
-    """``success`` (1.0 at the first success, else 0.0) or ``dense`` (MetaWorld's own, 0 to 10 a step)."""
     environment_state: bool = False
     """True if observations hold ``observation.environment_state``: MetaWorld's own 39 numbers, objects and
     goal included, the share of `max_steps` gone, and which of several tasks it is. For
@@ -280,11 +278,9 @@ class MetaWorldConfig(EnvConfig):
 
     @property
     def state_size(self) -> int:
-        """See the base class."""
         return RAW_DIM + 1 + len(task_code(self.tasks, self.tasks[0])) if self.environment_state else 0
 
     def nominal(self) -> MetaWorldConfig:
-        """See the base class."""
         return replace(self, shift=ShiftConfig())
 
     @property
@@ -350,8 +346,7 @@ class MetaWorld(EpisodeWorld):
         self._raw, reward, _, _, info = sim.step(self._delayed.popleft())
         finite = math.isfinite(reward) and np.isfinite(self._raw).all() and not diverged(sim.data)
         success = bool(info["success"])
-        dense = reward if self.config.reward == "dense" else None
-        return Step(success=success, ended=success, reward=dense, finite=bool(finite))
+        return Step(success=success, ended=success, finite=bool(finite))
 
     def render(self, height: int, width: int) -> np.ndarray:
         if not self._task:

@@ -53,7 +53,6 @@ class SimulatedConfig(EnvConfig):
 
     @property
     def state_size(self) -> int:
-        """See the base class."""
         return STATE_DIM + 1 if self.environment_state else 0
 
     def __post_init__(self) -> None:

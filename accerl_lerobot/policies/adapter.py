@@ -89,14 +89,6 @@ class PolicyAdapter(nn.Module, ABC):
 
     device: torch.device
 
-    @property
-    @abstractmethod
-    def actions(self) -> int | None:
-        """Number of equal groups of consecutive log-prob factors, one group per action of the chunk.
-
-        None if factors do not align with actions: ratios per action are refused then.
-        """
-
     def factors(self, latent: dict[str, Tensor]) -> Tensor | None:
         """bool (B, L), False for log-prob factors that a latent does not have, such as tokens after the
         terminator; None if all latents have all of them."""
@@ -285,10 +277,6 @@ class LeRobotAdapter(PolicyAdapter):
         if self.precision == "fp32":
             return contextlib.nullcontext()
         return torch.autocast(self.device.type, torch.bfloat16)
-
-    @property
-    def actions(self) -> int | None:
-        return self.family.actions
 
     def factors(self, latent: dict[str, Tensor]) -> Tensor | None:
         return self.family.factors(latent)

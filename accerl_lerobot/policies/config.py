@@ -32,22 +32,14 @@ class SamplerConfig(Section, draccus.ChoiceRegistry, section="policy.sampler"):
         """The registered name, that of the family."""
         return str(self.get_choice_name(self.__class__))
 
-    def override(self, policy_config: Any) -> None:
-        """Puts what it asks of the policy itself into LeRobot's config, which is saved with the policy."""
-
 
 @SamplerConfig.register_subclass("flow")
 @dataclass(frozen=True, kw_only=True)
 class FlowSamplerConfig(SamplerConfig):
-    """Flow policies: which denoising steps are Gaussian, and how wide. `flow.py` explains the choices."""
+    """Flow policies: the last denoising step is Gaussian; see `flow.py`."""
 
-    stochastic: Literal["last", "all"] = "last"
-    """Which denoising steps are Gaussian: last or all."""
-    noise: Literal["euler", "flow_sde"] = "euler"
-    """euler (stock mean, constant std) or flow_sde (marginal-preserving, std grows with t)."""
     noise_level: Annotated[float, Range("(0, 2]")] = 0.2
-    """euler: total injected std in normalised action units. flow_sde: the factor a of
-    σ_t = a·√(t/(1−t))."""
+    """Std of the noise on every action, in normalised units."""
 
 
 @SamplerConfig.register_subclass("tokens")
@@ -63,10 +55,7 @@ class TokenSamplerConfig(SamplerConfig):
 @SamplerConfig.register_subclass("gaussian")
 @dataclass(frozen=True, kw_only=True)
 class GaussianSamplerConfig(SamplerConfig):
-    """Policies that predict one chunk, with a Gaussian around it; see `gaussian.py`.
-
-    A policy with a std of its own, gaussian_actor, reads none of these.
-    """
+    """Policies that predict one chunk, with a Gaussian around it; see `gaussian.py`."""
 
     std: Annotated[float, Range("(0, 2]")] = 0.2
     """Std of every action at the start, in normalised units. It is learned, between a quarter of this and 2.5
@@ -89,13 +78,6 @@ class DiffusionSamplerConfig(SamplerConfig):
     std_min: Annotated[float, Range("(0, 1]")] = 0.1
     """Lower bound of a step's std while exploring, in normalised units. The last step has no noise
     of its own, so this is the executed action's std around what the chain arrives at."""
-    scheduler: Literal["DDPM", "DDIM"] | None = None
-    """DDPM or DDIM, whatever the policy was trained with: both reverse the same noising. None keeps the
-    checkpoint's. Written into what is saved."""
-
-    def override(self, policy_config: Any) -> None:
-        if self.scheduler is not None:
-            policy_config.noise_scheduler_type = self.scheduler
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,7 +149,6 @@ def loader(load: Load | None) -> Load:
 POLICIES: dict[str, tuple[str, tuple[str, ...]]] = {
     "smolvla": ("accerl_lerobot.policies.vla:SmolVLA", ("flow",)),
     "act": ("accerl_lerobot.policies.gaussian:ACT", ("gaussian",)),
-    "gaussian_actor": ("accerl_lerobot.policies.gaussian:GaussianActor", ("gaussian",)),
     "diffusion": ("accerl_lerobot.policies.diffusion:Diffusion", ("diffusion",)),
     "pi0": ("accerl_lerobot.policies.vla:Pi0", ("flow",)),
     "pi05": ("accerl_lerobot.policies.vla:Pi05", ("flow",)),
@@ -188,6 +169,7 @@ USES_HISTORY = ("diffusion",)
 """Types that read the observations of ``n_obs_steps`` env steps; the others read one."""
 NO_DENSITY = {
     "tdmpc": "it plans by sampling and has no action density; LeRobot trains it with its own RL objective",
+    "gaussian_actor": "it takes one action a decision and is trained by LeRobot's SAC; use act",
     "vqbet": "LeRobot does not return its code log-probs; use smolvla",
 }
 

@@ -40,9 +40,9 @@ from accerl_lerobot.policies.family import (
     Score,
     exploring,
     normal_entropy,
+    normal_log_prob,
     standard_normal,
 )
-from accerl_lerobot.policies.flow import gaussian_log_prob
 
 Network = Callable[[Tensor, int], Tensor]
 """(x (B, H, A), timestep) → what the network predicts, (B, H, A)."""
@@ -92,8 +92,6 @@ class Schedule:
 
         Args:
             k: counted from the noise, 0 to N − 1.
-            x: (B, H, A) before the step.
-            output: (B, H, A), the network's at x.
             eta: of DDIM: 0 is LeRobot's own, 1 adds as much noise as DDPM.
         """
         alpha, following = self.alphas[k], self.following[k]
@@ -186,6 +184,11 @@ def entropy(shape: DiffusionShape, schedule: Schedule, config: DiffusionSamplerC
         entries = int(_mask(k, shape, schedule, zero.device).sum()) * shape.action_dim
         total += entries * float(normal_entropy(std))
     return total
+
+
+def gaussian_log_prob(x: Tensor, mean: Tensor, std: Tensor, mask: Tensor) -> Tensor:
+    """Log-density of each row (B, H), summed over the entries that `mask` (H, 1) keeps."""
+    return torch.where(mask, normal_log_prob(x, mean, std), 0.0).sum(-1)
 
 
 def _mask(k: int, shape: DiffusionShape, schedule: Schedule, device: torch.device) -> Tensor:
@@ -329,9 +332,3 @@ class DiffusionFamily(Family):
             encoded.context.network, noise, eps, not_exploring, self.shape, self.schedule, self.sampler
         )
         return float((x[:, self.shape.rows] - stock).abs().max())
-
-    @property
-    def actions(self) -> int:
-        """Every factor is one row of the chunk."""
-        rows = factors(self.shape, self.schedule)
-        return rows.stop - rows.start

@@ -89,9 +89,6 @@ class Model(ABC):
 class Family(nn.Module, ABC):
     """One way of acting at random with a known density; may own parameters, which are trained."""
 
-    imitates: ClassVar[bool] = False
-    """True if it has an `imitation_loss`."""
-
     @abstractmethod
     def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
         """Samples; where a request does not explore, LeRobot's own sampler."""
@@ -107,15 +104,9 @@ class Family(nn.Module, ABC):
     def imitation_loss(self, encoded: Encoded, chunk: Tensor) -> Tensor:
         """LeRobot's training loss (B,) on chunks (B, K, A) of as many actions as are executed, normalised.
 
-        Raises:
-            NotImplementedError: see `imitates`.
+        `engine.preflight` refuses off-policy algorithms for a family without it.
         """
         raise NotImplementedError
-
-    @property
-    @abstractmethod
-    def actions(self) -> int | None:
-        """See `adapter.PolicyAdapter.actions`."""
 
     def factors(self, latent: dict[str, Tensor]) -> Tensor | None:
         return None
@@ -133,23 +124,6 @@ def normal_log_prob(x: Tensor, mean: Tensor, std: Tensor) -> Tensor:
 def normal_entropy(std: Tensor) -> Tensor:
     """Differential entropy of N(·, std²) in nats, of each entry."""
     return torch.log(std) + LOG_SQRT_2PI + 0.5
-
-
-class BoundedStd:
-    """A std between two bounds above 0 from a layer's output, by a sigmoid between their logarithms."""
-
-    def __init__(self, low: float, high: float) -> None:
-        self.low, self.high = math.log(low), math.log(high)
-
-    def __call__(self, raw: Tensor) -> Tensor:
-        """The std, of the shape of `raw`, in fp32."""
-        return torch.exp(self.low + (self.high - self.low) * torch.sigmoid(raw.float()))
-
-    def start(self, layer: nn.Linear, std: float) -> None:
-        """Makes the layer's std equal to `std`, between the bounds, whatever its input."""
-        share = (math.log(std) - self.low) / (self.high - self.low)
-        nn.init.zeros_(layer.weight)
-        nn.init.constant_(layer.bias, math.log(share / (1 - share)))
 
 
 def pooled(features: Tensor, weights: Tensor) -> Tensor:

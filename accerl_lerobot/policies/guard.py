@@ -130,11 +130,7 @@ def check_processor(folder: Path, name: str, origin: Origin, *, fetched: bool = 
 
 
 def check_statistics(folder: Path, origin: Origin) -> None:
-    """Checks the numbers that a checkpoint's processors normalise by.
-
-    Raises:
-        InputError: a number is NaN or infinite.
-    """
+    """Checks the numbers that a checkpoint's processors normalise by."""
     for name in PROCESSORS:
         steps = read_json(folder / name, origin)["steps"] if (folder / name).is_file() else ()
         for step in steps:
@@ -157,13 +153,9 @@ def check_origin(name: Any, own: Path | None, what: str, origin: Origin, fetched
     """Checks that a backbone or tokeniser is the checkpoint's own, the Hub's, or at a path of a local one's.
 
     Args:
-        name: as its config says.
         own: the checkpoint's own folder of it, where it may have one.
         what: file and key that say so, for the error.
         fetched: the checkpoint is from the Hub, and must not name folders of this machine.
-
-    Raises:
-        InputError: it is something else.
     """
     if name is None:
         return

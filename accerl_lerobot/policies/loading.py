@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import logging
-import shutil
 import string
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,7 +19,6 @@ from typing import Any, NamedTuple
 import draccus
 import torch
 
-from accerl_lerobot.checkpoint import layout, snapshot
 from accerl_lerobot.checkpoint.isolation import rehearse
 from accerl_lerobot.checkpoint.layout import BACKBONE, CONFIG_FOLDERS, PREPROCESSOR, STEP_FOLDERS
 from accerl_lerobot.checkpoint.safety import Origin, brief, read_tensors, tensor_shapes
@@ -58,7 +56,7 @@ from accerl_lerobot.policies.guard import (
     guarded,
     input_error,
 )
-from accerl_lerobot.policies.saving import save_pretrained, subtract_adapters, tune
+from accerl_lerobot.policies.saving import tune
 
 logger = logging.getLogger(__name__)
 
@@ -127,7 +125,7 @@ def load_lerobot_config(config: PolicyConfig) -> Any:
     try:
         name = json.loads((folder / CONFIG).read_text()).get("type")
         kind = check_type(name, "policy.type", f"{config.path} is of this type: ")
-        sampler = sampler_config(config, kind)
+        sampler_config(config, kind)
         lerobot_config = PreTrainedConfig.from_pretrained(folder)
     except InputError:
         raise
@@ -136,7 +134,6 @@ def load_lerobot_config(config: PolicyConfig) -> Any:
         raise InputError("policy.path", config.path, remedy) from error
     lerobot_config.device = str(resolve_device(config.device))
     override(lerobot_config, config)
-    sampler.override(lerobot_config)
     check_observations(lerobot_config, "policy.n_obs_steps")
     _use_backbone(lerobot_config, folder, config.path)
     return lerobot_config
@@ -353,8 +350,6 @@ def load_weights(policy: Any, model: type[Model], file: Path, path: str | None, 
     """Fills a policy from a file.
 
     Args:
-        model: knows which tensors a file may lack.
-        path: the checkpoint as the user named it.
         read: False: only names and shapes are compared.
 
     Raises:
@@ -402,29 +397,3 @@ def _names(shapes: dict[str, Any], policy: Any) -> dict[str, str]:
 
 def _prefixed(names: dict[str, str]) -> dict[str, str]:
     return {k if k.startswith("model.") else f"model.{k}": v for k, v in names.items()}
-
-
-def reconstruct_base(config: PolicyConfig, checkpoint: Path, directory: Path) -> None:
-    """Writes the policy that a run with low-rank adapters began from.
-
-    A checkpoint holds the policy with its adapters added in, W + s·BA, and A and B apart. Where W itself is
-    gone, it is the difference of the two, as exact as the sum was rounded.
-
-    Args:
-        config: the run's; its ``path`` does not matter.
-        checkpoint: one of the run's, with its ``training_state``.
-        directory: for a LeRobot ``pretrained_model``; appears when it is whole.
-
-    Raises:
-        InputError: the checkpoint is none of such a run.
-    """
-    path = str(checkpoint / layout.PRETRAINED)
-    adapter = load_adapter(replace(config, path=path, revision=None, device="cpu"))
-    adapter.load_trainable(snapshot.load(checkpoint / layout.TRAINING_STATE / layout.WEIGHTS))
-    with torch.no_grad():
-        subtract_adapters(adapter.policy)
-    new = directory.with_name(f".{directory.name}.new")
-    shutil.rmtree(new, ignore_errors=True)
-    save_pretrained(adapter, new, config)
-    layout.relocate(new, directory)
-    new.rename(directory)

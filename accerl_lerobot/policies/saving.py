@@ -54,16 +54,6 @@ def tune(policy: Any, model: Model, config: TuningConfig) -> None:
             parameter.requires_grad_(False)
 
 
-def subtract_adapters(policy: nn.Module) -> None:
-    """Takes low-rank adapters out of weights that they were added to already, and sets them to nothing."""
-    from peft.tuners.lora import Linear
-
-    for layer in (module for module in policy.modules() if isinstance(module, Linear)):
-        weight = layer.base_layer.weight
-        weight -= layer.get_delta_weight("default").to(weight)
-        layer.lora_B["default"].weight.zero_()
-
-
 def merged_state_dict(policy: nn.Module) -> dict[str, Tensor] | None:
     """The weights with low-rank adapters added in, under their plain names; None where there are none."""
     if not any(".lora_" in name for name, _ in policy.named_parameters()):
@@ -120,7 +110,6 @@ def save_pretrained(
     """Writes LeRobot's ``pretrained_model`` layout, and what is ours beside it, into `directory`.
 
     Args:
-        config: what the adapter was loaded by.
         weights: from `copy_weights`; None: the adapter's current ones.
     """
     weights = weights or copy_weights(adapter)

@@ -25,6 +25,8 @@ from accerl_lerobot.policies.config import Load, PolicyConfig
 from accerl_lerobot.seeds import episode_of
 
 WIDTH = 256
+NOISE = 0.25
+"""Standard deviation of its exploration, in normalised action units."""
 TASK_BITS = 16
 """Numbers of a state that stand for the task."""
 PREFIX = "teacher."
@@ -32,13 +34,7 @@ PREFIX = "teacher."
 
 
 class Ensemble(nn.Module):
-    """M networks of three layers with LayerNorm and SiLU, computed at once.
-
-    Args:
-        inputs: width of the input.
-        outputs: width of the output.
-        members: M.
-    """
+    """M networks of three layers with LayerNorm and SiLU, computed at once."""
 
     def __init__(self, inputs: int, outputs: int, members: int) -> None:
         super().__init__()
@@ -64,13 +60,10 @@ class Teacher(nn.Module):
     gradient reaches are set by the trainer.
 
     Args:
-        state: S.
-        chunk: (K, A).
         share: share of exploring episodes in which it acts, once it is `ready`.
-        noise: standard deviation of its exploration, in normalised action units.
     """
 
-    def __init__(self, state: int, chunk: tuple[int, int], share: float, noise: float) -> None:
+    def __init__(self, state: int, chunk: tuple[int, int], share: float, noise: float = NOISE) -> None:
         super().__init__()
         self.chunk, self.share, self.noise = chunk, share, noise
         self.network = Ensemble(state, chunk[0] * chunk[1], 1)
@@ -133,16 +126,13 @@ class WithTeacher:
     """Loads a policy and gives it an untrained teacher.
 
     Args:
-        load: makes the adapter.
         state: numbers of ``observation.environment_state``.
-        share: see `Teacher`.
-        noise: see `Teacher`.
     """
 
     load: Load
     state: int
     share: float
-    noise: float
+    noise: float = NOISE
 
     def __call__(self, config: PolicyConfig) -> Any:
         """The adapter, with its teacher."""

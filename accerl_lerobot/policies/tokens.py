@@ -61,8 +61,6 @@ class TokenModel(Model):
     """The token after which the others mean nothing; None: all L always count."""
     length: int
     """L, most tokens of a decision. Tokens that reach no executed action have no place among them."""
-    rows: int | None
-    """Into how many actions the tokens fall, in order and equally; None: they do not, as with FAST."""
 
     @abstractmethod
     def chunk(self, tokens: Tensor) -> Tensor:
@@ -170,10 +168,6 @@ class TokenFamily(Family):
         gap = (scored - acted)[factors].abs().max()
         # A NaN is not below: argmax finds a token among NaNs too.
         return difference if gap <= torch.finfo(logits.dtype).eps ** 0.5 else difference + float(gap)
-
-    @property
-    def actions(self) -> int | None:
-        return self.model.rows
 
     def _decide(self, encoded: Encoded, explore: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
         """Tokens and their log-probs, each (B, L), in one pass or position by position."""

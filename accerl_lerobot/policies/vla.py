@@ -313,7 +313,6 @@ class Pi0Fast(TokenModel):
     """Drives LeRobot's `PI0FastPolicy`."""
 
     parallel = False
-    rows = None
     loading = staticmethod(data_only)
 
     def __init__(self, policy: Any) -> None:
@@ -414,11 +413,7 @@ class Pi0Fast(TokenModel):
 
 
 def _refuse(config: Any) -> None:
-    """Refuses settings under which LeRobot's own sampler is not what evaluation and the self-check need.
-
-    Raises:
-        InputError: it is not greedy, or decodes fewer rows than were encoded.
-    """
+    """Refuses settings under which LeRobot's own sampler is not what evaluation and the self-check need."""
     if config.temperature != 0:
         remedy = "LeRobot's sampler has to be greedy here: set it to 0 in config.json; exploration has a "
         raise InputError("policy.temperature", config.temperature, f"{remedy}policy.sampler.temperature")

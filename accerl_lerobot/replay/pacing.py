@@ -162,18 +162,16 @@ def lag_bound(
     *,
     batch_decisions: int,
     in_flight: int,
-    publish_every: int = 1,
     pickup: int = 0,
     prefetch: int = 0,
 ) -> int:
     """The largest lag an update can see, in updates.
 
-        lag ≤ min(max_lag, published + drawn) + prefetch
-        published = publish_every − 1 + pickup
-        drawn     = ⌊⌈samples_per_insert⌉ · (max(ahead, min_decisions) + 2·in_flight + capacity) / batch⌋ − 1
+        lag ≤ min(max_lag, pickup + drawn) + prefetch
+        drawn = ⌊⌈samples_per_insert⌉ · (max(ahead, min_decisions) + 2·in_flight + capacity) / batch⌋ − 1
 
     The version counts the updates behind the weights. Take a segment's first decision, at time 0, and the
-    moment it is drawn. The weights that decided were `published` updates old at most. Each update since
+    moment it is drawn. The weights that decided were `pickup` updates old at most. Each update since
     then has drawn a batch, at most ⌈samples_per_insert⌉ times each, out of
 
     * what was available at time 0, at most max(ahead, min_decisions) + in_flight: the door shuts at the
@@ -190,13 +188,12 @@ def lag_bound(
             inserted itself, its own included, and not less than what may be under way when the door shuts.
             With environments of about equal speed: `decisions_under_way`, twice that to be safe. One worker
             that hangs breaks this assumption; `max_lag` then retires its segment.
-        publish_every: updates from one publication of the weights to the next.
         pickup: updates made while a publication travels to the inference service, or is held back.
         prefetch: batches drawn ahead of the update that uses them.
     """
     decisions = max(config.ahead, config.min_decisions) + 2 * in_flight + config.capacity
     drawn = math.ceil(config.samples_per_insert) * decisions // batch_decisions - 1
-    return min(config.max_lag, publish_every - 1 + pickup + drawn) + prefetch
+    return min(config.max_lag, pickup + drawn) + prefetch
 
 
 Schedule = Literal["asynchronous", "overlap", "synchronous"]

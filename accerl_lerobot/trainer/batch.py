@@ -101,12 +101,6 @@ def turns(rows: np.ndarray, size: int, rank: int, ranks: int) -> list[Turn]:
 
     Every rank gets as many parts, because all ranks have to run a network of which each keeps a part: who has
     no rows left repeats the first of all, and what comes of it is not counted.
-
-    Args:
-        rows: of all ranks, at least one.
-        size: the largest part.
-        rank: whose share.
-        ranks: how many there are.
     """
     shares = np.array_split(rows, ranks)
     mine = [Turn(part, own=True) for part in split(shares[rank], size) if len(part)]

@@ -33,6 +33,8 @@ from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.off_policy import OffPolicyUpdate, mean
 
 MEMBERS = 6
+MONTE_CARLO = 0.25
+"""Share of the observed return in the critic's target."""
 BATCH = 256
 """Rows of one step of critic or teacher."""
 TAU = 0.01
@@ -56,11 +58,7 @@ SMALLEST_SCALE = 0.02
 
 
 class Critic(nn.Module):
-    """An ensemble of Q(state, chunk).
-
-    Args:
-        teacher: scales states.
-    """
+    """An ensemble of Q(state, chunk)."""
 
     def __init__(self, teacher: Teacher) -> None:
         super().__init__()
@@ -76,8 +74,9 @@ class Critic(nn.Module):
 class ChunkCriticUpdate(OffPolicyUpdate):
     """The arguments are those of `off_policy.OffPolicyUpdate`."""
 
+    n_step = 4
+
     def __init__(self, adapter: LeRobotAdapter, algorithm: ChunkCriticConfig, config: TrainerConfig) -> None:
-        self.n_step = algorithm.n_step
         super().__init__(adapter, algorithm, config)
         assert adapter.teacher is not None
         self.algorithm, self.teacher = algorithm, adapter.teacher
@@ -96,7 +95,6 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         self.optimizer.add_param_group({"params": list(self.reader.parameters()), "lr": READER_LR})
 
     def step(self, segments: Sequence[Segment]) -> dict[str, float]:
-        """See the base class."""
         for segment in segments:
             taught = bool(self.teacher.ready) and self.teacher.plays(segment.origin.seed)
             self._outcomes["teacher_success" if taught else "policy_success"].append(segment.success)
@@ -104,7 +102,6 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         return super().step(segments) | outcomes
 
     def learn(self, new: int) -> dict[str, float]:
-        """See the base class."""
         won = np.flatnonzero(self.memory["success"])
         # Without a success there is nothing to learn: the teacher would follow the critic's noise.
         if self.version < self.config.value_warmup_updates or not len(won):
@@ -127,12 +124,10 @@ class ChunkCriticUpdate(OffPolicyUpdate):
 
     @torch.no_grad()
     def target(self, rows: np.ndarray) -> Tensor:
-        """See the base class."""
         chunk: Tensor = self.teacher(self.tensor("state", rows))
         return chunk
 
     def auxiliary(self, rows: np.ndarray, encoded: Encoded) -> dict[str, Tensor]:
-        """See the base class."""
         weight = self.algorithm.perception
         if not weight:
             return {}
@@ -141,14 +136,12 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         return {"perception_loss": weight * (self.reader(features) - state).square().mean()}
 
     def state(self) -> dict[str, Any]:
-        """See the base class."""
         networks = {name: copied(module) for name, module in self._networks().items()}
         optimizers = {name: optimizer_state(optimizer) for name, optimizer in self.optimizers.items()}
         outcomes = {name: list(last) for name, last in self._outcomes.items()}
         return super().state() | {"networks": networks, "optimizers": optimizers, "outcomes": outcomes}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """See the base class."""
         super().restore(state)
         for name, module in self._networks().items():
             module.load_state_dict(state["networks"][name])
@@ -199,9 +192,9 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         with torch.no_grad():
             planned = self.teacher(following)
             planned = planned + SMOOTHING * torch.randn_like(planned)
-            bootstrap = self._pessimistic(self.slow(self.teacher.scaled(following), planned))
-            m = self.algorithm.monte_carlo
-            target = (1 - m) * (reward + discount * bootstrap.clamp(*bounds)) + m * returns
+            bootstrap = pessimistic(self.slow(self.teacher.scaled(following), planned))
+            predicted = reward + discount * bootstrap.clamp(*bounds)
+            target = (1 - MONTE_CARLO) * predicted + MONTE_CARLO * returns
         q = self.critic(self.teacher.scaled(state), chunk)
         loss = (q - target).square().mean(1).sum()
         norm = self._descend("critic", loss, clip=math.inf)
@@ -222,17 +215,13 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         """One gradient step of the teacher; `won` are the rows of successful episodes."""
         state = self.tensor("state", self._draw())
         q = self.critic(self.teacher.scaled(state), self.teacher(state))
-        loss = -self._pessimistic(q).mean() / q.detach().abs().mean().clamp(min=SMALLEST_SCALE)
+        loss = -pessimistic(q).mean() / q.detach().abs().mean().clamp(min=SMALLEST_SCALE)
         rows = won[torch.randint(len(won), (BATCH,)).numpy()]
         gap = self.teacher(self.tensor("state", rows)) - self.tensor("chunk", rows)
         distance = gap.square().mean() / DISTANCE**2
         self._descend("teacher", loss + self.algorithm.imitation * distance)
         metrics = {"teacher_value": q.mean(), "disagreement": q.std(0).mean(), "distance": distance}
         return {name: float(value.detach()) for name, value in metrics.items()}
-
-    def _pessimistic(self, q: Tensor) -> Tensor:
-        """(M, B) to (B,)."""
-        return q.mean(0) - self.algorithm.pessimism * q.std(0)
 
     def _descend(self, name: str, loss: Tensor, clip: float = 1.0) -> float:
         """A step of one optimiser, left out where it is not finite; the gradient's norm."""
@@ -247,3 +236,8 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         else:
             self.skip(f"a step of the {name}", float(loss.detach()), norm)
         return norm
+
+
+def pessimistic(q: Tensor) -> Tensor:
+    """Mean of the ensemble less its standard deviation, (M, B) to (B,)."""
+    return q.mean(0) - q.std(0)

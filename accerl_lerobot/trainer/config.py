@@ -10,9 +10,6 @@ from typing import Annotated, Literal
 from accerl_lerobot.config.ranges import Positive, Range, Section, Share, Steps, Threads
 from accerl_lerobot.errors import InputError
 
-ZERO = ("zero2", "zero3")
-"""Ways of sharing in which no rank keeps everything."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class TrainerConfig(Section, section="trainer"):
@@ -35,10 +32,9 @@ class TrainerConfig(Section, section="trainer"):
     warmup_updates: Steps = 20
     """Updates over which each rate rises linearly from 0: the critic's from the first update on, the policy's
     once `value_warmup_updates` are over."""
-    schedule: Literal["constant", "cosine"] = "constant"
-    """constant, or cosine: falls to `final_lr_share` of the peak over `updates`, and stays there in the
-    updates that a resumed run adds."""
-    final_lr_share: Share = 0.1
+    final_lr_share: Share = 1.0
+    """Share of the peak learning rate at the end: it falls there over `updates`, like a cosine, and stays
+    there in the updates that a resumed run adds; 1: it is constant."""
     value_warmup_updates: Steps = 20
     """First updates, in which only the critic head learns: advantages of an untrained one are noise.
 
@@ -54,8 +50,6 @@ class TrainerConfig(Section, section="trainer"):
     grad_clip: Positive = 1.0
     """Largest gradient norm of the policy, and of the critic head, each by itself."""
     betas: tuple[Annotated[float, Range("[0, 1)")], Annotated[float, Range("[0, 1)")]] = (0.9, 0.95)
-    publish_every: Annotated[int, Range("[1, 1000000]")] = 1
-    """Updates between two publications of the weights."""
     hold_back: Steps = 0
     """Updates by which published weights are held back: lag on purpose, to study it; 0: none."""
     probe_every: Steps = 25
@@ -67,11 +61,10 @@ class TrainerConfig(Section, section="trainer"):
     """CPU threads of each rank."""
     ranks: Annotated[int, Range("[1, 1024]")] = 1
     """Processes that make each update together, each from its part of the batch; on GPUs each has its own."""
-    sharding: Literal["none", "ddp", "zero2", "zero3"] = "none"
-    """Part of the training state that each of several ranks keeps. none: there is one rank. ddp: everything.
-    zero2: its part of weights, gradients and optimiser state, and all weights from an update's forward pass
-    to the end of its backward pass. zero3: its part, and all weights of one block at a time (PyTorch's
-    FSDP2)."""
+    sharding: Literal["ddp", "zero2", "zero3"] = "ddp"
+    """Part of the training state that each of several ranks keeps. ddp: everything. zero2: its part of
+    weights, gradients and optimiser state, and all weights from an update's forward pass to the end of its
+    backward pass. zero3: its part, and all weights of one block at a time (PyTorch's FSDP2)."""
     activation_checkpointing: bool = False
     """Repeated blocks of the network, a transformer's layers for instance, forget what they computed and
     compute it again for the gradient: less memory, about a third more work."""
@@ -81,11 +74,6 @@ class TrainerConfig(Section, section="trainer"):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.ranks > 1 and self.sharding == "none":
-            remedy = f"say how the {self.ranks} ranks share: ddp, zero2 or zero3"
-            raise InputError("trainer.sharding", "none", remedy)
-        if self.ranks == 1 and self.sharding != "none":
-            raise InputError("trainer.sharding", self.sharding, "there is one rank: add --trainer.ranks=2")
         if self.ranks > self.batch_decisions:
             remedy = (
                 f"use at most trainer.batch_decisions, {self.batch_decisions}: each rank needs a decision"
@@ -95,11 +83,7 @@ class TrainerConfig(Section, section="trainer"):
     @property
     def zero(self) -> bool:
         """True if each rank keeps its part of the weights only."""
-        return self.sharding in ZERO
-
-    def publishes(self, version: int) -> bool:
-        """True if the weights of `version` are handed over."""
-        return version % self.publish_every == 0 or version == self.updates
+        return self.ranks > 1 and self.sharding != "ddp"
 
     def gpu_shares(self, gpus: float, others: int) -> tuple[float, float]:
         """Share of a GPU for each rank, and for each other process with a network.
@@ -142,8 +126,6 @@ class TrainerConfig(Section, section="trainer"):
         warm = start + self.warmup_updates
         if update < warm:
             return (update - start + 1) / self.warmup_updates
-        if self.schedule == "constant":
-            return 1.0
         end = self.updates if updates is None else updates
         done = min(1.0, (update - warm) / max(1, end - warm))
         fall = 0.5 * (1 + math.cos(math.pi * done))

@@ -25,13 +25,7 @@ ROWS, FRAMES = 5000, 20_000
 
 @dataclass(frozen=True)
 class WithDemonstrations:
-    """Loads a policy whose trainer remembers demonstrations.
-
-    Args:
-        load: makes the adapter.
-        dataset: the demonstrations.
-        decision_cost: see `demonstrations`.
-    """
+    """Loads a policy whose trainer remembers demonstrations."""
 
     load: Load
     dataset: DatasetConfig
@@ -61,7 +55,6 @@ def demonstrations(dataset: DatasetConfig, decision_cost: float, like: Segment) 
     environment is not read, which is logged.
 
     Args:
-        dataset: on the Hub or in a folder.
         decision_cost: taken off each decision's reward, as of explored ones.
         like: an explored episode, of which names and shapes are taken.
     """

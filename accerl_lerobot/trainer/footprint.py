@@ -3,8 +3,8 @@
 
 Weights, gradients and Adam's moments follow from the numbers of parameters. What a decision adds depends on
 images, denoising steps, precision and tuning mode, so a decision is made, and one and two are prepared for
-their gradient, while every tensor is counted. Networks of more than `FAKED_FROM` parameters compute with PyTorch's fake
-tensors, which have shapes and no data: π0 needs no 14 GiB to be measured.
+their gradient, while every tensor is counted. Networks of more than `FAKED_FROM` parameters compute with
+PyTorch's fake tensors, which have shapes and no data: π0 needs no 14 GiB to be measured.
 """
 
 from __future__ import annotations

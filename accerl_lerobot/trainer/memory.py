@@ -22,8 +22,6 @@ class Memory:
     """Rows of whole episodes.
 
     Args:
-        capacity: rows.
-        gamma: discount per decision.
         n_step: decisions ahead that `following` points to.
 
     Example:
@@ -63,9 +61,6 @@ class Memory:
 
         Returns:
             Its T rows.
-
-        Raises:
-            InputError: it is not a whole episode, or longer than the memory.
         """
         t = len(segment)
         if segment.origin.decision or not segment.episode or t > self.capacity:
@@ -125,6 +120,6 @@ class Memory:
         return {"total": self.total, "tasks": list(self.tasks), "columns": columns}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Goes on from what `state` gave."""
+        """Resume from `state`."""
         self.total, self.tasks, self._columns = state["total"], list(state["tasks"]), dict(state["columns"])
         self._codes = {task: task_code(task) for task in self.tasks}

@@ -17,7 +17,6 @@ from torch import Tensor
 from accerl_lerobot.algorithms import OffPolicyConfig
 from accerl_lerobot.algorithms.objective import lag_metrics
 from accerl_lerobot.checkpoint.tensors import optimizer_state, restore_optimizer
-from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.family import Encoded
@@ -26,7 +25,6 @@ from accerl_lerobot.trainer.batch import MAX_NONFINITE, NonFiniteError
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.memory import Memory
 from accerl_lerobot.trainer.probe import CRITIC
-from accerl_lerobot.trainer.sharding import arrange
 
 POLICY_BATCH = 64
 """Rows of one step of the policy."""
@@ -36,22 +34,13 @@ class OffPolicyUpdate:
     """Has the methods of `update.Update`, and stands in its place. As it is, imitates successful episodes.
 
     Args:
-        adapter: the policy.
-        algorithm: the objective.
         config: the optimiser; ``batch_decisions`` of new experience make one update.
-
-    Raises:
-        InputError: the policy cannot be trained to imitate a chunk.
     """
 
     n_step = 1
     """Decisions after which a target bootstraps."""
 
     def __init__(self, adapter: LeRobotAdapter, algorithm: OffPolicyConfig, config: TrainerConfig) -> None:
-        if not adapter.family.imitates:
-            remedy = "needs a policy that explores by flow or gaussian; use gipo"
-            raise InputError("algorithm.type", algorithm.type, remedy)
-        arrange(adapter, config)
         self.adapter, self.config = adapter, config
         self.policy_steps = algorithm.policy_steps
         self.memory = Memory(algorithm.memory, algorithm.gamma, self.n_step)
@@ -120,7 +109,7 @@ class OffPolicyUpdate:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Goes on from what `state` gave; the adapter has its weights already."""
+        """Resume from `state`; the adapter has its weights already."""
         self.version = state["version"]
         self.skipped, self._skipped_in_a_row = state["skipped"]
         self._schedule_updates, self._owed = state["schedule_updates"], dict(state["owed"])

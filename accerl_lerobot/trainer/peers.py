@@ -84,12 +84,7 @@ class Learner:
 
 
 class TrainerRank:
-    """Any rank but the first; becomes a Ray actor of one thread, so that calls are done in their order.
-
-    Args:
-        rank: which one.
-        settings: of its `Learner`.
-    """
+    """Any rank but the first; becomes a Ray actor of one thread, so that calls are done in their order."""
 
     def __init__(self, rank: int, settings: LearnerSettings) -> None:
         self._rank, self._learner = rank, Learner(settings)
@@ -142,7 +137,6 @@ class Peers:
 
     Args:
         actors: handles of `TrainerRank`, of rank 1, 2 …; none where there is one rank.
-        config: how long to wait for them.
 
     Example:
         >>> with peers.joining("step", batch):   # they are told …
@@ -208,8 +202,6 @@ class Peers:
         """The others' fault, if there is any: first the dead, then the silent, then the rest.
 
         Args:
-            method: what they were to do.
-            calls: for it.
             silence: whether silence is a fault.
             own: what the first rank has raised; what all ranks raise alike is not theirs.
         """

@@ -40,11 +40,6 @@ class Probe:
     """One copy of the policy's trainable weights after the other, without the critic's.
 
     A copy lies on the same device and in the same parts as the weights, and is freed once it has been read.
-
-    Args:
-        adapter: the policy that is being trained.
-        config: how often, and which versions are published.
-        ranks: who measure together; None: this process alone.
     """
 
     def __init__(self, adapter: PolicyAdapter, config: TrainerConfig, ranks: Ranks | None = None) -> None:
@@ -62,20 +57,16 @@ class Probe:
         return {"version": self._version, "next": self._next, "weights": weights}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Goes on from what `state` gave."""
+        """Resume from `state`."""
         self._version, self._next = state["version"], state["next"]
         # There are no weights in the state where there was no copy.
         self._copy = [part_of(t, live) for t, live in zip(state["weights"], self._live, strict=False)]
 
     def renew(self, version: int) -> None:
-        """Takes a copy if it is time for one.
-
-        Args:
-            version: of the weights, which have just been made.
-        """
+        """Takes a copy if it is time for one."""
         config = self._config
         due = config.probe_every and self._version is None and version >= self._next
-        if due and config.publishes(version) and version < config.updates:
+        if due and version < config.updates:
             self._copy = [parameter.detach().clone() for parameter in self._live]
             self._version, self._next = version, version + config.probe_every
 

@@ -39,7 +39,6 @@ class Ranks:
 
         Args:
             mine: (rows, ...), on the CPU; `np.array_split` of all rows says how many.
-            total: rows of all ranks.
         """
         return mine
 
@@ -56,15 +55,7 @@ class Ranks:
 
 
 class Group(Ranks):
-    """One of several ranks, once all of them have come.
-
-    Args:
-        store: where they have met.
-        rank: which one this is.
-        size: how many there are.
-        device: where their networks are.
-        timeout_s: how long each waits for the others.
-    """
+    """One of several ranks, once all of them have come."""
 
     def __init__(
         self, store: dist.Store, rank: int, size: int, device: torch.device, timeout_s: float
@@ -131,9 +122,6 @@ def use_only(address: str) -> None:
     """Have gloo and NCCL use the interface with this address, by environment variables of this process.
 
     Left alone, gloo takes the one that the host name leads to, which others often cannot reach.
-
-    Raises:
-        RuntimeError: no interface has it.
     """
     interfaces = psutil.net_if_addrs().items()
     names = [name for name, addresses in interfaces if any(a.address == address for a in addresses)]

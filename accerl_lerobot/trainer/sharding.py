@@ -33,7 +33,6 @@ def arrange(adapter: PolicyAdapter, config: TrainerConfig) -> None:
 
     Args:
         adapter: on every rank with the same weights; called before anybody takes hold of its parameters.
-        config: which of the two.
 
     Raises:
         InputError: the policy has no block that can forget.
@@ -81,7 +80,7 @@ def _share_out(adapter: PolicyAdapter, blocks: Sequence[nn.Module], config: Trai
 
 
 def synchronise(adapter: PolicyAdapter, now: bool) -> None:
-    """True if the next backward pass ends with gradients averaged over ranks, or adds to those kept back."""
+    """Have the next backward pass average gradients over ranks, or, if not `now`, keep them back."""
     if hasattr(adapter, "set_requires_gradient_sync"):
         adapter.set_requires_gradient_sync(now)
 
@@ -90,13 +89,7 @@ def synchronise(adapter: PolicyAdapter, now: bool) -> None:
 def swapped_in(
     adapter: PolicyAdapter, live: Sequence[nn.Parameter], tensors: Sequence[Tensor]
 ) -> Iterator[None]:
-    """Parameters have other values inside, and their own again afterwards, whatever happens.
-
-    Args:
-        adapter: whose they are.
-        live: its parameters.
-        tensors: like them.
-    """
+    """Parameters have other values inside, and their own again afterwards, whatever happens."""
     sharded = any(map(in_parts, live))
     own = [p.detach().clone() if sharded else p.data for p in live]
     try:
@@ -125,8 +118,7 @@ class Watch(TorchFunctionMode):
     """Which modules one evaluation calls, and where it uses which parameter.
 
     Args:
-        adapter: what is watched.
-        evaluate: runs its network once.
+        evaluate: runs the adapter's network once.
 
     Attributes:
         blocks: see the top of this file; none within another.
@@ -186,8 +178,7 @@ class Watch(TorchFunctionMode):
     def _is_block(self, module: nn.Module) -> bool:
         """Called, of more than vectors, and no weight of it is used or held anywhere else."""
         parameters = list(module.parameters())
-        # Gradients that come by way of a cache pass by a module's output, where FSDP waits for them; and what
-        # is computed again would be put there again.
+        # Gradients that come by way of a cache pass by a module's output, where FSDP waits for them.
         if module not in self._called or module in self._leaky or all(p.dim() < 2 for p in parameters):
             return False
         inside = set(module.modules())

@@ -24,7 +24,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from accerl_lerobot.algorithms import AlgorithmConfig, LossInputs, RatioConfig, check_level
+from accerl_lerobot.algorithms import AlgorithmConfig, LossInputs, RatioConfig
 from accerl_lerobot.algorithms.advantages import decision_mask, gae, moments, normalise
 from accerl_lerobot.algorithms.objective import lag_metrics, present
 from accerl_lerobot.checkpoint.tensors import optimizer_state, restore_optimizer, whole
@@ -56,8 +56,6 @@ class Update:
 
     Args:
         adapter: the policy; its parameters are others afterwards where ranks keep parts of them.
-        algorithm: the objective.
-        config: the optimiser.
         ranks: those that make each update; None: this process alone.
 
     Example:
@@ -73,7 +71,6 @@ class Update:
         config: TrainerConfig,
         ranks: Ranks | None = None,
     ) -> None:
-        check_level(algorithm.level, adapter.actions)
         self.adapter, self.algorithm, self.config = adapter, algorithm, config
         self.ranks = ranks or Ranks()
         self.ranks.begin_alike(list(adapter.trainable().values()))
@@ -141,7 +138,7 @@ class Update:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Goes on from what `state` gave; the adapter has its weights already."""
+        """Resume from `state`; the adapter has its weights already."""
         self.version = state["version"]
         self.skipped, self._skipped_in_a_row = state["skipped"]
         self._schedule_updates = state["schedule_updates"]
@@ -196,7 +193,6 @@ class Update:
             inputs = LossInputs(
                 log_prob_new=evaluation.log_prob,
                 log_prob_old=batch.log_prob[rows].to(device),
-                actions=self.adapter.actions,
                 advantage=targets[0][rows].to(device),
                 value=evaluation.value,
                 value_error=(evaluation.value - returns).square(),
@@ -213,7 +209,7 @@ class Update:
             _add(means, {k: float(v) if turn.own else 0.0 for k, v in output.means.items()}, share)
             rows_of_samples = output.samples.rows()
             samples.append(rows_of_samples if turn.own else rows_of_samples[:0])
-        if self.config.sharding == "ddp":
+        if not self.config.zero:
             self.ranks.average(self._policy + self._value)
         assert targets is not None
         joined = output.samples.joined(self.ranks.gather(torch.cat(samples), len(batch)))
@@ -232,7 +228,7 @@ class Update:
         return dict(zip(means, self.ranks.gather(mine, self.ranks.size).sum(0).tolist(), strict=True))
 
     def _ratios_per_decision(self, factors: Tensor) -> float:
-        return float(present(factors, self.algorithm.level, self.adapter.actions).sum()) / len(factors)
+        return float(present(factors, self.algorithm.level).sum()) / len(factors)
 
     def _targets(self, batch: Batch, values: Tensor, bootstrap: Tensor) -> tuple[Tensor, Tensor]:
         """Advantages, normalised unless they come from groups, and returns, each (N,)."""

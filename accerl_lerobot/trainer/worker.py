@@ -2,7 +2,7 @@
 """The trainer process: the run's clock.
 
 consumes    batches of segments from replay, the next one drawn while the current one is learned from
-produces    weights, published every `publish_every` updates without waiting for more than a copy of them;
+produces    weights, published after each update without waiting for more than a copy of them;
             to readers that come later as well, even after the last update
 waits for   a batch
 ends        after `updates` updates, or when replay is closed
@@ -36,9 +36,6 @@ class TrainerWorker:
     """Becomes a threaded Ray actor in `launch`: `run` on one thread, everything else beside it.
 
     Args:
-        settings: of the policy and its updates.
-        timeline: folder of the timeline; None: none is kept.
-        peers: handles of the other ranks.
         directory: of the run, for batches that nothing could be learnt from; None: they are not kept.
     """
 
@@ -69,13 +66,7 @@ class TrainerWorker:
         return os.getpid()
 
     def run(self, replay: Any, readers: list[Any], transport: Transport = "auto") -> int:
-        """Trains; returns the number of updates made.
-
-        Args:
-            replay: actor handle.
-            readers: actor handles; where the weights go.
-            transport: see `make_publisher`.
-        """
+        """Trains; returns the number of updates made."""
         self._clock.enter(WEIGHT_SYNC)
         publisher = make_publisher(readers, transport)
         try:
@@ -96,9 +87,6 @@ class TrainerWorker:
 
     def join(self, reader: Any) -> int:
         """Has another reader receive the weights, once `run` publishes any.
-
-        Args:
-            reader: actor handle.
 
         Returns:
             The newest version that has been published: it gets no older one.
@@ -139,8 +127,7 @@ class TrainerWorker:
                 updated = time.monotonic()
                 self._clock.enter(WEIGHT_SYNC)
                 version = self._update.version
-                if config.publishes(version):
-                    self._publish(publisher, held, last=version == config.updates)
+                self._publish(publisher, held, last=version == config.updates)
                 if self._in_turn:
                     publisher.flush()
                 metrics |= {

@@ -13,10 +13,7 @@ from accerl_lerobot.algorithms import LossInputs
 def make_inputs(
     n: int = 12, factors: int = 3, spread: float = 0.4, seed: int = 0, **replace: Any
 ) -> LossInputs:
-    """Random float64 batch; `spread` is the standard deviation of log ρ per factor.
-
-    Every factor is an action, and the critic's error is squared.
-    """
+    """Random float64 batch; `spread` is the standard deviation of log ρ per factor."""
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> torch.Tensor:
@@ -26,7 +23,6 @@ def make_inputs(
     fields: dict[str, Any] = {
         "log_prob_old": old,
         "log_prob_new": (old + spread * normal(n, factors)).requires_grad_(),
-        "actions": factors,
         "advantage": normal(n),
         "value": normal(n),
         "returns": normal(n),
@@ -43,7 +39,6 @@ def one(log_ratio: float, advantage: float) -> LossInputs:
     return LossInputs(
         log_prob_new=new,
         log_prob_old=torch.zeros(1, 1, dtype=torch.float64),
-        actions=1,
         advantage=torch.tensor([advantage], dtype=torch.float64),
         value=zero,
         value_error=zero,

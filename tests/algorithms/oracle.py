@@ -36,20 +36,12 @@ Ragged = list[list[float]]
 """One list per decision, with an entry for each of its ratios."""
 
 
-def grouped(
-    x: np.ndarray, level: str, actions: int | None = None, factors: np.ndarray | None = None
-) -> Ragged:
-    """Sums of (N, L) log-probs over what one ratio covers, without factors and groups that do not exist."""
+def grouped(x: np.ndarray, level: str, factors: np.ndarray | None = None) -> Ragged:
+    """Sums of (N, L) log-probs over what one ratio covers, without factors that do not exist."""
     found: Ragged = []
-    n, width = x.shape
-    size = {"token": 1, "action": width // (actions or width), "chunk": width}[level]
-    for i in range(n):
-        row = []
-        for start in range(0, width, size):
-            there = [j for j in range(start, start + size) if factors is None or factors[i, j]]
-            if there:
-                row.append(sum(float(x[i, j]) for j in there))
-        found.append(row)
+    for i in range(len(x)):
+        row = [float(x[i, j]) for j in range(x.shape[1]) if factors is None or factors[i, j]]
+        found.append([sum(row)] if level == "chunk" else row)
     return found
 
 

@@ -24,11 +24,11 @@ from tests.algorithms.inputs import gradient, make_inputs, one
 from tests.runs import ALGORITHMS
 
 CONFIGS: list[RatioConfig] = [
-    GIPOConfig(level="action", sigma=0.5, entropy_coef=0.01),
+    GIPOConfig(level="token", sigma=0.5, entropy_coef=0.01),
     GIPOConfig(level="chunk", sigma=math.inf, kl_coef=0.0),
-    PPOConfig(level="action", kl_coef=0.2),
+    PPOConfig(level="token", kl_coef=0.2),
     PPOConfig(level="chunk", clip_low=0.1, clip_high=0.4, entropy_coef=0.01),
-    AWRConfig(level="action", beta=0.5, cap=3.0, kl_coef=0.1),
+    AWRConfig(level="token", beta=0.5, cap=3.0, kl_coef=0.1),
     AWRConfig(level="chunk", beta=math.inf),
 ]
 each_config = pytest.mark.parametrize("config", CONFIGS, ids=lambda c: f"{c.type}-{c.level}")
@@ -41,7 +41,7 @@ def logs_of(inputs: LossInputs, level: str) -> oracle.Ragged:
     """log of π over μ."""
     factors = None if inputs.factors is None else inputs.factors.numpy()
     difference = (inputs.log_prob_new.detach() - inputs.log_prob_old).numpy()
-    return oracle.grouped(difference, level, inputs.actions, factors)
+    return oracle.grouped(difference, level, factors)
 
 
 def policy_loss_of(inputs: LossInputs, config: RatioConfig) -> float:
@@ -50,7 +50,7 @@ def policy_loss_of(inputs: LossInputs, config: RatioConfig) -> float:
     if isinstance(config, AWRConfig):
         factors = None if inputs.factors is None else inputs.factors.numpy()
         log_prob = inputs.log_prob_new.detach().numpy()
-        grouped = oracle.grouped(log_prob, config.level, inputs.actions, factors)
+        grouped = oracle.grouped(log_prob, config.level, factors)
         return oracle.awr(grouped, advantage, config.beta, config.cap)
     if isinstance(config, GIPOConfig):
         return oracle.gipo(logs, advantage, config.sigma)
@@ -79,11 +79,9 @@ def test_equals_the_oracle(config: RatioConfig) -> None:
 
 
 @each_config
-@pytest.mark.parametrize("level", ["token", "action", "chunk"])
+@pytest.mark.parametrize("level", ["token", "chunk"])
 def test_equals_the_oracle_for_tokens_of_which_some_do_not_exist(config: RatioConfig, level: Any) -> None:
-    """Two actions of three tokens."""
-    inputs = make_inputs(factors=6, actions=2)
-    inputs = replace(inputs, factors=ragged_factors(12, 6))
+    inputs = replace(make_inputs(factors=6), factors=ragged_factors(12, 6))
     config = replace(config, level=level)
     assert config.loss(inputs).loss.item() == pytest.approx(loss_of(inputs, config), abs=1e-12)
 
@@ -124,7 +122,7 @@ def test_good_actions_become_likelier_and_bad_ones_less(config: RatioConfig, log
         assert math.copysign(1.0, -slope) == math.copysign(1.0, advantage)  # descent: minus the gradient
 
 
-@pytest.mark.parametrize("level", ["action", "chunk"])
+@pytest.mark.parametrize("level", ["token", "chunk"])
 def test_gipo_gradient_is_that_of_importance_sampling_with_the_weight_held_still(level: Any) -> None:
     """−E[ω ρ Â ∇log π], with ω a constant: by its formula, and by finite differences over a policy
     parameter."""
@@ -150,12 +148,12 @@ def test_gipo_gradient_is_that_of_importance_sampling_with_the_weight_held_still
 
 
 @each_algorithm
-@pytest.mark.parametrize("level", ["action", "chunk"])
+@pytest.mark.parametrize("level", ["token", "chunk"])
 def test_on_policy_all_are_the_plain_policy_gradient(config: RatioConfig, level: Any) -> None:
     """At ρ = 1 the gradient is −E[Â ∇log π]: of the chunk, or of its factors one by one (1/L of it)."""
     inputs = make_inputs(spread=0.0)
     config = replace(config, level=level, kl_coef=0.3)  # the KL has no gradient there
-    terms = inputs.log_prob_new.mean(1) if level == "action" else inputs.log_prob_new.sum(1)
+    terms = inputs.log_prob_new.mean(1) if level == "token" else inputs.log_prob_new.sum(1)
     expected = gradient(inputs, -(terms * inputs.advantage).mean())
     torch.testing.assert_close(gradient(inputs, config.loss(inputs).loss), expected)
 
@@ -186,7 +184,6 @@ def test_absurd_ratios_stay_finite_in_float32(config: RatioConfig) -> None:
     inputs = LossInputs(
         log_prob_new=new,
         log_prob_old=torch.zeros(4, 1),
-        actions=1,
         advantage=torch.tensor([1.0, -1.0, 1.0, 1.0]),
         value=ones,
         value_error=ones,
@@ -221,5 +218,3 @@ def test_mismatched_shapes_are_refused() -> None:
         make_inputs(advantage=torch.zeros(12, 1))
     with pytest.raises(ValueError, match=r"factors has shape \(12,\), not \(12, 3\)"):
         replace(make_inputs(), factors=torch.ones(12).bool())
-    with pytest.raises(ValueError, match="3 factors do not fall into 2 equal groups"):
-        make_inputs(actions=2)

@@ -14,10 +14,8 @@ import torch
 from accerl_lerobot.algorithms import (
     AlgorithmConfig,
     GIPOConfig,
-    LossInputs,
     PPOConfig,
     RatioConfig,
-    check_level,
 )
 from accerl_lerobot.algorithms.objective import (
     KL_LINEAR_ABOVE,
@@ -33,54 +31,36 @@ from accerl_lerobot.algorithms.objective import (
     quantiles,
     share_below,
 )
-from accerl_lerobot.errors import InputError
 from tests.algorithms.inputs import gradient, make_inputs
 from tests.runs import ALGORITHMS
 
 X = torch.tensor([[1.0, 2.0, 4.0, 8.0, 16.0, 32.0]])
 FACTORS = torch.tensor([[True, True, True, True, False, False]])
-each_level = pytest.mark.parametrize("level", ["token", "action", "chunk"])
+each_level = pytest.mark.parametrize("level", ["token", "chunk"])
 each_algorithm = pytest.mark.parametrize(
     "config", [AlgorithmConfig.get_choice_class(name)() for name in ALGORITHMS], ids=str
 )
 
 
-def inputs_of(**replaced: Any) -> LossInputs:
-    return make_inputs(n=1, factors=6, **replaced)
-
-
 @pytest.mark.parametrize(
-    ("level", "actions", "expected"),
-    [
-        ("token", None, [1.0, 2.0, 4.0, 8.0, 16.0, 32.0]),
-        ("action", 6, [1.0, 2.0, 4.0, 8.0, 16.0, 32.0]),
-        ("action", 3, [3.0, 12.0, 48.0]),
-        ("action", 2, [7.0, 56.0]),
-        ("chunk", None, [63.0]),
-    ],
+    ("level", "expected"), [("token", [1.0, 2.0, 4.0, 8.0, 16.0, 32.0]), ("chunk", [63.0])]
 )
-def test_sums_by_hand(level: Any, actions: int | None, expected: list[float]) -> None:
-    assert at_level(X, inputs_of(actions=actions), level).tolist() == [expected]
+def test_sums_by_hand(level: Any, expected: list[float]) -> None:
+    assert at_level(X, make_inputs(n=1, factors=6), level).tolist() == [expected]
 
 
 @pytest.mark.parametrize(
     ("level", "expected", "there"),
     [
         ("token", [1.0, 2.0, 4.0, 8.0, 0.0, 0.0], [True, True, True, True, False, False]),
-        ("action", [3.0, 12.0, 0.0], [True, True, False]),
         ("chunk", [15.0], [True]),
     ],
 )
 def test_factors_that_do_not_exist_by_hand(level: Any, expected: list[float], there: list[bool]) -> None:
-    inputs = replace(inputs_of(actions=3), factors=FACTORS)
+    inputs = replace(make_inputs(n=1, factors=6), factors=FACTORS)
     holes = X.masked_fill(~FACTORS, torch.nan)
     assert at_level(holes, inputs, level).tolist() == [expected]
-    assert present(FACTORS, level, 3).tolist() == [there]
-
-
-def test_an_action_with_one_token_left_still_counts() -> None:
-    partly = torch.tensor([[True, False, False, False, True, True]])
-    assert present(partly, "action", 3).tolist() == [[True, False, True]]
+    assert present(FACTORS, level).tolist() == [there]
 
 
 def test_means_weigh_existing_factors_alike() -> None:
@@ -97,7 +77,7 @@ def test_what_does_not_exist_is_never_looked_at(config: RatioConfig, level: Any)
     """NaN there changes neither loss nor metrics nor gradient."""
     config = replace(config, level=level)
     factors = torch.arange(4) < torch.tensor([4, 2, 3, 1, 4, 2, 3])[:, None]
-    clean = replace(make_inputs(n=7, factors=4, actions=2), factors=factors)
+    clean = replace(make_inputs(n=7, factors=4), factors=factors)
     names = ("log_prob_new", "log_prob_old")
     holes = {n: getattr(clean, n).detach().masked_fill(~factors, torch.nan) for n in names}
     holes["log_prob_new"].requires_grad_()
@@ -117,9 +97,9 @@ def test_micro_batches_add_up(config: RatioConfig, level: Any) -> None:
     """Parts of 2 and 5 decisions, with different numbers of factors, against all 7."""
     config = replace(config, level=level)
     factors = torch.arange(4) < torch.tensor([4, 4, 1, 2, 1, 3, 1])[:, None]
-    whole = replace(make_inputs(n=7, factors=4, actions=2), factors=factors)
+    whole = replace(make_inputs(n=7, factors=4), factors=factors)
     expected = gradient(whole, config.loss(whole).loss)
-    each = present(factors, level, 2).sum().item() / 7
+    each = present(factors, level).sum().item() / 7
     total = torch.zeros_like(expected)
     for rows in (slice(0, 2), slice(2, 7)):
         fields = {k: v[rows] for k, v in vars(whole).items() if isinstance(v, torch.Tensor)}
@@ -127,18 +107,6 @@ def test_micro_batches_add_up(config: RatioConfig, level: Any) -> None:
         share = len(part.value) / 7
         total += gradient(whole, config.loss(part).loss * share)
     torch.testing.assert_close(total, expected)
-
-
-def test_a_ratio_per_action_needs_actions() -> None:
-    for level in ("token", "chunk"):
-        check_level(level, None)
-        assert GIPOConfig(level=level).loss(make_inputs(actions=None)).loss.isfinite()
-    check_level("action", 3)
-    with pytest.raises(InputError, match="algorithm.level='action': use token or chunk") as caught:
-        check_level("action", None)
-    assert caught.value.field == "algorithm.level"
-    with pytest.raises(InputError, match="algorithm.level"):
-        GIPOConfig().loss(make_inputs(actions=None))
 
 
 # ---- the KL

@@ -32,7 +32,7 @@ def test_it_measures_both_precisions_and_a_run_of_one_and_of_two_ranks(
     config = BenchGpuConfig(output_dir=str(tmp_path), device="cpu", batch=2, repeats=1)
     result = bench_gpu(config)
     assert asked == [
-        ("--trainer.ranks=1", "--trainer.sharding=none"),
+        ("--trainer.ranks=1", "--trainer.sharding=ddp"),
         ("--trainer.ranks=2", "--trainer.sharding=zero2"),
     ]
     assert set(result["policies"]) == {"fp32", "bf16"}

@@ -16,7 +16,7 @@ from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos import guarded_train, sft
 from accerl_lerobot.demos.sft import CODE_REVISION, REFUSED, SFTConfig, run_sft, sft_command
 from accerl_lerobot.errors import InputError
-from tests.policies.checkpoints import write_gaussian_actor
+from tests.policies.checkpoints import write_act
 from tests.policies.test_loading import remote
 from tests.policies.tiny_pi import ACTIONS, COMMIT, PALIGEMMA, hub
 
@@ -92,7 +92,7 @@ def test_a_hostile_dataset_ends_the_training_in_a_line(tmp_path: Path):
 
 
 def test_a_hostile_start_is_refused_before_anything_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    start, marker = write_gaussian_actor(tmp_path / "start"), tmp_path / "was-run"
+    start, marker = write_act(tmp_path / "start"), tmp_path / "was-run"
     steps = {"steps": [{"class": "subprocess.Popen", "config": {"args": ["touch", str(marker)]}}]}
     (start / "policy_preprocessor.json").write_text(json.dumps(steps))
     monkeypatch.setattr(sft.subprocess, "Popen", None)

@@ -218,7 +218,7 @@ def test_act_is_trained_as_well(tmp_path: Path):
     } | small
     config = SFTConfig(steps=2, batch_size=4, num_threads=1, policy=policy)
     adapter = adapter_at(run_sft(config, LOCAL, tmp_path / "sft", seed=0))
-    assert adapter.policy.name == "act" and adapter.family.actions == 4
+    assert adapter.policy.name == "act" and adapter.family.model.executed == 4
     assert adapter.policy.config.optimizer_lr == config.lr
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from accerl_lerobot.envs import HistoryWorld, MetaWorldConfig, SimulatedConfig, World, make_world
+from accerl_lerobot.envs import HistoryWorld, SimulatedConfig, World, make_world
 from accerl_lerobot.envs.base import ChunkResult
 from accerl_lerobot.experience import TASK, Observation
 
@@ -130,18 +130,3 @@ def test_a_world_that_ends_early_shows_its_last_state_for_those_it_did_not_show(
     result = world.step_chunk(actions)
     assert result.truncated and result.steps == cut and result.observation is not None
     same(result.observation, [states[i] for i in shown])
-
-
-def test_metaworld_too():
-    config = MetaWorldConfig(task="reach-v3", max_steps=20, image_size=64)
-    actions = chunks(1, 6, dims=4)[0]
-    bare = make_world(config)
-    seen, _ = one_by_one(bare, "reach-v3", actions)
-    world = make_world(config, 2)
-    world.reset(5, "reach-v3")
-    result = world.step_chunk(actions)
-    assert result.observation is not None
-    same(result.observation, seen[-2:])
-    assert np.array_equal(world.render(32, 32), bare.render(32, 32))
-    for one in (bare, world):
-        one.close()

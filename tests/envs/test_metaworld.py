@@ -41,21 +41,20 @@ def test_success_terminates_with_one_reward_and_a_last_picture(monkeypatch: pyte
     assert len(frames) == len(results) + 1, "one picture at the reset and one per chunk"
 
 
-def test_same_states_rewards_and_frames_as_lerobot():
+def test_same_states_and_frames_as_lerobot():
     gl.import_mujoco()
     stock_module = pytest.importorskip("lerobot.envs.metaworld")
     stock = stock_module.MetaworldEnv("push-v3", obs_type="pixels_agent_pos")
     actions = np.random.default_rng(0).uniform(-1, 1, (3, 4)).astype(np.float32)
     # LeRobot's pictures first: once ours has an OpenGL context, theirs would be drawn into it.
-    theirs = [(stock.reset(seed=11)[0], 0.0), *(stock.step(action)[:2] for action in actions)]
-    world = make_world(MetaWorldConfig(task="push-v3", image_size=480, lighting="default", reward="dense"))
+    theirs = [stock.reset(seed=11)[0], *(stock.step(action)[0] for action in actions)]
+    world = make_world(MetaWorldConfig(task="push-v3", image_size=480, lighting="default"))
     ours = world.reset(11, "push-v3")
-    assert np.array_equal(theirs[0][0]["agent_pos"].astype(np.float32), ours["observation.state"])
-    for action, (raw, reward) in zip(actions, theirs[1:], strict=True):
+    assert np.array_equal(theirs[0]["agent_pos"].astype(np.float32), ours["observation.state"])
+    for action, raw in zip(actions, theirs[1:], strict=True):
         result = world.step_chunk(action[None])
         assert np.array_equal(raw["agent_pos"].astype(np.float32), result.observation["observation.state"])
         assert np.array_equal(raw["pixels"], result.observation[IMAGE])
-        assert np.float32(reward) == result.rewards[0]
     assert result.observation["task"] == stock.task_description
     stock.close()
     world.close()
@@ -151,12 +150,3 @@ def test_a_missing_opengl_names_the_package(headless: pytest.MonkeyPatch):
     headless.setattr(gl, "_LIBRARIES", {"egl": ("libNoEGL.so",), "osmesa": ("libNoMesa.so",)})
     with pytest.raises(InputError, match="apt-get install -y libosmesa6"):
         gl.choose_backend()
-
-
-def test_the_package_is_light_to_import():
-    code = (
-        "import sys, accerl_lerobot.envs, accerl_lerobot.demos.record\n"
-        "heavy = {'torch', 'lerobot', 'mujoco', 'metaworld', 'gymnasium', 'ray'} & set(sys.modules)\n"
-        "assert not heavy, heavy"
-    )
-    subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parents[2], check=True)

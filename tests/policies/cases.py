@@ -33,7 +33,6 @@ from tests.policies.checkpoints import (
     write_act,
     write_bins,
     write_diffusion,
-    write_gaussian_actor,
     write_smolvla,
 )
 from tests.policies.tiny import looking_back, perturb, requests
@@ -113,26 +112,18 @@ def features_of(adapter: LeRobotAdapter, request: Request) -> np.ndarray:
 # ---- flow: SmolVLA, π0, π0.5
 
 
-def slow_flow(
-    adapter: LeRobotAdapter,
-    asked: Sequence[Request],
-    latent: Latent,
-    velocity: oracle.SlowVelocity | None = None,
-) -> np.ndarray:
-    """See `Case.slow`; without `velocity`, each observation is read alone."""
-    encoded = [adapter.model.encode(alone(adapter, request)) for request in asked] if velocity is None else []
+def slow_flow(adapter: LeRobotAdapter, asked: Sequence[Request], latent: Latent) -> np.ndarray:
+    """See `Case.slow`; each observation is read alone."""
+    encoded = [adapter.model.encode(alone(adapter, request)) for request in asked]
 
     def read(x: np.ndarray, t: float, sample: int) -> np.ndarray:
         with torch.no_grad():
             field = encoded[sample].context.velocity
             return field(torch.from_numpy(x).float()[None], torch.tensor([t]).float())[0].double().numpy()
 
-    shape, config = adapter.family.shape, adapter.family.sampler
-    path = np.full((len(asked), shape.num_steps + 1, shape.chunk_size, shape.padded_dim), np.nan)
-    for b, stored in enumerate(latent["path"]):
-        places = slice(None) if config.stochastic == "all" else [0, -1]
-        path[b, places] = stored
-    return oracle.log_prob(velocity or read, path, shape, config)
+    x0, x = (part.numpy() for part in latent["path"].unbind(1))
+    shape, std = adapter.family.shape, adapter.family.sampler.noise_level
+    return oracle.log_prob(read, x0, x, shape, std)
 
 
 def stock_flow(
@@ -141,7 +132,7 @@ def stock_flow(
     return adapter.policy.predict_action_chunk(batch, noise=latent["path"][:, 0])
 
 
-# ---- Gaussian: ACT, gaussian_actor
+# ---- Gaussian: ACT
 
 
 def slow_act(adapter: LeRobotAdapter, asked: list[Request], latent: Latent) -> list[float]:
@@ -170,24 +161,6 @@ def stock_act(
     )
     adapter.policy.reset()
     return queued
-
-
-def slow_gaussian_actor(adapter: LeRobotAdapter, asked: list[Request], latent: Latent) -> list[float]:
-    """States of the checkpoint are within ±2; variances, not stds, are what LeRobot clamps."""
-    weights, totals = arrays(adapter.policy), []
-    for request, u in zip(asked, latent["u"].double().numpy()[:, 0], strict=True):
-        state = request.observation["observation.state"].astype(np.float64) / 2
-        x = linear(state, weights, "actor.encoder.state_encoder.0")
-        x = np.tanh(layer_norm(x, weights, "actor.encoder.state_encoder.1"))
-        for i in (0, 3):
-            x = layer_norm(
-                linear(x, weights, f"actor.network.net.{i}"), weights, f"actor.network.net.{i + 1}"
-            )
-            x = x / (1 + np.exp(-x))
-        mean = linear(x, weights, "actor.mean_layer")
-        std = np.sqrt(np.clip(np.exp(linear(x, weights, "actor.std_layer")), 1e-5, 10.0))
-        totals.append(sum(map(normal_log_prob, u, mean, std)) - np.log(1 - np.tanh(u) ** 2).sum())
-    return totals
 
 
 # ---- diffusion
@@ -301,13 +274,6 @@ def stock_tokens(
     return adapter.policy.predict_action_chunk(batch)
 
 
-LEVELS = {"euler": 0.2, "flow_sde": 0.5}
-"""Rounding of log ρ is over these."""
-FLOW = tuple(
-    FlowSamplerConfig(stochastic=stochastic, noise=noise, noise_level=level)
-    for noise, level in LEVELS.items()
-    for stochastic in ("last", "all")
-)
 UNET = ("rgb_encoder", "down_modules", "mid_modules", "up_modules", "final_conv")
 
 
@@ -316,10 +282,7 @@ def _pi(kind: str, **fields: Any) -> Case:
     return Case(
         kind=kind,
         write=lambda path: write_pi(path, kind, chunk=5, executed=3, padded_dim=4, action_dim=2),
-        samplers=(
-            FlowSamplerConfig(noise_level=0.4),
-            FlowSamplerConfig(stochastic="all", noise="flow_sde", noise_level=0.5),
-        ),
+        samplers=(FlowSamplerConfig(noise_level=0.4),),
         slow=slow_flow,
         stock=stock_flow,
         parts=parts,
@@ -332,7 +295,7 @@ CASES = {
     "smolvla": Case(
         kind="smolvla",
         write=lambda path: write_smolvla(path, chunk=5, executed=3, padded_dim=4, action_dim=2, num_steps=3),
-        samplers=FLOW,
+        samplers=(FlowSamplerConfig(noise_level=0.2),),  # rounding of log ρ is over this
         slow=slow_flow,
         stock=stock_flow,
         parts=("vision_model", "text_model", "lm_expert", "action_out_proj"),
@@ -376,18 +339,6 @@ CASES = {
         close=(1e-5, 1e-4),
         step=0.005,
     ),
-    "gaussian_actor": Case(
-        kind="gaussian_actor",
-        write=write_gaussian_actor,
-        samplers=(GaussianSamplerConfig(),),
-        slow=slow_gaussian_actor,
-        parts=("state_encoder", "actor.network", "mean_layer", "std_layer"),
-        chunk=(1, 2),
-        one_token=True,
-        moved=0.3,
-        close=(1e-3, 1e-3),
-        step=0.005,
-    ),
     "diffusion": Case(
         kind="diffusion",
         write=lambda path: write_diffusion(path, image=40, n_obs_steps=2),
@@ -402,7 +353,7 @@ CASES = {
         one_token=True,
     ),
 }
-"""The eight types, by their names in LeRobot."""
+"""The seven types, by their names in LeRobot."""
 VARIANTS = {
     "diffusion, DDIM, one observation, batch norm": Case(
         kind="diffusion",

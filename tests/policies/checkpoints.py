@@ -29,7 +29,7 @@ def write_policy(
     """Saves a new policy and its processors as a LeRobot ``pretrained_model`` folder.
 
     Args:
-        image: its side in pixels; 0: the policy reads none.
+        image: its side in pixels.
         stats: in place of the default: states and actions of std 0.5 around 0, or within ±2.
         prepare: changes the weights before they are saved.
         fields: of LeRobot's policy config.
@@ -39,9 +39,10 @@ def write_policy(
     from lerobot.policies.factory import get_policy_class, make_policy_config, make_pre_post_processors
 
     sizes = {"observation.state": state_dim, "action": action_dim}
-    inputs = {"observation.state": PolicyFeature(type=FeatureType.STATE, shape=(state_dim,))}
-    if image:
-        inputs = {camera: PolicyFeature(type=FeatureType.VISUAL, shape=(3, image, image))} | inputs
+    inputs = {
+        camera: PolicyFeature(type=FeatureType.VISUAL, shape=(3, image, image)),
+        "observation.state": PolicyFeature(type=FeatureType.STATE, shape=(state_dim,)),
+    }
     options: dict[str, Any] = {
         "input_features": inputs,
         "output_features": {"action": PolicyFeature(type=FeatureType.ACTION, shape=(action_dim,))},
@@ -129,15 +130,6 @@ def write_act(directory: Path, *, chunk: int = 5, executed: int = 3, **options: 
         "pretrained_backbone_weights": None,
     }
     return write_policy(directory, "act", **(small | options))
-
-
-def write_gaussian_actor(directory: Path, **options: Any) -> Path:
-    """A gaussian_actor of a few thousand parameters that reads the state only, unless told otherwise."""
-    from lerobot.policies.gaussian_actor.configuration_gaussian_actor import ActorNetworkConfig
-
-    network = ActorNetworkConfig(hidden_dims=[32, 32])
-    small = {"image": 0, "latent_dim": 16, "actor_network_kwargs": network}
-    return write_policy(directory, "gaussian_actor", **(small | options))
 
 
 def write_diffusion(directory: Path, *, horizon: int = 8, executed: int = 3, **options: Any) -> Path:

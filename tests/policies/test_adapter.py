@@ -51,12 +51,6 @@ def test_instructions_get_lerobot_s_newline_and_padding(tiny_checkpoint: Path):
         assert tokenizer.decode(row[real]) == text + "\n"
 
 
-def test_actions_come_back_in_the_world_s_units(tiny_checkpoint: Path):
-    adapter = adapter_at(tiny_checkpoint)
-    chunk = torch.randn(2, 4, 2, generator=torch.Generator().manual_seed(0))
-    assert torch.allclose(adapter.processing.unnormalise(chunk), 0.5 * chunk)
-
-
 # ---- the critic
 
 

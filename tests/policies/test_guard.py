@@ -23,7 +23,7 @@ from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.guard import Unfilled, check_checkpoint, guarded, input_error
 from accerl_lerobot.policies.loading import load_adapter
 from accerl_lerobot.policies.saving import save_pretrained
-from tests.policies.checkpoints import edit_config, write_gaussian_actor
+from tests.policies.checkpoints import edit_config, write_act, write_smolvla
 
 PRE = "policy_preprocessor.json"
 ORIGIN = Origin("policy.path", "theirs")
@@ -31,7 +31,7 @@ ORIGIN = Origin("policy.path", "theirs")
 
 @pytest.fixture(scope="module")
 def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    made = write_gaussian_actor(tmp_path_factory.mktemp("files") / "made")
+    made = write_act(tmp_path_factory.mktemp("files") / "made")
     config = PolicyConfig(path=str(made), device="cpu")
     save_pretrained(load_adapter(config), made.parent / "saved", config)
     return made.parent / "saved"
@@ -249,18 +249,15 @@ def test_the_commit_that_is_named_is_run_and_no_other(theirs: Repository):
     assert theirs.marker.exists()
 
 
-def test_a_checkpoint_cannot_have_its_encoder_s_code_run(
+def test_a_checkpoint_cannot_have_its_backbone_s_code_run(
     theirs: Repository, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    path = write_gaussian_actor(tmp_path / "policy", image=64)
-    edit_config(path, vision_encoder_name=theirs.name)
-    with pytest.raises(InputError) as caught:
+    monkeypatch.setattr("builtins.input", lambda *_: "y")
+    path = write_smolvla(tmp_path / "policy")
+    edit_config(path, vlm_model_name=theirs.name)
+    with pytest.raises(InputError):
         load_adapter(PolicyConfig(path=str(path), device="cpu"))
-    assert str(caught.value).startswith("policy.trust_remote_code=") and not theirs.marker.exists()
-    trusting = PolicyConfig(path=str(path), device="cpu", trust_remote_code=True, code_revision=COMMIT)
-    with pytest.raises(InputError, match="its network cannot be built"):  # it is a config and no encoder
-        load_adapter(trusting)
-    assert theirs.marker.exists()
+    assert not theirs.marker.exists()
 
 
 class Mark:

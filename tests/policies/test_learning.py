@@ -32,7 +32,7 @@ from accerl_lerobot.policies.config import (
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
-from tests.policies.checkpoints import write_act, write_bins, write_diffusion, write_gaussian_actor
+from tests.policies.checkpoints import write_act, write_bins, write_diffusion
 from tests.policies.tiny import TOLERANCE
 from tests.policies.tiny_pi import write_pi
 from tests.runs import collect, drive, tiny_run
@@ -128,14 +128,6 @@ RUNS = {
         lr=1e-3,
         success=(0.4, 0.6),
         reward=1.0,
-    ),
-    "gaussian_actor": Run(
-        write=write_gaussian_actor,
-        env=replace(ENV, image_size=8),
-        updates=100,
-        lr=2e-3,
-        success=(0.5, 0.8),
-        reward=0.2,
     ),
     "diffusion": Run(
         write=write_diffusion_that_looks_back,

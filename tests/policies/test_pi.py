@@ -107,12 +107,6 @@ def test_what_no_action_depends_on_is_not_trained(adapter: LeRobotAdapter):
     }
 
 
-def test_lerobot_s_own_freezing_is_kept(tmp_path: Path):
-    for kind in KINDS:
-        path = write_pi(tmp_path / kind, kind, train_expert_only=True)
-        assert not any("paligemma." in k for k in adapter_at(path).trainable())
-
-
 def test_a_bfloat16_checkpoint_acts_and_is_saved_in_float32(path: Path, tmp_path: Path):
     kind = adapter_at(path).policy.config.type
     origin = write_pi(tmp_path / "origin", kind, dtype="bfloat16", padded_dim=4)

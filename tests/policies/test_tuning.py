@@ -32,7 +32,6 @@ BACKBONES = {
 TARGETS = dict.fromkeys(BACKBONES) | {
     "pi0_fast": r".*language_model.*\.(q|v)_proj",
     "act": r"model\.(encoder|decoder|vae_encoder)\..*linear\d",
-    "gaussian_actor": r".*state_encoder\.0|actor\.mean_layer",  # an encoder that it holds under three names
     "diffusion": r"diffusion\.unet\..*cond_encoder\.1",
 }
 """Type → regular expression of layers for low-rank adapters; None: LeRobot's own choice."""

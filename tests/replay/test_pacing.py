@@ -73,8 +73,8 @@ def test_a_store_without_room_for_the_pace_is_refused() -> None:
 
 
 def test_lag_bound_by_hand() -> None:
-    # ⌊2·(30 + 2·12 + 100)/8⌋ − 1 = 37; published 4 − 1 + 1 = 4; prefetch 2
-    arguments = {"batch_decisions": 8, "in_flight": 12, "publish_every": 4, "pickup": 1, "prefetch": 2}
+    # ⌊2·(30 + 2·12 + 100)/8⌋ − 1 = 37; pickup 4; prefetch 2
+    arguments = {"batch_decisions": 8, "in_flight": 12, "pickup": 4, "prefetch": 2}
     assert lag_bound(CONFIG, **arguments) == 4 + 37 + 2
     capped = ReplayConfig(capacity=100, min_decisions=10, samples_per_insert=2.0, ahead=30, max_lag=9)
     assert lag_bound(capped, **arguments) == 9 + 2
@@ -124,7 +124,7 @@ class Simulation:
             self.config,
             batch_decisions=self.batch,
             in_flight=self.in_flight,
-            publish_every=self.publish_every,
+            pickup=self.publish_every - 1,
         )
         self.started = 0
 

@@ -36,10 +36,6 @@ class LinearAdapter(PolicyAdapter):
             self.value_head.bias.fill_(0.3)
         self.device = torch.device("cpu")
 
-    @property
-    def actions(self) -> int | None:
-        return 2
-
     def factors(self, latent: dict[str, Tensor]) -> Tensor | None:
         return torch.arange(2) < latent["count"][:, None] if "count" in latent else None
 

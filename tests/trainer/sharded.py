@@ -122,7 +122,7 @@ def run(case: Case, config: TrainerConfig, group: ranks.Ranks, state: Any = None
 
 
 def config_of(case: Case, sharding: str, size: int) -> TrainerConfig:
-    return TrainerConfig(**case.config, ranks=size, sharding=sharding if size > 1 else "none")
+    return TrainerConfig(**case.config, ranks=size, sharding=sharding)
 
 
 def cases() -> dict[str, Case]:
@@ -157,7 +157,6 @@ def cases() -> dict[str, Case]:
         "counted": Case(LinearAdapter, GIPOConfig(level="token"), plain | {"micro_batch": 2}, counted),
         "compared": Case(LinearAdapter, GIPOConfig(advantage="group"), plain, compared),
         "layers": Case(LayeredAdapter, GIPOConfig(), plain | {"micro_batch": 2, "probe_every": 1}, uneven),
-        "forgetful": Case(LayeredAdapter, GIPOConfig(), plain | {"activation_checkpointing": True}, uneven),
     }
 
 

@@ -19,7 +19,7 @@ from tests.light_workers import light_ray
 
 __all__ = ["light_ray"]
 
-THREE = TrainerConfig(ranks=3, sharding="ddp", rank_timeout_s=2.0)
+THREE = TrainerConfig(ranks=3, rank_timeout_s=2.0)
 
 
 class LightRank:

@@ -17,11 +17,8 @@ import torch
 
 from accerl_lerobot.algorithms import GIPOConfig
 from accerl_lerobot.checkpoint import snapshot
-from accerl_lerobot.demos.sft import SFTConfig
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig
-from accerl_lerobot.engine.preflight import check_start
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.trainer.batch import turns
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.ranks import Ranks
@@ -47,7 +44,7 @@ def alone() -> dict[str, dict[str, Any]]:
     """One rank's results for every case."""
     found = {}
     for name, case in sharded.cases().items():
-        found[name] = sharded.run(case, sharded.config_of(case, "none", 1), Ranks())
+        found[name] = sharded.run(case, sharded.config_of(case, "ddp", 1), Ranks())
     return found
 
 
@@ -132,7 +129,7 @@ def test_one_goes_on_from_the_checkpoint_of_ranks(made: Any, alone: dict[str, di
     case, expected = sharded.cases()[name], alone[name]
     saved = results[0]["half"]
     assert saved["update"].keys() == expected["half"]["update"].keys()
-    resumed = sharded.run(case, sharded.config_of(case, "none", 1), Ranks(), saved)
+    resumed = sharded.run(case, sharded.config_of(case, "ddp", 1), Ranks(), saved)
     half = len(expected["metrics"]) - len(resumed["metrics"])
     assert_same(resumed, expected | {"metrics": expected["metrics"][half:]}, name)
 
@@ -223,22 +220,14 @@ def test_a_policy_without_blocks_cannot_forget():
 # ---- what is refused when a run is parsed
 
 
-@pytest.mark.parametrize(
-    ("fields", "says"),
-    [
-        ({"ranks": 2}, r"trainer\.sharding='none': say how the 2 ranks share"),
-        ({"sharding": "zero3"}, r"trainer\.sharding='zero3': there is one rank"),
-        ({"ranks": 9, "sharding": "ddp", "batch_decisions": 8}, r"trainer\.ranks=9: use at most .*, 8"),
-    ],
-)
-def test_what_cannot_be_shared_is_refused(fields: dict[str, Any], says: str):
-    with pytest.raises(InputError, match=says):
-        TrainerConfig(**fields)
+def test_more_ranks_than_decisions_are_refused():
+    with pytest.raises(InputError, match=r"trainer\.ranks=9: use at most .*, 8"):
+        TrainerConfig(ranks=9, batch_decisions=8)
 
 
 def test_ranks_want_workers():
     with pytest.raises(InputError, match=r"trainer\.ranks=2: launch\.engine=local is one process"):
-        RunConfig(trainer=TrainerConfig(ranks=2, sharding="zero2"), launch=LaunchConfig(engine="local"))
+        RunConfig(trainer=TrainerConfig(ranks=2), launch=LaunchConfig(engine="local"))
 
 
 # ---- GPUs
@@ -258,35 +247,16 @@ def test_ranks_want_workers():
     ],
 )
 def test_no_two_ranks_share_a_gpu(ranks: int, gpus: int, others: int, shares: tuple[float, float]):
-    config = TrainerConfig(ranks=ranks, sharding="none" if ranks == 1 else "zero2")
+    config = TrainerConfig(ranks=ranks)
     found = config.gpu_shares(gpus, others)
     assert found == pytest.approx(shares)
     assert ranks * found[0] + others * found[1] <= gpus + 1e-9
     assert ranks == 1 or not gpus or found[0] > 0.5
 
 
-@pytest.mark.parametrize("gpus", [2, 3, 4, 8])
-def test_whoever_needs_a_part_of_a_gpu_finds_one(gpus: int):
-    """Ranks are placed first, each on the fullest GPU that has room, as Ray does."""
-    for ranks in range(2, gpus + 1):
-        for others in range(1, 9):
-            shares = TrainerConfig(ranks=ranks, sharding="zero2").gpu_shares(gpus, others)
-            free = [1.0] * gpus
-            for share in [shares[0]] * ranks + [shares[1]] * others:
-                room = min((g for g in range(gpus) if free[g] >= share - 1e-9), key=lambda g: free[g])
-                free[room] -= share
-
-
 def test_more_ranks_than_gpus_are_refused_with_the_arithmetic():
-    config = TrainerConfig(ranks=4, sharding="zero2")
+    config = TrainerConfig(ranks=4)
     with pytest.raises(
         InputError, match=r"trainer\.ranks=4: .* 4 ranks on 3 GPUs leave 1 without; use at most 3"
     ):
         config.gpu_shares(3, 1)
-
-
-def test_a_run_with_more_ranks_than_gpus_does_not_begin(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
-    trainer = TrainerConfig(ranks=2, sharding="ddp")
-    with pytest.raises(InputError, match=r"trainer\.ranks=2: .* 2 ranks on 1 GPUs leave 1 without"):
-        check_start(RunConfig(trainer=trainer, policy=PolicyConfig(path="nowhere"), sft=SFTConfig(steps=0)))

@@ -49,8 +49,6 @@ class Case(NamedTuple):
 CASES = {kind: Case(kind) for kind in POLICIES} | {
     "smolvla, zero2": Case("smolvla", {"ranks": 2, "sharding": "zero2"}),
     "smolvla, lora": Case("smolvla", options={"tuning": TuningConfig(mode="lora", rank=2)}),
-    "smolvla_bins, forgetful": Case("smolvla_bins", SHARDED | {"activation_checkpointing": True}),
-    "pi0, forgetful": Case("pi0", SHARDED | {"activation_checkpointing": True}),
 }
 
 

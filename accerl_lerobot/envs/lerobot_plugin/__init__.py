@@ -149,7 +149,6 @@ class AccerlMetaWorldEnvConfig(AccerlEnvConfig):
 
     @property
     def world_config(self) -> MetaWorldConfig:
-        """See the base class."""
         return self._filled(MetaWorldConfig, shift=ShiftConfig(**self.shift))
 
 
@@ -168,7 +167,6 @@ class AccerlLiberoEnvConfig(AccerlEnvConfig):
 
     @property
     def world_config(self) -> LiberoConfig:
-        """See the base class."""
         return self._filled(LiberoConfig)
 
 

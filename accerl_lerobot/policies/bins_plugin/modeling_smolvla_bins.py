@@ -28,11 +28,7 @@ from accerl_lerobot.policies.bins_plugin.configuration_smolvla_bins import SmolV
 
 
 class ParallelDecoder(nn.Module):
-    """The network.
-
-    Args:
-        config: with its features filled in.
-    """
+    """The network."""
 
     def __init__(self, config: SmolVLABinsConfig) -> None:
         super().__init__()
@@ -59,9 +55,7 @@ class ParallelDecoder(nn.Module):
 
         Args:
             images: each (B, 3, H, W) in [-1, 1].
-            tokens: (B, T) of the instruction.
             mask: bool (B, T), True where a token is no padding.
-            state: (B, S), if the policy has one.
         """
         parts = [self.vlm.connector(self.vlm.vision_model(pixel_values=i).last_hidden_state) for i in images]
         parts.append(self.vlm.text_model.get_input_embeddings()(tokens))
@@ -98,7 +92,6 @@ class SmolVLABinsPolicy(PreTrainedPolicy):
 
     Args:
         config: its config; `load_vlm_weights` is False afterwards.
-        kwargs: what LeRobot's factory passes to every policy.
     """
 
     config_class = SmolVLABinsConfig
