@@ -29,10 +29,11 @@ from accerl_lerobot.policies.loading import load_adapter
 from accerl_lerobot.policies.saving import save_pretrained
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.rollout.worker import RolloutWorker, WorkerShare
+from accerl_lerobot.testing import log_ratio, perturb, stored
 from accerl_lerobot.trainer.config import TrainerConfig
 from tests.policies.cases import slow_diffusion
 from tests.policies.checkpoints import edit_config, stock_chunk, write_diffusion
-from tests.policies.tiny import adapter_at, deviation, log_ratio, perturb, requests, stored
+from tests.policies.tiny import adapter_at, deviation, requests
 from tests.rounding import assert_close
 from tests.runs import tiny_run
 from tests.transport.played import played

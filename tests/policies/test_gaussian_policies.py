@@ -18,8 +18,9 @@ from accerl_lerobot.experience import Request
 from accerl_lerobot.policies.adapter import LeRobotAdapter, stack_observations
 from accerl_lerobot.policies.config import GaussianSamplerConfig, PolicyConfig, TuningConfig
 from accerl_lerobot.policies.saving import save_pretrained
+from accerl_lerobot.testing import check_ratio_one, log_ratio, perturb, stored
 from tests.policies.checkpoints import edit_config, write_act, write_gaussian_actor
-from tests.policies.tiny import adapter_at, check_ratio_one, log_ratio, perturb, requests, stored
+from tests.policies.tiny import adapter_at, requests
 from tests.rounding import assert_close
 
 

@@ -11,8 +11,9 @@ import pytest
 from accerl_lerobot.policies.config import (
     FlowSamplerConfig,
 )
+from accerl_lerobot.testing import stored
 from tests.policies.cases import CASES
-from tests.policies.tiny import adapter_at, requests, stored
+from tests.policies.tiny import adapter_at, requests
 
 
 @pytest.fixture(scope="module")
