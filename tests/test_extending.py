@@ -52,6 +52,7 @@ def forget() -> None:
 @pytest.fixture(autouse=True)
 def unheard_of(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.syspath_prepend(str(SOURCE))
+    forget()
     yield
     forget()
 
