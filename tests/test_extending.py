@@ -226,6 +226,5 @@ def test_the_installed_package_is_found_by_every_process(checkpoint: Path, tmp_p
     command = [sys.executable, "-c", STOCK, str(trained)]
     shown = subprocess.run(command, check=True, env=environment, cwd=tmp_path, capture_output=True)
     assert shown.stdout.decode().splitlines()[-1] == f"{POLICY} (1, 2)"
-    subprocess.run(
-        [*accerl, "eval", *common, f"--policy.path={trained}"], check=True, env=environment, cwd=tmp_path
-    )
+    evaluation = ["eval", *common, f"--policy.path={trained}", "--launch.engine=local"]
+    subprocess.run([*accerl, *evaluation], check=True, env=environment, cwd=tmp_path)
