@@ -35,9 +35,11 @@ TOLERANCE = 1e-4
 """|ρ − 1| of a whole chunk at equal weights, in fp32 on any CPU; found are 1e-7 to 2e-5. Also the error of
 other numbers, relative to the largest of their kind."""
 BATCH = 12
+"""Decisions that are compared in batches of several sizes."""
 MOVED = 0.5
 """Std of log ρ between the two policies of `check_importance`."""
 STEPS_MOST = 100
+"""Small steps of the weights until log ρ varies by that much."""
 DEVIATIONS = 5.0
 """Largest difference of two estimates in standard errors; one in two million is above it by chance."""
 
@@ -58,10 +60,7 @@ def check_policy(policy: PolicyConfig | Path | str, observations: Sequence[Obser
     config = policy if isinstance(policy, PolicyConfig) else PolicyConfig(path=str(policy), device="cpu")
     adapter = load_adapter(config)
     perturb(adapter, 0.1)  # heads start at zero, where only their output layers have a gradient
-    asked = [
-        Request(observation=observations[i % len(observations)], noise_seed=i, explore=True)
-        for i in range(BATCH)
-    ]
+    asked = [Request(observation=observations[i % len(observations)], noise_seed=i) for i in range(BATCH)]
     check_batches(adapter, asked, few=4)
     check_stock_sampler(adapter, asked)
     with tempfile.TemporaryDirectory() as folder:
