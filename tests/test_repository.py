@@ -11,6 +11,7 @@ import sys
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 
@@ -18,6 +19,7 @@ from accerl_lerobot.cli.doctor import pins
 from accerl_lerobot.cli.verbs import CONFIGS
 from accerl_lerobot.engine.config import RunConfig, parse
 from accerl_lerobot.engine.preflight import check_sft_policy
+from accerl_lerobot.policies.config import PLUGINS, POLICIES
 from benchmarks.__main__ import CONFIGS as BENCHMARKS
 
 ROOT = Path(__file__).parents[1]
@@ -246,7 +248,8 @@ def commands() -> list[tuple[str, str]]:
 @pytest.mark.parametrize(("path", "line"), commands())
 def test_commands_in_the_documents_parse(path: str, line: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Verb, fields, types and values; places that the reader fills in are written in capitals."""
-    monkeypatch.syspath_prepend(str(ROOT / "tests" / "packages" / "lerobot_env_reach"))
+    for package in (ROOT / "tests" / "packages").iterdir():
+        monkeypatch.syspath_prepend(str(package))
     configs = CONFIGS if line.startswith("accerl ") else BENCHMARKS
     verb, *arguments = shlex.split(line.removeprefix("python -m ").partition(" ")[2])
     if verb == "bench":
@@ -254,4 +257,5 @@ def test_commands_in_the_documents_parse(path: str, line: str, monkeypatch: pyte
     assert verb in configs, path
     # A run's own config is one that train resolved, so its place is taken by no recipe at all.
     here = [a.replace("recipes/", f"{ROOT}/recipes/") for a in arguments if "RUN/config.yaml" not in a]
-    parse(configs[verb], here, recipe_class=RunConfig)
+    with patch.dict(POLICIES), patch.dict(PLUGINS):
+        parse(configs[verb], here, recipe_class=RunConfig)

@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 from collections import deque
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -21,7 +21,7 @@ import numpy as np
 
 from accerl_lerobot.checkpoint.layout import CONFIG
 from accerl_lerobot.checkpoint.safety import Origin, check_folder
-from accerl_lerobot.config.parsing import decode, drop_consents, read_recipe
+from accerl_lerobot.config.parsing import DISCOVER, decode, drop_consents, read_recipe
 from accerl_lerobot.config.ranges import DatasetName, NewFolder, Range, Section, Steps
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.record import (
@@ -66,6 +66,8 @@ class ExportConfig(Section):
     """Simulator processes; does not change the content."""
     hub_path: str | None = None
     """``owner/name@COMMIT`` whose code is run with your rights, if the run's environment is on the Hub."""
+    discover_packages_path: str | None = field(default=None, metadata={"registers": True})
+    """Package to import that registers the run's environment, if a package does."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -83,7 +85,7 @@ def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
     if not (run / CONFIG).is_file():
         raise InputError("path", str(run), f"no run in it: there is no {CONFIG}")
     check_folder(run, Origin("path", str(run)))
-    settings = _settings(run, config.hub_path)
+    settings = _settings(run, config)
     chosen = _picked(whole_episodes(read_journal(run / EPISODES)), config)
     if not chosen:
         remedy = f"no whole episode in its {EPISODES} of those asked for ({config.pick})"
@@ -98,15 +100,23 @@ def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
     return tally
 
 
-def _settings(run: Path, hub_path: str | None) -> RunConfig:
-    """The run's config, in which nothing but `hub_path` lets code run."""
+def _settings(run: Path, config: ExportConfig) -> RunConfig:
+    """The run's config, in which nothing but what `config` names lets code run."""
     tree = read_recipe(run / CONFIG)
-    wanted = drop_consents(tree).get("env.kwargs.hub_path")
-    if wanted is not None and hub_path is None:
-        remedy = f"the run's environment is code of {wanted}, which would run with your rights"
-        raise InputError("hub_path", None, f"{remedy}: if you trust it, name that here")
+    dropped, hub_path, package = drop_consents(tree), config.hub_path, config.discover_packages_path
+    for name, given, asked in (
+        ("hub_path", hub_path, dropped.get("env.kwargs.hub_path")),
+        (DISCOVER, package, dropped.get(f"env.{DISCOVER}")),
+    ):
+        if asked is not None and given is None:
+            remedy = f"the run's environment is code of {asked}, which would run with your rights"
+            raise InputError(name, None, f"{remedy}: if you trust it, name that here")
+    for section in ("policy", "algorithm"):  # neither is needed, and either may be of another package
+        tree.pop(section, None)
+    env = tree["env"] = dict(tree.get("env") or {})
+    if package is not None:
+        env[DISCOVER] = package
     if hub_path is not None:
-        env = tree["env"] = dict(tree.get("env") or {})
         env |= {"trust_remote_code": True, "kwargs": dict(env.get("kwargs") or {}) | {"hub_path": hub_path}}
     settings: RunConfig = decode(RunConfig, tree)
     return settings

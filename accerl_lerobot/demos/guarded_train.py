@@ -4,6 +4,8 @@
 Same arguments, same result, but that a new policy of images reads no ``observation.environment_state``, which
 a real robot does not have. π0-FAST's action tokeniser, whose newest code LeRobot would fetch and run, is
 read by `policies.vla` instead. ``--code_revision=COMMIT`` has code from the Hub run, of this commit only.
+``--policy.discover_packages_path`` goes with ``--policy.path`` too, where LeRobot 0.6.1 takes it for a field
+of the policy's config.
 
 The dataset's items are kept in memory where they take less than 4 GiB and are not transformed at random:
 LeRobot 0.6.1 decodes every image of an action chunk to read the chunk's actions, 3.8 ms an item for a chunk
@@ -23,11 +25,13 @@ from typing import Any
 from torch.utils.data import Dataset
 
 from accerl_lerobot.checkpoint.safety import Origin
+from accerl_lerobot.config.parsing import DISCOVER, discover
 from accerl_lerobot.demos.dataset_files import checked
 from accerl_lerobot.demos.sft import CODE_REVISION, REFUSED
 from accerl_lerobot.experience import ENVIRONMENT_STATE
 from accerl_lerobot.policies.guard import guarded, input_error
 
+PACKAGE = f"--policy.{DISCOVER}="
 MAX_BYTES = 4 * 1024**3
 """Datasets that would take more memory than this as float images are read the stock way."""
 
@@ -91,7 +95,8 @@ def main() -> None:
     code, root, name = given(CODE_REVISION), given("--dataset.root="), given("--dataset.repo_id=")
     origin = Origin("dataset.repo_id", name) if root is None else Origin("dataset.root", root)
     lerobot_train.make_train_eval_datasets = _adapted(lerobot_train.make_train_eval_datasets)
-    sys.argv[1:] = [a for a in sys.argv[1:] if not a.startswith(CODE_REVISION)]
+    discover(given(PACKAGE), "policy")
+    sys.argv[1:] = [a for a in sys.argv[1:] if not a.startswith((CODE_REVISION, PACKAGE))]
     try:
         with contextlib.ExitStack() as guards:
             guards.enter_context(guarded("sft", code))

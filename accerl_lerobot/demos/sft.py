@@ -264,7 +264,7 @@ def policy_fields(kind: str, field: str) -> set[str]:
     """Names of the fields of LeRobot's config of a policy type; one it cannot fine-tune is refused."""
     from lerobot.configs.policies import PreTrainedConfig
 
-    register_policies()
+    register_policies(kind)
     choices = PreTrainedConfig.get_known_choices()
     if kind not in choices:
         raise InputError(field, kind, f"LeRobot has {', '.join(sorted(choices))}")

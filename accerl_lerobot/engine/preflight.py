@@ -369,12 +369,13 @@ def sft_policy(config: SFTConfig) -> Any:
         return check_sft_policy(config)
     from lerobot.configs.policies import PreTrainedConfig
 
-    from accerl_lerobot.checkpoint.safety import brief
+    from accerl_lerobot.checkpoint.safety import Origin, brief, read_json
     from accerl_lerobot.policies.config import register_policies
-    from accerl_lerobot.policies.guard import fetched_checkpoint
+    from accerl_lerobot.policies.guard import CONFIG, fetched_checkpoint
 
-    register_policies()
     folder = fetched_checkpoint(config.init_path, None, "sft.init_path")
+    kind = read_json(folder / CONFIG, Origin("sft.init_path", config.init_path)).get("type")
+    register_policies(str(kind))
     try:
         return PreTrainedConfig.from_pretrained(folder)
     except Exception as error:  # LeRobot takes the file at its word, and may fail over any of it

@@ -453,12 +453,24 @@ def evaluate(
     )
 
 
-def load_policy(path: str | Path, revision: str | None = None, device: str = "auto") -> ActingPolicy:
-    """A LeRobot checkpoint, on disk or the Hub, ready to act; runs no code from it and unpickles nothing."""
+def load_policy(
+    path: str | Path,
+    revision: str | None = None,
+    device: str = "auto",
+    discover_packages_path: str | None = None,
+) -> ActingPolicy:
+    """A LeRobot checkpoint, on disk or the Hub, ready to act; runs no code from it and unpickles nothing.
+
+    `discover_packages_path` names the package of its policy type, where that is not ours and not installed
+    as ``lerobot_policy_*``.
+    """
     from accerl_lerobot.policies.loading import load_adapter
 
+    config = PolicyConfig(
+        path=str(path), revision=revision, device=device, discover_packages_path=discover_packages_path
+    )
     with redirect_stdout(sys.stderr):
-        return ActingPolicy(load_adapter(PolicyConfig(path=str(path), revision=revision, device=device)))
+        return ActingPolicy(load_adapter(config))
 
 
 def _result(directory: Path, summary: dict[str, Any]) -> TrainResult:

@@ -368,7 +368,8 @@ class LeRobotAdapter(PolicyAdapter):
         import lerobot
 
         remedy = (
-            f"our adapter of {self.policy.name} does not fit LeRobot {lerobot.__version__}: it {reason}, so "
-            "log-probs would be those of another policy; install the LeRobot version that this package pins"
+            f"the adapter of {self.policy.name} does not fit LeRobot {lerobot.__version__}: it {reason}, so "
+            "log-probs would be those of another policy; install the LeRobot version that this package pins, "
+            "or correct the adapter"
         )
         return InputError("lerobot", lerobot.__version__, remedy)

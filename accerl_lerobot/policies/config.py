@@ -10,7 +10,7 @@ import importlib
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import draccus
 
@@ -25,7 +25,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class SamplerConfig(Section, draccus.ChoiceRegistry, section="policy.sampler"):
-    """Base of every sampler config."""
+    """Base of every sampler config; one for each family of likelihood."""
+
+    family: ClassVar[str]
+    """``module:class`` of the `family.Family`, made from the model and this config."""
 
     @property
     def type(self) -> str:
@@ -38,6 +41,8 @@ class SamplerConfig(Section, draccus.ChoiceRegistry, section="policy.sampler"):
 class FlowSamplerConfig(SamplerConfig):
     """Flow policies: the last denoising step is Gaussian; see `flow.py`."""
 
+    family = "accerl_lerobot.policies.flow:FlowFamily"
+
     noise_level: Annotated[float, Range("(0, 2]")] = 0.2
     """Std of the noise on every action, in normalised units."""
 
@@ -46,6 +51,8 @@ class FlowSamplerConfig(SamplerConfig):
 @dataclass(frozen=True, kw_only=True)
 class TokenSamplerConfig(SamplerConfig):
     """Token policies: every token is drawn from the softmax of its logits; see `tokens.py`."""
+
+    family = "accerl_lerobot.policies.tokens:TokenFamily"
 
     temperature: Annotated[float, Range("(0, 10]")] = 1.0
     """Logits are divided by it, when acting and when re-scoring: below 1 the most likely tokens are
@@ -56,6 +63,8 @@ class TokenSamplerConfig(SamplerConfig):
 @dataclass(frozen=True, kw_only=True)
 class GaussianSamplerConfig(SamplerConfig):
     """Policies that predict one chunk, with a Gaussian around it; see `gaussian.py`."""
+
+    family = "accerl_lerobot.policies.gaussian:GaussianFamily"
 
     std: Annotated[float, Range("(0, 2]")] = 0.2
     """Std of every action at the start, in normalised units. It is learned, between a quarter of this and 2.5
@@ -74,6 +83,8 @@ class DiffusionSamplerConfig(SamplerConfig):
 
     How many steps there are is ``policy.num_steps``.
     """
+
+    family = "accerl_lerobot.policies.diffusion:DiffusionFamily"
 
     std_min: Annotated[float, Range("(0, 1]")] = 0.1
     """Lower bound of a step's std while exploring, in normalised units. The last step has no noise
@@ -112,6 +123,9 @@ class PolicyConfig(Section, section="policy"):
     """Local checkpoint directory or Hub id (``lerobot/smolvla_base``). None: the run's own SFT makes it."""
     revision: str | None = None
     """Hub revision."""
+    discover_packages_path: str | None = field(default=None, metadata={"registers": True})
+    """Package to import that registers the checkpoint's policy type, where that is not one of ours and the
+    package is not an installed ``lerobot_policy_*``."""
     trust_remote_code: bool = False
     """True if Python code from a Hub repository that the checkpoint names, such as a vision encoder's, is run
     with your rights. It needs `code_revision`."""
@@ -156,15 +170,8 @@ POLICIES: dict[str, tuple[str, tuple[str, ...]]] = {
     "smolvla_bins": ("accerl_lerobot.policies.vla:SmolVLABins", ("tokens",)),
 }
 """LeRobot policy type → its model, and the families that suit it, the default one first."""
-FAMILIES = {
-    "flow": "accerl_lerobot.policies.flow:FlowFamily",
-    "gaussian": "accerl_lerobot.policies.gaussian:GaussianFamily",
-    "diffusion": "accerl_lerobot.policies.diffusion:DiffusionFamily",
-    "tokens": "accerl_lerobot.policies.tokens:TokenFamily",
-}
-"""Family → class; its config is registered under the same name in `config`."""
 PLUGINS = {"smolvla_bins": "accerl_lerobot.policies.bins_plugin"}
-"""LeRobot policy type of this package → the package that registers it with LeRobot."""
+"""LeRobot policy type that is not LeRobot's own → the package that registers it with LeRobot."""
 USES_HISTORY = ("diffusion",)
 """Types that read the observations of ``n_obs_steps`` env steps; the others read one."""
 NO_DENSITY = {
@@ -174,11 +181,35 @@ NO_DENSITY = {
 }
 
 
-def register_policies() -> None:
-    """Fills LeRobot's registry of policy types in this process: its own, and ours."""
+def register_policy(policy_type: str, model: str, *families: str) -> None:
+    """Gives a LeRobot policy type of another package a likelihood.
+
+    Call it where the type is registered with LeRobot, so that who imports the package has both.
+
+    Args:
+        policy_type: its name in LeRobot's registry.
+        model: ``module:class``, of that package, of its `FlowModel`, `GaussianModel`, or another
+            `family.Model`.
+        families: names of the samplers that suit it, the default one first.
+    """
+    module = model.partition(":")[0]
+    POLICIES[policy_type] = (model, families)
+    PLUGINS[policy_type] = module.rpartition(".")[0] or module
+
+
+def register_policies(wanted: str | None = None) -> None:
+    """Fills LeRobot's registry of policy types in this process: its own, and ours.
+
+    If `wanted` is none of them, LeRobot's installed plugins, such as ``lerobot_policy_*``, are imported.
+    """
     importlib.import_module("lerobot.policies")
     for package in PLUGINS.values():
         importlib.import_module(package)
+    from lerobot.configs.policies import PreTrainedConfig
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    if wanted is not None and wanted not in PreTrainedConfig.get_known_choices():
+        register_third_party_plugins()
 
 
 def discovery(policy_type: str | None) -> list[str]:
@@ -195,7 +226,8 @@ def check_type(policy_type: Any, field: str, prefix: str = "") -> str:
         InputError: it has none.
     """
     if policy_type not in POLICIES:
-        why = NO_DENSITY.get(policy_type, f"no likelihood for it here; use one of {', '.join(POLICIES)}")
+        known = f"use one of {', '.join(POLICIES)}, or name its package: policy.discover_packages_path"
+        why = NO_DENSITY.get(policy_type, f"no likelihood for it here; {known}")
         raise InputError(field, policy_type, prefix + why)
     return str(policy_type)
 

@@ -21,8 +21,8 @@ import torch
 
 from accerl_lerobot.checkpoint.isolation import rehearse
 from accerl_lerobot.checkpoint.layout import BACKBONE, CONFIG_FOLDERS, PREPROCESSOR, STEP_FOLDERS
-from accerl_lerobot.checkpoint.safety import Origin, brief, read_tensors, tensor_shapes
-from accerl_lerobot.config.parsing import imported
+from accerl_lerobot.checkpoint.safety import Origin, brief, read_json, read_tensors, tensor_shapes
+from accerl_lerobot.config.parsing import discover, imported
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK
 from accerl_lerobot.policies.adapter import (
@@ -33,7 +33,6 @@ from accerl_lerobot.policies.adapter import (
     stack_observations,
 )
 from accerl_lerobot.policies.config import (
-    FAMILIES,
     POLICIES,
     PolicyConfig,
     SamplerConfig,
@@ -120,10 +119,9 @@ def load_lerobot_config(config: PolicyConfig) -> Any:
     """
     from lerobot.configs.policies import PreTrainedConfig
 
-    register_policies()
     folder = _checkpoint_folder(config)
+    name = _registered_type(config, folder)
     try:
-        name = json.loads((folder / CONFIG).read_text()).get("type")
         kind = check_type(name, "policy.type", f"{config.path} is of this type: ")
         sampler_config(config, kind)
         lerobot_config = PreTrainedConfig.from_pretrained(folder)
@@ -148,8 +146,8 @@ def rehearsed_config(config: PolicyConfig) -> Any:
     Raises:
         InputError: see `load_lerobot_config`, `load_adapter` and `isolation.rehearse`.
     """
-    register_policies()  # before the fork: it imports all of LeRobot's policies
     folder = _checkpoint_folder(config)
+    _registered_type(config, folder)  # before the fork: it imports all of LeRobot's policies
     key = _key(config, folder)
     if key not in _rehearsed:
         there = replace(config, device="cpu", precision="fp32")
@@ -237,7 +235,7 @@ def _load(config: PolicyConfig, *, rehearsal: bool = False) -> LeRobotAdapter:
     try:
         processing = Processing(pre, post, device, config.rename_map)
         sampler = sampler_config(config, lerobot_config.type)
-        family = imported(FAMILIES[sampler.type])(model, sampler)
+        family = imported(sampler.family)(model, sampler)
         critic = ValueHead(model.width)
         adapter = LeRobotAdapter(policy, processing, model, family, critic, config.precision)
         if (folder / OURS).is_file():
@@ -262,6 +260,14 @@ def _checkpoint_folder(config: PolicyConfig) -> Path:
         remedy = "give a LeRobot checkpoint directory or Hub id, or an sft section"
         raise InputError("policy.path", None, remedy)
     return fetched_checkpoint(config.path, config.revision, "policy.path")
+
+
+def _registered_type(config: PolicyConfig, folder: Path) -> Any:
+    """The checkpoint's policy type; packages that may have it are imported."""
+    discover(config.discover_packages_path, "policy")
+    kind = read_json(folder / CONFIG, Origin("policy.path", config.path)).get("type")
+    register_policies(str(kind))
+    return kind
 
 
 def _load_ours(adapter: LeRobotAdapter, folder: Path, origin: Origin) -> None:

@@ -77,6 +77,20 @@ def test_some_of_them(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert (found["episodes"], found["successes"]) == (3, 3)
 
 
+def test_a_run_with_types_of_other_packages(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    other = tmp_path / "run"
+    other.mkdir()
+    (other / "episodes.jsonl").write_bytes((run / "episodes.jsonl").read_bytes())
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    config |= {"algorithm": {"type": "theirs", "discover_packages_path": "a_package"}}
+    config["env"]["discover_packages_path"] = "accerl_lerobot.envs"
+    (other / "config.yaml").write_text(yaml.safe_dump(config))
+    capsys.readouterr()
+    assert exported(other, tmp_path / "set", "--last=1") == 2
+    assert "discover_packages_path=None: the run's environment is code of" in capsys.readouterr().err
+    assert exported(other, tmp_path / "set", "--last=1", "--discover_packages_path=accerl_lerobot.envs") == 0
+
+
 def test_episodes_that_cannot_be_repeated_are_left_out(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):

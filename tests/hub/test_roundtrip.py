@@ -24,11 +24,11 @@ from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.loading import load_adapter, load_lerobot_config
 from accerl_lerobot.policies.saving import save_pretrained
+from accerl_lerobot.testing import perturb
 from accerl_lerobot.trainer.config import TrainerConfig
 from tests.hub.folders import SUMMARY, write_json
 from tests.hub_server import HubServer, environment
 from tests.policies.checkpoints import write_act
-from tests.policies.tiny import perturb
 from tests.runs import tiny_run
 from tests.world_model.test_pixels import model
 

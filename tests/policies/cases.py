@@ -28,6 +28,7 @@ from accerl_lerobot.policies.config import (
     SamplerConfig,
     TokenSamplerConfig,
 )
+from accerl_lerobot.testing import perturb
 from tests.policies import diffusion_oracle, oracle
 from tests.policies.checkpoints import (
     write_act,
@@ -35,7 +36,7 @@ from tests.policies.checkpoints import (
     write_diffusion,
     write_smolvla,
 )
-from tests.policies.tiny import looking_back, perturb, requests
+from tests.policies.tiny import looking_back, requests
 from tests.policies.tiny_pi import small, write_pi
 
 Latent = dict[str, Tensor]

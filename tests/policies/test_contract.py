@@ -24,16 +24,9 @@ from accerl_lerobot.policies.config import (
     SamplerConfig,
 )
 from accerl_lerobot.policies.saving import save_pretrained
+from accerl_lerobot.testing import check_batches, check_gradient, log_ratio, perturb, stored
 from tests.policies.cases import CASES, VARIANTS, Case
-from tests.policies.tiny import (
-    adapter_at,
-    check_batches,
-    check_gradient,
-    check_journey,
-    log_ratio,
-    perturb,
-    stored,
-)
+from tests.policies.tiny import adapter_at, check_journey
 from tests.policies.tiny_pi import hub
 from tests.rounding import assert_close
 

@@ -14,9 +14,10 @@ from torch import Tensor
 from accerl_lerobot.policies import flow
 from accerl_lerobot.policies.config import FlowSamplerConfig
 from accerl_lerobot.policies.flow import FlowShape, Velocity
+from accerl_lerobot.testing import stored
 from tests.policies import oracle
 from tests.policies.cases import CASES
-from tests.policies.tiny import adapter_at, deviation, requests, stored
+from tests.policies.tiny import adapter_at, deviation, requests
 
 STD = 0.3
 CONFIG = FlowSamplerConfig(noise_level=STD)

@@ -31,9 +31,9 @@ from accerl_lerobot.policies.config import (
 )
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
+from accerl_lerobot.testing import TOLERANCE
 from accerl_lerobot.trainer.config import TrainerConfig
 from tests.policies.checkpoints import write_act, write_bins, write_diffusion
-from tests.policies.tiny import TOLERANCE
 from tests.policies.tiny_pi import write_pi
 from tests.runs import collect, drive, tiny_run
 

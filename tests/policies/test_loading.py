@@ -24,6 +24,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import FlowSamplerConfig, PolicyConfig, SamplerConfig
 from accerl_lerobot.policies.loading import load_adapter, load_lerobot_config, no_tf32, resolve_device
 from accerl_lerobot.policies.saving import save_pretrained
+from accerl_lerobot.testing import perturb
 from tests.policies.checkpoints import (
     edit_config,
     stock_chunk,
@@ -32,7 +33,7 @@ from tests.policies.checkpoints import (
     write_diffusion,
     write_smolvla,
 )
-from tests.policies.tiny import adapter_at, perturb, requests
+from tests.policies.tiny import adapter_at, requests
 from tests.policies.tiny_pi import ACTIONS, COMMIT, KINDS, PALIGEMMA, SKIP, hub, write_pi
 
 MODELING = "lerobot.policies.pi0_fast.modeling_pi0_fast"

@@ -19,8 +19,9 @@ from accerl_lerobot.policies import vla as pi0_fast
 from accerl_lerobot.policies.adapter import LeRobotAdapter, stack_observations
 from accerl_lerobot.policies.config import FlowSamplerConfig, PolicyConfig, TokenSamplerConfig
 from accerl_lerobot.policies.saving import save_pretrained
+from accerl_lerobot.testing import check_ratio_one, perturb, stored
 from tests.policies.cases import CASES
-from tests.policies.tiny import adapter_at, check_ratio_one, perturb, requests, stored
+from tests.policies.tiny import adapter_at, requests
 from tests.policies.tiny_pi import CHARACTERS, KINDS, LOWEST, SCALE, SKIP, VOCABULARY, write_pi
 from tests.rounding import assert_close
 

@@ -17,9 +17,10 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.adapter import LeRobotAdapter, stack_observations
 from accerl_lerobot.policies.config import PolicyConfig, TuningConfig
 from accerl_lerobot.policies.saving import save_pretrained
+from accerl_lerobot.testing import check_ratio_one, log_ratio, perturb, stored
 from accerl_lerobot.weights.shared_memory import Received, SharedMemoryPublisher, SharedMemoryReader
 from tests.policies.cases import CASES
-from tests.policies.tiny import adapter_at, check_ratio_one, log_ratio, perturb, requests, stored
+from tests.policies.tiny import adapter_at, requests
 from tests.rounding import assert_close
 
 BACKBONES = {

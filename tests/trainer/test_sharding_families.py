@@ -22,11 +22,12 @@ from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.config import TuningConfig
 from accerl_lerobot.policies.saving import copy_weights
+from accerl_lerobot.testing import perturb
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.ranks import Ranks
 from accerl_lerobot.trainer.update import Update
 from tests.policies.cases import CASES as POLICIES
-from tests.policies.tiny import adapter_at, as_segment, perturb
+from tests.policies.tiny import adapter_at, as_segment
 from tests.rounding import assert_close
 from tests.trainer.sharded import joined
 

@@ -1,0 +1,230 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A policy and an algorithm of somebody else's package: checked, trained, and run by LeRobot.
+
+Each test begins where nobody has heard of them: who forgets to import the package fails.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from lerobot.configs.policies import PreTrainedConfig
+
+from accerl_lerobot import load_policy
+from accerl_lerobot.algorithms import AlgorithmConfig
+from accerl_lerobot.config.parsing import parse
+from accerl_lerobot.config.ranges import DatasetConfig
+from accerl_lerobot.demos.sft import SFTConfig, sft_command
+from accerl_lerobot.engine.config import LaunchConfig, RunConfig
+from accerl_lerobot.envs import SimulatedConfig, make_world
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.experience import Observation
+from accerl_lerobot.policies.config import PLUGINS, POLICIES, PolicyConfig
+from accerl_lerobot.policies.flow import FlowShape
+from accerl_lerobot.policies.loading import load_adapter, rehearsed_config
+from accerl_lerobot.testing import check_policy
+from tests.policies.checkpoints import write_policy
+from tests.runs import tiny_run, trained
+
+SOURCE = Path(__file__).parent / "packages" / "lerobot_policy_mlp_flow"
+PACKAGE, POLICY, ALGORITHM = SOURCE.name, "mlp_flow", "cispo"
+FLAG = f"--policy.discover_packages_path={PACKAGE}"
+NAMED = [f"--algorithm.discover_packages_path={PACKAGE}.algorithm", f"--algorithm.type={ALGORITHM}"]
+
+
+def forget() -> None:
+    for registry in (POLICIES, PLUGINS, PreTrainedConfig.get_known_choices()):
+        registry.pop(POLICY, None)  # type: ignore[attr-defined]
+    AlgorithmConfig.get_known_choices().pop(ALGORITHM, None)
+    for name in [name for name in sys.modules if name.partition(".")[0] == PACKAGE]:
+        del sys.modules[name]
+
+
+@pytest.fixture(autouse=True)
+def unheard_of(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.syspath_prepend(str(SOURCE))
+    forget()
+    yield
+    forget()
+
+
+@pytest.fixture
+def checkpoint(tmp_path: Path) -> Path:
+    importlib.import_module(PACKAGE)
+    path = write_policy(tmp_path / "pretrained_model", POLICY, image=32)
+    forget()
+    return path
+
+
+@pytest.fixture(scope="module")
+def observations() -> list[Observation]:
+    world = make_world(SimulatedConfig())
+    return [world.reset(seed, "match") for seed in range(3)]
+
+
+def named(checkpoint: Path) -> PolicyConfig:
+    return PolicyConfig(path=str(checkpoint), device="cpu", discover_packages_path=PACKAGE)
+
+
+def test_the_likelihood(checkpoint: Path, observations: list[Observation]):
+    check_policy(named(checkpoint), observations)
+
+
+def another_velocity(policy: Any) -> None:
+    """A sampler that is not LeRobot's."""
+    stock = policy.predict_action_chunk
+    policy.predict_action_chunk = lambda *given, **more: 1.01 * stock(*given, **more)
+
+
+def mixed_batch(policy: Any) -> None:
+    """One decision depends on the others in its batch."""
+    alone = policy.features
+
+    def features(batch: Any) -> Any:
+        return alone(batch) + 0.1 * alone(batch).mean(0)
+
+    policy.features = features
+
+
+def no_gradient(policy: Any) -> None:
+    """The encoder's gradient is lost."""
+    attached = policy.features
+    policy.features = lambda batch: attached(batch).detach()
+
+
+@pytest.mark.parametrize(
+    ("mistake", "message"),
+    [
+        (another_velocity, "the adapter of mlp_flow does not fit LeRobot .*: it differs from its sampler"),
+        (mixed_batch, "of two decisions on one request, .* is off by"),
+        (
+            no_gradient,
+            r"the log-prob does not depend on \['policy.encoder.0.weight', 'policy.encoder.0.bias'",
+        ),
+    ],
+)
+def test_mistakes_are_found(
+    mistake: Callable[[Any], None],
+    message: str,
+    checkpoint: Path,
+    observations: list[Observation],
+    monkeypatch: pytest.MonkeyPatch,
+):
+    module = importlib.import_module(f"{PACKAGE}.modeling_mlp_flow")
+    built = module.MLPFlowPolicy.__init__
+
+    def build(self: Any, config: Any) -> None:
+        built(self, config)
+        mistake(self)
+
+    monkeypatch.setattr(module.MLPFlowPolicy, "__init__", build)
+    with pytest.raises((AssertionError, InputError), match=message):
+        check_policy(named(checkpoint), observations)
+
+
+def test_a_density_that_leaves_out_executed_actions_is_found(
+    checkpoint: Path, observations: list[Observation], monkeypatch: pytest.MonkeyPatch
+):
+    whole = FlowShape.action_mask
+
+    def partial(self: FlowShape) -> Any:
+        mask = whole(self)
+        mask[1:] = False
+        return mask
+
+    monkeypatch.setattr(FlowShape, "action_mask", partial)
+    with pytest.raises(
+        AssertionError, match="standard errors apart: the log-prob is not that of the actions"
+    ):
+        check_policy(named(checkpoint), observations)
+
+
+def test_it_acts(checkpoint: Path, observations: list[Observation]):
+    with pytest.raises(
+        InputError, match=rf"^policy\.type='{POLICY}': .*or name its package: policy\.discover"
+    ):
+        load_adapter(PolicyConfig(path=str(checkpoint)))
+    policy = load_policy(checkpoint, device="cpu", discover_packages_path=PACKAGE)
+    assert policy.act(observations[0]).shape == (4, 2)
+    assert load_policy(checkpoint, device="cpu").history == 1, "once imported, it is known"
+
+
+def test_a_file_alone_imports_no_package(checkpoint: Path, tmp_path: Path):
+    recipe = tmp_path / "recipe.yaml"
+    recipe.write_text(f"policy: {{path: {checkpoint}, discover_packages_path: {PACKAGE}}}\n")
+    with pytest.raises(InputError, match=rf"^policy\.discover_packages_path='{PACKAGE}': a file cannot"):
+        parse(RunConfig, [f"--config_path={recipe}"])
+    assert PACKAGE not in sys.modules
+    config = parse(RunConfig, [f"--config_path={recipe}", FLAG]).policy
+    assert rehearsed_config(config).type == POLICY
+
+
+def test_a_package_that_is_not_there(checkpoint: Path):
+    config = replace(named(checkpoint), discover_packages_path="no_such_package")
+    with pytest.raises(InputError, match=r"^policy\.discover_packages_path='no_such_package': cannot be imp"):
+        rehearsed_config(config)
+
+
+def test_lerobot_s_trainer_is_told_of_it(checkpoint: Path, tmp_path: Path):
+    importlib.import_module(PACKAGE)
+    for sft in (SFTConfig(steps=1, policy={"type": POLICY}), SFTConfig(steps=1, init_path=str(checkpoint))):
+        assert FLAG in sft_command(sft, DatasetConfig(repo_id="a/b"), tmp_path / "sft", 0, "cpu")
+
+
+def test_it_trains_with_its_own_algorithm(checkpoint: Path):
+    algorithm = parse(RunConfig, [*NAMED, "--algorithm.cap=1.5"]).algorithm
+    config = tiny_run(checkpoint, policy=named(checkpoint), algorithm=algorithm)
+    made = trained(replace(config, launch=LaunchConfig(engine="local")), ("match",))
+    assert len(made) == 12 and made[-1]["skipped"] == 0
+    assert any(update["policy_loss"] != 0 for update in made)
+
+
+STOCK = """
+import sys
+import torch
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+from lerobot.utils.import_utils import register_third_party_plugins
+
+register_third_party_plugins()
+config = PreTrainedConfig.from_pretrained(sys.argv[1])
+policy = get_policy_class(config.type).from_pretrained(sys.argv[1])
+before, after = make_pre_post_processors(config, pretrained_path=sys.argv[1])
+images = {name: torch.zeros(1, *feature.shape) for name, feature in config.image_features.items()}
+action = after(policy.select_action(before({"observation.state": torch.zeros(1, 4), **images})))
+print(config.type, tuple(action.shape))
+"""
+
+
+@pytest.mark.slow
+def test_the_installed_package_is_found_by_every_process(checkpoint: Path, tmp_path: Path):
+    """In a run on Ray, by its name; by LeRobot and in an evaluation, as a plugin that pip has announced."""
+    site = tmp_path / "site"
+    pip = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--no-index"]
+    source = shutil.copytree(SOURCE, tmp_path / "source")  # pip builds within it
+    subprocess.run([*pip, f"--target={site}", str(source)], check=True)
+    path = os.pathsep.join([str(site), *filter(None, [os.environ.get("PYTHONPATH")])])
+    environment = os.environ | {"PYTHONPATH": path}
+    accerl = [sys.executable, "-m", "accerl_lerobot.cli"]
+    common = ["--env.type=simulated", "--policy.device=cpu", "--rollout.worlds=4", "--evaluation.episodes=4"]
+    run = [
+        "train", *common, *NAMED, FLAG, f"--policy.path={checkpoint}", "--rollout.segment_length=3",
+        "--replay.capacity=64", "--replay.min_decisions=16", "--replay.ahead=32",
+        "--trainer.updates=4", "--trainer.batch_decisions=16", f"--output_dir={tmp_path / 'run'}",
+    ]  # fmt: skip
+    subprocess.run([*accerl, *run], check=True, env=environment, cwd=tmp_path)
+    trained = tmp_path / "run" / "checkpoints" / "last" / "pretrained_model"
+    command = [sys.executable, "-c", STOCK, str(trained)]
+    shown = subprocess.run(command, check=True, env=environment, cwd=tmp_path, capture_output=True)
+    assert shown.stdout.decode().splitlines()[-1] == f"{POLICY} (1, 2)"
+    evaluation = ["eval", *common, f"--policy.path={trained}", "--launch.engine=local"]
+    subprocess.run([*accerl, *evaluation], check=True, env=environment, cwd=tmp_path)
