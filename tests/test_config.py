@@ -110,9 +110,10 @@ class TestOverrides:
 
 
 MISTAKES: list[tuple[list[str], str]] = [
+    ([], "policy.path=None: give a LeRobot checkpoint"),
     (["--lr=3"], "lr=3: no such field; did you mean sft.lr or trainer.lr?"),
     (["--trainer.lrr=3"], "trainer.lrr=3: no such field; did you mean trainer.lr?"),
-    (["--wandb.zzz=1"], "wandb.zzz=1: no such field; wandb has enable, project, entity"),
+    (["--wandb.zzz=1"], "wandb.zzz=1: no such field; wandb has enable, project"),
     (["--trainer.lr=many"], "trainer.lr='many': use a number"),
     (["--trainer.updates=1.5"], "trainer.updates=1.5: use a whole number"),
     (["--trainer.updates"], "trainer.updates='': give it a value: --trainer.updates=…"),
@@ -139,7 +140,6 @@ MISTAKES: list[tuple[list[str], str]] = [
     (["--policy.push_to_hub=false"], "policy.push_to_hub=False: the name is LeRobot's; a run pushes nothing"),
     (["--algorithm.type=grpo"], "algorithm.type='grpo': use ppo or gipo with --algorithm.advantage=group"),
     (["--env.type=vlabench"], "env.type='vlabench': for LeRobot's vlabench use env.type=lerobot --env.name="),
-    (["--path=x"], "path='x': not a field of this command, but of accerl world-model-eval"),
     (["--seed=1", "--seed=2"], "seed=2: it is set to 1 already; give it once"),
     (["--job_name=" + "x" * 5000], "job_name='xxx"),
     (["--trainer..lr=1"], "argument='--trainer..lr=1': write --section.field=value"),

@@ -320,7 +320,7 @@ def pull(arguments: list[str]) -> int:
 def report(arguments: list[str]) -> int:
     """``accerl report``."""
     config: ReportConfig = parse(ReportConfig, arguments)
-    sys.stdout.write(f"{write_report(config, CONFIGS)}\n")
+    sys.stdout.write(f"{write_report(config)}\n")
     return 0
 
 

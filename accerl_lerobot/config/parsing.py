@@ -503,8 +503,6 @@ def dotted_fields(cls: type[Any], path: tuple[str, ...] = ()) -> Iterator[str]:
 
 def _unknown(key: str, value: Any, path: tuple[str, ...], names: list[str], whole: type[Any]) -> InputError:
     """The error for a field that a config does not have: what it resembles, or where it belongs."""
-    from accerl_lerobot.cli.verbs import CONFIGS
-
     if len(key) > LONGEST_KEY:
         return InputError(key[:LONGEST_KEY], value, "no such field")
     dotted, leaf = ".".join((*path, key)), value
@@ -517,9 +515,6 @@ def _unknown(key: str, value: Any, path: tuple[str, ...], names: list[str], whol
     everywhere = list(dict.fromkeys(dotted_fields(whole)))
     known = {*near, ".".join((*path, key))}
     near += [f for f in everywhere if f.rpartition(".")[2] == key and f not in known]
-    having = [verb for verb, cls in CONFIGS.items() if dotted in set(dotted_fields(cls))]
-    if having and not path:
-        return InputError(dotted, leaf, f"not a field of this command, but of accerl {', '.join(having[:4])}")
     if near:
         remedy = f"no such field; did you mean {' or '.join(near[:4])}?"
     else:

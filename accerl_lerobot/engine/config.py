@@ -162,8 +162,6 @@ class RunConfig(Section):
     save_every_s: NonNegative = 600.0
     """Checkpoint at least every so many seconds of training; 0: none by time. There is always one at the end,
     and one when the run is asked to stop; there is one before training if there are any by number or time."""
-    save_keep: Annotated[int, Range("[1, 1000000]")] = 2
-    """Newest checkpoints that can be resumed from; the others keep their policies only."""
     resume: bool = False
     """Resume the run whose config is ``--config_path``: ``RUN/config.yaml``, or that of one of its
     checkpoints, ``RUN/checkpoints/last/config.yaml``."""

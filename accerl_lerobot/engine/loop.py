@@ -248,7 +248,7 @@ class Loop:
         write_atomically(self.directory / SUMMARY, json.dumps(summary, indent=2) + "\n")
         for left in self.directory.glob(f"{FILMED}.*"):
             left.unlink()
-        prune(self.directory / CHECKPOINTS, self.config.save_keep)  # it has ended
+        prune(self.directory / CHECKPOINTS)  # it has ended
         return dict(summary)
 
     def _state(self) -> dict[str, Any]:
@@ -435,7 +435,7 @@ class Loop:
 
         with self.times.clock.during(CHECKPOINT):
             path = save_checkpoint(self.directory / CHECKPOINTS, write)
-        prune(self.directory / CHECKPOINTS, self.config.save_keep, self._began_at)
+        prune(self.directory / CHECKPOINTS, needed=self._began_at)
         self._saved_at = time.monotonic()
         self.console.say(f"checkpoint {path / PRETRAINED}")
 

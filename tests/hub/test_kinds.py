@@ -89,8 +89,6 @@ def test_other_fields_are_checked():
         PullConfig(repo_id="a/b")
     with pytest.raises(InputError, match="repo_type='space': use model or dataset"):
         PullConfig(repo_id="a/b", output_dir="x", repo_type="space")
-    with pytest.raises(InputError, match="use some text or null"):
-        PushConfig(path="x", repo_id="a/b", message=" ")
 
 
 def test_a_device_or_a_pipe_in_place_of_a_file_is_not_read(tmp_path: Path):

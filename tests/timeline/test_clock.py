@@ -67,17 +67,6 @@ def merged(spans: list[tuple[int, int]]) -> list[tuple[int, int]]:
     return [(s, sum(n for _, n in own)) for s, own in itertools.groupby(spans, key=lambda span: span[0])]
 
 
-def test_entering_the_same_state_again_is_no_entry(tmp_path: Path) -> None:
-    clock, hands = a_clock(tmp_path)
-    clock.enter(COMPUTE)
-    hands.now += 5
-    clock.enter(COMPUTE)
-    clock.close()
-    (path,) = (tmp_path / TIMELINE).iterdir()
-    assert len(path.read_bytes().split(b"\n", 1)[1]) == 2 * 8  # and the beat at the end
-    clock.close()
-
-
 def test_a_while_in_another_state_ends_in_the_one_before_whatever_happens(tmp_path: Path) -> None:
     clock, hands = a_clock(tmp_path)
     clock.enter(COMPUTE)
@@ -154,6 +143,7 @@ def test_a_process_that_was_killed_leaves_all_but_what_was_on_its_way(tmp_path: 
         ("format", "format 9"),
         ("back", "time goes back"),
         ("state", "no such state"),
+        ("name", "no part of a timeline has such a name"),
     ],
 )
 def test_a_damaged_file_is_named(tmp_path: Path, broken: bytes | str, why: str) -> None:
@@ -162,6 +152,8 @@ def test_a_damaged_file_is_named(tmp_path: Path, broken: bytes | str, why: str) 
     head, entries = path.read_bytes().split(b"\n", 1)
     if isinstance(broken, bytes):
         path.write_bytes(broken)
+    elif broken == "name":
+        path = path.rename(path.with_name("notes.bin"))
     elif broken == "format":
         path.write_bytes(json.dumps({**json.loads(head), "timeline": 9}).encode() + b"\n")
     else:
@@ -172,13 +164,6 @@ def test_a_damaged_file_is_named(tmp_path: Path, broken: bytes | str, why: str) 
     assert caught.value.field == "runs"
 
 
-def test_a_file_that_is_none_of_ours_is_named(tmp_path: Path) -> None:
-    (tmp_path / TIMELINE).mkdir()
-    (tmp_path / TIMELINE / "notes.bin").write_bytes(b"")
-    with pytest.raises(InputError, match=r"notes\.bin.*no part of a timeline has such a name"):
-        read_timeline(tmp_path)
-
-
 def test_without_a_folder_nothing_is_recorded() -> None:
     clock = open_clock(None, "trainer")
     assert isinstance(clock, NoClock)
@@ -186,11 +171,3 @@ def test_without_a_folder_nothing_is_recorded() -> None:
         clock.beat()
     clock.close()
     assert clock.totals_ns() == {}
-
-
-def test_processes_of_one_worker_write_beside_each_other(tmp_path: Path) -> None:
-    for _ in range(3):
-        open_clock(tmp_path, "rollout 1").close()
-    open_clock(tmp_path, "rollout 11").close()
-    names = {path.name for path in tmp_path.iterdir()}
-    assert names == {"rollout-1.0.0.bin", "rollout-1.1.0.bin", "rollout-1.2.0.bin", "rollout-11.0.0.bin"}
