@@ -82,22 +82,6 @@ def test_a_service_that_dies_while_it_is_asked_and_one_that_is_gone_when_it_is_c
     assert caller.done(60.0) == [(ticket, "last early")]
 
 
-def test_what_is_forgotten_is_not_asked_again():
-    first, second = Service("first"), Service("second")
-    caller = connected(first)
-    kept, forgotten = caller.send("kept"), caller.send("forgotten")
-    caller.forget(forgotten)
-    first.stop()
-    caller.done(0.0)
-    caller.move(second.endpoint)
-    caller.done(0.0)
-    assert [message for message, _ in second.held] == ["kept"]
-    second.answer()
-    assert caller.done(60.0) == [(kept, "second kept")]
-    caller.close()
-    caller.close()
-
-
 def test_a_wait_ends_when_the_service_is_there_and_how_long_it_was_away_counts_from_then():
     service = Service("only")
     caller = ReconnectingClient("inference")
