@@ -159,6 +159,7 @@ def test_mistakes(arguments: list[str], message: str, capsys: pytest.CaptureFixt
 
 
 FILES: list[tuple[str, str]] = [
+    ("sft: &a {steps: 1}\ndemos: *a\n", "not good YAML: line 2: an alias; write the value itself"),
     ("env: {type: metaworld\n", "not good YAML: line 2: expected ',' or '}'"),
     ("env:\n\ttype: metaworld\n", "not good YAML: line 2: found character '\\t'"),
     ("trainer: {lr: 1}\nseed: 1\ntrainer: {lr: 2}\n", "not good YAML: line 3: trainer is given twice"),
@@ -241,8 +242,6 @@ class TestConsent:
             ("imagination: {discover_packages_path: os}", "--imagination.discover_packages_path=os"),
             ("imagination: {success: {code_revision: a}}", "--imagination.success.code_revision=a"),
             ("launch: {address: 'them:6379'}", "--launch.address=them:6379"),
-            ("launch: {open_cluster: true}", "--launch.open_cluster=true"),
-            ("a: &a {trust_remote_code: true}\nsft: *a", "--a.trust_remote_code=true"),
             ('sft: {extra_args: ["\\e[2J"]}', "\\u001b"),
         ],
     )
@@ -274,12 +273,6 @@ class TestConsent:
         path = tmp_path / "config.yaml"
         path.write_text("sft: {trust_remote_code: true}\nenv: {type: simulated}")
         assert parse(EvalRun, [str(path)], recipe_class=RunConfig).env == SimulatedConfig()
-
-    def test_is_looked_for_once_in_what_aliases_repeat(self) -> None:
-        tree: Any = {"x": 1}
-        for _ in range(40):
-            tree = [tree] * 9
-        assert parsing.consents({"a": tree}) == {}
 
 
 class TestPreflight:
