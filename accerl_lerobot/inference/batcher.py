@@ -101,11 +101,6 @@ class Batcher[R: Sized]:
         """Requests that wait."""
         return len(self._waiting)
 
-    @property
-    def observations(self) -> int:
-        """Observations that wait."""
-        return self._observations
-
     def add(self, request: R, now: float) -> None:
         """Queue a request.
 

@@ -15,10 +15,11 @@ import yaml
 from accerl_lerobot.checkpoint.layout import SUMMARY
 from accerl_lerobot.console import count, duration, number, percent, rate
 from accerl_lerobot.engine.preflight import lag_limits
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.report.charts import COLOURS, Chart, Series, line, rates
 from accerl_lerobot.report.read import Record, Run, apart, column, differences, newest, resolved
-from accerl_lerobot.timeline import ROLES, STATES
-from accerl_lerobot.world_model.config import OnlineLearnConfig
+from accerl_lerobot.timeline import STATES
+from accerl_lerobot.timeline.read import read_timeline
 
 RECENT_S = 120.0
 """A run that has written something since is taken to be still going."""
@@ -80,19 +81,6 @@ IMAGINATION: tuple[Spec, ...] = (
      {"imagination_check_skill_changed_first": "after one chunk",
       "imagination_check_skill_changed_last": "at the horizon"}, {"top": 1}),
 )  # fmt: skip
-CHECKS = {
-    "skill_changed_first": ("skill_first", "better than a copy of the last frame, where pixels changed"),
-    "skill_changed_last": ("skill_last", "the same at the end of the horizon"),
-    "skill_last": ("skill_last", "the same on all pixels"),
-    "sensitivity_low": ("sensitivity", "how much worse it gets with another episode's actions"),
-    "auroc": ("auroc", "tells episodes that succeed from those that fail, lower end of the interval"),
-    "false_success": ("false_success", "failed episodes that are imagined as successes"),
-    "false_success_idle": ("false_success", "rollouts imagined without actions, taken for successes"),
-    "recall": ("recall", "successes that are imagined as such"),
-}
-"""Check of a world model → the field of `ValidationConfig` with its threshold, and its meaning."""
-
-
 Table = tuple[str, Sequence[str], Sequence[Sequence[str]]]
 """Caption, columns and rows; the first cell of a row is its heading."""
 
@@ -124,7 +112,8 @@ def run_page(run: Run, now: float) -> dict[str, Any]:
     """Values for the template: the page of one run, at `now`, in seconds since 1970."""
     config, why = resolved(run.config)
     bound = None if config is None else lag_limits(config)[0]
-    changes = [(name, shown(value), shown(default)) for name, value, default in differences(run.config)]
+    found = () if config is None else differences(config)
+    changes = [(name, shown(value), shown(default)) for name, value, default in found]
     text = f"This accerl cannot read the recipe: {why}." if why else "Fields that differ from the defaults:"
     success, *others = _training_sections(run, bound)
     sections = [
@@ -214,7 +203,8 @@ def shown(value: Any) -> str:
     """A value as one would type it."""
     if isinstance(value, str):
         return value
-    text = yaml.safe_dump(value, default_flow_style=True, width=10_000, allow_unicode=True)
+    plain = list(value) if isinstance(value, tuple) else value
+    text = yaml.safe_dump(plain, default_flow_style=True, width=10_000, allow_unicode=True)
     return text.removesuffix("\n").removesuffix("\n...")
 
 
@@ -276,7 +266,7 @@ def evaluated(run: Run, name: str, colour: int) -> Series:
 
 
 def _imagination(run: Run) -> Section:
-    """Imagined rollouts: how many, how true, and the checks that the world model had to pass."""
+    """Imagined rollouts: how many, how true, and how often the world model passed validation."""
     title, settings, rollout = "Imagined rollouts", run.section("imagination"), run.rollout
     if not settings.get("share") or newest(rollout, "imagination_rollouts") is None:
         return Section(title)
@@ -292,43 +282,34 @@ def _imagination(run: Run) -> Section:
     real, imagined = (newest(rollout, f"replay_{kind}trained_decisions") or 0.0 for kind in ("", "imagined_"))
     if real + imagined:
         text += f" {percent(imagined / (real + imagined))} of the decisions learned from were imagined."
-    checks = []
-    for name, (threshold, meaning) in CHECKS.items():
-        value = newest(rollout, f"imagination_check_{name}")
-        if value is not None:
-            bound, below = getattr(OnlineLearnConfig.validation, threshold), threshold == "false_success"
-            holds = value <= bound if below else value > bound
-            wanted = f"{'at most' if below else 'above'} {bound}"
-            checks.append((name, number(value, 3), wanted, "holds" if holds else "fails", meaning))
     caption = "a recorded episode above, and what the world model imagined with the same actions below. The "
     caption += "frame at the end is green for a success and red for a failure."
     videos = [
         (path, f"Validation {path.stem.replace('_', ', ').lstrip('0')}: {caption}")
         for path in dict.fromkeys([*run.imagined_videos[:1], *run.imagined_videos[-1:]])
     ]
-    columns = ("check", "value", "wanted", "", "meaning")
-    tables = [("The last validation of the world model", columns, checks)] if checks else []
-    return Section(title, text, charts=_charts(rollout, IMAGINATION), tables=tables, videos=videos)
+    return Section(title, text, charts=_charts(rollout, IMAGINATION), videos=videos)
 
 
 def _time_shares(run: Run) -> dict[str, list[tuple[str, float, str, int]]]:
-    """How the time of each role divides, as `Section.bars`; nothing for a run without a timeline."""
-    bars = {}
-    for role in ROLES[1:]:  # the driver neither works nor waits
-        prefix = f"timeline_{role.replace(' ', '_')}"
-        own = {s: _time_mean(run.rollout, f"{prefix}_{s}_share", f"{prefix}_bubble") for s in STATES}
-        if any(own.values()):
-            bars[role] = [(s.replace("_", " "), v, percent(v), STATE_COLOURS[s]) for s, v in own.items() if v]
-    return bars
+    """How the time of each role divides in the training, as `Section.bars`; nothing without a timeline."""
+    try:
+        timeline = read_timeline(run.path)
+    except InputError:
+        return {}
+    shares = timeline.shares(timeline.training())
+    return {
+        role: [(state.replace("_", " "), v, percent(v), STATE_COLOURS[state]) for state, v in own.items()]
+        for role, own in shares.items()
+        if role != "driver"  # which neither works nor waits
+    }
 
 
-def _time_mean(records: Sequence[Record], name: str, present: str = "") -> float | None:
-    """Mean of shares of the time since the record before, over the records that have `present`."""
+def _time_mean(records: Sequence[Record], name: str) -> float | None:
+    """Mean of shares of the time since the record before."""
     length = np.diff(column(records, "wall_s"), prepend=np.nan)
-    there = np.isfinite(column(records, present or name)) & (length > 0)
-    if not there.any():
-        return None
-    return float(np.average(np.nan_to_num(column(records, name)[there]), weights=length[there]))
+    there = np.isfinite(column(records, name)) & (length > 0)
+    return float(np.average(column(records, name)[there], weights=length[there])) if there.any() else None
 
 
 def _speed(run: Run) -> Section:

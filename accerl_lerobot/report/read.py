@@ -11,8 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,14 +20,7 @@ import numpy as np
 
 from accerl_lerobot.checkpoint.layout import CONFIG, SUMMARY
 from accerl_lerobot.checkpoint.safety import Origin, brief, check_folder
-from accerl_lerobot.config.parsing import (
-    TYPE,
-    choices_of,
-    decode,
-    encode,
-    read_recipe,
-    section_of,
-)
+from accerl_lerobot.config.parsing import TYPE, decode, read_recipe
 from accerl_lerobot.console import ABSENT
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.errors import InputError
@@ -108,14 +100,11 @@ class Run:
 
 def read_run(path: Path) -> Run:
     """Reads a folder."""
-    if not path.is_dir():
-        remedy = "no such folder" if not path.exists() else "a file; name the folder of a run"
-        raise InputError("runs", str(path), remedy)
+    check_folder(path, Origin("runs", str(path)))
     config_path = path / CONFIG
     if not config_path.is_file():
         remedy = f"no run in it: there is no {CONFIG}, which every run writes first"
         raise InputError("runs", str(path), remedy)
-    check_folder(path, Origin("runs", str(path)))
     config = read_recipe(config_path)
     if not {"algorithm", "trainer"} <= config.keys():
         raise InputError("runs", str(path), f"no run in it: its {CONFIG} is not one of accerl train")
@@ -229,22 +218,37 @@ def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return fields
 
 
-def differences(tree: dict[str, Any]) -> list[tuple[str, Any, Any]]:
-    """Field, value and default, where the two differ.
+def differences(config: Any, default: Any = None, prefix: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Dotted field, value and default, where the two differ.
 
     Defaults are those of the types that were chosen: GIPO's for a run of GIPO. That it was chosen is a
     difference too, and so is a section that is off unless it is given.
+
+    Args:
+        config: a section, or all of it.
+        default: its default; None, or one of another type: the defaults of its fields.
+        prefix: name of the section with a dot.
     """
-    values = {key: value for key, value in flat(tree).items() if key not in PLACES}
-    defaults, untouched = (flat(_defaults(None, RunConfig, chosen)) for chosen in (tree, {}))
-    given = [k for k in untouched if k not in values and any(other.startswith(f"{k}.") for other in values)]
-    for key in untouched:
-        if key.rpartition(".")[2] == TYPE:
-            defaults[key] = untouched[key]
-    changed = [
-        (k, v, defaults.get(k, ABSENT)) for k, v in values.items() if k not in defaults or defaults[k] != v
-    ]
-    return [(k, values.get(f"{k}.{TYPE}", "given"), untouched[k]) for k in given] + changed
+    for field in dataclasses.fields(config):
+        name, value = f"{prefix}{field.name}", getattr(config, field.name)
+        usual = getattr(default, field.name) if type(default) is type(config) else _default(field)
+        if name in PLACES:
+            continue
+        if not dataclasses.is_dataclass(value):
+            if value != usual:
+                yield name, value, usual
+            continue
+        if usual is None:
+            yield name, getattr(value, TYPE, "given"), None
+        elif type(value) is not type(usual):
+            yield f"{name}.{TYPE}", getattr(value, TYPE), usual.type
+        yield from differences(value, usual, f"{name}.")
+
+
+def _default(field: dataclasses.Field[Any]) -> Any:
+    if field.default_factory is not dataclasses.MISSING:
+        return field.default_factory()
+    return ABSENT if field.default is dataclasses.MISSING else field.default
 
 
 def apart(trees: list[dict[str, Any]]) -> list[tuple[str, list[Any]]]:
@@ -261,29 +265,3 @@ def resolved(tree: dict[str, Any]) -> tuple[RunConfig | None, str]:
         return decode(RunConfig, tree), ""
     except InputError as error:
         return None, str(error)
-
-
-def _defaults(instance: Any, config_class: type[Any], tree: dict[str, Any]) -> dict[str, Any]:
-    """Default of every field where `tree` chooses types; unchecked, as some sections have no default.
-
-    The fields of an `instance` are the defaults, if there is one.
-    """
-    defaults: dict[str, Any] = {}
-    hints = typing.get_type_hints(config_class)
-    for field in dataclasses.fields(config_class):
-        name, value = field.name, _default(field) if instance is None else getattr(instance, field.name)
-        section, given = section_of(hints[name]), tree.get(name)
-        if section is None or not isinstance(given, dict):
-            chosen = getattr(value, TYPE, None) if dataclasses.is_dataclass(value) else None
-            defaults[name] = encode(value) if chosen is None else encode(value) | {TYPE: chosen}
-            continue
-        kind = choices_of(section).get(str(given.get(TYPE)), section)
-        same = value if type(value) is kind else None
-        defaults[name] = _defaults(same, kind, given) | ({TYPE: given[TYPE]} if TYPE in given else {})
-    return defaults
-
-
-def _default(field: dataclasses.Field[Any]) -> Any:
-    if field.default_factory is not dataclasses.MISSING:
-        return field.default_factory()
-    return ABSENT if field.default is dataclasses.MISSING else field.default

@@ -139,5 +139,5 @@ def imagined(share: float = 0.5, on: float = 1.0) -> dict[str, Any]:
         "imagination_success_real": 0.4, "imagination_on": on, "imagination_promoted": 1.0,
         "imagination_rejected": 2.0, "imagination_learn_episodes": 30.0, "replay_imagined_share": share,
         "replay_trained_decisions": 100.0, "replay_imagined_trained_decisions": 300.0,
-        "imagination_check_skill_changed_first": 0.7, "imagination_check_false_success": 0.8,
+        "imagination_check_skill_changed_first": 0.7,
     }  # fmt: skip

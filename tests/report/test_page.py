@@ -23,6 +23,7 @@ from accerl_lerobot.report import ReportConfig, write_report
 from accerl_lerobot.report.charts import Chart
 from accerl_lerobot.report.content import evaluated, exploring
 from accerl_lerobot.report.read import read_run
+from accerl_lerobot.timeline import COMPUTE, RECOVERY, TRAINING, WAIT_IN
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.world_model.config import VIDEOS
 from tests.report.folders import (
@@ -36,6 +37,7 @@ from tests.report.folders import (
 )
 from tests.report.html import Seen
 from tests.runs import tiny_run
+from tests.timeline.folders import write_worker
 
 
 def page_of(*runs: Path, **fields: Any) -> Seen:
@@ -108,7 +110,9 @@ def test_the_headline_does_not_promise_more_than_was_measured(
 
 def test_numbers_of_a_known_run(tmp_path: Path) -> None:
     folder = write_run(tmp_path / "run")
-    text, run = page_of(folder).text, read_run(folder)
+    seen, run = page_of(folder), read_run(folder)
+    text = seen.text
+    assert not [a for _, a in seen.elements if a.get("class") == "warnings"], "nothing went wrong"
     points = evaluated(run, "evaluation", 0)
     assert (points.x.tolist(), points.y.tolist()) == ([0, 4000], [0.4, 0.9])
     # The 1000 env steps of the evaluation before are not experience; the first 24 episodes say nothing.
@@ -138,10 +142,6 @@ def test_who_waited_for_whom(tmp_path: Path, waited: float, busy: float, said: s
     assert said in page_of(folder).text
 
 
-def test_nothing_goes_wrong_so_nothing_is_warned_of(tmp_path: Path) -> None:
-    assert [a for _, a in page_of(write_run(tmp_path / "run")).elements if a.get("class") == "warnings"] == []
-
-
 @pytest.mark.parametrize(
     ("numbers", "said"),
     [
@@ -156,6 +156,13 @@ def test_nothing_goes_wrong_so_nothing_is_warned_of(tmp_path: Path) -> None:
 )
 def test_what_went_wrong_is_said(tmp_path: Path, numbers: dict[str, float], said: str) -> None:
     assert said in page_of(write_run(tmp_path / "run", rollout=numbers)).text
+
+
+def test_how_workers_spent_their_time_in_the_training(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run")
+    write_worker(folder, "driver", [(RECOVERY, 1), (TRAINING, 4)])
+    write_worker(folder, "rollout 0", [(RECOVERY, 1), (COMPUTE, 3), (WAIT_IN, 1)])
+    assert "rollout compute 75 % wait in 25 %" in page_of(folder).text
 
 
 def test_a_run_that_is_going_on_and_one_that_has_died(tmp_path: Path) -> None:
@@ -186,8 +193,6 @@ def test_imagined_rollouts(tmp_path: Path) -> None:
     assert "100 imagined rollouts of 700 decisions; 60 % of them succeeded, and 3 ended early" in text
     assert "The world model passed 1 of 3 validations." in text
     assert "75 % of the decisions learned from were imagined" in text and "real 40 % → 40 %" in text
-    assert "skill_changed_first 0.7 above 0.3 holds" in text
-    assert "false_success 0.8 at most 0.5 fails" in text
     off = page_of(write_run(tmp_path / "off", config=imagining(), rollout=imagined(on=0.0))).text
     assert "Imagination was switched off: 70 % success imagined, 40 % in reality." in off
     assert "imagined rollouts" not in page_of(write_run(tmp_path / "none")).text
@@ -272,13 +277,6 @@ class TestPlace:
         with pytest.raises(InputError, match="there is another file or folder of this name"):
             page_of(folder)
         assert (folder / "report.html").read_text() == "<html>somebody's own</html>"
-
-    def test_an_older_page_is_replaced(self, tmp_path: Path) -> None:
-        folder = write_run(tmp_path / "run", finished=False)
-        assert "still going" in page_of(folder).text
-        write_run(tmp_path / "other")
-        (tmp_path / "other" / "summary.json").rename(folder / "summary.json")
-        assert "finished" in page_of(folder).text
 
     def test_no_such_place(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         runs = [write_run(tmp_path / name) for name in ("a", "b")]

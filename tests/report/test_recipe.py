@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def changed(config: RunConfig) -> dict[str, Any]:
-    return {field: value for field, value, _ in differences(encode(config))}
+    return {field: value for field, value, _ in differences(config)}
 
 
 def test_the_defaults_differ_in_nothing() -> None:
@@ -40,7 +40,7 @@ def test_a_recipe_differs_in_what_it_says(path: Path) -> None:
     config = parse(RunConfig, [str(path)])
     said = {k: v for k, v in flat(read_recipe(path)).items() if k != "job_name"}
     found = changed(config)
-    assert said.keys() >= found.keys() - {"sft.backbone", "policy.sampler"}
+    assert said.keys() >= found.keys() - {"sft.backbone", "sft.policy", "policy.sampler"}
     now, usual = flat(encode(config)), flat(encode(RunConfig()))
     assert found.keys() >= {key for key in said if key in usual and usual[key] != now[key]}
 
@@ -59,9 +59,6 @@ def test_a_recipe_of_another_version() -> None:
     tree["replay"]["colour"] = "blue"
     config, why = resolved(tree)
     assert config is None and "replay.colour" in why
-    assert ("replay.colour", "blue", "–") in differences(tree)
-    tree["algorithm"] = {"type": "reinforce"}
-    assert ("algorithm.type", "reinforce", "gipo") in differences(tree)
 
 
 def test_a_section_that_is_off_unless_given() -> None:

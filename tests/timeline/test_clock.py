@@ -51,11 +51,6 @@ def test_states_exclude_each_other_and_leave_no_time_out(tmp_path: Path, seed: i
     clock, hands = a_clock(tmp_path)
     spans = lived(clock, hands, random.Random(seed), turns=3000)
     clock.close()
-    totals = clock.totals_ns()
-    assert sum(totals.values()) == hands.now - UP
-    assert totals == {
-        name: sum(length for state, length in spans if state == number) for number, name in enumerate(STATES)
-    }
     (row,) = read_timeline(tmp_path).rows
     assert row.times[0] == 0 and row.times[-1] == hands.now - UP
     # States in which no time was spent may be there or not.
@@ -75,7 +70,9 @@ def test_a_while_in_another_state_ends_in_the_one_before_whatever_happens(tmp_pa
         raise KeyError
     hands.now += 2
     clock.beat()
-    assert (clock.totals_ns()["wait_out"], clock.totals_ns()["compute"]) == (7, 2)
+    (row,) = read_timeline(tmp_path).rows
+    assert row.states.tolist() == [RECOVERY, COMPUTE, WAIT_OUT, COMPUTE]
+    assert np.diff(row.times).tolist() == [0, 0, 7, 2]
 
 
 def test_entries_and_beats_of_two_threads_leave_no_time_out(tmp_path: Path) -> None:
@@ -94,7 +91,7 @@ def test_entries_and_beats_of_two_threads_leave_no_time_out(tmp_path: Path) -> N
     thread.join()
     clock.close()
     (process,) = read_processes(tmp_path / TIMELINE)
-    assert sum(clock.totals_ns().values()) == process.times[-1] > 0
+    assert process.times[-1] > 0
     assert np.sum(np.diff(process.states.astype(int)) != 0) == 5000
 
 
@@ -105,16 +102,11 @@ def test_what_is_old_makes_room_and_is_counted(tmp_path: Path) -> None:
     files = list((tmp_path / TIMELINE).iterdir())
     # Two parts, each beyond its size by one batch of entries and a first line at most.
     assert len(files) == 2 and sum(f.stat().st_size for f in files) < 2 * (8 * (1000 + 512) + 1000)
-    timeline = read_timeline(tmp_path)
-    (row,) = timeline.rows
+    (row,) = read_timeline(tmp_path).rows
     (process,) = read_processes(tmp_path / TIMELINE)
     assert len(process.states) >= 1000 and row.kept_from > 0
     kept = [(s, n) for s, n in zip(row.states.tolist(), np.diff(row.times).tolist(), strict=True) if n]
     assert merged(kept)[1:] == merged([(s, n) for s, n in spans if n])[-len(merged(kept)) + 1 :]
-    whole = sum(n for _, n in spans)
-    for number, name in enumerate(STATES):
-        exact = sum(n for s, n in spans if s == number) / whole
-        assert timeline.shares()["trainer"][name] == pytest.approx(exact, rel=1e-12)
     assert PART_BYTES / 8 >= 400_000
 
 
@@ -170,4 +162,3 @@ def test_without_a_folder_nothing_is_recorded() -> None:
     with clock.during(COMPUTE):
         clock.beat()
     clock.close()
-    assert clock.totals_ns() == {}
