@@ -218,19 +218,3 @@ def test_a_dataset_is_tagged_where_lerobot_looks(
     assert first["unchanged"] and repo.tags == {"v3.0": first["commit"]}
     write_json(dataset / "meta" / "more.json", {"origin": str(tmp_path)})
     assert repo.tags == {"v3.0": pushed(dataset)["commit"]} != {"v3.0": first["commit"]}
-
-
-@pytest.mark.parametrize("kind", ["run", "policy"])
-def test_no_path_of_this_machine_is_uploaded(hub: HubServer, tmp_path: Path, pushed: Push, kind: str):
-    run = write_run_folder(tmp_path / "run", pretrained_path=str(tmp_path / "sft"), type="smolvla")
-    policy = run / "checkpoints" / "last" / "pretrained_model"
-    write_json(
-        policy / "train_config.json", {"output_dir": str(tmp_path), "dataset": {"root": str(tmp_path / "d")}}
-    )
-    assert str(tmp_path) in (run / "metrics.jsonl").read_text()
-    pushed(run if kind == "run" else policy)
-    leaks = {
-        n for n, data in hub.files(NAME).items() if str(tmp_path).encode() in data or b"my demos" in data
-    }
-    assert leaks == set()
-    assert not [line for line in hub.seen if str(tmp_path) in line]
