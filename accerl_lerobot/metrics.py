@@ -30,11 +30,9 @@ class WandBConfig(Section, section="wandb"):
     """Weights & Biases, off unless enabled."""
 
     enable: bool = False
-    """Log there too; the machine must be logged in."""
+    """Log there too; the machine must be logged in. WANDB_ENTITY names a team."""
     project: str = "accerl-lerobot"
     """Project of the run."""
-    entity: str | None = None
-    """User or team; null is the default one."""
 
 
 class MetricsLog:
@@ -60,7 +58,6 @@ class MetricsLog:
                 note.write_text(secrets.token_hex(8))
             self._wandb = client.init(
                 project=wandb.project,
-                entity=wandb.entity,
                 dir=str(directory),
                 name=directory.name,
                 id=note.read_text(),

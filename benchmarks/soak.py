@@ -27,7 +27,7 @@ from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError, check_absent, make_folder
 from accerl_lerobot.metrics import METRICS, MetricsLog, WandBConfig
 from accerl_lerobot.replay.journal import EPISODES
-from accerl_lerobot.timeline.read import shares
+from accerl_lerobot.timeline.read import read_timeline
 from accerl_lerobot.trainer.batch import MAX_NONFINITE
 from benchmarks.audit import audit_segments, audit_updates
 from benchmarks.faults import BenchFaultsConfig, Start, end_run, recipe_of
@@ -176,7 +176,8 @@ def costs(run: Path) -> dict[str, float]:
     """Shares of a run's time: the trainer's and replay's in which they were saved, the driver's in which it
     saved, and of one process what writing its log once more takes.
     """
-    spent = shares(run, training=True)
+    timeline = read_timeline(run)
+    spent = timeline.shares(timeline.training())
     roles = ("trainer", "replay", "driver")
     found = {f"checkpoint_{role}": spent.get(role, {}).get("checkpoint", 0.0) for role in roles}
     lines = (run / METRICS).read_text().splitlines()

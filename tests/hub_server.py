@@ -265,7 +265,7 @@ class Handler(BaseHTTPRequestHandler):
         if found is None:
             raise RefusedError(404, message=f"no route {path}")
         kind, repo_id, verb, rest = found.groups()
-        writing = verb in ("commit", "preupload", "tag", "branch")
+        writing = verb in ("commit", "preupload", "tag")
         return self._api(self._open(kind, repo_id, who, writing=writing), repo_id, verb, rest, body)
 
     def _account(self) -> tuple[str, str] | None:
@@ -311,9 +311,6 @@ class Handler(BaseHTTPRequestHandler):
             return self._json(refs)
         if verb == "tag" and self.command == "DELETE":
             return self._json(repo.tags.pop(str(rest)))
-        if verb == "branch":
-            repo.branches[str(rest)] = repo.branches["main"]
-            return self._json({})
         commit = repo.resolve(rest or "main")
         if commit is None:
             raise RefusedError(404, "RevisionNotFound", "Invalid rev id")

@@ -45,36 +45,21 @@ def listing(folder: Path) -> list[str]:
 
 
 def test_layout(tmp_path: Path):
-    path = save_checkpoint(tmp_path / "checkpoints", writer(7))
-    assert path == tmp_path / "checkpoints" / "000007"
-    assert listing(path) == ["manifest.json", PRETRAINED, "training_state"] and listing(
-        path / PRETRAINED
-    ) == ["model.safetensors"]
-    step = json.loads((path / "training_state" / "training_step.json").read_text())
-    assert step == {"step": 7}
-    assert listing(path.parent) == ["000007", "last"]
-
-
-def test_last_is_the_newest_and_survives_a_move(tmp_path: Path):
-    for version in (1, 20):
-        save_checkpoint(tmp_path / "run" / "checkpoints", writer(version))
-    last = tmp_path / "run" / "checkpoints" / "last"
-    assert os.readlink(last) == "000020", "relative"
-    shutil.move(tmp_path / "run", tmp_path / "moved")
-    moved = tmp_path / "moved" / "checkpoints"
-    assert (moved / "last" / PRETRAINED / "model.safetensors").read_text() == "weights"
-    assert listing(moved) == ["000001", "000020", "last"]
-
-
-def test_nothing_is_visible_while_it_is_written(tmp_path: Path):
     seen: list[list[str]] = []
 
     def write(directory: Path) -> int:
-        seen.append([name for name in listing(tmp_path) if not name.startswith(".")])
-        return writer(3)(directory)
+        seen.append([name for name in listing(directory.parent) if not name.startswith(".")])
+        return writer(20)(directory)
 
-    save_checkpoint(tmp_path, write)
-    assert seen == [[]]
+    save_checkpoint(tmp_path / "run", writer(7))
+    path = save_checkpoint(tmp_path / "run", write)
+    assert seen == [["000007", "last"]], "nothing is visible while it is written"
+    assert listing(path) == ["manifest.json", PRETRAINED, TRAINING_STATE]
+    assert listing(path / PRETRAINED) == ["model.safetensors"]
+    assert json.loads((path / TRAINING_STATE / "training_step.json").read_text()) == {"step": 20}
+    assert listing(path.parent) == ["000007", "000020", "last"]
+    shutil.move(tmp_path / "run", tmp_path / "moved")
+    assert os.readlink(tmp_path / "moved" / "last") == "000020", "relative"
 
 
 def test_a_failure_leaves_everything_as_it_was(tmp_path: Path):
@@ -134,6 +119,7 @@ def test_nothing_but_a_half_written_one_is_none(tmp_path: Path):
 def state_writer(version: int) -> Callable[[Path], int]:
     def write(directory: Path) -> int:
         snapshot.save(directory / TRAINING_STATE / RUN_STATE, {"version": version, "array": np.arange(50)})
+        snapshot.save(directory / TRAINING_STATE / WEIGHTS, {"w": np.array([1.0, 2.0])})
         return writer(version)(directory)
 
     return write
@@ -145,7 +131,7 @@ def test_every_torn_or_changed_file_is_noticed_and_the_one_before_is_taken(tmp_p
     newest = tmp_path / "000002"
     assert newest_whole(tmp_path) == (newest, [])
     files = [path for path in newest.rglob("*") if path.is_file()]
-    assert len(files) == 5
+    assert len(files) == 7
     for path in files:
         whole = path.read_bytes()
         changed = bytes([whole[0] ^ 1]) + whole[1:]
@@ -180,72 +166,47 @@ def test_where_nothing_is_whole_nothing_is_begun_from_scratch(tmp_path: Path):
         newest_whole(tmp_path)
 
 
-def test_an_older_one_may_be_named(tmp_path: Path):
-    for version in (1, 2, 30):
-        save_checkpoint(tmp_path, state_writer(version))
-    assert newest_whole(tmp_path, "000002")[0].name == "000002"
-    with pytest.raises(InputError, match="no such checkpoint; there are 000001, 000002, 000030"):
-        newest_whole(tmp_path, "000003")
-
-
-def test_only_the_newest_keep_what_it_takes_to_go_on(tmp_path: Path):
+def test_only_the_newest_keep_their_training_state(tmp_path: Path):
     for version in range(1, 6):
         save_checkpoint(tmp_path, state_writer(version))
-        prune(tmp_path, keep=2)
+        prune(tmp_path, needed="000002")
     kept = [path.name for path in sorted(tmp_path.glob("0*")) if (path / TRAINING_STATE).exists()]
-    assert kept == ["000004", "000005"]
+    assert kept == ["000002", "000004", "000005"]
+    assert listing(tmp_path / "000002" / TRAINING_STATE) == ["weights.json", "weights.safetensors"]
+    assert snapshot.load(tmp_path / "000002" / TRAINING_STATE / WEIGHTS)["w"].tolist() == [1.0, 2.0]
     assert all((tmp_path / f"00000{v}" / PRETRAINED / "model.safetensors").is_file() for v in range(1, 6))
     assert all(defect(tmp_path / f"00000{v}") is None for v in range(1, 6))
-    with pytest.raises(InputError, match="000003: its training state was not kept, see save_keep"):
+    assert newest_whole(tmp_path)[0].name == "000005" and newest_whole(tmp_path, "000004")[0].name == "000004"
+    with pytest.raises(InputError, match="000003: only the newest 2 keep their training state"):
         newest_whole(tmp_path, "000003")
+    with pytest.raises(InputError, match="no such checkpoint; there are 000001, 000002"):
+        newest_whole(tmp_path, "000006")
+    prune(tmp_path)
+    assert not (tmp_path / "000002" / TRAINING_STATE).exists()
 
 
-def test_of_the_one_that_the_workers_began_from_the_weights_are_spared(tmp_path: Path):
-    for version in range(1, 6):
-        write = state_writer(version)
-        save_checkpoint(tmp_path, lambda folder, write=write: (write(folder), with_weights(folder))[0])
-        prune(tmp_path, keep=1, needed="000002")
-    kept = [path.name for path in sorted(tmp_path.glob("0*")) if (path / TRAINING_STATE).exists()]
-    assert kept == ["000002", "000005"]
-    spared = tmp_path / "000002" / TRAINING_STATE
-    assert sorted(p.name for p in spared.iterdir()) == ["weights.json", "weights.safetensors"]
-    assert snapshot.load(spared / WEIGHTS)["w"].tolist() == [1.0, 2.0] and defect(tmp_path / "000002") is None
-    with pytest.raises(InputError, match="000002: its training state was not kept"):
-        newest_whole(tmp_path, "000004")  # and not what is older still
-    assert newest_whole(tmp_path)[0].name == "000005"
-    prune(tmp_path, keep=1)
-    assert not spared.exists()
-
-
-def with_weights(folder: Path) -> None:
-    snapshot.save(folder / TRAINING_STATE / WEIGHTS, {"w": np.array([1.0, 2.0])})
-
-
-def test_what_is_let_go_vouches_for_nothing_else(tmp_path: Path):
-    for version in (1, 2):
+def test_pruning_a_broken_checkpoint_leaves_it_broken(tmp_path: Path):
+    for version in (1, 2, 3):
         save_checkpoint(tmp_path, state_writer(version))
     (tmp_path / "000001" / PRETRAINED / "model.safetensors").write_text("WEIGHTS")
-    prune(tmp_path, keep=1)
+    prune(tmp_path)
     assert defect(tmp_path / "000001") == "pretrained_model/model.safetensors is not what was written"
-    save_checkpoint(tmp_path, state_writer(3))
+    save_checkpoint(tmp_path, state_writer(4))
     (tmp_path / "000002" / "manifest.json").write_text("{")
-    prune(tmp_path, keep=1)
-    assert not (tmp_path / "000002" / TRAINING_STATE).exists() and "is broken" in str(
-        defect(tmp_path / "000002")
-    )
+    prune(tmp_path)
+    assert not (tmp_path / "000002" / TRAINING_STATE).exists()
+    assert "is broken" in str(defect(tmp_path / "000002"))
 
 
-def test_one_that_was_being_let_go_when_the_process_died_is_no_obstacle(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    for version in (1, 2):
+def test_pruning_that_was_interrupted_is_completed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    for version in (1, 2, 3):
         save_checkpoint(tmp_path, state_writer(version))
     with monkeypatch.context() as context:
         context.setattr(shutil, "rmtree", lambda path: (path / "training_step.json").unlink() or 1 / 0)
         with pytest.raises(ZeroDivisionError):
-            prune(tmp_path, keep=1)
-    assert newest_whole(tmp_path)[0].name == "000002" and defect(tmp_path / "000001") is None
-    prune(tmp_path, keep=1)
+            prune(tmp_path)
+    assert newest_whole(tmp_path)[0].name == "000003" and defect(tmp_path / "000001") is None
+    prune(tmp_path)
     assert not (tmp_path / "000001" / TRAINING_STATE).exists()
 
 
@@ -272,13 +233,10 @@ def test_paths_in_the_files_are_those_of_the_final_place(tmp_path: Path):
     assert second["config"] == {"tokenizer_name": home, "max_length": 48}
 
 
-def test_a_backbone_from_the_hub_is_left_alone(tmp_path: Path):
+def test_a_backbone_by_its_bare_name_is_the_one_beside_and_one_from_the_hub_stays(tmp_path: Path):
     (tmp_path / "config.json").write_text('{"vlm_model_name": "some/backbone"}')
     relocate(tmp_path, tmp_path / "home")
     assert (tmp_path / "config.json").read_text() == '{"vlm_model_name": "some/backbone"}'
-
-
-def test_a_backbone_by_its_bare_name_is_the_one_beside(tmp_path: Path):
     (tmp_path / BACKBONE).mkdir()
     (tmp_path / "config.json").write_text(json.dumps({"vlm_model_name": BACKBONE}))
     (tmp_path / "policy_preprocessor.json").write_text('{"steps": []}')

@@ -27,7 +27,7 @@ from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, REAL, Segment
 from accerl_lerobot.rollout.runner import RolloutConfig
-from accerl_lerobot.timeline.read import shares
+from accerl_lerobot.timeline.read import read_timeline
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.world_model.config import (
     ImaginationConfig,
@@ -263,7 +263,7 @@ def test_it_runs_asynchronously(tiny_checkpoint: Path, world_model: Path, tmp_pa
     films = sorted(p.name for p in (tmp_path / "validation").iterdir())
     tried = int(last.imagination["promoted"] + last.imagination["rejected"])
     assert films[0].startswith("0001_") and tried - 1 <= len(films) <= tried + 1
-    spent = shares(tmp_path)
+    spent = read_timeline(tmp_path).shares()
     assert {"recovery", "compute", "transport", "wait_in"} <= spent["imagination"].keys()
     assert len(list((tmp_path / "timeline").glob("imagination*"))) == 1
     saved = snapshot.load(tmp_path / "saved" / TRAINING_STATE / "imagination")["imagination"]

@@ -46,6 +46,7 @@ def events(directory: Path) -> dict[str, list[tuple[int, float]]]:
 def test_each_record_is_a_line_and_an_event(tmp_path: Path) -> None:
     log = MetricsLog(tmp_path, WandBConfig(), {})
     log.write("train", 1, {"loss": 0.5, "decisions": 128})
+    assert len(lines(tmp_path)) == 1, "on disk at once"
     log.write("train", 2, {"loss": 0.25, "decisions": 130})
     log.close()
     first, second = lines(tmp_path)
@@ -77,14 +78,6 @@ def test_what_json_does_not_know(tmp_path: Path) -> None:
     assert (record["single"], record["whole"], record["yes"]) == (0.5, 3, True)
     assert record["tasks"] == {"a": {"ci95": [None, 1.0]}} and record["name"] == "during-1"
     assert events(tmp_path).keys() == {"evaluation/single", "evaluation/whole", "evaluation/yes"}
-
-
-def test_a_line_is_on_disk_at_once(tmp_path: Path) -> None:
-    """Whoever watches a run, or finds it after it was killed, sees all of it."""
-    log = MetricsLog(tmp_path, WandBConfig(), {})
-    log.write("train", 1, {"loss": 1.0})
-    assert len(lines(tmp_path)) == 1
-    log.close()
 
 
 def test_wandb_only_when_enabled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -183,30 +176,20 @@ def test_the_summary_is_explained() -> None:
     assert whens <= logged and logged - whens == set(re.findall(r"`([a-z_0-9]+)`", text)) - whens
 
 
-def test_progress_says_how_much_time_is_left(
+def test_progress_without_a_terminal_is_lines_with_the_time_left(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("accerl_lerobot.console.PLAIN_EVERY_S", -1.0)
     now = iter(range(0, 10_000, 60))
     monkeypatch.setattr("accerl_lerobot.console.time.monotonic", lambda: float(next(now)))
-    with Console().stage("RL", total=500) as stage:
+    console = Console()
+    console.say("success [not markup]")
+    with console.stage("RL", total=500) as stage:
         stage.update(100, "resumed at 100")
         stage.update(200, "and a minute later")
         stage.update(500)
-    err = capsys.readouterr().err
+    out, err = capsys.readouterr()
+    assert out == "" and "RL …" in err and "success [not markup]" in err
     assert "RL 100/500 (20%) · resumed at 100" in err
     assert "RL 200/500 (40%) · 0:03:00 left · and a minute later" in err
     assert "RL 500/500 (100%)\n" in err
-
-
-def test_console_without_a_terminal_prints_lines(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("accerl_lerobot.console.PLAIN_EVERY_S", -1.0)
-    console = Console()
-    with console.stage("SFT", total=10) as stage:
-        stage.update(4, "loss 0.5")
-    console.say("success [not markup]")
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert "SFT …" in err and "SFT 4/10 (40%) · loss 0.5" in err and "success [not markup]" in err

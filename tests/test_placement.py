@@ -164,7 +164,6 @@ def test_a_rollout_worker_whose_node_has_left_goes_to_one_that_is_there():
             r"launch\.address='auto': launch\.engine=local is one process",
         ),
         ({"placement": PlacementConfig(rollout="1")}, r"placement=.*a private Ray has one"),
-        ({"open_cluster": True}, r"launch\.open_cluster=True: it is about the cluster of launch\.address"),
     ],
 )
 def test_a_cluster_that_is_none_is_refused_when_the_recipe_is_read(fields: dict[str, Any], match: str):

@@ -170,7 +170,7 @@ NO_GPU = "no CUDA device here; use cpu or auto"
             [*QUICK, "--wandb.enable=true"],
             "wandb.enable=True: this machine is not logged in: run wandb login",
         ),
-        ([*QUICK, "--save_keep=9"], "output_dir='{out}': "),
+        (QUICK, "output_dir='{out}': "),
         (["demos", f"--config_path={QUICK[1]}"], "demos.root='{out}': "),
     ],
 )

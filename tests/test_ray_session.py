@@ -445,7 +445,8 @@ def test_what_is_no_cluster_to_join_is_refused(
     address: str, status: str, says: str, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(ray_session, "STATUS", ("-c", status))
-    monkeypatch.setattr(ray_session, "ANSWER_S", 1.0)
+    if "sleep" in status:  # the others have to start a process on a machine that may be busy
+        monkeypatch.setattr(ray_session, "ANSWER_S", 1.0)
     with pytest.raises(InputError, match=rf"^launch\.address='{address}': {says}"):
         ray_session.check_cluster(LaunchConfig(address=address))
 
@@ -457,5 +458,3 @@ def test_a_cluster_that_answers_those_with_a_token_only_is_joined(
     monkeypatch.setattr(ray_session, "STATUS", ("-c", asks))
     monkeypatch.setenv("RAY_AUTH_MODE", "token")
     ray_session.check_cluster(LaunchConfig(address=address))
-    monkeypatch.setattr(ray_session, "STATUS", ("-c", "pass"))
-    ray_session.check_cluster(LaunchConfig(address=address, open_cluster=True))

@@ -48,9 +48,7 @@ def recipe(folder: Path, checkpoint: Path, **sections: Any) -> Path:
 def records(run: Path) -> list[dict[str, Any]]:
     """All that was logged, but how long it took."""
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-    return [
-        {k: v for k, v in line.items() if k not in TIMES and not k.startswith("timeline_")} for line in lines
-    ]
+    return [{k: v for k, v in line.items() if k not in TIMES} for line in lines]
 
 
 def summary(run: Path) -> dict[str, Any]:

@@ -8,7 +8,6 @@ import importlib.metadata
 import re
 import subprocess
 import sys
-import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -40,13 +39,6 @@ def findings(source: str) -> Iterator[str]:
 def test_nothing_from_outside_is_run_or_unpickled():
     found = {path.name: list(findings(path.read_text())) for path in sorted(PACKAGE.rglob("*.py"))}
     assert {name: what for name, what in found.items() if what} == {}
-
-
-def test_the_search_finds_calls_and_leaves_others_alone():
-    bad = ["__import__(name)", "np.load(path, allow_pickle=flag)", "f(trust_remote_code=True)"]
-    assert all(list(findings(source)) for source in bad)
-    good = ["re.compile(text)", "np.load(path, allow_pickle=False)", "f(trust_remote_code=config.trust)"]
-    assert not any(list(findings(source)) for source in good)
 
 
 def test_ruff_refuses_what_runs_or_unpickles_what_it_reads():
@@ -99,21 +91,6 @@ def test_no_known_bad_version_is_installed(name: str):
     assert numbers(importlib.metadata.version(name)) >= numbers(least), why
 
 
-def test_versions_are_compared_as_numbers():
-    assert numbers("2.10.0") > numbers("2.9.1") and numbers("2.11.0+cpu") == (2, 11, 0)
-
-
-def test_pins_are_not_below_what_is_known_to_be_bad():
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    everything = [*project["dependencies"], *sum(project["optional-dependencies"].values(), [])]
-    pinned = dict(re.fullmatch(r"([a-z0-9-]+)(?:\[.*\])?==([0-9.]+)", entry).groups() for entry in everything)
-    checked = pinned.keys() & KNOWN_BAD.keys()
-    assert {"torch", "ray"} <= checked
-    for name in checked:
-        assert numbers(pinned[name]) >= numbers(KNOWN_BAD[name][0]), KNOWN_BAD[name][1]
-    assert "pip-audit" in pinned, "make audit"
-
-
 SECRETS = {
     "Hugging Face token": r"\bhf_[A-Za-z0-9]{30,}\b",
     "GitHub token": r"\b(gh[pousr]_[A-Za-z0-9]{36,}|github_pat_[A-Za-z0-9_]{60,})\b",
@@ -147,23 +124,3 @@ def test_no_secret_is_under_version_control():
         if path.is_file() and (there := secrets(path.read_bytes().decode("latin-1"))):
             found[name] = there
     assert found == {}
-
-
-@pytest.mark.parametrize(
-    ("name", "text"),
-    [
-        ("Hugging Face token", "hf_" + "a" * 34),
-        ("GitHub token", "ghp_" + "A1" * 18),
-        ("AWS key", "AKIA" + "ABCD" * 4),
-        ("Google key", "AIza" + "a" * 35),
-        ("Slack token", "xoxb-" + "1" * 12),
-        ("OpenAI or Anthropic key", "sk-ant-" + "x" * 40),
-        ("private key", "-----BEGIN RSA " + "PRIVATE KEY-----"),
-        ("JSON web token", ".".join(("eyJ" + "a" * 20, "eyJ" + "b" * 20, "c" * 20))),
-        ("password in an address", "https://me:" + "hunter22@example.com/x"),
-        ("key that is given", "api_key = '" + "a1" * 16 + "'"),
-        ("W&B key", "WANDB_API_KEY " + "0a" * 20),
-    ],
-)
-def test_the_patterns_find_what_they_are_for(name: str, text: str):
-    assert name in secrets(f"x {text} y")

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -114,19 +113,9 @@ def test_files_of_another_make_are_refused(text: str, tmp_path: Path):
         snapshot.load(tmp_path / "tree")
 
 
-def test_broken_arrays_are_refused(tmp_path: Path):
+@pytest.mark.parametrize("arrays", [b"", b"\xff" * 64])
+def test_broken_arrays_are_refused(arrays: bytes, tmp_path: Path):
     snapshot.save(tmp_path / "tree", {"a": np.zeros(30)})
-    path = tmp_path / "tree.safetensors"
-    whole = path.read_bytes()
-    for broken in (whole[:-1], b"", b"\xff" * 64):
-        path.write_bytes(broken)
-        with pytest.raises(InputError, match="not a state that accerl has saved"):
-            snapshot.load(tmp_path / "tree")
-    path.unlink()
-    with pytest.raises(InputError):
+    (tmp_path / "tree.safetensors").write_bytes(arrays)
+    with pytest.raises(InputError, match="not a state that accerl has saved"):
         snapshot.load(tmp_path / "tree")
-
-
-def test_it_is_json(tmp_path: Path):
-    snapshot.save(tmp_path / "tree", {"a": 1})
-    assert json.loads((tmp_path / "tree.json").read_text()) == {"a": 1}

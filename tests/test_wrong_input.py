@@ -41,7 +41,7 @@ VALUES = [
 RECIPES = [
     "[", "{", "a: [1, 2", "- 1\n- 2\n", "3", "text", "a: 1\na: 2\n", "trainer: {lr: 1, lr: 2}\n",
     "trainer: 3\n", "trainer: [lr]\n", "trainer:\n\tlr: 1\n", "---\na: 1\n---\nb: 2\n",
-    "!!python/object/apply:os.system [ls]\n", "seed: &s 1\nsave_keep: *t\n", "env: {type: [a]}\n",
+    "!!python/object/apply:os.system [ls]\n", "seed: &s 1\nsave_every_s: *t\n", "env: {type: [a]}\n",
     "env: {type: {a: b}}\n", "env: {type: 3}\n", "algorithm: {type: null}\n", "null: 3\n", "3: {a: 1}\n",
     "? [a, b]\n: 3\n", "{[1]: 2}: 3\n", "seed: 0x_\n", "job_name: 2024-13-45\n",
     "trainer: {betas: {a: 1}}\n", "seed: 1e400\n", "sft: {policy: 3}\n",

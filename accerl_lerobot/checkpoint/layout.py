@@ -34,6 +34,8 @@ CHECKPOINTS, DEMOS = "checkpoints", "demos"
 CONFIG, SUMMARY = "config.yaml", "summary.json"
 """Files of a run: its config, and its results once it has ended."""
 MANIFEST, LAST = "manifest.json", "last"
+KEEP = 2
+"""Newest checkpoints that can be resumed from; the others keep their policies only."""
 WRITING, REPLACED = ".writing-", ".replaced-"
 """Prefixes of checkpoints that are being written, and of those that are being replaced."""
 RUN_STATE, WEIGHTS = "run", "weights"
@@ -214,7 +216,7 @@ def newest_whole(checkpoints: Path, wanted: str = LAST) -> tuple[Path, list[str]
     for path in reversed(numbers):
         why = defect(path)
         if why is None and f"{TRAINING_STATE}/{RUN_STATE}.json" not in read_manifest(path)["files"]:
-            why = "its training state was not kept, see save_keep"
+            why = f"only the newest {KEEP} keep their training state"
         if why is None:
             return path, skipped
         skipped.append(f"{path.name}: {why}")
@@ -228,17 +230,16 @@ def saved_version(state: Path) -> int:
     return int(json.loads((state / STEP).read_text())["step"])
 
 
-def prune(checkpoints: Path, keep: int, needed: str | None = None) -> None:
-    """Removes the training state of all but the newest `keep` checkpoints; their policies stay.
+def prune(checkpoints: Path, *, needed: str | None = None) -> None:
+    """Removes the training state of all but the newest `KEEP` checkpoints; their policies stay.
 
     Args:
         checkpoints: their folder.
-        keep: how many.
         needed: name of one whose weights are kept as well, although it cannot be resumed from any more: an
             inference replica that is lost starts again where all workers did.
     """
     having = [path for path in _numbered(checkpoints) if (path / TRAINING_STATE).is_dir()]
-    for path in having[: max(0, len(having) - keep)]:
+    for path in having[:-KEEP]:
         # The manifest first: a checkpoint whose files are half removed would count as broken.
         with contextlib.suppress(InputError, KeyError, AttributeError):
             manifest = read_manifest(path)

@@ -86,7 +86,10 @@ RUN_FILES = {".yaml", ".json", ".jsonl", ".bin", ".safetensors"}
 
 
 def check_folder(folder: Path, origin: Origin) -> None:
-    """Refuses a run's folder with a link that leads out, a pipe or device, or a folder instead of a file."""
+    """Refuses what is no folder, or has a link that leads out, a pipe or device, or a folder for a file."""
+    if not folder.is_dir():
+        remedy = "a file; name the folder of a run" if folder.exists() else "no such folder"
+        raise InputError(origin.field, origin.value, remedy)
     for at, folders, files in os.walk(folder):
         for path in (Path(at, name) for name in (*folders, *files)):
             name = path.relative_to(folder).as_posix()

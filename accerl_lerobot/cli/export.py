@@ -11,7 +11,6 @@ journal is left out and counted.
 from __future__ import annotations
 
 import json
-from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -22,7 +21,7 @@ import numpy as np
 from accerl_lerobot.checkpoint.layout import CONFIG
 from accerl_lerobot.checkpoint.safety import Origin, check_folder
 from accerl_lerobot.config.parsing import DISCOVER, decode, drop_consents, read_recipe
-from accerl_lerobot.config.ranges import DatasetName, NewFolder, Range, Section, Steps
+from accerl_lerobot.config.ranges import DatasetName, NewFolder, Range, Section
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.record import (
     Episode,
@@ -60,8 +59,6 @@ class ExportConfig(Section):
     """Name of the dataset, ``owner/name``."""
     pick: Literal["all", "successes", "failures"] = "all"
     """Episodes by their outcome."""
-    last: Steps = 0
-    """Number of the newest of these; 0: all of them."""
     processes: Annotated[int, Range("[1, 64]")] = 2
     """Simulator processes; does not change the content."""
     hub_path: str | None = None
@@ -82,9 +79,9 @@ def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
         ``episodes``, ``frames``, ``successes``, and ``unlike``, those that differed and were left out.
     """
     run, root = Path(str(config.path)).expanduser(), check_free(config.root)
+    check_folder(run, Origin("path", str(run)))
     if not (run / CONFIG).is_file():
         raise InputError("path", str(run), f"no run in it: there is no {CONFIG}")
-    check_folder(run, Origin("path", str(run)))
     settings = _settings(run, config)
     chosen = _picked(whole_episodes(read_journal(run / EPISODES)), config)
     if not chosen:
@@ -124,8 +121,7 @@ def _settings(run: Path, config: ExportConfig) -> RunConfig:
 
 def _picked(episodes: Iterable[list[Done]], config: ExportConfig) -> list[list[Done]]:
     wanted = config.pick == "successes"
-    picked = (parts for parts in episodes if config.pick == "all" or parts[-1].success is wanted)
-    return list(deque(picked, maxlen=config.last or None))
+    return [parts for parts in episodes if config.pick == "all" or parts[-1].success is wanted]
 
 
 def _write(

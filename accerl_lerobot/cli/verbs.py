@@ -51,16 +51,23 @@ class DemosRun(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SFTRun(Section):
-    """``accerl sft``: LeRobot's own trainer on a LeRobotDataset."""
+class NewFolderRun(Section):
+    """Fields of verbs that compute something into a new folder."""
 
     seed: Seed = 0
     output_dir: str | None = None
     """Folder to create. None: ``outputs/<date>/<time>_<job_name>``."""
-    job_name: str = "sft"
+    job_name: str
     """Last part of the folder's name."""
     device: Device = "auto"
     """cpu, cuda, or auto."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SFTRun(NewFolderRun):
+    """``accerl sft``: LeRobot's own trainer on a LeRobotDataset."""
+
+    job_name: str = "sft"
     env: EnvConfig | None = None
     """When given, the dataset is checked against it first."""
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
@@ -89,16 +96,10 @@ class EvalRun(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class WorldModelRun(Section):
+class WorldModelRun(NewFolderRun):
     """``accerl world-model``: a world model, and a success model, from one or two LeRobotDatasets."""
 
-    seed: Seed = 0
-    output_dir: str | None = None
-    """Folder to create. None: ``outputs/<date>/<time>_<job_name>``."""
     job_name: str = "world_model"
-    """Last part of the folder's name."""
-    device: Device = "auto"
-    """cpu, cuda, or auto: where both networks are trained and validated."""
     env: EnvConfig = field(default_factory=MetaWorldConfig)
     """Environment to model: its cameras, sizes, rate and tasks."""
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
@@ -110,21 +111,14 @@ class WorldModelRun(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class WorldModelEvalRun(Section):
+class WorldModelEvalRun(NewFolderRun):
     """``accerl world-model-eval``: a saved world model on one or two LeRobotDatasets."""
 
+    job_name: str = "world_model_eval"
     path: str | None = None
     """The folder named world_model that ``accerl world-model`` wrote."""
     discover_packages_path: str | None = None
     """Package to import that registers the type of the world model, where that is not one of ours."""
-    seed: Seed = 0
-    """Seed of the choice of windows."""
-    output_dir: str | None = None
-    """Folder to create. None: ``outputs/<date>/<time>_<job_name>``."""
-    job_name: str = "world_model_eval"
-    """Last part of the folder's name."""
-    device: Device = "auto"
-    """cpu, cuda, or auto: where the world model and the success model run."""
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     """Episodes it was not trained on; of its own dataset, those that were held out."""
     online: DatasetConfig = field(default_factory=DatasetConfig)
@@ -320,7 +314,7 @@ def pull(arguments: list[str]) -> int:
 def report(arguments: list[str]) -> int:
     """``accerl report``."""
     config: ReportConfig = parse(ReportConfig, arguments)
-    sys.stdout.write(f"{write_report(config, CONFIGS)}\n")
+    sys.stdout.write(f"{write_report(config)}\n")
     return 0
 
 

@@ -140,17 +140,13 @@ def docstrings(cls: type[Any]) -> dict[str, str]:
 
 
 def _fields(cls: type[Any], prefix: str, usual: Any = None, without: Collection[str] = ()) -> list[str]:
-    """Lines of its fields with their defaults: those of `usual`, which is one of it, or its own.
-
-    Sections of one class and equal defaults beside each other are listed once, as are the fields that types
-    of a choice have in common.
-    """
+    """Lines of its fields with their defaults: those of `usual`, which is one of it, or its own."""
     hints = hints_of(cls)
     lines: list[str] = []
     sections: list[str] = []
-    listed: list[str] = []
-    fields = [field for field in dataclasses.fields(cls) if field.name not in without]
-    for field in fields:
+    for field in dataclasses.fields(cls):
+        if field.name in without:
+            continue
         name, section = f"{prefix}{field.name}", section_of(hints[field.name])
         if section is None:
             lines += _field(cls, field, prefix, usual)
@@ -159,14 +155,7 @@ def _fields(cls: type[Any], prefix: str, usual: Any = None, without: Collection[
         if choices:
             sections += _types(choices, name, default)
             continue
-        if field.name in listed:
-            continue
-        alike = [
-            f.name for f in fields if hints[f.name] is hints[field.name] and _default(f, usual) == default
-        ]
-        listed += alike
-        others = f" (likewise {', '.join(alike[1:])})" if default is not None and len(alike) > 1 else ""
-        note = others if default is not None else " (off unless given)"
+        note = "" if default is not None else " (off unless given)"
         sections += ["", f"{name}{note}: {_summary(section)}", *_fields(section, f"{name}.", default)]
     return lines + sections
 

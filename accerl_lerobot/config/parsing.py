@@ -51,10 +51,8 @@ def discover(package: str | None, section: str = "") -> None:
         raise InputError(field, package, f"cannot be imported ({why})") from error
 
 
-DEEPEST = 50
-MOST_NODES = 20_000
-LARGEST_RECIPE = 2**20
-"""Bounds of a recipe: levels, values and bytes."""
+LARGEST_RECIPE = 2**18
+"""Bytes of a recipe at most."""
 RECIPES = "recipes"
 TYPE = "type"
 """The key that picks one config of several, as in ``env.type``."""
@@ -98,8 +96,7 @@ REGISTERS = "registers"
 """In a field's metadata: the package that it names registers types of the section that the field is in."""
 CONSENT = frozenset(
     {
-        "trust_remote_code", "code_revision", "hub_path", "discover_packages_path", "extra_args",
-        "address", "open_cluster",
+        "trust_remote_code", "code_revision", "hub_path", "discover_packages_path", "extra_args", "address",
     }
 )  # fmt: skip
 """Names of the fields that let somebody's code run with the user's rights: from the Hub, from a package, by
@@ -146,12 +143,10 @@ def consents(tree: Any, given: Any = None, *, drop: bool = False) -> dict[str, A
     Fields that the command line sets as well, in `given`, are left out. `drop` removes them from `tree`.
     """
     found: dict[str, Any] = {}
-    seen: set[int] = set()  # YAML's aliases can make a small file a tree without end
 
     def look(below: Any, given: Any, path: tuple[str, ...]) -> None:
-        if id(below) in seen or below is given:
+        if below is given:
             return
-        seen.add(id(below))
         given = given if isinstance(given, dict) else {}
         if isinstance(below, list):
             for number, entry in enumerate(below):
@@ -268,35 +263,20 @@ def choices_of(section: type[Any]) -> dict[str, type[Any]]:
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML that refuses a key given twice, of which PyYAML silently keeps the last, and oversized values."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__(text)
-        self._nodes = self._depth = 0
-        self._sizes: dict[int, int] = {}
+    """YAML without aliases, which let a small file stand for billions of values, and with unique keys."""
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        """Counts nodes; an alias counts as often as the nodes that it repeats."""
-        before, event = self._nodes, self.peek_event()
-        mark: Any = event.start_mark
-        self._depth += 1
-        node = super().compose_node(parent, index) if self._depth <= DEEPEST else None
-        self._depth -= 1
-        if isinstance(event, yaml.AliasEvent) and id(node) not in self._sizes:
-            raise yaml.constructor.ConstructorError(None, None, "an alias within itself", mark)
-        self._nodes += self._sizes.get(id(node), 1)
-        self._sizes.setdefault(id(node), self._nodes - before)
-        if node is None or self._nodes > MOST_NODES:
-            problem = f"more than {MOST_NODES:,} values" if node else f"nested more than {DEEPEST} deep"
-            raise yaml.constructor.ConstructorError(None, None, problem, mark)
-        return node
+        if self.check_event(yaml.AliasEvent):
+            problem = "an alias; write the value itself"
+            raise yaml.constructor.ConstructorError(None, None, problem, self.peek_event().start_mark)
+        return super().compose_node(parent, index)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen = set()
         for key_node, _ in node.value:
             if not isinstance(key_node, yaml.ScalarNode):
                 raise yaml.constructor.ConstructorError(None, None, "a key is not text", key_node.start_mark)
-            if key_node.value in seen and key_node.tag != "tag:yaml.org,2002:merge":
+            if key_node.value in seen:
                 raise yaml.constructor.ConstructorError(
                     None, None, f"{key_node.value} is given twice", key_node.start_mark
                 )
@@ -305,12 +285,12 @@ class _Loader(yaml.SafeLoader):
 
 
 def _load_yaml(text: str) -> Any:
-    """The value in a YAML text, within `DEEPEST` and `MOST_NODES`."""
+    """The value in a YAML text."""
     try:
         return yaml.load(text, _Loader)
     except yaml.YAMLError:
         raise
-    except Exception as error:  # PyYAML's own, of a number such as 0x_ or a date such as 2024-13-45
+    except Exception as error:  # of a number such as 0x_, a date such as 2024-13-45, or too many levels
         raise yaml.YAMLError(f"{type(error).__name__}: {error}") from error
 
 
@@ -503,8 +483,6 @@ def dotted_fields(cls: type[Any], path: tuple[str, ...] = ()) -> Iterator[str]:
 
 def _unknown(key: str, value: Any, path: tuple[str, ...], names: list[str], whole: type[Any]) -> InputError:
     """The error for a field that a config does not have: what it resembles, or where it belongs."""
-    from accerl_lerobot.cli.verbs import CONFIGS
-
     if len(key) > LONGEST_KEY:
         return InputError(key[:LONGEST_KEY], value, "no such field")
     dotted, leaf = ".".join((*path, key)), value
@@ -517,9 +495,6 @@ def _unknown(key: str, value: Any, path: tuple[str, ...], names: list[str], whol
     everywhere = list(dict.fromkeys(dotted_fields(whole)))
     known = {*near, ".".join((*path, key))}
     near += [f for f in everywhere if f.rpartition(".")[2] == key and f not in known]
-    having = [verb for verb, cls in CONFIGS.items() if dotted in set(dotted_fields(cls))]
-    if having and not path:
-        return InputError(dotted, leaf, f"not a field of this command, but of accerl {', '.join(having[:4])}")
     if near:
         remedy = f"no such field; did you mean {' or '.join(near[:4])}?"
     else:

@@ -87,8 +87,6 @@ class LaunchConfig(Section, section="launch"):
     """HOST:PORT of a running Ray cluster to join, or auto: the one that ``ray start`` has started here. It
     must ask for a token, which is looked for where Ray does: RAY_AUTH_TOKEN, RAY_AUTH_TOKEN_PATH,
     ``~/.ray/auth_token``. None: a private Ray on this machine."""
-    open_cluster: bool = False
-    """Join a cluster that asks for no token: whoever reaches it runs code in your workers."""
     placement: PlacementConfig = field(default_factory=PlacementConfig)
     """Nodes of the workers."""
     schedule: Schedule = ASYNCHRONOUS
@@ -125,8 +123,6 @@ class LaunchConfig(Section, section="launch"):
         if self.address is None and self.placement.elsewhere:
             remedy = "a private Ray has one node; add --launch.address=auto, or leave the field out"
             raise InputError("launch.placement", "…", remedy)
-        if self.address is None and self.open_cluster:
-            raise InputError("launch.open_cluster", True, "it is about the cluster of launch.address")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,8 +158,6 @@ class RunConfig(Section):
     save_every_s: NonNegative = 600.0
     """Checkpoint at least every so many seconds of training; 0: none by time. There is always one at the end,
     and one when the run is asked to stop; there is one before training if there are any by number or time."""
-    save_keep: Annotated[int, Range("[1, 1000000]")] = 2
-    """Newest checkpoints that can be resumed from; the others keep their policies only."""
     resume: bool = False
     """Resume the run whose config is ``--config_path``: ``RUN/config.yaml``, or that of one of its
     checkpoints, ``RUN/checkpoints/last/config.yaml``."""

@@ -34,8 +34,7 @@ from accerl_lerobot.engine.stopping import Stopping, raise_if_stopped
 from accerl_lerobot.evaluation import before_after, evaluation_plans, success_curve, summarise
 from accerl_lerobot.metrics import MetricsLog, plain
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
-from accerl_lerobot.timeline import CHECKPOINT, EVALUATION, TIMELINE, TRAINING, Clock, NoClock
-from accerl_lerobot.timeline.read import Watch
+from accerl_lerobot.timeline import CHECKPOINT, EVALUATION, TRAINING, Clock, NoClock
 
 FILMED = ".before"
 """Name of the filmed episodes of the first evaluation, kept until the video is made."""
@@ -218,7 +217,6 @@ class Loop:
         self._began_at: str | None = None
         self._training_since: float | None = None
         self._saved_at = time.monotonic()
-        self._watch = Watch(self.directory / TIMELINE)
 
     def run(self, state: Path | None) -> dict[str, Any]:
         """Do the run, or the rest of it; returns the summary."""
@@ -248,7 +246,7 @@ class Loop:
         write_atomically(self.directory / SUMMARY, json.dumps(summary, indent=2) + "\n")
         for left in self.directory.glob(f"{FILMED}.*"):
             left.unlink()
-        prune(self.directory / CHECKPOINTS, self.config.save_keep)  # it has ended
+        prune(self.directory / CHECKPOINTS)  # it has ended
         return dict(summary)
 
     def _state(self) -> dict[str, Any]:
@@ -311,7 +309,6 @@ class Loop:
         config = self.config
         self.engine.train()
         self.times.clock.enter(TRAINING)
-        self._watch.news()  # the first record begins here
         self._training_since = self._saved_at = time.monotonic()
         with self.console.stage(f"RL ({config.algorithm.type})", total=config.trainer.updates) as stage:
             while True:
@@ -368,7 +365,7 @@ class Loop:
             values = progress.rollout | {"success_exploring": share}
             for part in ("replay", "inference", "imagination"):
                 values |= {f"{part}_{k}": v for k, v in getattr(progress, part).items()}
-            self.log.write("rollout", progress.version, values | self._watch.news())
+            self.log.write("rollout", progress.version, values)
         for episode in progress.episodes:
             results = self.during.get(episode.plan.group)
             if results is not None:
@@ -435,7 +432,7 @@ class Loop:
 
         with self.times.clock.during(CHECKPOINT):
             path = save_checkpoint(self.directory / CHECKPOINTS, write)
-        prune(self.directory / CHECKPOINTS, self.config.save_keep, self._began_at)
+        prune(self.directory / CHECKPOINTS, needed=self._began_at)
         self._saved_at = time.monotonic()
         self.console.say(f"checkpoint {path / PRETRAINED}")
 

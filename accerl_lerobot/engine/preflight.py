@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import draccus
 
 from accerl_lerobot.algorithms import OffPolicyConfig, RatioConfig
+from accerl_lerobot.checkpoint.layout import KEEP
 from accerl_lerobot.config.ranges import Range, check
 from accerl_lerobot.engine import ray_session
 from accerl_lerobot.envs import EnvConfig, WorldSpec, make_world
@@ -207,7 +208,7 @@ def disk_bytes(config: RunConfig, spec: WorldSpec, history: int) -> int:
     policies = 1 + bool(config.saves)
     if config.save_every_updates:
         policies = 2 + config.trainer.updates // config.save_every_updates
-    whole = 1 + min(config.save_keep, policies)  # one more than is kept while it is written
+    whole = 1 + min(KEEP, policies)  # one more than is kept while it is written
     records = config.policy.path is None and config.dataset.repo_id is None
     made = demos_bytes(config.demos, spec) if records else 0
     weights = 0

@@ -223,11 +223,9 @@ def _join(launch: LaunchConfig) -> None:
     import ray
     from ray.exceptions import AuthenticationError
 
-    if not has_token() and not launch.open_cluster:
-        remedy = (
-            "there is no token; start the cluster with RAY_AUTH_MODE=token and give its token by "
-            "RAY_AUTH_TOKEN_PATH, or add --launch.open_cluster=true to do without"
-        )
+    if not has_token():
+        remedy = "there is no token; start the cluster with RAY_AUTH_MODE=token and give its token by "
+        remedy += "RAY_AUTH_TOKEN_PATH"
         raise InputError(FIELD, launch.address, remedy)
     check_cluster(launch)
     try:
@@ -270,11 +268,9 @@ def check_cluster(launch: LaunchConfig) -> None:
             last = (complaint.strip().splitlines() or ["no answer"])[-1][:200]
             remedy = f"it does not answer as Ray does: {last}"
         raise InputError(FIELD, address, remedy)
-    if open_to_all and not launch.open_cluster:
-        remedy = (
-            "it asks for no token, so whoever reaches it runs code in its workers; start it with "
-            "RAY_AUTH_MODE=token, or add --launch.open_cluster=true"
-        )
+    if open_to_all:
+        remedy = "it asks for no token, so whoever reaches it runs code in its workers; start it with "
+        remedy += "RAY_AUTH_MODE=token"
         raise InputError(FIELD, address, remedy)
 
 

@@ -28,7 +28,7 @@ SIGNALS = (signal.SIGTERM, signal.SIGINT)
 LOCK = ".lock"
 CHANGEABLE = (
     "resume", "output_dir", "evaluation", "launch", "wandb", "save_every_updates", "save_every_s",
-    "save_keep", "trainer.updates", "trainer.num_threads", "trainer.ranks", "trainer.sharding",
+    "trainer.updates", "trainer.num_threads", "trainer.ranks", "trainer.sharding",
     "trainer.activation_checkpointing", "trainer.rank_timeout_s", "inference",
     "imagination.discover_packages_path",
 )  # fmt: skip

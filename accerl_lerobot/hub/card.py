@@ -63,13 +63,9 @@ class PushConfig(Section):
     """Folder to push; its type is told by its files."""
     repo_id: RepoId = ""
     """``user/name`` on the Hub; created if it does not exist."""
-    revision: Annotated[str, Pattern(r".+", "a branch, or leave the field out")] = "main"
-    """Existing branch."""
     private: bool = True
     """Keep the repository private. A public repository is written to only when this is false, and a private
     one stays private."""
-    message: Annotated[str, Pattern(r"(?s).*\S.*", "some text")] | None = None
-    """Commit message. None: names the type of the artifact."""
     include: list[str] = field(default_factory=list)
     """Folders of a run that are not pushed otherwise, such as ``[demos, sft, tensorboard]``."""
     evaluation: str | None = None

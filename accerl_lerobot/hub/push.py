@@ -56,6 +56,7 @@ from accerl_lerobot.hub.errors import LOGIN, check_commit, hub_errors
 
 logger = logging.getLogger(__name__)
 
+BRANCH = "main"
 NOT_CONTENTS = (CARD, MANIFEST, RECORD, ".gitattributes")
 RESULTS = (".yaml", ".json", ".jsonl", ".png", ".jpg", ".gif", ".svg", ".mp4", ".html")
 """Suffixes of files at the top of a run that are pushed."""
@@ -80,7 +81,7 @@ def push(config: PushConfig) -> dict[str, Any]:
     files, own_card = stage(config, folder, artifact)
     if get_token() is None:
         raise InputError("repo_id", repo_id, f"pushing needs a token; {LOGIN} that may write")
-    with hub_errors(repo_id, config.revision, writing=True):
+    with hub_errors(repo_id, BRANCH, writing=True):
         return _upload(config, artifact, files, own_card)
 
 
@@ -126,16 +127,15 @@ def _upload(config: PushConfig, artifact: str, files: Files, own_card: bool) -> 
     gone = previous - files.keys()
     gone &= set(api.list_repo_files(revision=parent, **where)) if gone else set()
     operations += [CommitOperationDelete(name, is_folder=False) for name in sorted(gone)]
-    message = config.message or f"{artifact.capitalize()} pushed with accerl-lerobot"
+    message = f"{artifact.capitalize()} pushed with accerl-lerobot"
     commit = api.create_commit(
-        operations=operations, commit_message=message, revision=config.revision, parent_commit=parent, **where
+        operations=operations, commit_message=message, revision=BRANCH, parent_commit=parent, **where
     ).oid
-    if artifact == DATASET and config.revision == "main":
+    if artifact == DATASET:
         _tag(api, where, commit)
     return {
         "kind": artifact,
         **where,
-        "revision": config.revision,
         "commit": commit,
         "unchanged": commit == parent,
         "private": bool(api.repo_info(**where).private),
@@ -155,20 +155,12 @@ def _parent(api: HfApi, config: PushConfig, artifact: str) -> str:
         if api.repo_exists(repo_id, repo_type=other):
             remedy = f"it is a {other} repository, and this is a {artifact}; choose another name"
             raise InputError("repo_id", repo_id, remedy) from None
-        if config.revision != "main":
-            remedy = f"{repo_id} is new, and has only main; push to main first"
-            raise InputError("revision", config.revision, remedy) from None
         api.create_repo(repo_id, private=config.private, repo_type=kind, exist_ok=True)
         info = api.repo_info(repo_id, repo_type=kind)
     if config.private and info.private is False:
         remedy = "this repository is public: add --private=false, or choose another name"
         raise InputError("private", True, remedy)
-    branches = {b.name: b.target_commit for b in api.list_repo_refs(repo_id, repo_type=kind).branches}
-    if config.revision not in branches:
-        make = f"hf repos branch create {repo_id} {config.revision}"
-        remedy = f"{repo_id} has no such branch, but {', '.join(sorted(branches))}; make it with '{make}'"
-        raise InputError("revision", config.revision, remedy)
-    return check_commit(branches[config.revision], repo_id)
+    return check_commit(info.sha, repo_id)
 
 
 def _previous_files(manifest: bytes | None, artifact: str, repo_id: str) -> set[str]:
@@ -182,7 +174,7 @@ def _previous_files(manifest: bytes | None, artifact: str, repo_id: str) -> set[
         logger.warning("the %s on the Hub is broken, and is replaced", MANIFEST)
         return set()
     if kind != artifact:
-        remedy = f"it holds a {kind}, and this is a {artifact}; choose another name or branch"
+        remedy = f"it holds a {kind}, and this is a {artifact}; choose another name"
         raise InputError("repo_id", repo_id, remedy)
     return files
 

@@ -22,8 +22,6 @@ from collections import Counter, deque
 from collections.abc import Sequence, Sized
 from dataclasses import dataclass, field
 
-from accerl_lerobot.errors import InputError
-
 GRAIN = 1.1
 """Ratio of neighbouring bins of waits."""
 SHORTEST_S = 1e-6
@@ -88,10 +86,6 @@ class Batcher[R: Sized]:
     """
 
     def __init__(self, max_batch: int, max_wait_s: float) -> None:
-        if max_batch < 1:
-            raise InputError("inference.max_batch", max_batch, "use at least 1 observation")
-        if not max_wait_s >= 0.0:
-            raise InputError("inference.max_wait_s", max_wait_s, "use 0 or more seconds")
         self.max_batch = max_batch
         self.max_wait_s = max_wait_s
         self.stats = BatcherStats()
@@ -106,11 +100,6 @@ class Batcher[R: Sized]:
     def __len__(self) -> int:
         """Requests that wait."""
         return len(self._waiting)
-
-    @property
-    def observations(self) -> int:
-        """Observations that wait."""
-        return self._observations
 
     def add(self, request: R, now: float) -> None:
         """Queue a request.

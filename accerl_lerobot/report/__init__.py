@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``accerl report``: one HTML file about a run, or about several, with its style, charts and videos inside.
+"""``accerl report``: one HTML file about a run of ``accerl train``, or about several, with all that it needs.
 
 The template escapes all text, and a content security policy forbids the browser every script and request, so
 text of a run that got past the escaping could do nothing. Free of torch.
@@ -11,10 +11,9 @@ import base64
 import contextlib
 import os
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 from urllib.parse import quote
 
 from accerl_lerobot import __version__
@@ -36,7 +35,7 @@ class ReportConfig(Section):
     BARE: ClassVar[str] = "runs"
 
     runs: tuple[str, ...] = ()
-    """Folders of runs; several of ``accerl train`` make a page that compares them. Bare ones are runs."""
+    """Folders of runs of ``accerl train``; several make a page that compares them. Bare ones are runs."""
     output: str | None = None
     """The page. None: ``report.html`` in the run's folder, or here if there are several. An older page of
     accerl is replaced; any other file is left alone."""
@@ -47,8 +46,8 @@ class ReportConfig(Section):
             raise InputError("runs", "", "name the folder of a run: accerl report RUN")
 
 
-def write_report(config: ReportConfig, recipes: Mapping[str, type[Any]]) -> Path:
-    """Reads the runs and writes the page; `recipes` has the config class of each verb."""
+def write_report(config: ReportConfig) -> Path:
+    """Reads the runs and writes the page."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     from accerl_lerobot.report.charts import POINTS
@@ -59,15 +58,12 @@ def write_report(config: ReportConfig, recipes: Mapping[str, type[Any]]) -> Path
     runs = [read_run(Path(name).expanduser()) for name in config.runs]
     if len({run.path.resolve() for run in runs}) < len(runs):
         raise InputError("runs", ",".join(config.runs), "name each run once")
-    if len(runs) > 1 and (other := next((run.verb for run in runs if run.verb != "train"), None)):
-        remedy = f"a page compares runs of accerl train, and one is of accerl {other}"
-        raise InputError("runs", ",".join(config.runs), remedy)
     if output is None:
         output = runs[0].path / NAME if len(runs) == 1 else Path(NAME)
     check_output(output, _is_ours)
     now = time.time()
     try:
-        page = comparison_page(runs, now) if len(runs) > 1 else run_page(runs[0], recipes[runs[0].verb], now)
+        page = comparison_page(runs, now) if len(runs) > 1 else run_page(runs[0], now)
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         if isinstance(error, InputError):
             raise

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Contents of the pages: of a training run, of a world model, and of several runs side by side."""
+"""Contents of the pages: of one training run, and of several side by side."""
 
 from __future__ import annotations
 
@@ -12,24 +12,14 @@ from typing import Any
 import numpy as np
 import yaml
 
-from accerl_lerobot.console import ABSENT, count, duration, number, percent, rate
+from accerl_lerobot.checkpoint.layout import SUMMARY
+from accerl_lerobot.console import count, duration, number, percent, rate
+from accerl_lerobot.engine.preflight import lag_limits
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.report.charts import COLOURS, Chart, Series, line, rates
-from accerl_lerobot.report.read import (
-    SUMMARY,
-    VALIDATION,
-    Record,
-    Run,
-    apart,
-    column,
-    commands,
-    differences,
-    lag_bound,
-    newest,
-    unreadable,
-)
-from accerl_lerobot.timeline import ROLES, STATES
-from accerl_lerobot.world_model.config import OnlineLearnConfig
-from accerl_lerobot.world_model.metrics import dataset_rows, has_several, per_dataset
+from accerl_lerobot.report.read import Record, Run, apart, column, differences, newest, resolved
+from accerl_lerobot.timeline import STATES
+from accerl_lerobot.timeline.read import read_timeline
 
 RECENT_S = 120.0
 """A run that has written something since is taken to be still going."""
@@ -38,15 +28,12 @@ FEW = 25
 STATE_COLOURS = dict(zip(STATES, (0, 7, 1, 3, 2, 6, 5, 4, 4), strict=True))
 MISMATCH = 1e-4
 """Nats between acting and learning at equal weights that rounding in float32 does not explain."""
-STEPS, DEPTH = "env steps of online experience", "depth of the imagined rollout in chunks"
+STEPS = "env steps of online experience"
 SHARE: dict[str, Any] = {"share": True, "bottom": -0.03, "top": 1.04}
 """Options of a chart of shares, such that points at both ends are whole."""
 VIDEOS = {
     "before_after.mp4": "The same episodes before training, left, and after it, right, under the success of "
     "the whole evaluation. The frame at the end of a clip is green for a success and red for a failure.",
-    "preview.mp4": "Top to bottom: recorded episodes; what the world model imagines with the same actions; "
-    "and with those of another episode.",
-    "preview_online.mp4": "The same of episodes that a policy collected.",
 }
 """Captions of the videos that runs make."""
 WARNINGS = {
@@ -94,28 +81,6 @@ IMAGINATION: tuple[Spec, ...] = (
      {"imagination_check_skill_changed_first": "after one chunk",
       "imagination_check_skill_changed_last": "at the horizon"}, {"top": 1}),
 )  # fmt: skip
-BY_DEPTH: tuple[Spec, ...] = (
-    ("Skill", "1 is perfect, 0 is a copy of the last frame.",
-     {"skill_changed": "where pixels changed", "skill": "all pixels"}, {"top": 1}),
-    ("Sensitivity to actions", "Growth of the error with wrong actions; 1: the model ignores them.",
-     {"sensitivity_shuffled": "another episode's", "sensitivity_zero": "none"},
-     {"unit": "times the error", "bottom": 0}),
-    ("Error of the state", "",
-     {"state_error": "imagined", "state_error_copy": "copy of the last state"}, {"bottom": 0}),
-)  # fmt: skip
-CHECKS = {
-    "skill_changed_first": ("skill_first", "better than a copy of the last frame, where pixels changed"),
-    "skill_changed_last": ("skill_last", "the same at the end of the horizon"),
-    "skill_last": ("skill_last", "the same on all pixels"),
-    "sensitivity_low": ("sensitivity", "how much worse it gets with another episode's actions"),
-    "auroc": ("auroc", "tells episodes that succeed from those that fail, lower end of the interval"),
-    "false_success": ("false_success", "failed episodes that are imagined as successes"),
-    "false_success_idle": ("false_success", "rollouts imagined without actions, taken for successes"),
-    "recall": ("recall", "successes that are imagined as such"),
-}
-"""Check of a world model → the field of `ValidationConfig` with its threshold, and its meaning."""
-
-
 Table = tuple[str, Sequence[str], Sequence[Sequence[str]]]
 """Caption, columns and rows; the first cell of a row is its heading."""
 
@@ -134,36 +99,34 @@ class Section:
     videos: Sequence[tuple[Path, str]] = ()
     changes: Sequence[tuple[str, str, str]] = ()
     """Field, value and default."""
-    commands: Sequence[tuple[str, str]] = ()
     details: str = ""
 
     @property
     def empty(self) -> bool:
         """True if there is nothing under the heading."""
-        rest = (self.text, self.bars, self.tables, self.videos, self.changes, self.commands, self.details)
+        rest = (self.text, self.bars, self.tables, self.videos, self.changes, self.details)
         return not any(rest) and not any(chart.drawable for chart in self.charts)
 
 
-def run_page(run: Run, config_class: type[Any], now: float) -> dict[str, Any]:
+def run_page(run: Run, now: float) -> dict[str, Any]:
     """Values for the template: the page of one run, at `now`, in seconds since 1970."""
-    trained, why = run.verb == "train", unreadable(config_class, run.config)
-    bound = lag_bound(config_class, run.config) if trained else None
-    changes = [(name, shown(v), shown(default)) for name, v, default in differences(config_class, run.config)]
+    config, why = resolved(run.config)
+    bound = None if config is None else lag_limits(config)[0]
+    found = () if config is None else differences(config)
+    changes = [(name, shown(value), shown(default)) for name, value, default in found]
     text = f"This accerl cannot read the recipe: {why}." if why else "Fields that differ from the defaults:"
-    first, *others = _training_sections(run, bound) if trained else _world_model_sections(run)
+    success, *others = _training_sections(run, bound)
     sections = [
-        first,
+        success,
         Section("Videos", videos=[(path, VIDEOS.get(path.name, path.name)) for path in run.videos]),
         *others,
         Section("Recipe", text, changes=changes, details=run.config_text),
-        Section("Commands", commands=commands(run)),
     ]
     return {
         "title": run.name,
-        "verb": run.verb,
         "status": status(run, now),
-        "headline": _headline(run) if trained else _verdict(run),
-        "tiles": _tiles(run, bound) if trained else _world_model_tiles(run.result or {}),
+        "headline": _headline(run),
+        "tiles": _tiles(run, bound),
         "warnings": list(warnings(run, bound, now)),
         "sections": [section for section in sections if not section.empty],
     }
@@ -183,7 +146,6 @@ def comparison_page(runs: Sequence[Run], now: float) -> dict[str, Any]:
     ]
     return {
         "title": f"{len(runs)} runs",
-        "verb": runs[0].verb,
         "status": f"{sum(run.result is not None for run in runs)} of {len(runs)} finished",
         "headline": count(len(runs), "training run"),
         "tiles": (),
@@ -196,19 +158,20 @@ def status(run: Run, now: float) -> str:
     """How a run stands."""
     if run.result is None:
         return "still going" if now - run.written < RECENT_S else "not finished"
-    return "finished" if run.verb == "train" else "passed" if run.result["passed"] else "failed"
+    return "finished"
 
 
 def warnings(run: Run, bound: int | None, now: float) -> Iterator[str]:
     """Caveats of a run's numbers: one plain sentence each, none if all is well."""
     if run.result is None:
-        file, age = SUMMARY if run.verb == "train" else VALIDATION, now - run.written
+        age = now - run.written
         at = datetime.datetime.fromtimestamp(run.written).strftime("%d %B %Y, %H:%M")
         if age < RECENT_S:
-            yield f"The run is still going: there is no {file} yet. This page shows it {at}."
+            yield f"The run is still going: there is no {SUMMARY} yet. This page shows it {at}."
         else:
-            yield f"The run has no {file}: it ended early, or waits. It last wrote {at}, {duration(age)} ago."
-    if not run.records and run.verb != "world-model-eval":
+            ago = f"It last wrote {at}, {duration(age)} ago."
+            yield f"The run has no {SUMMARY}: it ended early, or waits. {ago}"
+    if not run.records:
         yield "There are no metrics: the run has not come to its first record."
     if run.truncated:
         yield "The last line of metrics.jsonl is incomplete and left out: the run was writing it, or crashed."
@@ -240,7 +203,8 @@ def shown(value: Any) -> str:
     """A value as one would type it."""
     if isinstance(value, str):
         return value
-    text = yaml.safe_dump(value, default_flow_style=True, width=10_000, allow_unicode=True)
+    plain = list(value) if isinstance(value, tuple) else value
+    text = yaml.safe_dump(plain, default_flow_style=True, width=10_000, allow_unicode=True)
     return text.removesuffix("\n").removesuffix("\n...")
 
 
@@ -302,7 +266,7 @@ def evaluated(run: Run, name: str, colour: int) -> Series:
 
 
 def _imagination(run: Run) -> Section:
-    """Imagined rollouts: how many, how true, and the checks that the world model had to pass."""
+    """Imagined rollouts: how many, how true, and how often the world model passed validation."""
     title, settings, rollout = "Imagined rollouts", run.section("imagination"), run.rollout
     if not settings.get("share") or newest(rollout, "imagination_rollouts") is None:
         return Section(title)
@@ -318,52 +282,34 @@ def _imagination(run: Run) -> Section:
     real, imagined = (newest(rollout, f"replay_{kind}trained_decisions") or 0.0 for kind in ("", "imagined_"))
     if real + imagined:
         text += f" {percent(imagined / (real + imagined))} of the decisions learned from were imagined."
-    checks = []
-    for name, (threshold, _) in CHECKS.items():
-        value = newest(rollout, f"imagination_check_{name}")
-        bound = getattr(OnlineLearnConfig.validation, threshold)
-        if value is not None and threshold == "false_success":
-            checks.append((name, value, f"at most {bound}", value <= bound))
-        elif value is not None:
-            checks.append((name, value, f"above {bound}", value > bound))
     caption = "a recorded episode above, and what the world model imagined with the same actions below. The "
     caption += "frame at the end is green for a success and red for a failure."
     videos = [
         (path, f"Validation {path.stem.replace('_', ', ').lstrip('0')}: {caption}")
         for path in dict.fromkeys([*run.imagined_videos[:1], *run.imagined_videos[-1:]])
     ]
-    tables = _checks("The last validation of the world model", checks)
-    return Section(title, text, charts=_charts(rollout, IMAGINATION), tables=tables, videos=videos)
-
-
-def _checks(caption: str, rows: Sequence[tuple[str, float | None, str, bool]]) -> list[Table]:
-    """A table of checks: name, value, what is wanted, and whether it holds; none without rows."""
-    cells = [
-        (name, number(value, 3), wanted, "holds" if holds else "fails",
-         CHECKS.get(name.rpartition(".")[2], ("", ""))[1])
-        for name, value, wanted, holds in rows
-    ]  # fmt: skip
-    return [(caption, ("check", "value", "wanted", "", "meaning"), cells)] if rows else []
+    return Section(title, text, charts=_charts(rollout, IMAGINATION), videos=videos)
 
 
 def _time_shares(run: Run) -> dict[str, list[tuple[str, float, str, int]]]:
-    """How the time of each role divides, as `Section.bars`; nothing for a run without a timeline."""
-    bars = {}
-    for role in ROLES[1:]:  # the driver neither works nor waits
-        prefix = f"timeline_{role.replace(' ', '_')}"
-        own = {s: _time_mean(run.rollout, f"{prefix}_{s}_share", f"{prefix}_bubble") for s in STATES}
-        if any(own.values()):
-            bars[role] = [(s.replace("_", " "), v, percent(v), STATE_COLOURS[s]) for s, v in own.items() if v]
-    return bars
+    """How the time of each role divides in the training, as `Section.bars`; nothing without a timeline."""
+    try:
+        timeline = read_timeline(run.path)
+    except InputError:
+        return {}
+    shares = timeline.shares(timeline.training())
+    return {
+        role: [(state.replace("_", " "), v, percent(v), STATE_COLOURS[state]) for state, v in own.items()]
+        for role, own in shares.items()
+        if role != "driver"  # which neither works nor waits
+    }
 
 
-def _time_mean(records: Sequence[Record], name: str, present: str = "") -> float | None:
-    """Mean of shares of the time since the record before, over the records that have `present`."""
+def _time_mean(records: Sequence[Record], name: str) -> float | None:
+    """Mean of shares of the time since the record before."""
     length = np.diff(column(records, "wall_s"), prepend=np.nan)
-    there = np.isfinite(column(records, present or name)) & (length > 0)
-    if not there.any():
-        return None
-    return float(np.average(np.nan_to_num(column(records, name)[there]), weights=length[there]))
+    there = np.isfinite(column(records, name)) & (length > 0)
+    return float(np.average(column(records, name)[there], weights=length[there])) if there.any() else None
 
 
 def _speed(run: Run) -> Section:
@@ -440,86 +386,6 @@ def _tiles(run: Run, bound: int | None) -> list[tuple[str, str, str]]:
         ("algorithm", str(algorithm.get("type")).upper(), f"advantage {advantage}" if advantage else ""),
         ("seed", str(run.config.get("seed")), ""),
     ]
-
-
-def _world_model_sections(run: Run) -> list[Section]:
-    found = run.result or {}
-    depths, text, by_dataset = found.get("depths", []), "", Section("By dataset")
-    if found:
-        every = per_dataset(found)
-        text = count(sum(one["windows"] for one in every), "window")
-        if all(one.get("episodes") for one in every):
-            text += f" on {count(sum(one['episodes'] for one in every), 'episode')} it had not learned from"
-        text += ", each imagined from a real frame on, with the executed actions, and with others."
-    if has_several(found):
-        datasets = [str(one.get("name")) for one in every]
-        rows = [(name, *(cell or ABSENT for cell in cells)) for name, cells in dataset_rows(every)]
-        table = ("The same on episodes of each dataset", ("", *datasets), rows)
-        by_dataset = Section("By dataset", tables=[table])
-    checks = [(k, c["value"], str(c.get("wanted")), c["holds"]) for k, c in found.get("checks", {}).items()]
-    by_depth = []
-    for title, note, metrics, options in BY_DEPTH:
-        series = [estimates(depths, key, label, i) for i, (key, label) in enumerate(metrics.items())]
-        by_depth.append(Chart(title, note, DEPTH, series, **options))
-    return [
-        Section("Validation", text, tables=_checks("Checks it had to pass", checks)),
-        Section("By depth", charts=by_depth),
-        by_dataset,
-        Section("Learning", charts=_loss_charts(run)),
-    ]
-
-
-def estimates(depths: Sequence[Record], key: str, name: str, colour: int) -> Series:
-    """An estimate at each depth with its interval; numbers without one are a plain line."""
-    x, plain = column(depths, "depth"), column(depths, key)
-    if np.isfinite(plain).any():
-        return line(name, x, plain, colour)
-    parts = [d[key] if isinstance(d.get(key), dict) else {} for d in depths]
-    y, low, high = (column(parts, end) for end in ("value", "low", "high"))
-    low, high = (np.where(np.isfinite(end), end, y) for end in (low, high))
-    x, y, low, high = (values[np.isfinite(y)] for values in (x, y, low, high))
-    return Series(name, x, y, colour, low, high, points=True)
-
-
-def _loss_charts(run: Run) -> list[Chart]:
-    """Training losses."""
-    names = dict.fromkeys(name for record in run.records.get("world_model", []) for name in record)
-    parts = [name for name in names if name not in ("kind", "step", "loss", "grad_norm")] or ["loss"]
-    charts = []
-    for kind, metrics in (("world_model", parts), ("success_model", ["loss", "accuracy"])):
-        rows = run.records.get(kind, [])
-        steps = column(rows, "step")
-        series = [
-            line(name.replace("_", " "), steps, column(rows, name), i) for i, name in enumerate(metrics)
-        ]
-        charts.append(Chart(kind.replace("_", " ").capitalize(), "", "gradient steps", series, bottom=0))
-    return charts
-
-
-def _verdict(run: Run) -> str:
-    """The result of a world model in one sentence."""
-    if run.result is None:
-        steps = max((int(r.get("step", 0)) for r in run.records.get("world_model", [])), default=0)
-        return f"A world model after {count(steps, 'step')}, not validated yet"
-    failed = [name for name, check in run.result["checks"].items() if not check["holds"]]
-    if failed:
-        return f"The world model failed validation: {', '.join(failed)}"
-    return f"The world model passed validation: all {len(run.result['checks'])} checks hold"
-
-
-def _world_model_tiles(found: Record) -> list[tuple[str, str, str]]:
-    tiles = []
-    for key, name in (("learnt", "learned from"), ("held_out", "held out")):
-        if isinstance(part := found.get(key), dict):
-            steps = f"{number(part.get('env_steps'))} env steps"
-            tiles.append((name, count(part.get("episodes", 0), "episode"), steps))
-    for row in found.get("depths", [])[-1:]:
-        skill = (row.get("skill_changed") or {}).get("value")
-        tiles.append(("skill", number(skill, 2), f"after {count(row['depth'], 'chunk')}"))
-    if auroc := (found.get("outcomes") or {}).get("auroc"):
-        value, low, high = (number(auroc.get(key), 3) for key in ("value", "low", "high"))
-        tiles.append(("AUROC of outcomes", value, f"[{low}, {high}]"))
-    return tiles + [("learning", duration(found["seconds"]), "")] if found.get("seconds") else tiles
 
 
 def _run_table(runs: Mapping[str, Run], now: float) -> Table:

@@ -1,55 +1,36 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run's folder as plain data.
+"""The folder of a run of ``accerl train`` as plain data.
 
 A run that is still going or has crashed has no result file, and the last line of its ``metrics.jsonl`` may be
 incomplete. Both are common and no error; any other damage is an error that names the file.
 
-A run's recipe: its differences from the defaults and from other runs, and commands to type next.
+Also the differences of a run's recipe from the defaults and from other runs.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import json
-import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from shlex import quote
 from typing import Any
 
 import numpy as np
 
-from accerl_lerobot.checkpoint.layout import CHECKPOINTS, CONFIG, LAST, PRETRAINED, SUMMARY
+from accerl_lerobot.checkpoint.layout import CONFIG, SUMMARY
 from accerl_lerobot.checkpoint.safety import Origin, brief, check_folder
-from accerl_lerobot.config.parsing import (
-    TYPE,
-    choices_of,
-    decode,
-    encode,
-    read_recipe,
-    section_of,
-)
+from accerl_lerobot.config.parsing import TYPE, decode, read_recipe
 from accerl_lerobot.console import ABSENT
-from accerl_lerobot.engine.preflight import lag_limits
-from accerl_lerobot.engine.stopping import resume_command
-from accerl_lerobot.envs.base import lerobot_eval_arguments
+from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.metrics import METRICS
 from accerl_lerobot.world_model.config import VIDEOS
 
 Record = dict[str, Any]
 
-VALIDATION = "validation.json"
 COUNTERS = ("env_steps", "decisions", "episodes")
 """Counters of workers, which may restart at 0 when a run is resumed."""
-
-VERBS = {
-    "train": {"algorithm", "trainer"},
-    "world-model": {"world_model"},
-    "world-model-eval": {"path", "validation"},
-}
-"""Verbs that write runs, and sections by which their config is recognised."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,14 +38,12 @@ class Run:
     """Contents of a run's folder."""
 
     path: Path
-    verb: str
-    """Verb that wrote it, one of `VERBS`."""
     config: Record
     config_text: str
     records: dict[str, list[Record]]
     """Lines of metrics.jsonl by their kind, in order."""
     result: Record | None
-    """summary.json or validation.json; None: not finished."""
+    """summary.json; None: not finished."""
     truncated: bool
     """True if the last line of metrics.jsonl is incomplete."""
     sessions: int
@@ -74,8 +53,6 @@ class Run:
     videos: tuple[Path, ...]
     imagined_videos: tuple[Path, ...]
     """Held-out episodes beside imagined ones, the oldest first."""
-    checkpoint: Path | None
-    """The newest policy, a LeRobot checkpoint."""
 
     @property
     def name(self) -> str:
@@ -123,26 +100,19 @@ class Run:
 
 def read_run(path: Path) -> Run:
     """Reads a folder."""
-    if not path.is_dir():
-        remedy = "no such folder" if not path.exists() else "a file; name the folder of a run"
-        raise InputError("runs", str(path), remedy)
+    check_folder(path, Origin("runs", str(path)))
     config_path = path / CONFIG
     if not config_path.is_file():
         remedy = f"no run in it: there is no {CONFIG}, which every run writes first"
         raise InputError("runs", str(path), remedy)
-    check_folder(path, Origin("runs", str(path)))
     config = read_recipe(config_path)
-    verb = next((verb for verb, keys in VERBS.items() if keys <= config.keys()), None)
-    if verb is None:
-        remedy = "no run in it: its config.yaml is not one of accerl train, world-model or world-model-eval"
-        raise InputError("runs", str(path), remedy)
+    if not {"algorithm", "trainer"} <= config.keys():
+        raise InputError("runs", str(path), f"no run in it: its {CONFIG} is not one of accerl train")
     lines, truncated = _lines(path / METRICS)
     records, sessions = _continuous(lines)
-    result = path / (SUMMARY if verb == "train" else VALIDATION)
-    checkpoint = path / CHECKPOINTS / LAST / PRETRAINED
+    result = path / SUMMARY
     return Run(
         path=path,
-        verb=verb,
         config=config,
         config_text=config_path.read_text(),
         records=records,
@@ -152,7 +122,6 @@ def read_run(path: Path) -> Run:
         written=max(file.stat().st_mtime for file in path.iterdir() if file.suffix != ".html"),
         videos=tuple(sorted(path.glob("*.mp4"))),
         imagined_videos=tuple(sorted(path.glob(f"{VIDEOS}/[0-9]*.mp4"))),
-        checkpoint=checkpoint if checkpoint.is_dir() else None,
     )
 
 
@@ -249,22 +218,37 @@ def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return fields
 
 
-def differences(config_class: type[Any], tree: dict[str, Any]) -> list[tuple[str, Any, Any]]:
-    """Field, value and default, where the two differ.
+def differences(config: Any, default: Any = None, prefix: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Dotted field, value and default, where the two differ.
 
     Defaults are those of the types that were chosen: GIPO's for a run of GIPO. That it was chosen is a
     difference too, and so is a section that is off unless it is given.
+
+    Args:
+        config: a section, or all of it.
+        default: its default; None, or one of another type: the defaults of its fields.
+        prefix: name of the section with a dot.
     """
-    values = {key: value for key, value in flat(tree).items() if key not in PLACES}
-    defaults, untouched = (flat(_defaults(None, config_class, chosen)) for chosen in (tree, {}))
-    given = [k for k in untouched if k not in values and any(other.startswith(f"{k}.") for other in values)]
-    for key in untouched:
-        if key.rpartition(".")[2] == TYPE:
-            defaults[key] = untouched[key]
-    changed = [
-        (k, v, defaults.get(k, ABSENT)) for k, v in values.items() if k not in defaults or defaults[k] != v
-    ]
-    return [(k, values.get(f"{k}.{TYPE}", "given"), untouched[k]) for k in given] + changed
+    for field in dataclasses.fields(config):
+        name, value = f"{prefix}{field.name}", getattr(config, field.name)
+        usual = getattr(default, field.name) if type(default) is type(config) else _default(field)
+        if name in PLACES:
+            continue
+        if not dataclasses.is_dataclass(value):
+            if value != usual:
+                yield name, value, usual
+            continue
+        if usual is None:
+            yield name, getattr(value, TYPE, "given"), None
+        elif type(value) is not type(usual):
+            yield f"{name}.{TYPE}", getattr(value, TYPE), usual.type
+        yield from differences(value, usual, f"{name}.")
+
+
+def _default(field: dataclasses.Field[Any]) -> Any:
+    if field.default_factory is not dataclasses.MISSING:
+        return field.default_factory()
+    return ABSENT if field.default is dataclasses.MISSING else field.default
 
 
 def apart(trees: list[dict[str, Any]]) -> list[tuple[str, list[Any]]]:
@@ -275,61 +259,9 @@ def apart(trees: list[dict[str, Any]]) -> list[tuple[str, list[Any]]]:
     return [(key, values) for key, values in rows if any(v != values[0] for v in values)]
 
 
-def lag_bound(config_class: type[Any], tree: dict[str, Any]) -> int | None:
-    """The largest lag that a run's recipe allows; None if this version cannot read it, see `unreadable`."""
-    return None if unreadable(config_class, tree) else lag_limits(decode(config_class, tree))[0]
-
-
-def unreadable(config_class: type[Any], tree: dict[str, Any]) -> str:
-    """Why this version does not understand a recipe that another version wrote; empty if it does."""
+def resolved(tree: dict[str, Any]) -> tuple[RunConfig | None, str]:
+    """A run's recipe as a config, or why this version does not understand what another version wrote."""
     try:
-        decode(config_class, tree)
+        return decode(RunConfig, tree), ""
     except InputError as error:
-        return str(error)
-    return ""
-
-
-def _defaults(instance: Any, config_class: type[Any], tree: dict[str, Any]) -> dict[str, Any]:
-    """Default of every field where `tree` chooses types; unchecked, as some sections have no default.
-
-    The fields of an `instance` are the defaults, if there is one.
-    """
-    defaults: dict[str, Any] = {}
-    hints = typing.get_type_hints(config_class)
-    for field in dataclasses.fields(config_class):
-        name, value = field.name, _default(field) if instance is None else getattr(instance, field.name)
-        section, given = section_of(hints[name]), tree.get(name)
-        if section is None or not isinstance(given, dict):
-            chosen = getattr(value, TYPE, None) if dataclasses.is_dataclass(value) else None
-            defaults[name] = encode(value) if chosen is None else encode(value) | {TYPE: chosen}
-            continue
-        kind = choices_of(section).get(str(given.get(TYPE)), section)
-        same = value if type(value) is kind else None
-        defaults[name] = _defaults(same, kind, given) | ({TYPE: given[TYPE]} if TYPE in given else {})
-    return defaults
-
-
-def _default(field: dataclasses.Field[Any]) -> Any:
-    if field.default_factory is not dataclasses.MISSING:
-        return field.default_factory()
-    return ABSENT if field.default is dataclasses.MISSING else field.default
-
-
-def commands(run: Run) -> list[tuple[str, str]]:
-    """Purpose and line of each command to type next; those that need a checkpoint only where there is one."""
-    recipe = quote(str(run.path / CONFIG))
-    again = f"accerl {run.verb} --config_path={recipe} --output_dir={quote(f'{run.path}-again')}"
-    lines = [("Run it again; choose a folder that does not exist yet", again)]
-    if run.verb == "train" and run.result is None:
-        lines.insert(0, ("Resume it, if it has stopped", resume_command(run.path)))
-    if run.checkpoint is None:
-        return lines
-    policy = f"--policy.path={quote(str(run.checkpoint))}"
-    episodes = run.section("evaluation").get("episodes", 100)
-    evaluate = f"accerl eval --config_path={recipe} {policy} --evaluation.episodes={quote(str(episodes))}"
-    lines.append(("Evaluate its policy on the seeds of this page", evaluate))
-    if env := lerobot_eval_arguments(run.section("env")):
-        stock = f"lerobot-eval {policy} {' '.join(env)} --eval.n_episodes=50 --eval.batch_size=5"
-        lines.append(("Evaluate it with LeRobot itself", stock))
-    share = f"accerl push --path={quote(str(run.checkpoint))} --repo_id=USER/NAME"
-    return [*lines, ("Share it on the Hub", share)]
+        return None, str(error)

@@ -7,8 +7,7 @@ calendar time at which a process began is noted too.
 
 ``RUN/timeline/rollout-0.1.3.bin`` is part 3 of the second process (1) of ``rollout 0``: a line of JSON, then
 8 bytes per entry, nanoseconds since the process began << 4 | state, little-endian. The newest two parts are
-kept. A part's first line has the totals before it, so those are exact although older parts are gone. Nothing
-is overwritten: a killed process leaves at worst half an entry, which is not read.
+kept. Nothing is overwritten: a killed process leaves at worst half an entry, which is not read.
 
 The states of a worker, which is in exactly one at any time; see ``docs/metrics.md``.
 """
@@ -82,7 +81,6 @@ class Clock:
         >>> clock = open_clock(folder, "trainer")
         >>> clock.enter(WAIT_IN)         # from one thread
         >>> clock.beat()                 # from any: entries so far are written, up to now
-        >>> clock.totals_ns()["wait_in"]
 
     Args:
         folder: of the timeline; made if it is not there.
@@ -105,7 +103,6 @@ class Clock:
         self._now, self._lock = now, threading.Lock()
         self._state, self._origin = RECOVERY, begins.clock_ns
         self._since, self._due = self._origin, self._origin + FLUSH_NS
-        self._totals = [0] * len(STATES)
         self._entries = array("Q")
         self._head = {"timeline": FORMAT, "worker": worker, "pid": os.getpid(), **begins._asdict()}
         self._point = f"{role_of(worker).split()[-1]}.timeline"
@@ -140,11 +137,6 @@ class Clock:
             self._note(self._state)
             self._write()
 
-    def totals_ns(self) -> dict[str, int]:
-        """Nanoseconds in each state, up to the last entry or beat."""
-        with self._lock:
-            return dict(zip(STATES, self._totals, strict=True))
-
     def close(self) -> None:
         """Ends the timeline of this worker; safe to call twice."""
         if not self._file.closed:
@@ -153,7 +145,6 @@ class Clock:
 
     def _note(self, state: int) -> None:
         now = self._now()
-        self._totals[self._state] += now - self._since
         self._entries.append((now - self._origin) << BITS | state)
         self._state, self._since = state, now
 
@@ -172,7 +163,6 @@ class Clock:
         """Opens a new file and removes the one before the last."""
         self._part += 1
         head = {**self._head, "at_ns": self._since - self._origin, "state": STATES[self._state]}
-        head["totals_ns"] = dict(zip(STATES, self._totals, strict=True))
         file = self._path(self._part).open("xb")
         file.write((json.dumps(head) + "\n").encode())
         file.flush()
@@ -194,9 +184,6 @@ class NoClock(Clock):
 
     def beat(self) -> None:
         pass
-
-    def totals_ns(self) -> dict[str, int]:
-        return {}
 
     def close(self) -> None:
         pass

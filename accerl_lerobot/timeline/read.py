@@ -19,7 +19,7 @@ from rich.box import SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
 
-from accerl_lerobot.checkpoint.layout import CONFIG, write_atomically
+from accerl_lerobot.checkpoint.layout import write_atomically
 from accerl_lerobot.checkpoint.safety import Origin, check_folder
 from accerl_lerobot.config.ranges import NonNegative, Positive, Section
 from accerl_lerobot.errors import InputError, check_output, expanded
@@ -54,8 +54,6 @@ class Row:
     """int64 (n + 1,), nanoseconds since the timeline began; n intervals lie between them."""
     states: np.ndarray
     """uint8 (n,), of each interval."""
-    older_ns: np.ndarray
-    """int64 (states,), time in each state before what is kept."""
     kept_from: int
     """Nothing after this is missing."""
 
@@ -101,14 +99,12 @@ class Timeline:
                 ]
         return found or [(0.0, self.seconds)]
 
-    def shares(self, windows: Sequence[Window] | None = None) -> Shares:
-        """How the time of each role divides: in `windows`, of what is kept of them; None: in all, exactly."""
+    def shares(self, windows: Sequence[Window] = ()) -> Shares:
+        """How the time of each role divides in `windows`, as far as it is kept; empty: in all of it."""
+        ends = 1e9 * np.ravel(windows or [(0.0, self.seconds)])
         spent: dict[str, np.ndarray] = {}
         for row in self.rows:
-            if windows is None:
-                own = row.older_ns + row.until(row.times[-1:])[0]
-            else:
-                own = np.diff(row.until(1e9 * np.ravel(windows)), axis=0)[::2].sum(axis=0)
+            own = np.diff(row.until(ends), axis=0)[::2].sum(axis=0)
             spent[row.role] = spent.get(row.role, 0) + own
         return {role: divided(own) for role, own in spent.items() if own.sum() > 0}
 
@@ -118,28 +114,12 @@ def divided(spent: np.ndarray) -> dict[str, float]:
     return {STATES[i]: float(spent[i] / spent.sum()) for i in np.flatnonzero(spent)}
 
 
-def shares(run_directory: Path, *, training: bool = False) -> Shares:
-    """How the time of each role of a run divides among the states; `bubble` adds up the waiting.
-
-    If `training`, only that of the training, if the driver has recorded any, as far as it is kept.
-    """
-    timeline = read_timeline(run_directory)
-    return timeline.shares(timeline.training() if training else None)
-
-
 def read_timeline(run_directory: Path) -> Timeline:
     """Reads what the workers of a run have left."""
-    folder = run_directory / TIMELINE
-    if not run_directory.is_dir():
-        remedy = "a file; name the folder of a run" if run_directory.exists() else "no such folder"
-        raise InputError("runs", str(run_directory), remedy)
     check_folder(run_directory, Origin("runs", str(run_directory)))
-    processes = read_processes(folder)
-    if not processes and not (run_directory / CONFIG).is_file() and not folder.is_dir():
-        remedy = f"no run in it: there is no {CONFIG}, which every run writes first"
-        raise InputError("runs", str(run_directory), remedy)
+    processes = read_processes(run_directory / TIMELINE)
     if not processes:
-        remedy = "a run without a timeline: no worker has begun"
+        remedy = "no timeline in it: it is no run, or no worker has begun"
         raise InputError("runs", str(run_directory), remedy)
     return Timeline(run=run_directory, rows=_rows(processes))
 
@@ -154,8 +134,6 @@ class Head(NamedTuple):
     """When the part begins, since the process did."""
     state: int
     """In which it begins."""
-    totals_ns: np.ndarray
-    """int64, in each state up to then."""
     size: int
     """Bytes of the line."""
 
@@ -211,7 +189,6 @@ def read_head(path: Path) -> Head | None:
             begins=Moment(str(content["node"]), int(content["clock_ns"]), int(content["wall_ns"])),
             at_ns=int(content["at_ns"]),
             state=STATES.index(content["state"]),
-            totals_ns=np.array([int(content["totals_ns"].get(name, 0)) for name in STATES], dtype=np.int64),
             size=len(line),
         )
     except (ValueError, KeyError, TypeError, AttributeError) as error:
@@ -264,67 +241,23 @@ def _rows(processes: list[Process]) -> tuple[Row, ...]:
 def _row(worker: str, processes: list[tuple[int, Process]]) -> Row:
     times: np.ndarray = np.empty(0, np.int64)
     states: np.ndarray = np.empty(0, np.uint8)
-    older, kept_from = np.zeros(len(STATES), np.int64), 0
+    kept_from = 0
     for begun, process in processes:
         own = process.times + begun
         if len(times):  # the last entries of a process that was being ended are cut where the next one begins
             left = max(1, int(np.searchsorted(times, own[0])))
             times, states = times[:left], np.append(states[: left - 1], np.uint8(ABSENT))
         times, states = np.concatenate([times, own]), np.concatenate([states, process.states])
-        older += process.head.totals_ns
         if process.head.at_ns:
             kept_from = int(own[0])
     change = np.flatnonzero(np.diff(states, prepend=-1) != 0)  # beats are no changes of state
     times = np.append(times[:-1][change], times[-1])
-    return Row(worker=worker, times=times, states=states[change], older_ns=older, kept_from=kept_from)
+    return Row(worker=worker, times=times, states=states[change], kept_from=kept_from)
 
 
 def _place(row: Row) -> tuple[int, int, str]:
     number = row.worker[len(row.role) :].strip()
     return ROLES.index(row.role) if row.role in ROLES else len(ROLES), int(number or 0), row.role
-
-
-class Watch:
-    """Shares of a run that is still going, for its metrics; reads on where it stopped."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._seen: dict[tuple[str, int], tuple[Path, Head]] = {}
-        """Newest part of each process, and a head as if that part began where reading has stopped."""
-        self.news()
-
-    def news(self) -> dict[str, float]:
-        """``timeline_<role>_<state>_share`` and ``timeline_<role>_bubble`` since the last call."""
-        spent: dict[str, np.ndarray] = {}
-        for process, paths in part_paths(self._folder).items():
-            # Its worker has begun another part meanwhile; or it is damaged, which must not end a run.
-            with contextlib.suppress(FileNotFoundError, InputError):
-                path, before = self._seen.get(process, (None, None))
-                head = before if path == paths[-1] else read_head(paths[-1])
-                if head is not None:
-                    head = _read_on(paths[-1], head)
-                    self._seen[process] = paths[-1], head
-                    new = head.totals_ns if before is None else head.totals_ns - before.totals_ns
-                    role = role_of(head.worker)
-                    spent[role] = spent.get(role, 0) + new
-        news: dict[str, float] = {}
-        for role, own in spent.items():
-            if own.sum() > 0:
-                parts, name = divided(own), f"timeline_{role.replace(' ', '_')}"
-                news |= {f"{name}_{state}_share": share for state, share in parts.items()}
-                news[f"{name}_bubble"] = bubble(parts)
-        return news
-
-
-def _read_on(path: Path, head: Head) -> Head:
-    """The head that a part would have if it began after its last entry."""
-    times, states = read_entries(path, head.size, head.at_ns)
-    if not len(times):
-        return head
-    totals = head.totals_ns.copy()
-    np.add.at(totals, np.append(np.uint8(head.state), states[:-1]), np.diff(times, prepend=head.at_ns))
-    size = head.size + 8 * len(times)
-    return head._replace(at_ns=int(times[-1]), state=int(states[-1]), totals_ns=totals, size=size)
 
 
 PICTURE, TRACE = "timeline.png", "timeline.json"
@@ -334,13 +267,11 @@ MARK = "accerl timeline"
 TRACE_S = 60.0
 """Seconds of a trace, around the middle of the picture."""
 COLOURS = {
-    "compute": ("#3a7d44", "thread_state_running"), "wait_in": ("#dfe3e8", "white"),
-    "wait_out": ("#f0b429", "thread_state_iowait"), "transport": ("#5b8def", "rail_load"),
-    "weights": ("#9b5de5", "rail_animation"), "checkpoint": ("#8d6e63", "olive"),
-    "recovery": ("#d64545", "terrible"), "training": ("#a8c8a0", "good"),
-    "evaluation": ("#7fb8c9", "generic_work"),
+    "compute": "#3a7d44", "wait_in": "#dfe3e8", "wait_out": "#f0b429", "transport": "#5b8def",
+    "weights": "#9b5de5", "checkpoint": "#8d6e63", "recovery": "#d64545", "training": "#a8c8a0",
+    "evaluation": "#7fb8c9",
 }  # fmt: skip
-"""State → its colour in the picture, and the name of one that trace viewers know."""
+"""State → its colour in the picture."""
 COLUMNS = 1600
 """Columns of the picture; an interval that is shorter than one colours it in proportion."""
 
@@ -448,7 +379,7 @@ def trace(timeline: Timeline, window: Window) -> dict[str, Any]:
         begins, ends = np.maximum(row.times[:-1], first), np.minimum(row.times[1:], last)
         for i in np.flatnonzero((ends > begins) & (row.states != ABSENT)):
             state, begin = STATES[row.states[i]], int(begins[i])
-            event = {"ph": "X", "name": state, "cat": row.role, "cname": COLOURS[state][1], **place}
+            event = {"ph": "X", "name": state, "cat": row.role, **place}
             events.append({**event, "ts": begin / 1e3, "dur": (int(ends[i]) - begin) / 1e3})
     return {"traceEvents": events, "displayTimeUnit": "ms"}
 
@@ -459,7 +390,7 @@ def draw(path: Path, parts: Sequence[tuple[Timeline, Window]]) -> None:
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
-    colours = np.array([to_rgb(COLOURS[state][0]) for state in STATES])
+    colours = np.array([to_rgb(COLOURS[state]) for state in STATES])
     heights = [len(timeline.rows) for timeline, _ in parts]
     longest = max(end - start for _, (start, end) in parts)
     size = (12, 0.9 + sum(0.75 + 0.28 * height for height in heights))
@@ -481,7 +412,7 @@ def draw(path: Path, parts: Sequence[tuple[Timeline, Window]]) -> None:
         ax.tick_params(length=0)
         ax.spines[:].set_visible(False)
     axes[-1].set_xlabel("seconds")
-    handles = [Patch(color=COLOURS[STATES[i]][0], label=STATES[i]) for i in np.flatnonzero(seen)]
+    handles = [Patch(color=COLOURS[STATES[i]], label=STATES[i]) for i in np.flatnonzero(seen)]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles) or 1, frameon=False)
     figure.savefig(path, metadata={"Software": MARK})
 

@@ -2,8 +2,7 @@
 """The contract that both transports keep.
 
 * *whole*: what arrives has the dtypes, shapes, keys, texts and kinds of what was sent;
-* *answered*: each reply goes to the message it answers, in whatever order replies are made; a reply that is
-  not awaited any more is dropped;
+* *answered*: each reply goes to the message it answers, in whatever order replies are made;
 * *detached*: once `Client.send` has returned, the caller may change its arrays;
 * *bounded*: every wait has a timeout, and its error says what was awaited;
 * *no silence*: a client learns at once that the service has died or failed; a service drops the requests of
@@ -64,15 +63,15 @@ class Client(ABC):
         """
 
     @abstractmethod
-    def forget(self, ticket: int) -> None:
-        """Drop the reply to a message, whether it has come or will."""
-
-    @abstractmethod
     def close(self) -> None:
         """End the connection and forget what is under way. Safe to call twice."""
 
     def ask(self, messages: Sequence[Any], timeout: float) -> list[Any]:
-        """Send messages and wait for all replies; nothing else may be under way."""
+        """Send messages and wait for all replies; nothing else may be under way.
+
+        Raises:
+            TimeoutError: some have not come; the connection is of no use any more.
+        """
         under_way: dict[int, int] = {}
         """Ticket → index of the message."""
         replies: dict[int, Any] = {}
@@ -83,8 +82,6 @@ class Client(ABC):
                 sent += 1
             left = deadline - time.monotonic()
             if left <= 0:
-                for ticket in under_way:
-                    self.forget(ticket)
                 missing = f"{len(messages) - len(replies)} of {len(messages)} replies"
                 raise TimeoutError(f"{self.name}: {missing} did not come within {timeout:g} s")
             replies |= {under_way.pop(ticket): reply for ticket, reply in self.done(left)}

@@ -77,9 +77,6 @@ class RayClient(Client):
         except self._ray.exceptions.RayError as error:
             raise ServiceStoppedError(f"{self.name}: {error}") from error
 
-    def forget(self, ticket: int) -> None:
-        self._tickets = {reference: t for reference, t in self._tickets.items() if t != ticket}
-
     def close(self) -> None:
         self._tickets.clear()
 
@@ -150,13 +147,6 @@ class ReconnectingClient(Client):
         for ticket, _ in answered:
             del self._messages[ticket]
         return answered
-
-    def forget(self, ticket: int) -> None:
-        self._messages.pop(ticket, None)
-        for theirs in [theirs for theirs, ours in self._tickets.items() if ours == ticket]:
-            del self._tickets[theirs]
-            if self._client is not None:
-                self._client.forget(theirs)
 
     def close(self) -> None:
         self._messages.clear()

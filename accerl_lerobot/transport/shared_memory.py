@@ -75,7 +75,6 @@ class SharedMemoryClient(Client):
         self._free: list[int] = []
         self._under_way: dict[int, int] = {}
         """Ticket → slot."""
-        self._forgotten: set[int] = set()
         self._sent = 0
 
     def send(self, message: object) -> int:
@@ -106,36 +105,29 @@ class SharedMemoryClient(Client):
                 received = receive_token(self._socket)
                 if received is None:
                     raise self._gone("its end of the connection is closed")
-                replies += self._read(*received)
+                replies.append(self._read(*received))
                 if not self._under_way:
                     break
         except (OSError, DamagedTokenError, DamagedMessageError) as error:
             raise self._gone(error) from error
         return replies
 
-    def forget(self, ticket: int) -> None:
-        if ticket in self._under_way:
-            self._forgotten.add(ticket)
-
     def close(self) -> None:
         self._socket.close()
         self._slots.clear()
 
-    def _read(self, token: Token, slot: Slot | None) -> list[tuple[int, object]]:
-        """Copy a reply out, which frees its slot; empty if it was forgotten."""
+    def _read(self, token: Token, slot: Slot | None) -> tuple[int, object]:
+        """Copy a reply out, which frees its slot."""
         index = self._under_way.pop(token.ticket, -1)
         if index != token.slot:
             raise self._gone(f"a reply to message {token.ticket}, which was not asked")
         if slot is not None:
             self._slots[index] = slot
         self._free.append(index)
-        if token.ticket in self._forgotten:
-            self._forgotten.discard(token.ticket)
-            return []
         reply = decode(self._slots[index].memory, token.start, token.size)
         if token.purpose == FAIL:
             raise ServiceStoppedError(f"{self.name}: {reply}")
-        return [(token.ticket, reply)]
+        return token.ticket, reply
 
     def _gone(self, reason: object) -> ServiceStoppedError:
         return ServiceStoppedError(f"{self.name} is gone: {reason}")

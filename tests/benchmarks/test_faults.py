@@ -196,7 +196,7 @@ def test_a_run_of_time_survives_what_is_done_to_it(tmp_path: Path):
 def test_a_service_comes_back_long_after_the_run_was_taken_back(tmp_path: Path):
     """Where it begins again is still there, whatever has been saved since."""
     light = tmp_path / "light.yaml"
-    config = replace(light_config(updates=1_000_000), save_every_s=0.0, save_every_updates=1, save_keep=1)
+    config = replace(light_config(updates=1_000_000), save_every_s=0.0, save_every_updates=1)
     light.write_text(yaml.safe_dump(encode(config), sort_keys=False))
     victim = Victim(tmp_path / "run", [f"--config_path={light}"], tmp_path / "run.log", LIGHT)
     try:

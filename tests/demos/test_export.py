@@ -72,9 +72,9 @@ def test_every_whole_episode_is_in_the_dataset_step_by_step(
 
 def test_some_of_them(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     capsys.readouterr()
-    assert exported(run, tmp_path / "set", "--pick=successes", "--last=3") == 0
+    assert exported(run, tmp_path / "set", "--pick=successes") == 0
     found = json.loads(capsys.readouterr().out)
-    assert (found["episodes"], found["successes"]) == (3, 3)
+    assert found["episodes"] == found["successes"] > 0
 
 
 def test_a_run_with_types_of_other_packages(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -82,17 +82,6 @@ def test_what_is_no_name_of_a_repository(name: str | None):
             make()
 
 
-def test_other_fields_are_checked():
-    with pytest.raises(InputError, match="the name of the folder to push"):
-        PushConfig(repo_id="a/b")
-    with pytest.raises(InputError, match="the name of a folder to create"):
-        PullConfig(repo_id="a/b")
-    with pytest.raises(InputError, match="repo_type='space': use model or dataset"):
-        PullConfig(repo_id="a/b", output_dir="x", repo_type="space")
-    with pytest.raises(InputError, match="use some text or null"):
-        PushConfig(path="x", repo_id="a/b", message=" ")
-
-
 def test_a_device_or_a_pipe_in_place_of_a_file_is_not_read(tmp_path: Path):
     os.symlink("/dev/zero", tmp_path / "evaluation.json")
     os.mkfifo(tmp_path / "summary.json")

@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,6 +20,8 @@ from tests.hub_server import STRANGER, Answer, Fault, HubServer
 
 NAME = "alice/door"
 Files = dict[str, bytes]
+Pull = Callable[..., dict[str, Any]]
+Refusal = Callable[..., str]
 
 
 @pytest.fixture
@@ -34,7 +34,7 @@ def policy(hub: HubServer, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def pulled(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., dict[str, Any]]:
+def pulled(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Pull:
     def do(*more: str, to: str = "pulled") -> dict[str, Any]:
         capsys.readouterr()
         assert cli.main(["pull", f"--repo_id={NAME}", f"--output_dir={tmp_path / to}", *more]) == 0
@@ -45,20 +45,22 @@ def pulled(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., 
 
 
 @pytest.fixture
-def refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+def refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Refusal:
     """The one line of a pull that is refused; there is no folder then, and nothing else new."""
 
+    def our_paths() -> set[Path]:
+        tops = [top for top in tmp_path.iterdir() if top.name not in ("cache", "hub")]
+        return {
+            path for top in tops if not top.name.startswith(".pulling-") for path in (top, *top.rglob("*"))
+        }
+
     def do(*more: str, name: str = NAME) -> str:
-        before = {p for p in tmp_path.rglob("*") if not {"cache", "hub"} & set(p.relative_to(tmp_path).parts)}
+        before = our_paths()
         capsys.readouterr()
         assert cli.main(["pull", f"--repo_id={name}", f"--output_dir={tmp_path / 'pulled'}", *more]) == 2
         out, err = capsys.readouterr()
         (line,) = [line for line in err.splitlines() if line.startswith("accerl: ")]
-        after = {p for p in tmp_path.rglob("*") if not {"cache", "hub"} & set(p.relative_to(tmp_path).parts)}
-        assert out == "" and "Traceback" not in err
-        assert {
-            p for p in after - before if not p.relative_to(tmp_path).parts[0].startswith(".pulling-")
-        } == set()
+        assert out == "" and "Traceback" not in err and our_paths() == before
         return line
 
     return do
@@ -68,9 +70,7 @@ def contents_of(folder: Path) -> Files:
     return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
-def test_what_comes_is_what_went(
-    hub: HubServer, policy: Path, tmp_path: Path, pulled: Callable[..., dict[str, Any]]
-):
+def test_what_comes_is_what_went(hub: HubServer, policy: Path, tmp_path: Path, pulled: Pull):
     found = pulled()
     came = contents_of(tmp_path / "pulled")
     assert came.keys() - contents_of(policy).keys() == {"README.md", "accerl_pulled.json"}
@@ -83,7 +83,7 @@ def test_what_comes_is_what_went(
 
 
 def test_branches_tags_and_commits_are_pinned(
-    hub: HubServer, policy: Path, tmp_path: Path, pulled: Callable[..., dict[str, Any]], refused: Any
+    hub: HubServer, policy: Path, tmp_path: Path, pulled: Pull, refused: Refusal
 ):
     first = hub.repo(NAME).branches["main"]
     hub.repo(NAME).tags["best"] = hub.repo(NAME).branches["dev"] = first
@@ -105,7 +105,7 @@ def test_branches_tags_and_commits_are_pinned(
 
 
 def test_a_folder_that_is_there_is_not_touched(
-    hub: HubServer, policy: Path, tmp_path: Path, refused: Callable[..., str]
+    hub: HubServer, policy: Path, tmp_path: Path, refused: Refusal
 ):
     (tmp_path / "pulled").mkdir()
     (tmp_path / "pulled" / "mine").write_text("mine")
@@ -120,9 +120,7 @@ def test_a_folder_that_is_there_is_not_touched(
         ".cache/huggingface/download/x.metadata", ".git/config", "C:/escaped", "a/./b", "nul\0byte",
     ],
 )  # fmt: skip
-def test_names_that_lead_elsewhere(
-    hub: HubServer, policy: Path, refused: Callable[..., str], name: str, tmp_path: Path
-):
+def test_names_that_lead_elsewhere(hub: HubServer, policy: Path, refused: Refusal, name: str, tmp_path: Path):
     hub.plant(NAME, {name: b"evil"})
     assert "which is not safe to write" in refused()
     assert not [path for method, path, _ in hub.journal if "/resolve/" in path], "nothing was fetched"
@@ -151,7 +149,7 @@ ENTRY = {"size": 4, "sha256": "0" * 64}
     ],
 )
 def test_what_was_not_pushed_like_this_is_refused(
-    hub: HubServer, policy: Path, refused: Callable[..., str], tmp_path: Path, planted: Files, words: str
+    hub: HubServer, policy: Path, refused: Refusal, tmp_path: Path, planted: Files, words: str
 ):
     hub.plant(NAME, {"backbone/config.json": b"{}"} | planted)
     assert words in refused()
@@ -159,7 +157,7 @@ def test_what_was_not_pushed_like_this_is_refused(
 
 
 def test_code_that_a_recipe_could_name_does_not_come(
-    hub: HubServer, policy: Path, pulled: Callable[..., dict[str, Any]], tmp_path: Path
+    hub: HubServer, policy: Path, pulled: Pull, tmp_path: Path
 ):
     hub.plant(NAME, {"evil.py": b"raise SystemExit", "deep/er/x.so": b"\x7fELF", "notes.txt": b"py"})
     assert pulled()["left_out"] == ["deep/er/x.so", "evil.py"]
@@ -178,14 +176,12 @@ def test_code_that_a_recipe_could_name_does_not_come(
 
 
 @pytest.mark.parametrize("name", ["model.safetensors", "accerl.json"])
-def test_bytes_that_change_on_the_way(hub: HubServer, policy: Path, refused: Any, name: str):
+def test_bytes_that_change_on_the_way(hub: HubServer, policy: Path, refused: Refusal, name: str):
     hub.faults.append(Fault("GET", f"/{name}", spoil=True))
     assert f"{name} is not what the server lists: its hash is another" in refused()
 
 
-def test_a_cut_download_goes_on(
-    hub: HubServer, policy: Path, refused: Any, pulled: Callable[..., dict[str, Any]], tmp_path: Path
-):
+def test_a_cut_download_goes_on(hub: HubServer, policy: Path, refused: Refusal, pulled: Pull, tmp_path: Path):
     hub.faults.append(Fault("GET", "/model.safetensors", cut_after=0, times=6))
     line = refused()
     assert "run the same command again" in line and not (tmp_path / "pulled").exists()
@@ -200,9 +196,7 @@ def test_a_cut_download_goes_on(
     )
 
 
-def test_what_others_uploaded_has_no_manifest(
-    hub: HubServer, tmp_path: Path, pulled: Callable[..., dict[str, Any]], refused: Any
-):
+def test_what_others_uploaded_has_no_manifest(hub: HubServer, tmp_path: Path, pulled: Pull, refused: Refusal):
     hub.plant(NAME, contents_of(write_policy_folder(tmp_path / "theirs")))
     found = pulled()
     assert found["kind"] == "policy" and found["checked"] == 0 and found["unchecked"] == 6
@@ -212,7 +206,7 @@ def test_what_others_uploaded_has_no_manifest(
 
 
 def test_names_that_two_have_or_nobody(
-    hub: HubServer, policy: Path, refused: Any, pulled: Any, monkeypatch: Any
+    hub: HubServer, policy: Path, refused: Refusal, pulled: Pull, monkeypatch: Any
 ):
     hub.plant(NAME, {"meta/info.json": b"{}"}, repo_type="dataset")
     assert "alice/door is a model and a dataset; say which" in refused()
@@ -223,21 +217,35 @@ def test_names_that_two_have_or_nobody(
     assert "it is not there, or private; log in" in refused(name="alice/nowhere")
 
 
+def changed(where: str, change: Callable[[Answer], object]) -> Callable[[Answer], Answer]:
+    """Changes answers whose path has a part."""
+
+    def apply(answer: Answer) -> Answer:
+        if where in answer.path:
+            change(answer)
+        return answer
+
+    return apply
+
+
+def body(answer: Answer, data: bytes) -> None:
+    """Replaces the body of an answer."""
+    answer.pieces, answer.headers["Content-Length"] = [data], str(len(data))
+
+
 def altered(where: str, edit: Callable[[Any], Any]) -> Callable[[Answer], Answer]:
     """Changes the JSON of answers whose path has a part."""
 
-    def change(answer: Answer) -> Answer:
-        if where in answer.path and answer.status == 200:
-            answer.pieces = [json.dumps(edit(json.loads(b"".join(answer.pieces)))).encode()]
-            answer.headers["Content-Length"] = str(len(answer.pieces[0]))
-        return answer
+    def change(answer: Answer) -> None:
+        if answer.status == 200:
+            body(answer, json.dumps(edit(json.loads(b"".join(answer.pieces)))).encode())
 
-    return change
+    return changed(where, change)
 
 
 @pytest.mark.parametrize("commit", ["/../../escaped", "main", "", "A" * 40, f"{'0' * 40}\n", 7, ["0"]])
 def test_a_commit_is_forty_hexadecimal_digits(
-    hub: HubServer, policy: Path, refused: Callable[..., str], tmp_path: Path, commit: Any
+    hub: HubServer, policy: Path, refused: Refusal, tmp_path: Path, commit: Any
 ):
     hub.change = altered("/api/models/alice/door", lambda c: c | {"sha": commit} if "sha" in c else c)
     assert "a commit, which has 40 hexadecimal digits" in refused()
@@ -246,14 +254,9 @@ def test_a_commit_is_forty_hexadecimal_digits(
 
 @pytest.mark.parametrize("header", ["X-Repo-Commit", "ETag", "X-Linked-ETag"])
 def test_hashes_in_headers_become_no_paths(
-    hub: HubServer, policy: Path, refused: Callable[..., str], header: str, tmp_path: Path
+    hub: HubServer, policy: Path, refused: Refusal, header: str, tmp_path: Path
 ):
-    def change(answer: Answer) -> Answer:
-        if "/resolve/" in answer.path:
-            answer.headers[header] = "../../../../escaped"
-        return answer
-
-    hub.change = change
+    hub.change = changed("/resolve/", lambda answer: answer.headers.update({header: "../../../../escaped"}))
     line = refused()
     assert "40 hexadecimal digits" in line or "is no hash" in line
     assert not list(tmp_path.rglob("*escaped*"))
@@ -267,12 +270,7 @@ def test_huggingface_hub_alone_writes_where_a_header_says(hub: HubServer, policy
     from accerl_lerobot.errors import InputError
     from accerl_lerobot.policies.guard import fetched_checkpoint
 
-    def change(answer: Answer) -> Answer:
-        if "/resolve/" in answer.path:
-            answer.headers["ETag"] = "../../../escaped"
-        return answer
-
-    hub.change = change
+    hub.change = changed("/resolve/", lambda answer: answer.headers.update({"ETag": "../../../escaped"}))
     set_client_factory(default_client_factory)
     hf_hub_download(NAME, "config.json")
     assert (tmp_path / "escaped").is_file()
@@ -293,7 +291,7 @@ def test_huggingface_hub_alone_writes_where_a_header_says(hub: HubServer, policy
     ],
 )
 def test_what_a_server_may_list(
-    hub: HubServer, policy: Path, refused: Callable[..., str], entry: dict[str, Any], words: str
+    hub: HubServer, policy: Path, refused: Refusal, entry: dict[str, Any], words: str
 ):
     entry = {"type": "file", "path": "x", "size": 1, "oid": "0" * 40} | entry
     hub.change = altered("/tree/", lambda listed: [*listed, entry])
@@ -305,58 +303,46 @@ def test_what_a_server_may_list(
     "names", [("a", "a/b"), ("a/b", "a"), ("x/Y", "x/y"), ("X/a", "x/b"), ("\xe9", "e\u0301")]
 )
 def test_names_of_which_one_would_be_written_over_the_other(
-    hub: HubServer, policy: Path, refused: Callable[..., str], names: tuple[str, str]
+    hub: HubServer, policy: Path, refused: Refusal, names: tuple[str, str]
 ):
     hub.plant(NAME, dict.fromkeys(names, b"x"))
     assert "and another file of it cannot both be written" in refused()
 
 
-@pytest.mark.parametrize("body", [b"[]", b"as it was"])
-def test_pages_without_end(
-    hub: HubServer, policy: Path, refused: Callable[..., str], body: bytes, monkeypatch: Any
-):
-    def change(answer: Answer) -> Answer:
-        if "/tree/" in answer.path:
-            answer.headers["Link"] = f'<{hub.url}{answer.path}?page=1>; rel="next"'
-            if body == b"[]":
-                answer.pieces, answer.headers["Content-Length"] = [body], "2"
-        return answer
+@pytest.mark.parametrize("empty", [True, False])
+def test_pages_without_end(hub: HubServer, policy: Path, refused: Refusal, empty: bool, monkeypatch: Any):
+    def change(answer: Answer) -> None:
+        answer.headers["Link"] = f'<{hub.url}{answer.path}?page=1>; rel="next"'
+        if empty:
+            body(answer, b"[]")
 
-    hub.change = change
+    hub.change = changed("/tree/", change)
     monkeypatch.setattr(errors, "REQUESTS_MOST", 50)
     assert "answering takes more requests than its files can need" in refused()
 
 
-def test_a_byte_now_and_then(hub: HubServer, policy: Path, refused: Callable[..., str], monkeypatch: Any):
-    def change(answer: Answer) -> Answer:
-        if "/resolve/" in answer.path:
-            answer.pieces = [bytes([byte]) for byte in b"".join(answer.pieces)]
-            answer.pause_s = 0.02
-        return answer
+def test_a_byte_now_and_then(hub: HubServer, policy: Path, refused: Refusal, monkeypatch: Any):
+    def change(answer: Answer) -> None:
+        answer.pieces = [bytes([byte]) for byte in b"".join(answer.pieces)]
+        answer.pause_s = 0.02
 
-    hub.change = change
+    hub.change = changed("/resolve/", change)
     monkeypatch.setattr(errors, "WINDOW_S", 0.2)
     monkeypatch.setattr(errors, "SLOWEST", 10_000)
     assert "it sends less than 10000 bytes a second" in refused()
 
 
-def test_redirects_in_a_circle(hub: HubServer, policy: Path, refused: Callable[..., str]):
-    def change(answer: Answer) -> Answer:
+def test_redirects_in_a_circle(hub: HubServer, policy: Path, refused: Refusal):
+    def change(answer: Answer) -> None:
         answer.status, answer.headers["Location"] = 302, f"{hub.url}{answer.path}"
-        return answer
 
-    hub.change = change
+    hub.change = changed("", change)
     assert "Exceeded maximum allowed redirects" in refused()
 
 
-@pytest.mark.parametrize("body", [b"{", b"[" * 100_000, b"\xff", b"null", b"[[1]]"])
-def test_answers_that_are_no_answers(hub: HubServer, policy: Path, refused: Callable[..., str], body: bytes):
-    def change(answer: Answer) -> Answer:
-        if "/api/" in answer.path:
-            answer.pieces, answer.headers["Content-Length"] = [body], str(len(body))
-        return answer
-
-    hub.change = change
+@pytest.mark.parametrize("data", [b"{", b"[" * 100_000, b"\xff", b"null", b"[[1]]"])
+def test_answers_that_are_no_answers(hub: HubServer, policy: Path, refused: Refusal, data: bytes):
+    hub.change = changed("/api/", lambda answer: body(answer, data))
     assert refused().startswith(f"accerl: repo_id='{NAME}': ")
 
 
@@ -364,7 +350,7 @@ ARENA = f"them/arena@{'0123456789' * 4}"
 
 
 def test_no_run_that_was_pulled_lets_code_run(
-    hub: HubServer, pulled: Callable[..., dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    hub: HubServer, pulled: Pull, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     run = write_run_folder(tmp_path / "run")
     recipe = (
@@ -397,14 +383,3 @@ def test_no_run_that_was_pulled_lets_code_run(
         assert "a file cannot allow this, only the command line can" in "".join(capsys.readouterr())
     assert cli.main(["export", f"--path={run}", f"--root={tmp_path / 'set'}"]) == 2
     assert f"the run's environment is code of {ARENA}" in capsys.readouterr().err
-
-
-def test_a_hostile_hub_writes_nothing_elsewhere_and_ends_in_one_line(tmp_path: Path):
-    command = [sys.executable, "-m", "tests.hub.hostile_hub", "0", str(tmp_path), "60"]
-    root = Path(__file__).parents[2]
-    done = subprocess.run(command, cwd=root, capture_output=True, text=True, errors="replace", check=False)
-    assert done.returncode == 0, done.stderr[-3000:]
-    found = json.loads(done.stdout.splitlines()[-1])
-    assert found["uncaught"] == found["outside"] == [] and found["consented"] == 0
-    assert found["longest_nap_s"] <= 10 and found["memory_mib"] < 300
-    assert {name.split()[1] for name in found["outcomes"]} == {"good", "refused"}

@@ -115,15 +115,6 @@ def play(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     return run
 
 
-def test_a_full_batch_is_served_without_waiting(play):
-    async def scene(worker, adapter):
-        worker._batcher.max_wait_s = 1e9  # only fullness can be why this is answered
-        await asyncio.gather(*(worker.decide(requests(i)) for i in range(4)))
-        assert adapter.batches == [[0, 1, 2, 3]]
-
-    play(scene, max_batch=4)
-
-
 def test_a_lonely_request_is_served_when_it_has_waited(play):
     async def scene(worker, adapter):
         await worker.decide(requests(5))
@@ -132,22 +123,6 @@ def test_a_lonely_request_is_served_when_it_has_waited(play):
         assert metrics["wait_max_s"] >= 0.05 and metrics["batches"] == 1
 
     play(scene, max_batch=4, max_wait_s=0.05)
-
-
-def test_a_trickle_of_requests_does_not_postpone_the_oldest(play):
-    async def scene(worker, adapter):
-        first = asyncio.create_task(worker.decide(requests(0)))
-        later = []
-        for i in range(1, 200):
-            await asyncio.sleep(0.01)
-            later.append(asyncio.create_task(worker.decide(requests(i))))
-            if first.done():
-                break
-        await asyncio.gather(first, *later)
-        # Were the clock to begin with the newest request, all of them would have been one batch.
-        assert adapter.batches[0][0] == 0 and len(adapter.batches[0]) < 200 - 1 and len(later) < 199
-
-    play(scene, max_batch=1000, max_wait_s=0.1)
 
 
 def test_answers_go_to_those_who_asked_in_their_order(play):
@@ -216,16 +191,6 @@ def test_weights_that_arrive_while_nobody_asks_are_loaded(play):
         assert (await worker.metrics())["version"] == 3
 
     play(scene, max_batch=4, max_wait_s=0.0)
-
-
-def test_the_first_weights_are_version_zero_and_are_loaded(play):
-    async def scene(worker, adapter):
-        adapter.weights = dict.fromkeys(NAMES, -1.0)  # another critic than the trainer's
-        await worker.receive_weights(0, weights(0), time.time())
-        (decision,) = await worker.decide(requests(0))
-        assert decision.version == 0 and set(decision.chunk.ravel()) == {0.0}
-
-    play(scene, max_batch=1, max_wait_s=0.0)
 
 
 def test_older_weights_are_ignored_even_while_newer_ones_are_loaded(play):
@@ -310,6 +275,7 @@ def test_weights_through_shared_memory_are_swapped_in_and_let_go_of(play):
     publisher = SharedMemoryPublisher(1)
 
     async def scene(worker, adapter):
+        assert not await worker.open_weights("accerl-weights-nobody")
         assert await worker.open_weights(publisher.address)
         for version in range(30):
             publisher.publish(version, weights(version))
@@ -321,13 +287,6 @@ def test_weights_through_shared_memory_are_swapped_in_and_let_go_of(play):
 
     play(scene, max_batch=1, max_wait_s=0.0)
     publisher.close()
-
-
-def test_nobody_at_the_address_is_an_answer_and_no_error(play):
-    async def scene(worker, adapter):
-        assert not await worker.open_weights("accerl-weights-nobody")
-
-    play(scene)
 
 
 def test_a_torn_set_ends_the_service_and_is_never_served(play, monkeypatch: pytest.MonkeyPatch):

@@ -6,15 +6,12 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from accerl_lerobot.algorithms import PPOConfig
-from accerl_lerobot.cli.verbs import WorldModelRun
-from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.engine.config import RunConfig, encode
 from accerl_lerobot.envs import MetaWorldConfig, SimulatedConfig
 from accerl_lerobot.evaluation import wilson_interval
@@ -142,41 +139,5 @@ def imagined(share: float = 0.5, on: float = 1.0) -> dict[str, Any]:
         "imagination_success_real": 0.4, "imagination_on": on, "imagination_promoted": 1.0,
         "imagination_rejected": 2.0, "imagination_learn_episodes": 30.0, "replay_imagined_share": share,
         "replay_trained_decisions": 100.0, "replay_imagined_trained_decisions": 300.0,
-        "imagination_check_skill_changed_first": 0.7, "imagination_check_false_success": 0.8,
+        "imagination_check_skill_changed_first": 0.7,
     }  # fmt: skip
-
-
-def write_world_model(folder: Path, *, passed: bool = True, finished: bool = True) -> Path:
-    """A run of ``accerl world-model``."""
-    folder.mkdir(parents=True)
-    recipe = replace(WorldModelRun(), dataset=DatasetConfig(repo_id="accerl/demos"))
-    (folder / "config.yaml").write_text(yaml.safe_dump(encode(recipe), sort_keys=False))
-    losses = [
-        {"kind": "world_model", "step": step, "image": 1 / step, "state": 0.1, "image_imagined": 1.1 / step}
-        for step in range(20, 420, 20)
-    ]
-    (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in losses))
-    if finished:
-        depths = [
-            {
-                "depth": depth, "windows": 50, "skill": {"value": 0.7, "low": 0.6, "high": 0.8},
-                "skill_changed": {"value": 0.8, "low": 0.7, "high": 0.9},
-                "state_error": 0.1, "state_error_copy": 0.2,
-                "sensitivity_shuffled": {"value": 2.0, "low": 1.5, "high": math.nan},
-            }
-            for depth in (1, 2, 3)
-        ]  # fmt: skip
-        checks = {
-            "skill_last": {"value": 0.7, "wanted": "above 0.0", "holds": True},
-            "recall": {"value": 0.1, "wanted": "above 0.3", "holds": passed},
-        }
-        result = {
-            "checks": checks,
-            "passed": passed,
-            "depths": depths,
-            "windows": 50,
-            "episodes": 8,
-            "seconds": 61.0,
-        }
-        (folder / "validation.json").write_text(json.dumps(result) + "\n")
-    return folder

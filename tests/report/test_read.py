@@ -22,18 +22,17 @@ def append(folder: Path, *records: dict[str, Any]) -> None:
 
 def test_a_finished_run(tmp_path: Path) -> None:
     run = read_run(write_run(tmp_path / "run"))
-    assert run.verb == "train" and run.name == "run" and not run.truncated and run.sessions == 1
+    assert run.name == "run" and not run.truncated and run.sessions == 1
     assert {kind: len(records) for kind, records in run.records.items()} == {
         "train": 40, "rollout": 40, "evaluation": 2,
     }  # fmt: skip
     assert run.result is not None and run.result["success_after"] == 0.9
-    assert run.checkpoint == tmp_path / "run" / "checkpoints" / "last" / "pretrained_model"
 
 
 def test_a_run_that_is_not_finished_or_did_not_come_to_its_metrics(tmp_path: Path) -> None:
     folder = write_run(tmp_path / "run", finished=False)
     run = read_run(folder)
-    assert run.result is None and run.checkpoint is None and len(run.records["train"]) == 40
+    assert run.result is None and len(run.records["train"]) == 40
     (folder / "metrics.jsonl").unlink()
     run = read_run(folder)
     assert run.records == {} and not run.truncated and run.outcomes == []

@@ -51,11 +51,6 @@ def test_states_exclude_each_other_and_leave_no_time_out(tmp_path: Path, seed: i
     clock, hands = a_clock(tmp_path)
     spans = lived(clock, hands, random.Random(seed), turns=3000)
     clock.close()
-    totals = clock.totals_ns()
-    assert sum(totals.values()) == hands.now - UP
-    assert totals == {
-        name: sum(length for state, length in spans if state == number) for number, name in enumerate(STATES)
-    }
     (row,) = read_timeline(tmp_path).rows
     assert row.times[0] == 0 and row.times[-1] == hands.now - UP
     # States in which no time was spent may be there or not.
@@ -67,17 +62,6 @@ def merged(spans: list[tuple[int, int]]) -> list[tuple[int, int]]:
     return [(s, sum(n for _, n in own)) for s, own in itertools.groupby(spans, key=lambda span: span[0])]
 
 
-def test_entering_the_same_state_again_is_no_entry(tmp_path: Path) -> None:
-    clock, hands = a_clock(tmp_path)
-    clock.enter(COMPUTE)
-    hands.now += 5
-    clock.enter(COMPUTE)
-    clock.close()
-    (path,) = (tmp_path / TIMELINE).iterdir()
-    assert len(path.read_bytes().split(b"\n", 1)[1]) == 2 * 8  # and the beat at the end
-    clock.close()
-
-
 def test_a_while_in_another_state_ends_in_the_one_before_whatever_happens(tmp_path: Path) -> None:
     clock, hands = a_clock(tmp_path)
     clock.enter(COMPUTE)
@@ -86,7 +70,9 @@ def test_a_while_in_another_state_ends_in_the_one_before_whatever_happens(tmp_pa
         raise KeyError
     hands.now += 2
     clock.beat()
-    assert (clock.totals_ns()["wait_out"], clock.totals_ns()["compute"]) == (7, 2)
+    (row,) = read_timeline(tmp_path).rows
+    assert row.states.tolist() == [RECOVERY, COMPUTE, WAIT_OUT, COMPUTE]
+    assert np.diff(row.times).tolist() == [0, 0, 7, 2]
 
 
 def test_entries_and_beats_of_two_threads_leave_no_time_out(tmp_path: Path) -> None:
@@ -105,7 +91,7 @@ def test_entries_and_beats_of_two_threads_leave_no_time_out(tmp_path: Path) -> N
     thread.join()
     clock.close()
     (process,) = read_processes(tmp_path / TIMELINE)
-    assert sum(clock.totals_ns().values()) == process.times[-1] > 0
+    assert process.times[-1] > 0
     assert np.sum(np.diff(process.states.astype(int)) != 0) == 5000
 
 
@@ -116,16 +102,11 @@ def test_what_is_old_makes_room_and_is_counted(tmp_path: Path) -> None:
     files = list((tmp_path / TIMELINE).iterdir())
     # Two parts, each beyond its size by one batch of entries and a first line at most.
     assert len(files) == 2 and sum(f.stat().st_size for f in files) < 2 * (8 * (1000 + 512) + 1000)
-    timeline = read_timeline(tmp_path)
-    (row,) = timeline.rows
+    (row,) = read_timeline(tmp_path).rows
     (process,) = read_processes(tmp_path / TIMELINE)
     assert len(process.states) >= 1000 and row.kept_from > 0
     kept = [(s, n) for s, n in zip(row.states.tolist(), np.diff(row.times).tolist(), strict=True) if n]
     assert merged(kept)[1:] == merged([(s, n) for s, n in spans if n])[-len(merged(kept)) + 1 :]
-    whole = sum(n for _, n in spans)
-    for number, name in enumerate(STATES):
-        exact = sum(n for s, n in spans if s == number) / whole
-        assert timeline.shares()["trainer"][name] == pytest.approx(exact, rel=1e-12)
     assert PART_BYTES / 8 >= 400_000
 
 
@@ -154,6 +135,7 @@ def test_a_process_that_was_killed_leaves_all_but_what_was_on_its_way(tmp_path: 
         ("format", "format 9"),
         ("back", "time goes back"),
         ("state", "no such state"),
+        ("name", "no part of a timeline has such a name"),
     ],
 )
 def test_a_damaged_file_is_named(tmp_path: Path, broken: bytes | str, why: str) -> None:
@@ -162,6 +144,8 @@ def test_a_damaged_file_is_named(tmp_path: Path, broken: bytes | str, why: str) 
     head, entries = path.read_bytes().split(b"\n", 1)
     if isinstance(broken, bytes):
         path.write_bytes(broken)
+    elif broken == "name":
+        path = path.rename(path.with_name("notes.bin"))
     elif broken == "format":
         path.write_bytes(json.dumps({**json.loads(head), "timeline": 9}).encode() + b"\n")
     else:
@@ -172,25 +156,9 @@ def test_a_damaged_file_is_named(tmp_path: Path, broken: bytes | str, why: str) 
     assert caught.value.field == "runs"
 
 
-def test_a_file_that_is_none_of_ours_is_named(tmp_path: Path) -> None:
-    (tmp_path / TIMELINE).mkdir()
-    (tmp_path / TIMELINE / "notes.bin").write_bytes(b"")
-    with pytest.raises(InputError, match=r"notes\.bin.*no part of a timeline has such a name"):
-        read_timeline(tmp_path)
-
-
 def test_without_a_folder_nothing_is_recorded() -> None:
     clock = open_clock(None, "trainer")
     assert isinstance(clock, NoClock)
     with clock.during(COMPUTE):
         clock.beat()
     clock.close()
-    assert clock.totals_ns() == {}
-
-
-def test_processes_of_one_worker_write_beside_each_other(tmp_path: Path) -> None:
-    for _ in range(3):
-        open_clock(tmp_path, "rollout 1").close()
-    open_clock(tmp_path, "rollout 11").close()
-    names = {path.name for path in tmp_path.iterdir()}
-    assert names == {"rollout-1.0.0.bin", "rollout-1.1.0.bin", "rollout-1.2.0.bin", "rollout-11.0.0.bin"}

@@ -18,7 +18,7 @@ from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.inference import worker as inference_worker
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.timeline import TIMELINE
-from accerl_lerobot.timeline.read import ABSENT, Timeline, read_head, read_timeline, shares
+from accerl_lerobot.timeline.read import ABSENT, Timeline, read_head, read_timeline
 from accerl_lerobot.trainer import worker as trainer_worker
 from benchmarks.simulated_world import LatencyConfig
 from tests.light_workers import LightInference, LightTrainer, light_ray
@@ -72,7 +72,7 @@ def test_the_asynchronous_engine(light: None, tmp_path: Path) -> None:
     rows = {row.worker: row for row in timeline.rows}
     assert list(rows) == ["rollout 0", "rollout 1", "replay"]
     assert (rows["rollout 0"].states == ABSENT).sum() == 1 and ABSENT not in rows["rollout 1"].states
-    found = shares(tmp_path)
+    found = read_timeline(tmp_path).shares()
     assert {"recovery", "compute", "transport", "wait_in"} <= found["rollout"].keys()
     assert found["replay"].keys() == {"recovery", "compute", "wait_in"}
     # The whole life of replay is in it, from before it was ready to when it was asked last.

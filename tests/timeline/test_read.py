@@ -14,14 +14,13 @@ from accerl_lerobot.timeline import (
     COMPUTE,
     EVALUATION,
     RECOVERY,
-    TIMELINE,
     TRAINING,
     WAIT_IN,
     WAIT_OUT,
     Moment,
     bubble,
 )  # fmt: skip
-from accerl_lerobot.timeline.read import ABSENT, Watch, read_timeline, shares
+from accerl_lerobot.timeline.read import ABSENT, read_timeline
 from tests.timeline.folders import SECOND, UP, a_clock, write_worker
 
 
@@ -37,7 +36,7 @@ def run(tmp_path: Path) -> Path:
 
 
 def test_shares_are_of_the_time_of_all_workers_of_a_role(run: Path) -> None:
-    found = shares(run)
+    found = read_timeline(run).shares()
     assert found["rollout"] == pytest.approx({"compute": 0.4, "wait_in": 0.2, "wait_out": 0.4})
     assert found["trainer"] == pytest.approx({"compute": 4 / 9, "wait_in": 5 / 9})
     assert list(found) == ["driver", "rollout", "trainer"]
@@ -50,7 +49,7 @@ def test_shares_of_a_part(run: Path) -> None:
     assert timeline.shares([(9.0, 10.0)])["rollout"] == pytest.approx({"wait_in": 0.5, "wait_out": 0.5})
     assert timeline.shares([(0.0, 0.5)]).keys() == {"driver", "rollout"}, "the trainer had not begun"
     # From second 2 to 8, the checkpoint included.
-    assert shares(run, training=True)["trainer"] == pytest.approx({"wait_in": 0.5, "compute": 0.5})
+    assert timeline.shares(timeline.training())["trainer"] == pytest.approx({"wait_in": 0.5, "compute": 0.5})
 
 
 def test_a_resumed_run_has_trained_twice(run: Path) -> None:
@@ -58,7 +57,9 @@ def test_a_resumed_run_has_trained_twice(run: Path) -> None:
     write_worker(run, "trainer", [(RECOVERY, 6), (COMPUTE, 4)], at_s=100)
     timeline = read_timeline(run)
     assert timeline.training() == [(2.0, 8.0), (107.0, 110.0)]
-    assert shares(run, training=True)["trainer"] == pytest.approx({"wait_in": 3 / 9, "compute": 6 / 9})
+    assert timeline.shares(timeline.training())["trainer"] == pytest.approx(
+        {"wait_in": 3 / 9, "compute": 6 / 9}
+    )
 
 
 def test_a_worker_that_was_started_again_is_one_row_with_a_gap(tmp_path: Path) -> None:
@@ -67,15 +68,12 @@ def test_a_worker_that_was_started_again_is_one_row_with_a_gap(tmp_path: Path) -
     (row,) = read_timeline(tmp_path).rows
     assert row.states.tolist() == [RECOVERY, COMPUTE, ABSENT, RECOVERY, COMPUTE]
     assert (row.times / SECOND).tolist() == [0, 0, 2, 4, 5, 6]
-    assert shares(tmp_path)["rollout"] == pytest.approx({"compute": 0.75, "recovery": 0.25})
-
-
-def test_the_last_entries_of_a_process_are_cut_where_its_successor_begins(tmp_path: Path) -> None:
-    write_worker(tmp_path, "rollout 0", [(COMPUTE, 2), (WAIT_IN, 3)])
-    write_worker(tmp_path, "rollout 0", [(COMPUTE, 1)], at_s=4)
+    assert read_timeline(tmp_path).shares()["rollout"] == pytest.approx({"compute": 0.75, "recovery": 0.25})
+    # The next process begins before the last entries of this one end.
+    write_worker(tmp_path, "rollout 3", [(COMPUTE, 1)], at_s=5.5)
     (row,) = read_timeline(tmp_path).rows
     assert (np.diff(row.times) >= 0).all() and len(row.states) == len(row.times) - 1
-    assert row.times[-1] == 5 * SECOND
+    assert row.times[-1] == 6.5 * SECOND
 
 
 def test_machines_are_set_by_the_calendar_and_processes_of_one_by_its_clock(tmp_path: Path) -> None:
@@ -103,41 +101,7 @@ def test_workers_are_in_order(tmp_path: Path) -> None:
 def test_a_folder_without_a_run_and_a_run_without_a_timeline(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     (tmp_path / "empty").mkdir()
-    (tmp_path / "bare").mkdir()
-    (tmp_path / "bare" / "config.yaml").write_text("")
-    said = {"nowhere": "no such folder", "file": "a file", "empty": "no run in it", "bare": "no worker"}
+    said = {"nowhere": "no such folder", "file": "a file", "empty": "no timeline in it"}
     for name, text in said.items():
         with pytest.raises(InputError, match=f"^runs='[^']*{name}': .*{text}"):
-            shares(tmp_path / name)
-
-
-def test_news_cover_the_time_since_the_last_call(tmp_path: Path) -> None:
-    write_worker(tmp_path, "trainer", [(WAIT_IN, 100)], at_s=-200)  # before anyone watched
-    clock, hands = a_clock(tmp_path, "trainer", part_bytes=80)
-    watch = Watch(tmp_path / TIMELINE)
-    assert watch.news() == {}
-    for state, length in ((COMPUTE, 3), (WAIT_IN, 1)):
-        clock.enter(state)
-        hands.now += length * SECOND
-    clock.beat()
-    assert watch.news() == {
-        "timeline_trainer_compute_share": 0.75,
-        "timeline_trainer_wait_in_share": 0.25,
-        "timeline_trainer_bubble": 0.25,
-    }
-    assert watch.news() == {}
-    spent = 0.0
-    for _ in range(50):  # through many parts
-        clock.enter(COMPUTE)
-        hands.now += SECOND
-        clock.enter(WAIT_OUT)
-        hands.now += 3 * SECOND
-        clock.beat()
-        spent += watch.news()["timeline_trainer_bubble"]
-    assert spent == pytest.approx(50 * 0.75)
-    write_worker(tmp_path, "world learning", [(COMPUTE, 1)])
-    assert watch.news() == {
-        "timeline_world_learning_compute_share": 1.0,
-        "timeline_world_learning_bubble": 0.0,
-    }
-    assert Watch(tmp_path / "nowhere").news() == {}
+            read_timeline(tmp_path / name)

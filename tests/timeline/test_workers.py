@@ -1,44 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Each worker's reported activity, while it does something that a test knows. Engines:
-``test_engines.py``."""
+"""Successive states of trainer, inference and replay while they do something that a test knows."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
-from concurrent.futures import Future
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from accerl_lerobot.algorithms import GIPOConfig
-from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.experience import TASK, Decision, Request
 from accerl_lerobot.inference.worker import InferenceConfig, InferenceWorker
 from accerl_lerobot.policies import loading
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.replay.worker import ReplayWorker
-from accerl_lerobot.rollout import worker as rollout
-from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.timeline import STATES, TIMELINE
 from accerl_lerobot.timeline.read import read_timeline
 from accerl_lerobot.trainer import worker as trainer
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.peers import LearnerSettings
-from accerl_lerobot.transport.contract import Client
-from accerl_lerobot.transport.endpoint import Endpoint
 from accerl_lerobot.weights import factory
 from tests.local_ray import Handle, Local
 from tests.replay.segments import make_segment
 from tests.trainer.linear import LinearAdapter, make_segments
-from tests.transport.played import PlayedClient, played
-
-
-class StoppedError(Exception):
-    """Ends a loop that has no end."""
 
 
 def states(run: Path) -> list[str]:
@@ -112,58 +98,3 @@ def test_replay(tmp_path: Path) -> None:
 def decision() -> Decision:
     zeros = np.zeros((4, 2), np.float32)
     return Decision(chunk=zeros, latent={"x": zeros}, log_prob=np.zeros(4, np.float32), value=0.0, version=0)
-
-
-@pytest.fixture
-def collect(tmp_path: Path) -> Callable[..., list[str]]:
-    """Has a rollout worker explore until `over` is set; what it was in."""
-
-    def run(door: Endpoint, decide: Callable[[list[Request]], Any]) -> list[str]:
-        worker = rollout.RolloutWorker(
-            SimulatedConfig(max_steps=8, tolerance=0.05), RolloutConfig(worlds=1, segment_length=1),
-            ("match",), 0, rollout.WorkerShare(0), timeline=tmp_path / TIMELINE,
-        )  # fmt: skip
-        worker.report(True, [])
-        with pytest.raises(StoppedError):
-            worker.run(played(decide), door)
-        worker.report(True, [])
-        return states(tmp_path)
-
-    return run
-
-
-def test_collecting_is_to_step_worlds_and_wait_for_decisions(collect) -> None:
-    calls: list[int] = []
-
-    def decide(requests: list[Request]) -> list[Decision]:
-        calls.append(len(requests))
-        if len(calls) > 20:
-            raise StoppedError
-        return [decision() for _ in requests]
-
-    seen = collect(played(lambda segments: True), decide)
-    assert set(seen) == {"recovery", "compute", "transport", "wait_in"}
-    # Every decision is waited for, executed, and followed by a segment and a request.
-    start = seen.index("wait_in", 2)
-    assert seen[start : start + 4] == ["wait_in", "compute", "transport", "wait_in"]
-
-
-class ShutDoor(Endpoint):
-    """Lets nobody in, and ends the loop that has waited there three times."""
-
-    def connect(self) -> Client:
-        class Shut(PlayedClient):
-            waits = 0
-
-            def done(self, timeout: float) -> list[tuple[int, Any]]:
-                self.waits += bool(self._under_way) and timeout > 0
-                if self.waits > 3:
-                    raise StoppedError
-                return []
-
-        return Shut(self.name, lambda segments: Future())
-
-
-def test_a_full_door_is_waited_at(collect) -> None:
-    seen = collect(ShutDoor(name="door", method=None), lambda requests: [decision() for _ in requests])
-    assert seen[-1] == "wait_out"

@@ -35,9 +35,6 @@ class PlayedClient(Client):
         done = [ticket for ticket, future in self._under_way.items() if future.done()]
         return [(ticket, self._under_way.pop(ticket).result()) for ticket in done]
 
-    def forget(self, ticket: int) -> None:
-        self._under_way.pop(ticket, None)
-
     def close(self) -> None:
         self._under_way.clear()
 

@@ -37,11 +37,6 @@ def test_views_are_of_the_buffer_and_copies_are_not():
     assert (view == 255).all() and (copy == 0).all()
 
 
-def test_arrays_begin_at_lines_of_the_cache():
-    message = [np.zeros(3, np.uint8), "text", np.zeros(5, np.float64)]
-    assert all(offset % 64 == 0 for offset in encode(message).offsets)
-
-
 @dataclass
 class Stranger:
     """An object of no registered kind."""

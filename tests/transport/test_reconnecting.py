@@ -8,8 +8,6 @@ import time
 from concurrent.futures import Future
 from typing import Any
 
-import pytest
-
 from accerl_lerobot.transport.contract import ServiceStoppedError
 from accerl_lerobot.transport.endpoint import Endpoint, ReconnectingClient
 from tests.transport.played import played
@@ -84,35 +82,6 @@ def test_a_service_that_dies_while_it_is_asked_and_one_that_is_gone_when_it_is_c
     assert caller.done(60.0) == [(ticket, "last early")]
 
 
-def test_what_is_lost_after_it_was_said_where_the_next_one_is_was_the_one_before():
-    first, second = Service("first"), Service("second")
-    caller = connected(first)
-    ticket = caller.send("question")
-    caller._lose(ServiceStoppedError("seen late"))  # as if `move` had come in the middle of `done`
-    caller._next.append(second.endpoint)
-    assert caller.away_s > 0.0
-    caller.done(0.0)
-    assert caller.away_s == 0.0
-    second.answer()
-    assert caller.done(60.0) == [(ticket, "second question")]
-
-
-def test_what_is_forgotten_is_not_asked_again():
-    first, second = Service("first"), Service("second")
-    caller = connected(first)
-    kept, forgotten = caller.send("kept"), caller.send("forgotten")
-    caller.forget(forgotten)
-    first.stop()
-    caller.done(0.0)
-    caller.move(second.endpoint)
-    caller.done(0.0)
-    assert [message for message, _ in second.held] == ["kept"]
-    second.answer()
-    assert caller.done(60.0) == [(kept, "second kept")]
-    caller.close()
-    caller.close()
-
-
 def test_a_wait_ends_when_the_service_is_there_and_how_long_it_was_away_counts_from_then():
     service = Service("only")
     caller = ReconnectingClient("inference")
@@ -131,25 +100,3 @@ def test_a_wait_ends_when_the_service_is_there_and_how_long_it_was_away_counts_f
     caller.done(0.0)
     service.answer()
     assert caller.done(60.0) == [(ticket, "only question")]
-
-
-def test_asking_lasts_until_the_next_one_answers_and_no_longer_than_it_may():
-    first, second = Service("first"), Service("second")
-    caller = connected(first)
-    with pytest.raises(TimeoutError, match="1 of 1 replies did not come"):
-        caller.ask(["question"], 0.05)
-    answers: list[Any] = []
-    asking = threading.Thread(target=lambda: answers.extend(caller.ask(["x", "y"], 60.0)), daemon=True)
-    asking.start()
-    while len(first.held) < 3:
-        time.sleep(0.005)
-    first.stop()
-    while caller.away_s == 0.0:
-        time.sleep(0.005)
-    caller.move(second.endpoint)
-    while len(second.held) < 2:
-        time.sleep(0.005)
-    second.answer(1)
-    second.answer(0)
-    asking.join(30)
-    assert answers == ["second x", "second y"]

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import pytest
 import ray
@@ -13,9 +12,9 @@ from accerl_lerobot.transport import endpoint as module
 from accerl_lerobot.transport.contract import Client, ServiceStoppedError
 from accerl_lerobot.transport.endpoint import Endpoint, RayClient, uses_shared_memory
 from accerl_lerobot.transport.memfd import available
-from accerl_lerobot.transport.shared_memory import Address, SharedMemoryClient
-from tests.light_workers import LightInference, light_ray
-from tests.transport.contract import CHECKS, Check, Service, messages, same
+from accerl_lerobot.transport.shared_memory import Address
+from tests.light_workers import light_ray
+from tests.transport.contract import CHECKS, Check, Service
 
 __all__ = ["light_ray"]
 
@@ -23,15 +22,11 @@ NO_MEMORY = pytest.mark.skipif(not available(), reason="no memfd, epoll and even
 WAYS = [pytest.param("ray"), pytest.param("auto", marks=NO_MEMORY)]
 
 
-def endpoint_of(actor: Any, method: str, transport: Any) -> Endpoint:
-    address = None if transport == "ray" else ray.get(actor.listen.remote(), timeout=60)
-    return Endpoint(name="service", method=getattr(actor, method), address=address)
-
-
 @pytest.fixture(scope="module", params=WAYS)
 def service(request: pytest.FixtureRequest, light_ray: None) -> Iterator[Endpoint]:
     actor = ray.remote(Service).options(num_cpus=0).remote()
-    yield endpoint_of(actor, "obey", request.param)
+    address = None if request.param == "ray" else ray.get(actor.listen.remote(), timeout=60)
+    yield Endpoint(name="service", method=actor.obey, address=address)
     ray.kill(actor)
 
 
@@ -51,17 +46,6 @@ def connect(service: Endpoint) -> Iterator[Callable[[], Client]]:
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
 def test_contract(check: Check, connect: Callable[[], Client]):
     check(connect)
-
-
-@NO_MEMORY
-def test_both_give_the_same_decisions(light_ray: None):
-    actor = ray.remote(LightInference).options(num_cpus=0).remote()
-    requests = messages()[1]
-    callers = [endpoint_of(actor, "decide", way).connect() for way in ("ray", "auto")]
-    assert [type(caller) for caller in callers] == [RayClient, SharedMemoryClient]
-    through_ray, through_memory = (caller.ask([requests, requests[:1]], 60.0) for caller in callers)
-    assert same(through_ray, through_memory) and [len(some) for some in through_ray] == [2, 1]
-    ray.kill(actor)
 
 
 HERE, ELSEWHERE = "this node", "another node"

@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 import ray as real_ray
 
-from accerl_lerobot.transport import endpoint
 from accerl_lerobot.transport.endpoint import Transport
 from accerl_lerobot.weights import factory
 from accerl_lerobot.weights.factory import RayPublisher, make_publisher
@@ -122,13 +121,6 @@ def test_a_moment_survives_the_way_to_another_machine_s_clock():
     now = time.monotonic()
     assert abs(monotonic_clock(wall_clock(now - 500)) - (now - 500)) < 60
     assert monotonic_clock(time.time() + 100) <= time.monotonic()  # the other clock is ahead
-
-
-def test_without_memfd_there_is_ray(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(endpoint, "available", lambda: False)
-    publisher = make_publisher([Inference().handle])
-    assert [type(part) for part in publisher.parts] == [RayPublisher]
-    publisher.close()
 
 
 def test_a_reader_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPatch):
