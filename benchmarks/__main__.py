@@ -3,13 +3,16 @@
 
 from __future__ import annotations
 
+import importlib
+import json
 import sys
+from contextlib import redirect_stdout
 from typing import Any
 
 from accerl_lerobot.cli import exit_code, guarded, help_asked, set_up_logging
-from accerl_lerobot.cli.verbs import measure
 from accerl_lerobot.config.help import brief, help_text
 from accerl_lerobot.config.parsing import parse
+from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError
 from benchmarks.async_vs_sync import BenchAsyncVsSyncConfig
 from benchmarks.batching import BenchBatchingConfig
@@ -17,20 +20,26 @@ from benchmarks.efficiency import BenchEfficiencyConfig
 from benchmarks.faults import BenchFaultsConfig
 from benchmarks.few_shot import BenchFewShotConfig
 from benchmarks.lag import BenchLagConfig
-from benchmarks.ranking import BenchRankingConfig
+from benchmarks.latency import BenchLatencyConfig
+from benchmarks.policy import BenchPolicyConfig
 from benchmarks.replay import BenchReplayConfig
 from benchmarks.scaling import BenchScalingConfig
 from benchmarks.soak import BenchSoakConfig
+from benchmarks.throughput import BenchThroughputConfig
 from benchmarks.timeline import BenchTimelineConfig
 from benchmarks.transport import BenchTransportConfig
 from benchmarks.weights import BenchWeightsConfig
+from benchmarks.world import BenchWorldConfig
 from benchmarks.world_model import BenchWorldModelConfig
 
 CONFIGS: dict[str, type[Any]] = {
+    "world": BenchWorldConfig,
+    "latency": BenchLatencyConfig,
+    "policy": BenchPolicyConfig,
+    "throughput": BenchThroughputConfig,
     "few_shot": BenchFewShotConfig,
     "lag": BenchLagConfig,
     "efficiency": BenchEfficiencyConfig,
-    "ranking": BenchRankingConfig,
     "faults": BenchFaultsConfig,
     "soak": BenchSoakConfig,
     "async_vs_sync": BenchAsyncVsSyncConfig,
@@ -68,7 +77,17 @@ def run(name: str, rest: list[str]) -> int:
         sys.stdout.write(f"{text}\n")
         return 0
     with guarded():
-        return measure(f"benchmarks.{name}", parse(CONFIGS[name], rest))
+        return measure(name, parse(CONFIGS[name], rest))
+
+
+def measure(name: str, config: Any) -> int:
+    """Runs ``bench_NAME`` of the module NAME, and shows what its ``table`` makes of the result."""
+    module: Any = importlib.import_module(f"benchmarks.{name}")
+    with redirect_stdout(sys.stderr):
+        result = getattr(module, f"bench_{name}")(config)
+    Console().rich.print(module.table(result))
+    sys.stdout.write(json.dumps(result, indent=2) + "\n")
+    return 0
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -20,17 +20,17 @@ from typing import Annotated, Any
 
 from rich.console import Group
 
-from accerl_lerobot.bench import as_table, host, ranged, spread
-from accerl_lerobot.bench.latency import TRACE
-from accerl_lerobot.bench.throughput import ARMS, MOST_BUSY, Block
 from accerl_lerobot.config.ranges import Positive, Range, Repeats, Seed, Steps
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError, output_folder
 from accerl_lerobot.evaluation import Rate, drawing, evaluation_plans
 from accerl_lerobot.replay.pacing import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, Schedule
+from benchmarks.latency import TRACE
 from benchmarks.machinery import MachineryConfig
+from benchmarks.measure import as_table, host, ranged, spread
 from benchmarks.records import as_markdown, floors, write
 from benchmarks.simulated_world import read_trace
+from benchmarks.throughput import ARMS, MOST_BUSY, Block
 
 LEARNING = MachineryConfig(worlds=4, latency_ms=4.0, image_size=16, decide_ms=1.0, update_ms=8.0)
 """Small, as nothing is timed in it."""
@@ -45,7 +45,7 @@ class BenchAsyncVsSyncConfig(MachineryConfig):
     cvs: tuple[Annotated[float, Range("[0, 10]")], ...] = (0.0, 0.1, 0.3, 0.5, 1.0)
     """Laws of latency: standard deviation over mean; takes the place of `latency_cv`."""
     traces: tuple[str, ...] = ()
-    """More laws: files of `accerl bench latency`, each a world's own; takes the place of `latency_trace`."""
+    """More laws: files of the benchmark `latency`, each a world's own; takes the place of `latency_trace`."""
     seconds: Positive = 8.0
     """Shortest duration of a block."""
     rounds: Repeats = 3

@@ -24,7 +24,6 @@ import numpy as np
 import yaml
 from rich.table import Table
 
-from accerl_lerobot.bench import as_table, host
 from accerl_lerobot.checkpoint.layout import CHECKPOINTS, LAST, PRETRAINED, SUMMARY
 from accerl_lerobot.config.ranges import Range, Repeats, Section, Seed, Steps
 from accerl_lerobot.console import Console
@@ -36,6 +35,7 @@ from accerl_lerobot.trainer.batch import MAX_NONFINITE
 from benchmarks.audit import audit_segments, audit_updates
 from benchmarks.hits import FAULTS, START_S, TIDY_S, places, strike
 from benchmarks.light_run import light_config
+from benchmarks.measure import as_table, host
 from benchmarks.records import as_markdown, write
 from benchmarks.study import last_words
 from benchmarks.victims import CLASSES, DRIVER, EVERYTHING, LIGHT, TRAIN, Victim, alive

@@ -15,7 +15,6 @@ from typing import Annotated
 
 import numpy as np
 
-from accerl_lerobot.bench.throughput import Measured
 from accerl_lerobot.config.ranges import NonNegative, Positive, Range, Section
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig
 from accerl_lerobot.errors import InputError
@@ -25,6 +24,7 @@ from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
 from benchmarks.simulated_world import LatencyConfig, read_trace
+from benchmarks.throughput import Measured
 
 EPISODE = 16
 """Decisions of an episode."""
@@ -42,7 +42,7 @@ class MachineryConfig(Section):
     latency_cv: Annotated[float, Range("[0, 10]")] = 0.5
     """Standard deviation of that over its mean, lognormal; 0: always the mean."""
     latency_trace: str | None = None
-    """File of `accerl bench latency`, for its law in place of the lognormal one; scaled to `latency_ms`."""
+    """File of the benchmark `latency`, for its law in place of the lognormal one; scaled to `latency_ms`."""
     image_size: Annotated[int, Range("[8, 480]")] = 64
     """Height and width of the one image of an observation; 317 makes it 301 KB."""
     segment_length: Annotated[int, Range("[1, 10000]")] = 4

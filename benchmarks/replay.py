@@ -18,7 +18,6 @@ from typing import Annotated, Any
 import numpy as np
 from rich.table import Table
 
-from accerl_lerobot.bench import as_table, host, ranged, spread
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import save_checkpoint
 from accerl_lerobot.config.ranges import Range, Repeats, Section
@@ -27,6 +26,7 @@ from accerl_lerobot.experience import Origin, Segment
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.replay.buffer import MixedReplay
 from accerl_lerobot.replay.journal import EPISODES, Journal
+from benchmarks.measure import as_table, host, ranged, spread
 from benchmarks.records import floors
 
 CAMERA = "observation.images.front"

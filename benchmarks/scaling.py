@@ -16,16 +16,16 @@ from typing import Annotated, Any
 
 from rich.table import Table
 
-from accerl_lerobot.bench import as_table, host, ranged, spread
-from accerl_lerobot.bench.throughput import MOST_BUSY, Block
 from accerl_lerobot.config.ranges import NonNegative, Positive, Range, Repeats
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError, output_folder
 from accerl_lerobot.evaluation import drawing
 from accerl_lerobot.replay.pacing import ASYNCHRONOUS
 from benchmarks.machinery import MachineryConfig
+from benchmarks.measure import as_table, host, ranged, spread
 from benchmarks.records import as_markdown, floors, write
 from benchmarks.simulated_world import read_trace
+from benchmarks.throughput import MOST_BUSY, Block
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,11 +14,11 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from accerl_lerobot.bench.latency import RESET
 from accerl_lerobot.config.ranges import NonNegative, Range, Steps
 from accerl_lerobot.envs import ChunkResult, EnvConfig, SimulatedConfig, SimulatedWorld
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Observation
+from benchmarks.latency import RESET
 
 
 @EnvConfig.register_subclass("simulated_latency")
@@ -37,7 +37,7 @@ class LatencyConfig(SimulatedConfig):
     latency_cv: Annotated[float, Range("[0, 10]")] = 0.0
     """Standard deviation over mean of its lognormal law, drawn from the episode's seed; 0: constant."""
     latency_trace: str | None = None
-    """File that `accerl bench latency` has written of another world, scaled so that its decisions take
+    """File that the benchmark `latency` has written of another world, scaled so that its decisions take
     `frame_ms` on average: an episode takes a stretch of it, from a moment drawn from its seed. What a reset
     takes is drawn from what resets took there."""
     crash_after: Steps = 0

@@ -21,7 +21,6 @@ from typing import Annotated, Any
 import psutil
 from rich.console import Group
 
-from accerl_lerobot.bench import as_table, host, ranged, spread
 from accerl_lerobot.config.ranges import Positive, Range, Section, Seed
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError, check_absent, make_folder
@@ -32,6 +31,7 @@ from accerl_lerobot.trainer.batch import MAX_NONFINITE
 from benchmarks.audit import audit_segments, audit_updates
 from benchmarks.faults import BenchFaultsConfig, Start, end_run, recipe_of
 from benchmarks.hits import START_S, strike
+from benchmarks.measure import as_table, host, ranged, spread
 from benchmarks.records import as_markdown, write
 from benchmarks.victims import DRIVER, EVERYTHING, Victim
 

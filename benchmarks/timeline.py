@@ -20,10 +20,10 @@ from typing import Annotated, Any
 import numpy as np
 from rich.table import Table
 
-from accerl_lerobot.bench import host, spread
 from accerl_lerobot.config.ranges import Range, Repeats, Section
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.timeline import COMPUTE, WAIT_IN, Clock, NoClock
+from benchmarks.measure import host, spread
 
 ON, OFF, FLOOR = "on", "off", "floor"
 

@@ -26,13 +26,13 @@ from typing import Annotated, Any
 import numpy as np
 from rich.table import Table
 
-from accerl_lerobot.bench import host, spread
 from accerl_lerobot.config.ranges import Choice, Range, Repeats, Section, Seed
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine import ray_session
 from accerl_lerobot.errors import InputError, check_absent, make_folder
 from accerl_lerobot.evaluation import drawing
 from accerl_lerobot.experience import Decision, Request
+from benchmarks.measure import host, spread
 
 RAY, RAY_PUT, SHARED_MEMORY = "ray", "ray_put", "shared_memory"
 PIPE, SLOT, MEMCPY = "pipe", "slot", "memcpy"

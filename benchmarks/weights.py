@@ -23,12 +23,12 @@ from typing import Annotated, Any
 import numpy as np
 from rich.table import Table
 
-from accerl_lerobot.bench import as_table, host, ranged, spread
 from accerl_lerobot.config.ranges import Range, Repeats, Section, Seed
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine import ray_session
 from accerl_lerobot.errors import check_absent, make_folder
 from accerl_lerobot.transport.endpoint import Transport
+from benchmarks.measure import as_table, host, ranged, spread
 from benchmarks.records import as_markdown, write
 from benchmarks.study import named
 

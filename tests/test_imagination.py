@@ -24,7 +24,6 @@ from accerl_lerobot.engine.local import LocalEngine
 from accerl_lerobot.engine.loop import Progress
 from accerl_lerobot.engine.run import execute
 from accerl_lerobot.envs import SimulatedConfig
-from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, REAL, Segment
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.timeline.read import shares
@@ -260,9 +259,6 @@ def test_it_runs_asynchronously(tiny_checkpoint: Path, world_model: Path, tmp_pa
     explained = (Path(__file__).parents[1] / "docs" / "metrics.md").read_text()
     for name in last.imagination:
         assert f"`imagination_{name}`" in explained or name.startswith("check_"), name
-    films = sorted(p.name for p in (tmp_path / "validation").iterdir())
-    tried = int(last.imagination["promoted"] + last.imagination["rejected"])
-    assert films[0].startswith("0001_") and tried - 1 <= len(films) <= tried + 1
     spent = shares(tmp_path)
     assert {"recovery", "compute", "transport", "wait_in"} <= spent["imagination"].keys()
     assert len(list((tmp_path / "timeline").glob("imagination*"))) == 1
@@ -338,16 +334,6 @@ def test_what_a_run_learns_its_world_model_from_is_real(tiny_checkpoint: Path, w
     history = drive(engine)
     engine.close()
     assert {s.source for s in taken} == {REAL} and history[-1].imagination["decisions"] > 0
-
-
-def test_sections_that_do_not_go_together(tiny_checkpoint: Path):
-    with pytest.raises(InputError, match=r"^rollout\.group_size=2: leave it out with imagination\.share"):
-        groups = RolloutConfig(worlds=4, segment_length=4, group_size=2)
-        tiny_run(
-            tiny_checkpoint, env=ENV, imagination=ImaginationConfig(share=0.5, model="oracle"), rollout=groups
-        )
-    with pytest.raises(InputError, match=r"^rollout\.episodes=7: use a multiple of rollout.group_size, 4"):
-        RolloutConfig(group_size=4, episodes=7)
 
 
 def test_the_summary_says_what_was_imagined(tiny_checkpoint: Path, tmp_path: Path):

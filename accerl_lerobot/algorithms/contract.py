@@ -54,9 +54,6 @@ class RatioConfig(AlgorithmConfig):
 
     lam: Share = 0.95
     """λ of GAE per decision: 0 trusts the critic, 1 the observed rewards."""
-    advantage: Literal["gae", "group"] = "gae"
-    """``gae``: from the critic. ``group``: relative to other episodes from the same start, stamped on
-    segments by the rollout worker; V is not used then, and `value_coef` may as well be 0."""
     level: Level = "action"
     """Extent of one importance ratio: each log-prob factor (``token``), those of one ``action`` of the
     chunk, or the whole ``chunk``. A flow or Gaussian policy has one factor per action."""
@@ -121,7 +118,7 @@ class LossInputs:
     not align with actions, as with compressed tokens: level ``action`` is refused then.
     """
     advantage: Tensor
-    """(N,), normalised over the batch by the caller, or relative to a group of episodes."""
+    """(N,), normalised over the batch by the caller."""
     value: Tensor
     """(N,), V of the current critic; measured, not trained."""
     value_error: Tensor

@@ -29,7 +29,6 @@ VERBS = {
     "timeline": "show when every worker of a run did what: a picture, a trace and shares",
     "export": "write the episodes of a run as a LeRobotDataset, with an image at every env step",
     "doctor": "resolve a recipe and check this machine",
-    "bench": "measure this machine: accerl bench world, policy, throughput or latency",
 }
 FUNCTIONS = {"eval": "verbs:evaluate", "doctor": "doctor:main"}
 """Verb → module and function, where that is not the one of the same name in `verbs`."""
@@ -57,18 +56,11 @@ def usage() -> str:
 
 
 def show_help(verb: str, rest: list[str], section: str) -> int:
-    """``accerl VERB --help``; for bench, of the measurement that is named, or a list of them."""
+    """``accerl VERB --help``."""
     from accerl_lerobot.cli.verbs import CONFIGS
-    from accerl_lerobot.config.help import brief, help_text
+    from accerl_lerobot.config.help import help_text
 
-    names = [name for name in CONFIGS if name.split()[0] == verb]
-    named = [name for name in names if len(names) == 1 or name.split()[-1] in rest]
-    if named:
-        text = help_text(f"accerl {named[0]}", CONFIGS[named[0]], VERBS[verb], section)
-    else:
-        lines = [f"  {name.split()[-1]:16} {brief(CONFIGS[name])[:90]}" for name in names]
-        usage = [f"usage: accerl {verb} NAME [--field=value …]", "", *lines]
-        text = "\n".join([*usage, "", f"accerl {verb} NAME --help lists its fields."])
+    text = help_text(f"accerl {verb}", CONFIGS[verb], VERBS[verb], section)
     sys.stdout.write(f"{text}\n")
     return 0
 

@@ -7,7 +7,6 @@ results should stay readable for programs.
 
 from __future__ import annotations
 
-import importlib
 import json
 import sys
 from collections.abc import Callable
@@ -18,14 +17,10 @@ from typing import Any
 
 import yaml
 
-from accerl_lerobot.bench.latency import BenchLatencyConfig
-from accerl_lerobot.bench.policy import BenchPolicyConfig
-from accerl_lerobot.bench.throughput import BenchThroughputConfig
-from accerl_lerobot.bench.world import BenchWorldConfig
 from accerl_lerobot.checkpoint.layout import CONFIG
 from accerl_lerobot.cli.export import ExportConfig
 from accerl_lerobot.config.parsing import read_arguments
-from accerl_lerobot.config.ranges import Device, Section, Seed
+from accerl_lerobot.config.ranges import Device, NewFolder, Section, Seed
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.record import DemosConfig
 from accerl_lerobot.demos.sft import SFTConfig
@@ -46,6 +41,10 @@ from accerl_lerobot.world_model.config import ValidationConfig, WorldModelConfig
 class DemosRun(Section):
     """``accerl demos``: scripted experts, recorded."""
 
+    seed: Seed = 0
+    """Disjoint demonstrations for different seeds."""
+    root: NewFolder = "outputs/demos"
+    """Folder of the dataset; must not exist."""
     env: EnvConfig = field(default_factory=MetaWorldConfig)
     demos: DemosConfig = field(default_factory=DemosConfig)
 
@@ -172,8 +171,8 @@ def demos(arguments: list[str]) -> int:
     from accerl_lerobot.engine.preflight import check_disk, check_world, demos_bytes
 
     with redirect_stdout(sys.stderr):
-        check_disk(config.demos.root, demos_bytes(config.demos, check_world(config.env)), "demos.root")
-        path = record_demos(config.env, config.demos)
+        check_disk(config.root, demos_bytes(config.demos, check_world(config.env)), "root")
+        path = record_demos(config.env, config.demos, config.root, config.seed)
     sys.stdout.write(f"{path}\n")
     return 0
 
@@ -345,26 +344,6 @@ def export(arguments: list[str]) -> int:
     return 0
 
 
-def bench(arguments: list[str]) -> int:
-    """``accerl bench NAME``; see `CONFIGS` for the names."""
-    name = arguments[0] if arguments else ""
-    if f"bench {name}" not in CONFIGS:
-        names = [verb.split()[1] for verb in CONFIGS if verb.startswith("bench ")]
-        raise InputError("bench", name, f"name what is measured: {', '.join(names)}")
-    config = parse(CONFIGS[f"bench {name}"], arguments[1:])
-    return measure(f"accerl_lerobot.bench.{name}", config)
-
-
-def measure(module_name: str, config: Any) -> int:
-    """Runs ``bench_NAME`` of the module ``….NAME``, and shows what its ``table`` makes of the result."""
-    module: Any = importlib.import_module(module_name)
-    with redirect_stdout(sys.stderr):
-        result = getattr(module, f"bench_{module_name.rpartition('.')[2]}")(config)
-    Console().rich.print(module.table(result))
-    sys.stdout.write(json.dumps(result, indent=2) + "\n")
-    return 0
-
-
 CONFIGS: dict[str, type[Any]] = {
     "train": RunConfig,
     "demos": DemosRun,
@@ -378,10 +357,6 @@ CONFIGS: dict[str, type[Any]] = {
     "timeline": TimelineConfig,
     "export": ExportConfig,
     "doctor": RunConfig,
-    "bench world": BenchWorldConfig,
-    "bench policy": BenchPolicyConfig,
-    "bench throughput": BenchThroughputConfig,
-    "bench latency": BenchLatencyConfig,
 }
 """Verb → what its command line is parsed into."""
 

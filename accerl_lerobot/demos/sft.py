@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import json
 import logging
-import math
 import os
-import re
 import shlex
 import shutil
 import subprocess
@@ -33,12 +31,8 @@ logger = logging.getLogger(__name__)
 
 CODE_REVISION = "--code_revision="
 """Our argument of the trainer."""
-HELD_OUT = re.compile(r"\bstep (\d+): eval_loss=(\S+)")
-"""LeRobot's report of a loss on held-out episodes."""
 REFUSED = "accerl refuses: "
 """Begins the last line of a trainer that met something it must not use; JSON follows."""
-CANDIDATES = 10
-"""Checkpoints of which the best on held-out episodes is used."""
 LOG_EVERY = 25
 """Optimiser steps between two lines of progress."""
 NO_SFT = {
@@ -61,9 +55,6 @@ class SFTConfig(Section, section="sft"):
     """Without effect on a policy type whose preset has no warm-up, such as act."""
     pick: Literal["all", "successes", "failures"] = "all"
     """Episodes that are imitated, by their ``next.success``; the others stay in the dataset."""
-    held_out: Annotated[float, Range("[0, 1)")] = 0.0
-    """Share of each task's episodes that is not trained on: the checkpoint, one of ten, that predicts these
-    actions best is used; 0: all are trained on, and the last checkpoint is used."""
     num_workers: Annotated[int, Range("[0, 256]")] = 0
     """Data-loading processes; 0 loads in the trainer, which is best for datasets that fit into memory, see
     `guarded_train`."""
@@ -125,17 +116,13 @@ def sft_command(
     named = {"repo_id": dataset.repo_id, "root": dataset.root, "revision": dataset.revision}
     command += [f"--dataset.{key}={value}" for key, value in named.items() if value]
     command += [f"--dataset.episodes={json.dumps(episodes)}"] if episodes is not None else []
-    every = config.steps
-    if config.held_out:
-        every = math.ceil(config.steps / CANDIDATES)
-        command += [f"--dataset.eval_split={config.held_out}", f"--eval_steps={every}"]
     command += [
         f"--output_dir={output_dir}",
         f"--steps={config.steps}",
         f"--batch_size={config.batch_size}",
         f"--num_workers={config.num_workers}",
         f"--seed={seed}",
-        f"--save_freq={every}",
+        f"--save_freq={config.steps}",
         f"--log_freq={LOG_EVERY}",
         "--env_eval_freq=0",
         "--wandb.enable=false",
@@ -162,7 +149,7 @@ def run_sft(
         seed: of LeRobot's trainer.
         device: cpu or cuda.
         texts: the dataset's instructions, for a new backbone's tokeniser.
-        on_step: called with (step, loss) as progress is reported, from 1000 on rounded to thousands.
+        on_step: receives step and loss as progress is reported, from 1000 on rounded to thousands.
 
     Raises:
         InputError: `output_dir` exists; the checkpoint to start from, or the dataset, is not to be trusted.
@@ -213,9 +200,7 @@ def run_sft(
             raise InputError(*json.loads(last.removeprefix(REFUSED)))
         tail = "".join(log.read_text().splitlines(keepends=True)[-15:])
         raise RuntimeError(f"lerobot-train ended with exit code {code}; the end of {log}:\n{tail}")
-    checkpoints = output_dir / CHECKPOINTS
-    best = _best(log.read_text(), checkpoints) if config.held_out else checkpoints / LAST
-    return best / PRETRAINED
+    return output_dir / CHECKPOINTS / LAST / PRETRAINED
 
 
 def picked(dataset: DatasetConfig, pick: str) -> list[int] | None:
@@ -238,18 +223,6 @@ def picked(dataset: DatasetConfig, pick: str) -> list[int] | None:
     if not wanted:
         raise InputError("sft.pick", pick, f"none of the dataset's {meta.total_episodes} episodes; use all")
     return wanted
-
-
-def _best(log: str, checkpoints: Path) -> Path:
-    """The checkpoint with the lowest loss on held-out episodes; the last one, if none has a finite loss."""
-    losses = {int(step): float(loss) for step, loss in HELD_OUT.findall(log)}
-    saved = {int(path.name): path for path in checkpoints.iterdir() if path.name.isdecimal()}
-    found = {step: losses[step] for step in saved if math.isfinite(losses.get(step, math.nan))}
-    if not found:
-        return checkpoints / LAST
-    best = min(found, key=found.__getitem__)
-    logger.info("loss on held-out episodes: %s; step %d is used", losses, best)
-    return saved[best]
 
 
 def _with_backbone_in_place(config: SFTConfig, copy: Path) -> SFTConfig:

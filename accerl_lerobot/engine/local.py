@@ -87,13 +87,7 @@ class LocalEngine(Engine):
         self._outbox: deque[Segment] = deque()
         count = config.rollout.worlds * config.rollout.workers
         worlds = [make_world(config.env, history) for _ in range(count)]
-        self._plans = EpisodePlans(
-            config.rollout,
-            tasks,
-            seed=config.seed,
-            worlds=len(worlds),
-            budget=config.rollout.episodes or None,
-        )
+        self._plans = EpisodePlans(tasks, seed=config.seed, budget=config.rollout.episodes or None)
         self._runner = RolloutRunner(
             worlds,
             lambda: self._plans.next(self._exploring),
@@ -101,7 +95,6 @@ class LocalEngine(Engine):
             "local",
             self._outbox.append,
             self._episodes.append,
-            self._plans.groups,
         )
         self._due: dict[int, Request] = {}
         if state is not None:
@@ -217,8 +210,6 @@ class LocalEngine(Engine):
 
     def _act(self) -> None:
         """One decision in every environment that may continue."""
-        if not self._exploring:
-            self._runner.abandon_groups()
         for slot in range(len(self._runner)):
             request = self._due.get(slot)
             if request is None or (request.explore and not self._exploring):
@@ -276,7 +267,7 @@ class LocalEngine(Engine):
             self._acting_version = number
 
     def _store(self) -> None:
-        """Store waiting segments one at a time, since those of a group come all at once."""
+        """Store waiting segments while replay takes them."""
         while self._outbox and self._replay.may_insert(REAL):
             segment = self._outbox.popleft()
             if not self._replay.insert(segment):

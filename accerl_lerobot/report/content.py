@@ -56,7 +56,6 @@ WARNINGS = {
     "replay_retired_unused": ("segment", "left the replay buffer unused, being older than replay.max_lag"),
     "replay_lost_unused": ("segment", "not learned from were lost when the run was resumed"),
     "replay_dropped_nonfinite": ("segment", "refused by the replay buffer because of a NaN or infinity"),
-    "replay_duplicates": ("segment", "received twice and ignored"),
 }
 """Counter → what is counted, and what happened; a run in which it is 0 needs no warning."""
 
@@ -98,8 +97,7 @@ BY_DEPTH: tuple[Spec, ...] = (
     ("Skill", "1 is perfect, 0 is a copy of the last frame.",
      {"skill_changed": "where pixels changed", "skill": "all pixels"}, {"top": 1}),
     ("Sensitivity to actions", "Growth of the error with wrong actions; 1: the model ignores them.",
-     {"sensitivity_shuffled": "another episode's", "sensitivity_zero": "none"},
-     {"unit": "times the error", "bottom": 0}),
+     {"sensitivity_shuffled": "another episode's"}, {"unit": "times the error", "bottom": 0}),
     ("Error of the state", "",
      {"state_error": "imagined", "state_error_copy": "copy of the last state"}, {"bottom": 0}),
 )  # fmt: skip
@@ -217,9 +215,6 @@ def warnings(run: Run, bound: int | None, now: float) -> Iterator[str]:
     for name, (thing, what) in WARNINGS.items():
         if n := int(newest(run.rollout, name) or 0):
             yield f"{count(n, thing)} {what}."
-    dropped, kept = (int(newest(run.rollout, f"groups_{name}") or 0) for name in ("dropped", "kept"))
-    if dropped > kept:
-        yield f"{count(dropped, 'group')} of equal starts thrown away and {kept:,} kept: most had equal ends."
     if skipped := int(newest(run.train, "skipped") or 0):
         yield f"{count(skipped, 'update')} skipped, because loss or gradient was not finite."
     lag, mismatch = (np.nanmax([0.0, *column(run.train, k)]) for k in ("lag_max", "logprob/mismatch_max"))
@@ -326,14 +321,8 @@ def _imagination(run: Run) -> Section:
             checks.append((name, value, f"at most {bound}", value <= bound))
         elif value is not None:
             checks.append((name, value, f"above {bound}", value > bound))
-    caption = "a recorded episode above, and what the world model imagined with the same actions below. The "
-    caption += "frame at the end is green for a success and red for a failure."
-    videos = [
-        (path, f"Validation {path.stem.replace('_', ', ').lstrip('0')}: {caption}")
-        for path in dict.fromkeys([*run.imagined_videos[:1], *run.imagined_videos[-1:]])
-    ]
     tables = _checks("The last validation of the world model", checks)
-    return Section(title, text, charts=_charts(rollout, IMAGINATION), tables=tables, videos=videos)
+    return Section(title, text, charts=_charts(rollout, IMAGINATION), tables=tables)
 
 
 def _checks(caption: str, rows: Sequence[tuple[str, float | None, str, bool]]) -> list[Table]:
@@ -418,8 +407,7 @@ def _headline(run: Run) -> str:
 
 
 def _tiles(run: Run, bound: int | None) -> list[tuple[str, str, str]]:
-    result, algorithm = run.result or {}, run.section("algorithm")
-    advantage = algorithm.get("advantage")
+    result = run.result or {}
     mean = float(np.nanmean(column(run.train, "lag_mean"))) if run.train else None
     largest = float(np.nanmax(column(run.train, "lag_max"))) if run.train else None
     parts = {"warm start": result.get("warm_start_s") or 0.0, "RL": result.get("rl_s") or 0.0}
@@ -437,7 +425,7 @@ def _tiles(run: Run, bound: int | None) -> list[tuple[str, str, str]]:
         ("wall time", duration(run.wall_s), spent),
         ("updates", updates, f"of {run.section('trainer').get('updates')}"),
         ("lag", number(mean, 2), f"largest {number(largest)}, bound {number(bound)}"),
-        ("algorithm", str(algorithm.get("type")).upper(), f"advantage {advantage}" if advantage else ""),
+        ("algorithm", str(run.section("algorithm").get("type")).upper(), ""),
         ("seed", str(run.config.get("seed")), ""),
     ]
 

@@ -9,9 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from accerl_lerobot.bench import Processors, host, spread
-from accerl_lerobot.bench.throughput import BenchThroughputConfig, Block, bench_throughput, books
-from accerl_lerobot.bench.throughput import table as throughput_table
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.errors import InputError
@@ -21,9 +18,12 @@ from benchmarks.async_vs_sync import ARMS, BenchAsyncVsSyncConfig, bench_async_v
 from benchmarks.async_vs_sync import compare as compare_schedules
 from benchmarks.async_vs_sync import table as schedules_table
 from benchmarks.machinery import MachineryConfig
+from benchmarks.measure import Processors, host, spread
 from benchmarks.records import floors
 from benchmarks.scaling import BenchScalingConfig, bench_scaling
 from benchmarks.scaling import compare as compare_counts
+from benchmarks.throughput import BenchThroughputConfig, Block, bench_throughput, books
+from benchmarks.throughput import table as throughput_table
 from tests.light_workers import light_ray
 
 __all__ = ["light_ray"]
@@ -92,7 +92,7 @@ def test_efficiency_is_relative_to_the_first_count():
 
 def test_books_that_do_not_add_up_are_an_error():
     run = RunConfig(rollout=RolloutConfig(workers=2, worlds=2, segment_length=4))
-    rollout = {"decisions": 100.0, "dropped_nonfinite": 3.0, "groups_dropped_decisions": 0.0}
+    rollout = {"decisions": 100.0, "dropped_nonfinite": 3.0}
     found = books(run, rollout, {"inserted_decisions": 90.0, "dropped_nonfinite": 1.0})
     assert found == {"generated": 100.0, "committed": 90.0, "dropped": 4.0, "under_way": 6.0}
     for inserted in (20.0, 170.0):

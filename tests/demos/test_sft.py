@@ -9,7 +9,6 @@ import pickle
 import shutil
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -160,21 +159,13 @@ def test_what_cannot_be_cached_is_read_the_stock_way(
     assert isinstance(got[0], guarded_train.CachedDataset) == expected and got[1] == "evaluation"
 
 
-def test_the_checkpoint_that_is_best_on_held_out_episodes_is_used(tmp_path: Path):
-    path = run_sft(replace(TINY, steps=4, held_out=0.3), LOCAL, tmp_path / "sft", seed=0)
-    lines = [line for line in (tmp_path / "sft.log").read_text().splitlines() if "eval_loss=" in line]
-    losses = [float(line.rpartition("eval_loss=")[2]) for line in lines]
-    assert len(losses) == 4
-    assert path == tmp_path / "sft/checkpoints" / f"{1 + int(np.argmin(losses)):06d}" / "pretrained_model"
-
-
 class TestPick:
     @pytest.fixture(scope="class")
     def dataset(self, tmp_path_factory: pytest.TempPathFactory) -> DatasetConfig:
         """Every second episode fails."""
         root = str(tmp_path_factory.mktemp("demos") / "dataset")
-        config = DemosConfig(episodes=4, failure_share=0.5, processes=1, repo_id="a/b", root=root)
-        record_demos(SimulatedConfig(max_steps=16), config)
+        config = DemosConfig(episodes=4, failure_share=0.5, processes=1)
+        record_demos(SimulatedConfig(max_steps=16), config, root)
         return DatasetConfig(repo_id="a/b", root=root)
 
     def test_episodes_by_their_label(self, dataset: DatasetConfig, tmp_path: Path):

@@ -31,7 +31,6 @@ from accerl_lerobot.world_model.store import Source, save_world_model
 from accerl_lerobot.world_model.validation import (
     HELD_OUT,
     ONLINE,
-    DatasetRoles,
     open_datasets,
     validate_datasets,
 )
@@ -165,8 +164,7 @@ def tried(monkeypatch: pytest.MonkeyPatch) -> Tried:
 
 def validated(tmp_path: Path, of: dict[str, Any], **options: Any) -> tuple[dict[str, Any], float]:
     success: Any = SimpleNamespace(config=SimpleNamespace(threshold=SAVED))
-    roles = DatasetRoles(**options)
-    found = validate_datasets(None, of, ValidationConfig(), success, tmp_path, roles)  # type: ignore[arg-type]
+    found = validate_datasets(None, of, ValidationConfig(), success, tmp_path, **options)  # type: ignore[arg-type]
     return found, success.config.threshold
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Speed of our MetaWorld or LIBERO next to LeRobot's: both step random actions, in turns, on one machine.
 
-    accerl bench world --env.type=libero --env.task=libero_object/0 --env.image_size=128 --env.rendering=fast
+    python -m benchmarks world --env.type=libero --env.task=libero_object/0 --env.rendering=fast
 
 Three arms: ``ours`` (a picture per decision), ``ours_every_step`` (chunks of one, so a picture per step) and
 ``stock`` (LeRobot's own environment, a picture per step: of MetaWorld 480 pixels with default lights, of
@@ -24,7 +24,6 @@ import draccus
 import numpy as np
 from rich.table import Table
 
-from accerl_lerobot.bench import as_table, host, ranged, spread
 from accerl_lerobot.config.ranges import Positive, Range, Repeats, Section
 from accerl_lerobot.demos.record import simulators
 from accerl_lerobot.envs import EnvConfig, LiberoConfig, MetaWorldConfig, make_world
@@ -32,6 +31,7 @@ from accerl_lerobot.envs.libero_tasks import load_libero
 from accerl_lerobot.envs.metaworld import import_mujoco
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.seeds import train_seed
+from benchmarks.measure import as_table, host, ranged, spread
 
 OURS, EVERY_STEP, STOCK = "ours", "ours_every_step", "stock"
 _ARMS = (OURS, EVERY_STEP, STOCK)
@@ -41,7 +41,7 @@ Decide = Callable[[], int]
 
 @dataclass(frozen=True, kw_only=True)
 class BenchWorldConfig(Section):
-    """Fields of ``accerl bench world``."""
+    """Speed of our MetaWorld or LIBERO next to LeRobot's."""
 
     env: EnvConfig = field(default_factory=MetaWorldConfig)
     """One task of ``env.type=metaworld`` or ``libero``."""

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Time of an environment from a decision to its next observation, and of a reset, under random actions.
 
-    accerl bench latency --env.type=metaworld --env.task=door-open-v3
+    python -m benchmarks latency --env.type=metaworld --env.task=door-open-v3
     python -m benchmarks async_vs_sync --traces='[outputs/latency/trace.txt]'
 
 The second command measures what asynchrony gains where many environments take these times.
@@ -18,12 +18,12 @@ from typing import Annotated, Any
 import numpy as np
 from rich.table import Table
 
-from accerl_lerobot.bench import as_table, host
 from accerl_lerobot.config.ranges import Range, Section, Seed
 from accerl_lerobot.console import Console
 from accerl_lerobot.envs import EnvConfig, MetaWorldConfig, World, make_world
 from accerl_lerobot.errors import output_folder
 from accerl_lerobot.seeds import train_seed
+from benchmarks.measure import as_table, host
 
 TRACE = "trace.txt"
 RESET = "reset"
@@ -33,7 +33,7 @@ QUANTILES = (0.5, 0.95, 0.99)
 
 @dataclass(frozen=True, kw_only=True)
 class BenchLatencyConfig(Section):
-    """Fields of ``accerl bench latency``."""
+    """Durations of an environment's decisions and resets."""
 
     env: EnvConfig = field(default_factory=MetaWorldConfig)
     """Any environment."""

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from accerl_lerobot.bench.latency import BenchLatencyConfig, bench_latency, described, table
 from accerl_lerobot.console import Console
 from accerl_lerobot.envs import SimulatedConfig
+from benchmarks.latency import BenchLatencyConfig, bench_latency, described, table
 from benchmarks.simulated_world import LatencyConfig, read_trace
 
 

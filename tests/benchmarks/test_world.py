@@ -9,8 +9,8 @@ import json
 import pytest
 from rich.console import Console
 
-from accerl_lerobot.bench.world import BenchWorldConfig, bench_world, table
 from accerl_lerobot.envs import EnvConfig, LiberoConfig, MetaWorldConfig
+from benchmarks.world import BenchWorldConfig, bench_world, table
 from tests.envs.libero_assets import ASSETS, needs_assets
 
 LIBERO = LiberoConfig(task="libero_object/0", image_size=64, rendering="fast", assets=ASSETS)
