@@ -5,8 +5,8 @@ What must hold, in segments and in decisions:
 
     inserted = stored + evicted + retired
 
-*evicted* made room for newer ones, *retired* were older than `max_lag` allows. A non-finite segment
-is counted but never inserted.
+*evicted* made room for newer ones, *retired* were older than `max_lag` allows. A non-finite segment is
+counted but never inserted.
 
 The store survives its process: `state` is all of it, as it was before the batches that a trainer has drawn
 and not learnt from.
@@ -255,8 +255,10 @@ class Replay:
     def retire(self, trainer_version: int) -> None:
         """Takes out what is too old for a trainer that has made so many updates."""
         cutoff = trainer_version - self.config.max_lag
-        for entry in [e for e in self._entries if e.oldest < cutoff]:
-            self._entries.remove(entry)
+        old = [e for e in self._entries if e.oldest < cutoff]
+        if old:
+            self._entries = deque(e for e in self._entries if e.oldest >= cutoff)
+        for entry in old:
             self._depart(entry, "retired")
 
     def _use(self, entry: _Entry) -> None:
