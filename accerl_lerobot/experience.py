@@ -114,9 +114,7 @@ class Segment:
     success: bool
     """True if the episode had succeeded when the segment ended."""
     key: str
-    """Unique: worker, incarnation, sequence number. Makes an insert idempotent."""
-    advantage: np.ndarray | None = None
-    """float32 (T,), how much better the episode went than others that started alike; None: not compared."""
+    """Worker, incarnation, sequence number."""
     source: str = REAL
     """``real`` or ``imagined``."""
     origin: Origin
@@ -139,8 +137,6 @@ class Segment:
         sizes["actions"] = len(self.actions)
         sizes |= {"steps": len(self.steps)} | {f"latent.{k}": len(v) for k, v in self.latent.items()}
         sizes |= {k: len(v) - 1 for k, v in self.observations.items()}
-        if self.advantage is not None:
-            sizes["advantage"] = len(self.advantage)
         wrong = {k: n for k, n in sizes.items() if n != t}
         if wrong:
             raise ValueError(f"segment {self.key}: {t} rewards but {wrong}")

@@ -18,7 +18,6 @@ from benchmarks.faults import BenchFaultsConfig
 from benchmarks.few_shot import BenchFewShotConfig
 from benchmarks.gpu import BenchGpuConfig
 from benchmarks.lag import BenchLagConfig
-from benchmarks.ranking import BenchRankingConfig
 from benchmarks.replay import BenchReplayConfig
 from benchmarks.scaling import BenchScalingConfig
 from benchmarks.soak import BenchSoakConfig
@@ -31,7 +30,6 @@ CONFIGS: dict[str, type[Any]] = {
     "few_shot": BenchFewShotConfig,
     "lag": BenchLagConfig,
     "efficiency": BenchEfficiencyConfig,
-    "ranking": BenchRankingConfig,
     "faults": BenchFaultsConfig,
     "soak": BenchSoakConfig,
     "async_vs_sync": BenchAsyncVsSyncConfig,

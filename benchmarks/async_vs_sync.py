@@ -45,7 +45,7 @@ class BenchAsyncVsSyncConfig(MachineryConfig):
     cvs: tuple[Annotated[float, Range("[0, 10]")], ...] = (0.0, 0.1, 0.3, 0.5, 1.0)
     """Laws of latency: standard deviation over mean; takes the place of `latency_cv`."""
     traces: tuple[str, ...] = ()
-    """More laws: files of `accerl bench latency`, each a world's own; takes the place of `latency_trace`."""
+    """More laws: files of the benchmark `latency`, each a world's own; takes the place of `latency_trace`."""
     seconds: Positive = 8.0
     """Shortest duration of a block."""
     rounds: Repeats = 3

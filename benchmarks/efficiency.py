@@ -22,6 +22,7 @@ from accerl_lerobot.checkpoint.layout import DEMOS
 from accerl_lerobot.config.ranges import Choice, DatasetConfig, Range, Seed
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.dataset_files import open_metadata
+from accerl_lerobot.demos.record import REPO_ID
 from accerl_lerobot.engine.config import RunConfig, parse
 from benchmarks.records import as_markdown, mean_interval, write
 from benchmarks.study import (
@@ -175,12 +176,12 @@ def beside(study: Study, recipe: RunConfig) -> dict[str, dict[str, float]]:
     found = {}
     if recipe.policy.path is None:
         folders = [study.start(seed) / DEMOS for seed in study.starts]
-        recorded = [DatasetConfig(repo_id=recipe.demos.repo_id, root=str(folder)) for folder in folders]
+        recorded = [DatasetConfig(repo_id=REPO_ID, root=str(folder)) for folder in folders]
         used = recorded if recipe.dataset.repo_id is None else [recipe.dataset]
         found["demonstrations"] = {name: total / len(used) for name, total in _totals(used).items()}
     learn = recipe.imagination.learn
     learnt = [dataset for dataset in (learn.dataset, learn.online) if dataset.repo_id is not None]
-    if learnt and any(run.imagination.share and run.imagination.kind.needs_path for run in study.runs):
+    if learnt and any(run.imagination.share and run.imagination.needs_path for run in study.runs):
         found["world model"] = _totals(learnt)
     return found
 

@@ -42,7 +42,7 @@ class MachineryConfig(Section):
     latency_cv: Annotated[float, Range("[0, 10]")] = 0.5
     """Standard deviation of that over its mean, lognormal; 0: always the mean."""
     latency_trace: str | None = None
-    """File of `accerl bench latency`, for its law in place of the lognormal one; scaled to `latency_ms`."""
+    """File of the benchmark `latency`, for its law in place of the lognormal one; scaled to `latency_ms`."""
     image_size: Annotated[int, Range("[8, 480]")] = 64
     """Height and width of the one image of an observation; 317 makes it 301 KB."""
     segment_length: Annotated[int, Range("[1, 10000]")] = 4

@@ -37,7 +37,7 @@ class LatencyConfig(SimulatedConfig):
     latency_cv: Annotated[float, Range("[0, 10]")] = 0.0
     """Standard deviation over mean of its lognormal law, drawn from the episode's seed; 0: constant."""
     latency_trace: str | None = None
-    """File that `accerl bench latency` has written of another world, scaled so that its decisions take
+    """File that the benchmark `latency` has written of another world, scaled so that its decisions take
     `frame_ms` on average: an episode takes a stretch of it, from a moment drawn from its seed. What a reset
     takes is drawn from what resets took there."""
     crash_after: Steps = 0

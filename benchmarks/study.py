@@ -25,6 +25,7 @@ from accerl_lerobot.bench import as_table
 from accerl_lerobot.checkpoint.layout import CHECKPOINTS, CONFIG, DEMOS, LAST, PRETRAINED, SUMMARY
 from accerl_lerobot.config.ranges import Range, Section, Seed, Steps
 from accerl_lerobot.console import Console
+from accerl_lerobot.demos.record import REPO_ID
 from accerl_lerobot.engine.config import RunConfig, encode, parse
 from accerl_lerobot.engine.stopping import locked
 from accerl_lerobot.errors import InputError, expanded
@@ -239,7 +240,7 @@ class Study:
             if self.starts[cell.seed].dataset.repo_id is None:
                 root = self.start(cell.seed) / DEMOS
                 chosen += [
-                    f"--dataset.repo_id={self.starts[cell.seed].demos.repo_id}",
+                    f"--dataset.repo_id={REPO_ID}",
                     f"--dataset.root={root}",
                 ]
         return self._parse(cell.seed, chosen, self.folder(cell))

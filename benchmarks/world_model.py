@@ -55,7 +55,7 @@ def bench_world_model(config: BenchWorldModelConfig) -> dict[str, Any]:
     import torch
 
     from accerl_lerobot.policies.loading import resolve_device
-    from accerl_lerobot.world_model.contract import WorldModelSpec, new_learnable
+    from accerl_lerobot.world_model.contract import WorldModelSpec, learnable_class
     from accerl_lerobot.world_model.learners import Learner, new_success_model
     from accerl_lerobot.world_model.rollout_eval import context_of
     from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import probabilities
@@ -74,7 +74,7 @@ def bench_world_model(config: BenchWorldModelConfig) -> dict[str, Any]:
         context=of.model.context,
         provides=of.model.provides(config.state_dim),
     )
-    model = new_learnable(spec, of.model).to(device)
+    model = learnable_class(of.model)(spec, of.model).to(device)
     success = new_success_model(of.chunk).to(device).eval()
     seconds: dict[str, Any] = {"predict": {}, "classify": {}}
     for batch in config.batches:

@@ -44,7 +44,7 @@ def test_usage(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None
 
 
 def test_every_verb_has_a_function_and_a_config() -> None:
-    assert {name.split()[0] for name in verbs.CONFIGS} == cli.VERBS.keys()
+    assert verbs.CONFIGS.keys() == cli.VERBS.keys()
 
 
 @pytest.mark.parametrize("verb", list(cli.VERBS))
@@ -53,8 +53,6 @@ def test_verb_help_lists_fields_with_their_docstrings(verb: str, capsys: pytest.
     out = capsys.readouterr().out
     assert out.startswith(f"usage: accerl {verb}")
     assert out.count("\n") <= 60 and max(map(len, out.splitlines())) <= 115
-    if verb == "bench":
-        return
     if verb in ("train", "doctor"):
         assert "  --trainer.lr=" in out and "--algorithm.clip_low" not in out
         assert "--algorithm.type=gipo" in out and " ppo |" in out
@@ -258,29 +256,19 @@ def test_eval_in_one_process(
     assert "the folder exists" in capsys.readouterr().err
 
 
-def test_bench_without_a_name(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["bench"]) == 2
-    assert (
-        capsys.readouterr().err
-        == "accerl: bench='': name what is measured: world, policy, throughput, latency\n"
-    )
-
-
 def test_a_verb_that_is_asked_to_stop_ends_what_it_has_started(monkeypatch: pytest.MonkeyPatch) -> None:
-    from accerl_lerobot.bench import world
-
     ended: list[bool] = []
 
-    def asked(config: object) -> None:
+    def asked(arguments: list[str]) -> None:
         try:
             os.kill(os.getpid(), signal.SIGTERM)
             time.sleep(60)
         finally:
             ended.append(True)
 
-    monkeypatch.setattr(world, "bench_world", asked)
+    monkeypatch.setattr(verbs, "demos", asked)
     before = signal.getsignal(signal.SIGTERM)
-    assert cli.main(["bench", "world"]) == 128 + signal.SIGTERM and ended
+    assert cli.main(["demos"]) == 128 + signal.SIGTERM and ended
     assert signal.getsignal(signal.SIGTERM) is before
 
 
@@ -332,13 +320,11 @@ def test_a_run_that_cannot_go_on_ends_with_one_line(
     "arguments",
     [
         ["eval", "--env.type=simulated", "--policy.path=a/b", "--output_dir="],
-        ["demos", "--demos.root="],
+        ["demos", "--root="],
         ["export", "--path=x", "--root="],
         ["pull", "--repo_id=a/b", "--output_dir="],
         ["report", "@run", "--output="],
         ["timeline", "@run", "--output="],
-        ["bench", "latency", "--env.type=simulated", "--output_dir="],
-        ["bench", "throughput", f"--recipe={QUICKSTART}", "--policy_path=a/b", "--output_dir="],
     ],
     ids=lambda arguments: " ".join(arguments[:2]),
 )

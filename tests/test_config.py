@@ -130,15 +130,16 @@ MISTAKES: list[tuple[list[str], str]] = [
     (["--env.type=mujoco"], "env.type='mujoco': use one of gym, lerobot, libero, metaworld, simulated"),
     (["--env.task=drawer-v3"], "env.task='drawer-v3': 'drawer-v3' is not a MetaWorld task; did you mean"),
     (["--trainer.hold_back=50"], "replay.max_lag=50: use more than trainer.hold_back, 50, or all is"),
-    (["--algorithm.advantage=group"], "algorithm.advantage='group': add --rollout.group_size=8, say"),
     (["--replay.ahead=3"], "replay.ahead=3: use at least one batch, 128, or both sides wait for each other"),
     (["--dataset.root=x"], "dataset.repo_id=None: name the dataset in dataset.root"),
-    (["--demos.seed=1"], "demos.seed=1: a run's demonstrations take its own seed; use --seed"),
     (["--policy.path=x", "--sft.steps=5"], "policy.path='x': add --sft.steps=0 to improve this checkpoint"),
     (["--sft.policy.chunk_size=5"], "sft.policy={'chunk_size': 5}: name LeRobot's policy type, e.g."),
     (["--steps=3"], "steps=3: the name is LeRobot's; use trainer.updates (RL) or sft.steps (fine-tuning)"),
     (["--policy.push_to_hub=false"], "policy.push_to_hub=False: the name is LeRobot's; a run pushes nothing"),
-    (["--algorithm.type=grpo"], "algorithm.type='grpo': use ppo or gipo with --algorithm.advantage=group"),
+    (
+        ["--algorithm.discover_packages_path=a/b"],
+        "algorithm.discover_packages_path='a/b': use the name of a package",
+    ),
     (["--env.type=vlabench"], "env.type='vlabench': for LeRobot's vlabench use env.type=lerobot --env.name="),
     (["--seed=1", "--seed=2"], "seed=2: it is set to 1 already; give it once"),
     (["--job_name=" + "x" * 5000], "job_name='xxx"),
@@ -198,12 +199,6 @@ def test_sizes_far_beyond_the_machine_are_refused(monkeypatch: pytest.MonkeyPatc
     with pytest.raises(InputError, match=r"replay\.capacity=50000000"):
         preflight.check_machine(parse(RunConfig, ["--replay.capacity=50000000"]))
     preflight.check_machine(parse(RunConfig, ["--rollout.workers=100", "--launch.address=auto"]))
-
-
-def test_groups_serve_either_kind_of_advantage() -> None:
-    for advantage in ("gae", "group"):
-        config = parse(RunConfig, ["--rollout.group_size=2", f"--algorithm.advantage={advantage}"])
-        assert (config.algorithm.advantage, config.rollout.group_size) == (advantage, 2)
 
 
 def test_long_values_are_shortened() -> None:

@@ -201,7 +201,6 @@ def lose_a_rollout_worker(one: RayEngine, how: signal.Signals) -> None:
         if not left:
             break
     assert sorted(r.plan.index for r in results if r.plan.group == "during") == list(range(24))
-    assert progress.replay["duplicates"] == 0
     assert progress.rollout["restarts"] == 1.0 or how is signal.SIGSTOP  # a busy machine may seem to hang
     explored = [r.plan.seed for r in results if r.plan.explore]
     assert len(set(explored)) == len(explored)
@@ -236,7 +235,7 @@ def test_a_rollout_worker_that_fails_to_report_is_replaced(engine, monkeypatch: 
     for progress in polls(one):
         if progress.rollout["restarts"] >= 1 and progress.version >= 3:
             break
-    assert progress.rollout["restarts"] == 1 and progress.replay["duplicates"] == 0
+    assert progress.rollout["restarts"] == 1
 
 
 def lose_inference(one: RayEngine, how: Callable[[str], object], name: str = "inference") -> list[Progress]:
@@ -287,7 +286,7 @@ def lose_inference(one: RayEngine, how: Callable[[str], object], name: str = "in
     assert all(r.versions[0] <= r.versions[1] for r in results)
     explored = [r.plan.seed for r in results if r.plan.explore]
     assert len(set(explored)) == len(explored)
-    assert progress.replay["duplicates"] == 0 and progress.rollout["restarts"] == 0.0
+    assert progress.rollout["restarts"] == 0.0
     assert progress.inference["restarts"] == 1.0
     assert one.pids()[name] != pid and gone(pid)
     return away

@@ -109,21 +109,6 @@ def test_a_random_policy_learns_the_task(tiny_checkpoint: Path):
 
 
 @pytest.mark.slow
-def test_a_random_policy_learns_the_task_from_groups_and_without_a_critic(tiny_checkpoint: Path):
-    rollout = RolloutConfig(worlds=32, segment_length=8, group_size=8, group_filter="return")
-    algorithm = GIPOConfig(advantage="group", value_coef=0.0)
-    config = learning_run(tiny_checkpoint, algorithm=algorithm, rollout=rollout)
-    engine = LocalEngine(config, ("match",))
-    before = success(engine)
-    engine.train()
-    history = drive(engine)
-    after = success(engine)
-    engine.close()
-    assert before < 0.5
-    assert after > 0.8, f"{before:.0%} → {after:.0%}"
-    assert history[-1].rollout["groups_kept"] >= 100 * 128 / 2 / (8 * 2)
-
-
 def test_planned_episodes_run_without_training_and_are_not_learned_from(tiny_checkpoint: Path):
     engine = LocalEngine(tiny_run(tiny_checkpoint), ("match",))
     engine.plan(evaluation_plans(("match",), 9, "test", filmed=1))

@@ -165,13 +165,12 @@ NO_GPU = "no CUDA device here; use cpu or auto"
     [
         ([*QUICK, "--policy.device=cuda"], f"policy.device='cuda': {NO_GPU}"),
         (["sft", *TINY, "--sft.steps=1", "--device=cuda"], f"device='cuda': {NO_GPU}"),
-        (["bench", "policy", "--device=cuda"], f"device='cuda': {NO_GPU}"),
         (
             [*QUICK, "--wandb.enable=true"],
             "wandb.enable=True: this machine is not logged in: run wandb login",
         ),
         (QUICK, "output_dir='{out}': "),
-        (["demos", f"--config_path={QUICK[1]}"], "demos.root='{out}': "),
+        (["demos", f"--config_path={QUICK[1]}"], "root='{out}': "),
     ],
 )
 def test_what_the_machine_lacks(
@@ -187,14 +186,13 @@ def test_what_the_machine_lacks(
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(type(wandb.api), "api_key", None)
     monkeypatch.delenv("WANDB_MODE", raising=False)
-    if "output_dir" in line or "demos.root" in line:
+    if "output_dir" in line or "root" in line:
         pytest.importorskip("metaworld")
         usage = namedtuple("usage", "total used free")(2**40, 2**40, 10 * 2**20)
         monkeypatch.setattr(shutil, "disk_usage", lambda path: usage)
     out = tmp_path / "out"
-    where = f"--{'demos.root' if arguments[0] == 'demos' else 'output_dir'}={out}"
-    given = arguments if arguments[0] == "bench" else [*arguments, where]
-    assert refused(capsys, *given).startswith("accerl: " + line.replace("{out}", str(out)))
+    where = f"--{'root' if arguments[0] == 'demos' else 'output_dir'}={out}"
+    assert refused(capsys, *arguments, where).startswith("accerl: " + line.replace("{out}", str(out)))
     assert not out.exists()
 
 
@@ -223,6 +221,6 @@ def test_a_simulator_that_is_not_installed(
     line = "accerl: " + line.format(f"the package {module} is not installed; pip install ")
     out = tmp_path / "out"
     sft = ["--sft.steps=1", ACT]
-    for verb, more in (("train", [*sft, f"--output_dir={out}"]), ("demos", [f"--demos.root={out}"])):
+    for verb, more in (("train", [*sft, f"--output_dir={out}"]), ("demos", [f"--root={out}"])):
         assert refused(capsys, verb, *env, *more) == line
         assert not out.exists()

@@ -19,7 +19,6 @@ from accerl_lerobot.cli.verbs import CONFIGS
 from accerl_lerobot.config.parsing import choices_of, section_of
 from accerl_lerobot.config.ranges import Choice, Device, Positive, Range, Section, Share, check, hints_of
 from accerl_lerobot.demos.backbone import BackboneConfig
-from accerl_lerobot.demos.record import DemosConfig
 from accerl_lerobot.demos.sft import SFTConfig
 from accerl_lerobot.engine.config import PlacementConfig
 from accerl_lerobot.errors import InputError
@@ -28,7 +27,6 @@ from accerl_lerobot.policies.config import (
     TuningConfig,
 )
 from accerl_lerobot.replay import ReplayConfig
-from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.timeline.read import TimelineConfig
 from accerl_lerobot.world_model.config import NetworkConfig, WorldModelConfig
 from benchmarks.__main__ import CONFIGS as BENCHMARKS
@@ -110,13 +108,11 @@ RULES = [
     (BenchReplayConfig, {"capacity": 256}, "capacity="),
     (BenchScalingConfig, {"counts": (2, 2)}, "counts="),
     (BenchTransportConfig, {"sizes": ("1 GB",)}, "sizes="),
-    (DemosConfig, {"repo_id": "plain"}, "demos.repo_id="),
     (MachineryConfig, {"segment_length": 5}, "segment_length="),
     (NetworkConfig, {"channels": ()}, "world_model.model.network.channels="),
     (ReplayConfig, {"min_decisions": 5000}, "replay.min_decisions="),
     (ReplayConfig, {"ahead": 5000}, "replay.ahead="),
     (PlacementConfig, {"rollout": " "}, "launch.placement.rollout=' ': name a node"),
-    (RolloutConfig, {"group_size": 1}, "rollout.group_size=1: groups of one have no comparison"),
     (SFTConfig, {"policy": {"chunk_size": 4}}, "sft.policy="),
     (TimelineConfig, {"runs": ()}, "runs="),
     (TuningConfig, {"targets": "("}, "policy.tuning.targets='(': not a regular"),

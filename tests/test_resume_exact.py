@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from accerl_lerobot.algorithms import ChunkCriticConfig, GIPOConfig, SelfImitationConfig
+from accerl_lerobot.algorithms import ChunkCriticConfig, SelfImitationConfig
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.local import LocalEngine
@@ -24,16 +24,9 @@ from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
 from tests.runs import drive, polls, tiny_run
 
-GROUPS: dict[str, Any] = {
-    "rollout": RolloutConfig(worlds=5, segment_length=2, group_size=3, group_filter="none"),
-    "algorithm": GIPOConfig(advantage="group", level="chunk"),
-    # A whole group enters at once.
-    "replay": ReplayConfig(capacity=96, min_decisions=16, ahead=48, samples_per_insert=1.5, max_lag=50),
-}
 CASES: dict[str, dict[str, Any]] = {
     "plain": {},
     "probed": {"trainer": {"probe_every": 4}},
-    "groups": GROUPS,
     "chunk critic": {
         "env": SimulatedConfig(max_steps=16, environment_state=True),
         "rollout": RolloutConfig(worlds=4, segment_length=4),

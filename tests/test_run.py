@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -284,27 +284,6 @@ def test_without_a_checkpoint_there_is_nothing_to_go_on_from(
     with pytest.raises(WorkerError, match="Killed"):
         run.execute(config, tmp_path, Console())
     assert len(made) == 1 and made[0].closed
-
-
-def test_groups_with_nothing_to_compare_are_said_aloud(
-    tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
-    """In a real run no update would be made then; here, one is made for every 20 groups, 240 in all."""
-    engine = scripted(monkeypatch, local_run(tiny_checkpoint, tmp_path))
-    poll = engine.poll
-
-    def fruitless() -> Progress:
-        explored = _succeeded(EpisodePlan(task="match", seed=1, explore=True))
-        progress = poll()
-        counters = {"groups_kept": float(engine.version > 6), "groups_dropped": 20.0 * engine.version}
-        return replace(progress, episodes=[*progress.episodes, explored], rollout=progress.rollout | counters)
-
-    monkeypatch.setattr(engine, "poll", fruitless)
-    run.execute(engine.config, tmp_path, Console())
-    said = " ".join(capsys.readouterr().err.split())
-    # At 60 and 120; one is kept at 140, from where it is counted again: at 200.
-    assert said.count("50 groups in a row were dropped and nothing is learned from them") == 3
-    assert "rollout.group_filter=outcome (success while exploring 100%)" in said
 
 
 @pytest.mark.parametrize("error", [RuntimeError("inference worker failed for good"), KeyboardInterrupt()])

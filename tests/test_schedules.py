@@ -281,7 +281,5 @@ def test_schedules_that_cannot_be_are_refused():
     launch = LaunchConfig(schedule=SYNCHRONOUS)
     with pytest.raises(InputError, match=r"launch\.schedule.*rollout\.episodes"):
         RunConfig(launch=launch, rollout=RolloutConfig(episodes=8))
-    with pytest.raises(InputError, match=r"launch\.schedule.*rollout\.group_size"):
-        RunConfig(launch=launch, rollout=RolloutConfig(group_size=4))
     with pytest.raises(InputError, match=r"launch\.schedule.*imagination"):
         RunConfig(launch=launch, imagination=ImaginationConfig(share=0.5, path="somewhere"))

@@ -53,9 +53,6 @@ class RatioConfig(AlgorithmConfig):
 
     lam: Share = 0.95
     """λ of GAE per decision: 0 trusts the critic, 1 the observed rewards."""
-    advantage: Literal["gae", "group"] = "gae"
-    """``gae``: from the critic. ``group``: relative to other episodes from the same start, stamped on
-    segments by the rollout worker; V is not used then, and `value_coef` may as well be 0."""
     level: Level = "token"
     """Extent of one importance ratio: each log-prob factor, a token or, of a flow or Gaussian policy, an
     action (``token``), or the whole ``chunk``."""
@@ -103,7 +100,7 @@ class LossInputs:
     log_prob_old: Tensor
     """(N, L), log μ as the behaviour policy stored it."""
     advantage: Tensor
-    """(N,), normalised over the batch by the caller, or relative to a group of episodes."""
+    """(N,), normalised over the batch by the caller."""
     value: Tensor
     """(N,), V of the current critic; measured, not trained."""
     value_error: Tensor

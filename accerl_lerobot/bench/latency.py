@@ -33,7 +33,7 @@ QUANTILES = (0.5, 0.95, 0.99)
 
 @dataclass(frozen=True, kw_only=True)
 class BenchLatencyConfig(Section):
-    """Fields of ``accerl bench latency``."""
+    """Durations of an environment's decisions and resets."""
 
     env: EnvConfig = field(default_factory=MetaWorldConfig)
     """Any environment."""

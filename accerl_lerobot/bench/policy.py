@@ -19,16 +19,33 @@ from rich.table import Table
 
 from accerl_lerobot.bench import Memory, as_table, device_name, ranged, timed
 from accerl_lerobot.config.ranges import Device, Range, Repeats, Section
+from accerl_lerobot.demos.backbone import BackboneSizes, write_backbone
 from accerl_lerobot.policies.config import TuningConfig
 
 STATE = "observation.state"
 STATE_DIM, ACTION_DIM, TOKENS = 8, 7, 48
 """LIBERO's sizes: end-effector state, end-effector action; length of a padded instruction."""
+SMOLVLM2_500M = BackboneSizes(
+    hidden=960,
+    layers=32,
+    heads=15,
+    kv_heads=5,
+    vision_hidden=768,
+    vision_layers=12,
+    vision_heads=12,
+    patch=16,
+    image=512,
+    embeddings=49280,
+    intermediate=2560,
+    vision_intermediate=3072,
+    shuffle=4,
+)
+"""The sizes of SmolVLM2-500M, the backbone of ``lerobot/smolvla_base``."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class BenchPolicyConfig(Section):
-    """Fields of ``accerl bench policy``."""
+    """Cost of a full-size policy."""
 
     type: Literal["smolvla", "pi0", "pi05"] = "smolvla"
     """LeRobot's policy type."""
@@ -220,8 +237,6 @@ def lerobot_config(config: BenchPolicyConfig, directory: Path) -> Any:
     """LeRobot's config of a policy of the published size; files that it needs go into `directory`."""
     from lerobot.configs.types import FeatureType, PolicyFeature
     from lerobot.policies.factory import make_policy_config
-
-    from accerl_lerobot.demos.backbone import SMOLVLM2_500M, write_backbone
 
     picture = PolicyFeature(type=FeatureType.VISUAL, shape=(3, 256, 256))
     inputs = {f"observation.images.camera{c}": picture for c in range(config.cameras)}

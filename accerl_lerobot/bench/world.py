@@ -41,7 +41,7 @@ Decide = Callable[[], int]
 
 @dataclass(frozen=True, kw_only=True)
 class BenchWorldConfig(Section):
-    """Fields of ``accerl bench world``."""
+    """Speed of our MetaWorld or LIBERO next to LeRobot's."""
 
     env: EnvConfig = field(default_factory=MetaWorldConfig)
     """One task of ``env.type=metaworld`` or ``libero``."""

@@ -25,7 +25,7 @@ from accerl_lerobot.bench.world import BenchWorldConfig
 from accerl_lerobot.checkpoint.layout import CONFIG
 from accerl_lerobot.cli.export import ExportConfig
 from accerl_lerobot.config.parsing import read_arguments
-from accerl_lerobot.config.ranges import Device, Section, Seed
+from accerl_lerobot.config.ranges import Device, NewFolder, Section, Seed
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.record import DemosConfig
 from accerl_lerobot.demos.sft import SFTConfig
@@ -46,6 +46,10 @@ from accerl_lerobot.world_model.config import ValidationConfig, WorldModelConfig
 class DemosRun(Section):
     """``accerl demos``: scripted experts, recorded."""
 
+    seed: Seed = 0
+    """Disjoint demonstrations for different seeds."""
+    root: NewFolder = "outputs/demos"
+    """Folder of the dataset; must not exist."""
     env: EnvConfig = field(default_factory=MetaWorldConfig)
     demos: DemosConfig = field(default_factory=DemosConfig)
 
@@ -166,8 +170,8 @@ def demos(arguments: list[str]) -> int:
     from accerl_lerobot.engine.preflight import check_disk, check_world, demos_bytes
 
     with redirect_stdout(sys.stderr):
-        check_disk(config.demos.root, demos_bytes(config.demos, check_world(config.env)), "demos.root")
-        path = record_demos(config.env, config.demos)
+        check_disk(config.root, demos_bytes(config.demos, check_world(config.env)), "root")
+        path = record_demos(config.env, config.demos, config.root, config.seed)
     sys.stdout.write(f"{path}\n")
     return 0
 

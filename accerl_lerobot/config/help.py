@@ -27,11 +27,11 @@ PAGE = 60
 """Lines that are shown at once; what is longer is shown by section."""
 COMMON = (
     "output_dir", "job_name", "seed", "resume", "path", "repo_id", "env.type", "env.task", "env.image_size",
-    "env.max_steps", "dataset.repo_id", "dataset.root", "demos.episodes", "demos.root", "sft.steps",
+    "env.max_steps", "dataset.repo_id", "dataset.root", "demos.episodes", "root", "sft.steps",
     "sft.batch_size", "sft.lr", "policy.path", "policy.device", "policy.precision", "policy.tuning.mode",
     "device", "rollout.workers", "rollout.worlds", "rollout.decision_cost", "replay.capacity",
-    "replay.samples_per_insert", "algorithm.type", "algorithm.advantage", "trainer.updates",
-    "trainer.batch_decisions", "trainer.lr", "trainer.value_lr", "evaluation.episodes",
+    "replay.samples_per_insert", "algorithm.type", "trainer.updates", "trainer.batch_decisions",
+    "trainer.lr", "trainer.value_lr", "evaluation.episodes",
     "evaluation.every_updates", "launch.engine", "wandb.enable", "save_every_s",
 )  # fmt: skip
 """Fields that people change."""
@@ -162,7 +162,7 @@ def _fields(cls: type[Any], prefix: str, usual: Any = None, without: Collection[
 
 def _field(cls: type[Any], field: Any, prefix: str, usual: Any) -> list[str]:
     """Lines of a field that is no section."""
-    text = " ".join([docstrings(cls)[field.name], *_choices(field)])
+    text = docstrings(cls)[field.name]
     span = range_in_words(hints_of(cls)[field.name])
     if span and not all(choice in text for choice in span.split(" | ")):
         text = f"{text} {span[0].upper()}{span[1:]}.".strip()
@@ -201,11 +201,6 @@ def _entry(flag: str, text: str) -> list[str]:
     if len(start) < COLUMN:
         return textwrap.wrap(text, WIDTH, initial_indent=start.ljust(COLUMN), subsequent_indent=" " * COLUMN)
     return [start, *textwrap.wrap(text, WIDTH, initial_indent=" " * COLUMN, subsequent_indent=" " * COLUMN)]
-
-
-def _choices(field: Any) -> list[str]:
-    """Meanings of a field's values, where its metadata has a table of them: each entry has a `what`."""
-    return [f"{name}: {entry.what}" for name, entry in field.metadata.get("choices", {}).items()]
 
 
 def _default(field: Any, usual: Any = None) -> Any:

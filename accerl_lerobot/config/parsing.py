@@ -57,7 +57,6 @@ RECIPES = "recipes"
 TYPE = "type"
 """The key that picks one config of several, as in ``env.type``."""
 LONGEST_KEY = 80
-_GROUP = "use ppo or gipo with --algorithm.advantage=group --rollout.group_size=8"
 _PUSH = "a run pushes nothing: leave it out, and use accerl push --path=RUN --repo_id=USER/NAME afterwards"
 LEROBOT = {
     "steps": "use trainer.updates (RL) or sft.steps (fine-tuning)",
@@ -82,7 +81,6 @@ LEROBOT = {
     "policy.repo_id": _PUSH,
     "push_to_hub": _PUSH,
     "save_checkpoint_to_hub": _PUSH,
-    "algorithm.type=grpo": f"{_GROUP}. Otherwise ",
     **{
         f"env.type={name}": f"for LeRobot's {name} use env.type=lerobot --env.name={name}. Otherwise "
         for name in (

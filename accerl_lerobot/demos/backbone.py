@@ -76,35 +76,11 @@ class BackboneConfig(Section, section="sft.backbone"):
         return BackboneSizes(**vars(self))
 
 
-SMOLVLM2_500M = BackboneSizes(
-    hidden=960,
-    layers=32,
-    heads=15,
-    kv_heads=5,
-    vision_hidden=768,
-    vision_layers=12,
-    vision_heads=12,
-    patch=16,
-    image=512,
-    embeddings=49280,
-    intermediate=2560,
-    vision_intermediate=3072,
-    shuffle=4,
-)
-"""The sizes of SmolVLM2-500M, the backbone of ``lerobot/smolvla_base``."""
-
-
 def write_backbone(directory: Path, sizes: BackboneSizes, texts: Sequence[str] = ()) -> Path:
-    """Writes config, tokeniser and image processor; no weights.
+    """Writes config, tokeniser and image processor into `directory`; no weights.
 
-    Args:
-        directory: created if need be.
-        sizes: of the network.
-        texts: instructions the tokeniser merges bytes on, so that they become a few tokens instead of one per
-            byte; any other text still encodes, byte by byte.
-
-    Returns:
-        `directory`.
+    The tokeniser merges bytes on `texts`, so that these instructions become a few tokens instead of one per
+    byte; any other text still encodes, byte by byte.
     """
     from tokenizers import Tokenizer, decoders, models, pre_tokenizers, trainers
     from transformers import (

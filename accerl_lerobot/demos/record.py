@@ -30,7 +30,7 @@ from rich.progress import Progress
 
 from accerl_lerobot import guardian
 from accerl_lerobot.config.parsing import imported
-from accerl_lerobot.config.ranges import DatasetName, NewFolder, Range, Section, Seed, Share
+from accerl_lerobot.config.ranges import Range, Section, Share
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.envs.base import EnvConfig, World, WorldSpec
 from accerl_lerobot.envs.metaworld import MetaWorld, expert_name, import_mujoco
@@ -39,6 +39,8 @@ from accerl_lerobot.errors import InputError, check_absent, expanded
 from accerl_lerobot.experience import ENVIRONMENT_STATE, REWARD, SUCCESS, Observation
 from accerl_lerobot.seeds import demo_seed
 
+REPO_ID = "accerl/demos"
+"""Name of a recorded dataset, which is where its folder is."""
 SIDECAR = Path("meta") / "accerl_demos.json"
 """Inside the dataset: the two configs, what came of them, and the versions that decide on the physics."""
 
@@ -101,13 +103,12 @@ def play(
     """Plays one episode to its end; equal arguments give equal episodes.
 
     Args:
-        world: Reset here with `seed`.
-        expert: Reads `world`.
-        task: Name of the task.
-        seed: Of the world and of the noise.
-        noise: Standard deviation of the Gaussian added to each action.
-        push: Largest length of the constant vector that is added to what the expert wants.
-        fail: If true, actions are a random drift from a random early step on.
+        world: reset here with `seed`.
+        expert: reads `world`.
+        task: name of the task.
+        seed: of the world and of the noise.
+        noise, push: see `DemosConfig`.
+        fail: actions are a random drift from a random early step on.
     """
     rng = np.random.default_rng((seed, 1))
     low, high = world.spec.action_low, world.spec.action_high
@@ -173,10 +174,10 @@ def simulated_expert(world: World, task: str) -> Expert:
 # A dataset, from simulated episodes: several processes simulate, the parent writes, in order.
 
 
-def check_free(root: str, prefix: str = "") -> Path:
+def check_free(root: str) -> Path:
     """The folder of a dataset that is to be written; an existing one is refused."""
-    folder = expanded(root, f"{prefix}root")
-    check_absent(folder, f"{prefix}root")
+    folder = expanded(root, "root")
+    check_absent(folder, "root")
     return folder
 
 
@@ -273,11 +274,7 @@ def new_dataset(
 
 @dataclass(frozen=True, kw_only=True)
 class DemosConfig(Section, section="demos"):
-    """How many demonstrations, how disturbed, written where.
-
-    Example:
-        >>> record_demos(MetaWorldConfig(), DemosConfig(episodes=25, root="outputs/drawer"))
-    """
+    """How many demonstrations, and how disturbed."""
 
     episodes: Annotated[int, Range("[1, 10000]")] = 25
     """Episodes in the dataset; spread evenly over the tasks."""
@@ -286,33 +283,26 @@ class DemosConfig(Section, section="demos"):
     action is executed and recorded, so the dataset also shows how to recover."""
     push: Annotated[float, Range("[0, 2]")] = 0.0
     """Largest length of a constant vector, drawn anew for each episode, that is added to the expert's action
-    before the noise. An expert that is pushed aside misses narrowly, as a policy does, and drifting
-    does not; use it with `keep_failures`, for success and world models."""
+    before the noise. An expert that is pushed aside misses narrowly, as a policy does, and one that drifts
+    does not; episodes that fail so are kept, for success and world models."""
     failure_share: Share = 0.0
-    """Share of episodes that drift at random from early on and fail; for success and world models."""
-    keep_failures: bool = False
-    """Keep expert episodes that failed; otherwise they are tried again with another seed."""
+    """Share of episodes that drift at random from early on and fail; for success and world models. Without a
+    push, other episodes that fail are tried again with another seed."""
     shifted: bool = False
     """Apply ``env.shift`` to the demonstrations too; otherwise they show the world without it."""
-    seed: Seed = 0
-    """Disjoint demonstrations for different seeds."""
     processes: Annotated[int, Range("[1, 64]")] = 2
     """Simulator processes; does not change the content."""
-    repo_id: DatasetName = "accerl/demos"
-    """Name of the dataset, ``owner/name``; also its place on the Hub if it is pushed."""
-    root: NewFolder = "outputs/demos"
-    """Folder to create; must not exist."""
 
 
-def record_demos(env_config: EnvConfig, config: DemosConfig) -> Path:
-    """Records demonstrations.
+def record_demos(env_config: EnvConfig, config: DemosConfig, root: str, seed: int = 0) -> Path:
+    """Records demonstrations, disjoint ones for different seeds.
 
-    The dataset appears at ``config.root`` only when it is complete.
+    The dataset appears at `root` only when it is complete.
 
     Returns:
-        The dataset's folder; open it with ``LeRobotDataset(config.repo_id, root=...)``.
+        The dataset's folder; open it with ``LeRobotDataset(REPO_ID, root=...)``.
     """
-    root = check_free(config.root, "demos.")
+    folder = check_free(root)
     if not config.shifted:
         env_config = env_config.nominal()
     world = make_world(env_config)
@@ -320,29 +310,31 @@ def record_demos(env_config: EnvConfig, config: DemosConfig) -> Path:
     for task in spec.tasks:
         make_expert(env_config, world, task)  # refuses a task without an expert before any work
     world.close()
-    with appearing(root) as partial:
-        tally = _write(env_config, config, spec, partial)
+    with appearing(folder) as partial:
+        tally = _write(env_config, config, spec, partial, seed)
         sidecar = {
             "env": draccus.encode(env_config, EnvConfig),
-            "demos": {k: v for k, v in draccus.encode(config).items() if k not in ("root", "processes")},
+            "demos": {k: v for k, v in draccus.encode(config).items() if k != "processes"} | {"seed": seed},
             **tally,
             "versions": {k: importlib.metadata.version(v) for k, v in _VERSIONS.items() if find_spec(k)},
         }
         (partial / SIDECAR).write_text(json.dumps(sidecar, indent=2) + "\n")
-    _logger.info("%s: %s", root, tally)
-    return root
+    _logger.info("%s: %s", folder, tally)
+    return folder
 
 
-def _write(env_config: EnvConfig, config: DemosConfig, spec: WorldSpec, root: Path) -> dict[str, Any]:
+def _write(
+    env_config: EnvConfig, config: DemosConfig, spec: WorldSpec, root: Path, seed: int
+) -> dict[str, Any]:
     tally = {"episodes": 0, "frames": 0, "successes": 0, "discarded": 0}
     with (
-        simulators(config.processes, _start, env_config, config) as pool,
+        simulators(config.processes, _start, env_config, config, seed) as pool,
         Progress(transient=True) as progress,
     ):
         # The first episodes are already being simulated while LeRobot is imported.
         episodes = in_order(pool, _record_one, range(config.episodes), ahead=2 * config.processes)
         table = features(spec, env_config.state_size)
-        with new_dataset(root, config.repo_id, spec.fps, env_config.type, table) as dataset:
+        with new_dataset(root, REPO_ID, spec.fps, env_config.type, table) as dataset:
             bar = progress.add_task("recording", total=config.episodes)
             for episode, discarded in episodes:
                 for frame in frames(episode):
@@ -359,9 +351,7 @@ def _write(env_config: EnvConfig, config: DemosConfig, spec: WorldSpec, root: Pa
 def features(spec: WorldSpec, environment_state: int) -> dict[str, dict[str, Any]]:
     """LeRobot's feature table for a world; reward, done and success under LeRobot's own names.
 
-    Args:
-        spec: of the world.
-        environment_state: numbers of its ``observation.environment_state``; 0: it offers none.
+    `environment_state` is the size of its ``observation.environment_state``; 0: it offers none.
     """
     table: dict[str, dict[str, Any]] = {
         key: {"dtype": "image", "shape": shape, "names": ["height", "width", "channels"]}
@@ -394,14 +384,15 @@ def frames(episode: Episode) -> Iterator[dict[str, Any]]:
 _world: World
 _env_config: EnvConfig
 _config: DemosConfig
+_seed: int
 
 
-def _start(env_config: EnvConfig, config: DemosConfig) -> None:
+def _start(env_config: EnvConfig, config: DemosConfig, seed: int) -> None:
     """Makes a worker process ready: one world for all its episodes."""
-    global _world, _env_config, _config
+    global _world, _env_config, _config, _seed
     # The experts' gains are too high on purpose, and `play` clips.
     warnings.filterwarnings("ignore", message="Constant.s. may be too high", category=UserWarning)
-    _world, _env_config, _config = make_world(env_config), env_config, config
+    _world, _env_config, _config, _seed = make_world(env_config), env_config, config, seed
 
 
 def _record_one(slot: int) -> tuple[Episode, int]:
@@ -415,12 +406,12 @@ def _record_one(slot: int) -> tuple[Episode, int]:
             _world,
             make_expert(_env_config, _world, task),
             task=task,
-            seed=demo_seed(_config.seed, slot + attempt * _MAX_EPISODES),
+            seed=demo_seed(_seed, slot + attempt * _MAX_EPISODES),
             noise=_config.action_noise,
             push=_config.push,
             fail=fail,
         )
-        if episode.success != fail or (_config.keep_failures and not fail):
+        if episode.success != fail or (_config.push and not fail):
             return episode, attempt
     raise InputError(
         "demos.failure_share" if fail else "demos.action_noise",

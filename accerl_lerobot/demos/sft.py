@@ -35,10 +35,10 @@ CODE_REVISION = "--code_revision="
 """Our argument of the trainer."""
 HELD_OUT = re.compile(r"\bstep (\d+): eval_loss=(\S+)")
 """LeRobot's report of a loss on held-out episodes."""
-REFUSED = "accerl refuses: "
-"""Begins the last line of a trainer that met something it must not use; JSON follows."""
 CANDIDATES = 10
 """Checkpoints of which the best on held-out episodes is used."""
+REFUSED = "accerl refuses: "
+"""Begins the last line of a trainer that met something it must not use; JSON follows."""
 LOG_EVERY = 25
 """Optimiser steps between two lines of progress."""
 NO_SFT = {"gaussian_actor": "only LeRobot's SAC trains it, lerobot-train does not; use act"}
@@ -160,7 +160,7 @@ def run_sft(
         seed: of LeRobot's trainer.
         device: cpu or cuda.
         texts: the dataset's instructions, for a new backbone's tokeniser.
-        on_step: called with (step, loss) as progress is reported, from 1000 on rounded to thousands.
+        on_step: receives step and loss as progress is reported, from 1000 on rounded to thousands.
 
     Raises:
         InputError: `output_dir` exists; the checkpoint to start from, or the dataset, is not to be trusted.
@@ -212,8 +212,8 @@ def run_sft(
         tail = "".join(log.read_text().splitlines(keepends=True)[-15:])
         raise RuntimeError(f"lerobot-train ended with exit code {code}; the end of {log}:\n{tail}")
     checkpoints = output_dir / CHECKPOINTS
-    best = _best(log.read_text(), checkpoints) if config.held_out else checkpoints / LAST
-    return best / PRETRAINED
+    chosen = _best(log.read_text(), checkpoints) if config.held_out else checkpoints / LAST
+    return chosen / PRETRAINED
 
 
 def picked(dataset: DatasetConfig, pick: str) -> list[int] | None:

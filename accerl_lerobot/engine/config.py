@@ -16,7 +16,6 @@ from accerl_lerobot.algorithms import (
     ChunkCriticConfig,
     GIPOConfig,
     OffPolicyConfig,
-    RatioConfig,
 )
 from accerl_lerobot.config.parsing import decode, encode, parse
 from accerl_lerobot.config.ranges import (
@@ -176,10 +175,6 @@ class RunConfig(Section):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.demos.seed:
-            raise InputError(
-                "demos.seed", self.demos.seed, "a run's demonstrations take its own seed; use --seed"
-            )
         if self.policy.path is not None and self.sft.steps:
             remedy = "add --sft.steps=0 to improve this checkpoint, or fine-tune it first with sft.init_path"
             raise InputError("policy.path", self.policy.path, remedy)
@@ -187,12 +182,6 @@ class RunConfig(Section):
             check_chunk(self.sft.policy)
         if isinstance(self.algorithm, OffPolicyConfig):
             self._check_off_policy()
-        elif (
-            isinstance(self.algorithm, RatioConfig)
-            and self.algorithm.advantage == "group"
-            and not self.rollout.group_size
-        ):
-            raise InputError("algorithm.advantage", "group", "add --rollout.group_size=8, say: 2 or more")
         if self.trainer.hold_back >= self.replay.max_lag:
             remedy = (
                 f"use more than trainer.hold_back, {self.trainer.hold_back}, or all is thrown away as too old"
@@ -216,16 +205,9 @@ class RunConfig(Section):
         if imagination.share and self.launch.schedule != ASYNCHRONOUS:
             remedy = "use asynchronous: imagination takes no turns"
             raise InputError("launch.schedule", self.launch.schedule, remedy)
-        for name in ("episodes", "group_size"):
-            if getattr(self.rollout, name) and self.launch.schedule != ASYNCHRONOUS:
-                remedy = (
-                    f"use asynchronous, or leave out rollout.{name}: a world that has to pause is waited for"
-                )
-                raise InputError("launch.schedule", self.launch.schedule, remedy)
-        if imagination.share and self.rollout.group_size:
-            # Nor could the episodes of a group, which bear one name, be told from each other.
-            remedy = "leave it out with imagination.share: imagined rollouts start at different states"
-            raise InputError("rollout.group_size", self.rollout.group_size, remedy)
+        if self.rollout.episodes and self.launch.schedule != ASYNCHRONOUS:
+            remedy = "use asynchronous, or leave out rollout.episodes: a paused environment is waited for"
+            raise InputError("launch.schedule", self.launch.schedule, remedy)
 
     def _check_off_policy(self) -> None:
         """A memory of its own stands for replay's reuse, and holds whole real episodes."""
@@ -242,7 +224,6 @@ class RunConfig(Section):
             ("replay.samples_per_insert", self.replay.samples_per_insert, 1.0, "draws from its own memory"),
             ("trainer.ranks", self.trainer.ranks, 1, "is learnt by one process"),
             ("imagination.share", self.imagination.share, 0.0, "learns from real episodes only"),
-            ("rollout.group_size", self.rollout.group_size, 0, "compares no episodes"),
             ("rollout.time_limit", self.rollout.time_limit, "fail", "sees the time that is left"),
         ):
             if value != wanted:

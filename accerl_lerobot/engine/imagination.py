@@ -26,7 +26,7 @@ from typing import Any
 
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE, WORLD_MODEL
-from accerl_lerobot.engine.config import DatasetConfig, RunConfig, journal_folder
+from accerl_lerobot.engine.config import DatasetConfig, RunConfig
 from accerl_lerobot.engine.preflight import policy_to_be
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.envs.base import WorldSpec
@@ -36,7 +36,7 @@ from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.policies.loading import load_lerobot_config
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TRANSPORT, WAIT_IN, WAIT_OUT, WEIGHT_SYNC, open_clock
 from accerl_lerobot.transport.endpoint import Endpoint, ReconnectingClient
-from accerl_lerobot.world_model.config import IMAGINATION, VIDEOS, WORLD_LEARNING, OnlineLearnConfig
+from accerl_lerobot.world_model.config import IMAGINATION, WORLD_LEARNING, OnlineLearnConfig
 from accerl_lerobot.world_model.contract import WorldModelSpec
 from accerl_lerobot.world_model.data import fingerprint, load_episodes
 from accerl_lerobot.world_model.online import OnlineLearner, PretrainingEpisodes, Promotion
@@ -51,7 +51,6 @@ from accerl_lerobot.world_model.store import OWN_RUN, Source, find_source, load_
 from accerl_lerobot.world_model.validation import (
     DATASET,
     ONLINE,
-    ValidationVideos,
     check_disjoint,
     name_section,
     open_datasets,
@@ -124,15 +123,7 @@ def make_learner(config: RunConfig, models: ImaginationModels | None = None) -> 
         source = find_source(sources, fingerprint(meta))
         known.learnt.extend(episodes if source is None else [episodes[i] for i in source.learnt])
         known.held_out.extend([] if source is None else [episodes[i] for i in source.held_out])
-    return OnlineLearner(
-        model,
-        success,
-        config.imagination,
-        known,
-        longest,
-        seed=config.seed,
-        on_validation=_videos(config),
-    )
+    return OnlineLearner(model, success, config.imagination, known, longest, seed=config.seed)
 
 
 def check_imagination(config: RunConfig) -> None:
@@ -148,12 +139,6 @@ def _dataset_sections(learn: OnlineLearnConfig) -> dict[str, DatasetConfig]:
     """The datasets that are named, by their config section."""
     sections = {DATASET: learn.dataset, ONLINE: learn.online}
     return {f"imagination.learn.{name}": of for name, of in sections.items() if of.repo_id is not None}
-
-
-def _videos(config: RunConfig) -> ValidationVideos | None:
-    """Videos into the run's folder, if that is known."""
-    folder = journal_folder(config)
-    return None if folder is None else ValidationVideos(folder / VIDEOS)
 
 
 def _longest(world: WorldSpec, chunk: int) -> int:

@@ -80,13 +80,7 @@ class LocalEngine(Engine):
         self._outbox: deque[Segment] = deque()
         count = config.rollout.worlds * config.rollout.workers
         worlds = [make_world(config.env, history) for _ in range(count)]
-        self._plans = EpisodePlans(
-            config.rollout,
-            tasks,
-            seed=config.seed,
-            worlds=len(worlds),
-            budget=config.rollout.episodes or None,
-        )
+        self._plans = EpisodePlans(tasks, seed=config.seed, budget=config.rollout.episodes or None)
         self._runner = RolloutRunner(
             worlds,
             lambda: self._plans.next(self._exploring),
@@ -94,7 +88,6 @@ class LocalEngine(Engine):
             "local",
             self._outbox.append,
             self._episodes.append,
-            self._plans.groups,
         )
         self._due: dict[int, Request] = {}
         if state is not None:
@@ -202,8 +195,6 @@ class LocalEngine(Engine):
 
     def _act(self) -> None:
         """One decision in every environment that may continue."""
-        if not self._exploring:
-            self._runner.abandon_groups()
         for slot in range(len(self._runner)):
             request = self._due.get(slot)
             if request is None or (request.explore and not self._exploring):
@@ -248,7 +239,7 @@ class LocalEngine(Engine):
         self._replay.hold(learner.validation_due(last=False) and not last)
 
     def _store(self) -> None:
-        """Store waiting segments one at a time, since those of a group come all at once."""
+        """Store waiting segments while replay takes them."""
         while self._outbox and self._replay.may_insert(REAL):
             segment = self._outbox.popleft()
             if not self._replay.insert(segment):

@@ -38,15 +38,13 @@ from accerl_lerobot.timeline import CHECKPOINT, EVALUATION, TRAINING, Clock, NoC
 
 FILMED = ".before"
 """Name of the filmed episodes of the first evaluation, kept until the video is made."""
-FRUITLESS_GROUPS = 50
-"""Groups dropped in a row after which a message is printed: no update is made of them."""
 RECORD_EVERY = 10
 """Updates between two records of the workers' counters when no episode ends."""
 RECENT = 100
 """Exploring episodes over which the training success of the curve is averaged."""
 _STATE = (
     "before", "evaluations", "curve", "recent", "explored", "lags", "lag_max", "mismatch_max", "during",
-    "base", "groups", "steps", "evaluated", "saved",
+    "base", "steps", "evaluated", "saved",
 )  # fmt: skip
 
 
@@ -208,8 +206,6 @@ class Loop:
         self.lag_max = self.mismatch_max = 0.0
         self.during: dict[str, list[EpisodeResult]] = {}
         self.base: dict[str, float] = {}
-        self.groups = (0.0, 0.0)
-        """Groups kept, and groups dropped at the last message or kept group."""
         self.steps = math.inf
         """Env steps of the training, once it has ended."""
         self.evaluated = self.saved = 0
@@ -318,7 +314,6 @@ class Loop:
                 if progress.done:
                     self.times.rl_s, self._training_since = self._rl_s, None
                     return progress
-                self._warn_of_groups(progress.rollout)
                 every = config.evaluation.every_updates
                 if every and progress.version // every > self.evaluated:
                     self.evaluated = progress.version // every
@@ -372,20 +367,6 @@ class Loop:
                 results.append(episode)
                 if len(results) == self.config.evaluation.episodes_during:
                     self._report(episode.plan.group, results, self._steps(progress), progress.version)
-
-    def _warn_of_groups(self, counters: dict[str, float]) -> None:
-        """Print a message when groups have nothing to compare, as the run would seem to hang."""
-        kept, dropped = counters.get("groups_kept", 0.0), counters.get("groups_dropped", 0.0)
-        if kept > self.groups[0]:
-            self.groups = (kept, dropped)
-        elif dropped - self.groups[1] >= FRUITLESS_GROUPS:
-            self.groups = (kept, dropped)
-            success = f"{np.mean(self.recent):.0%}" if self.recent else "unknown"
-            self.console.say(
-                f"{FRUITLESS_GROUPS} groups in a row were dropped and nothing is learned from them: they had "
-                f"nothing to compare under rollout.group_filter={self.config.rollout.group_filter} "
-                f"(success while exploring {success}); stop the run, or choose tasks that succeed sometimes"
-            )
 
     def _plan_during(self, number: int) -> None:
         group = f"during-{number}"

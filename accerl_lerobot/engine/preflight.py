@@ -432,14 +432,12 @@ def lag_limits(config: RunConfig) -> tuple[int, int]:
 
 
 def under_way(config: RunConfig) -> int:
-    """Decisions on their way to replay; an unknown chunk counts as one action, the worst case."""
+    """Decisions on their way to replay."""
     rollout = config.rollout
     return decisions_under_way(
         workers=rollout.workers,
         worlds=rollout.worlds,
         segment_length=rollout.segment_length,
-        group_size=rollout.group_size,
-        episode_decisions=math.ceil(config.env.max_steps / (executed(config) or 1)),
     )
 
 

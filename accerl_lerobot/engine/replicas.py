@@ -2,7 +2,7 @@
 """Supervision of the processes of an asynchronous run.
 
     ActorHandle          one process: a long call that must not end unasked, and one question at a time
-    RolloutWorkers       restarted alone: a process loses its unfinished segments and groups; planned episodes
+    RolloutWorkers       restarted alone: a process loses its unfinished segments; planned episodes
                          are run again
     InferenceReplicas    restarted alone: nothing is lost, as a request carries its noise and clients ask the
                          successor again
@@ -36,7 +36,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.inference.batcher import BatcherStats, dealt, merge_metrics, merge_stats
 from accerl_lerobot.metrics import numbered
 from accerl_lerobot.policies.config import Load
-from accerl_lerobot.rollout.plans import budgets, incarnation_after, whole_groups
+from accerl_lerobot.rollout.plans import budgets, incarnation_after
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.rollout.worker import Report
 from accerl_lerobot.transport.endpoint import Endpoint, Transport, uses_shared_memory
@@ -381,7 +381,6 @@ class RolloutWorkers(ReplicaSet[RolloutSlot]):
         for slot, was in zip(self._slots, saved["slots"], strict=True):
             slot.incarnation, slot.budget = was["incarnation"] + 1, was["budget"]
             if slot.budget is not None:
-                slot.budget = whole_groups(slot.budget, self._config.rollout)
                 slot.spent = slot.budget == 0
             self._assign(slot, was["outstanding"])
 
@@ -424,8 +423,6 @@ class RolloutWorkers(ReplicaSet[RolloutSlot]):
         _add(self._past, slot.report)
         slot.incarnation = slot.next_incarnation
         slot.report, slot.moved = None, None
-        if slot.budget is not None:
-            slot.budget = whole_groups(slot.budget, self._config.rollout)
         slot.worker = self._new(slot)
         slot.unsent = list(slot.outstanding.values())
         self._run(slot)

@@ -49,6 +49,7 @@ from accerl_lerobot.checkpoint.layout import (
 )
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.console import Console
+from accerl_lerobot.demos.record import REPO_ID, record_demos
 from accerl_lerobot.engine import ray_session
 from accerl_lerobot.engine.config import RunConfig, encode, parse, timeline_folder
 from accerl_lerobot.engine.loop import Engine, Loop, Outputs, Times, run_plans
@@ -200,13 +201,12 @@ def demonstrations_of(config: RunConfig) -> DatasetConfig | None:
     own = None if config.output_dir is None else Path(config.output_dir).absolute() / DEMOS
     if own is None or not own.is_dir():
         return None
-    return replace(config.dataset, repo_id=config.demos.repo_id, root=str(own))
+    return replace(config.dataset, repo_id=REPO_ID, root=str(own))
 
 
 def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfig:
     """Record demonstrations and run SFT where the config asks for it; set ``policy.path``."""
     from accerl_lerobot.demos.dataset_files import open_metadata, task_texts
-    from accerl_lerobot.demos.record import record_demos
     from accerl_lerobot.demos.sft import run_sft
     from accerl_lerobot.policies.loading import resolve_device
 
@@ -217,8 +217,8 @@ def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfi
     if dataset.repo_id is None:
         root = directory / DEMOS
         with console.stage("demonstrations"):
-            record_demos(config.env, replace(config.demos, root=str(root), seed=config.seed))
-        dataset = replace(dataset, repo_id=config.demos.repo_id, root=str(root))
+            record_demos(config.env, config.demos, str(root), config.seed)
+        dataset = replace(dataset, repo_id=REPO_ID, root=str(root))
     meta = open_metadata(dataset)
     with console.stage("SFT", total=config.sft.steps) as stage:
         assert dataset.repo_id is not None

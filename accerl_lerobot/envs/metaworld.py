@@ -111,10 +111,7 @@ Metres = Annotated[float, Range("[-2, 2]")]
 
 @dataclass(frozen=True, kw_only=True)
 class ShiftConfig(Section, section="env.shift"):
-    """Deployment shift of a MetaWorld scene; the defaults change nothing.
-
-    Scripted demonstrations are recorded without it, unless ``demos.shifted`` says otherwise.
-    """
+    """Deployment shift of a MetaWorld scene; the defaults change nothing. Demonstrations are without it."""
 
     camera: tuple[Metres, Metres, Metres] = (0.0, 0.0, 0.0)
     """Metres added to the position of every camera, along its body's x, y and z."""

@@ -254,7 +254,7 @@ def before_after(
     blank = np.full_like(filmed[0][both[0]].frames[0], 255)
     gap = np.full((len(blank), 2 * GAP, 3), 255, np.uint8)
     halves = [
-        [captioned(half[i].frames, "", half[i].success) for i in both]
+        [_with_outcome(half[i].frames, half[i].success) for i in both]
         + [[blank]] * (-len(both) % columns)
         for half in filmed
     ]  # fmt: skip
@@ -300,20 +300,13 @@ def _caption(halves: Sequence[Sequence[str]], width: int, gap: int) -> np.ndarra
     return np.asarray(image)
 
 
-def captioned(frames: Sequence[np.ndarray], name: str, success: bool) -> list[np.ndarray]:
-    """Frames uint8 (H, W, 3) under a name, and one more that tells the end by the colour of its frame."""
-    from PIL import Image, ImageDraw
-
-    told = []
-    for i in range(len(frames) + 1):
-        image = Image.fromarray(frames[min(i, len(frames) - 1)])
-        draw = ImageDraw.Draw(image)
-        draw.text((6, 4), name, fill=(255, 255, 255), stroke_width=1, stroke_fill=(0, 0, 0))
-        if i == len(frames):
-            colour = (40, 160, 60) if success else (200, 40, 40)
-            draw.rectangle((0, 0, image.width - 1, image.height - 1), outline=colour, width=BORDER)
-        told.append(np.asarray(image))
-    return told
+def _with_outcome(frames: Sequence[np.ndarray], success: bool) -> list[np.ndarray]:
+    """Frames uint8 (H, W, 3), and the last once more in a frame whose colour tells how the episode ended."""
+    ended = frames[-1].copy()
+    colour = (40, 160, 60) if success else (200, 40, 40)
+    for edge in (ended[:BORDER], ended[-BORDER:], ended[:, :BORDER], ended[:, -BORDER:]):
+        edge[:] = colour
+    return [*frames, ended]
 
 
 def _joined(pictures: Sequence[np.ndarray], axis: int) -> np.ndarray:

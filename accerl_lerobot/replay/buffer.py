@@ -5,8 +5,8 @@ What must hold, in segments and in decisions:
 
     inserted = stored + evicted + retired
 
-*evicted* made room for newer ones, *retired* were older than `max_lag` allows. A duplicate or a non-finite
-segment is counted but never inserted.
+*evicted* made room for newer ones, *retired* were older than `max_lag` allows. A non-finite segment is
+counted but never inserted.
 
 The store survives its process: `state` is all of it, as it was before the batches that a trainer has drawn
 and not learnt from.
@@ -27,8 +27,8 @@ When neither can give, and neither ever will, the replay is *exhausted*.
 
 from __future__ import annotations
 
-from collections import Counter, OrderedDict, deque
-from dataclasses import asdict, dataclass, field, replace
+from collections import Counter, deque
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -39,14 +39,6 @@ from accerl_lerobot.experience import REAL, Segment
 from accerl_lerobot.replay import pacing
 from accerl_lerobot.replay.journal import Journal
 from accerl_lerobot.replay.pacing import Pace, ReplayConfig
-
-KEY_MEMORY = 65_536
-"""How many keys are remembered to recognise a segment that is sent twice, even after it has left the store.
-
-A worker repeats an insert within seconds, thousands of segments at most; remembering all keys would grow
-without end.
-"""
-
 
 DRAWS = 1024
 """How many of the last draws are remembered, to be taken back in `Replay.state`.
@@ -70,8 +62,6 @@ class ReplayCounters:
     retired_decisions: int = 0
     retired_unused: int = 0
     """Segments retired before they were ever trained on."""
-    duplicates: int = 0
-    """Segments ignored because their key had been seen."""
     dropped_nonfinite: int = 0
     """Segments refused because they hold a NaN or an infinity."""
     trained_decisions: int = 0
@@ -80,11 +70,9 @@ class ReplayCounters:
     """Drawn at least once."""
     unspent_draws: int = 0
     """Draws that left with their segments, in decisions: what pacing failed to use."""
-    departed_uses: dict[int, int] = field(default_factory=dict)
-    """Uses of the segments that left: times trained on → segments."""
 
 
-@dataclass(kw_only=True)
+@dataclass(kw_only=True, eq=False)
 class _Entry:
     segment: Segment | None
     """None once it has left."""
@@ -110,7 +98,7 @@ class Replay:
     Example:
         >>> replay = Replay(ReplayConfig(capacity=4096, min_decisions=256, samples_per_insert=2.0))
         >>> if replay.may_insert():
-        ...     replay.insert(segment)  # again with the same key: ignored
+        ...     replay.insert(segment)
         >>> if replay.may_sample(256):
         ...     segments = replay.sample(256, trainer_version=17, rng=np.random.default_rng(0))
     """
@@ -118,8 +106,7 @@ class Replay:
     def __init__(self, config: ReplayConfig) -> None:
         self.config = config
         self.counters = ReplayCounters()
-        self._entries: OrderedDict[str, _Entry] = OrderedDict()  # oldest first
-        self._keys: OrderedDict[str, None] = OrderedDict()
+        self._entries: deque[_Entry] = deque()  # oldest first
         self._stored = 0
         self._available = 0
         self._carry = 0.0
@@ -148,32 +135,22 @@ class Replay:
         return pacing.may_sample(self.config, self.pace, batch_decisions)
 
     def insert(self, segment: Segment) -> bool:
-        """Stores a segment and evicts the oldest ones if room is needed.
-
-        Args:
-            segment: kept by reference; the caller must not change it any more.
+        """Stores a segment, by reference, and evicts the oldest ones if room is needed.
 
         Returns:
-            Whether it was stored: False for a key seen before and for a non-finite segment, which are
-            counted.
+            False for a non-finite segment, which is counted and not stored.
         """
         n = len(segment)
         if n > self.config.capacity:
             raise InputError("replay.capacity", self.config.capacity, f"use at least {n}, a segment's length")
-        if segment.key in self._keys or segment.key in self._entries:
-            self.counters.duplicates += 1
-            return False
         if not is_finite(segment):
             self.counters.dropped_nonfinite += 1
             return False
-        self._keys[segment.key] = None
-        if len(self._keys) > KEY_MEMORY:
-            self._keys.popitem(last=False)
         while self._stored + n > self.config.capacity:
-            self._depart(next(iter(self._entries)), "evicted")
+            self._depart(self._entries.popleft(), "evicted")
         draws, self._carry = pacing.entitle(self.config.samples_per_insert, n, self._carry)
         oldest = int(segment.version.min())
-        self._entries[segment.key] = _Entry(segment=segment, size=n, oldest=oldest, draws=draws)
+        self._entries.append(_Entry(segment=segment, size=n, oldest=oldest, draws=draws))
         self._stored += n
         self._available += n
         self.counters.inserted_segments += 1
@@ -202,7 +179,7 @@ class Replay:
         self.retire(trainer_version)
         if self._available < num_decisions:
             return []
-        available = [e for e in self._entries.values() if e.unspent]
+        available = [e for e in self._entries if e.unspent]
         shuffled = [available[i] for i in rng.permutation(len(available))]
         drawn: list[_Entry] = []
         collected = 0
@@ -215,16 +192,9 @@ class Replay:
         self._drawn.append((trainer_version, drawn))
         return [entry.segment for entry in drawn if entry.segment is not None]
 
-    def uses_histogram(self) -> dict[int, int]:
-        """Times trained on → segments, over all ever inserted, ascending."""
-        counts = dict(self.counters.departed_uses)
-        for entry in self._entries.values():
-            counts[entry.uses] = counts.get(entry.uses, 0) + 1
-        return dict(sorted(counts.items()))
-
     def metrics(self) -> dict[str, float]:
         """Everything worth logging, by name."""
-        flat = {k: float(v) for k, v in asdict(self.counters).items() if k != "departed_uses"}
+        flat = {k: float(v) for k, v in asdict(self.counters).items()}
         flat["stored_segments"], flat["stored_decisions"] = float(self.stored_segments), float(self._stored)
         flat["available_decisions"] = float(self._available)
         return flat
@@ -243,7 +213,7 @@ class Replay:
         if late and len(late) == self._drawn.maxlen:
             raise RuntimeError(f"replay has given more than {DRAWS} batches since update {version}")
         back: Counter[int] = Counter(id(entry) for entries in late for entry in entries)
-        counters = replace(self.counters, departed_uses=dict(self.counters.departed_uses))
+        counters = replace(self.counters)
         for entry in {id(e): e for entries in late for e in entries}.values():
             count = back[id(entry)]
             counters.trained_decisions -= count * entry.size
@@ -251,24 +221,19 @@ class Replay:
                 counters.unique_decisions -= entry.size
             if not entry.left:
                 continue
-            uses, unused = entry.uses - count, f"{entry.left}_unused"
+            unused = f"{entry.left}_unused"
             counters.unspent_draws += count * entry.size
-            counters.departed_uses[entry.uses] -= 1
-            counters.departed_uses[uses] = counters.departed_uses.get(uses, 0) + 1
-            setattr(counters, unused, getattr(counters, unused) + (uses == 0))
+            setattr(counters, unused, getattr(counters, unused) + (count == entry.uses))
         entries = [
-            {"segment": e.segment, "draws": e.draws, "uses": e.uses - back[id(e)]}
-            for e in self._entries.values()
+            {"segment": e.segment, "draws": e.draws, "uses": e.uses - back[id(e)]} for e in self._entries
         ]
-        counters.departed_uses = {k: v for k, v in counters.departed_uses.items() if v}
-        return {"counters": counters, "keys": list(self._keys), "entries": entries, "carry": self._carry}
+        return {"counters": counters, "entries": entries, "carry": self._carry}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Goes on from what `state` gave."""
         if self.counters != ReplayCounters():
             raise RuntimeError("restore before the first insert")
         self.counters, self._carry = state["counters"], state["carry"]
-        self._keys = OrderedDict.fromkeys(state["keys"])
         for held in state["entries"]:
             segment: Segment = held["segment"]
             entry = _Entry(
@@ -278,20 +243,23 @@ class Replay:
                 draws=held["draws"],
                 uses=held["uses"],
             )
-            self._entries[segment.key] = entry
+            self._entries.append(entry)
             self._stored += entry.size
             self._available += entry.size if entry.unspent else 0
 
     @property
     def segments(self) -> list[Segment]:
         """All that is stored, the oldest first."""
-        return [e.segment for e in self._entries.values() if e.segment is not None]
+        return [e.segment for e in self._entries if e.segment is not None]
 
     def retire(self, trainer_version: int) -> None:
         """Takes out what is too old for a trainer that has made so many updates."""
         cutoff = trainer_version - self.config.max_lag
-        for key in [k for k, e in self._entries.items() if e.oldest < cutoff]:
-            self._depart(key, "retired")
+        old = [e for e in self._entries if e.oldest < cutoff]
+        if old:
+            self._entries = deque(e for e in self._entries if e.oldest >= cutoff)
+        for entry in old:
+            self._depart(entry, "retired")
 
     def _use(self, entry: _Entry) -> None:
         n = entry.size
@@ -301,9 +269,8 @@ class Replay:
         if not entry.unspent:
             self._available -= n
 
-    def _depart(self, key: str, how: str) -> None:
-        """Takes a segment out and books it under ``<how>_*``."""
-        entry = self._entries.pop(key)
+    def _depart(self, entry: _Entry, how: str) -> None:
+        """Books a segment that has left under ``<how>_*``."""
         entry.segment, entry.left = None, how
         n, counters = entry.size, self.counters
         self._stored -= n
@@ -311,14 +278,12 @@ class Replay:
         for name, amount in (("segments", 1), ("decisions", n), ("unused", int(entry.uses == 0))):
             setattr(counters, f"{how}_{name}", getattr(counters, f"{how}_{name}") + amount)
         counters.unspent_draws += entry.unspent
-        counters.departed_uses[entry.uses] = counters.departed_uses.get(entry.uses, 0) + 1
 
 
 def is_finite(segment: Segment) -> bool:
     """True if no floating-point number of the segment is a NaN or an infinity."""
     arrays = [segment.log_prob, segment.value, segment.reward, *segment.latent.values()]
     arrays += segment.observations.values()
-    arrays += [] if segment.advantage is None else [segment.advantage]
     return all(bool(np.isfinite(a).all()) for a in arrays if np.issubdtype(a.dtype, np.inexact))
 
 
@@ -329,14 +294,9 @@ ROOM = 0.9
 
 
 class MixedReplay:
-    """Segments in, batches of segments out.
+    """Segments in, batches of segments out, of which a `share` of decisions is imagined.
 
-    Args:
-        real: size and pace of real experience.
-        imagined: of imagined experience.
-        share: of a batch's decisions, in [0, 1), that are imagined.
-        patient: whether real episodes are counted.
-        journal: where real segments that are stored are noted; None: nowhere.
+    `patient`: real episodes are counted. Real segments that are stored are noted in the journal.
     """
 
     def __init__(

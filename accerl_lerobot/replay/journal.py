@@ -119,11 +119,7 @@ def _done(line: dict[str, Any]) -> Done:
 
 
 def whole_episodes(segments: Iterator[Done]) -> Iterator[list[Done]]:
-    """Episodes of which all segments are there, in the order of their ends.
-
-    Episodes that start alike, of a group, come one after the other: a segment goes on with the latest episode
-    of its start.
-    """
+    """Episodes of which all segments are there, in the order of their ends."""
     under_way: dict[tuple[str, int], list[Done]] = {}
     for segment in segments:
         name = segment.origin[:2]

@@ -137,24 +137,9 @@ def may_insert(config: ReplayConfig, pace: Pace) -> bool:
     return pace.stored < config.min_decisions or pace.available < config.ahead
 
 
-def decisions_under_way(
-    *, workers: int, worlds: int, segment_length: int, group_size: int = 0, episode_decisions: int = 0
-) -> int:
-    """Decisions that environments of equal speed make while a segment is on its way to the door.
-
-        workers · worlds · segment_length                                          without groups
-        workers · worlds · episode_decisions · (1 + ⌈(group_size − 1) / worlds⌉)   with groups
-
-    A segment of a group is held back until the group's last episode has ended. Every world begins an episode
-    at least once in `episode_decisions` and completes the oldest group first; so the last episode begins at
-    most ⌈(group_size − 1)/worlds⌉ episodes after the first, and lasts one more. What is inserted in that time
-    was decided in it or was itself held back, for no longer than that: at most twice this number.
-    """
-    if not group_size:
-        return workers * worlds * segment_length
-    if episode_decisions < 1:
-        raise ValueError("groups are held back for whole episodes: give episode_decisions")
-    return workers * worlds * episode_decisions * (1 + math.ceil((group_size - 1) / worlds))
+def decisions_under_way(*, workers: int, worlds: int, segment_length: int) -> int:
+    """Decisions that environments of equal speed make while a segment is on its way to the door."""
+    return workers * worlds * segment_length
 
 
 def lag_bound(

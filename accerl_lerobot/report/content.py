@@ -43,7 +43,6 @@ WARNINGS = {
     "replay_retired_unused": ("segment", "left the replay buffer unused, being older than replay.max_lag"),
     "replay_lost_unused": ("segment", "not learned from were lost when the run was resumed"),
     "replay_dropped_nonfinite": ("segment", "refused by the replay buffer because of a NaN or infinity"),
-    "replay_duplicates": ("segment", "received twice and ignored"),
 }
 """Counter → what is counted, and what happened; a run in which it is 0 needs no warning."""
 
@@ -81,6 +80,8 @@ IMAGINATION: tuple[Spec, ...] = (
      {"imagination_check_skill_changed_first": "after one chunk",
       "imagination_check_skill_changed_last": "at the horizon"}, {"top": 1}),
 )  # fmt: skip
+
+
 Table = tuple[str, Sequence[str], Sequence[Sequence[str]]]
 """Caption, columns and rows; the first cell of a row is its heading."""
 
@@ -180,9 +181,6 @@ def warnings(run: Run, bound: int | None, now: float) -> Iterator[str]:
     for name, (thing, what) in WARNINGS.items():
         if n := int(newest(run.rollout, name) or 0):
             yield f"{count(n, thing)} {what}."
-    dropped, kept = (int(newest(run.rollout, f"groups_{name}") or 0) for name in ("dropped", "kept"))
-    if dropped > kept:
-        yield f"{count(dropped, 'group')} of equal starts thrown away and {kept:,} kept: most had equal ends."
     if skipped := int(newest(run.train, "skipped") or 0):
         yield f"{count(skipped, 'update')} skipped, because loss or gradient was not finite."
     lag, mismatch = (np.nanmax([0.0, *column(run.train, k)]) for k in ("lag_max", "logprob/mismatch_max"))
@@ -282,13 +280,7 @@ def _imagination(run: Run) -> Section:
     real, imagined = (newest(rollout, f"replay_{kind}trained_decisions") or 0.0 for kind in ("", "imagined_"))
     if real + imagined:
         text += f" {percent(imagined / (real + imagined))} of the decisions learned from were imagined."
-    caption = "a recorded episode above, and what the world model imagined with the same actions below. The "
-    caption += "frame at the end is green for a success and red for a failure."
-    videos = [
-        (path, f"Validation {path.stem.replace('_', ', ').lstrip('0')}: {caption}")
-        for path in dict.fromkeys([*run.imagined_videos[:1], *run.imagined_videos[-1:]])
-    ]
-    return Section(title, text, charts=_charts(rollout, IMAGINATION), videos=videos)
+    return Section(title, text, charts=_charts(rollout, IMAGINATION))
 
 
 def _time_shares(run: Run) -> dict[str, list[tuple[str, float, str, int]]]:
@@ -364,8 +356,7 @@ def _headline(run: Run) -> str:
 
 
 def _tiles(run: Run, bound: int | None) -> list[tuple[str, str, str]]:
-    result, algorithm = run.result or {}, run.section("algorithm")
-    advantage = algorithm.get("advantage")
+    result = run.result or {}
     mean = float(np.nanmean(column(run.train, "lag_mean"))) if run.train else None
     largest = float(np.nanmax(column(run.train, "lag_max"))) if run.train else None
     parts = {"warm start": result.get("warm_start_s") or 0.0, "RL": result.get("rl_s") or 0.0}
@@ -383,7 +374,7 @@ def _tiles(run: Run, bound: int | None) -> list[tuple[str, str, str]]:
         ("wall time", duration(run.wall_s), spent),
         ("updates", updates, f"of {run.section('trainer').get('updates')}"),
         ("lag", number(mean, 2), f"largest {number(largest)}, bound {number(bound)}"),
-        ("algorithm", str(algorithm.get("type")).upper(), f"advantage {advantage}" if advantage else ""),
+        ("algorithm", str(run.section("algorithm").get("type")).upper(), ""),
         ("seed", str(run.config.get("seed")), ""),
     ]
 

@@ -25,7 +25,6 @@ from accerl_lerobot.console import ABSENT
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.metrics import METRICS
-from accerl_lerobot.world_model.config import VIDEOS
 
 Record = dict[str, Any]
 
@@ -51,8 +50,6 @@ class Run:
     written: float
     """When something was last written, in seconds since 1970."""
     videos: tuple[Path, ...]
-    imagined_videos: tuple[Path, ...]
-    """Held-out episodes beside imagined ones, the oldest first."""
 
     @property
     def name(self) -> str:
@@ -121,7 +118,6 @@ def read_run(path: Path) -> Run:
         sessions=sessions,
         written=max(file.stat().st_mtime for file in path.iterdir() if file.suffix != ".html"),
         videos=tuple(sorted(path.glob("*.mp4"))),
-        imagined_videos=tuple(sorted(path.glob(f"{VIDEOS}/[0-9]*.mp4"))),
     )
 
 

@@ -1,19 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which episode a free world runs next: planned evaluations first, then exploring ones.
 
-An exploring episode is a task, each in turn, a seed of this worker's own (`seeds.py`) and, where episodes are
-compared with each other, a place in a group (`groups.py`): the episodes of a group share task and seed, so
-they start alike, and their exploration noise differs.
+An exploring episode is a task, each in turn, and a seed of this worker's own (`seeds.py`).
 """
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Iterable
 from typing import Any
 
-from accerl_lerobot.rollout.groups import Groups
 from accerl_lerobot.rollout.runner import EpisodePlan, RolloutConfig
 from accerl_lerobot.seeds import train_seed
 
@@ -22,17 +18,10 @@ STARTS_PER_INCARNATION = 1000
 
 
 def budgets(config: RolloutConfig) -> list[int | None]:
-    """How many exploring episodes each worker plays, in whole groups; None: no end."""
+    """How many exploring episodes each worker plays; None: no end."""
     if not config.episodes:
         return [None] * config.workers
-    size = max(1, config.group_size)
-    return [size * len(range(w, config.episodes // size, config.workers)) for w in range(config.workers)]
-
-
-def whole_groups(episodes: int, config: RolloutConfig) -> int:
-    """At least so many: a group that was under way when its worker died is played anew."""
-    size = max(1, config.group_size)
-    return size * math.ceil(episodes / size)
+    return [len(range(w, config.episodes, config.workers)) for w in range(config.workers)]
 
 
 def incarnation_after(incarnation: int, starts: int) -> int:
@@ -49,29 +38,23 @@ class EpisodePlans:
     """The episodes of one worker, in order.
 
     Example:
-        >>> plans = EpisodePlans(config, tasks, seed=0, worlds=8)
-        >>> runner = RolloutRunner(worlds, lambda: plans.next(exploring=True), ..., groups=plans.groups)
+        >>> plans = EpisodePlans(tasks, seed=0)
+        >>> runner = RolloutRunner(worlds, lambda: plans.next(exploring=True), ...)
     """
 
     def __init__(
         self,
-        config: RolloutConfig,
         tasks: tuple[str, ...],
         *,
         seed: int,
-        worlds: int,
         worker: int = 0,
         incarnation: int = 0,
         budget: int | None = None,
     ) -> None:
         self._budget = budget
-        self.groups: Groups | None = None
-        if config.group_size:
-            self.groups = Groups(config.group_size, worlds, config.group_filter)
         self._seed, self._worker = seed, worker
         self._starts = incarnation * STARTS_PER_INCARNATION
         self._tasks = tasks
-        self._start = ("", 0)
         # Filled and emptied on different threads: appending to and popping from a deque is atomic.
         self._queued: deque[EpisodePlan] = deque()
 
@@ -85,10 +68,11 @@ class EpisodePlans:
             return self._queued.popleft()
         if not exploring or self.spent:
             return None
-        plan = self._explore()
-        if plan is not None and self._budget is not None:
+        if self._budget is not None:
             self._budget -= 1
-        return plan
+        number, self._starts = self._starts, self._starts + 1
+        task = self._tasks[(number + self._worker) % len(self._tasks)]
+        return EpisodePlan(task=task, seed=train_seed(self._seed, self._worker, number), explore=True)
 
     @property
     def starts(self) -> int:
@@ -102,35 +86,9 @@ class EpisodePlans:
 
     def state(self) -> dict[str, Any]:
         """All that `restore` needs; see `snapshot`."""
-        return {
-            "budget": self._budget,
-            "starts": self._starts,
-            "start": self._start,
-            "queued": list(self._queued),
-            "groups": None if self.groups is None else self.groups.state(),
-        }
+        return {"budget": self._budget, "starts": self._starts, "queued": list(self._queued)}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Goes on from what `state` gave."""
-        self._budget, self._starts, self._start = state["budget"], state["starts"], state["start"]
+        self._budget, self._starts = state["budget"], state["starts"]
         self._queued.extend(state["queued"])
-        if self.groups is not None:
-            self.groups.restore(state["groups"])
-
-    def _explore(self) -> EpisodePlan | None:
-        if self.groups is None:
-            task, seed = self._new_start()
-            return EpisodePlan(task=task, seed=seed, explore=True)
-        place = self.groups.claim()
-        if place is None:
-            return None
-        if place.member == 0:
-            self._start = self._new_start()
-        task, seed = self._start
-        return EpisodePlan(task=task, seed=seed, explore=True, place=place)
-
-    def _new_start(self) -> tuple[str, int]:
-        """A task, and a seed that no episode of this worker has had."""
-        number, self._starts = self._starts, self._starts + 1
-        task = self._tasks[(number + self._worker) % len(self._tasks)]
-        return task, train_seed(self._seed, self._worker, number)

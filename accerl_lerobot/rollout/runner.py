@@ -3,10 +3,7 @@
 
 A slot is one world. `start` resets it and `advance` executes a decision in it; both return the request for
 the next decision, and whoever drives the runner decides when that is answered: the Ray worker goes on with
-other slots meanwhile, the single-process mode answers at once. Segments of an episode that belongs to a group
-are held back until the group has ended.
-
-One world, and the episode in it.
+other slots meanwhile, the single-process mode answers at once.
 """
 
 from __future__ import annotations
@@ -20,14 +17,7 @@ import numpy as np
 from accerl_lerobot.checkpoint.snapshot import kind
 from accerl_lerobot.config.ranges import NonNegative, Range, Section, Steps
 from accerl_lerobot.envs.base import ChunkResult, World
-from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Decision, Observation, Origin, Request, Segment
-from accerl_lerobot.rollout.groups import (
-    EpisodeOutcome,
-    GroupFilter,
-    Groups,
-    GroupSlot,
-)
 from accerl_lerobot.rollout.segments import SegmentBuilder
 from accerl_lerobot.seeds import noise_seed
 
@@ -99,32 +89,10 @@ class RolloutConfig(Section, section="rollout"):
     with `truncate`, and failures go unpunished: on door-open, success at update 100 fell from 0.82 to 0.50
     (n = 20, one seed).
     """
-    group_size: Annotated[int, Range("[0, 256]")] = 0
-    """Exploring episodes that start alike (same task and seed, other noise) and are compared with each other,
-    for ``algorithm.advantage=group``; 0: none are.
-    """
-    group_filter: GroupFilter = "outcome"
-    """Which groups are thrown away, having nothing to compare. return: those whose returns are all equal.
-    outcome: also those in which all episodes succeeded or all failed. none: no group.
-
-    `decision_cost` makes the returns of two successes differ by how fast they were, and the division by std
-    would make that as loud as success itself; hence `outcome`, as in DAPO. Rewards that do not come from
-    success need `return`. Where all groups are thrown away, because the policy never fails or always does, no
-    update is made: watch ``groups_dropped``.
-    """
     episodes: Steps = 0
     """Exploring episodes in all; 0: as many as the updates need. Once they are played, learning goes on while
     replay has something to give, which is little unless more is imagined, and then ends.
     """
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.group_size == 1:
-            remedy = "groups of one have no comparison; use 0 (none) or 2 and more"
-            raise InputError("rollout.group_size", 1, remedy)
-        if self.group_size and self.episodes % self.group_size:
-            remedy = f"use a multiple of rollout.group_size, {self.group_size}"
-            raise InputError("rollout.episodes", self.episodes, remedy)
 
 
 @kind
@@ -140,8 +108,6 @@ class EpisodePlan:
     """Position in the evaluation it belongs to."""
     group: str = "train"
     """Which evaluation it belongs to."""
-    place: GroupSlot | None = None
-    """Its group of equal starts and which of them it is, where exploring episodes are compared."""
     film: tuple[int, int] | None = None
     """Side in pixels and env steps per frame of a video for people; None: none. It executes a chunk in parts,
     which changes nothing else."""
@@ -173,25 +139,14 @@ class Counters:
     episodes: int = 0
     dropped_nonfinite: int = 0
     """Decisions thrown away because the world returned NaN or infinity."""
-    groups_kept: int = 0
-    """Groups handed out with advantages."""
-    groups_dropped: int = 0
-    """Groups thrown away: nothing to compare, too few left, or unfinished when exploring ended."""
-    groups_dropped_decisions: int = 0
-    """Decisions that were held back and thrown away, with their group or with their own episode."""
 
 
 class RolloutRunner:
-    """Drives a set of worlds through planned episodes.
+    """Drives a set of worlds, one per slot, through planned episodes.
 
-    Args:
-        worlds: one per slot.
-        next_plan: called for each new episode; None leaves the slot idle until `start` is called again.
-        config: segment length and decision cost.
-        name: unique per incarnation of a worker; the prefix of its segments' keys.
-        on_segment: receives finished segments of exploring episodes; those of a group all at its end.
-        on_episode: receives every finished episode.
-        groups: those that plans with a `place` belong to.
+    `next_plan` is called for each new episode; None leaves the slot idle until `start` is called again.
+    `name`, unique per incarnation of a worker, is the prefix of its segments' keys. `on_segment` receives
+    finished segments of exploring episodes, `on_episode` every finished episode.
     """
 
     def __init__(
@@ -202,11 +157,9 @@ class RolloutRunner:
         name: str,
         on_segment: Callable[[Segment], object],
         on_episode: Callable[[EpisodeResult], object],
-        groups: Groups | None = None,
     ) -> None:
         self.config, self.name = config, name
         self.counters = Counters()
-        self._groups = groups
         self._slots = [Slot(world) for world in worlds]
         self._next_plan, self._on_segment, self._on_episode = next_plan, on_segment, on_episode
         self._sequence = 0
@@ -247,7 +200,6 @@ class RolloutRunner:
             self.counters.dropped_nonfinite += len(builder.decisions) + 1
             if not plan.explore:  # an evaluation counts every episode it planned
                 self._finish(state, plan, success=False)
-            self._leave_group(plan, None)
             return self.start(slot)
         reward = float(result.rewards.sum())
         if (
@@ -286,12 +238,6 @@ class RolloutRunner:
         for slot, saved in zip(self._slots, state["slots"], strict=True):
             slot.restore(saved, self.config.segment_length)
 
-    def abandon_groups(self) -> None:
-        """Throws unfinished groups away, because exploring has ended."""
-        if self._groups is not None:
-            self._groups.abandon()
-            self._count_groups()
-
     def close(self) -> None:
         """Closes the worlds."""
         for state in self._slots:
@@ -314,7 +260,7 @@ class RolloutRunner:
     def _request(self, state: Slot) -> Request:
         plan, builder = state.plan, state.builder
         assert plan is not None and builder is not None
-        seed = noise_seed(plan.seed, plan.place.member if plan.place else 0, state.decisions)
+        seed = noise_seed(plan.seed, 0, state.decisions)
         return Request(observation=builder.latest, noise_seed=seed, explore=plan.explore)
 
     def _emit(
@@ -337,10 +283,7 @@ class RolloutRunner:
             }
         key = f"{self.name}.{self._sequence}"
         segment = builder.cut(key, terminated, truncated, success, episode)
-        if plan.place is not None:
-            assert self._groups is not None
-            self._groups.add(plan.place, segment)
-        elif plan.explore:
+        if plan.explore:
             self._on_segment(segment)
 
     def _finish(self, state: Slot, plan: EpisodePlan, success: bool) -> None:
@@ -357,21 +300,6 @@ class RolloutRunner:
                 frames=state.frames,
             )
         )
-        self._leave_group(plan, EpisodeOutcome(state.episode_return, success))
-
-    def _leave_group(self, plan: EpisodePlan, outcome: EpisodeOutcome | None) -> None:
-        if plan.place is None:
-            return
-        assert self._groups is not None
-        for segment in self._groups.end(plan.place, outcome):
-            self._on_segment(segment)
-        self._count_groups()
-
-    def _count_groups(self) -> None:
-        assert self._groups is not None
-        counted = self._groups.counters
-        self.counters.groups_kept, self.counters.groups_dropped = counted.kept, counted.dropped
-        self.counters.groups_dropped_decisions = counted.dropped_decisions
 
 
 def _finite(observation: Observation) -> bool:

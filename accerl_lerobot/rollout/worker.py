@@ -39,8 +39,6 @@ AT_THE_DOOR = 2
 """Messages to replay that may be waiting before exploring worlds pause."""
 PAUSE_S = 0.005
 """Between two looks at whether there is something to do."""
-QUEUE = 32
-"""Messages to replay that may be waiting before segments stay here: no transport carries any number."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,10 +88,8 @@ class RolloutWorker:
     ) -> None:
         self._clock = open_clock(timeline, f"rollout {share.index}")
         self._plans = EpisodePlans(
-            config,
             tasks,
             seed=seed,
-            worlds=config.worlds,
             worker=share.index,
             incarnation=share.incarnation,
             budget=share.budget,
@@ -116,7 +112,6 @@ class RolloutWorker:
             name,
             self._outbox.append,
             self._results.append,
-            self._plans.groups,
         )
         self._clock.enter(WAIT_IN)
 
@@ -134,10 +129,10 @@ class RolloutWorker:
         """Takes orders and reports. One call at a time, so that orders cannot overtake each other.
 
         Args:
-            training: whether training episodes are run between planned ones, from now on.
+            training: training episodes are run between planned ones, from now on.
             plans: evaluation episodes to queue; they are taken before any training episode.
             in_turn: exploring worlds pause until replay lets them go on after each segment, from now on.
-            inference: where it is from now on; None: where it was.
+            inference: its endpoint from now on; None: unchanged.
         """
         self._clock.beat()
         if inference is not None:
@@ -188,8 +183,8 @@ class RolloutWorker:
                     self._advance(slot, decision, due, idle)
 
     def _bring(self, door: Client, at_the_door: set[int], size: int) -> None:
-        """Brings segments to replay; those of a whole group may come at once, and its pace is for a few."""
-        while self._outbox and len(at_the_door) < QUEUE:
+        """Brings segments to replay, a few at a time."""
+        while self._outbox:
             self._clock.enter(TRANSPORT)
             if fault_point("rollout.send"):
                 self._outbox[0].reward = self._outbox[0].reward * np.float32(np.nan)
@@ -224,7 +219,6 @@ class RolloutWorker:
         """Abandons training episodes once training has ended, so that planned ones need not wait for them."""
         if self._training.is_set():
             return
-        self._runner.abandon_groups()
         for slot in [slot for slot, request in due.items() if request.explore]:
             del due[slot]
             idle.append(slot)

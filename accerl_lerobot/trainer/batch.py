@@ -50,8 +50,6 @@ class Batch:
     last_observations: dict[str, np.ndarray]
     """Each (S, ...)."""
     segment_tasks: list[str]
-    advantage: Tensor | None = None
-    """(N,), stamped by the rollout workers; None: not on all segments."""
 
     def __len__(self) -> int:
         return len(self.tasks)
@@ -65,7 +63,6 @@ class Batch:
 def collate(segments: Sequence[Segment]) -> Batch:
     """Lays segments end to end."""
     keys, names = segments[0].observations.keys(), segments[0].latent.keys()
-    stamped = [s.advantage for s in segments if s.advantage is not None]
     return Batch(
         observations={k: np.concatenate([s.observations[k][:-1] for s in segments]) for k in keys},
         tasks=[s.task for s in segments for _ in range(len(s))],
@@ -77,7 +74,6 @@ def collate(segments: Sequence[Segment]) -> Batch:
         terminated=torch.tensor([s.terminated for s in segments]),
         last_observations={k: np.stack([s.observations[k][-1] for s in segments]) for k in keys},
         segment_tasks=[s.task for s in segments],
-        advantage=torch.from_numpy(np.concatenate(stamped)) if len(stamped) == len(segments) else None,
     )
 
 

@@ -36,10 +36,7 @@ class TrainerConfig(Section, section="trainer"):
     """Share of the peak learning rate at the end: it falls there over `updates`, like a cosine, and stays
     there in the updates that a resumed run adds; 1: it is constant."""
     value_warmup_updates: Steps = 20
-    """First updates, in which only the critic head learns: advantages of an untrained one are noise.
-
-    None with ``algorithm.advantage=group``, which asks no critic.
-    """
+    """First updates, in which only the critic head learns: advantages of an untrained one are noise."""
     advantage_memory: Annotated[float, Range("[0, 1)")] = 0.0
     """Advantages are normalised by the moments of this batch and of those before it, of which each
     earlier one is weighted by this factor once more; 0: this batch alone.

@@ -3,9 +3,6 @@
 
     values of the current critic (bootstraps too) → GAE → advantages normalised over the batch → loss → step
 
-With ``advantage=group`` the advantages are those that the rollout workers stamped on the segments. GAE then
-only makes the critic's targets; where ``value_coef`` is 0, not even those, and V is not computed beforehand.
-
 Values stored with the samples are stale by their lag, so they are recomputed; the stored log-probs are not,
 since they are what the ratio divides by. Knows no process: the Ray worker and the single-process mode both
 call `Update.step`.
@@ -75,8 +72,6 @@ class Update:
         self.ranks = ranks or Ranks()
         self.ranks.begin_alike(list(adapter.trainable().values()))
         arrange(adapter, config)
-        self._grouped = algorithm.advantage == "group"
-        self._critic = not self._grouped or algorithm.value_coef > 0
         self.version = 0
         self.skipped = 0
         self._skipped_in_a_row = 0
@@ -101,7 +96,7 @@ class Update:
         self.optimizer.zero_grad(set_to_none=True)
         metrics = self._backward(batch)
         fault_point("trainer.backward")
-        if self.version < self._policy_start:
+        if self.version < self.config.value_warmup_updates:
             for parameter in self._policy:  # its moments in the optimiser begin with its learning rate
                 parameter.grad = None
         # Each by itself, or the larger gradient would scale the other one down.
@@ -146,16 +141,12 @@ class Update:
         restore_optimizer(self.optimizer, state["optimizer"])
         self._probe.restore(state["probe"])
 
-    @property
-    def _policy_start(self) -> int:
-        """First update in which the policy learns; the critic learns from the first of all."""
-        return 0 if self._grouped else self.config.value_warmup_updates
-
     def _set_rates(self) -> tuple[float, float]:
         """Sets the learning rates of policy and critic for this update, and returns them."""
         # A resumed run with more updates keeps the schedule that it began with, so that rates do not jump.
         share = partial(self.config.lr_share, self.version, updates=self._schedule_updates)
-        lr, value_lr = self.config.lr * share(start=self._policy_start), self.config.value_lr * share()
+        lr = self.config.lr * share(start=self.config.value_warmup_updates)
+        value_lr = self.config.value_lr * share()
         for group, rate in zip(self.optimizer.param_groups, (lr, value_lr), strict=True):
             group["lr"] = rate
         return lr, value_lr
@@ -231,11 +222,9 @@ class Update:
         return float(present(factors, self.algorithm.level).sum()) / len(factors)
 
     def _targets(self, batch: Batch, values: Tensor, bootstrap: Tensor) -> tuple[Tensor, Tensor]:
-        """Advantages, normalised unless they come from groups, and returns, each (N,)."""
+        """Normalised advantages, and returns, each (N,)."""
         mask = decision_mask(batch.lengths, int(batch.lengths.max()))
         padded = torch.zeros(mask.shape)
-        if not self._critic:
-            values = torch.zeros_like(values)
         reward, value = (padded.masked_scatter(mask, x.float()) for x in (batch.reward, values))
         advantages, returns = gae(
             reward,
@@ -246,12 +235,6 @@ class Update:
             gamma=self.algorithm.gamma,
             lam=self.algorithm.lam,
         )
-        if self._grouped:
-            if batch.advantage is None:
-                raise ValueError(
-                    "algorithm.advantage=group, but a segment carries none: set rollout.group_size"
-                )
-            return batch.advantage, returns[mask]
         total = self.config.advantage_memory * self._moments + moments(advantages, mask)
         if bool(torch.isfinite(total).all()):  # a batch that is not finite is skipped, and must be forgotten
             self._moments = total
@@ -259,8 +242,6 @@ class Update:
 
     def _values(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Tensor:
         """V of each row, (rows,), without gradient, at most `micro_batch` rows at a time."""
-        if not self._critic:  # V is neither used nor learnt
-            return torch.zeros(len(tasks))
 
         def values(rows: np.ndarray) -> Tensor:
             return self.adapter.values(*pick(observations, tasks, rows)).float()

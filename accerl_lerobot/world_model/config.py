@@ -5,12 +5,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Literal
 
 import draccus
 
 from accerl_lerobot.config.ranges import (
-    Choice,
     DatasetConfig,
     LearningRate,
     NonNegative,
@@ -25,8 +24,6 @@ from accerl_lerobot.replay.pacing import ReplayConfig
 
 PIXELS = "pixels"
 """The type of our own class of learned world models."""
-VIDEOS = "validation"
-"""Folder of a run with a video of each validation of its world model."""
 IMAGINATION = "imagination"
 """Name of the worker that imagines, and of its state."""
 WORLD_LEARNING = "world learning"
@@ -227,41 +224,6 @@ class WorldModelConfig(Section, section="world_model"):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ModelKind:
-    """Properties of an entry of `MODELS` that are known before it is built."""
-
-    make: str
-    """``module:name`` of a function of a `contract.BuildInputs`."""
-    what: str
-    """For ``--help``, one sentence."""
-    needs_path: bool = True
-    """True if it is built from the world model in ``imagination.path``."""
-    learns: bool = False
-    """True if that world model can be trained on during a run."""
-    min_rollouts: int = 1
-    """Imagined rollouts that it must have at the same time, at least."""
-
-
-_REGISTRY = "accerl_lerobot.world_model.registry"
-MODELS = {
-    "learned": ModelKind(make=f"{_REGISTRY}:learned", what="the one in `path`.", learns=True),
-    "shuffled": ModelKind(
-        make=f"{_REGISTRY}:shuffled",
-        what="the learned one, given the actions of another imagined rollout.",
-        learns=True,
-        min_rollouts=2,
-    ),
-    "copy": ModelKind(make=f"{_REGISTRY}:copy", what="nothing ever moves."),
-    "oracle": ModelKind(
-        make=f"{_REGISTRY}:oracle",
-        what="a simulator, put where a rollout starts: the best there can be.",
-        needs_path=False,
-    ),
-}
-"""The world models that ``imagination.model`` can name. A new one is a class and an entry here."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class OnlineLearnConfig(Section, section="imagination.learn"):
     """Training of the world model on the policy's episodes during a run."""
 
@@ -297,21 +259,16 @@ class ImaginationConfig(Section, section="imagination"):
 
     share: Annotated[float, Range("[0, 1)")] = 0.0
     """Share of the decisions of a batch that are imagined; 0: none."""
-    model: Annotated[str, Choice(MODELS)] = field(default="learned", metadata={"choices": MODELS})
-    """World model. shuffled and copy are placebos: a gain that they give too is not the world model's."""
+    model: Literal["learned", "shuffled", "copy", "oracle"] = "learned"
+    """World model. learned: the one in `path`. oracle: a simulator, put where a rollout starts: the best
+    there can be. copy (nothing ever moves) and shuffled (the learned one, given the actions of another
+    imagined rollout) are placebos: a gain that they give too is not the world model's."""
     path: str | None = None
     """The folder ``world_model`` that ``accerl world-model`` has written; oracle needs none, copy uses its
     success model."""
     discover_packages_path: str | None = None
     """Package to import that registers the type of the world model in `path`, where that is not one of ours;
     every machine of the cluster needs it."""
-    threshold: Share | None = None
-    """P above which an imagined frame counts as a success; an oracle knows. None: the threshold saved with
-    the success model of `path`, which is chosen anew as that is trained on.
-
-    That one is chosen on rollouts with executed actions. A policy that sees imagined frames succeeds more
-    often: ``python -m benchmarks ranking`` says at which threshold it succeeds as often as in reality.
-    """
     rollouts: Annotated[int, Range("[1, 100000]")] = 32
     """Imagined rollouts at a time, as one batch."""
     learn: OnlineLearnConfig = field(default_factory=OnlineLearnConfig)
@@ -337,10 +294,9 @@ class ImaginationConfig(Section, section="imagination"):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.rollouts < self.kind.min_rollouts:
-            remedy = f"use at least {self.kind.min_rollouts}: {self.model} needs them"
-            raise InputError("imagination.rollouts", self.rollouts, remedy)
-        if self.share and self.path is None and self.kind.needs_path:
+        if self.model == "shuffled" and self.rollouts < 2:
+            raise InputError("imagination.rollouts", self.rollouts, "use at least 2: shuffled needs them")
+        if self.share and self.path is None and self.needs_path:
             remedy = "give the folder world_model that accerl world-model has written"
             raise InputError("imagination.path", None, remedy)
 
@@ -349,11 +305,12 @@ class ImaginationConfig(Section, section="imagination"):
         return replace(replay, min_decisions=1, samples_per_insert=self.samples_per_insert)
 
     @property
-    def kind(self) -> ModelKind:
-        """Properties of `model`."""
-        return MODELS[self.model]
+    def needs_path(self) -> bool:
+        """True if `model` is built from the world model in `path`."""
+        return self.model != "oracle"
 
     @property
     def learns(self) -> bool:
         """True if the world model is trained on during the run."""
-        return self.share > 0 and self.kind.learns and self.learn.steps_per_episode > 0
+        trainable = self.model in ("learned", "shuffled")
+        return self.share > 0 and trainable and self.learn.steps_per_episode > 0

@@ -5,7 +5,7 @@
     prediction = model.step(state, actions, seeds)    # .frames, .robot; the next step starts at .state
 
 A learned one has a `loss` too; `pixels.py` has ours, and ``docs/world_model.md`` says how to add another.
-`config.MODELS` lists what a run can imagine with. Success is classified by another model, see
+`registry.py` has what a run can imagine with. Success is classified by another model, see
 `learners.py`.
 
 States are dicts of tensors with the batch in front, so that rows can be selected and replaced.
@@ -17,7 +17,7 @@ action dims.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -30,8 +30,7 @@ from accerl_lerobot.config.parsing import imported
 from accerl_lerobot.errors import InputError
 
 if TYPE_CHECKING:
-    from accerl_lerobot.envs.base import World
-    from accerl_lerobot.world_model.config import ImaginationConfig, LearnableModelConfig
+    from accerl_lerobot.world_model.config import LearnableModelConfig
     from accerl_lerobot.world_model.data import Windows
 
 State = dict[str, Tensor]
@@ -132,13 +131,7 @@ class WorldModel(ABC):
 
     @abstractmethod
     def begin(self, context: Context, tasks: Sequence[str], resets: Sequence[Reset] | None = None) -> State:
-        """Starts B rollouts.
-
-        Args:
-            context: last real observations.
-            tasks: B instructions.
-            resets: of the environment, if the rollouts start there.
-        """
+        """Starts B rollouts at their last real observations, or at resets of the environment."""
 
     @abstractmethod
     def step(self, state: State, actions: Tensor, seeds: Sequence[int]) -> Prediction:
@@ -179,7 +172,7 @@ class LearnableWorldModel(nn.Module, WorldModel):
 
 
 def learnable_class(config: LearnableModelConfig) -> type[LearnableWorldModel]:
-    """Imports the class of `config`.
+    """Imports the class of `config`, which is made from a `WorldModelSpec` and the config.
 
     Raises:
         InputError: it cannot be imported, or is not a complete `LearnableWorldModel`.
@@ -199,24 +192,3 @@ def learnable_class(config: LearnableModelConfig) -> type[LearnableWorldModel]:
     if lacking := sorted(made.__abstractmethods__):
         raise refuse(f"{name} lacks {', '.join(lacking)}")
     return made
-
-
-def new_learnable(spec: WorldModelSpec, config: LearnableModelConfig) -> LearnableWorldModel:
-    """Builds an untrained model.
-
-    Raises:
-        InputError: see `learnable_class`; or it does not suit the environment.
-    """
-    return learnable_class(config)(spec, config)
-
-
-class BuildInputs(NamedTuple):
-    """Inputs of the functions in `config.MODELS`."""
-
-    config: ImaginationConfig
-    spec: WorldModelSpec
-    """Spec of `learned`; without that, of all that the environment shows."""
-    learned: LearnableWorldModel | None
-    """The model in ``imagination.path``, in eval mode; None: the entry needs no path."""
-    make_simulator: Callable[[], World]
-    device: torch.device

@@ -163,15 +163,9 @@ def cut_windows(
     chunks: int,
     anchors: Sequence[int] | None = None,
 ) -> Windows:
-    """Cuts windows of R = `chunks` chunks.
+    """Cuts windows of R = `chunks` chunks of K = `chunk` env steps, with L = `context` frames.
 
-    Args:
-        episodes: all with the same cameras and sizes.
-        at: where the windows begin.
-        chunk: K.
-        context: L ≥ 1.
-        chunks: R ≥ 1.
-        anchors: for each, how many chunks before its first frame the anchor lies; None: 0, the first frame.
+    The anchor of each lies so many chunks before its first frame; None: it is the first frame.
     """
     rows = [
         _window(episodes[start.episode], start.frame, chunk, context, chunks, anchor)
@@ -314,7 +308,7 @@ def load_episodes(
     Args:
         dataset: on the Hub, or in a folder.
         spec: of the world model.
-        source: see `Episode.source`.
+        source: see `Episode`.
         both: refuse a dataset without a success, or without a failure.
         only: indices of the episodes to read; None: all.
 

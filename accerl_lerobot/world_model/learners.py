@@ -51,11 +51,8 @@ class Learner:
         >>> learner.step(windows)["image"]
         >>> prediction = learner.serving.step(state, actions, seeds)
 
-    Args:
-        model: with its statistics fitted.
-        config: of the training.
-        seed: of noise and of what is drawn.
-        shuffle: train with the actions of other windows, as a placebo.
+    The model's statistics must be fitted. With `shuffle` it is trained with the actions of other windows, as
+    a placebo.
     """
 
     def __init__(
@@ -167,10 +164,6 @@ float (B,), the progress by then, NaN for episodes without a success."""
 class Examples:
     """Examples for a success model: frames of successes and of failures, and chunks that led to them.
 
-    Args:
-        episodes: to draw from.
-        chunk: K.
-
     Raises:
         ValueError: there is no frame, or no chunk, of either kind.
     """
@@ -255,15 +248,8 @@ class ImaginedPairs:
         depth: int,
         rng: np.random.Generator,
     ) -> ImaginedPairs:
-        """Replays episodes, half of them successes and half from their first frame.
-
-        Args:
-            examples: episodes.
-            world: world model.
-            success: failures that it classifies as successes get the largest weights.
-            count: episodes.
-            depth: chunks of a replay at most.
-            rng: of all draws.
+        """Replays `count` episodes for `depth` chunks at most, half of them successes and half from their
+        first frame; failures that `success` classifies as successes get the largest weights.
         """
         at = [WindowStart(e, 0 if rng.random() < 0.5 else f) for e, f in examples.chunks(count, rng)]
         replayed = replay(world, examples.episodes, at, depth, rng)

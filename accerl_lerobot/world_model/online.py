@@ -13,7 +13,7 @@ import contextlib
 import copy
 import time
 from collections import OrderedDict, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -47,9 +47,6 @@ MAX_VALIDATION_S = 3600.0
 ENDLESS = 10**9
 """Steps of a learning rate that never falls."""
 _COUNTS = ("pending_steps", "promoted", "rejected", "result", "_ended", "_since", "_final_validations")
-
-OnValidation = Callable[[LearnableWorldModel, SuccessPairsRewardModel, Episode, int, bool], object]
-"""Receives both models, the newest held-out episode, the validation's number, and True if it passed."""
 
 
 def episode_from_segments(segments: Sequence[Segment], spec: WorldModelSpec) -> Episode:
@@ -127,14 +124,7 @@ class OnlineLearner:
         >>> if learner.validation_due(last=False) and (promotion := learner.promote(last=False)):
         ...     imagination.swap(promotion)
 
-    Args:
-        model: start of the training; not changed.
-        success: the same.
-        config: of the run's imagination.
-        pretraining: episodes of the pre-training.
-        longest: chunks of a rollout at most.
-        seed: of everything random.
-        on_validation: see there.
+    It starts at a copy of both models. A rollout has `longest` chunks at most.
     """
 
     def __init__(
@@ -145,12 +135,10 @@ class OnlineLearner:
         pretraining: PretrainingEpisodes | None = None,
         longest: int = 15,
         seed: int = 0,
-        on_validation: OnValidation | None = None,
     ) -> None:
-        self.config, self._threshold = config.learn, config.threshold
+        self.config = config.learn
         validation = self.config.validation
         self.validation = replace(validation, depth=min(validation.depth, longest))
-        self._on_validation = on_validation
         self.pending_steps = 0.0
         """Gradient steps that are due."""
         self.promoted = self.rejected = 0
@@ -264,9 +252,6 @@ class OnlineLearner:
         learnt = self._scores(model, success, list(self._learnt)[-self.validation.max_windows :])
         self._set_threshold(success, learnt)
         result = self.result = validate(model, held, self.validation, success, self._seed)
-        if self._on_validation is not None:
-            number = self.promoted + self.rejected + 1
-            self._on_validation(model, success, held[-1], number, result["passed"])
         if not result["passed"]:
             self.rejected += 1
             if last and self._final_validations < FINAL_VALIDATIONS:
@@ -280,15 +265,11 @@ class OnlineLearner:
     def _scores(
         self, model: LearnableWorldModel, success: SuccessPairsRewardModel, episodes: list[Episode]
     ) -> list[Scores]:
-        if not episodes or self._threshold is not None:
-            return []
-        return [score_episodes(model, success, episodes, self.validation, self._seed)]
+        return [score_episodes(model, success, episodes, self.validation, self._seed)] if episodes else []
 
     def _set_threshold(self, success: SuccessPairsRewardModel, parts: list[Scores]) -> None:
         """Chooses it on the policy's own episodes; without a failure among them it stays."""
-        if self._threshold is not None:
-            success.config.threshold = self._threshold
-        elif parts:
+        if parts:
             scores = concatenate(*parts)
             chosen = choose_threshold(scores, np.ones(len(scores.achieved), bool), self.validation)
             success.config.threshold = chosen or success.config.threshold

@@ -260,12 +260,8 @@ class FrameNetwork(nn.Module):
     layer works at full resolution. The chunk enters twice, through adaptive norms and as planes beside the
     frames. The last layers start at zero, so an untrained model predicts no change.
 
-    Args:
-        image: channels of the image that is made.
-        frames: channels of the frames it is conditioned on.
-        action: numbers that describe a chunk.
-        state: S; 0: none.
-        config: size of the network.
+    `image` and `frames` are channels of the image that is made and of the frames it is conditioned on;
+    `action` is how many numbers describe a chunk; `state` is S, which may be 0.
     """
 
     def __init__(self, image: int, frames: int, action: int, state: int, config: NetworkConfig) -> None:

@@ -31,7 +31,6 @@ from accerl_lerobot.world_model.contract import (
     LearnableWorldModel,
     WorldModelSpec,
     learnable_class,
-    new_learnable,
 )
 from accerl_lerobot.world_model.data import (
     Episode,
@@ -53,7 +52,6 @@ from accerl_lerobot.world_model.validation import (
     HELD_OUT,
     ONLINE,
     RESULT,
-    DatasetRoles,
     check_disjoint,
     dataset_sections,
     fit_uncertainty_scale,
@@ -135,9 +133,18 @@ def pretrain(run: WorldModelRun, directory: Path, console: Console) -> dict[str,
     save_world_model(directory / "world_model", serving, None, [part.source for part in parts.values()])
     # The threshold is chosen on the policy's failures, where there are any, as demonstrations fail otherwise.
     *_, fresh = held_out
-    roles = DatasetRoles(trained_on=held_out, fresh=fresh, keep_threshold=True)
     with console.stage("validation"):
-        result = validate_datasets(serving, held_out, config.validation, success, directory, roles, seed)
+        result = validate_datasets(
+            serving,
+            held_out,
+            config.validation,
+            success,
+            directory,
+            trained_on=held_out,
+            fresh=fresh,
+            keep_threshold=True,
+            seed=seed,
+        )
     result |= {
         "seconds": seconds,
         "learnt": count_episodes(learn),
@@ -161,7 +168,7 @@ def _train(
     examples = Examples(learn, config.chunk)
     torch.manual_seed(seed)
     # Both networks are initialised on the CPU, so alike on every device.
-    model = new_learnable(spec, config.model).to(device)
+    model = learnable_class(config.model)(spec, config.model).to(device)
     with (directory / METRICS).open("w") as log:
 
         def record(kind: str, step: int, metrics: dict[str, float]) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The world models of `config.MODELS`, and the check that one fits environment and policy.
+"""The world models that a run can imagine with, and the check that one fits environment and policy.
 
 Beside the learned one there are reference models: an oracle, the best there can be, and two placebos. What a
 policy gains from a copy of the last frame, or from a model that gets other actions, it does not gain from the
@@ -18,7 +18,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from accerl_lerobot.config.parsing import imported
 from accerl_lerobot.envs import EnvConfig, make_world
 from accerl_lerobot.envs.base import ChunkResult, World, WorldSpec
 from accerl_lerobot.errors import InputError
@@ -26,7 +25,6 @@ from accerl_lerobot.experience import TASK
 from accerl_lerobot.policies.loading import resolve_device
 from accerl_lerobot.world_model.config import ImaginationConfig
 from accerl_lerobot.world_model.contract import (
-    BuildInputs,
     Context,
     LearnableWorldModel,
     Prediction,
@@ -60,57 +58,32 @@ def make_models(
     *,
     first: bool = False,
 ) -> ImaginationModels:
-    """Builds the models that `config` names.
+    """Builds the models that `config` names, of an environment and the actions executed per decision.
 
-    Args:
-        config: of imagination.
-        env: for an oracle.
-        world: spec of `env`.
-        executed: actions that the policy executes per decision.
-        device: see `PolicyConfig.device`.
-        first: nobody has loaded the files before, so a child process does so first, see `isolation`.
+    If nobody has loaded the files before (`first`), a child process does so first, see `isolation`.
 
     Raises:
         InputError: they cannot be loaded.
     """
-    where, kind = resolve_device(device), config.kind
-    learned_model = success = None
-    if kind.needs_path:
+    where = resolve_device(device)
+    learned = success = None
+    if config.needs_path:
         assert config.path is not None  # as ImaginationConfig has checked
         path, package = Path(config.path), config.discover_packages_path
         if first:
             rehearse_world_model(path, package, section=SECTION)
-        learned_model, success = load_world_model(path, package, section=SECTION)
-        learned_model.to(where)
-    spec = _spec_of(world, executed) if learned_model is None else learned_model.spec
-    inputs = BuildInputs(config, spec, learned_model, lambda: make_world(env), where)
-    model: WorldModel = imported(kind.make)(inputs)
+        learned, success = load_world_model(path, package, section=SECTION)
+        learned.to(where)
+    model: WorldModel
+    if learned is None:
+        model = OracleModel(_spec_of(world, executed), lambda: make_world(env), config.rollouts)
+    elif config.model == "copy":
+        model = CopyModel(learned.spec)
+    else:
+        model = ShuffledModel(learned) if config.model == "shuffled" else learned
     if success is not None:
         success.config.device = str(where)
-        if config.threshold is not None:
-            success.config.threshold = config.threshold
     return ImaginationModels(model, None if success is None else success.to(where))
-
-
-def learned(inputs: BuildInputs) -> WorldModel:
-    """The learned model as it is."""
-    assert inputs.learned is not None  # as its entry in `MODELS` needs a path
-    return inputs.learned
-
-
-def shuffled(inputs: BuildInputs) -> WorldModel:
-    """The learned model with the wrong actions."""
-    return ShuffledModel(learned(inputs))
-
-
-def copy(inputs: BuildInputs) -> WorldModel:
-    """Frames of the learned model's size that never change."""
-    return CopyModel(inputs.spec)
-
-
-def oracle(inputs: BuildInputs) -> WorldModel:
-    """A simulator for each rollout."""
-    return OracleModel(inputs.spec, inputs.make_simulator, inputs.config.rollouts)
 
 
 def _spec_of(world: WorldSpec, executed: int) -> WorldModelSpec:
@@ -152,11 +125,6 @@ class ShuffledModel(WorldModel):
         return self.model.begin(context, tasks, resets)
 
     def step(self, state: State, actions: Tensor, seeds: Sequence[int]) -> Prediction:
-        """See the base class.
-
-        Raises:
-            ValueError: there is only one row.
-        """
         if len(actions) < 2:
             raise ValueError("a single rollout can only get its own actions")
         return self.model.step(state, actions.roll(1, 0), seeds)
@@ -165,7 +133,7 @@ class ShuffledModel(WorldModel):
 def learned_part(model: WorldModel) -> LearnableWorldModel:
     """The model that is trained: the model itself, or the one inside a `ShuffledModel`."""
     model = model.model if isinstance(model, ShuffledModel) else model
-    assert isinstance(model, LearnableWorldModel)  # `ModelKind.learns` says so of no other
+    assert isinstance(model, LearnableWorldModel)  # as `ImaginationConfig.learns` says
     return model
 
 
@@ -185,11 +153,6 @@ class OracleModel(WorldModel):
         self.tasks: list[str] = []
 
     def begin(self, context: Context, tasks: Sequence[str], resets: Sequence[Reset] | None = None) -> State:
-        """See the base class.
-
-        Raises:
-            ValueError: the resets are not known.
-        """
         if resets is None:
             raise ValueError("an oracle needs the reset of every start")
         self.tasks += sorted({reset.task for reset in resets} - set(self.tasks))
@@ -260,12 +223,7 @@ def check_fit(
 ) -> None:
     """Refuses a world model that does not fit environment and policy, before a run begins.
 
-    Args:
-        spec: of the world model.
-        world: of the environment.
-        executed: actions that the policy executes per decision.
-        history: env steps that the policy's observations hold.
-        has_success_model: True if there is one beside the world model.
+    The policy executes so many actions per decision, and its observations hold `history` env steps.
 
     Raises:
         InputError: it has other cameras, another robot, other tasks or another chunk, nothing classifies

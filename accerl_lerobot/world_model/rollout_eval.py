@@ -74,7 +74,7 @@ def predict(
 
     Args:
         model: in eval mode.
-        windows: M of them.
+        windows: where the predictions begin.
         actions: (M, D, K, A).
         ends: (M, D, K, A), alternatives of the last chunk; None: the same.
         lengths: int (M,), chunks of each rollout, zeros follow; None: D.
@@ -165,15 +165,9 @@ def executed_chunks(windows: Windows) -> np.ndarray:
 
 
 def match_cut_lengths(steps: np.ndarray, success: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Shortens failed chunks at random so that they are cut short as often as successful ones.
+    """Shortens failed chunks (M, D) at random so that they are cut short as often as successful ones.
 
-    Args:
-        steps: (M, D) actions that were executed.
-        success: bool (M, D), True if that achieved the task.
-        rng: draws, for each failure of a column, the steps of one of its successes.
-
-    Returns:
-        (M, D), never more than were executed.
+    Each failure of a column gets the steps of one of its successes, if these are fewer.
     """
     shortened = steps.copy()
     for d in range(steps.shape[1]):
@@ -278,10 +272,8 @@ def choose_threshold(scores: Scores, own: np.ndarray, config: ValidationConfig) 
     the one with the largest share of successes less share of failures above it. The strictest would be safe,
     and a policy that never sees a success learns nothing.
 
-    Args:
-        scores: of episodes that were not trained on, as others flatter.
-        own: bool (M,), True for the policy's own episodes; only their failures count if there are any.
-        config: see above.
+    Scores are of episodes that were not trained on, as others flatter. `own`, bool (M,), is True for the
+    policy's own episodes; only their failures count if there are any.
 
     Returns:
         At least 0.5; None if there is no failure.
@@ -307,11 +299,7 @@ def outcome_metrics(
 ) -> dict[str, Any]:
     """Compares the outcomes of imagined rollouts with the real ones.
 
-    Args:
-        scores: of the rollouts.
-        own: see `choose_threshold`.
-        config: see there.
-        threshold: of a success. None: of each fold of the episodes, it is chosen on the others.
+    Where `threshold` is None, that of each fold of the episodes is chosen on the others.
 
     Returns:
         Numbers of ``rollouts``, ``successes`` and ``failures``; ``auroc``, ``auroc_real`` (of real frames),

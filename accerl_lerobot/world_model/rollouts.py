@@ -207,13 +207,7 @@ class Imagination:
         >>> requests = imagination.requests()
         >>> imagination.advance(adapter.decide(requests, version))
 
-    Args:
-        models: in eval mode.
-        world: spec of the policy's environment.
-        config: of imagination.
-        run: settings of the run.
-        on_segment: receives the imagined segments.
-        sources: datasets that a promoted model was trained on, beside the run's own episodes.
+    `on_segment` receives the imagined segments; `sources` are saved with a model that is promoted.
     """
 
     def __init__(

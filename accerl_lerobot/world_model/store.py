@@ -39,7 +39,7 @@ from accerl_lerobot.world_model.contract import (
     Context,
     LearnableWorldModel,
     WorldModelSpec,
-    new_learnable,
+    learnable_class,
 )
 from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
 
@@ -125,10 +125,7 @@ def load_world_model(
 ) -> tuple[LearnableWorldModel, SuccessPairsRewardModel | None]:
     """Reads what `save_world_model` wrote, in eval mode.
 
-    Args:
-        directory: the folder.
-        package: registers the model's type, where that is not one of ours.
-        section: config section that named both, for errors.
+    `package` registers the model's type, where that is not one of ours; errors name the config `section`.
 
     Raises:
         InputError: it is missing, of an unknown type, its weights do not match its config, or its success
@@ -141,8 +138,9 @@ def load_world_model(
     _check_type(content.get("model"), origin)
     weights = _weights(directory, origin)
     try:
+        made = draccus.decode(LearnableModelConfig, content["model"])
         with Unfilled():
-            model = new_learnable(spec, draccus.decode(LearnableModelConfig, content["model"]))
+            model = learnable_class(made)(spec, made)
         model.load_state_dict(dict(read_tensors(weights, origin)))
     except (*UNREADABLE, draccus.utils.DraccusException) as error:
         if (ours := input_error(error)) is not None:  # draccus wraps what a config refuses

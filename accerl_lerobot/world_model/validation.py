@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Validation of a world model on held-out episodes, and videos of it.
+"""Validation of a world model on held-out episodes.
 
-From each window some chunks are predicted with the executed actions, with another episode's, and with none. A
-model must be better than a copy of the last frame where something moves, and worse with wrong actions; and
-whole imagined rollouts must end as the real episodes did, see `rollout_eval.py`.
+From each window some chunks are predicted with the executed actions, and with another episode's. A model
+must be better than a copy of the last frame where something moves, and worse with wrong actions; and whole
+imagined rollouts must end as the real episodes did, see `rollout_eval.py`.
 
 Predictions are of whole chunks. Where an episode ended within one, its last action is held.
 
@@ -24,10 +24,9 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -36,7 +35,7 @@ import numpy as np
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.dataset_files import open_metadata
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.evaluation import captioned, write_video
+from accerl_lerobot.evaluation import write_video
 from accerl_lerobot.policies.loading import resolve_device
 from accerl_lerobot.world_model import metrics
 from accerl_lerobot.world_model.config import ValidationConfig
@@ -51,14 +50,11 @@ from accerl_lerobot.world_model.data import (
     fingerprint,
     hold_last_action,
     load_episodes,
-    longest_rollout,
 )
 from accerl_lerobot.world_model.rollout_eval import (
-    Predictions,
     choose_threshold,
     outcome_metrics,
     predict,
-    replay,
     score_episodes,
     spaced_frames,
     subsample,
@@ -70,10 +66,7 @@ from accerl_lerobot.world_model.store import (
     load_world_model,
     rehearse_world_model,
 )
-from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import (
-    SuccessPairsRewardModel,
-    probabilities,
-)
+from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
 
 if TYPE_CHECKING:
     from accerl_lerobot.cli.verbs import WorldModelEvalRun, WorldModelRun
@@ -81,8 +74,6 @@ if TYPE_CHECKING:
     from accerl_lerobot.world_model.contract import WorldModelSpec
 
 
-ARMS = ("true", "shuffled", "zero")
-"""Actions that are predicted with: the executed ones, another episode's, none."""
 PREVIEW_ROWS = 4
 SCALE = 3
 """Enlargement of videos."""
@@ -106,12 +97,9 @@ def validation_windows(
     return replace(windows, actions=hold_last_action(windows.actions, windows.steps))
 
 
-def arm_actions(windows: Windows, arm: str, rng: np.random.Generator) -> np.ndarray:
-    """(M, D, K, A), the actions of one of `ARMS`."""
-    actions = windows.actions
-    if arm == "shuffled":
-        return actions[metrics.shuffle_across_groups(len(windows), windows.episode.tolist(), rng)]
-    return {"true": actions, "zero": np.zeros_like(actions)}[arm]
+def shuffled_actions(windows: Windows, rng: np.random.Generator) -> np.ndarray:
+    """(M, D, K, A), the actions of windows of other episodes."""
+    return windows.actions[metrics.shuffle_across_groups(len(windows), windows.episode.tolist(), rng)]
 
 
 def fit_uncertainty_scale(
@@ -134,15 +122,10 @@ def validate(
     seed: int = 0,
     fresh: bool = False,
 ) -> dict[str, Any]:
-    """Validates a model.
+    """Validates a model on episodes that it was not trained on.
 
-    Args:
-        model: in eval mode.
-        episodes: not trained on.
-        config: data and checks.
-        success: None: outcomes are not checked.
-        seed: of windows and shuffles.
-        fresh: the success model is new: its threshold is chosen on these episodes.
+    Without a success model, outcomes are not checked. If it is `fresh`, its threshold is chosen on these
+    episodes.
 
     Returns:
         ``depths``: a row per depth with estimates of skill and sensitivity, and errors of pixels and state;
@@ -160,7 +143,8 @@ def validate(
         ended["outcomes"] = outcome_metrics(scores, own, config, None if fresh else threshold)
         ended["threshold"] = threshold
     windows = validation_windows(episodes, model, config, seed)
-    arms = {arm: predict(model, windows, arm_actions(windows, arm, rng)) for arm in ARMS}
+    predicted = predict(model, windows, windows.actions)
+    shuffled = predict(model, windows, shuffled_actions(windows, rng)).frames
     context = model.spec.context
     newest = windows.frames[:, context - 1]
     rows = []
@@ -170,13 +154,15 @@ def validate(
         fits = whole[:, d]
         row: dict[str, Any] = {"depth": d + 1, "windows": int(fits.sum())}
         if fits.sum() >= 2:
-            row |= _frame_metrics(arms, newest[fits], windows.frames[fits, context + d], fits, d, windows)
-            robots = arms["true"].robot[fits, d]
+            frames = predicted.frames[fits, d], shuffled[fits, d]
+            real = windows.frames[fits, context + d]
+            row |= _frame_metrics(*frames, newest[fits], real, windows.episode[fits])
+            robots = predicted.robot[fits, d]
             if robots.shape[1]:
-                real = windows.state[fits, context + d]
-                row["state_error"] = float(np.abs(robots - real).mean())
-                row["state_error_copy"] = float(np.abs(windows.state[fits, context - 1] - real).mean())
-            row["uncertainty"] = float(arms["true"].uncertainty[fits, d].mean())
+                state = windows.state[fits, context + d]
+                row["state_error"] = float(np.abs(robots - state).mean())
+                row["state_error_copy"] = float(np.abs(windows.state[fits, context - 1] - state).mean())
+            row["uncertainty"] = float(predicted.uncertainty[fits, d].mean())
         rows.append(row)
     checks = _checks(rows, config, ended.get("outcomes"))
     return ended | {
@@ -189,28 +175,22 @@ def validate(
 
 
 def _frame_metrics(
-    arms: dict[str, Predictions],
-    newest: np.ndarray,
-    real: np.ndarray,
-    fits: np.ndarray,
-    d: int,
-    windows: Windows,
+    predicted: np.ndarray, shuffled: np.ndarray, newest: np.ndarray, real: np.ndarray, episode: np.ndarray
 ) -> dict[str, Any]:
-    groups, moved = windows.episode[fits], metrics.changed(newest, real)
-    errors = {arm: metrics.squared_errors(of.frames[fits, d], real) for arm, of in arms.items()}
-    copy = metrics.squared_errors(newest, real)
-    where_moved = metrics.squared_errors(arms["true"].frames[fits, d], real, moved)
-    copy_where_moved = metrics.squared_errors(newest, real, moved)
+    """Metrics of frames (M, V, H, W, 3) predicted with the executed actions and with another episode's."""
+    moved = metrics.changed(newest, real)
+    error, copy = (metrics.squared_errors(frames, real) for frames in (predicted, newest))
+    error_moved, copy_moved = (metrics.squared_errors(frames, real, moved) for frames in (predicted, newest))
+    mse = metrics.mean_error(error)
     return {
-        "mse": metrics.mean_error(errors["true"]),
+        "mse": mse,
         "mse_copy": metrics.mean_error(copy),
-        "psnr": float(10 * np.log10(255**2 / max(metrics.mean_error(errors["true"]), 1e-9))),
-        "skill": metrics.skill(errors["true"], copy, groups)._asdict(),
-        "skill_changed": metrics.skill(where_moved, copy_where_moved, groups)._asdict(),
-        **{
-            f"sensitivity_{arm}": metrics.sensitivity(errors["true"], errors[arm], groups)._asdict()
-            for arm in ARMS[1:]
-        },
+        "psnr": float(10 * np.log10(255**2 / max(mse, 1e-9))),
+        "skill": metrics.skill(error, copy, episode)._asdict(),
+        "skill_changed": metrics.skill(error_moved, copy_moved, episode)._asdict(),
+        "sensitivity_shuffled": metrics.sensitivity(
+            error, metrics.squared_errors(shuffled, real), episode
+        )._asdict(),
     }
 
 
@@ -244,9 +224,6 @@ def _checks(
     }
 
 
-# Videos.
-
-
 def preview_video(
     path: Path, model: WorldModel, episodes: Sequence[Episode], config: ValidationConfig, seed: int
 ) -> None:
@@ -256,78 +233,21 @@ def preview_video(
     rows = sorted(rng.choice(len(windows), min(PREVIEW_ROWS, len(windows)), replace=False).tolist())
     chosen, context = windows.rows(rows), model.spec.context
     lines = [chosen.frames[:, context - 1 :]]
-    for arm in ("true", "shuffled"):
-        frames = predict(model, chosen, arm_actions(windows, arm, rng)[rows]).frames
+    for actions in (windows.actions, shuffled_actions(windows, rng)):
+        frames = predict(model, chosen, actions[rows]).frames
         lines.append(np.concatenate([chosen.frames[:, context - 1 : context], frames], 1))
     write_video(path, [[list(_enlarge(clip)) for clip in line] for line in lines], fps=FPS)
 
 
-def comparison_video(
-    path: Path,
-    model: WorldModel,
-    success: SuccessPairsRewardModel | None,
-    episode: Episode,
-    scale: int = SCALE,
-) -> None:
-    """An episode above its replay in the model, from beginning to end; the file appears when it is complete.
-
-    The frame at the end has the colour of the outcome: green for a success, red for a failure. The replay
-    counts as a success if any chunk does; without a success model none does.
-    """
-    depth = longest_rollout([episode], model.spec.chunk)
-    replayed = replay(model, [episode], [WindowStart(0, 0)], depth)
-    count = int(replayed.executed.sum())
-    imagined = np.concatenate([replayed.newest, replayed.predictions.frames[0, :count]])
-    real = replayed.windows.frames[0, model.spec.context - 1 :][: count + 1]
-    achieved = success is not None and bool(
-        (probabilities(success, imagined[:-1], imagined[1:]) > success.config.threshold).any()
-    )
-    rows = [
-        [captioned(list(_enlarge(frames, scale)), name, outcome)]
-        for frames, name, outcome in ((real, "real", episode.success), (imagined, "imagined", achieved))
-    ]
-    part = path.with_name(f".{path.name}")
-    write_video(part, rows, fps=FPS)
-    os.replace(part, path)
-
-
-class ValidationVideos:
-    """A comparison video after each validation of a run; the folder is made with the first."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-
-    def __call__(
-        self, model: WorldModel, success: SuccessPairsRewardModel, episode: Episode, number: int, passed: bool
-    ) -> None:
-        """Called after the validation of this number, counted from 1, with a held-out episode."""
-        self.folder.mkdir(exist_ok=True)
-        name = f"{number:04d}_{'passed' if passed else 'failed'}.mp4"
-        comparison_video(self.folder / name, model, success, episode)
-
-
-def _enlarge(frames: np.ndarray, scale: int = SCALE) -> np.ndarray:
-    """(D, V, H, W, 3) as (D, scale·H, V·scale·W, 3): cameras beside each other."""
+def _enlarge(frames: np.ndarray) -> np.ndarray:
+    """(D, V, H, W, 3) as (D, SCALE·H, V·SCALE·W, 3): cameras beside each other."""
     cameras = np.concatenate(list(frames.transpose(1, 0, 2, 3, 4)), axis=2)
-    return cameras.repeat(scale, 1).repeat(scale, 2)
+    return cameras.repeat(SCALE, 1).repeat(SCALE, 2)
 
 
 HELD_OUT, DATASET, ONLINE = "held out", "dataset", "online"
 """Names of datasets in the results."""
 PREVIEW, RESULT = "preview.mp4", "validation.json"
-
-
-@dataclass(frozen=True, kw_only=True)
-class DatasetRoles:
-    """How the datasets of a validation count, by their names."""
-
-    trained_on: Collection[str] = ()
-    """Datasets of which the model was trained on other episodes. Their checks count, too."""
-    fresh: str | None = None
-    """The one on which the success threshold is chosen: of each fold, on the others. All other datasets are
-    judged by the present threshold."""
-    keep_threshold: bool = False
-    """Keep the threshold that is chosen on all of `fresh`, for the other datasets too."""
 
 
 def validate_datasets(
@@ -336,7 +256,10 @@ def validate_datasets(
     config: ValidationConfig,
     success: SuccessPairsRewardModel | None,
     directory: Path,
-    roles: DatasetRoles,
+    *,
+    trained_on: Collection[str] = (),
+    fresh: str | None = None,
+    keep_threshold: bool = False,
     seed: int = 0,
 ) -> dict[str, Any]:
     """Validates a world model on each dataset and makes a video of it.
@@ -345,10 +268,13 @@ def validate_datasets(
         model: in eval mode.
         datasets: name → episodes that it was not trained on.
         config: data and checks.
-        success: None: outcomes are not checked.
+        success: see `validate`.
         directory: receives the videos.
-        roles: of the datasets.
-        seed: of windows and shuffles.
+        trained_on: datasets of which the model was trained on other episodes. Their checks count, too.
+        fresh: the dataset on which the success threshold is chosen: of each fold, on the others. All other
+            datasets are judged by the present threshold.
+        keep_threshold: keep the threshold that is chosen on all of `fresh`, for the other datasets too.
+        seed: see `validate`.
 
     Returns:
         Results of `validate` on the first, with its ``name`` and how many episodes were ``tried``; and
@@ -357,18 +283,18 @@ def validate_datasets(
     """
     first, *others = datasets
     results: dict[str, dict[str, Any]] = {}
-    for name in sorted(datasets, key=lambda name: name != roles.fresh):
+    for name in sorted(datasets, key=lambda name: name != fresh):
         episodes = datasets[name]
         threshold = None if success is None else success.config.threshold
-        result = validate(model, episodes, config, success, seed, name == roles.fresh)
+        result = validate(model, episodes, config, success, seed, name == fresh)
         results[name] = {"name": name} | result | {"tried": count_episodes(episodes)}
         video = directory / (PREVIEW if name == first else f"preview_{name}.mp4")
         preview_video(video, model, episodes, config, seed)
-        if success is not None and threshold is not None and not roles.keep_threshold:
+        if success is not None and threshold is not None and not keep_threshold:
             success.config.threshold = threshold
     checks = dict(results[first]["checks"])
     for name in others:
-        if name in roles.trained_on:
+        if name in trained_on:
             checks |= {f"{name}.{check}": held for check, held in results[name]["checks"].items()}
     passed = all(check["holds"] for check in checks.values())
     rest = {name: results[name] for name in others}
@@ -425,9 +351,17 @@ def evaluate(config: WorldModelEvalRun, directory: Path, console: Console) -> di
     # The threshold was chosen on what was held out of the last source: there, it is chosen in folds.
     fresh = next((names[r] for r, part in parts.items() if sources[-1:] == (part.source,)), None)
     trained_on = [names[section] for section, part in parts.items() if part.source is not None]
-    roles = DatasetRoles(trained_on=trained_on, fresh=fresh)
     with console.stage("validation"):
-        result = validate_datasets(model, datasets, config.validation, success, directory, roles, config.seed)
+        result = validate_datasets(
+            model,
+            datasets,
+            config.validation,
+            success,
+            directory,
+            trained_on=trained_on,
+            fresh=fresh,
+            seed=config.seed,
+        )
     (directory / RESULT).write_text(json.dumps(result, indent=2) + "\n")
     return result
 

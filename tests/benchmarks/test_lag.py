@@ -9,14 +9,13 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 
-from accerl_lerobot.engine.config import RunConfig, encode, parse
+from accerl_lerobot.engine.config import RunConfig, encode
 from accerl_lerobot.errors import InputError
 from benchmarks import lag as bench
 from benchmarks import study as studies
@@ -143,40 +142,17 @@ def test_settings_are_checked_before_anything_runs(tmp_path: Path, tiny_checkpoi
     assert not (tmp_path / "study").exists()
 
 
-def failing(*, during: Callable[[], None] = lambda: None) -> Callable[..., subprocess.Popen[bytes]]:
-    """Stands where `subprocess.Popen` does: the run says why it fails."""
-    real = subprocess.Popen
-
-    def start(command: list[str], **options: Any) -> subprocess.Popen[bytes]:
-        during()
-        return real([sys.executable, "-c", "print('one'); print('it broke'); raise SystemExit(3)"], **options)
-
-    return start
-
-
 def test_a_run_that_fails_ends_the_study_with_its_last_lines(
     tmp_path: Path, tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(studies.subprocess, "Popen", failing())
+    real = subprocess.Popen
+
+    def start(command: list[str], **options: Any) -> subprocess.Popen[bytes]:
+        return real([sys.executable, "-c", "print('one'); print('it broke'); raise SystemExit(3)"], **options)
+
+    monkeypatch.setattr(studies.subprocess, "Popen", start)
     with pytest.raises(RuntimeError, match="the run start-seed. failed, see .*\\none\\nit broke"):
         bench.bench_lag(small(tmp_path, tiny_checkpoint))
-
-
-def test_one_study_at_a_time_writes_into_a_folder(
-    tmp_path: Path, tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
-):
-    config = small(tmp_path, tiny_checkpoint)
-    seen: list[BaseException] = []
-
-    def another() -> None:
-        with pytest.raises(InputError, match="a study, or a run of one that was killed, still") as caught:
-            bench.bench_lag(config)
-        seen.append(caught.value)
-
-    monkeypatch.setattr(studies.subprocess, "Popen", failing(during=another))
-    with pytest.raises(RuntimeError, match="it broke"):
-        bench.bench_lag(config)
-    assert seen
 
 
 def test_a_study_that_is_stopped_ends_its_runs(
@@ -199,11 +175,3 @@ def test_a_study_that_is_stopped_ends_its_runs(
     with pytest.raises(KeyboardInterrupt):
         bench.bench_lag(small(tmp_path, tiny_checkpoint))
     assert len(started) == 2 and all(p.returncode == -signal.SIGTERM for p in started)
-
-
-def test_lists_as_people_type_them():
-    config = parse(BenchLagConfig, ["--algorithms=gipo,ppo", "--lags=0, 4", "--seeds=7"])
-    assert (config.algorithms, config.lags, config.seeds) == (("gipo", "ppo"), (0, 4), (7,))
-    for bad in ("--lags=a", "--lags=1.5", "--lags=[true]"):
-        with pytest.raises(InputError, match="use a list such as .*each a whole number"):
-            parse(BenchLagConfig, [bad])

@@ -92,7 +92,7 @@ def test_efficiency_is_relative_to_the_first_count():
 
 def test_books_that_do_not_add_up_are_an_error():
     run = RunConfig(rollout=RolloutConfig(workers=2, worlds=2, segment_length=4))
-    rollout = {"decisions": 100.0, "dropped_nonfinite": 3.0, "groups_dropped_decisions": 0.0}
+    rollout = {"decisions": 100.0, "dropped_nonfinite": 3.0}
     found = books(run, rollout, {"inserted_decisions": 90.0, "dropped_nonfinite": 1.0})
     assert found == {"generated": 100.0, "committed": 90.0, "dropped": 4.0, "under_way": 6.0}
     for inserted in (20.0, 170.0):

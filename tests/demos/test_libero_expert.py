@@ -74,6 +74,6 @@ def test_a_drawn_object_stands_on_its_fixture_in_every_episode():
 @pytest.mark.parametrize("task", ["libero_10/0", "libero_goal"])
 def test_a_task_without_an_expert_is_refused_before_any_work(task: str, tmp_path: Path):
     with pytest.raises(InputError, match="libero_object, libero_spatial, libero_goal") as caught:
-        record_demos(LiberoConfig(task=task), DemosConfig(root=str(tmp_path / "demos")))
+        record_demos(LiberoConfig(task=task), DemosConfig(), str(tmp_path / "demos"))
     assert caught.value.field == "env.task" and "\n" not in str(caught.value)
     assert not (tmp_path / "demos").exists()

@@ -30,8 +30,8 @@ def rows(root: Path) -> list[dict]:
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pytest.importorskip("metaworld")
     root = tmp_path_factory.mktemp("demos") / "two"
-    config = DemosConfig(episodes=2, root=str(root), processes=2)
-    assert record_demos(MetaWorldConfig(task=TASKS, max_steps=100), config) == root
+    config = DemosConfig(episodes=2, processes=2)
+    assert record_demos(MetaWorldConfig(task=TASKS, max_steps=100), config, str(root)) == root
     return root
 
 
@@ -75,8 +75,8 @@ def test_frames_are_what_the_world_showed_when_the_action_was_chosen(recorded: P
 
 
 def test_the_content_does_not_depend_on_the_processes(recorded: Path, tmp_path: Path):
-    config = DemosConfig(episodes=2, root=str(tmp_path / "one"), processes=1)
-    record_demos(MetaWorldConfig(task=TASKS, max_steps=100), config)
+    config = DemosConfig(episodes=2, processes=1)
+    record_demos(MetaWorldConfig(task=TASKS, max_steps=100), config, str(tmp_path / "one"))
     one, two = rows(tmp_path / "one"), rows(recorded)
     assert len(one) == len(two)
     assert all(np.array_equal(a[key], b[key]) for a, b in zip(one, two, strict=True) for key in a)
@@ -85,8 +85,8 @@ def test_the_content_does_not_depend_on_the_processes(recorded: Path, tmp_path: 
 
 def test_failures_are_recorded_on_request_spread_over_tasks(tmp_path: Path):
     env = SimulatedConfig(task="match,mirror", max_steps=60, hold=25)
-    config = DemosConfig(episodes=8, root=str(tmp_path / "mixed"), failure_share=0.5, processes=1, seed=3)
-    record_demos(env, config)
+    config = DemosConfig(episodes=8, failure_share=0.5, processes=1)
+    record_demos(env, config, str(tmp_path / "mixed"), seed=3)
     data = rows(tmp_path / "mixed")
     outcome: dict[str, list[bool]] = {"Match the target": [], "Mirror the target": []}
     for row in data:
@@ -135,22 +135,22 @@ def test_an_expert_that_is_pushed_misses_by_more_the_more_it_is_pushed():
 
 
 def test_an_expert_that_cannot_succeed_is_reported_and_leaves_nothing(tmp_path: Path):
-    config = DemosConfig(episodes=1, root=str(tmp_path / "none"), processes=1, action_noise=1.0)
+    config = DemosConfig(episodes=1, processes=1, action_noise=1.0)
     with pytest.raises(InputError, match="demos.action_noise=1.0: .*match"):
-        record_demos(SimulatedConfig(tolerance=1e-6, max_steps=8), config)
+        record_demos(SimulatedConfig(tolerance=1e-6, max_steps=8), config, str(tmp_path / "none"))
     assert list(tmp_path.iterdir()) == []
 
 
 def test_an_existing_folder_is_never_touched(tmp_path: Path):
     (tmp_path / "mine").mkdir()
-    with pytest.raises(InputError, match="^demos.root=.*the folder exists"):
-        record_demos(SimulatedConfig(), DemosConfig(root=str(tmp_path / "mine")))
+    with pytest.raises(InputError, match="^root=.*the folder exists"):
+        record_demos(SimulatedConfig(), DemosConfig(), str(tmp_path / "mine"))
 
 
 def test_an_environment_without_experts_is_refused(tmp_path: Path):
     pytest.importorskip("gym_pusht")
     with pytest.raises(InputError, match="env.type='lerobot'"):
-        record_demos(LeRobotEnvConfig(name="pusht"), DemosConfig(root=str(tmp_path / "x")))
+        record_demos(LeRobotEnvConfig(name="pusht"), DemosConfig(), str(tmp_path / "x"))
 
 
 def test_its_size_and_place():

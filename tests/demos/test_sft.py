@@ -173,8 +173,8 @@ class TestPick:
     def dataset(self, tmp_path_factory: pytest.TempPathFactory) -> DatasetConfig:
         """Every second episode fails."""
         root = str(tmp_path_factory.mktemp("demos") / "dataset")
-        config = DemosConfig(episodes=4, failure_share=0.5, processes=1, repo_id="a/b", root=root)
-        record_demos(SimulatedConfig(max_steps=16), config)
+        config = DemosConfig(episodes=4, failure_share=0.5, processes=1)
+        record_demos(SimulatedConfig(max_steps=16), config, root)
         return DatasetConfig(repo_id="a/b", root=root)
 
     def test_episodes_by_their_label(self, dataset: DatasetConfig, tmp_path: Path):

@@ -53,7 +53,7 @@ def test_only_what_replay_stores_is_written_and_a_cut_forgets(tmp_path: Path):
     replay = MixedReplay(config, config, 0.5, journal=Journal(path))
     broken = part("c", 3, 0)
     broken.reward[0] = np.nan
-    for segment in (part("a", 1, 0), part("a", 1, 0), broken, part("d", 1, 0, source=IMAGINED)):
+    for segment in (part("a", 1, 0), broken, part("d", 1, 0, source=IMAGINED)):
         replay.insert(segment)
     assert [d.key for d in read_journal(path)] == ["a"]
     state = replay.state()

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from accerl_lerobot.experience import IMAGINED, REAL, Segment
+from accerl_lerobot.experience import IMAGINED, REAL
 from accerl_lerobot.replay import MixedReplay, ReplayConfig
 from tests.replay.segments import make_segment
 
@@ -121,8 +121,7 @@ def test_what_is_too_old_for_one_part_costs_the_other_nothing():
 
 def test_a_segment_goes_where_it_belongs():
     replay = mixed()
-    segment: Segment = make_segment("a", 4, source=IMAGINED)
-    assert replay.insert(segment) and not replay.insert(segment)
+    assert replay.insert(make_segment("a", 4, source=IMAGINED))
     assert replay.imagined.stored_decisions == 4 and replay.real.stored_decisions == 0
 
 

@@ -14,7 +14,6 @@ from accerl_lerobot.replay import (
     Pace,
     Replay,
     ReplayConfig,
-    decisions_under_way,
     lag_bound,
     may_insert,
     may_sample,
@@ -78,20 +77,6 @@ def test_lag_bound_by_hand() -> None:
     assert lag_bound(CONFIG, **arguments) == 4 + 37 + 2
     capped = ReplayConfig(capacity=100, min_decisions=10, samples_per_insert=2.0, ahead=30, max_lag=9)
     assert lag_bound(capped, **arguments) == 9 + 2
-
-
-@pytest.mark.parametrize(
-    ("worlds", "group_size", "episodes"),
-    [(8, 2, 2), (8, 8, 2), (8, 9, 2), (8, 10, 3), (4, 8, 3), (4, 10, 4), (1, 4, 4)],
-)
-def test_groups_are_under_way_for_whole_episodes(worlds: int, group_size: int, episodes: int) -> None:
-    """That it holds in runners is tested in ``tests/rollout/test_runner_groups.py``."""
-    counts = {"workers": 3, "worlds": worlds, "segment_length": 4}
-    assert decisions_under_way(**counts) == 3 * worlds * 4
-    found = decisions_under_way(**counts, group_size=group_size, episode_decisions=50)
-    assert found == 3 * worlds * 50 * episodes
-    with pytest.raises(ValueError, match="episode_decisions"):
-        decisions_under_way(**counts, group_size=group_size)
 
 
 @dataclass(kw_only=True)

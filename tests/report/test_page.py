@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import os
 import re
@@ -25,7 +24,6 @@ from accerl_lerobot.report.content import evaluated, exploring
 from accerl_lerobot.report.read import read_run
 from accerl_lerobot.timeline import COMPUTE, RECOVERY, TRAINING, WAIT_IN
 from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.world_model.config import VIDEOS
 from tests.report.folders import (
     HOSTILE,
     imagined,
@@ -151,7 +149,6 @@ def test_who_waited_for_whom(tmp_path: Path, waited: float, busy: float, said: s
             {"replay_retired_unused": 7.0},
             "7 segments left the replay buffer unused, being older than replay.max_lag",
         ),
-        ({"groups_dropped": 9.0, "groups_kept": 1.0}, "9 groups of equal starts thrown away and 1 kept"),
     ],
 )
 def test_what_went_wrong_is_said(tmp_path: Path, numbers: dict[str, float], said: str) -> None:
@@ -196,20 +193,6 @@ def test_imagined_rollouts(tmp_path: Path) -> None:
     off = page_of(write_run(tmp_path / "off", config=imagining(), rollout=imagined(on=0.0))).text
     assert "Imagination was switched off: 70 % success imagined, 40 % in reality." in off
     assert "imagined rollouts" not in page_of(write_run(tmp_path / "none")).text
-
-
-def test_videos_of_imagined_rollouts(tmp_path: Path) -> None:
-    folder = write_run(tmp_path / "run", config=imagining(), rollout=imagined())
-    (folder / VIDEOS).mkdir()
-    for name in ("0001_failed", "0002_failed", "0013_passed", ".0014_failed"):
-        (folder / VIDEOS / f"{name}.mp4").write_bytes(name.encode())
-    text = page_of(folder).text
-    assert "Validation 1, failed: a recorded episode" in text
-    assert "Validation 13, passed: " in text
-    assert "Validation 2, failed" not in text and "Validation 14" not in text
-    html = (folder / "report.html").read_text()
-    for name, there in (("0001_failed", True), ("0002_failed", False), ("0013_passed", True)):
-        assert (base64.b64encode(name.encode()).decode() in html) is there
 
 
 def test_runs_side_by_side(tmp_path: Path) -> None:

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -71,12 +69,6 @@ def test_the_next_segment_begins_where_this_one_was_cut():
 def test_what_was_seen_when_the_episode_ended_is_the_last_row():
     segment = collected(2).cut("k", terminated=True, success=True)
     assert states(segment) == [0, 1, 2] and segment.terminated and segment.success
-
-
-@pytest.mark.parametrize("size", [1, 3])
-def test_an_advantage_is_one_of_each_decision(size: int):
-    with pytest.raises(ValueError, match=f"2 rewards but {{'advantage': {size}}}"):
-        replace(collected(2).cut("k"), advantage=np.zeros(size, np.float32))
 
 
 def test_full_at_its_length():

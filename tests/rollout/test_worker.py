@@ -182,39 +182,6 @@ def test_the_end_of_training_abandons_its_episodes_and_frees_their_slots(stage):
     one.until(lambda: len(one.evaluated) == 6, training=False)
 
 
-def test_a_group_reaches_replay_whole_stamped_and_in_small_parts(stage):
-    calls: list[list[Segment]] = []
-    one = stage(lambda segments: calls.append(segments) or True, group_size=3, group_filter="none")
-    one.until(lambda: one.order(True).counters["groups_kept"] >= 4)
-    one.order(False, planned(1))
-    one.until(lambda: len(one.evaluated) == 1, training=False)
-    assert max(len(call) for call in calls) == 2, "no more than half the worlds can finish at once"
-    inserted = [segment for call in calls for segment in call]
-    kept = one.order(False).counters["groups_kept"]
-    assert len({s.key for s in inserted}) == len(inserted) == 3 * kept, "one segment an episode"
-    assert all(s.advantage is not None and s.advantage.shape == (len(s),) for s in inserted)
-    seeds: dict[int, list[int]] = {}
-    for episode in one.episodes[: 3 * 4]:
-        assert episode.plan.place is not None
-        seeds.setdefault(episode.plan.seed, []).append(episode.plan.place.member)
-    assert [0, 1, 2] in map(sorted, seeds.values())
-    assert all(len(set(members)) == len(members) <= 3 for members in seeds.values())
-
-
-def test_exploring_pauses_while_a_group_stands_at_the_door(stage):
-    door: list[Future[bool]] = []
-    arguments: dict[str, Any] = {"group_size": 3, "group_filter": "none", "segment_length": 1}
-    one = stage(lambda segments: door.append(Future()) or door[-1], **arguments)
-    one.until(lambda: len(door) >= AT_THE_DOOR)  # six segments, two at a time
-    explored = one.settle()
-    while one.explored == explored:
-        for future in door:
-            if not future.done():
-                future.set_result(True)
-        one.order(True)
-        time.sleep(0.005)
-
-
 def test_an_insert_that_fails_ends_the_worker(stage):
     def insert(segments: list[Segment]) -> bool:
         raise OSError("replay is gone")

@@ -138,10 +138,6 @@ def cases() -> dict[str, Case]:
     for batch in counted:
         for segment in batch:
             segment.latent["count"] = 1 + np.arange(len(segment)) % 2
-    compared = [make_segments((3, 2, 4), seed=i) for i in range(6)]
-    for batch in compared:
-        for number, segment in enumerate(batch):
-            segment.advantage = np.full(len(segment), 1.0 - number, np.float32)
     few = [make_segments((1,) * (1 + i % 3), seed=i) for i in range(6)]
     shrunk = {"grad_clip": 0.05}
     return {
@@ -155,7 +151,6 @@ def cases() -> dict[str, Case]:
         "few": Case(LinearAdapter, PPOConfig(), plain | {"probe_every": 0}, few),
         "broken": Case(LinearAdapter, GIPOConfig(), plain | {"micro_batch": 3}, broken),
         "counted": Case(LinearAdapter, GIPOConfig(level="token"), plain | {"micro_batch": 2}, counted),
-        "compared": Case(LinearAdapter, GIPOConfig(advantage="group"), plain, compared),
         "layers": Case(LayeredAdapter, GIPOConfig(), plain | {"micro_batch": 2, "probe_every": 1}, uneven),
     }
 

@@ -39,8 +39,8 @@ K, COST = 4, 0.25
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> DatasetConfig:
     """Three successes and a failure."""
     root = tmp_path_factory.mktemp("demos") / "dataset"
-    config = DemosConfig(episodes=4, failure_share=0.25, processes=1, repo_id="a/b", root=str(root))
-    record_demos(ENV, config)
+    config = DemosConfig(episodes=4, failure_share=0.25, processes=1)
+    record_demos(ENV, config, str(root))
     return DatasetConfig(repo_id="a/b", root=str(root))
 
 

@@ -18,7 +18,7 @@ from accerl_lerobot.trainer.batch import MAX_NONFINITE, NonFiniteError, collate
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.update import Update
 from tests.rounding import assert_close
-from tests.trainer.linear import STATE, STD, LinearAdapter, make_segments
+from tests.trainer.linear import STATE, LinearAdapter, make_segments
 
 PLAIN = TrainerConfig(
     updates=100, lr=1e-2, value_lr=1e-2, warmup_updates=0, value_warmup_updates=0, grad_clip=1e9
@@ -174,93 +174,6 @@ def test_advantages_are_normalised_over_the_batch():
         gradients.append(update.adapter.weight.grad)
     assert gradients[0].abs().max() > 1e-3
     assert_close(*gradients)
-
-
-# ---- advantages stamped on the segments
-
-
-def stamped(seed: int = 0, scale: float = 1.0) -> list[Segment]:
-    """Episodes that each have one advantage, of either sign."""
-    segments = make_segments(LENGTHS, seed=seed)
-    for segment, advantage in zip(segments, (1.5, -0.5, -2.0, 0.25), strict=True):
-        segment.advantage = np.full(len(segment), scale * advantage, np.float32)
-    return segments
-
-
-def policy_gradient(update: Update, segments: Sequence[Segment]) -> torch.Tensor:
-    update.step(segments)
-    gradient = update.adapter.weight.grad
-    assert gradient is not None and gradient.abs().max() > 1e-3
-    return gradient
-
-
-def test_stamped_advantages_are_used_as_they_are():
-    """GIPO at equal weights is the plain policy gradient, here by hand: −mean Â ∂log π/∂W."""
-    update = make_update(advantage="group", sigma=1e6)
-    segments = stamped()
-    state = np.concatenate([s.observations[STATE][:-1] for s in segments])
-    weight = update.adapter.weight.detach().numpy()
-    z = (np.concatenate([s.latent["x"] for s in segments]) - state @ weight.T) / STD
-    new = -0.5 * z * z
-    for segment, rows in zip(segments, np.split(new, np.cumsum(LENGTHS)[:-1]), strict=True):
-        segment.log_prob = rows.astype(np.float32)
-    advantage = np.concatenate([s.advantage for s in segments if s.advantage is not None])
-    # Mean over decisions and the two factors; log π of factor i is −z²/2 and ∂z_i/∂W_i = −state/STD.
-    expected = -((advantage[:, None] * z / STD).T @ state) / (2 * len(state))
-    assert_close(policy_gradient(update, segments), expected)
-
-
-def test_stamped_advantages_are_not_normalised_again_and_gae_does_not_look_at_them():
-    one, other = (
-        policy_gradient(make_update(advantage="group", kl_coef=0.0), stamped(scale=s)) for s in (1.0, 3.0)
-    )
-    assert_close(3 * one, other)
-    assert make_update().step(stamped()) == make_update().step(make_segments(LENGTHS))
-
-
-@pytest.mark.parametrize("value_coef", [0.0, 0.5])
-@pytest.mark.parametrize("micro_batch", [4, 13])
-def test_stamped_advantages_in_micro_batches(value_coef: float, micro_batch: int):
-    whole = make_update(advantage="group", value_coef=value_coef)
-    parts = make_update(replace(PLAIN, micro_batch=micro_batch), advantage="group", value_coef=value_coef)
-    expected = policy_gradient(whole, stamped())
-    assert_close(policy_gradient(parts, stamped()), expected)
-    one, other = (update.step(stamped(1)) for update in (whole, parts))
-    for name in ("return_mean", "value_loss", "policy_loss"):
-        assert one[name] == pytest.approx(other[name], rel=1e-4, abs=1e-5), name
-
-
-def test_a_critic_that_counts_for_nothing_is_not_asked():
-    update = make_update(replace(PLAIN, micro_batch=4), advantage="group", value_coef=0.0)
-    update.adapter.values = lambda *_: pytest.fail("asked")  # type: ignore[method-assign]
-    before = update.adapter.copy()
-    update.step(stamped())
-    after = update.adapter.copy()
-    assert torch.equal(before["value_head.weight"], after["value_head.weight"])
-    assert not torch.equal(before["policy.weight"], after["policy.weight"])
-
-
-def test_a_critic_beside_stamped_advantages_still_learns_its_returns():
-    update = make_update(advantage="group", gamma=0.9, lam=0.8)
-    segments = stamped()
-    by_hand = returns_by_hand(segments, critic_values(update, segments), 0.9, 0.8)
-    before = update.adapter.copy()
-    assert update.step(segments)["return_mean"] == pytest.approx(by_hand.mean(), abs=1e-4)
-    assert not torch.equal(before["value_head.weight"], update.adapter.copy()["value_head.weight"])
-
-
-def test_stamped_advantages_wait_for_no_critic():
-    update = make_update(replace(PLAIN, value_warmup_updates=3), advantage="group")
-    before = update.adapter.copy()
-    assert update.step(stamped())["lr"] == PLAIN.lr
-    assert not torch.equal(before["policy.weight"], update.adapter.copy()["policy.weight"])
-
-
-def test_a_segment_that_nobody_compared_is_an_error():
-    segments = stamped()
-    segments[2].advantage = None
-    with pytest.raises(ValueError, match=r"a segment carries none: set rollout\.group_size"):
-        make_update(advantage="group").step(segments)
 
 
 # ---- schedules

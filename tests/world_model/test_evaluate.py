@@ -31,12 +31,11 @@ from accerl_lerobot.world_model.store import Source, save_world_model
 from accerl_lerobot.world_model.validation import (
     HELD_OUT,
     ONLINE,
-    DatasetRoles,
     open_datasets,
     validate_datasets,
 )
 from tests.runs import replacing
-from tests.world_model.test_pretrain import moved, recorded
+from tests.world_model.test_pretrain import recorded
 
 ENV = SimulatedConfig(max_steps=60, hold=25, image_size=16)
 CONFIG = WorldModelConfig(
@@ -87,25 +86,10 @@ def test_the_same_measures_on_every_dataset(
         "config.yaml", "validation.json", "preview.mp4", "preview_online.mp4",
     }  # fmt: skip
     assert "By dataset" in stderr and "checks that hold" in stderr
+    assert "trained on a/b (dataset): evaluated on its 4 held-out episodes" in stderr
     assert cli.main(["report", str(out)]) == 0
     page = (out / "report.html").read_text()
     assert "By dataset" in page and "that a policy collected" in page
-
-
-def test_both_models_go_to_the_device(
-    folders: tuple[Path, Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    asked, went = moved(monkeypatch)
-    tried: list[list[str]] = []
-    real = evaluate.validate_datasets
-
-    def validate_datasets(*args: Any, **options: Any) -> Any:
-        tried.append([kind for kind, device in went if device == torch.device("cpu", 0)])
-        return real(*args, **options)
-
-    monkeypatch.setattr(evaluate, "validate_datasets", validate_datasets)
-    cli.main(told(folders, tmp_path / "out", "--device=cuda:3"))
-    assert asked == ["cuda:3"] and tried == [["PixelWorldModel", "SuccessPairsRewardModel"]]
 
 
 def test_one_that_does_not_know_the_dataset_is_tried_on_all_of_it(
@@ -122,6 +106,7 @@ def test_one_that_does_not_know_the_dataset_is_tried_on_all_of_it(
     [
         ("--online={repo_id: a/b, root: nowhere}", "online.root='nowhere': no meta/info.json there"),
         ("--policies=[a]", "policies"),
+        ("--path=nowhere", "path='nowhere': config.json: is missing"),
     ],
 )
 def test_what_is_refused(
@@ -165,8 +150,7 @@ def tried(monkeypatch: pytest.MonkeyPatch) -> Tried:
 
 def validated(tmp_path: Path, of: dict[str, Any], **options: Any) -> tuple[dict[str, Any], float]:
     success: Any = SimpleNamespace(config=SimpleNamespace(threshold=SAVED))
-    roles = DatasetRoles(**options)
-    found = validate_datasets(None, of, ValidationConfig(), success, tmp_path, roles)  # type: ignore[arg-type]
+    found = validate_datasets(None, of, ValidationConfig(), success, tmp_path, **options)  # type: ignore[arg-type]
     return found, success.config.threshold
 
 

@@ -39,12 +39,11 @@ NETWORK = NetworkConfig(space_to_depth=2, channels=(8, 8), condition=8, planes=2
 def learner(**config: Any) -> OnlineLearner:
     torch.manual_seed(0)
     known = PretrainingEpisodes(config.pop("offline", []), config.pop("held_out_offline", []))
-    threshold = config.pop("threshold", None)
     fields: dict[str, Any] = {"steps_per_episode": 2.0, "validate_every": 4, "held_out": 0.25}
     fields |= {"validation": ValidationConfig(depth=2)} | config
     learn = adjusted(OnlineLearnConfig, **fields)(steps_per_episode=fields.pop("steps_per_episode"))
     model = PixelWorldModel(SPEC, PixelModelConfig(network=NETWORK))
-    imagination = ImaginationConfig(learn=learn, threshold=threshold)
+    imagination = ImaginationConfig(learn=learn)
     made = OnlineLearner(model, new_success_model(K), imagination, known, seed=0)
     made.given = model  # type: ignore[attr-defined]
     return made
@@ -194,21 +193,6 @@ def test_what_passes_is_promoted_and_what_does_not_is_not(monkeypatch: pytest.Mo
     assert tried == [["demo", "online"], ["demo", "online", "online"]]
     assert made.metrics()["check_auroc"] == 0.5 and made.metrics()["promoted"] == 1
     assert made.pending_steps == 0
-
-
-@pytest.mark.parametrize(("fixed", "served"), [(None, 0.7), (0.95, 0.95)])
-def test_a_threshold_that_was_named_stays(
-    monkeypatch: pytest.MonkeyPatch, fixed: float | None, served: float
-):
-    monkeypatch.setattr(online, "choose_threshold", lambda *_: 0.7)
-    passes(monkeypatch, True)
-    made = learner(threshold=fixed)
-    for segment in episodes(*[False] * 4):
-        made.add(segment)
-        made.pending_steps = 0
-    made._learner.count = 1
-    promotion = made.promote(last=False)
-    assert promotion is not None and promotion.success.config.threshold == served
 
 
 def test_after_the_last_episode_it_learns_on_until_it_passes_or_is_given_up(monkeypatch: pytest.MonkeyPatch):

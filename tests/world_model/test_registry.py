@@ -1,37 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reference models, and what another world model needs: a class and an entry of the table."""
+"""World models that a run can imagine with."""
 
 from __future__ import annotations
 
-import subprocess
-import sys
-from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
-from accerl_lerobot.config.help import help_text
-from accerl_lerobot.engine.config import RunConfig, parse
 from accerl_lerobot.envs import SimulatedWorld, World, make_world
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import IMAGINED, Segment
+from accerl_lerobot.experience import Segment
 from accerl_lerobot.world_model.config import (
-    MODELS,
     ImaginationConfig,
-    ModelKind,
     NetworkConfig,
     PixelModelConfig,
 )
 from accerl_lerobot.world_model.contract import (
-    BuildInputs,
     Context,
-    Prediction,
     Reset,
     State,
     WorldModel,
@@ -42,7 +31,6 @@ from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.registry import CopyModel, OracleModel, ShuffledModel, make_models
 from accerl_lerobot.world_model.rollouts import Start, StartPool
 from accerl_lerobot.world_model.store import save_world_model
-from tests.test_imagination import imagining, run_locally
 from tests.world_model import real_segments as real
 from tests.world_model.real_segments import SPEC, WORLD, real_episode
 
@@ -143,89 +131,13 @@ def test_shuffled_actions_are_those_of_the_row_before():
     assert torch.equal(got.robot, wanted.robot) and shuffled.spec == oracle.spec
 
 
-class Snow(WorldModel):
-    """All that a newcomer writes: everything is white after the first chunk, and nothing ever succeeds."""
-
-    def __init__(self, means: BuildInputs) -> None:
-        self.spec = replace(means.spec, provides=means.spec.provides | {"success"})
-
-    def begin(self, context: Context, tasks: Sequence[str], resets: Sequence[Reset] | None = None) -> State:
-        return {"robot": context.robot[:, -1]}
-
-    def step(self, state: State, actions: Tensor, seeds: Sequence[int]) -> Prediction:
-        count = len(actions)
-        size = (count, len(self.spec.cameras), *self.spec.image_size, 3)
-        return Prediction(
-            state=state,
-            frames=torch.full(size, 255, dtype=torch.uint8),
-            robot=state["robot"],
-            uncertainty=torch.full((count,), torch.nan),
-            success=torch.zeros(count),
-        )
-
-
-SNOW = ModelKind(make=f"{__name__}:Snow", what="a blizzard.", needs_path=False)
-
-
-@pytest.fixture
-def snow(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The line of the table."""
-    monkeypatch.setitem(MODELS, "snow", SNOW)
-
-
-@pytest.mark.usefixtures("snow")
-def test_a_policy_learns_from_a_new_kind_of_imagination(tiny_checkpoint: Path):
-    _, batches, engine = run_locally(imagining(tiny_checkpoint, model="snow"))
-    assert engine._imagination is not None and isinstance(engine._imagination.models.model, Snow)
-    imagined = [s for batch in batches for s in batch if s.source == IMAGINED]
-    assert len(batches) == 12 and imagined and not any(s.success for s in imagined)
-    following = 0
-    for segment in imagined:
-        first, *later = segment.observations["observation.images.front"]
-        assert first.min() < 255, "it begins at what is real"
-        assert all((frame == 255).all() for frame in later)
-        following += len(later)
-    assert following
-
-
-@pytest.mark.usefixtures("snow")
-def test_what_is_asked_of_a_config_replaces_the_table(monkeypatch: pytest.MonkeyPatch):
-    def told(**line: Any) -> None:
-        monkeypatch.setitem(MODELS, "snow", replace(SNOW, **line))
-
-    with pytest.raises(InputError, match="use learned, shuffled, copy, oracle or snow$"):
-        parse(RunConfig, ["--imagination.model=magic"])
-    config = ImaginationConfig(share=0.5, model="snow")
-    assert not config.learns
-    told(needs_path=True)
-    with pytest.raises(InputError, match=r"^imagination\.path=None"):
-        replace(config)
-    told(needs_path=True, learns=True)
-    assert replace(config, path="x").learns and not replace(config, path="x", share=0.0).learns
-    told(min_rollouts=3)
-    with pytest.raises(InputError, match=r"^imagination\.rollouts=2: use at least 3: snow needs them"):
-        replace(config, rollouts=2)
-
-
-def test_the_table_is_read_without_torch():
-    code = "import sys, accerl_lerobot.world_model.config; sys.exit('torch' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
-
-
-@pytest.mark.usefixtures("snow")
-def test_help_names_them_all():
-    shown = " ".join(help_text("train", RunConfig, "trains", "all").split())
-    for name, kind in MODELS.items():
-        assert f" {name}: {kind.what} " in shown
-
-
 @pytest.mark.parametrize(
     ("name", "made"),
     [("learned", PixelWorldModel), ("shuffled", ShuffledModel), ("copy", CopyModel), ("oracle", OracleModel)],
 )
-def test_entries_of_the_table_are_true(name: str, made: type, tmp_path: Path):
-    world, kind, path = make_world(real.WORLD), MODELS[name], None
-    if kind.needs_path:
+def test_what_a_run_can_imagine_with(name: Any, made: type, tmp_path: Path):
+    world, path = make_world(real.WORLD), None
+    if name != "oracle":
         network = NetworkConfig(channels=(8, 8), condition=8, planes=2)
         saved = PixelWorldModel(real.SPEC, PixelModelConfig(network=network))
         save_world_model(tmp_path / "world", saved, new_success_model(real.K))
@@ -234,15 +146,15 @@ def test_entries_of_the_table_are_true(name: str, made: type, tmp_path: Path):
     model, success = make_models(config, real.WORLD, world.spec, real.K, "cpu")
     assert type(model) is made and (success is None) is ("success" in model.spec.provides)
     learnt = model.model if isinstance(model, ShuffledModel) else model
-    assert isinstance(learnt, PixelWorldModel) is kind.learns is config.learns
+    assert isinstance(learnt, PixelWorldModel) is config.learns
     frames = torch.zeros(1, real.SPEC.context, 1, 16, 16, 3, dtype=torch.uint8)
     robot, actions = torch.zeros(1, real.SPEC.context, 4), torch.zeros(1, real.SPEC.context - 1, real.K, 2)
     context = Context(frames, robot, actions, commanded_sum=torch.zeros(1, 2), initial_state=robot[:, 0])
     with pytest.raises(ValueError, match="reset of every") if name == "oracle" else nullcontext():
         model.begin(context, ["match"])
-    if kind.min_rollouts > 1:
+    if name == "shuffled":
         with pytest.raises(ValueError, match="single rollout"):
-            model.step({}, torch.zeros(kind.min_rollouts - 1, real.K, 2), [0])
+            model.step({}, torch.zeros(1, real.K, 2), [0])
     world.close()
 
 
