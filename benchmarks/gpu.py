@@ -43,7 +43,7 @@ class BenchGpuConfig(Section):
     recipe: str = "recipes/quickstart.yaml"
     """The runs', with fewer demonstrations, steps and episodes."""
     updates: Annotated[int, Range("[1, 100000]")] = 20
-    """Of each run."""
+    """Updates of each run."""
     batch: Annotated[int, Range("[1, 65536]")] = 8
     """Decisions that are made, and learnt from, together."""
     repeats: Repeats = 3

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from lerobot.configs.policies import PreTrainedConfig
 
 from accerl_lerobot import load_policy
@@ -28,8 +29,8 @@ from accerl_lerobot.engine.config import LaunchConfig, RunConfig
 from accerl_lerobot.envs import SimulatedConfig, make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Observation
+from accerl_lerobot.policies import flow
 from accerl_lerobot.policies.config import PLUGINS, POLICIES, PolicyConfig
-from accerl_lerobot.policies.flow import FlowShape
 from accerl_lerobot.policies.loading import load_adapter, rehearsed_config
 from accerl_lerobot.testing import check_policy
 from tests.policies.checkpoints import write_policy
@@ -134,14 +135,13 @@ def test_mistakes_are_found(
 def test_a_density_that_leaves_out_executed_actions_is_found(
     checkpoint: Path, observations: list[Observation], monkeypatch: pytest.MonkeyPatch
 ):
-    whole = FlowShape.action_mask
+    whole = flow.row_log_prob
 
-    def partial(self: FlowShape) -> Any:
-        mask = whole(self)
-        mask[1:] = False
-        return mask
+    def first_row(*arguments: Any) -> Any:
+        rows = whole(*arguments)
+        return torch.cat([rows[:, :1], 0 * rows[:, 1:]], 1)
 
-    monkeypatch.setattr(FlowShape, "action_mask", partial)
+    monkeypatch.setattr(flow, "row_log_prob", first_row)
     with pytest.raises(
         AssertionError, match="standard errors apart: the log-prob is not that of the actions"
     ):

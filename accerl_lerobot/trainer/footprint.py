@@ -36,7 +36,7 @@ class PolicyMemory(NamedTuple):
     weights: int
     """All parameters, in float32 whatever ``policy.precision``."""
     trained: int
-    """Those that are trained, the critic's included."""
+    """Parameters that are trained, the critic's included."""
     shared: int
     """Memory of a batch that waits for its gradient, whatever its size; copies of weights in bf16."""
     acting: int

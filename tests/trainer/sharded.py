@@ -152,6 +152,7 @@ def cases() -> dict[str, Case]:
         "broken": Case(LinearAdapter, GIPOConfig(), plain | {"micro_batch": 3}, broken),
         "counted": Case(LinearAdapter, GIPOConfig(level="token"), plain | {"micro_batch": 2}, counted),
         "layers": Case(LayeredAdapter, GIPOConfig(), plain | {"micro_batch": 2, "probe_every": 1}, uneven),
+        "forgetful": Case(LayeredAdapter, GIPOConfig(), plain | {"activation_checkpointing": True}, uneven),
     }
 
 
