@@ -37,10 +37,12 @@ class PolicyMemory(NamedTuple):
     """All parameters, in float32 whatever ``policy.precision``."""
     trained: int
     """Parameters that are trained, the critic's included."""
-    shared: int
-    """Memory of a batch that waits for its gradient, whatever its size; copies of weights in bf16."""
+    acting_batch: int
+    """Highest memory while a batch is decided, whatever its size; copies of weights in bf16."""
     acting: int
-    """Highest memory of a decision while it is made."""
+    """Further memory for each of its decisions."""
+    learning_batch: int
+    """Memory of a batch that waits for its gradient, whatever its size."""
     learning: int
     """Further memory for each of its decisions."""
 
@@ -50,11 +52,11 @@ class PolicyMemory(NamedTuple):
         Args:
             copies: of the trained weights; the gradient and Adam's two moments.
         """
-        return self.weights + copies * self.trained + self.shared + decisions * self.learning
+        return self.weights + copies * self.trained + self.learning_batch + decisions * self.learning
 
     def replica(self, decisions: int) -> int:
         """An inference replica that decides `decisions` at a time."""
-        return self.weights + decisions * self.acting
+        return self.weights + self.acting_batch + decisions * self.acting
 
 
 class Counter(TorchDispatchMode):
@@ -115,20 +117,27 @@ def policy_memory(adapter: LeRobotAdapter, *, imitates: bool, checkpointing: boo
         batch = tree_map_only(Tensor, mode.from_tensor, batch)
         _fake(adapter, mode)
     one = tree_map_only(Tensor, lambda tensor: tensor[:1], batch)
+    peaks, kept = [], []
     with mode:
-        with torch.no_grad(), adapter.autocast(), Counter() as acting:
-            action = adapter.family.act(adapter.model.encode(one), requests[:1])
+        for rows, asked in ((batch, requests), (one, requests[:1])):
+            with torch.no_grad(), adapter.autocast(), Counter() as counter:
+                action = adapter.family.act(adapter.model.encode(rows), asked)
+            peaks.append(counter.peak)
         learn = partial(_prepare_gradient, adapter, action, imitates)
         if checkpointing:
             forget(Watch(adapter, partial(learn, one)))
-        kept = []
-        for rows in (one, batch):
-            with Counter() as learning:
+        for rows in (batch, one):
+            with Counter() as counter:
                 waiting = learn(rows)
-            kept.append(learning.now)
+            kept.append(counter.now)
             del waiting
-    learning_each = kept[1] - kept[0]
-    return PolicyMemory(weights, trained, max(0, kept[0] - learning_each), acting.peak, learning_each)
+    return PolicyMemory(weights, trained, *_line(*peaks), *_line(*kept))
+
+
+def _line(two: int, one: int) -> tuple[int, int]:
+    """Bytes of a batch whatever its size, and of each decision, from those of two decisions and of one."""
+    each = max(0, two - one)
+    return max(0, one - each), each
 
 
 def _prepare_gradient(adapter: LeRobotAdapter, action: Action, imitates: bool, batch: dict[str, Any]) -> Any:

@@ -66,8 +66,8 @@ def test_fake_tensors_take_what_real_ones_take(
         monkeypatch.setattr(footprint, "FAKED_FROM", 0)
         fake = policy_memory(pi0(tmp_path / "pi0"), imitates=imitates)
     assert fake[:2] == real[:2]
-    assert fake.shared == pytest.approx(real.shared, rel=0.05, abs=1000)
-    assert fake.acting == pytest.approx(real.acting, rel=0.02)
+    assert fake.learning_batch == pytest.approx(real.learning_batch, rel=0.05, abs=1000)
+    assert fake.acting == pytest.approx(real.acting, rel=0.05)
     assert fake.learning == pytest.approx(real.learning, rel=0.02)
 
 
@@ -94,13 +94,13 @@ def test_a_decision_of_act_is_the_difference_between_batches(act: LeRobotAdapter
         kept.append(counter.now)
         del evaluation
     assert memory.learning == pytest.approx(kept[1] - kept[0], rel=0.1)
-    assert memory.shared == pytest.approx(2 * kept[0] - kept[1], rel=0.1)
+    assert memory.learning_batch == pytest.approx(2 * kept[0] - kept[1], rel=0.1)
 
 
 def test_sums_are_those_of_the_parts():
-    memory = PolicyMemory(weights=1000, trained=100, shared=7, acting=10, learning=50)
+    memory = PolicyMemory(1000, 100, acting_batch=3, acting=10, learning_batch=7, learning=50)
     assert memory.trainer(8) == 1000 + 3 * 100 + 7 + 8 * 50
-    assert memory.replica(4) == 1040
+    assert memory.replica(4) == 1043
 
 
 PROCESS = """
@@ -155,5 +155,5 @@ def test_a_process_takes_what_was_estimated_at_published_size(tmp_path: Path):
     memory = PolicyMemory(*found)
     assert memory.weights > 1600 * MIB
     # Gradients appear as what was kept for them goes, so not all of both is there at once.
-    most = memory.trained + memory.shared + DECISIONS * memory.learning
+    most = memory.trained + memory.learning_batch + DECISIONS * memory.learning
     assert 0.8 * DECISIONS * memory.learning < taken < 1.15 * most
