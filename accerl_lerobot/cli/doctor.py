@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """``accerl doctor``: checks a recipe against this machine; every failure comes with its remedy.
 
-A frame is really drawn, in a process of its own, because a broken OpenGL can take a process down. Packages
-are compared with the versions that this one was tested with.
+A frame is really drawn, in a process of its own, because a broken OpenGL can take a process down.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ import importlib.util
 import math
 import os
 import platform
-import re
 import shutil
 import subprocess
 import sys
@@ -34,6 +32,7 @@ if TYPE_CHECKING:
 OK, WARN, FAIL = "ok", "warn", "FAIL"
 RESOLVED = "--resolved="
 DISTRIBUTION = "accerl-lerobot"
+SIMULATOR_EXTRAS = ("metaworld", "libero", "pusht")
 
 GIB = 2**30
 POLICY_PROCESS_GIB, ROLLOUT_PROCESS_GIB, RAY_GIB = 1.2, 0.4, 0.7
@@ -115,45 +114,37 @@ def machine(config: RunConfig | None, history: int = 1) -> Iterator[Check]:
     yield from resources(config, history)
 
 
-def pins(requirements: list[str]) -> dict[str, tuple[str, bool]]:
-    """Package → (pinned version, True if it belongs to an extra) from requirement strings.
-
-    Example:
-        >>> pins(["lerobot[dataset]==0.6.1", 'mujoco==3.3.2; extra == "metaworld"'])
-        {'lerobot': ('0.6.1', False), 'mujoco': ('3.3.2', True)}
-    """
-    found: dict[str, tuple[str, bool]] = {}
-    for requirement in requirements:
-        match = re.match(r"([A-Za-z0-9._-]+)\s*(?:\[[^]]*\])?\s*\(?==\s*([^;\s)]+)", requirement)
-        if match and match[1] not in found:
-            found[match[1]] = (match[2], "extra ==" in requirement)
-    return found
-
-
 def packages() -> Check:
-    """Installed versions against the pins."""
+    """Installed versions against the ranges of this package's requirements."""
+    from packaging.requirements import Requirement
+
     try:
-        pinned = pins(importlib.metadata.requires(DISTRIBUTION) or [])
+        wanted = [Requirement(text) for text in importlib.metadata.requires(DISTRIBUTION) or []]
     except importlib.metadata.PackageNotFoundError:
         return Check("packages", FAIL, f"{DISTRIBUTION} is not installed: run make setup")
-    differing: list[str] = []
-    absent: dict[bool, list[str]] = {True: [], False: []}
-    for name, (version, extra) in pinned.items():
-        try:
-            installed = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            absent[extra].append(name)
+    count, differing = 0, []
+    needed, optional = set[str](), set[str]()
+    for requirement in wanted:
+        of = ["", *SIMULATOR_EXTRAS] if (marker := requirement.marker) is not None else [""]
+        found = [name for name in of if marker is None or marker.evaluate({"extra": name})]
+        if not found:  # of the extras for development
             continue
-        if installed.partition("+")[0] != version:
-            differing.append(f"{name} {installed} instead of {version}")
-    if absent[False]:
-        return Check("packages", FAIL, f"not installed: {', '.join(absent[False])}; run make setup")
+        extra = found[0] != ""
+        try:
+            installed = importlib.metadata.version(requirement.name)
+        except importlib.metadata.PackageNotFoundError:
+            (optional if extra else needed).add(requirement.name)
+            continue
+        count += 1
+        if not requirement.specifier.contains(installed, prereleases=True):
+            differing.append(f"{requirement.name} {installed}, not {requirement.specifier}")
+    if needed:
+        return Check("packages", FAIL, f"not installed: {', '.join(sorted(needed))}; run make setup")
     if differing:
-        return Check("packages", WARN, f"{', '.join(differing)}: not the tested versions; run make setup")
-    count = len(pinned) - len(absent[True])
-    text = f"{count} at the tested versions, lerobot {pinned['lerobot'][0]} among them"
-    if absent[True]:
-        text += f"; without the extras' {', '.join(absent[True])}"
+        return Check("packages", WARN, f"{'; '.join(differing)}: not tested; run make setup")
+    text = f"{count} within their ranges, lerobot {importlib.metadata.version('lerobot')} among them"
+    if optional:
+        text += f"; without the extras' {', '.join(sorted(optional))}"
     return Check("packages", OK, text)
 
 
