@@ -22,7 +22,12 @@ from accerl_lerobot.cli.doctor import FAIL, OK, WARN, Check
 from accerl_lerobot.engine.config import RunConfig, decode
 from accerl_lerobot.engine.preflight import check_weights_fit
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.inference.worker import InferenceConfig
+from accerl_lerobot.policies import loading
+from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.loading import policy_sizes
+from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.trainer.footprint import PolicyMemory
 
 QUICKSTART = Path(__file__).parents[1] / "recipes" / "quickstart.yaml"
 
@@ -277,3 +282,33 @@ def test_imagination_is_checked_where_there_is_any(capsys: pytest.CaptureFixture
     doctor.main([recipe, "--imagination.model=oracle"])
     told = capsys.readouterr().out
     assert "ok    imagination 90% of every batch; world model: oracle" in told
+
+
+@pytest.mark.parametrize(
+    ("room_gib", "status", "words"),
+    [
+        (
+            12.0,
+            OK,
+            "trainer 4 GiB and 0.25 GiB for each of 16 decisions, inference 2.5 GiB; 10 GiB of 12 GiB",
+        ),
+        (9.6, WARN, "use --trainer.micro_batch=12, or --trainer.activation_checkpointing=true"),
+        (6.0, WARN, "use policy.tuning.mode=lora, or --trainer.activation_checkpointing=true"),
+    ],
+)
+def test_a_policy_is_compared_with_its_device(
+    room_gib: float, status: str, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sizes = {"weights": 2, "trained": 0.5, "acting_batch": 0.25, "acting": 0.125, "learning_batch": 0.5}
+    memory = PolicyMemory(
+        **{name: int(doctor.GIB * size) for name, size in (sizes | {"learning": 0.25}).items()}
+    )
+    monkeypatch.setattr(loading, "rehearsed", lambda config, task: memory)
+    monkeypatch.setattr(doctor, "_device_room", lambda config, device: (doctor.GIB * room_gib, 1, "a GPU"))
+    config = RunConfig(
+        policy=PolicyConfig(path="p", device="cpu"),
+        inference=InferenceConfig(max_batch=2),
+        trainer=TrainerConfig(batch_decisions=64, micro_batch=16, probe_every=0),
+    )
+    (check,) = doctor.policy_fits(config)
+    assert check.status == status and words in check.text
