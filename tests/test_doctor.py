@@ -290,7 +290,7 @@ def test_imagination_is_checked_where_there_is_any(capsys: pytest.CaptureFixture
         (
             12.0,
             OK,
-            "trainer 4 GiB and 0.25 GiB for each of 16 decisions, inference 2.5 GiB; 10 GiB of 12 GiB",
+            "trainer 4.0 GiB and 256 MiB for each of 16 decisions, inference 2.5 GiB; 10 GiB of 12 GiB",
         ),
         (9.6, WARN, "use --trainer.micro_batch=12, or --trainer.activation_checkpointing=true"),
         (6.0, WARN, "use policy.tuning.mode=lora, or --trainer.activation_checkpointing=true"),

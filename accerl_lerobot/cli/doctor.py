@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from accerl_lerobot.checkpoint.safety import brief
+from accerl_lerobot.checkpoint.safety import MIB, brief
 from accerl_lerobot.errors import InputError, expanded
 
 if TYPE_CHECKING:
@@ -322,7 +322,9 @@ def _device_room(config: RunConfig, device: Any) -> tuple[float, int, str]:
 
 
 def _gib(size: float) -> str:
-    return f"{size / GIB:.2g} GiB" if size < 10 * GIB else f"{size / GIB:.0f} GiB"
+    if size < GIB:
+        return f"{size / MIB:.0f} MiB"
+    return f"{size / GIB:.1f} GiB" if size < 10 * GIB else f"{size / GIB:.0f} GiB"
 
 
 def memory_estimate_gib(config: RunConfig, history: int = 1) -> float:
