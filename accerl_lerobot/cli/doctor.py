@@ -43,8 +43,9 @@ of one task with its renderers."""
 DISK_GIB = 2.0
 """Space that demonstrations, checkpoints and videos of a run may need."""
 RENDER_TIMEOUT_S = 120
-USABLE = 0.9
-"""Share of a GPU's memory that tensors can have: CUDA, its libraries and fragmentation take the rest."""
+USABLE = 0.8
+"""Share of a device's memory that an estimate may fill: SmolVLA's backward pass took 1.19 times its estimate on a
+CPU, for gradients under way and fragmentation; on a GPU CUDA's libraries need their part too."""
 
 DRAW = """
 import time
@@ -313,7 +314,7 @@ def _device_room(config: RunConfig, device: Any) -> tuple[float, int, str]:
     others = config.inference.workers if config.launch.engine != "local" else 0
     if device.type == "cpu":
         rest = sum(memory_parts_gib(config).values())
-        return ((_memory_gib() or math.inf) - rest) * GIB, others, "this machine"
+        return USABLE * ((_memory_gib() or math.inf) - rest) * GIB, others, "this machine"
     gpus = torch.cuda.device_count()
     rank, other = config.trainer.gpu_shares(gpus, others)
     beside = int((1 - rank) / other + 1e-6) if other else 0

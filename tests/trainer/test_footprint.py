@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from accerl_lerobot.cli.doctor import USABLE
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.config import PolicyConfig, TuningConfig
 from accerl_lerobot.policies.loading import load_adapter
@@ -156,4 +157,5 @@ def test_a_process_takes_what_was_estimated_at_published_size(tmp_path: Path):
     assert memory.weights > 1600 * MIB
     # Gradients appear as what was kept for them goes, so not all of both is there at once.
     most = memory.trained + memory.learning_batch + DECISIONS * memory.learning
-    assert 0.8 * DECISIONS * memory.learning < taken < 1.15 * most
+    # Further gradients under way, and fragmentation: see `doctor.USABLE`.
+    assert DECISIONS * memory.learning < taken < most / USABLE
