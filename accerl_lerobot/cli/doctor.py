@@ -44,8 +44,8 @@ DISK_GIB = 2.0
 """Space that demonstrations, checkpoints and videos of a run may need."""
 RENDER_TIMEOUT_S = 120
 USABLE = 0.8
-"""Share of a device's memory that an estimate may fill. SmolVLA's backward pass took 1.19 times its estimate on
-a CPU, for gradients under way and fragmentation; on a GPU CUDA's libraries need their part too."""
+"""Share of a device's memory that an estimate may fill. SmolVLA's backward pass took 1.19 times its estimate
+on a CPU, for gradients under way and fragmentation; on a GPU CUDA's libraries need their part too."""
 
 DRAW = """
 import time
