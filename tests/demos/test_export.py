@@ -86,9 +86,9 @@ def test_a_run_with_types_of_other_packages(run: Path, tmp_path: Path, capsys: p
     config["env"]["discover_packages_path"] = "accerl_lerobot.envs"
     (other / "config.yaml").write_text(yaml.safe_dump(config))
     capsys.readouterr()
-    assert exported(other, tmp_path / "set", "--last=1") == 2
+    assert exported(other, tmp_path / "set") == 2
     assert "discover_packages_path=None: the run's environment is code of" in capsys.readouterr().err
-    assert exported(other, tmp_path / "set", "--last=1", "--discover_packages_path=accerl_lerobot.envs") == 0
+    assert exported(other, tmp_path / "set", "--discover_packages_path=accerl_lerobot.envs") == 0
 
 
 def test_episodes_that_cannot_be_repeated_are_left_out(

@@ -35,13 +35,15 @@ def test_another_type_is_a_difference_and_its_own_defaults_are_none() -> None:
 
 @pytest.mark.parametrize("path", sorted((ROOT / "recipes").glob("*.yaml")), ids=lambda p: p.stem)
 def test_a_recipe_differs_in_what_it_says(path: Path) -> None:
-    if path.stem.startswith("libero"):
+    if "type: libero" in path.read_text():
         pytest.importorskip("libero")
     config = parse(RunConfig, [str(path)])
     said = {k: v for k, v in flat(read_recipe(path)).items() if k != "job_name"}
     found = changed(config)
     assert said.keys() >= found.keys() - {"sft.backbone", "sft.policy", "policy.sampler"}
     now, usual = flat(encode(config)), flat(encode(RunConfig()))
+    # What is said of a policy is shown as a whole.
+    said = {key: value for key, value in said.items() if not key.startswith("sft.policy.")}
     assert found.keys() >= {key for key in said if key in usual and usual[key] != now[key]}
 
 
