@@ -26,7 +26,7 @@ from tests.runs import tiny_run
 
 def recipe(tmp_path: Path, checkpoint: Path, engine: Any = "ray") -> str:
     """One process, `engine` local, holds no weights back."""
-    path = tmp_path / f"{checkpoint.name}.yaml"
+    path = tmp_path / f"{checkpoint.name}-{engine}.yaml"
     run = tiny_run(checkpoint, launch=LaunchConfig(engine=engine))
     path.write_text(yaml.safe_dump(encode(run)))
     return str(path)
