@@ -109,6 +109,26 @@ def test_a_random_policy_learns_the_task(tiny_checkpoint: Path):
 
 
 @pytest.mark.slow
+def test_weights_held_back_act_so_many_updates_late(tiny_checkpoint: Path):
+    def lags(hold_back: int) -> tuple[list[float], Progress]:
+        trainer = TrainerConfig(
+            updates=14,
+            batch_decisions=16,
+            lr=1e-3,
+            value_warmup_updates=0,
+            hold_back=hold_back,
+            probe_every=4,
+        )
+        history, _ = train(tiny_run(tiny_checkpoint, trainer=trainer))
+        assert max(u.get("logprob/mismatch_max", 0.0) for u in updates(history)) < 1e-4
+        return [u["lag_mean"] for u in updates(history)], history[-1]
+
+    (prompt, end), (late, other_end) = lags(0), lags(4)
+    assert late[:1] == prompt[:1] == [0.0]
+    assert all(lag >= 4 for lag in late[5:]) and max(prompt) < 4, "samples of an acting policy 4 updates old"
+    assert end.inference["version"] == other_end.inference["version"] == 14, "the last weights act at once"
+
+
 def test_planned_episodes_run_without_training_and_are_not_learned_from(tiny_checkpoint: Path):
     engine = LocalEngine(tiny_run(tiny_checkpoint), ("match",))
     engine.plan(evaluation_plans(("match",), 9, "test", filmed=1))

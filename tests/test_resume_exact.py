@@ -26,7 +26,7 @@ from tests.runs import drive, polls, tiny_run
 
 CASES: dict[str, dict[str, Any]] = {
     "plain": {},
-    "probed": {"trainer": {"probe_every": 4}},
+    "weights held back": {"trainer": {"hold_back": 3, "probe_every": 4}},
     "chunk critic": {
         "env": SimulatedConfig(max_steps=16, environment_state=True),
         "rollout": RolloutConfig(worlds=4, segment_length=4),

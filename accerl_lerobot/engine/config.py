@@ -187,14 +187,13 @@ class RunConfig(Section):
                 f"use more than trainer.hold_back, {self.trainer.hold_back}, or all is thrown away as too old"
             )
             raise InputError("replay.max_lag", self.replay.max_lag, remedy)
-        for name, value, only in (
-            ("inference.workers", self.inference.workers, 1),
-            ("trainer.ranks", self.trainer.ranks, 1),
-            ("trainer.hold_back", self.trainer.hold_back, 0),
+        for name, count in (
+            ("inference.workers", self.inference.workers),
+            ("trainer.ranks", self.trainer.ranks),
         ):
-            if value > only and self.launch.engine == "local":
-                remedy = f"launch.engine=local is one process; use launch.engine=ray, or {only}"
-                raise InputError(name, value, remedy)
+            if count > 1 and self.launch.engine == "local":
+                remedy = "launch.engine=local is one process; use launch.engine=ray, or 1"
+                raise InputError(name, count, remedy)
         if self.inference.workers > self.rollout.workers:
             remedy = f"use at most rollout.workers, {self.rollout.workers}, or some have nobody to answer"
             raise InputError("inference.workers", self.inference.workers, remedy)

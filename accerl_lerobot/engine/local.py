@@ -5,7 +5,8 @@
                   → all imagined rollouts get a decision and a step, if the pace allows it
                   → one update, if the pace allows it
 
-For tests and debugging. The policy that acts is the one that learns, so the lag comes from replay alone.
+For tests and debugging. Weights reach the acting policy at once, so the lag comes from replay alone, unless
+`trainer.hold_back` asks for more.
 """
 
 from __future__ import annotations
@@ -30,8 +31,9 @@ from accerl_lerobot.replay.journal import EPISODES, Journal
 from accerl_lerobot.rollout.plans import EpisodePlans
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutRunner
 from accerl_lerobot.seeds import global_generators, restore_global_generators
-from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, open_clock
+from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, WEIGHT_SYNC, open_clock
 from accerl_lerobot.trainer.batch import keeping
+from accerl_lerobot.weights.publisher import PublishDelay
 from accerl_lerobot.world_model.config import IMAGINATION
 
 logger = logging.getLogger(__name__)
@@ -61,6 +63,11 @@ class LocalEngine(Engine):
         self._config = config
         self._adapter = loader(load)(config.policy)
         self._update = make_update(self._adapter, config.algorithm, config.trainer)
+        self._delay = PublishDelay(config.trainer.hold_back)
+        self._acting, self._acting_version = self._adapter, 0
+        if config.trainer.hold_back:
+            self._acting = loader(load)(config.policy)
+            self._acting.load_trainable(self._adapter.export_trainable())
         imagination = config.imagination
         folder, counted = journal_folder(config), config.rollout.episodes > 0
         journal = None if folder is None else Journal(folder / EPISODES)
@@ -116,6 +123,7 @@ class LocalEngine(Engine):
             if segments:
                 with keeping(journal_folder(self._config), self._update, segments):
                     updates.append(self._update.step(segments) | {"update": float(self._update.version)})
+                self._publish()
         self._clock.enter(WAIT_IN)
         episodes = list(self._episodes)
         self._episodes.clear()
@@ -128,7 +136,7 @@ class LocalEngine(Engine):
             rollout={k: float(v) for k, v in asdict(self._runner.counters).items()},
             replay=self._replay.metrics(),
             imagination=self._imagined(),
-            inference={"version": float(self._update.version)},
+            inference={"version": float(self._acting_version)},
         )
 
     def save(self, directory: Path) -> Saved:
@@ -138,9 +146,12 @@ class LocalEngine(Engine):
         snapshot.save(state / WEIGHTS, self._adapter.export_trainable())
         snapshot.save(state / "trainer", self._update.state())
         snapshot.save(state / "replay", self._replay.state())
+        acting = None if self._acting is self._adapter else self._acting.export_trainable()
         engine = {
             "generators": global_generators(),
             "rng": self._rng,
+            "acting": (self._acting_version, acting),
+            "held_back": self._delay.state(),
             "outstanding": sorted(self._outstanding),
             "outbox": list(self._outbox),
             "plans": self._plans.state(),
@@ -164,6 +175,10 @@ class LocalEngine(Engine):
         self._replay.restore(snapshot.load(directory / "replay"))
         engine = snapshot.load(directory / LOCAL)
         self._rng = engine["rng"]
+        self._acting_version, acting = engine["acting"]
+        if acting is not None:
+            self._acting.load_trainable(acting)
+        self._delay.restore(engine["held_back"])
         self._outstanding = set(engine["outstanding"])
         self._outbox.extend(engine["outbox"])
         self._plans.restore(engine["plans"])
@@ -206,7 +221,7 @@ class LocalEngine(Engine):
         slots = [s for s, r in self._due.items() if may_explore or not r.explore]
         if not slots:
             return
-        decisions = self._adapter.decide([self._due[s] for s in slots], self._update.version)
+        decisions = self._acting.decide([self._due[s] for s in slots], self._acting_version)
         for slot, decision in zip(slots, decisions, strict=True):
             request = self._runner.advance(slot, decision)
             if request is None:
@@ -224,7 +239,7 @@ class LocalEngine(Engine):
         if not self._exploring:
             return
         if self._replay.may_insert(IMAGINED) and (requests := self._imagination.requests()):
-            self._imagination.advance(self._adapter.decide(requests, self._update.version))
+            self._imagination.advance(self._acting.decide(requests, self._acting_version))
 
     def _learn_world(self) -> None:
         """One gradient step of the world model, or its validation, if either is due."""
@@ -237,6 +252,19 @@ class LocalEngine(Engine):
             self._imagination.swap(promotion)
             learner.mark_served()
         self._replay.hold(learner.validation_due(last=False) and not last)
+
+    def _publish(self) -> None:
+        """Give weights to the acting policy, which is the trainer's own unless they are delayed."""
+        version, updates = self._update.version, self._config.trainer.updates
+        if self._acting is self._adapter:
+            self._acting_version = version
+            return
+        self._clock.enter(WEIGHT_SYNC)
+        last = version == updates or not self._exploring
+        weights = self._adapter.export_trainable()
+        for number, tensors in self._delay.push(version, weights, last=last):
+            self._acting.load_trainable(tensors)
+            self._acting_version = number
 
     def _store(self) -> None:
         """Store waiting segments while replay takes them."""

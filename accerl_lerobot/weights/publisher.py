@@ -319,6 +319,14 @@ class PublishDelay:
             due.append(self._waiting.popleft())
         return due[-1:] if last else due
 
+    def state(self) -> list[tuple[int, Tensors]]:
+        """Everything that `restore` needs; see `snapshot`."""
+        return list(self._waiting)
+
+    def restore(self, state: list[tuple[int, Tensors]]) -> None:
+        """Resume from `state`."""
+        self._waiting.extend(state)
+
 
 def wall_clock(moment: float) -> float:
     """A moment of `time.monotonic` on the clock that machines share as well as theirs are set."""

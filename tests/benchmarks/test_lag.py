@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 import yaml
 
-from accerl_lerobot.engine.config import LaunchConfig, RunConfig, encode
+from accerl_lerobot.engine.config import RunConfig, encode
 from accerl_lerobot.errors import InputError
 from benchmarks import lag as bench
 from benchmarks import study as studies
@@ -24,11 +24,9 @@ from benchmarks.study import Results, Study
 from tests.runs import tiny_run
 
 
-def recipe(tmp_path: Path, checkpoint: Path, engine: Any = "ray") -> str:
-    """One process, `engine` local, holds no weights back."""
-    path = tmp_path / f"{checkpoint.name}-{engine}.yaml"
-    run = tiny_run(checkpoint, launch=LaunchConfig(engine=engine))
-    path.write_text(yaml.safe_dump(encode(run)))
+def recipe(tmp_path: Path, checkpoint: Path) -> str:
+    path = tmp_path / f"{checkpoint.name}.yaml"
+    path.write_text(yaml.safe_dump(encode(tiny_run(checkpoint))))
     return str(path)
 
 
@@ -85,21 +83,20 @@ def test_the_table_says_rate_interval_and_each_seed(result: dict[str, Any]):
 def test_a_study_is_run_and_goes_on_where_it_was_stopped(
     tmp_path: Path, tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    local = {"recipe": recipe(tmp_path, tiny_checkpoint, "local"), "lags": (0,), "seeds": (3,)}
-    config = small(tmp_path, tiny_checkpoint, algorithms=("gipo",), **local)
+    config = small(tmp_path, tiny_checkpoint, algorithms=("gipo",), lags=(2,), seeds=(3,))
     first = bench.bench_lag(config)
     (cell,) = first["cells"]
-    assert (cell["algorithm"], cell["lag"], cell["seed"], cell["updates"], cell["n"]) == ("gipo", 0, 3, 4, 4)
-    assert 0 <= cell["lag_mean"] <= cell["lag_max"]
+    assert (cell["algorithm"], cell["lag"], cell["seed"], cell["updates"], cell["n"]) == ("gipo", 2, 3, 4, 4)
+    assert 0 < cell["lag_mean"] <= cell["lag_max"]
     study = tmp_path / "study"
     assert json.loads((study / "lag.json").read_text()) == json.loads(json.dumps(first))
-    runs = ("start-seed3", "gipo-lag0-seed3")
+    runs = ("start-seed3", "gipo-lag2-seed3")
     made = {run + end for run in runs for end in ("", ".log", ".yaml")} | {".lock"}
     assert {p.name for p in study.iterdir()} == made | {"lag.json", "lag.md", "lag.png"}
 
-    (study / "gipo-lag0-seed3" / "summary.json").unlink()  # as if it had been stopped just before
+    (study / "gipo-lag2-seed3" / "summary.json").unlink()  # as if it had been stopped just before
     (cell_again,) = bench.bench_lag(config)["cells"]
-    assert "going on from" in (study / "gipo-lag0-seed3.log").read_text()
+    assert "going on from" in (study / "gipo-lag2-seed3.log").read_text()
     assert {**cell_again, "rl_s": 0} == {**cell, "rl_s": 0}
     cell = cell_again
 
@@ -112,14 +109,14 @@ def test_a_study_is_run_and_goes_on_where_it_was_stopped(
         (folder / "summary.json").write_text(json.dumps(a_summary(0.5)))
 
     monkeypatch.setattr(studies._Runner, "_one", fake)
-    again = bench.bench_lag(small(tmp_path, tiny_checkpoint, **local))
-    assert ran == ["ppo-lag0-seed3"] and again["cells"][0] == cell
-    with pytest.raises(InputError, match="gipo-lag0-seed3 in it was run with other settings; choose another"):
-        bench.bench_lag(small(tmp_path, tiny_checkpoint, **local, updates=5))
+    again = bench.bench_lag(small(tmp_path, tiny_checkpoint, lags=(2,), seeds=(3,)))
+    assert ran == ["ppo-lag2-seed3"] and again["cells"][0] == cell
+    with pytest.raises(InputError, match="gipo-lag2-seed3 in it was run with other settings; choose another"):
+        bench.bench_lag(small(tmp_path, tiny_checkpoint, lags=(2,), seeds=(3,), updates=5))
     shutil.rmtree(study / "start-seed3")
-    with pytest.raises(InputError, match="gipo-lag0-seed3 in it is older than start-seed3"):
-        bench.bench_lag(small(tmp_path, tiny_checkpoint, **local))
-    assert ran == ["ppo-lag0-seed3", "start-seed3"]
+    with pytest.raises(InputError, match="gipo-lag2-seed3 in it is older than start-seed3"):
+        bench.bench_lag(small(tmp_path, tiny_checkpoint, lags=(2,), seeds=(3,)))
+    assert ran == ["ppo-lag2-seed3", "start-seed3"]
 
 
 def test_cells_differ_from_the_recipe_in_what_is_studied(tmp_path: Path, tiny_checkpoint: Path):
@@ -129,7 +126,7 @@ def test_cells_differ_from_the_recipe_in_what_is_studied(tmp_path: Path, tiny_ch
     assert len(study.cells) == 8
     made = study.runs[-1]
     assert (made.algorithm.type, made.trainer.hold_back, made.seed) == ("ppo", 2, 4)
-    assert (made.trainer.updates, made.launch.engine, made.policy.path) == (4, "ray", str(tiny_checkpoint))
+    assert (made.trainer.updates, made.launch.engine, made.policy.path) == (4, "local", str(tiny_checkpoint))
     assert (made.evaluation.episodes, made.evaluation.before) == (4, False)
     assert made.output_dir == str(tmp_path / "study" / "ppo-lag2-seed4")
     assert made.replay == tiny_run(tiny_checkpoint).replay
