@@ -115,7 +115,7 @@ def _rows(result: dict[str, Any]) -> list[list[str]]:
         name, seconds, gap = f"SmolVLA, {precision}", found["seconds"], found["mismatch"]
         memory = PolicyMemory(**found["estimate"])
         for part in ("decide", "score", "update"):
-            rows.append([f"{name}: {part} {batch}", f"{batch / seconds[part]['median']:.1f} decisions/s"])
+            rows.append([f"{name}: {part} {batch}", f"{batch / seconds[part]['median']:.2g} decisions/s"])
         taken, estimated = found["memory_gb"]["updated"] * 1e9 / GIB, memory.trainer(batch) / GIB
         rows.append([f"{name}: memory of an update", f"{taken:.1f} GiB, estimated {estimated:.1f}"])
         text = (
