@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,6 +27,14 @@ ALGORITHMS = [
     name for name, kind in AlgorithmConfig.get_known_choices().items() if issubclass(kind, RatioConfig)
 ]
 """Names of the algorithms with a likelihood ratio."""
+
+
+def pip_installed(source: Path, site: Path) -> dict[str, str]:
+    """Installs a package's source folder into `site`; the environment of processes that find it there."""
+    pip = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--no-index"]
+    subprocess.run([*pip, f"--target={site}", str(source)], check=True)
+    path = os.pathsep.join([str(site), *filter(None, [os.environ.get("PYTHONPATH")])])
+    return os.environ | {"PYTHONPATH": path}
 
 
 def replacing(arguments: list[str], *more: str) -> list[str]:

@@ -285,7 +285,7 @@ def test_imagination_is_checked_where_there_is_any(capsys: pytest.CaptureFixture
 
 
 @pytest.mark.parametrize(
-    ("room_gib", "status", "words"),
+    ("usable_gib", "status", "words"),
     [
         (
             12.0,
@@ -297,14 +297,16 @@ def test_imagination_is_checked_where_there_is_any(capsys: pytest.CaptureFixture
     ],
 )
 def test_a_policy_is_compared_with_its_device(
-    room_gib: float, status: str, words: str, monkeypatch: pytest.MonkeyPatch
+    usable_gib: float, status: str, words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sizes = {"weights": 2, "trained": 0.5, "acting_batch": 0.25, "acting": 0.125, "learning_batch": 0.5}
     memory = PolicyMemory(
         **{name: int(doctor.GIB * size) for name, size in (sizes | {"learning": 0.25}).items()}
     )
     monkeypatch.setattr(loading, "rehearsed", lambda config, task: memory)
-    monkeypatch.setattr(doctor, "_device_room", lambda config, device: (doctor.GIB * room_gib, 1, "a GPU"))
+    monkeypatch.setattr(
+        doctor, "_device_memory", lambda config, device: (doctor.GIB * usable_gib, 1, "a GPU")
+    )
     config = RunConfig(
         policy=PolicyConfig(path="p", device="cpu"),
         inference=InferenceConfig(max_batch=2),

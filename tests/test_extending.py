@@ -7,7 +7,6 @@ Each test begins where nobody has heard of them: who forgets to import the packa
 from __future__ import annotations
 
 import importlib
-import os
 import shutil
 import subprocess
 import sys
@@ -34,7 +33,7 @@ from accerl_lerobot.policies.config import PLUGINS, POLICIES, PolicyConfig
 from accerl_lerobot.policies.loading import load_adapter, rehearsed_config
 from accerl_lerobot.testing import check_policy
 from tests.policies.checkpoints import write_policy
-from tests.runs import tiny_run, trained
+from tests.runs import pip_installed, tiny_run, trained
 
 SOURCE = Path(__file__).parent / "packages" / "lerobot_policy_mlp_flow"
 PACKAGE, POLICY, ALGORITHM = SOURCE.name, "mlp_flow", "cispo"
@@ -208,12 +207,8 @@ print(config.type, tuple(action.shape))
 @pytest.mark.slow
 def test_the_installed_package_is_found_by_every_process(checkpoint: Path, tmp_path: Path):
     """In a run on Ray, by its name; by LeRobot and in an evaluation, as a plugin that pip has announced."""
-    site = tmp_path / "site"
-    pip = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--no-index"]
     source = shutil.copytree(SOURCE, tmp_path / "source")  # pip builds within it
-    subprocess.run([*pip, f"--target={site}", str(source)], check=True)
-    path = os.pathsep.join([str(site), *filter(None, [os.environ.get("PYTHONPATH")])])
-    environment = os.environ | {"PYTHONPATH": path}
+    environment = pip_installed(source, tmp_path / "site")
     accerl = [sys.executable, "-m", "accerl_lerobot.cli"]
     common = ["--env.type=simulated", "--policy.device=cpu", "--rollout.worlds=4", "--evaluation.episodes=4"]
     run = [

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.runs import pip_installed
+
 ROOT = Path(__file__).parents[1]
 
 
@@ -17,8 +19,7 @@ ROOT = Path(__file__).parents[1]
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with nothing but what the wheel puts there."""
     site = tmp_path_factory.mktemp("site")
-    pip = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--no-index"]
-    subprocess.run([*pip, f"--target={site}", str(ROOT)], check=True)
+    pip_installed(ROOT, site)
     return site
 
 

@@ -84,7 +84,8 @@ def bench_policy(config: BenchPolicyConfig) -> dict[str, Any]:
     from accerl_lerobot.experience import TASK, Request
     from accerl_lerobot.policies.adapter import stack_observations
     from accerl_lerobot.policies.guard import Unfilled
-    from accerl_lerobot.policies.loading import resolve_device
+    from accerl_lerobot.policies.loading import resolve_device, sizes_of
+    from accerl_lerobot.testing import stored
     from accerl_lerobot.trainer.footprint import policy_memory
 
     device = resolve_device("cpu" if config.memory_only else config.device, "device")
@@ -92,11 +93,10 @@ def bench_policy(config: BenchPolicyConfig) -> dict[str, Any]:
     started = time.perf_counter()
     with tempfile.TemporaryDirectory() as directory, Unfilled() if config.memory_only else nullcontext():
         adapter = _adapter(config, device, Path(directory))
-    trainable = adapter.trainable()
-    sizes = {"all": adapter.policy.parameters(), "trained": trainable.values()}
+    sizes = sizes_of(adapter)
     result = {
         "config": asdict(config),
-        "parameters": {name: sum(p.numel() for p in tensors) for name, tensors in sizes.items()},
+        "parameters": {"all": sizes.policy, "trained": sizes.trained},
         "host": {
             "device": device_name(device),
             "machine": platform.machine(),
@@ -116,9 +116,7 @@ def bench_policy(config: BenchPolicyConfig) -> dict[str, Any]:
     memory.note("decided")
     # One at a time, and re-scored together: rounding depends on the batch, and this is what a run does.
     decisions = [adapter.decide([request], 0)[0] for request in requests]
-    names = decisions[0].latent
-    latent = {k: torch.from_numpy(np.stack([d.latent[k] for d in decisions])) for k in names}
-    old = torch.stack([torch.from_numpy(d.log_prob) for d in decisions]).to(device)
+    latent, old = stored(decisions)
     observations = stack_observations(requests)
     chunks = torch.from_numpy(np.stack([d.chunk for d in decisions])).to(device)
 
@@ -127,9 +125,9 @@ def bench_policy(config: BenchPolicyConfig) -> dict[str, Any]:
             return adapter.evaluate(*observations, latent).log_prob
 
     scored = timed(score, config.repeats, device)
-    change = (score() - old).sum(1)
+    change = (score() - old.to(device)).sum(1)
     gap, ratio = change.abs(), change.exp()
-    optimizer = torch.optim.AdamW(trainable.values(), lr=1e-6)
+    optimizer = torch.optim.AdamW(adapter.trainable().values(), lr=1e-6)
 
     def update() -> None:
         optimizer.zero_grad(set_to_none=True)
@@ -139,7 +137,7 @@ def bench_policy(config: BenchPolicyConfig) -> dict[str, Any]:
             optimizer.step()
             return
         evaluation = adapter.evaluate(*observations, latent)
-        ratio = (evaluation.log_prob - old).sum(1).clamp(-1, 1).exp()
+        ratio = (evaluation.log_prob - old.to(device)).sum(1).clamp(-1, 1).exp()
         (ratio.mean() + (evaluation.value - 1).square().mean()).backward()
         optimizer.step()
 

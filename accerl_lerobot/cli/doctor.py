@@ -126,11 +126,10 @@ def packages() -> Check:
     count, differing = 0, []
     needed, optional = set[str](), set[str]()
     for requirement in wanted:
-        of = ["", *SIMULATOR_EXTRAS] if (marker := requirement.marker) is not None else [""]
-        found = [name for name in of if marker is None or marker.evaluate({"extra": name})]
-        if not found:  # of the extras for development
-            continue
-        extra = found[0] != ""
+        marker = requirement.marker
+        extra = marker is not None and not marker.evaluate({"extra": ""})
+        if marker and extra and not any(marker.evaluate({"extra": name}) for name in SIMULATOR_EXTRAS):
+            continue  # for development
         try:
             installed = importlib.metadata.version(requirement.name)
         except importlib.metadata.PackageNotFoundError:
@@ -270,6 +269,7 @@ def placement(config: RunConfig) -> Iterator[Check]:
 def policy_fits(config: RunConfig) -> Iterator[Check]:
     """The memory of a given policy where it learns and acts, against that of its device."""
     from accerl_lerobot.algorithms import RatioConfig
+    from accerl_lerobot.engine.preflight import trained_copies
     from accerl_lerobot.policies.loading import rehearsed, resolve_device
     from accerl_lerobot.trainer.footprint import PolicyMemory, policy_memory
     from accerl_lerobot.trainer.off_policy import POLICY_BATCH
@@ -286,28 +286,25 @@ def policy_fits(config: RunConfig) -> Iterator[Check]:
         return
     batch = math.ceil(trainer.batch_decisions / trainer.ranks) if ratio else POLICY_BATCH
     decisions = min(batch, trainer.micro_batch)
-    copies = (
-        4 if ratio and trainer.probe_every else 3
-    )  # the gradient, Adam's moments, weights to compare with
-    kept = memory.trainer(0, copies) / (trainer.ranks if trainer.zero else 1)
+    kept = memory.trainer(0, trained_copies(config)) / (trainer.ranks if trainer.zero else 1)
     acting = memory.replica(config.inference.max_batch)
-    room, replicas, place = _device_room(config, device)
+    usable, replicas, place = _device_memory(config, device)
     need = kept + decisions * memory.learning + replicas * acting
     text = (
         f"trainer {_gib(kept)} and {_gib(memory.learning)} for each of {decisions} decisions, "
-        f"inference {_gib(acting)}; {_gib(need)} of {_gib(room)} on {place}"
+        f"inference {_gib(acting)}; {_gib(need)} of {_gib(usable)} on {place}"
     )
-    if need <= room:
+    if need <= usable:
         yield Check("policy", OK, text)
         return
-    fitting = int((room - kept - replicas * acting) / memory.learning)
+    fitting = int((usable - kept - replicas * acting) / memory.learning)
     remedy = f"use --trainer.micro_batch={fitting}" if fitting > 0 else "use policy.tuning.mode=lora"
     if not trainer.activation_checkpointing:
         remedy += ", or --trainer.activation_checkpointing=true"
     yield Check("policy", WARN, f"{text}: {remedy}")
 
 
-def _device_room(config: RunConfig, device: Any) -> tuple[float, int, str]:
+def _device_memory(config: RunConfig, device: Any) -> tuple[float, int, str]:
     """Bytes that a rank and the inference replicas beside it may take, how many these are, and of what."""
     import torch
 

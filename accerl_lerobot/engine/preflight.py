@@ -264,14 +264,16 @@ def policy_gib(config: RunConfig) -> float:
     if config.policy.path is None or resolve_device(config.policy.device).type != "cpu":
         return 0.0
     rehearsed_config(config.policy)
-    sizes, trainer, algorithm = policy_sizes(config.policy), config.trainer, config.algorithm
-    copies = 3  # the gradient and Adam's two moments
-    if isinstance(algorithm, RatioConfig) and trainer.probe_every:
-        copies += 1  # of older weights
-    processes = 1
+    sizes, processes, copies = policy_sizes(config.policy), 1, trained_copies(config)
     if config.launch.engine != "local":
-        processes, copies = trainer.ranks + config.inference.workers, copies + 2  # two sets are published
+        processes = config.trainer.ranks + config.inference.workers
+        copies += 2  # two sets are published
     return 4 * (sizes.policy * processes + sizes.trained * copies) / 2**30
+
+
+def trained_copies(config: RunConfig) -> int:
+    """Copies of the trained weights that a trainer keeps: gradient, Adam's two moments, weights to probe."""
+    return 3 + (isinstance(config.algorithm, RatioConfig) and config.trainer.probe_every > 0)
 
 
 def _check_off_policy(config: RunConfig, spec: WorldSpec, policy: Any) -> None:

@@ -151,7 +151,8 @@ def rehearsed_config(config: PolicyConfig) -> Any:
     key = _key(config, folder)
     if key not in _rehearsed:
         there = replace(config, device="cpu", precision="fp32")
-        sizes = rehearse(lambda: _sizes(there), folder, Origin("policy.path", config.path))
+        origin = Origin("policy.path", config.path)
+        sizes = rehearse(lambda: sizes_of(_load(there, rehearsal=True)), folder, origin)
         _rehearsed[key] = Sizes(*sizes)
     return load_lerobot_config(config)
 
@@ -180,8 +181,8 @@ def _key(config: PolicyConfig, folder: Path) -> str:
     return repr((config, [(str(path), path.stat().st_size, path.stat().st_mtime_ns) for path in files]))
 
 
-def _sizes(config: PolicyConfig) -> Sizes:
-    adapter = _load(config, rehearsal=True)
+def sizes_of(adapter: LeRobotAdapter) -> Sizes:
+    """Numbers of an adapter's parameters."""
     of = (adapter.policy.parameters(), adapter.trainable().values())
     return Sizes(*(sum(parameter.numel() for parameter in parameters) for parameters in of))
 

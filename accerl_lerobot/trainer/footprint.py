@@ -22,6 +22,7 @@ from torch.utils._pytree import tree_leaves, tree_map_only
 
 from accerl_lerobot.policies.adapter import LeRobotAdapter, example_requests, stack_observations
 from accerl_lerobot.policies.family import Action
+from accerl_lerobot.policies.loading import sizes_of
 from accerl_lerobot.trainer.sharding import Watch, forget
 
 FAKED_FROM = 10**9
@@ -105,14 +106,11 @@ def policy_memory(adapter: LeRobotAdapter, *, imitates: bool, checkpointing: boo
     """
     from torch._subclasses.fake_tensor import FakeTensorMode
 
-    weights, trained = (
-        FLOAT32 * sum(p.numel() for p in parameters)
-        for parameters in (adapter.policy.parameters(), adapter.trainable().values())
-    )
+    sizes = sizes_of(adapter)
     requests = example_requests(adapter.policy.config, adapter.processing.rename_map)
     batch = adapter.processing.prepare(*stack_observations(requests))
     mode: Any = nullcontext()
-    if weights > FLOAT32 * FAKED_FROM:
+    if sizes.policy > FAKED_FROM:
         mode = FakeTensorMode(allow_non_fake_inputs=True)
         batch = tree_map_only(Tensor, mode.from_tensor, batch)
         _fake(adapter, mode)
@@ -131,6 +129,7 @@ def policy_memory(adapter: LeRobotAdapter, *, imitates: bool, checkpointing: boo
                 waiting = learn(rows)
             kept.append(counter.now)
             del waiting
+    weights, trained = FLOAT32 * sizes.policy, FLOAT32 * sizes.trained
     return PolicyMemory(weights, trained, *_line(*peaks), *_line(*kept))
 
 

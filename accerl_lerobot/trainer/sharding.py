@@ -178,7 +178,8 @@ class Watch(TorchFunctionMode):
     def _is_block(self, module: nn.Module) -> bool:
         """Called, of more than vectors, and no weight of it is used or held anywhere else."""
         parameters = list(module.parameters())
-        # Gradients that come by way of a cache pass by a module's output, where FSDP waits for them.
+        # Gradients that come by way of a cache pass by a module's output, where FSDP waits for them; and what
+        # is computed again would be put there again.
         if module not in self._called or module in self._leaky or all(p.dim() < 2 for p in parameters):
             return False
         inside = set(module.modules())

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import subprocess
 import sys
@@ -18,7 +17,7 @@ from accerl_lerobot.config.parsing import parse
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig
 from accerl_lerobot.envs import GymConfig, GymWorld, make_world
 from accerl_lerobot.errors import InputError
-from tests.runs import replacing, tiny_run, trained
+from tests.runs import pip_installed, replacing, tiny_run, trained
 
 PACKAGE = Path(__file__).parents[1] / "packages" / "lerobot_env_reach"
 GYM = [
@@ -109,11 +108,8 @@ def test_it_trains(tiny_checkpoint: Path):
 @pytest.mark.slow
 def test_the_installed_package_is_found_by_every_process(tiny_checkpoint: Path, tmp_path: Path):
     """As `env.type=gym` in a run on Ray, and as LeRobot's plugin ``reach``, which only pip has announced."""
-    site = tmp_path / "site"
-    pip = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--no-index"]
     source = shutil.copytree(PACKAGE, tmp_path / "source")  # pip builds within it
-    subprocess.run([*pip, f"--target={site}", str(source)], check=True)
-    path = os.pathsep.join([str(site), *filter(None, [os.environ.get("PYTHONPATH")])])
+    environment = pip_installed(source, tmp_path / "site")
     accerl = [sys.executable, "-m", "accerl_lerobot.cli"]
     run = [
         "train", *GYM, f"--policy.path={tiny_checkpoint}", "--policy.device=cpu", "--rollout.worlds=4",
@@ -122,14 +118,12 @@ def test_the_installed_package_is_found_by_every_process(tiny_checkpoint: Path, 
         "--trainer.updates=4", "--trainer.batch_decisions=16", "--evaluation.episodes=4",
         f"--output_dir={tmp_path / 'run'}",
     ]  # fmt: skip
-    subprocess.run([*accerl, *run], check=True, env=os.environ | {"PYTHONPATH": path}, cwd=tmp_path)
+    subprocess.run([*accerl, *run], check=True, env=environment, cwd=tmp_path)
     assert (tmp_path / "run" / "summary.json").is_file()
     code = (
         "from accerl_lerobot.envs import LeRobotEnvConfig, make_world\n"
         "world = make_world(LeRobotEnvConfig(name='reach', task='Reach the goal'))\n"
         "print(world.reset(0, 'reach')['observation.state'].shape)\n"
     )
-    shown = subprocess.run(
-        [sys.executable, "-c", code], check=True, env=os.environ | {"PYTHONPATH": path}, capture_output=True
-    )
+    shown = subprocess.run([sys.executable, "-c", code], check=True, env=environment, capture_output=True)
     assert shown.stdout.decode().splitlines()[-1] == "(2,)"

@@ -15,6 +15,7 @@ from accerl_lerobot.cli.doctor import USABLE
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.config import PolicyConfig, TuningConfig
 from accerl_lerobot.policies.loading import load_adapter
+from accerl_lerobot.testing import stored
 from accerl_lerobot.trainer import footprint
 from accerl_lerobot.trainer.footprint import Counter, PolicyMemory, policy_memory
 from tests.policies.checkpoints import write_act
@@ -133,9 +134,7 @@ def published(folder: Path) -> tuple[LeRobotAdapter, tuple, dict]:
         Request(observation={STATE: np.full(1, i, np.float32), TASK: "do it"}, noise_seed=i)
         for i in range(DECISIONS)
     ]
-    latents = [decision.latent for decision in adapter.decide(requests, 0)]
-    latent = {k: torch.from_numpy(np.stack([one[k] for one in latents])) for k in latents[0]}
-    return adapter, stack_observations(requests), latent
+    return adapter, stack_observations(requests), stored(adapter.decide(requests, 0))[0]
 
 
 def resident(*, peak: bool = False) -> int:
