@@ -18,13 +18,14 @@ from __future__ import annotations
 from accerl_lerobot.algorithms.chunk_critic import ChunkCriticConfig
 from accerl_lerobot.algorithms.contract import (
     AlgorithmConfig,
+    AWRConfig,
     Level,
     LossInputs,
     OffPolicyConfig,
     RatioConfig,
     SelfImitationConfig,
 )
-from accerl_lerobot.algorithms.losses import AWRConfig, GIPOConfig, PPOConfig
+from accerl_lerobot.algorithms.losses import GIPOConfig, PPOConfig
 from accerl_lerobot.algorithms.objective import LossOutput
 
 __all__ = [

@@ -91,6 +91,26 @@ class SelfImitationConfig(OffPolicyConfig):
     """
 
 
+@AlgorithmConfig.register_subclass("awr")
+@dataclass(frozen=True, kw_only=True)
+class AWRConfig(OffPolicyConfig):
+    """Settings of advantage-weighted regression (Peng et al., arXiv 1910.00177).
+
+        w = min(exp((R − V(o)) / (beta · s)), cap)
+        L = E[w · imitation loss]  +  E[(R − V(o))²]
+
+    R is the discounted return of the episode from the decision on, s the standard deviation of R − V(o) of
+    late. In place of −log π stands the loss that LeRobot trains the policy with.
+    """
+
+    update = "accerl_lerobot.trainer.off_policy:AWRUpdate"
+
+    beta: Annotated[float, Range("(0, inf]")] = 1.0
+    """Temperature in standard deviations of the advantage; ``inf`` weighs all decisions alike."""
+    cap: Annotated[float, Range("[1, inf)")] = 20.0
+    """Largest weight of a decision."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class LossInputs:
     """One batch of decisions, re-scored by the current policy."""

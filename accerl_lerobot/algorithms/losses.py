@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The objectives of an update: GIPO, PPO and AWR.
+"""The objectives with a likelihood ratio: GIPO and PPO.
 
 GIPO: a Gaussian trust weight on the log-ratio instead of a clip (arXiv 2603.03955, used by AcceRL,
 2603.18464).
@@ -23,19 +23,10 @@ PPO with a clip (Schulman et al., arXiv 1707.06347), asymmetric as in DAPO (arXi
 
 The ratio is taken against the behaviour policy, so under asynchrony the clip range is also the staleness
 budget: at a large lag most samples are outside and their gradient is gone. That is what GIPO is for.
-
-AWR, advantage-weighted regression (Peng et al., arXiv 1910.00177): the baseline without a ratio.
-
-    w = min(exp(Â / β), cap)
-    L = −E[w · log π]  +  the shared terms of `objective`
-
-Stale samples count like fresh ones, and no action is pushed away. Advantages have standard deviation 1 over
-the batch, so β is in units of that.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -95,26 +86,3 @@ class PPOConfig(RatioConfig):
             weight=(~dropped).to(logs.dtype),
             clip=(self.clip_low, self.clip_high),
         )
-
-
-@AlgorithmConfig.register_subclass("awr")
-@dataclass(frozen=True, kw_only=True)
-class AWRConfig(RatioConfig):
-    """Settings of advantage-weighted regression."""
-
-    beta: Annotated[float, Range("(0, inf]")] = 1.0
-    """Temperature in standard deviations of the advantage; ``inf`` weighs all samples alike."""
-    cap: Annotated[float, Range("[1, inf)")] = 20.0
-    """Largest weight of a sample; an average one has 1."""
-
-    def loss(self, inputs: LossInputs) -> LossOutput:
-        """See the top of the file. E is the mean over all factors, actions or chunks of all decisions."""
-        log_prob = at_level(inputs.log_prob_new, inputs, self.level)
-        logs = at_level(inputs.log_prob_new - inputs.log_prob_old.detach(), inputs, self.level)
-        # Limited before the exponential, which would overflow at Â/β = 89.
-        weight = (advantage_column(inputs) / self.beta).clamp(max=math.log(self.cap)).exp()
-        weight = weight.expand_as(log_prob)
-        policy_loss = -mean_over_ratios(weight * log_prob, inputs, self.level)
-        # Metrics multiply by ρ, which is not in this gradient.
-        weight = weight / ratio(logs.detach())
-        return assemble(inputs, self, policy_loss=policy_loss, log_ratio=logs, weight=weight)

@@ -20,6 +20,7 @@ VERBS = {
     "train": "improve a policy by online RL (demonstrations and SFT first, if the recipe says so)",
     "demos": "record scripted-expert demonstrations into a LeRobotDataset",
     "sft": "fine-tune on a LeRobotDataset with LeRobot's own trainer",
+    "offline": "improve a policy from recorded episodes alone, successes and failures of a real robot say",
     "eval": "measure the success of a checkpoint, with its confidence interval",
     "world-model": "train a world model on LeRobotDatasets and validate it on held-out episodes",
     "world-model-eval": "validate a world model on episodes of one or several datasets",

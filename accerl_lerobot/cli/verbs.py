@@ -18,6 +18,7 @@ from typing import Any
 
 import yaml
 
+from accerl_lerobot.algorithms import AlgorithmConfig, AWRConfig, ChunkCriticConfig, OffPolicyConfig
 from accerl_lerobot.bench.latency import BenchLatencyConfig
 from accerl_lerobot.bench.policy import BenchPolicyConfig
 from accerl_lerobot.bench.throughput import BenchThroughputConfig
@@ -35,10 +36,12 @@ from accerl_lerobot.errors import InputError, check_absent, expanded, is_full, k
 from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.hub.card import PullConfig, PushConfig
 from accerl_lerobot.inference.worker import InferenceConfig
+from accerl_lerobot.metrics import WandBConfig
 from accerl_lerobot.policies.config import Load, PolicyConfig
 from accerl_lerobot.report import ReportConfig, write_report
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
 from accerl_lerobot.timeline.read import TimelineConfig, show_timelines, timeline_table
+from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.world_model.config import ValidationConfig, WorldModelConfig
 
 
@@ -81,6 +84,40 @@ class SFTRun(NewFolderRun):
         super().__post_init__()
         if self.sft.init_path is None:
             check_chunk(self.sft.policy)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OfflineRun(Section):
+    """``accerl offline``: a LeRobot checkpoint learns from a LeRobotDataset whose episodes are labelled.
+
+    Each of ``trainer.updates`` is one gradient step on 64 decisions.
+    """
+
+    seed: Seed = 0
+    output_dir: str | None = None
+    """Folder to create. None: ``outputs/<date>/<time>_<job_name>``."""
+    job_name: str = "offline"
+    """Last part of the folder's name."""
+    policy: PolicyConfig = field(default_factory=PolicyConfig)
+    dataset: DatasetConfig = field(default_factory=DatasetConfig)
+    """Successes and failures, told apart by ``next.success``, or by ``next.reward``."""
+    algorithm: AlgorithmConfig = field(default_factory=AWRConfig)
+    trainer: TrainerConfig = field(default_factory=TrainerConfig)
+    wandb: WandBConfig = field(default_factory=WandBConfig)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not isinstance(self.algorithm, OffPolicyConfig) or isinstance(self.algorithm, ChunkCriticConfig):
+            why = "it needs likelihoods of what was done, or a simulator's state"
+            raise InputError("algorithm.type", self.algorithm.type, f"{why}; use awr or self_imitation")
+        if self.policy.path is None:
+            raise InputError("policy.path", None, "give a LeRobot checkpoint; accerl sft makes one")
+        if self.dataset.repo_id is None:
+            raise InputError(
+                "dataset.repo_id", None, "name a LeRobotDataset, on the Hub or with dataset.root"
+            )
+        if self.trainer.ranks != 1:
+            raise InputError("trainer.ranks", self.trainer.ranks, "offline learning is one process; use 1")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -211,6 +248,24 @@ def sft(arguments: list[str]) -> int:
             on_step=lambda step, loss: stage.update(step, f"loss {loss:.3f}"),
         )
     sys.stdout.write(f"{path}\n")
+    return 0
+
+
+def offline(arguments: list[str]) -> int:
+    """``accerl offline``."""
+    config: OfflineRun = parse(OfflineRun, arguments, recipe_class=RunConfig)
+    from accerl_lerobot.engine import run
+    from accerl_lerobot.engine.offline import learn_offline
+
+    directory, console = run.make_output_dir(config), Console()
+    console.say(f"run {directory}")
+    try:
+        with redirect_stdout(sys.stderr), kept_traceback(directory):
+            summary = learn_offline(config, directory, console)
+    except InputError:
+        run.discard_unused(directory)
+        raise
+    sys.stdout.write(json.dumps(summary, indent=2) + "\n")
     return 0
 
 
@@ -367,6 +422,7 @@ CONFIGS: dict[str, type[Any]] = {
     "train": RunConfig,
     "demos": DemosRun,
     "sft": SFTRun,
+    "offline": OfflineRun,
     "eval": EvalRun,
     "world-model": WorldModelRun,
     "world-model-eval": WorldModelEvalRun,

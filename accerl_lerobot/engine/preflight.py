@@ -23,7 +23,7 @@ from accerl_lerobot.algorithms import OffPolicyConfig, RatioConfig
 from accerl_lerobot.checkpoint.layout import KEEP
 from accerl_lerobot.config.ranges import Range, check
 from accerl_lerobot.engine import ray_session
-from accerl_lerobot.envs import EnvConfig, WorldSpec, make_world
+from accerl_lerobot.envs import EnvConfig, JudgedWorld, RewardModelConfig, WorldSpec, make_world
 from accerl_lerobot.errors import InputError, check_absent, expanded
 from accerl_lerobot.policies.features import (
     ACTION,
@@ -44,10 +44,12 @@ ABSURD = 2
 """Times this machine's memory that a rough estimate may be; ``accerl doctor`` warns long before."""
 
 if TYPE_CHECKING:
+    from accerl_lerobot.algorithms import AlgorithmConfig
     from accerl_lerobot.demos.record import DemosConfig
     from accerl_lerobot.demos.sft import SFTConfig
     from accerl_lerobot.engine.config import DatasetConfig, RunConfig
     from accerl_lerobot.metrics import WandBConfig
+    from accerl_lerobot.policies.config import PolicyConfig
 
 logger = logging.getLogger(__name__)
 
@@ -55,11 +57,13 @@ SLACK_BYTES = 128 * 2**20
 """Disk space for metrics, the timeline, the journal and videos."""
 
 
-def check_world(env: EnvConfig) -> WorldSpec:
+def check_world(env: EnvConfig, reward_model: RewardModelConfig | None = None) -> WorldSpec:
     """Build and reset an environment once, so that what is wrong with it shows before anything long."""
-    world = make_world(env)
+    world = make_world(env, reward_model=reward_model)
     try:
-        world.reset(0, world.spec.tasks[0])
+        observation = world.reset(0, world.spec.tasks[0])
+        if isinstance(world, JudgedWorld):
+            world.succeeded(observation)
         return world.spec
     finally:
         world.close()
@@ -99,7 +103,7 @@ def check_start(config: RunConfig) -> int:
     check_wandb(config.wandb)
     policy = policy_to_be(config)
     check_weights_fit(config)
-    spec = check_world(config.env)
+    spec = check_world(config.env, config.rollout.reward_model)
     off_policy = isinstance(config.algorithm, OffPolicyConfig)
     if off_policy:
         _check_off_policy(config, spec, policy)
@@ -276,19 +280,22 @@ def trained_copies(config: RunConfig) -> int:
     return 3 + (isinstance(config.algorithm, RatioConfig) and config.trainer.probe_every > 0)
 
 
-def _check_off_policy(config: RunConfig, spec: WorldSpec, policy: Any) -> None:
-    """Refuse policies that cannot imitate a chunk, and segments that are not whole episodes."""
+def check_imitates(algorithm: AlgorithmConfig, config: PolicyConfig, policy: Any) -> None:
+    """Refuse policies that cannot imitate a chunk; `policy` is LeRobot's config."""
     from accerl_lerobot.policies.config import sampler_config
 
-    sampler = sampler_config(config.policy, policy.type)
+    sampler = sampler_config(config, policy.type)
     if sampler.type not in ("flow", "gaussian"):
         remedy = "use flow or gaussian, or another algorithm.type"
-        raise InputError(
-            "policy.sampler.type", sampler.type, f"algorithm.type={config.algorithm.type}: {remedy}"
-        )
+        raise InputError("policy.sampler.type", sampler.type, f"algorithm.type={algorithm.type}: {remedy}")
     if getattr(policy, "use_relative_actions", False):
-        remedy = f"algorithm.type={config.algorithm.type} keeps actions without the state they refer to"
+        remedy = f"algorithm.type={algorithm.type} keeps actions without the state they refer to"
         raise InputError("policy.use_relative_actions", True, f"{remedy}; use another algorithm.type")
+
+
+def _check_off_policy(config: RunConfig, spec: WorldSpec, policy: Any) -> None:
+    """Refuse policies that cannot imitate a chunk, and segments that are not whole episodes."""
+    check_imitates(config.algorithm, config.policy, policy)
     decisions = math.ceil(spec.max_steps / getattr(policy, "n_action_steps", 1))
     if config.rollout.segment_length < decisions:
         remedy = f"algorithm.type={config.algorithm.type} looks at whole episodes; use at least {decisions}"

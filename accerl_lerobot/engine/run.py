@@ -157,7 +157,7 @@ def is_brief(error: BaseException) -> bool:
 def play_evaluation(config: RunConfig, console: Console, filmed: int = 0) -> list[EpisodeResult]:
     """Play the evaluation episodes of a run with LeRobot's sampler, on seeds that are never trained on."""
     check_machine(config)
-    spec = check_world(config.env)
+    spec = check_world(config.env, config.rollout.reward_model)
     engine = make_engine(config, spec.tasks, check_policy(config, spec))
     with contextlib.closing(engine):
         count = config.evaluation.episodes

@@ -12,6 +12,7 @@ from accerl_lerobot.envs.gym_env import GymConfig, GymWorld
 from accerl_lerobot.envs.lerobot_env import LeRobotEnvConfig, LeRobotWorld
 from accerl_lerobot.envs.libero import LiberoConfig, LiberoWorld
 from accerl_lerobot.envs.metaworld import MetaWorld, MetaWorldConfig
+from accerl_lerobot.envs.reward_model import JudgedWorld, RewardModelConfig, load_judge
 from accerl_lerobot.envs.simulated import SimulatedConfig, SimulatedWorld
 from accerl_lerobot.errors import InputError
 
@@ -21,12 +22,14 @@ __all__ = [
     "GymConfig",
     "GymWorld",
     "HistoryWorld",
+    "JudgedWorld",
     "LeRobotEnvConfig",
     "LeRobotWorld",
     "LiberoConfig",
     "LiberoWorld",
     "MetaWorld",
     "MetaWorldConfig",
+    "RewardModelConfig",
     "SimulatedConfig",
     "SimulatedWorld",
     "World",
@@ -35,10 +38,11 @@ __all__ = [
 ]
 
 
-def make_world(config: EnvConfig, history: int = 1) -> World:
+def make_world(config: EnvConfig, history: int = 1, reward_model: RewardModelConfig | None = None) -> World:
     """Builds the world that `config` describes.
 
-    An observation holds `history` env steps; above 1, arrays begin with that dimension.
+    An observation holds `history` env steps; above 1, arrays begin with that dimension. `reward_model` tells
+    success, if it has a path.
     """
     try:
         discover(config.discover_packages_path, "env")
@@ -49,4 +53,6 @@ def make_world(config: EnvConfig, history: int = 1) -> World:
         missing = str(error.name or getattr(error.__cause__, "name", None)).partition(".")[0]
         remedy = f"the package {missing} is not installed; pip install '{extra}'"
         raise InputError("env.type" if name == config.type else "env.name", name, remedy) from error
+    if reward_model is not None and reward_model.path is not None:
+        world = JudgedWorld(world, load_judge(reward_model))
     return world if history == 1 else HistoryWorld(world, history)

@@ -17,6 +17,7 @@ import numpy as np
 from accerl_lerobot.checkpoint.snapshot import kind
 from accerl_lerobot.config.ranges import NonNegative, Range, Section, Steps
 from accerl_lerobot.envs.base import ChunkResult, World
+from accerl_lerobot.envs.reward_model import RewardModelConfig
 from accerl_lerobot.experience import Decision, Observation, Origin, Request, Segment
 from accerl_lerobot.rollout.segments import SegmentBuilder
 from accerl_lerobot.seeds import noise_seed
@@ -93,6 +94,8 @@ class RolloutConfig(Section, section="rollout"):
     """Exploring episodes in all; 0: as many as the updates need. Once they are played, learning goes on while
     replay has something to give, which is little unless more is imagined, and then ends.
     """
+    reward_model: RewardModelConfig = field(default_factory=RewardModelConfig)
+    """The model that tells success, where the environment does not."""
 
 
 @kind

@@ -103,7 +103,7 @@ class RolloutWorker:
         self._moved: float | None = None
         self._outbox: list[Segment] = []
         self._deciding = ReconnectingClient("inference")
-        worlds = [make_world(env, history) for _ in range(config.worlds)]
+        worlds = [make_world(env, history, config.reward_model) for _ in range(config.worlds)]
         name = f"rollout{share.index}.{share.incarnation}"
         self._runner = RolloutRunner(
             worlds,

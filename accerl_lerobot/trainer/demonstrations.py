@@ -65,12 +65,33 @@ def demonstrations(dataset: DatasetConfig, decision_cost: float, like: Segment) 
         logger.warning("%s does not join the memory: %s", dataset.repo_id, why)
         return
     chunk = like.actions.shape[1]
-    phases = min(chunk, max(1, ROWS * chunk // meta.total_frames))
-    share = min(1.0, min(ROWS * chunk, FRAMES) / meta.total_frames)
+    yield from recorded(dataset, meta, wanted, chunk, min(ROWS, FRAMES // chunk), ROWS, decision_cost)
+
+
+def recorded(
+    dataset: DatasetConfig,
+    meta: Any,
+    wanted: dict[str, tuple[int, ...]],
+    chunk: int,
+    most: int,
+    enough: int,
+    decision_cost: float = 0.0,
+) -> Iterator[Segment]:
+    """Reads whole episodes as `demonstrations` does.
+
+    Args:
+        meta: what `open_metadata` gives for `dataset`.
+        wanted: shape of the observations that are read and of ``action``, by name.
+        chunk: env steps of a decision.
+        most: decisions of one reading of the dataset; episodes beyond it are left out.
+        enough: decisions in all, up to which episodes are read again from their second step on, ….
+    """
+    phases = min(chunk, max(1, enough * chunk // meta.total_frames))
+    share = min(1.0, most * chunk / meta.total_frames)
     episodes = range(math.ceil(share * meta.total_episodes))
     with opened(dataset, meta, episodes) as data:
         for index in episodes:
-            episode = _episode(frames_of(data, index), wanted)
+            episode = _episode(index, frames_of(data, index), wanted)
             for phase in range(min(phases, len(episode.rewards))):
                 yield _segment(episode, phase, chunk, decision_cost)
 
@@ -78,6 +99,7 @@ def demonstrations(dataset: DatasetConfig, decision_cost: float, like: Segment) 
 class _Episode(NamedTuple):
     """An episode up to its first success, T env steps."""
 
+    number: int
     columns: dict[str, np.ndarray]
     """Observations and actions, each (T, ...)."""
     rewards: np.ndarray
@@ -86,7 +108,7 @@ class _Episode(NamedTuple):
     task: str
 
 
-def _episode(frames: Iterator[dict[str, Any]], wanted: dict[str, tuple[int, ...]]) -> _Episode:
+def _episode(index: int, frames: Iterator[dict[str, Any]], wanted: dict[str, tuple[int, ...]]) -> _Episode:
     rows: list[dict[str, np.ndarray]] = []
     rewards: list[float] = []
     for frame in frames:
@@ -98,7 +120,7 @@ def _episode(frames: Iterator[dict[str, Any]], wanted: dict[str, tuple[int, ...]
     if REWARD not in frame:
         rewards[-1] = float(success)
     columns = {name: np.stack([row[name] for row in rows]) for name in wanted}
-    return _Episode(columns, np.array(rewards, np.float32), success, task)
+    return _Episode(index, columns, np.array(rewards, np.float32), success, task)
 
 
 def _segment(episode: _Episode, phase: int, chunk: int, decision_cost: float) -> Segment:
@@ -122,7 +144,7 @@ def _segment(episode: _Episode, phase: int, chunk: int, decision_cost: float) ->
         truncated=False,
         success=episode.success,
         key="demonstration",
-        origin=Origin(task="", seed=0, decision=0),
+        origin=Origin(task="", seed=episode.number, decision=0),
         episode={"return": float(reward.sum()), "decisions": float(t)},
     )
 

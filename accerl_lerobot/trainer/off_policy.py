@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Updates from a memory of all episodes: the loop that off-policy algorithms share, and self-imitation.
+"""Updates from a memory of all episodes: the loop that off-policy algorithms share, self-imitation, and AWR.
 
 demonstrations, then new episodes → memory → gradient steps of the policy, so many for each new decision
 """
@@ -14,7 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from accerl_lerobot.algorithms import OffPolicyConfig
+from accerl_lerobot.algorithms import AWRConfig, OffPolicyConfig
+from accerl_lerobot.algorithms.advantages import STD_EPSILON
 from accerl_lerobot.algorithms.objective import lag_metrics
 from accerl_lerobot.checkpoint.tensors import optimizer_state, restore_optimizer
 from accerl_lerobot.experience import Segment
@@ -28,6 +29,8 @@ from accerl_lerobot.trainer.probe import CRITIC
 
 POLICY_BATCH = 64
 """Rows of one step of the policy."""
+FORGET = 0.99
+"""Share of the mean square of R − V that a step keeps."""
 
 
 class OffPolicyUpdate:
@@ -62,10 +65,10 @@ class OffPolicyUpdate:
         """
         if not self.memory.total and self.adapter.demonstrations is not None:
             for demonstration in self.adapter.demonstrations(segments[0]):
-                self._remember(demonstration)
+                self.remember(demonstration)
         for segment in segments:
             if not segment.truncated:  # the simulator diverged: nothing follows, and nothing failed
-                self._remember(segment)
+                self.remember(segment)
         metrics = {"decisions": float(sum(map(len, segments))), "memory_decisions": float(len(self.memory))}
         rewards = np.concatenate([segment.reward for segment in segments])
         metrics |= {"reward_mean": float(rewards.mean())}
@@ -87,6 +90,10 @@ class OffPolicyUpdate:
     def target(self, rows: np.ndarray) -> Tensor:
         """Chunks (B, K, A) for the policy to imitate, in normalised units."""
         return self.tensor("chunk", rows)
+
+    def weight(self, rows: np.ndarray, encoded: Encoded) -> Tensor | float:
+        """Factor on the imitation loss of each row, (B,) or one for all; arguments as of `auxiliary`."""
+        return 1.0
 
     def auxiliary(self, rows: np.ndarray, encoded: Encoded) -> dict[str, Tensor]:
         """Further losses of a step of the policy, by name, already weighted.
@@ -133,7 +140,8 @@ class OffPolicyUpdate:
             metrics |= mean(self._policy_step(rows) for _ in self.steps("policy", self.policy_steps, new))
         return metrics
 
-    def _remember(self, segment: Segment) -> None:
+    def remember(self, segment: Segment) -> None:
+        """Adds a whole episode to the memory."""
         executed = self.adapter.processing.normalise(torch.from_numpy(segment.actions))
         self.memory.add(segment, executed.numpy())
 
@@ -149,8 +157,9 @@ class OffPolicyUpdate:
         for part in np.array_split(rows, math.ceil(len(rows) / self.config.micro_batch)):
             with self.adapter.autocast():
                 encoded = self.adapter.encode(*self.memory.observations(part))
-                imitation = self.adapter.family.imitation_loss(encoded, self.target(part)).float().mean()
-            losses = {"imitation_loss": imitation} | self.auxiliary(part, encoded)
+                imitation = self.adapter.family.imitation_loss(encoded, self.target(part)).float()
+            weighted = (self.weight(part, encoded) * imitation).mean()
+            losses = {"imitation_loss": weighted} | self.auxiliary(part, encoded)
             losses = {name: len(part) / len(rows) * value for name, value in losses.items()}
             torch.stack(list(losses.values())).sum().backward()
             for name, value in losses.items():
@@ -177,6 +186,54 @@ class OffPolicyUpdate:
                 f"{self._skipped_in_a_row} steps in a row had a non-finite loss or gradient (the last one, "
                 f"{step}: loss {loss:g}, gradient norm {norm:g}); lower trainer.lr or trainer.value_lr"
             )
+
+
+class AWRUpdate(OffPolicyUpdate):
+    """Advantage-weighted regression, see `AWRConfig`; the critic is the adapter's."""
+
+    def __init__(self, adapter: LeRobotAdapter, algorithm: AWRConfig, config: TrainerConfig) -> None:
+        super().__init__(adapter, algorithm, config)
+        self.algorithm = algorithm
+        self._variance = 0.0
+        """Mean square of R − V, over some hundred steps."""
+        value = {"params": list(adapter.value_head.parameters()), "lr": config.value_lr}
+        self.optimizer.add_param_group(value)
+
+    def learn(self, new: int) -> dict[str, float]:
+        share = self.config.lr_share(self.version, updates=self._schedule_updates)
+        self.optimizer.param_groups[1]["lr"] = self.config.value_lr * share
+        return super().learn(new)
+
+    def imitable(self) -> np.ndarray:
+        """See the base class: of failures too, what went better than expected."""
+        return np.arange(len(self.memory))
+
+    def weight(self, rows: np.ndarray, encoded: Encoded) -> Tensor:
+        error = self._error(rows, encoded).detach()
+        square = float(error.square().mean())
+        self._variance = FORGET * self._variance + (1 - FORGET) * square if self._variance else square
+        advantage = error / max(math.sqrt(self._variance), STD_EPSILON)
+        return weights(advantage, self.algorithm.beta, self.algorithm.cap)
+
+    def auxiliary(self, rows: np.ndarray, encoded: Encoded) -> dict[str, Tensor]:
+        return {"value_loss": self._error(rows, encoded).square().mean()}
+
+    def state(self) -> dict[str, Any]:
+        return super().state() | {"variance": self._variance}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        super().restore(state)
+        self._variance = state["variance"]
+
+    def _error(self, rows: np.ndarray, encoded: Encoded) -> Tensor:
+        """R − V(o), (B,), with the critic's gradient."""
+        value: Tensor = self.adapter.value_head(encoded.features, encoded.mask)
+        return self.tensor("return", rows) - value
+
+
+def weights(advantage: Tensor, beta: float, cap: float) -> Tensor:
+    """min(exp(advantage / beta), cap), limited before the exponential, which would overflow."""
+    return (advantage / beta).clamp(max=math.log(cap)).exp()
 
 
 def mean(steps: Iterator[dict[str, float]]) -> dict[str, float]:

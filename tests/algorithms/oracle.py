@@ -70,15 +70,6 @@ def ppo(logs: Ragged, advantage: np.ndarray, low: float, high: float) -> float:
     return -mean(terms)
 
 
-def awr(log_prob: Ragged, advantage: np.ndarray, beta: float, cap: float) -> float:
-    """−E[min(exp(Â/β), cap) log π]."""
-    terms = []
-    for row, a in zip(log_prob, advantage, strict=True):
-        for x in row:
-            terms.append(min(math.exp(a / beta), cap) * x)
-    return -mean(terms)
-
-
 def shared(error: np.ndarray, logs: Ragged, entropy: np.ndarray, config: RatioConfig) -> float:
     """value_coef · error + kl_coef · KL(μ‖π) − entropy_coef · H, where `logs` are log π/μ."""
     kl = mean([math.exp(x) - 1 - x for row in logs for x in row])

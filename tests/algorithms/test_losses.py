@@ -12,7 +12,6 @@ import torch
 
 from accerl_lerobot.algorithms import (
     AlgorithmConfig,
-    AWRConfig,
     GIPOConfig,
     LossInputs,
     PPOConfig,
@@ -28,8 +27,6 @@ CONFIGS: list[RatioConfig] = [
     GIPOConfig(level="chunk", sigma=math.inf, kl_coef=0.0),
     PPOConfig(level="token", kl_coef=0.2),
     PPOConfig(level="chunk", clip_low=0.1, clip_high=0.4, entropy_coef=0.01),
-    AWRConfig(level="token", beta=0.5, cap=3.0, kl_coef=0.1),
-    AWRConfig(level="chunk", beta=math.inf),
 ]
 each_config = pytest.mark.parametrize("config", CONFIGS, ids=lambda c: f"{c.type}-{c.level}")
 each_algorithm = pytest.mark.parametrize(
@@ -47,11 +44,6 @@ def logs_of(inputs: LossInputs, level: str) -> oracle.Ragged:
 def policy_loss_of(inputs: LossInputs, config: RatioConfig) -> float:
     """The algorithm's own term by its oracle."""
     logs, advantage = logs_of(inputs, config.level), inputs.advantage.numpy()
-    if isinstance(config, AWRConfig):
-        factors = None if inputs.factors is None else inputs.factors.numpy()
-        log_prob = inputs.log_prob_new.detach().numpy()
-        grouped = oracle.grouped(log_prob, config.level, factors)
-        return oracle.awr(grouped, advantage, config.beta, config.cap)
     if isinstance(config, GIPOConfig):
         return oracle.gipo(logs, advantage, config.sigma)
     assert isinstance(config, PPOConfig)

@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Learning from recorded episodes alone, a real robot's for instance: no environment, no rollout workers.
+
+LeRobotDataset with `next.success` or `next.reward` → the trainer's memory → steps of an off-policy algorithm
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import math
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+import yaml
+
+from accerl_lerobot.algorithms import OffPolicyConfig
+from accerl_lerobot.checkpoint.layout import CONFIG, PRETRAINED, SUMMARY, save_checkpoint, write_atomically
+from accerl_lerobot.config.parsing import encode
+from accerl_lerobot.console import Console
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.metrics import MetricsLog, plain
+
+if TYPE_CHECKING:
+    from accerl_lerobot.cli.verbs import OfflineRun
+
+logger = logging.getLogger(__name__)
+
+BYTES = 4 * 1024**3
+"""Observations that are kept in memory at most."""
+LOG_EVERY = 25
+"""Updates between two records of metrics, which are means over them."""
+COMPARED = 256
+"""Decisions of successes, and of failures, whose imitation loss is measured before and after."""
+
+
+def learn_offline(config: OfflineRun, directory: Path, console: Console) -> dict[str, Any]:
+    """Learns, writes ``checkpoints/NNNNNN`` and ``summary.json`` into `directory`; returns the summary.
+
+    Raises:
+        InputError: policy and dataset do not fit each other, or its episodes are not labelled.
+    """
+    from accerl_lerobot.demos.dataset_files import open_metadata
+    from accerl_lerobot.policies.loading import load_adapter, rehearsed_config
+    from accerl_lerobot.trainer.update import make_update
+
+    started = time.monotonic()
+    torch.manual_seed(config.seed)
+    torch.set_num_threads(config.trainer.num_threads)
+    policy, meta = rehearsed_config(config.policy), open_metadata(config.dataset)
+    wanted = _check(config, policy, meta)
+    write_atomically(directory / CONFIG, yaml.safe_dump(encode(config), sort_keys=False))
+    adapter = load_adapter(config.policy)
+    # One step for each update, instead of so many for each new decision.
+    assert isinstance(config.algorithm, OffPolicyConfig)
+    algorithm = replace(config.algorithm, policy_steps=1.0)
+    update: Any = make_update(adapter, algorithm, config.trainer)
+    counts = _remember(config, update, meta, wanted, console)
+    before = _imitation(update)
+    with (
+        contextlib.closing(MetricsLog(directory, config.wandb, encode(config))) as log,
+        console.stage(f"offline ({algorithm.type})", total=config.trainer.updates) as stage,
+    ):
+        recent: list[dict[str, float]] = []
+        while update.version < config.trainer.updates:
+            recent.append(update.learn(1))
+            update.version += 1
+            if update.version % LOG_EVERY == 0 or update.version == config.trainer.updates:
+                means = {k: float(np.mean([m[k] for m in recent if k in m])) for k in recent[-1]}
+                log.write("train", update.version, means)
+                stage.update(update.version, f"imitation loss {means.get('imitation_loss', math.nan):.4f}")
+                recent = []
+
+    def write(folder: Path) -> int:
+        adapter.save(folder / PRETRAINED, config.policy, adapter.copy_weights())
+        (folder / CONFIG).write_bytes((directory / CONFIG).read_bytes())
+        version: int = update.version
+        return version
+
+    path = save_checkpoint(directory / "checkpoints", write)
+    losses = {"before": before, "after": _imitation(update)}
+    summary: dict[str, Any] = plain(
+        counts
+        | {"algorithm": algorithm.type, "updates": update.version, "imitation_loss": losses}
+        | {"wall_s": time.monotonic() - started, "policy": str(path / PRETRAINED)}
+    )
+    write_atomically(directory / SUMMARY, json.dumps(summary, indent=2) + "\n")
+    return summary
+
+
+def _check(config: OfflineRun, policy: Any, meta: Any) -> dict[str, tuple[int, ...]]:
+    """Shapes of the observations that the policy reads, by the dataset's names, and of ``action``."""
+    from accerl_lerobot.engine.preflight import check_imitates
+    from accerl_lerobot.experience import REWARD, SUCCESS
+    from accerl_lerobot.policies.features import ACTION, check_features, dataset_features, policy_features
+
+    check_imitates(config.algorithm, config.policy, policy)
+    offered, renames = dataset_features(meta), config.policy.rename_map
+    check_features(policy_features(policy), offered, renames, "policy.path", config.policy.path, "dataset")
+    if policy.n_obs_steps > 1:
+        remedy = "it sees several env steps at once, which offline learning does not; use accerl sft"
+        raise InputError("policy.path", config.policy.path, remedy)
+    if not {SUCCESS, REWARD} & set(meta.features):
+        remedy = f"its episodes are labelled neither by {SUCCESS} nor {REWARD}; use accerl sft"
+        raise InputError("dataset.repo_id", config.dataset.repo_id, remedy)
+    read = policy_features(policy).shapes.keys() | {ACTION}
+    return {name: shape for name, shape in offered.shapes.items() if renames.get(name, name) in read}
+
+
+def _remember(
+    config: OfflineRun, update: Any, meta: Any, wanted: dict[str, tuple[int, ...]], console: Console
+) -> dict[str, Any]:
+    """Fills the memory; counts of what is in it."""
+    from accerl_lerobot.trainer.demonstrations import recorded
+
+    algorithm = config.algorithm
+    assert isinstance(algorithm, OffPolicyConfig)
+    chunk = update.adapter.policy.config.n_action_steps
+    size = sum(math.prod(shape) * (1 if len(shape) == 3 else 4) for shape in wanted.values())
+    most = max(1, min(algorithm.memory, BYTES // size))
+    outcomes: dict[int, bool] = {}
+    with console.stage("reading the dataset", total=meta.total_frames) as stage:
+        frames = 0
+        for segment in recorded(config.dataset, meta, wanted, chunk, most, most):
+            update.remember(segment)
+            outcomes[segment.origin.seed] = segment.success
+            frames += int(segment.steps.sum())
+            stage.update(min(frames, meta.total_frames))
+    if len(outcomes) < meta.total_episodes:
+        logger.warning(
+            "%d of %d episodes fit into %d decisions, the others are left out",
+            len(outcomes), meta.total_episodes, most,
+        )  # fmt: skip
+    counts = {"episodes": len(outcomes), "successes": sum(outcomes.values()), "decisions": len(update.memory)}
+    if not counts["successes"]:
+        remedy = "none of its episodes is a success; there is nothing to imitate"
+        raise InputError("dataset.repo_id", config.dataset.repo_id, remedy)
+    console.say(f"{counts['episodes']} episodes, {counts['successes']} of them successes; "
+                f"{counts['decisions']} decisions")  # fmt: skip
+    return counts
+
+
+@torch.no_grad()
+def _imitation(update: Any) -> dict[str, float | None]:
+    """Mean imitation loss of some decisions of successes, and of failures; equal noise at every call."""
+    found: dict[str, float | None] = {}
+    for name, outcome in (("successes", True), ("failures", False)):
+        rows = np.flatnonzero(update.memory["success"] == outcome)
+        rows = rows[np.random.default_rng(0).permutation(len(rows))[:COMPARED]]
+        found[name] = None
+        if len(rows):
+            with torch.random.fork_rng(), update.adapter.autocast():
+                torch.manual_seed(0)
+                encoded = update.adapter.encode(*update.memory.observations(rows))
+                loss = update.adapter.family.imitation_loss(encoded, update.target(rows))
+            found[name] = float(loss.float().mean())
+    return found

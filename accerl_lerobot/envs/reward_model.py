@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Success as one of LeRobot's reward models sees it, in place of the environment's own.
+
+For environments that cannot tell, such as a real robot behind Gymnasium's interface. The model judges what is
+seen after each executed chunk, at the rollout worker's CPU; an episode ends with the first success.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+
+from accerl_lerobot.checkpoint.safety import Origin, brief, check_remote_code, read_json, tensor_shapes
+from accerl_lerobot.config.ranges import Range, Section
+from accerl_lerobot.envs.base import ChunkResult, World
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.experience import TASK, Observation
+
+REWARD_MODEL = "rollout.reward_model"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RewardModelConfig(Section, section=REWARD_MODEL):
+    """The model that tells success, where the environment does not."""
+
+    path: str | None = None
+    """A reward model that judges single observations, as ``lerobot-train`` makes a
+    ``reward_classifier``: a folder or a Hub id. None: the environment tells."""
+    revision: str | None = None
+    """Hub revision."""
+    threshold: Annotated[float, Range("(0, 1)")] = 0.5
+    """Probability of success, or reward, above which an observation counts as a success."""
+    trust_remote_code: bool = False
+    """True if Python code that comes with the model's encoder on the Hub is run with your rights. It needs
+    `code_revision`."""
+    code_revision: str | None = None
+    """Commit of that code, 40 hexadecimal digits: the one that you have read. No other is run."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_remote_code(self.trust_remote_code, self.code_revision, REWARD_MODEL)
+
+
+@functools.lru_cache(maxsize=1)
+def load_judge(config: RewardModelConfig) -> Callable[[Observation], bool]:
+    """Loads a reward model, one for all worlds of a process; the result tells if an observation is a success.
+
+    Raises:
+        InputError: there is none, it cannot be loaded, or it judges several observations at once.
+    """
+    import torch
+    from lerobot.configs.rewards import RewardModelConfig as LeRobotConfig
+    from lerobot.processor import PolicyProcessorPipeline
+    from lerobot.rewards.factory import get_reward_model_class
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    from accerl_lerobot.checkpoint.layout import BACKBONE
+    from accerl_lerobot.policies.guard import (
+        WEIGHTS,
+        check_origin,
+        check_processor,
+        fetched_checkpoint,
+        guarded,
+    )
+
+    assert config.path is not None
+    origin = Origin(f"{REWARD_MODEL}.path", config.path)
+    folder = fetched_checkpoint(config.path, config.revision, origin.field)
+    fetched = not Path(config.path).expanduser().exists()
+    stored = read_json(folder / "config.json", origin)
+    check_origin(stored.get("model_name"), folder / BACKBONE, "config.json: model_name", origin, fetched)
+    names = [path.name for path in folder.glob("*_preprocessor.json")]
+    if len(names) != 1:
+        raise origin.refuse("*_preprocessor.json", f"{len(names)} of them; lerobot-train writes one")
+    check_processor(folder, names[0], origin, fetched=fetched)
+    register_third_party_plugins()
+    try:
+        with guarded(REWARD_MODEL, config.code_revision), contextlib.redirect_stdout(sys.stderr):
+            theirs = LeRobotConfig.from_pretrained(folder)
+            if theirs.observation_delta_indices is not None:
+                remedy = (
+                    f"{theirs.type} looks at several observations at once; use one that judges each alone"
+                )
+                raise InputError(origin.field, config.path, remedy)
+            theirs.device = "cpu"
+            model = get_reward_model_class(theirs.type).from_pretrained(folder, config=theirs)
+            overrides = {"device_processor": {"device": "cpu"}}
+            prepare = PolicyProcessorPipeline.from_pretrained(
+                folder, config_filename=names[0], overrides=overrides
+            )
+    except InputError:
+        raise
+    except Exception as error:  # LeRobot takes the files at their word, and may fail over any of them
+        remedy = f"it cannot be loaded as one of LeRobot's reward models ({brief(error)})"
+        raise InputError(origin.field, config.path, remedy) from error
+    mine, there = model.state_dict(), tensor_shapes(folder / WEIGHTS, origin).keys()
+    held = {mine[name].data_ptr() for name in there & mine.keys()}  # some have several names
+    if wrong := [name for name, tensor in mine.items() if tensor.data_ptr() not in held]:
+        raise origin.refuse(
+            WEIGHTS, f"{len(wrong)} tensors are missing, {wrong[0]} for instance; save it again"
+        )
+    wanted = {name: tuple(feature.shape) for name, feature in theirs.input_features.items()}
+
+    @torch.no_grad()
+    def succeeded(observation: Observation) -> bool:
+        batch: dict[str, Any] = {TASK: [observation[TASK]]}
+        for name, shape in wanted.items():
+            value = _tensor(observation, name)
+            if value.shape[1:] != shape:
+                remedy = f"its {name} is {shape}, the environment's {tuple(value.shape[1:])}"
+                raise InputError(origin.field, config.path, remedy)
+            batch[name] = value
+        batch = prepare(batch)
+        if hasattr(model, "predict_reward"):
+            return bool(model.predict_reward(batch, threshold=config.threshold)[0])
+        return bool(model.compute_reward(batch)[0] > config.threshold)
+
+    def _tensor(observation: Observation, name: str) -> torch.Tensor:
+        if name not in observation:
+            offers = ", ".join(key for key in observation if key != TASK)
+            raise InputError(
+                origin.field, config.path, f"no {name} in the environment, which offers {offers}"
+            )
+        value = torch.from_numpy(np.asarray(observation[name]))[None]
+        return value.permute(0, 3, 1, 2).float() / 255 if value.dim() == 4 else value.float()
+
+    return succeeded
+
+
+class JudgedWorld(World):
+    """A world whose successes, and rewards, are what a reward model says.
+
+    An episode also ends where the world itself ends it, successfully or not.
+    """
+
+    def __init__(self, world: World, succeeded: Callable[[Observation], bool]) -> None:
+        self._world, self.succeeded, self.spec = world, succeeded, world.spec
+
+    def reset(self, seed: int, task: str) -> Observation:
+        return self._world.reset(seed, task)
+
+    def step_chunk(self, actions: np.ndarray) -> ChunkResult:
+        result = self._world.step_chunk(actions)
+        success = not result.info.get("nonfinite") and self.succeeded(result.observation)
+        rewards = np.zeros_like(result.rewards)
+        rewards[-1] = success
+        return replace(
+            result,
+            rewards=rewards,
+            success=success,
+            terminated=result.terminated or success,
+            truncated=result.truncated and not success,
+        )
+
+    def render(self, height: int, width: int) -> np.ndarray:
+        return self._world.render(height, width)
+
+    def close(self) -> None:
+        self._world.close()

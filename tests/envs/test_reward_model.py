@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""LeRobot's reward models telling success in place of the environment."""
+
+from __future__ import annotations
+
+import json
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.rewards import RewardClassifierConfig, make_reward_pre_post_processors
+from lerobot.rewards.classifier.modeling_classifier import Classifier
+from transformers import ResNetConfig, ResNetModel
+
+from accerl_lerobot.engine.config import LaunchConfig
+from accerl_lerobot.engine.preflight import check_start, check_world
+from accerl_lerobot.engine.run import make_engine
+from accerl_lerobot.envs import JudgedWorld, RewardModelConfig, SimulatedConfig, make_world
+from accerl_lerobot.envs.reward_model import load_judge
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.rollout.runner import RolloutConfig
+from tests.policies.checkpoints import write_smolvla
+from tests.runs import collect, tiny_run
+
+CAMERA = "observation.images.front"
+ENV = SimulatedConfig(image_size=128, max_steps=16)
+MEAN, STD = 0.25, 0.5
+
+
+@pytest.fixture(scope="module")
+def encoder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A network with the shape that LeRobot's classifier expects of its ResNet."""
+    folder = tmp_path_factory.mktemp("encoder")
+    sizes = {"embedding_size": 4, "hidden_sizes": [4, 4, 4, 8], "depths": [1] * 4, "layer_type": "basic"}
+    torch.manual_seed(0)
+    ResNetModel(ResNetConfig(**sizes)).save_pretrained(folder)
+    return folder
+
+
+def write_classifier(folder: Path, encoder: Path, bias: float = 0.0, size: int = 128) -> Classifier:
+    """A random classifier, as ``lerobot-train`` saves one; `bias` of its logit."""
+    torch.manual_seed(0)
+    image = {CAMERA: PolicyFeature(FeatureType.VISUAL, (3, size, size))}
+    config = RewardClassifierConfig(input_features=image, model_name=str(encoder), num_cameras=1)
+    model = Classifier(config).eval()
+    with torch.no_grad():
+        model.classifier_head[-1].bias.add_(bias)
+    model.save_pretrained(folder)
+    stats = {CAMERA: {"mean": torch.full((3, 1, 1), MEAN), "std": torch.full((3, 1, 1), STD)}}
+    for processor in make_reward_pre_post_processors(config, dataset_stats=stats):
+        processor.save_pretrained(folder)
+    return model
+
+
+def test_it_is_asked_for_the_probability_that_lerobot_computes(encoder: Path, tmp_path: Path):
+    model = write_classifier(tmp_path, encoder)
+    world = make_world(ENV)
+    for seed in range(3):
+        observation = world.reset(seed, "match")
+        image = torch.from_numpy(np.asarray(observation[CAMERA]))[None].permute(0, 3, 1, 2) / 255
+        p = model.predict([(image - MEAN) / STD]).probabilities.item()
+        for threshold, expected in ((p - 1e-4, True), (p + 1e-4, False)):
+            judge = load_judge(RewardModelConfig(path=str(tmp_path), threshold=threshold))
+            assert judge(observation) is expected
+
+
+def solved(world: Any, seed: int) -> list[Any]:
+    """Chunks that solve the task, until the episode ends."""
+    world.reset(seed, "match")
+    inner = world._world if isinstance(world, JudgedWorld) else world
+    results = []
+    while not results or not results[-1].done:
+        results.append(world.step_chunk(np.tile(inner.solution, (2, 1))))
+    return results
+
+
+def test_episodes_succeed_and_end_as_it_says(encoder: Path, tmp_path: Path):
+    for name, bias in (("always", 9.0), ("never", -9.0)):
+        write_classifier(tmp_path / name, encoder, bias)
+    always, never = (
+        make_world(ENV, reward_model=RewardModelConfig(path=str(tmp_path / name)))
+        for name in ("always", "never")
+    )
+    (only,) = solved(always, 0)
+    assert only.success and only.terminated and not only.truncated and only.rewards.tolist() == [0.0, 1.0]
+    *_, last = solved(never, 0)
+    assert last.terminated and not last.success and last.rewards.sum() == 0  # the world itself ends it
+    *_, last = solved(make_world(ENV), 0)
+    assert last.success and last.rewards.sum() == 1
+    lasting = make_world(
+        replace(ENV, terminate_on_success=False), reward_model=RewardModelConfig(path=str(tmp_path / "never"))
+    )
+    results = solved(lasting, 0)
+    assert sum(r.steps for r in results) == ENV.max_steps and results[-1].truncated
+
+
+def test_a_run_learns_from_what_it_says(encoder: Path, tmp_path: Path):
+    write_classifier(tmp_path / "always", encoder, 9.0)
+    checkpoint = write_smolvla(tmp_path / "policy", image=128)
+    model = RewardModelConfig(path=str(tmp_path / "always"))
+    rollout = RolloutConfig(worlds=2, segment_length=3, reward_model=model)
+    config = tiny_run(checkpoint, env=ENV, rollout=rollout, launch=LaunchConfig(engine="local"))
+    check_start(config)
+    with closing(make_engine(config, ("match",), history=1)) as engine:
+        engine.train()
+        results = collect(engine, "train", 4)
+    assert all(result.success and result.decisions == 1 for result in results)
+
+
+def edited(folder: Path, **fields: Any) -> None:
+    file = folder / "config.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | fields))
+
+
+def test_what_cannot_judge_is_refused_in_one_line(encoder: Path, tmp_path: Path):
+    def refused(message: str, env: SimulatedConfig = ENV) -> None:
+        with pytest.raises(InputError, match=message):
+            check_world(env, RewardModelConfig(path=str(path)))
+
+    path = tmp_path / "absent"
+    refused(r"^rollout\.reward_model\.path=.*no config\.json there")
+    path = tmp_path / "classifier"
+    write_classifier(path, encoder)
+    refused(
+        r"its observation\.images\.front is \(3, 128, 128\), the environment's \(3, 32, 32\)",
+        SimulatedConfig(),
+    )
+    write_classifier(tmp_path / "b", encoder)
+    path = tmp_path / "b"
+    (path / "classifier_preprocessor.json").unlink()
+    refused(r"\*_preprocessor\.json: 0 of them")
+    path = tmp_path / "c"
+    write_classifier(path, encoder)
+    edited(path, type="sarm")
+    refused("it cannot be loaded|looks at several observations at once")
+    path = tmp_path / "d"
+    write_classifier(path, encoder)
+    edited(path, latent_dim=3)
+    refused("it cannot be loaded as one of LeRobot's reward models")
+
+
+def test_no_code_of_an_encoder_runs_unasked(encoder: Path, tmp_path: Path):
+    write_classifier(tmp_path / "classifier", encoder)
+    hostile = tmp_path / "hostile"
+    hostile.mkdir()
+    marker = tmp_path / "ran"
+    (hostile / "code.py").write_text(f"open({str(marker)!r}, 'w')\n")
+    mapping = {"AutoConfig": "code.Config", "AutoModel": "code.Model"}
+    (hostile / "config.json").write_text(json.dumps({"model_type": "odd", "auto_map": mapping}))
+    edited(tmp_path / "classifier", model_name=str(hostile))
+    with pytest.raises(InputError, match=r"^rollout\.reward_model\.trust_remote_code=.*code that came with"):
+        load_judge(RewardModelConfig(path=str(tmp_path / "classifier")))
+    assert not marker.exists()
+    with pytest.raises(InputError, match=r"rollout\.reward_model\.code_revision=None: name the commit"):
+        RewardModelConfig(path="a/b", trust_remote_code=True)

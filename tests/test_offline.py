@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``accerl offline``: recorded episodes in, a LeRobot checkpoint out."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from lerobot.datasets.dataset_tools import delete_episodes, remove_feature
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from accerl_lerobot.cli import main
+from accerl_lerobot.demos.dataset_files import frames_of
+from accerl_lerobot.demos.record import DemosConfig, record_demos
+from accerl_lerobot.envs import SimulatedConfig
+from accerl_lerobot.metrics import METRICS
+from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.policies.loading import load_adapter
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six successes and two failures."""
+    root = tmp_path_factory.mktemp("recorded") / "dataset"
+    config = DemosConfig(episodes=8, failure_share=0.25, processes=1)
+    record_demos(SimulatedConfig(max_steps=16), config, str(root))
+    return root
+
+
+def arguments(checkpoint: Path, root: Path, out: Path) -> list[str]:
+    fields = {
+        "policy.path": checkpoint,
+        "policy.device": "cpu",
+        "dataset.repo_id": "me/robot",
+        "dataset.root": root,
+        "output_dir": out,
+        "trainer.updates": 30,
+        "trainer.lr": 1e-3,
+        "trainer.warmup_updates": 0,
+        "trainer.value_warmup_updates": 0,
+    }
+    return ["offline", *(f"--{name}={value}" for name, value in fields.items())]
+
+
+@pytest.mark.parametrize("algorithm", ["awr", "self_imitation"])
+def test_the_checkpoint_does_more_of_what_succeeded(
+    algorithm: str, tiny_checkpoint: Path, recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    out = tmp_path / "out"
+    assert main([*arguments(tiny_checkpoint, recorded, out), f"--algorithm.type={algorithm}"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary == json.loads((out / "summary.json").read_text())
+    assert (summary["episodes"], summary["successes"], summary["updates"]) == (8, 6, 30)
+    before, after = (summary["imitation_loss"][when] for when in ("before", "after"))
+    assert after["successes"] < 0.8 * before["successes"]
+    assert after["successes"] - before["successes"] < after["failures"] - before["failures"]
+    kinds = [json.loads(line)["kind"] for line in (out / METRICS).read_text().splitlines()]
+    assert kinds == ["train"] * 2
+    last = out / "checkpoints" / "last" / "pretrained_model"
+    assert Path(summary["policy"]).resolve() == last.resolve()
+    load_adapter(PolicyConfig(path=str(last), device="cpu"))  # as LeRobot's own sampler acts
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (["--algorithm.type=gipo"], "algorithm.type='gipo': .*use awr or self_imitation"),
+        (["--algorithm.type=chunk_critic"], "algorithm.type='chunk_critic': .*use awr or self_imitation"),
+        (["--trainer.ranks=2"], "trainer.ranks=2: .*use 1"),
+        (["--dataset.repo_id=null", "--dataset.root=null"], "dataset.repo_id=None: name a LeRobotDataset"),
+        (["--policy.path=null"], "policy.path=None: give a LeRobot checkpoint"),
+    ],
+    ids=lambda value: value[0] if isinstance(value, list) else "",
+)
+def test_a_mistake_is_one_line_and_leaves_no_folder(
+    wrong: list[str],
+    message: str,
+    tiny_checkpoint: Path,
+    recorded: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+):
+    names = {argument.partition("=")[0] for argument in wrong}
+    given = [
+        a for a in arguments(tiny_checkpoint, recorded, tmp_path / "out") if a.split("=")[0] not in names
+    ]
+    assert main([*given, *wrong]) == 2
+    assert not (tmp_path / "out").exists()
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert re.search(message, error), error
+
+
+def test_episodes_without_labels_are_refused(
+    tiny_checkpoint: Path, recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    data = LeRobotDataset("me/robot", root=recorded)
+    remove_feature(data, ["next.success", "next.reward"], output_dir=tmp_path / "bare", repo_id="me/robot")
+    assert main(arguments(tiny_checkpoint, tmp_path / "bare", tmp_path / "out")) == 2
+    assert "labelled neither by next.success nor next.reward" in capsys.readouterr().err
+    won = [i for i in range(8) if any(bool(frame["next.success"]) for frame in frames_of(data, i))]
+    delete_episodes(data, won, output_dir=tmp_path / "lost", repo_id="me/robot")
+    assert main(arguments(tiny_checkpoint, tmp_path / "lost", tmp_path / "out")) == 2
+    assert "none of its episodes is a success" in capsys.readouterr().err

@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Advantage-weighted regression from a memory: its weights by hand, and where it leads."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from accerl_lerobot.algorithms import AWRConfig
+from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.policies.loading import load_adapter
+from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.trainer.off_policy import AWRUpdate, weights
+from accerl_lerobot.trainer.update import make_update
+from tests.trainer.test_chunk_critic import episode, first_action
+
+
+def learner(checkpoint: Path, algorithm: AWRConfig, **trainer: Any) -> AWRUpdate:
+    torch.manual_seed(0)
+    adapter = load_adapter(PolicyConfig(path=str(checkpoint), device="cpu"))
+    config = TrainerConfig(**{"warmup_updates": 0, "value_warmup_updates": 0, "lr": 1e-3} | trainer)
+    update = make_update(adapter, algorithm, config)
+    assert isinstance(update, AWRUpdate)
+    return update
+
+
+def test_weights_by_hand():
+    advantage = torch.tensor([-1.0, 0.0, 0.5, 2.0, 1e6])
+    expected = [math.exp(-2), 1, math.exp(1), 10, 10]
+    np.testing.assert_allclose(weights(advantage, beta=0.5, cap=10.0), expected, rtol=1e-6)
+    np.testing.assert_allclose(weights(advantage, beta=math.inf, cap=10.0), 1)
+
+
+def test_a_step_weighs_each_row_by_its_advantage(tiny_checkpoint: Path):
+    """Two decisions with known returns, a critic that says 0, and imitation losses of 1 and 3."""
+    update = learner(tiny_checkpoint, AWRConfig(policy_steps=1.0, beta=0.5, cap=5.0), lr=0.0, value_lr=0.0)
+    for value, reward in ((1.0, 0.0), (3.0, 1.0)):
+        update.remember(episode([reward], actions=np.full((1, 4, 2), value, np.float32)))
+    losses = update.adapter.processing.normalise(torch.tensor([1.0, 3.0])[:, None, None].expand(2, 4, 2))
+    update.adapter.family.imitation_loss = lambda encoded, chunk: (
+        chunk[:, 0, 0] + 0 * encoded.features.sum((1, 2))
+    )
+    rows = np.array([0, 1, 1])
+    for _ in range(2):
+        encoded = update.adapter.encode(*update.memory.observations(rows))
+        found = update.weight(rows, encoded)
+        square = 2 / 3  # the mean square of the returns 0, 1, 1 stays the same
+        expected = np.minimum(np.exp(np.array([0.0, 1.0, 1.0]) / math.sqrt(square) / 0.5), 5.0)
+        np.testing.assert_allclose(found, expected, rtol=1e-5)
+    assert update.auxiliary(rows, encoded)["value_loss"].item() == pytest.approx(2 / 3)
+    metrics = update.learn(1)
+    low, high = float(losses[0, 0, 0]), float(losses[1, 0, 0])
+    assert min(low, 5 * high) < metrics["imitation_loss"] < max(low, 5 * high)
+
+
+def test_the_critic_learns_returns_and_leaves_the_policy_alone(tiny_checkpoint: Path):
+    update = learner(tiny_checkpoint, AWRConfig(policy_steps=1.0), lr=0.0, value_lr=3e-2)
+    before = update.adapter.export_trainable()
+    update.remember(episode([0.0, 0.0, 1.0]))
+    for _ in range(60):
+        metrics = update.learn(1)
+        update.version += 1
+    after = update.adapter.export_trainable()
+    changed = {name.split(".")[0] for name in before if not np.array_equal(before[name], after[name])}
+    assert changed == {"value_head"} and metrics["value_loss"] < 0.05
+
+
+@pytest.mark.slow
+def test_it_goes_where_returns_are_high(tiny_checkpoint: Path):
+    """The return is how far the first action goes up; nothing counts as a success."""
+    update = learner(tiny_checkpoint, AWRConfig(policy_steps=0.5, beta=0.3), value_lr=1e-2)
+    rng, before = np.random.default_rng(0), first_action(update)
+    for _ in range(10):
+        actions = rng.uniform(-1, 1, (32, 1, 4, 2)).astype(np.float32)
+        segments = [episode([(1 + float(a[0, 0, 0])) / 2], actions=a) for a in actions]
+        for segment in segments:
+            segment.success = False
+        update.step(segments)
+    assert first_action(update) > before + 0.2
+
+
+def test_what_was_learnt_is_restored_to_the_last_bit(tiny_checkpoint: Path):
+    def step(update: AWRUpdate, seed: int) -> dict[str, float]:
+        torch.manual_seed(seed)
+        return update.step([episode([0.0, 0.0, float(i % 2)], first=i) for i in range(4)])
+
+    one, other = (learner(tiny_checkpoint, AWRConfig()) for _ in range(2))
+    step(one, 0)
+    other.adapter.load_trainable(one.adapter.export_trainable())
+    other.restore(one.state())
+    assert step(one, 1) == step(other, 1)
+    left, right = one.adapter.export_trainable(), other.adapter.export_trainable()
+    assert all(np.array_equal(left[name], right[name]) for name in left)
