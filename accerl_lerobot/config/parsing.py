@@ -110,12 +110,13 @@ def parse(config_class: type[Any], arguments: list[str], *, recipe_class: type[A
         arguments: ``--section.field=value`` or ``--section.field value``; a bare first one is the recipe, or
             bare ones are the entries of the field that `config_class` names in ``BARE``.
         recipe_class: top-level keys of a *file* that this class has and `config_class` has not are ignored,
-            so that one recipe serves several verbs.
+            and ``output_dir`` is, so that one recipe serves several verbs.
     """
     path, given = read_arguments(arguments, getattr(config_class, "BARE", None))
     tree = {} if path is None else read_recipe(path)
     if recipe_class is not None:
-        other = _names(recipe_class) - _names(config_class)
+        # A run's own config is a recipe too, and its folder is taken.
+        other = _names(recipe_class) - _names(config_class) | {"output_dir"}
         tree = {key: value for key, value in tree.items() if key not in other}
     _discover(config_class, given, ())
     merged = _overridden(config_class, tree, given)
@@ -224,7 +225,8 @@ def read_recipe(path: Path) -> dict[str, Any]:
     """The tree in a YAML (or JSON) file, or in one of `shipped_recipes`."""
     if not path.is_file():
         shipped = shipped_recipes()
-        path = shipped.get(str(path), path)
+        bare = path.stem if str(path.parent) == RECIPES else str(path)  # as in the repository
+        path = shipped.get(bare, path)
     if not path.is_file():
         names = [*(str(p) for p in path.parent.glob("*.y*ml")), *shipped]
         near = difflib.get_close_matches(str(path), names, n=3)

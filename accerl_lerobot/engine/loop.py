@@ -43,8 +43,8 @@ RECORD_EVERY = 10
 RECENT = 100
 """Exploring episodes over which the training success of the curve is averaged."""
 _STATE = (
-    "before", "evaluations", "curve", "recent", "explored", "lags", "lag_max", "mismatch_max", "during",
-    "base", "steps", "evaluated", "saved",
+    "before", "evaluations", "curve", "recent", "explored", "won", "lags", "lag_max", "mismatch_max",
+    "during", "base", "steps", "evaluated", "saved",
 )  # fmt: skip
 
 
@@ -202,6 +202,8 @@ class Loop:
         self.recent: list[bool] = []
         self.explored = 0
         """Exploring episodes that have ended."""
+        self.won = 0
+        """Successes among them."""
         self.lags: list[float] = []
         self.lag_max = self.mismatch_max = 0.0
         self.during: dict[str, list[EpisodeResult]] = {}
@@ -233,6 +235,11 @@ class Loop:
         last = self._train()
         self.steps = self._steps(last)
         self._save()
+        if self.explored and not self.won:
+            self.console.say(
+                f"none of {self.explored} exploring episodes succeeded; where success is the only reward "
+                "there was nothing to learn from: see docs/troubleshooting.md"
+            )
         after, results = self._evaluate("after", evaluation.episodes, self.steps)
         if any(result.frames for result in filmed):
             film = self.directory / "before_after.mp4"
@@ -350,6 +357,7 @@ class Loop:
         self._record_updates(progress.updates)
         explored = [e for e in progress.episodes if e.plan.explore]
         self.explored += len(explored)
+        self.won += sum(e.success for e in explored)
         self.recent = (self.recent + [e.success for e in explored])[-RECENT:]
         share = float(np.mean(self.recent)) if self.recent else math.nan
         # The first episodes to end are the short ones, which are successes.

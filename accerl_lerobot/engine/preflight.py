@@ -97,9 +97,16 @@ def check_start(config: RunConfig) -> int:
         check_absent(expanded(config.output_dir, "output_dir"))
     check_machine(config)
     if config.policy.path is None and not config.sft.steps:
-        remedy = "give a LeRobot checkpoint, or sft.steps > 0 to make one; recipes/quickstart.yaml does"
+        remedy = "give a LeRobot checkpoint, or sft.steps > 0 to make one; the recipe quickstart does"
         raise InputError("policy.path", None, remedy)
     resolve_device(config.policy.device)  # refuses one that is not there
+    if 0 < config.trainer.updates <= config.trainer.value_warmup_updates:
+        logger.warning(
+            "the policy will not change: trainer.updates=%d is not above trainer.value_warmup_updates=%d, "
+            "and in those only the critic learns; use more updates, or a shorter warm-up",
+            config.trainer.updates,
+            config.trainer.value_warmup_updates,
+        )
     check_wandb(config.wandb)
     policy = policy_to_be(config)
     check_weights_fit(config)

@@ -20,6 +20,8 @@ from accerl_lerobot.envs.base import EnvConfig, EpisodeWorld, Step, WorldSpec
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Observation
 
+FPS = 20
+"""Control rate of environments that name none."""
 RENDER = "render"
 """In `GymConfig.images`: the picture that the environment renders."""
 
@@ -57,8 +59,8 @@ class GymConfig(EnvConfig):
     """Key of the environment's ``info`` that is true once the task is achieved; empty: its ``terminated``."""
     task: str = ""
     """Instruction text."""
-    fps: Annotated[int, Range("[1, 1000]")] = 20
-    """Control rate in Hz, for datasets and videos."""
+    fps: Annotated[int, Range("[1, 1000]")] | None = None
+    """Control rate in Hz, for datasets and videos. None: the environment's ``render_fps``, or 20."""
     reward: Literal["success", "env"] = "success"
     """``success`` (1.0 at the first success, else 0.0) or ``env`` (the environment's own)."""
 
@@ -112,7 +114,7 @@ class GymWorld(EpisodeWorld):
             action_dim=space.shape[0],
             action_low=np.asarray(space.low, np.float32),
             action_high=np.asarray(space.high, np.float32),
-            fps=config.fps,
+            fps=config.fps or int(self._env.metadata.get("render_fps") or FPS),
             max_steps=config.max_steps,
             tasks=(config.id,),
             instructions=(config.task,) if config.task else (),

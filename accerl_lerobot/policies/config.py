@@ -254,7 +254,7 @@ def sampler_config(config: PolicyConfig, policy_type: str) -> SamplerConfig:
         default: SamplerConfig = SamplerConfig.get_choice_class(families[0])()
         return default
     if config.sampler.type not in families:
-        remedy = f"a {policy_type} policy explores by {' or '.join(families)}"
+        remedy = f"use {' or '.join(families)}: the policy is of type {policy_type}"
         raise InputError("policy.sampler.type", config.sampler.type, remedy)
     return config.sampler
 

@@ -103,7 +103,11 @@ def check_features(
         image = len(shape) == 3
         if name not in shapes:
             same = [k for k, other in shapes.items() if len(other) == len(shape) and k != ACTION]
-            remedy = "; choose env.camera accordingly, or map names with policy.rename_map" if image else ""
+            remedy = (
+                "; choose env.camera (env.images of gym), or map names with policy.rename_map"
+                if image
+                else ""
+            )
             offers = ", ".join(same) or "none"
             raise InputError(field, value, f"no {name} in the {offerer}, which offers {offers}{remedy}")
         skip = 1 if image and needed.any_size else len(shape)
@@ -113,7 +117,7 @@ def check_features(
                 field, value, f"its {name} is {shape}, but {shapes[name]} in the {offerer}; {remedy}"
             )
     if needed.fps and offered.fps and not math.isclose(needed.fps, offered.fps):
-        remedy = "its actions would be executed at another rate; use a dataset of this rate"
+        remedy = "its actions would be executed at another rate; use a dataset of this rate, or set env.fps"
         raise InputError(field, value, f"recorded at {needed.fps:g} Hz, but the environment runs at "
                          f"{offered.fps:g} Hz: {remedy}")  # fmt: skip
     _check_tasks(needed.tasks, offered.tasks, field, value)

@@ -148,7 +148,7 @@ def test_a_config_of_something_else(damaged: Any, text: str | None, why: str):
         ("pi0_fast", {"n_action_steps": 3}, {}, "policy.n_action_steps=3: LeRobot decodes so many rows from"),
         ("pi0_fast", {}, {"num_steps": 3}, "policy.num_steps=3: a pi0_fast policy does not denoise"),
         ("smolvla", {}, {"n_action_steps": 5}, "policy.n_action_steps=5: use 1 to 4, the chunk the policy"),
-        ("act", {}, {"sampler": FlowSamplerConfig()}, "policy.sampler.type='flow': a act policy explores"),
+        ("act", {}, {"sampler": FlowSamplerConfig()}, "policy.sampler.type='flow': use gaussian: the policy is of type act"),
     ],
 )  # fmt: skip
 def test_options_under_which_its_density_would_be_another(
