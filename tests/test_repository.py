@@ -34,7 +34,6 @@ SHELLS = ENGINE | {
     "worker.py",
     "imagination.py",
     "peers.py",
-    "factory.py",
     "endpoint.py",
 }
 """Files that may import Ray; all others are testable without it."""
@@ -52,7 +51,7 @@ LIGHT = [
     "accerl_lerobot.rollout.worker",
     "accerl_lerobot.timeline",
     "accerl_lerobot.trainer.config",
-    "accerl_lerobot.weights.factory",
+    "accerl_lerobot.transport.weights",
 ]
 """Modules of processes that hold no policy: torch and LeRobot would cost each 400 MB and four seconds."""
 

@@ -35,7 +35,14 @@ from accerl_lerobot.engine.config import RunConfig, journal_folder, timeline_fol
 from accerl_lerobot.engine.loop import Engine, Progress, Saved
 from accerl_lerobot.engine.placement import actor_options, place_workers
 from accerl_lerobot.engine.ray_session import RaySession
-from accerl_lerobot.engine.replicas import START_S, ActorHandle, InferenceReplicas, RolloutWorkers
+from accerl_lerobot.engine.replicas import (
+    START_S,
+    InferencePlace,
+    InferenceReplicas,
+    RolloutPlace,
+    RolloutWorkers,
+    Worker,
+)
 from accerl_lerobot.engine.stopping import WorkerError
 from accerl_lerobot.inference.batcher import BatcherStats
 from accerl_lerobot.policies.config import Load
@@ -54,7 +61,7 @@ BLAME_S = 10.0
 """How long to wait for the failure that another failure is the consequence of."""
 
 
-def end(workers: Iterable[ActorHandle], *, told: bool = True) -> None:
+def end(workers: Iterable[Worker], *, told: bool = True) -> None:
     """End workers and wait until they are gone, so that nothing writes any more when others start.
 
     Args:
@@ -96,10 +103,10 @@ class RayEngine(Engine):
         self._version = 0 if state is None else saved_version(state)
         self._rollouts = RolloutWorkers(config, tasks, history, state)
         self._inference = InferenceReplicas(config, self._version, state, load, self._move)
-        self._others: list[ActorHandle] = []
+        self._others: list[Worker] = []
         """All other workers."""
-        self._imaginer: ActorHandle | None = None
-        self._learner: ActorHandle | None = None
+        self._imaginer: Worker | None = None
+        self._learner: Worker | None = None
         self._updates: list[dict[str, float]] = []
         self._metrics: dict[str, dict[str, float]] = {}
         """Last metrics by worker; of inference as of one."""
@@ -123,13 +130,13 @@ class RayEngine(Engine):
     def train(self) -> None:
         self._training, self._last_change = True, time.monotonic()
         self.follow(self._config.launch.schedule)
-        readers = self._inference.publishing(self._trainer.actor)
-        self._trainer.work = self._trainer.actor.run.remote(
-            self._replay.actor, readers, self._config.launch.transport
-        )
+        self._inference.trainer = self._trainer.actor
+        self._trainer.work = self._trainer.actor.run.remote(self._replay.actor, self._deciding)
         if (imaginer := self._imaginer) is None:
             return
-        imaginer.work = imaginer.actor.run.remote(self._imaginer_asks, self._inserting, self._replay.actor)
+        # The last replica: the first ones may have one rollout worker more.
+        asks = self._deciding[-1]
+        imaginer.work = imaginer.actor.run.remote(asks, self._inserting, self._replay.actor)
         if self._learner is not None:
             self._learner.work = self._learner.actor.run.remote(imaginer.actor, self._replay.actor)
 
@@ -173,14 +180,13 @@ class RayEngine(Engine):
         # Records that the trainer has sent come first: `hold` returns the rest, up to its version.
         told = self._updates + (self._hear(self._trainer, self._limit) or [])
         self._updates = []
-        timeouts = {"timeout": max(START_S, self._limit), "silence": self._limit}  # files may be large
         version, records = self._trainer.call("hold", timeout=self._limit)  # it waits for an update at most
         # At once, so that little comes in that was decided by weights of later updates. The imaginer may
         # know of more than replay then; it is told anew of what comes after.
-        self._replay.call("save", state, version, **timeouts)
+        self._replay.call("save", state, version, timeout=self._limit)
         for worker in filter(None, (self._learner, self._imaginer)):
-            worker.call("save", directory, **timeouts)
-        self._trainer.call("write", directory, **timeouts)
+            worker.call("save", directory, timeout=self._limit)
+        self._trainer.call("write", directory, timeout=self._limit)
         self._rollouts.save(state)
         self._last_change = time.monotonic()
         return Saved(version, told + records)
@@ -206,7 +212,7 @@ class RayEngine(Engine):
         """Batches of the inference replicas so far."""
         return self._inference.batching()
 
-    def _everyone(self) -> Iterator[ActorHandle]:
+    def _everyone(self) -> Iterator[Worker]:
         """All workers, those that others depend on first."""
         yield from self._inference.workers()
         yield from self._others
@@ -250,22 +256,20 @@ class RayEngine(Engine):
         for worker, reference in ready:
             here = plan.places[worker.name].node.number == 0
             worker.await_start(reference, max(START_S, self._limit), here)
-        deciding = self._inference.open()
+        self._deciding = self._inference.open()  # the rollout workers share this list, see `_move`
         self._inserting = self._replay.endpoint("insert", c.launch.transport, self._limit)
-        # The last replica: the first ones may have one rollout worker more.
-        self._imaginer_asks = deciding[-1]
         self._replay.work = self._replay.actor.run.remote()
-        self._rollouts.run(deciding, self._inserting)
+        self._rollouts.run(self._deciding, self._inserting)
 
-    def _add(self, name: str, actor: Any) -> ActorHandle:
-        self._others.append(ActorHandle(name, actor))
+    def _add(self, name: str, actor: Any) -> Worker:
+        self._others.append(Worker(name, actor))
         return self._others[-1]
 
     def _move(self, index: int, inference: Endpoint) -> None:
         """Tell the clients of an inference replica its new endpoint."""
+        self._deciding[index] = inference
         self._rollouts.move(index, inference)
-        if self._imaginer is not None and index == self._config.inference.workers - 1:
-            self._imaginer_asks = inference
+        if self._imaginer is not None and index == len(self._deciding) - 1:
             self._imaginer.call("move", inference, timeout=self._limit)
         self._last_change = time.monotonic()  # a restart has timeouts of its own
 
@@ -285,7 +289,7 @@ class RayEngine(Engine):
             if reference in ended and worker.work is reference:
                 self._ended(worker)
 
-    def _ended(self, worker: ActorHandle) -> None:
+    def _ended(self, worker: Worker) -> None:
         """Handle the end of a worker's long call: restart it, finish, or raise."""
         reference, worker.work = worker.work, None
         try:
@@ -293,9 +297,13 @@ class RayEngine(Engine):
         except RayError as error:
             if isinstance(error, RayTaskError) and isinstance(error.cause, RayError | ServiceStoppedError):
                 self._blame()
-            if self._inference.restart_worker(worker, error) or self._rollouts.restart_worker(worker, error):
-                return
-            raise WorkerError(f"{worker.name} worker failed for good:\n{error}") from error
+            if isinstance(worker, InferencePlace):
+                self._inference.restart(worker, error)
+            elif isinstance(worker, RolloutPlace):
+                self._rollouts.restart(worker, error)
+            else:
+                raise WorkerError(f"{worker.name} worker failed for good:\n{error}") from error
+            return
         if worker is self._trainer:
             self._finish(int(result))
         elif not (self._done and worker in (self._replay, self._learner, self._imaginer)):
@@ -333,7 +341,7 @@ class RayEngine(Engine):
             self._replay.call("end_real", timeout=self._limit)
         return episodes
 
-    def _hear(self, worker: ActorHandle, timeout: float = 0.0) -> Any:
+    def _hear(self, worker: Worker, timeout: float = 0.0) -> Any:
         try:
             return worker.answer(timeout)
         except RayError as error:

@@ -267,7 +267,7 @@ def policy_gib(config: RunConfig) -> float:
     sizes, processes, copies = policy_sizes(config.policy), 1, trained_copies(config)
     if config.launch.engine != "local":
         processes = config.trainer.ranks + config.inference.workers
-        copies += 2  # two sets are published
+        copies += 2 * config.inference.workers  # sets under way
     return 4 * (sizes.policy * processes + sizes.trained * copies) / 2**30
 
 

@@ -31,6 +31,14 @@ class Endpoint:
     """Method of its Ray actor handle."""
     address: Address | None = None
     """Address of its shared memory; None: it can only be reached through Ray."""
+    actor: Any = None
+    """Ray's handle of its process."""
+
+    def kill(self) -> None:
+        """End its process."""
+        import ray
+
+        ray.kill(self.actor)
 
     def connect(self) -> Client:
         """Open a connection for this process."""

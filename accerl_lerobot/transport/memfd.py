@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 ALIGNMENT = 64
 """Alignment of arrays in shared memory, in bytes: a cache line."""
-LARGEST = 2**31
+LARGEST = 2**40
 """Bytes of a slot at most."""
 LEAST = 2**16
 """Bytes of a slot at least; the reply is written behind the message."""
