@@ -140,12 +140,12 @@ def what_does_not_fit_is_refused(made: Cluster, second: Any, monkeypatch: pytest
     key = next(n["NodeID"] for n in _nodes(address) if "sim" in n["Resources"])
     honest = planning.report_node
 
-    def report(policy: Path | None, marker: Path | None) -> Any:
+    def report(folders: list[Path]) -> Any:
         import ray
 
-        versions, *seen = honest(policy, marker)
+        versions, seen = honest(folders)
         there = ray.is_initialized() and ray.get_runtime_context().get_node_id() == key
-        return versions | ({"lerobot": "0.0"} if there else {}), *seen
+        return versions | ({"lerobot": "0.0"} if there else {}), seen
 
     with monkeypatch.context() as patch:
         patch.setattr(planning, "report_node", report)

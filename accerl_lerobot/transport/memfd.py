@@ -28,13 +28,8 @@ SLOTS = 64
 """Slots of one client at most, and so messages that it may have under way. Their tokens fit into the buffers
 of the two sockets, so no end ever waits for the other one to read."""
 _TOKEN = struct.Struct("<BIQQQd")
-_ONE_FILE = socket.CMSG_LEN(struct.calcsize("i"))
 ASK, ANSWER, FAIL = range(3)
 """Purpose of a token."""
-
-
-class DamagedTokenError(ValueError):
-    """A token or a slot that the other end should not have sent."""
 
 
 @functools.cache
@@ -57,15 +52,11 @@ def new_memory(size: int) -> int:
     file = os.memfd_create("accerl", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
     try:
         os.ftruncate(file, size)
-        fcntl.fcntl(file, fcntl.F_ADD_SEALS, _seals())
+        fcntl.fcntl(file, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL)
     except BaseException:
         os.close(file)
         raise
     return file
-
-
-def _seals() -> int:
-    return fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
 
 
 def new_name() -> str:
@@ -120,14 +111,8 @@ class Slot:
     """
 
     def __init__(self, file: int) -> None:
-        try:
-            self.size = os.fstat(file).st_size
-            sealed = fcntl.fcntl(file, fcntl.F_GET_SEALS) & _seals() == _seals()
-            if not LEAST <= self.size <= LARGEST or not sealed:
-                raise DamagedTokenError(f"no slot, but a file of {self.size} bytes whose size may change")
-            self.memory = mmap.mmap(file, self.size)
-        except OSError as error:
-            raise DamagedTokenError(f"a slot that cannot be mapped: {error}") from error
+        self.size = os.fstat(file).st_size
+        self.memory = mmap.mmap(file, self.size)
 
 
 def new_slot(size: int) -> int:
@@ -151,17 +136,11 @@ def send_token(connection: socket.socket, token: Token, file: int | None = None)
 
 def receive_token(connection: socket.socket) -> tuple[Token, Slot | None] | None:
     """The next token, and the slot that came with it; None if the other end is gone."""
-    packet, ancillary, _, _ = connection.recvmsg(_TOKEN.size + 1, _ONE_FILE)
-    file = None
-    for level, kind, data in ancillary:
-        if level == socket.SOL_SOCKET and kind == socket.SCM_RIGHTS:
-            (file,) = struct.unpack("i", data)  # the kernel drops further ones, as there is no room
-    try:
-        if not packet:
-            return None
-        if len(packet) != _TOKEN.size:
-            raise DamagedTokenError(f"a token of {len(packet)} bytes")
-        return Token._make(_TOKEN.unpack(packet)), None if file is None else Slot(file)
-    finally:
-        if file is not None:
-            os.close(file)
+    packet, files, _, _ = socket.recv_fds(connection, _TOKEN.size, 1, socket.MSG_CMSG_CLOEXEC)
+    if not packet:
+        return None
+    slot = None
+    if files:
+        slot = Slot(files[0])
+        os.close(files[0])
+    return Token._make(_TOKEN.unpack(packet)), slot

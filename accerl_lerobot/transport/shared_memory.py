@@ -21,7 +21,7 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from accerl_lerobot.transport.codec import DamagedMessageError, decode, encode
+from accerl_lerobot.transport.codec import decode, encode
 from accerl_lerobot.transport.contract import Client, PendingRequest, Server, ServiceStoppedError
 from accerl_lerobot.transport.memfd import (
     ANSWER,
@@ -29,7 +29,6 @@ from accerl_lerobot.transport.memfd import (
     FAIL,
     LEAST,
     SLOTS,
-    DamagedTokenError,
     Slot,
     Token,
     aligned,
@@ -108,7 +107,7 @@ class SharedMemoryClient(Client):
                 replies.append(self._read(*received))
                 if not self._under_way:
                     break
-        except (OSError, DamagedTokenError, DamagedMessageError) as error:
+        except OSError as error:
             raise self._gone(error) from error
         return replies
 
@@ -118,13 +117,11 @@ class SharedMemoryClient(Client):
 
     def _read(self, token: Token, slot: Slot | None) -> tuple[int, object]:
         """Copy a reply out, which frees its slot."""
-        index = self._under_way.pop(token.ticket, -1)
-        if index != token.slot:
-            raise self._gone(f"a reply to message {token.ticket}, which was not asked")
+        index = self._under_way.pop(token.ticket)
         if slot is not None:
             self._slots[index] = slot
         self._free.append(index)
-        reply = decode(self._slots[index].memory, token.start, token.size)
+        reply = decode(self._slots[index].memory, token.start)
         if token.purpose == FAIL:
             raise ServiceStoppedError(f"{self.name}: {reply}")
         return token.ticket, reply
@@ -189,7 +186,7 @@ class SharedMemoryServer(Server):
             for descriptor, _ in events:
                 connection = self._connections.get(descriptor)
                 if connection is not None:
-                    received += self._receive(connection)
+                    received += filter(None, [self._receive(connection)])
                 elif descriptor == self._listener.fileno():
                     self._accept()
                 elif descriptor == self._event.fileno():
@@ -219,20 +216,18 @@ class SharedMemoryServer(Server):
         self._connections[end.fileno()] = _Connection(end, self._drop)
         self._epoll.register(end, select.EPOLLIN)
 
-    def _receive(self, connection: _Connection) -> list[PendingRequest]:
-        """The client's next message; empty if it is gone, or has sent what no client sends."""
+    def _receive(self, connection: _Connection) -> PendingRequest | None:
+        """The client's next message; None if there is none, or it is gone."""
         try:
             received = receive_token(connection.socket)
-            if received is not None:
-                return connection.take(*received, self._copy)
         except BlockingIOError:
-            return []
+            return None
         except ConnectionError:
-            pass
-        except DamagedTokenError as error:
-            logger.warning("a client was dropped: %s", error)
-        self._drop(connection)
-        return []
+            received = None
+        if received is None:
+            self._drop(connection)
+            return None
+        return connection.take(*received, self._copy)
 
     def _drop(self, connection: _Connection) -> None:
         """Forget a client; its slots go with the last view of them."""
@@ -250,23 +245,14 @@ class _Connection:
         self.socket, self._drop = end, drop
         self.closed = False
         self.slots: dict[int, Slot] = {}
-        self._busy: set[int] = set()
 
-    def take(self, token: Token, slot: Slot | None, copy: bool) -> list[PendingRequest]:
-        """The message of a token; empty if it was answered here because it cannot be read."""
-        if slot is not None and token.slot < SLOTS and token.slot not in self._busy:
+    def take(self, token: Token, slot: Slot | None, copy: bool) -> PendingRequest:
+        """The message of a token."""
+        if slot is not None:
             self.slots[token.slot] = slot
-        known = token.purpose == ASK and token.slot in self.slots and token.slot not in self._busy
-        if not known or token.start + token.size > self.slots[token.slot].size:
-            raise DamagedTokenError(f"a token that makes no sense: {token}")
-        self._busy.add(token.slot)
         request = _RemoteRequest(self, token)
-        try:
-            request.message = decode(self.slots[token.slot].memory, token.start, token.size, copy=copy)
-        except DamagedMessageError as error:
-            request.fail(error)
-            return []
-        return [request]
+        request.message = decode(self.slots[token.slot].memory, token.start, copy=copy)
+        return request
 
     def reply(self, purpose: int, asked: Token, reply: object) -> None:
         """Write it behind the message, whose arrays it may consist of, or into a larger slot."""
@@ -276,7 +262,6 @@ class _Connection:
             file = new_slot(start + encoded.size)
             self.slots[asked.slot], start = Slot(file), 0
         encoded.write(self.slots[asked.slot].memory, start)
-        self._busy.discard(asked.slot)
         token = Token(purpose, asked.slot, asked.ticket, start, encoded.size, asked.sent)
         try:
             send_token(self.socket, token, file)
