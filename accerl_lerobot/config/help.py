@@ -146,13 +146,9 @@ def _types(choices: Mapping[str, type[Any]], name: str, default: Any) -> list[Li
     usual = {kind: default if getattr(default, TYPE, None) == kind else None for kind in choices}
     owners: dict[Line, list[str]] = {}
     for kind, subclass in choices.items():
-        plain = (
-            line
-            for line in _listed(subclass, f"{name}.", usual[kind])
-            if "." not in line.name[len(name) + 1 :]
-        )
-        for line in plain:
-            owners.setdefault(line, []).append(kind)
+        for line in _listed(subclass, f"{name}.", usual[kind]):
+            if "." not in line.name.removeprefix(f"{name}."):
+                owners.setdefault(line, []).append(kind)
     common: dict[tuple[str, ...], list[Line]] = {}
     for line, kinds in owners.items():
         if len(kinds) > 1 and line.default is not None:

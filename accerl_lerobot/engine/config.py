@@ -21,6 +21,7 @@ from accerl_lerobot.config.parsing import decode, encode, parse
 from accerl_lerobot.config.ranges import (
     DatasetConfig,
     NonNegative,
+    Pattern,
     Positive,
     Range,
     Section,
@@ -40,10 +41,12 @@ from accerl_lerobot.replay.pacing import ASYNCHRONOUS, ReplayConfig, Schedule
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.timeline import TIMELINE
 from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.transport.endpoint import Transport
 from accerl_lerobot.world_model.config import ImaginationConfig
 
 __all__ = ["DatasetConfig", "LaunchConfig", "RunConfig", "check_chunk", "decode", "encode", "parse"]
+
+
+Nodes = Annotated[str, Pattern(r".*\S.*", "a node's number, a resource, or all")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,21 +57,14 @@ class PlacementConfig(Section, section="launch.placement"):
     custom resource, as in ``ray start --resources='{"simulators": 1}'``; or all. None: node 0.
     """
 
-    trainer: str | None = None
+    trainer: Nodes | None = None
     """Nodes of the trainer's ranks."""
-    inference: str | None = None
+    inference: Nodes | None = None
     """Nodes of the inference replicas."""
-    imagination: str | None = None
+    imagination: Nodes | None = None
     """Nodes of the worker that imagines, and of the one that trains the world model."""
-    rollout: str | None = None
+    rollout: Nodes | None = None
     """Nodes of the rollout workers."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name, nodes in vars(self).items():
-            if nodes is not None and not nodes.strip():
-                remedy = "name a node's number or resource, or use all"
-                raise InputError(f"{self.SECTION}.{name}", nodes, remedy)
 
     @property
     def elsewhere(self) -> bool:
@@ -92,9 +88,6 @@ class LaunchConfig(Section, section="launch"):
     """asynchronous: no worker waits for another. synchronous: a batch is collected, by all environments in
     lock step, then learned from. overlap: the next one is collected meanwhile. The last two are for measuring
     what the first gains; with several inference replicas, the environments of each are in step."""
-    transport: Transport = "auto"
-    """Transport of requests, segments and weights. auto: shared memory between processes of one node, if the
-    system has it, and Ray otherwise. ray: always Ray."""
     stall_s: Positive = 300.0
     """Timeout in seconds for an answer of a worker, a step of an environment, and any progress of the run.
 

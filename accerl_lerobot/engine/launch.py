@@ -257,7 +257,7 @@ class RayEngine(Engine):
             here = plan.places[worker.name].node.number == 0
             worker.await_start(reference, max(START_S, self._limit), here)
         self._deciding = self._inference.open()  # the rollout workers share this list, see `_move`
-        self._inserting = self._replay.endpoint("insert", c.launch.transport, self._limit)
+        self._inserting = self._replay.endpoint("insert", self._limit)
         self._replay.work = self._replay.actor.run.remote()
         self._rollouts.run(self._deciding, self._inserting)
 

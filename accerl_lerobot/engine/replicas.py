@@ -41,7 +41,8 @@ from accerl_lerobot.policies.config import Load
 from accerl_lerobot.rollout.plans import budgets, incarnation_after
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.rollout.worker import Report
-from accerl_lerobot.transport.endpoint import Endpoint, Transport, uses_shared_memory
+from accerl_lerobot.transport.endpoint import Endpoint
+from accerl_lerobot.transport.memfd import available
 
 logger = logging.getLogger(__name__)
 
@@ -102,9 +103,9 @@ class Worker:
             with contextlib.suppress(psutil.NoSuchProcess):  # the next question will tell
                 self.process = psutil.Process(pid)
 
-    def endpoint(self, method: str, transport: Transport, timeout: float) -> Endpoint:
+    def endpoint(self, method: str, timeout: float) -> Endpoint:
         """Where other workers reach this method."""
-        address = self.call("listen", timeout=timeout) if uses_shared_memory(transport) else None
+        address = self.call("listen", timeout=timeout) if available() else None
         handle = getattr(self.actor, method)
         return Endpoint(name=self.name, method=handle, address=address, actor=self.actor)
 
@@ -537,7 +538,7 @@ class InferenceReplicas(Replicas[InferencePlace]):
         return None
 
     def _serve(self, worker: InferencePlace) -> Endpoint:
-        endpoint = worker.endpoint("decide", self._launch.transport, self._launch.stall_s)
+        endpoint = worker.endpoint("decide", self._launch.stall_s)
         worker.work, worker.since = worker.actor.serve.remote(), time.monotonic()
         return endpoint
 

@@ -7,13 +7,11 @@ import threading
 import time
 from collections import deque
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 from accerl_lerobot.transport.contract import Client, ServiceStoppedError
 from accerl_lerobot.transport.memfd import available
 from accerl_lerobot.transport.shared_memory import Address, SharedMemoryClient, this_node
-
-Transport = Literal["auto", "ray"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,11 +43,6 @@ class Endpoint:
         if self.address is not None and available() and self.address.node == this_node():
             return SharedMemoryClient(self.name, self.address)
         return RayClient(self.name, self.method)
-
-
-def uses_shared_memory(transport: Transport) -> bool:
-    """True if services are to offer shared memory."""
-    return transport != "ray" and available()
 
 
 class RayClient(Client):

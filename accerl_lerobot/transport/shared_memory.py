@@ -186,7 +186,7 @@ class SharedMemoryServer(Server):
             for descriptor, _ in events:
                 connection = self._connections.get(descriptor)
                 if connection is not None:
-                    received += filter(None, [self._receive(connection)])
+                    received += self._receive(connection)
                 elif descriptor == self._listener.fileno():
                     self._accept()
                 elif descriptor == self._event.fileno():
@@ -216,18 +216,18 @@ class SharedMemoryServer(Server):
         self._connections[end.fileno()] = _Connection(end, self._drop)
         self._epoll.register(end, select.EPOLLIN)
 
-    def _receive(self, connection: _Connection) -> PendingRequest | None:
-        """The client's next message; None if there is none, or it is gone."""
+    def _receive(self, connection: _Connection) -> list[PendingRequest]:
+        """The client's next message; empty if there is none, or it is gone."""
         try:
             received = receive_token(connection.socket)
         except BlockingIOError:
-            return None
+            return []
         except ConnectionError:
             received = None
         if received is None:
             self._drop(connection)
-            return None
-        return connection.take(*received, self._copy)
+            return []
+        return [connection.take(*received, self._copy)]
 
     def _drop(self, connection: _Connection) -> None:
         """Forget a client; its slots go with the last view of them."""

@@ -61,5 +61,3 @@ ITSELF.append(ITSELF)
 def test_what_cannot_be_sent_is_refused(message: Any, said: str):
     with pytest.raises(TypeError, match=said):
         encode(message)
-
-
