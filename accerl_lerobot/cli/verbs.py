@@ -29,7 +29,7 @@ from accerl_lerobot.config.ranges import Device, NewFolder, Section, Seed
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.record import DemosConfig
 from accerl_lerobot.demos.sft import SFTConfig
-from accerl_lerobot.engine.config import DatasetConfig, LaunchConfig, RunConfig, check_chunk, encode, parse
+from accerl_lerobot.engine.config import DatasetConfig, LaunchConfig, RunConfig, encode, parse
 from accerl_lerobot.envs import EnvConfig, MetaWorldConfig
 from accerl_lerobot.errors import InputError, check_absent, expanded, is_full, kept_traceback, make_folder
 from accerl_lerobot.evaluation import EvaluationConfig
@@ -76,11 +76,6 @@ class SFTRun(NewFolderRun):
     """When given, the dataset is checked against it first."""
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     sft: SFTConfig = field(default_factory=SFTConfig)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.sft.init_path is None:
-            check_chunk(self.sft.policy)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,7 +162,8 @@ def demos(arguments: list[str]) -> int:
     """``accerl demos``."""
     config: DemosRun = parse(DemosRun, arguments, recipe_class=RunConfig)
     from accerl_lerobot.demos.record import record_demos
-    from accerl_lerobot.engine.preflight import check_disk, check_world, demos_bytes
+    from accerl_lerobot.engine.preflight import check_world
+    from accerl_lerobot.engine.sizes import check_disk, demos_bytes
 
     with redirect_stdout(sys.stderr):
         check_disk(config.root, demos_bytes(config.demos, check_world(config.env)), "root")
@@ -186,7 +182,8 @@ def sft(arguments: list[str]) -> int:
     from accerl_lerobot.demos.dataset_files import task_texts
     from accerl_lerobot.demos.sft import run_sft
     from accerl_lerobot.engine import run
-    from accerl_lerobot.engine.preflight import check_disk, check_training_data, check_world, sft_policy
+    from accerl_lerobot.engine.preflight import check_training_data, check_world, sft_policy
+    from accerl_lerobot.engine.sizes import check_disk
     from accerl_lerobot.policies.loading import resolve_device
 
     device = str(resolve_device(config.device, "device"))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from accerl_lerobot.algorithms import (
     AlgorithmConfig,
@@ -27,7 +27,6 @@ from accerl_lerobot.config.ranges import (
     Section,
     Seed,
     Steps,
-    check,
 )
 from accerl_lerobot.demos.record import DemosConfig
 from accerl_lerobot.demos.sft import SFTConfig
@@ -43,7 +42,7 @@ from accerl_lerobot.timeline import TIMELINE
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.world_model.config import ImaginationConfig
 
-__all__ = ["DatasetConfig", "LaunchConfig", "RunConfig", "check_chunk", "decode", "encode", "parse"]
+__all__ = ["DatasetConfig", "LaunchConfig", "RunConfig", "decode", "encode", "parse"]
 
 
 Nodes = Annotated[str, Pattern(r".*\S.*", "a node's number, a resource, or all")]
@@ -171,8 +170,6 @@ class RunConfig(Section):
         if self.policy.path is not None and self.sft.steps:
             remedy = "add --sft.steps=0 to improve this checkpoint, or fine-tune it first with sft.init_path"
             raise InputError("policy.path", self.policy.path, remedy)
-        if self.sft.steps and self.sft.init_path is None:
-            check_chunk(self.sft.policy)
         if isinstance(self.algorithm, OffPolicyConfig):
             self._check_off_policy()
         if self.trainer.hold_back >= self.replay.max_lag:
@@ -231,16 +228,3 @@ def timeline_folder(config: RunConfig) -> Path | None:
     """Where the timeline of a run's workers is kept; None: nowhere."""
     folder = journal_folder(config)
     return None if folder is None else folder / TIMELINE
-
-
-def check_chunk(policy: dict[str, Any]) -> None:
-    """Refuse sizes in ``sft.policy`` that no LeRobot policy can have.
-
-    Args:
-        policy: fields of a LeRobot policy config; LeRobot itself checks the others, see `preflight`.
-    """
-    for name in ("chunk_size", "n_action_steps", "num_steps", "max_state_dim", "max_action_dim"):
-        check(Annotated[int, Range("[1, 10000]")], policy.get(name, 1), f"sft.policy.{name}")
-    chunk, executed = policy.get("chunk_size"), policy.get("n_action_steps")
-    if chunk is not None and executed is not None and executed > chunk:
-        raise InputError("sft.policy.n_action_steps", executed, f"use 1 to sft.policy.chunk_size, {chunk}")

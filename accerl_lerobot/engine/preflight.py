@@ -7,22 +7,19 @@
 from __future__ import annotations
 
 import copy
-import dataclasses
 import difflib
 import logging
 import math
 import os
-import shutil
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import draccus
 
-from accerl_lerobot.algorithms import OffPolicyConfig, RatioConfig
-from accerl_lerobot.checkpoint.layout import KEEP
+from accerl_lerobot.algorithms import OffPolicyConfig
 from accerl_lerobot.config.ranges import Range, check
 from accerl_lerobot.engine import ray_session
+from accerl_lerobot.engine.sizes import check_disk, check_memory, disk_bytes
 from accerl_lerobot.envs import EnvConfig, WorldSpec, make_world
 from accerl_lerobot.errors import InputError, check_absent, expanded
 from accerl_lerobot.policies.features import (
@@ -36,23 +33,16 @@ from accerl_lerobot.policies.features import (
     policy_features,
     resizes,
 )
-from accerl_lerobot.replay.pacing import decisions_under_way, lag_bound
-
-LARGEST_FIELD = 10**6
-"""Largest number in a policy config; LeRobot has no size or number of steps beyond."""
-ABSURD = 2
-"""Times this machine's memory that a rough estimate may be; ``accerl doctor`` warns long before."""
 
 if TYPE_CHECKING:
-    from accerl_lerobot.demos.record import DemosConfig
     from accerl_lerobot.demos.sft import SFTConfig
     from accerl_lerobot.engine.config import DatasetConfig, RunConfig
     from accerl_lerobot.metrics import WandBConfig
 
 logger = logging.getLogger(__name__)
 
-SLACK_BYTES = 128 * 2**20
-"""Disk space for metrics, the timeline, the journal and videos."""
+SIZES = ("chunk_size", "n_action_steps", "num_steps", "max_state_dim", "max_action_dim")
+"""Fields of policy configs that are at least 1; LeRobot itself checks the others."""
 
 
 def check_world(env: EnvConfig) -> WorldSpec:
@@ -91,14 +81,14 @@ def check_start(config: RunConfig) -> int:
 
     if config.output_dir is not None and not config.resume:
         check_absent(expanded(config.output_dir, "output_dir"))
-    check_machine(config)
+    check_memory(config, weights=False)
     if config.policy.path is None and not config.sft.steps:
         remedy = "give a LeRobot checkpoint, or sft.steps > 0 to make one; recipes/quickstart.yaml does"
         raise InputError("policy.path", None, remedy)
     resolve_device(config.policy.device)  # refuses one that is not there
     check_wandb(config.wandb)
     policy = policy_to_be(config)
-    check_weights_fit(config)
+    check_memory(config)
     spec = check_world(config.env)
     off_policy = isinstance(config.algorithm, OffPolicyConfig)
     if off_policy:
@@ -134,7 +124,7 @@ def _say_if_unlike(config: RunConfig, spec: WorldSpec, meta: Any, history: int) 
 def check_training_data(
     sft: SFTConfig, dataset: DatasetConfig, policy: Any, spec: WorldSpec | None, rename_map: dict[str, str]
 ) -> Any:
-    """Compare dataset, policy and environment of an SFT."""
+    """Compare dataset, policy and environment of an SFT; returns the dataset's metadata, if there is one."""
     from accerl_lerobot.demos.dataset_files import open_metadata
 
     meta = None if dataset.repo_id is None else open_metadata(dataset)
@@ -194,86 +184,6 @@ def check_wandb(config: WandBConfig) -> None:
     if not wandb.api.api_key:
         remedy = "this machine is not logged in: run wandb login, or set WANDB_API_KEY or WANDB_MODE=offline"
         raise InputError("wandb.enable", True, remedy)
-
-
-def demos_bytes(config: DemosConfig, spec: WorldSpec) -> int:
-    """Disk space that demonstrations take, if half of the env steps are made and PNG halves the images."""
-    return config.episodes * spec.max_steps * sum(map(math.prod, spec.images.values())) // 4
-
-
-def disk_bytes(config: RunConfig, spec: WorldSpec, history: int) -> int:
-    """Disk space that a run takes at least, as far as it is known before; weights made by SFT are not."""
-    picture = sum(map(math.prod, spec.images.values()))
-    replay = (config.replay.capacity + config.remembered) * history * picture
-    policies = 1 + bool(config.saves)
-    if config.save_every_updates:
-        policies = 2 + config.trainer.updates // config.save_every_updates
-    whole = 1 + min(KEEP, policies)  # one more than is kept while it is written
-    records = config.policy.path is None and config.dataset.repo_id is None
-    made = demos_bytes(config.demos, spec) if records else 0
-    weights = 0
-    for path in (config.policy.path, config.sft.init_path):
-        if path is not None:
-            weights = sum(f.stat().st_size for f in Path(path).expanduser().glob("*.safetensors"))
-    return made + whole * replay + policies * weights
-
-
-def check_disk(folder: str | None, needed: int, field: str = "output_dir") -> None:
-    """Refuse a folder on a disk with too little space for `needed` bytes and small files; blames `field`."""
-    path = expanded(folder or ".", field).absolute()
-    while not path.exists():
-        path = path.parent
-    free = shutil.disk_usage(path).free
-    if free < needed + SLACK_BYTES:
-        remedy = f"{(needed + SLACK_BYTES) / 2**30:.2f} GiB are needed and {free / 2**30:.2f} GiB are free"
-        raise InputError(field, folder, f"{remedy} on this disk; make room or choose another")
-
-
-def check_machine(config: RunConfig) -> None:
-    """Refuse sizes far beyond this machine's memory."""
-    if config.launch.address is not None:  # the other nodes may have more
-        return
-    from accerl_lerobot.cli.doctor import memory_parts_gib, total_memory_gib
-
-    parts, total = memory_parts_gib(config), total_memory_gib()
-    needed, largest = sum(parts.values()), max(parts, key=lambda name: parts[name])
-    if total is not None and needed > ABSURD * total:
-        remedy = f"the run needs about {needed:,.0f} GiB of memory, this machine has {total:.0f}; lower it"
-        section, _, name = largest.partition(".")
-        raise InputError(largest, getattr(getattr(config, section), name), remedy)
-
-
-def check_weights_fit(config: RunConfig) -> None:
-    """Refuse a policy whose weights this machine's memory cannot hold."""
-    from accerl_lerobot.cli.doctor import total_memory_gib
-
-    need, total = policy_gib(config), total_memory_gib()
-    if total is not None and need > total and config.launch.address is None:
-        remedy = "use a smaller policy, a GPU, launch.engine=local or policy.tuning.mode=lora"
-        said = f"its weights take {need:.1f} GiB in the processes of this run, this machine has {total:.1f}"
-        raise InputError("policy.path", config.policy.path, f"{said}; {remedy}")
-
-
-def policy_gib(config: RunConfig) -> float:
-    """Memory that the weights of ``policy.path`` take in all processes of a run; activations come on top.
-
-    On a GPU they are not in the machine's memory. Nothing is known of a policy that an SFT will make.
-    """
-    from accerl_lerobot.policies.loading import policy_sizes, rehearsed_config, resolve_device
-
-    if config.policy.path is None or resolve_device(config.policy.device).type != "cpu":
-        return 0.0
-    rehearsed_config(config.policy)
-    sizes, processes, copies = policy_sizes(config.policy), 1, trained_copies(config)
-    if config.launch.engine != "local":
-        processes = config.trainer.ranks + config.inference.workers
-        copies += 2 * config.inference.workers  # sets under way
-    return 4 * (sizes.policy * processes + sizes.trained * copies) / 2**30
-
-
-def trained_copies(config: RunConfig) -> int:
-    """Copies of the trained weights that a trainer keeps: gradient, Adam's two moments, weights to probe."""
-    return 3 + (isinstance(config.algorithm, RatioConfig) and config.trainer.probe_every > 0)
 
 
 def _check_off_policy(config: RunConfig, spec: WorldSpec, policy: Any) -> None:
@@ -350,11 +260,8 @@ def check_sft_policy(config: SFTConfig) -> Any:
             raise InputError(f"sft.policy.{key}", value, remedy)
     for key, value in fields.items():
         if isinstance(value, int):
-            check(
-                Annotated[int, Range(f"[-1, {LARGEST_FIELD}]")],
-                int(value),
-                f"sft.policy.{key}",
-            )
+            span = Range("[1, 10000]" if key in SIZES else "[-1, 1000000]")
+            check(Annotated[int, span], int(value), f"sft.policy.{key}")
     try:
         # Without a device LeRobot looks for one.
         return draccus.decode(PreTrainedConfig.get_choice_class(kind), {"device": "cpu"} | fields)
@@ -414,36 +321,3 @@ def check_placement(config: RunConfig) -> list[str]:
     from accerl_lerobot.engine.placement import rehearse
 
     return rehearse(config)
-
-
-def lag_limits(config: RunConfig) -> tuple[int, int]:
-    """The largest lag under this recipe, and what its pace alone would allow; in updates."""
-    trainer = config.trainer
-    ahead = 1 if config.launch.engine == "ray" else 0  # of publications under way, and of batches drawn early
-    bound, of_pace = (
-        lag_bound(
-            replay,
-            batch_decisions=trainer.batch_decisions,
-            in_flight=under_way(config),
-            pickup=ahead + trainer.hold_back,
-            prefetch=ahead,
-        )
-        for replay in (config.replay, dataclasses.replace(config.replay, max_lag=10**9))
-    )
-    return bound, of_pace
-
-
-def under_way(config: RunConfig) -> int:
-    """Decisions on their way to replay."""
-    rollout = config.rollout
-    return decisions_under_way(
-        workers=rollout.workers,
-        worlds=rollout.worlds,
-        segment_length=rollout.segment_length,
-    )
-
-
-def executed(config: RunConfig) -> int:
-    """Actions of a chunk that are executed; 0 if only the checkpoint says."""
-    of_sft = config.sft.steps and config.sft.policy.get("n_action_steps")
-    return int(config.policy.n_action_steps or of_sft or 0)

@@ -53,13 +53,8 @@ from accerl_lerobot.demos.record import REPO_ID, record_demos
 from accerl_lerobot.engine import ray_session
 from accerl_lerobot.engine.config import RunConfig, encode, parse, timeline_folder
 from accerl_lerobot.engine.loop import Engine, Loop, Outputs, Times, run_plans
-from accerl_lerobot.engine.preflight import (
-    check_machine,
-    check_placement,
-    check_policy,
-    check_start,
-    check_world,
-)
+from accerl_lerobot.engine.preflight import check_placement, check_policy, check_start, check_world
+from accerl_lerobot.engine.sizes import check_memory
 from accerl_lerobot.engine.stopping import (
     LOCK,
     WARM_START,
@@ -156,7 +151,7 @@ def is_brief(error: BaseException) -> bool:
 
 def play_evaluation(config: RunConfig, console: Console, filmed: int = 0) -> list[EpisodeResult]:
     """Play the evaluation episodes of a run with LeRobot's sampler, on seeds that are never trained on."""
-    check_machine(config)
+    check_memory(config, weights=False)
     spec = check_world(config.env)
     engine = make_engine(config, spec.tasks, check_policy(config, spec))
     with contextlib.closing(engine):
