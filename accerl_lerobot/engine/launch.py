@@ -28,7 +28,7 @@ from typing import Any
 
 import psutil
 import ray
-from ray.exceptions import RayError, RayTaskError
+from ray.exceptions import RayActorError, RayError, RayTaskError
 
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE, saved_version
 from accerl_lerobot.engine.config import RunConfig, journal_folder, timeline_folder
@@ -37,7 +37,6 @@ from accerl_lerobot.engine.placement import actor_options, place_workers
 from accerl_lerobot.engine.ray_session import RaySession
 from accerl_lerobot.engine.replicas import (
     START_S,
-    InferencePlace,
     InferenceReplicas,
     RolloutPlace,
     RolloutWorkers,
@@ -78,6 +77,13 @@ def end(workers: Iterable[Worker], *, told: bool = True) -> None:
     psutil.wait_procs(left, timeout=GONE_S)
 
 
+def _fail(worker: Worker, error: Exception, text: str = "") -> None:
+    """Restart a worker that has failed, or raise what ends the engine."""
+    if worker.restart is None:
+        raise WorkerError(text or f"{worker.name} worker failed for good:\n{error}") from error
+    worker.restart(error)
+
+
 class RayEngine(Engine):
     """The asynchronous engine.
 
@@ -105,11 +111,9 @@ class RayEngine(Engine):
         self._inference = InferenceReplicas(config, self._version, state, load, self._move)
         self._others: list[Worker] = []
         """All other workers."""
-        self._imaginer: Worker | None = None
-        self._learner: Worker | None = None
+        self._imagining: list[Worker] = []
+        """The one that imagines, and the one that trains the world model."""
         self._updates: list[dict[str, float]] = []
-        self._metrics: dict[str, dict[str, float]] = {}
-        """Last metrics by worker; of inference as of one."""
         self._schedule: Schedule = ASYNCHRONOUS
         self._training = self._real_ended = self._done = self._closed = False
         self._last_change = time.monotonic()
@@ -132,13 +136,12 @@ class RayEngine(Engine):
         self.follow(self._config.launch.schedule)
         self._inference.trainer = self._trainer.actor
         self._trainer.work = self._trainer.actor.run.remote(self._replay.actor, self._deciding)
-        if (imaginer := self._imaginer) is None:
-            return
-        # The last replica: the first ones may have one rollout worker more.
-        asks = self._deciding[-1]
-        imaginer.work = imaginer.actor.run.remote(asks, self._inserting, self._replay.actor)
-        if self._learner is not None:
-            self._learner.work = self._learner.actor.run.remote(imaginer.actor, self._replay.actor)
+        for worker in self._imagining[:1]:
+            # The last replica: the first ones may have one rollout worker more.
+            asks = self._deciding[-1]
+            worker.work = worker.actor.run.remote(asks, self._inserting, self._replay.actor)
+        for worker in self._imagining[1:]:
+            worker.work = worker.actor.run.remote(self._imagining[0].actor, self._replay.actor)
 
     def follow(self, schedule: Schedule) -> None:
         """Change the schedule of collecting and learning, see `replay.pacing`."""
@@ -154,10 +157,15 @@ class RayEngine(Engine):
     def poll(self) -> Progress:
         if lost := self._ray.lost:
             raise WorkerError(lost)
-        self._ask()
+        for worker in (*self._inference.workers(), *self._others):
+            worker.ask("metrics")
+        self._rollouts.ask(self._training and not self._done)
         self._await_end()
         episodes = self._listen()
-        self._check_hung()
+        # Inference last, since others are not listened to during its restart.
+        for worker in (*self._others, *self._rollouts.workers(), *self._inference.workers()):
+            if why := worker.hung(self._limit):
+                _fail(worker, RuntimeError(why), f"{worker.name} worker {why}")
         updates, self._updates = self._updates, []
         if updates:
             self._version = int(updates[-1]["update"])
@@ -167,9 +175,9 @@ class RayEngine(Engine):
             updates=updates,
             episodes=episodes,
             rollout=self._rollouts.counters(),
-            replay=self._metrics.get("replay", {}),
-            inference=self._metrics.get("inference", {}),
-            imagination=self._metrics.get(IMAGINATION, {}) | self._metrics.get(WORLD_LEARNING, {}),
+            replay=self._replay.told or {},
+            inference=self._inference.metrics(),
+            imagination={k: v for w in self._imagining for k, v in (w.told or {}).items()},
         )
         self._check_moving(progress)
         return progress
@@ -184,7 +192,7 @@ class RayEngine(Engine):
         # At once, so that little comes in that was decided by weights of later updates. The imaginer may
         # know of more than replay then; it is told anew of what comes after.
         self._replay.call("save", state, version, timeout=self._limit)
-        for worker in filter(None, (self._learner, self._imaginer)):
+        for worker in reversed(self._imagining):
             worker.call("save", directory, timeout=self._limit)
         self._trainer.call("write", directory, timeout=self._limit)
         self._rollouts.save(state)
@@ -246,11 +254,10 @@ class RayEngine(Engine):
         if imagination.share:
             from accerl_lerobot.engine.imagination import ImaginationWorker, WorldLearningWorker
 
-            imaginer = make(IMAGINATION, ImaginationWorker, 4, c, self._state, timeline)
-            self._imaginer = self._add(IMAGINATION, imaginer)
-            if imagination.learns:
-                learns = make(WORLD_LEARNING, WorldLearningWorker, 4, c, self._state, timeline)
-                self._learner = self._add(WORLD_LEARNING, learns)
+            kinds: dict[str, type] = {IMAGINATION: ImaginationWorker}
+            kinds |= {WORLD_LEARNING: WorldLearningWorker} if imagination.learns else {}
+            for name, kind in kinds.items():
+                self._imagining.append(self._add(name, make(name, kind, 4, c, self._state, timeline)))
         self._rollouts.start(plan)
         ready = [(worker, worker.actor.ready.remote()) for worker in self._everyone()]
         for worker, reference in ready:
@@ -269,15 +276,9 @@ class RayEngine(Engine):
         """Tell the clients of an inference replica its new endpoint."""
         self._deciding[index] = inference
         self._rollouts.move(index, inference)
-        if self._imaginer is not None and index == len(self._deciding) - 1:
-            self._imaginer.call("move", inference, timeout=self._limit)
+        if self._imagining and index == len(self._deciding) - 1:
+            self._imagining[0].call("move", inference, timeout=self._limit)
         self._last_change = time.monotonic()  # a restart has timeouts of its own
-
-    def _ask(self) -> None:
-        self._inference.ask()
-        for worker in self._others:
-            worker.ask("metrics")
-        self._rollouts.ask(self._training and not self._done)
 
     def _await_end(self) -> None:
         """Wait a little, and handle every worker whose long call has ended."""
@@ -297,16 +298,11 @@ class RayEngine(Engine):
         except RayError as error:
             if isinstance(error, RayTaskError) and isinstance(error.cause, RayError | ServiceStoppedError):
                 self._blame()
-            if isinstance(worker, InferencePlace):
-                self._inference.restart(worker, error)
-            elif isinstance(worker, RolloutPlace):
-                self._rollouts.restart(worker, error)
-            else:
-                raise WorkerError(f"{worker.name} worker failed for good:\n{error}") from error
+            _fail(worker, error)
             return
         if worker is self._trainer:
             self._finish(int(result))
-        elif not (self._done and worker in (self._replay, self._learner, self._imaginer)):
+        elif not (self._done and worker in (self._replay, *self._imagining)):
             raise WorkerError(f"{worker.name} worker ended without being asked to")
 
     def _blame(self) -> None:
@@ -324,36 +320,31 @@ class RayEngine(Engine):
         self._updates += self._trainer.call("metrics", timeout=self._limit)
         self._replay.call("close", timeout=self._limit)
         self._hear(self._replay, self._limit)
-        self._metrics["replay"] = self._replay.call("metrics", timeout=self._limit)
+        self._replay.told = self._replay.call("metrics", timeout=self._limit)
 
     def _listen(self) -> list[EpisodeResult]:
         """Pick up the answers that have come; the episodes among them."""
-        for worker in self._others:
+        episodes: list[EpisodeResult] = []
+        for worker in self._everyone():
             answer = self._hear(worker)
             if worker is self._trainer:
                 self._updates += answer or []
-            elif answer:
-                self._metrics[worker.name] = answer
-        self._metrics["inference"] = self._inference.listen()
-        episodes = self._rollouts.listen()
+            elif answer is not None and isinstance(worker, RolloutPlace):
+                episodes += worker.take(answer)
         if not self._real_ended and self._rollouts.spent:
             self._real_ended = True
             self._replay.call("end_real", timeout=self._limit)
         return episodes
 
     def _hear(self, worker: Worker, timeout: float = 0.0) -> Any:
+        """An answer that has come."""
         try:
             return worker.answer(timeout)
         except RayError as error:
-            raise WorkerError(f"{worker.name} worker failed for good:\n{error}") from error
-
-    def _check_hung(self) -> None:
-        """Restart a rollout worker or inference replica that hangs."""
-        for worker in self._others:
-            if worker.silent_s() > self._limit:
-                raise WorkerError(f"{worker.name} worker has not answered for {worker.silent_s():.0f} s")
-        self._rollouts.check_hung()
-        self._inference.check_hung()  # last, since others are not listened to during a restart
+            # Where a process has died, its long call has ended as well, which `_await_end` deals with.
+            if worker.restart is None or not isinstance(error, RayActorError):
+                _fail(worker, error)
+            return None
 
     def _check_moving(self, progress: Progress) -> None:
         """End a run in which every worker answers and nothing moves."""
@@ -361,7 +352,7 @@ class RayEngine(Engine):
         state = (progress.version, progress.rollout.get("decisions"), progress.rollout["restarts"], imagined)
         now = time.monotonic()
         waiting = self._rollouts.outstanding or (self._training and not self._done)
-        # Where one worker is to blame, `_check_hung` finds it a moment later.
+        # Where one worker is to blame, that is found a moment later.
         silent = max(worker.silent_s() for worker in self._everyone())
         suspect = max(silent, self._rollouts.stuck_s) > self._limit / 2
         if state != self._last_state or not waiting:

@@ -21,6 +21,7 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +77,8 @@ class Worker:
 
     def __init__(self, name: str, actor: Any = None) -> None:
         self.name = name
+        self.restart: Callable[[Exception], None] | None = None
+        """Replaces the process after a failure; None: the run cannot go on without it."""
         self.restarts = 0
         """In a row."""
         self.occupy(actor)
@@ -86,7 +89,8 @@ class Worker:
         self.work: Any = None
         self.process: psutil.Process | None = None
         """None: not known yet, or on another node."""
-        self.answered = False
+        self.told: Any = None
+        """Last answer."""
         self.since = math.inf
         """When it was at work, on `time.monotonic`."""
         self._question: Any = None
@@ -125,15 +129,19 @@ class Worker:
         if self._question is None or not ray.wait([self._question], timeout=timeout)[0]:
             return None
         question, self._question = self._question, None
-        answer = ray.get(question)
-        self.answered = True
-        return answer
+        self.told = ray.get(question)
+        return self.told
 
     def silent_s(self) -> float:
         """Seconds for which an answer has been outstanding."""
         if self._question is None or ray.wait([self._question], timeout=0)[0]:
             return 0.0
         return time.monotonic() - self._asked
+
+    def hung(self, limit: float) -> str:
+        """Reason to give it up; empty: none."""
+        silent = self.silent_s()
+        return f"has not answered for {silent:.0f} s" if silent > limit else ""
 
     def call(self, method: str, *arguments: Any, timeout: float) -> Any:
         """Call a method and wait for its answer.
@@ -178,6 +186,8 @@ class Replicas[W: Worker](ABC):
         self._config, self._launch = config, config.launch
         self._all = workers
         self._plan = Plan((), {})
+        for worker in workers:
+            worker.restart = partial(self._restart, worker)
 
     def start(self, plan: Plan) -> None:
         """Start all processes, where the plan says."""
@@ -194,25 +204,12 @@ class Replicas[W: Worker](ABC):
         """Start a process; its actor handle."""
 
     @abstractmethod
-    def restart(self, worker: W, error: Exception) -> None:
+    def _restart(self, worker: W, error: Exception) -> None:
         """Replace a process that has failed.
 
         Raises:
             WorkerError: it has been restarted too often; carries its traceback.
         """
-
-    def _answers(self) -> Iterator[tuple[W, Any]]:
-        """Answers that have come. A worker whose answer is an error is restarted."""
-        for worker in self._all:
-            try:
-                answer = worker.answer()
-            except RayActorError:
-                continue  # its long call has ended as well, and the engine deals with that
-            except RayError as error:
-                self.restart(worker, error)
-                continue
-            if answer is not None:
-                yield worker, answer
 
 
 class RolloutPlace(Worker):
@@ -230,17 +227,32 @@ class RolloutPlace(Worker):
         self.outstanding: dict[tuple[str, int], EpisodePlan] = {}
         """Planned episodes without a result."""
         self.unsent: list[EpisodePlan] = []
-        self.report: Report | None = None
-        """Last report of the process."""
         self.moved: Endpoint | None = None
         """New endpoint of its inference replica, until the process has been told."""
         self.spent = budget == 0
         """True if replay has all episodes of the budget."""
 
     @property
+    def report(self) -> Report | None:
+        """Last report of the process."""
+        report: Report | None = self.told
+        return report
+
+    @property
     def next_incarnation(self) -> int:
         """Incarnation of another process in this place."""
         return incarnation_after(self.incarnation, 0 if self.report is None else self.report.starts)
+
+    def take(self, report: Report) -> list[EpisodeResult]:
+        """Note a report; the episodes in it."""
+        self.spent, self.since = report.spent, min(self.since, time.monotonic())
+        if self.budget is not None:
+            self.budget -= sum(episode.plan.explore for episode in report.episodes)
+        return [
+            episode
+            for episode in report.episodes
+            if self.outstanding.pop(episode_key(episode.plan), None) is not None or episode.plan.explore
+        ]
 
     def assign(self, plans: list[EpisodePlan]) -> None:
         """Add planned episodes."""
@@ -248,12 +260,11 @@ class RolloutPlace(Worker):
         self.unsent += plans
 
     def hung(self, limit: float) -> str:
-        """Reason to restart it; empty: none."""
-        silent, report = self.silent_s(), self.report
-        if silent > (limit if self.answered else max(START_S, limit)):
-            return f"no answer for {silent:.0f} s"
-        if report is None:
-            return ""
+        """Also a world that does not return, and inference that is not found."""
+        if (report := self.report) is None:
+            return super().hung(max(START_S, limit))
+        if why := super().hung(limit):
+            return why
         if report.in_world_s > limit:
             return f"its world has not returned for {report.in_world_s:.0f} s"
         if report.stuck_s > limit:
@@ -309,22 +320,8 @@ class RolloutWorkers(Replicas[RolloutPlace]):
             if worker.ask("report", training, worker.unsent, self.in_turn, worker.moved):
                 worker.unsent = []
                 if worker.moved is not None and worker.report is not None:
-                    worker.report = replace(worker.report, away_s=0.0)  # that was about the old endpoint
+                    worker.told = replace(worker.report, away_s=0.0)  # that was about the old endpoint
                 worker.moved = None
-
-    def listen(self) -> list[EpisodeResult]:
-        """Pick up reports; returns the episodes in them."""
-        episodes: list[EpisodeResult] = []
-        for worker, report in self._answers():
-            worker.report, worker.spent = report, report.spent
-            worker.since = min(worker.since, time.monotonic())
-            if worker.budget is not None:
-                worker.budget -= sum(episode.plan.explore for episode in report.episodes)
-            for episode in report.episodes:
-                planned = worker.outstanding.pop(episode_key(episode.plan), None)
-                if episode.plan.explore or planned is not None:
-                    episodes.append(episode)
-        return episodes
 
     def counters(self) -> dict[str, float]:
         """Sums over all processes since the run began."""
@@ -348,13 +345,6 @@ class RolloutWorkers(Replicas[RolloutPlace]):
         """How long the slowest worker or world has been at what it does now."""
         reports = [worker.report for worker in self._all if worker.report is not None]
         return max((max(report.in_world_s, report.stuck_s) for report in reports), default=0.0)
-
-    def check_hung(self) -> None:
-        """Restart workers that do not answer or do nothing, whose world does not return, or that do not find
-        inference."""
-        for worker in self._all:
-            if why := worker.hung(self._launch.stall_s):
-                self.restart(worker, RuntimeError(why))
 
     def save(self, directory: Path) -> None:
         """Write the rollout workers' part of ``training_state``."""
@@ -392,14 +382,14 @@ class RolloutWorkers(Replicas[RolloutPlace]):
         share = WorkerShare(worker.index, worker.incarnation, worker.budget)
         return actor.remote(c.env, c.rollout, self._tasks, c.seed, share, self._history, timeline)
 
-    def restart(self, worker: RolloutPlace, error: Exception) -> None:
+    def _restart(self, worker: RolloutPlace, error: Exception) -> None:
         if not self._relocate(worker, error):  # that its node has left is not the worker's fault
             worker.count_restart(error, self._launch.max_restarts)
         worker.end(error)
         self._past["restarts"] += 1
         self._past.update(worker.report.counters if worker.report is not None else {})  # type: ignore[arg-type]
         worker.incarnation = worker.next_incarnation
-        worker.report, worker.moved = None, None
+        worker.moved = None
         worker.unsent = list(worker.outstanding.values())
         worker.occupy(self._new(worker))
         self._run(worker)
@@ -430,7 +420,6 @@ class InferencePlace(Worker):
     def __init__(self, index: int, name: str) -> None:
         super().__init__(name)
         self.index = index
-        self.metrics: dict[str, float] = {}
         self.lock_step = 0
         """Worlds that are decided for together; 0: each for itself."""
 
@@ -474,23 +463,10 @@ class InferenceReplicas(Replicas[InferencePlace]):
             worker.lock_step = clients[worker.index] * rollout.worlds if in_turn else 0
             worker.call("lock_step", worker.lock_step, timeout=self._launch.stall_s)
 
-    def ask(self) -> None:
-        """Ask each replica for its metrics, unless they are outstanding."""
-        for worker in self.workers():
-            worker.ask("metrics")
-
-    def listen(self) -> dict[str, float]:
-        """Pick up metrics; all replicas as one."""
-        for worker, metrics in self._answers():
-            worker.metrics = metrics
-        merged = merge_metrics([worker.metrics for worker in self._all if worker.metrics])
+    def metrics(self) -> dict[str, float]:
+        """Last metrics, of all replicas as of one."""
+        merged = merge_metrics([worker.told for worker in self._all if worker.told])
         return merged | {"restarts": float(self.restarts)}
-
-    def check_hung(self) -> None:
-        """Restart replicas that do not answer."""
-        for worker in self._all:
-            if (silent := worker.silent_s()) > self._launch.stall_s:
-                self.restart(worker, RuntimeError(f"no answer for {silent:.0f} s"))
 
     def batching(self) -> BatcherStats:
         """Batches of all replicas so far."""
@@ -503,7 +479,7 @@ class InferenceReplicas(Replicas[InferencePlace]):
         actor = ray.remote(InferenceWorker).options(**options, max_concurrency=1000)
         return actor.remote(*self._arguments, worker.name)
 
-    def restart(self, worker: InferencePlace, error: Exception) -> None:
+    def _restart(self, worker: InferencePlace, error: Exception) -> None:
         again: Exception | None = error
         while again is not None:
             worker.count_restart(again, self._launch.max_restarts)
@@ -512,7 +488,6 @@ class InferenceReplicas(Replicas[InferencePlace]):
                 raise WorkerError(f"{worker.name} worker is lost: {node} has left:\n{again}") from again
             self.restarts += 1
             time.sleep(pause_s(worker.restarts - 1))
-            worker.metrics = {}
             worker.occupy(self._new(worker))
             again = self._come_up(worker)
         logger.info("%s worker is up again", worker.name)
