@@ -48,12 +48,7 @@ class Stage:
 
 
 class Console:
-    """Where stages and results are announced.
-
-    Example:
-        >>> with console.stage("SFT", total=100) as stage:
-        ...     stage.update(25, "loss 0.9")
-    """
+    """Where stages and results are announced."""
 
     def __init__(self) -> None:
         self.rich = RichConsole(stderr=True)

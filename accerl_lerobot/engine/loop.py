@@ -123,12 +123,10 @@ def episode_key(plan: EpisodePlan) -> tuple[str, int]:
 
 def check_new(plans: Sequence[EpisodePlan], outstanding: Container[tuple[str, int]]) -> None:
     """Check the argument of `Engine.plan`."""
-    keys: set[tuple[str, int]] = set()
-    for plan in plans:
-        key = episode_key(plan)
-        if key in keys or key in outstanding:
+    keys = [episode_key(plan) for plan in plans]
+    for plan, key in zip(plans, keys, strict=True):
+        if key in outstanding or keys.count(key) > 1:
             raise ValueError(f"episode {plan.index} of {plan.group!r} is planned twice")
-        keys.add(key)
 
 
 def run_plans(
@@ -268,7 +266,7 @@ class Loop:
         self, before: dict[str, Any] | None, after: dict[str, Any], last: Progress
     ) -> dict[str, Any]:
         before = before or {}
-        summary = {
+        return {
             "success_before": before.get("success"),
             "success_after": after["success"],
             "n": after["n"],
@@ -299,7 +297,6 @@ class Loop:
             "tasks": list(self.tasks),
             "seed": self.config.seed,
         }
-        return summary
 
     def _train(self) -> Progress:
         config = self.config
@@ -333,9 +330,8 @@ class Loop:
     def _is_due(self, version: int) -> bool:
         """True if a checkpoint is due."""
         updates, seconds = self.config.save_every_updates, self.config.save_every_s
-        if updates and version // updates > self.saved:
-            return True
-        return bool(seconds) and time.monotonic() - self._saved_at > seconds
+        by_time = bool(seconds) and time.monotonic() - self._saved_at > seconds
+        return by_time or bool(updates and version // updates > self.saved)
 
     def _record_updates(self, updates: list[dict[str, float]]) -> None:
         for metrics in updates:

@@ -84,13 +84,7 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True)
 class Plan:
-    """A place for every worker.
-
-    Example:
-        >>> plan = plan_workers(nodes, config)
-        >>> plan.places["trainer"].node.number
-        0
-    """
+    """A place for every worker."""
 
     nodes: tuple[Node, ...]
     places: dict[str, Place]
@@ -114,9 +108,6 @@ class Plan:
 
         It goes to the node with the fewest rollout workers for its cores, among node 0 and those that have
         any.
-
-        Raises:
-            WorkerError: none is left, as when Ray itself has been lost.
         """
         load = Counter({0: 0})
         load.update(place.node.number for other, place in self.places.items() if other.startswith("rollout "))
@@ -171,11 +162,7 @@ def candidates(nodes: Sequence[Node], role: Role) -> list[Node]:
 
 
 def plan_workers(nodes: Sequence[Node], config: RunConfig) -> Plan:
-    """Place all workers of a run.
-
-    Raises:
-        InputError: a node is not there or does not see the run's files, or there are too few GPUs.
-    """
+    """Place all workers of a run."""
     roles = roles_of(config)
     sites = {role.name: _sites(nodes, role) for role in roles}
     shares = _gpu_shares(roles, sites, config)
@@ -247,12 +234,7 @@ def _take_gpu(sites: list[Node], free: dict[int, list[float]], share: float, rol
 
 
 def place_workers(config: RunConfig) -> Plan:
-    """Plan where the workers of a run go on the nodes that Ray has now.
-
-    Raises:
-        InputError: they do not fit, or a node has other versions.
-        WorkerError: a node does not answer.
-    """
+    """Plan where the workers of a run go on the nodes that Ray has now."""
     known = alive_nodes()
     try:
         nodes = _nodes(config)
@@ -296,12 +278,7 @@ def alive_nodes() -> frozenset[str]:
 
 
 def _nodes(config: RunConfig) -> list[Node]:
-    """The nodes that are there, this one first, with what they report where a cluster was joined.
-
-    Raises:
-        InputError: a node that a worker may be on has other versions.
-        WorkerError: it does not answer.
-    """
+    """The nodes that are there, this one first, with what they report where a cluster was joined."""
     import ray
 
     here = ray.get_runtime_context().get_node_id()

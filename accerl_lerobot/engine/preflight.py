@@ -70,12 +70,7 @@ def check_policy(config: RunConfig, spec: WorldSpec, *, own: bool = False) -> in
 
 
 def check_start(config: RunConfig) -> int:
-    """Refuse a run that could not begin or whose outcome could not be used; what can be is checked here.
-
-    Raises:
-        InputError: no policy, dataset or device; parts that do not fit each other, see `check_features`; too
-            little memory; no login to wandb; too little disk space; also what `check_sft_policy` raises.
-    """
+    """Refuse a run that could not begin or whose outcome could not be used; what can be is checked here."""
     from accerl_lerobot.demos.dataset_files import open_metadata
     from accerl_lerobot.policies.loading import resolve_device
 
@@ -206,11 +201,7 @@ def _check_off_policy(config: RunConfig, spec: WorldSpec, policy: Any) -> None:
 
 
 def policy_to_be(config: RunConfig) -> Any:
-    """LeRobot's config of the policy that a run will act with, as far as it is known before an SFT.
-
-    Raises:
-        InputError: there is no such checkpoint; RL has no likelihood for it; what `check_sft_policy` raises.
-    """
+    """LeRobot's config of the policy that a run will act with, as far as it is known before an SFT."""
     from accerl_lerobot.policies.config import check_observations, check_type, override, sampler_config
     from accerl_lerobot.policies.loading import rehearsed_config
 
@@ -238,11 +229,7 @@ def policy_to_be(config: RunConfig) -> Any:
 
 
 def check_sft_policy(config: SFTConfig) -> Any:
-    """Let LeRobot build the policy config that the SFT would ask for, and returns it.
-
-    Raises:
-        InputError: LeRobot has no such policy, no such field, or refuses a value; or cannot fine-tune it.
-    """
+    """Let LeRobot build the policy config that the SFT would ask for, and returns it."""
     from lerobot.configs.policies import PreTrainedConfig
 
     from accerl_lerobot.demos.sft import policy_fields
@@ -270,11 +257,7 @@ def check_sft_policy(config: SFTConfig) -> Any:
 
 
 def sft_policy(config: SFTConfig) -> Any:
-    """LeRobot's config of the policy that an SFT trains, of any of LeRobot's types.
-
-    Raises:
-        InputError: what `check_sft_policy` raises; the checkpoint to start from cannot be read.
-    """
+    """LeRobot's config of the policy that an SFT trains, of any of LeRobot's types."""
     if config.init_path is None:
         return check_sft_policy(config)
     from lerobot.configs.policies import PreTrainedConfig
@@ -306,11 +289,7 @@ def _as_input_error(error: BaseException, fields: dict[str, Any]) -> InputError:
 
 
 def check_placement(config: RunConfig) -> list[str]:
-    """Plan where the workers will be, so that what does not fit is refused before anything long; as lines.
-
-    Raises:
-        InputError: they do not fit, or the cluster that is to be joined is not as it has to be.
-    """
+    """Plan where the workers will be, so that what does not fit is refused before anything long; as lines."""
     if config.launch.engine == "local":
         return []
     if config.launch.address is None:

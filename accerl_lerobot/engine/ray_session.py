@@ -186,12 +186,7 @@ def kill_ray(known: Iterable[psutil.Process] = ()) -> None:
 
 
 def start_ray(launch: LaunchConfig | None = None) -> None:
-    """Start a private Ray on this machine, or join the cluster of ``launch.address``.
-
-    Raises:
-        InputError: there is no such cluster, or this run should not join it.
-        WorkerError: a private Ray did not start in `STARTS` attempts.
-    """
+    """Start a private Ray on this machine, or join the cluster of ``launch.address``."""
     import ray
 
     with deferred():
@@ -285,14 +280,7 @@ def _complaint(process: subprocess.Popen[str]) -> str | None:
 
 
 class RaySession:
-    """Ray until it is closed. One that was there before is used and left running, and so is a cluster.
-
-    Example:
-        >>> session = RaySession(config.launch)
-        >>> session.start()     # for the first workers
-        >>> session.start()     # for their successors: checks whether it still responds
-        >>> session.close()
-    """
+    """Ray until it is closed. One that was there before is used and left running, and so is a cluster."""
 
     def __init__(self, launch: LaunchConfig) -> None:
         self._launch, self._started = launch, False

@@ -68,11 +68,6 @@ class Worker:
     Questions are asked one at a time, without waiting, and answers picked up later, so a worker that hangs
     cannot hang the engine, its silence has a length, and orders arrive in order, which Ray does not promise
     for an actor with threads.
-
-    Example:
-        >>> worker = Worker("trainer", actor)
-        >>> worker.work = actor.run.remote()    # `ray.wait` on it: its end is an event
-        >>> worker.ask("metrics")               # does nothing until the last answer was picked up
     """
 
     def __init__(self, name: str, actor: Any = None) -> None:
@@ -121,11 +116,7 @@ class Worker:
         return True
 
     def answer(self, timeout: float = 0.0) -> Any:
-        """The answer to the last question, once; None if there is none yet.
-
-        Raises:
-            RayError: the call failed, or the process has died.
-        """
+        """The answer to the last question, once; None if there is none yet."""
         if self._question is None or not ray.wait([self._question], timeout=timeout)[0]:
             return None
         question, self._question = self._question, None
@@ -144,11 +135,7 @@ class Worker:
         return f"has not answered for {silent:.0f} s" if silent > limit else ""
 
     def call(self, method: str, *arguments: Any, timeout: float) -> Any:
-        """Call a method and wait for its answer.
-
-        Raises:
-            WorkerError: it failed, with its traceback, or did not answer in time.
-        """
+        """Call a method and wait for its answer."""
         return self.result(getattr(self.actor, method).remote(*arguments), method, timeout)
 
     def result(self, reference: Any, method: str, timeout: float) -> Any:
@@ -161,11 +148,7 @@ class Worker:
             raise WorkerError(f"{self.name} worker failed in {method}:\n{error}") from error
 
     def count_restart(self, error: Exception, max_restarts: int) -> None:
-        """Count a restart.
-
-        Raises:
-            WorkerError: there were too many of them in a row.
-        """
+        """Count a restart."""
         if time.monotonic() - self.since > STEADY_S:
             self.restarts = 0
         if self.restarts >= max_restarts:
@@ -205,11 +188,7 @@ class Replicas[W: Worker](ABC):
 
     @abstractmethod
     def _restart(self, worker: W, error: Exception) -> None:
-        """Replace a process that has failed.
-
-        Raises:
-            WorkerError: it has been restarted too often; carries its traceback.
-        """
+        """Replace a process that has failed."""
 
 
 class RolloutPlace(Worker):
@@ -275,11 +254,7 @@ class RolloutPlace(Worker):
 
 
 class RolloutWorkers(Replicas[RolloutPlace]):
-    """The rollout workers of a run.
-
-    Raises:
-        InputError: the state is not of an asynchronous run with as many workers.
-    """
+    """The rollout workers of a run."""
 
     def __init__(
         self, config: RunConfig, tasks: tuple[str, ...], history: int, state: Path | None = None

@@ -79,6 +79,7 @@ from accerl_lerobot.rollout.runner import EpisodeResult
 from accerl_lerobot.timeline import RECOVERY, open_clock
 
 if TYPE_CHECKING:
+    from accerl_lerobot.demos.sft import SFTConfig
     from accerl_lerobot.engine.ray_session import RaySession
     from accerl_lerobot.policies.adapter import LeRobotAdapter
 
@@ -106,12 +107,7 @@ def discard_unused(directory: Path) -> None:
 def start(
     config: RunConfig, console: Console, recipe: Path | None = None, load: Load | None = None
 ) -> tuple[Path, dict[str, Any]]:
-    """Do a new run, or with ``config.resume`` the rest of the one whose config is `recipe`.
-
-    Raises:
-        InputError: the settings do not fit each other, the policy or the environment.
-        StoppedError: a signal has stopped it.
-    """
+    """Do a new run, or with ``config.resume`` the rest of the one whose config is `recipe`."""
     resumed = resumed_run(recipe, config) if config.resume else None
     if load is None and resumed is None:
         check_start(config)  # before there is a folder
@@ -136,17 +132,12 @@ def start(
     except BaseException as error:
         if is_full(error):
             console.say(f"the disk of {directory} is full; free some space, then {how}")
-        elif is_brief(error):
+        elif isinstance(error, WorkerError) and error.brief:
             console.say(f"{error}; to resume: {how}")
         else:
             verb = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
             console.say(f"{verb}; to resume from the last checkpoint: {how}")
         raise
-
-
-def is_brief(error: BaseException) -> bool:
-    """True for the loss of a worker without a traceback of its own."""
-    return isinstance(error, WorkerError) and "\n" not in str(error)
 
 
 def play_evaluation(config: RunConfig, console: Console, filmed: int = 0) -> list[EpisodeResult]:
@@ -199,33 +190,46 @@ def demonstrations_of(config: RunConfig) -> DatasetConfig | None:
     return replace(config.dataset, repo_id=REPO_ID, root=str(own))
 
 
-def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfig:
-    """Record demonstrations and run SFT where the config asks for it; set ``policy.path``."""
+def fine_tune(
+    sft: SFTConfig, dataset: DatasetConfig, directory: Path, seed: int, device: str, console: Console
+) -> Path:
+    """Run SFT in ``directory/sft`` and show its progress; the policy that comes of it."""
     from accerl_lerobot.demos.dataset_files import open_metadata, task_texts
     from accerl_lerobot.demos.sft import run_sft
+
+    texts = task_texts(open_metadata(dataset))
+    with console.stage("SFT", total=sft.steps) as stage:
+
+        def show(step: int, loss: float) -> None:
+            stage.update(step, f"loss {loss:.3f}")
+
+        return run_sft(sft, dataset, directory / "sft", seed, device, texts, on_step=show)
+
+
+def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfig:
+    """The run with its ``policy.path``, for which demonstrations are recorded and SFT is run if need be.
+
+    What has been done is not done again; what was stopped begins again.
+    """
     from accerl_lerobot.policies.loading import resolve_device
 
-    if not config.sft.steps:
-        remedy = "give a LeRobot checkpoint, or sft.steps > 0 to make one from demonstrations"
-        raise InputError("policy.path", None, remedy)
+    note = directory / WARM_START
+    if config.policy.path is not None:
+        return config
+    if note.is_file():
+        return improving(config, directory / json.loads(note.read_text())["policy"])
+    for name in (DEMOS, f"{DEMOS}.partial", "sft"):
+        shutil.rmtree(directory / name, ignore_errors=True)
     dataset = config.dataset
     if dataset.repo_id is None:
-        root = directory / DEMOS
+        root = str(directory / DEMOS)
         with console.stage("demonstrations"):
-            record_demos(config.env, config.demos, str(root), config.seed)
-        dataset = replace(dataset, repo_id=REPO_ID, root=str(root))
-    meta = open_metadata(dataset)
-    with console.stage("SFT", total=config.sft.steps) as stage:
-        assert dataset.repo_id is not None
-        path = run_sft(
-            config.sft,
-            dataset,
-            directory / "sft",
-            config.seed,
-            str(resolve_device(config.policy.device)),
-            task_texts(meta),
-            on_step=lambda step, loss: stage.update(step, f"loss {loss:.3f}"),
-        )
+            record_demos(config.env, config.demos, root, config.seed)
+        dataset = replace(dataset, repo_id=REPO_ID, root=root)
+    device = str(resolve_device(config.policy.device))
+    path = fine_tune(config.sft, dataset, directory, config.seed, device, console)
+    relative = Path(path).absolute().relative_to(directory.absolute())
+    write_atomically(note, json.dumps({"policy": str(relative)}) + "\n")
     return improving(config, path)
 
 
@@ -236,18 +240,7 @@ def execute(
     wanted: str | None = None,
     load: Load | None = None,
 ) -> dict[str, Any]:
-    """Do all phases and return the summary, which is also in ``summary.json``.
-
-    Args:
-        directory: its folder; empty, if it is a new one.
-        wanted: the checkpoint to resume from, where the run has been begun before; see
-            `checkpoint.newest_whole`.
-        load: makes the policy's adapter, and may be given a path of its own; None: of LeRobot's checkpoint.
-
-    Raises:
-        InputError: the settings do not fit each other, or no checkpoint can be resumed from.
-        StoppedError: it was asked to stop, and has been saved.
-    """
+    """Do all phases and return the summary, which is also in ``summary.json``."""
     started = time.monotonic()
     checkpoint = None if wanted is None else checkpoint_of(directory, wanted, console)
     if wanted is not None and checkpoint is None and load is None:
@@ -258,7 +251,7 @@ def execute(
     check_placement(replace(config, output_dir=str(directory)))
     if checkpoint is None:
         _check_imagination(config, resuming=False)
-        config = _warm_started(config, directory, console)
+        config = warm_start(config, directory, console)
     else:
         go_back_to(checkpoint)
         config = continued(config, directory, checkpoint)
@@ -305,33 +298,16 @@ def execute(
                 config = continued(config, directory, checkpoint)
 
 
-def _warm_started(config: RunConfig, directory: Path, console: Console) -> RunConfig:
-    """Run the warm start, unless that has been done; one that was stopped begins again."""
-    note = directory / WARM_START
-    if config.policy.path is not None:
-        return config
-    if not note.is_file():
-        for name in (DEMOS, f"{DEMOS}.partial", "sft"):
-            shutil.rmtree(directory / name, ignore_errors=True)
-        warm = warm_start(config, directory, console)
-        path = Path(str(warm.policy.path)).absolute().relative_to(directory.absolute())
-        write_atomically(note, json.dumps({"policy": str(path)}) + "\n")
-        return warm
-    path = directory / json.loads(note.read_text())["policy"]
-    return improving(config, path)
-
-
 def _check_imagination(config: RunConfig, resuming: bool) -> None:
-    if config.imagination.share:
-        from accerl_lerobot.engine.imagination import check_imagination
+    if not config.imagination.share:
+        return
+    from accerl_lerobot.engine.imagination import check_imagination
 
-        path = config.imagination.path
-        if resuming and path is not None and not Path(path).expanduser().is_dir():
-            remedy = (
-                "no such folder; the first world model of a run is not in its checkpoints: put a copy there"
-            )
-            raise InputError("imagination.path", path, remedy)
-        check_imagination(config)
+    path = config.imagination.path
+    if resuming and path is not None and not Path(path).expanduser().is_dir():
+        remedy = "no such folder; the first world model of a run is not in its checkpoints: put a copy there"
+        raise InputError("imagination.path", path, remedy)
+    check_imagination(config)
 
 
 @dataclass(frozen=True, kw_only=True)

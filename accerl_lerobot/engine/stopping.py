@@ -70,6 +70,11 @@ def pause_s(restarts: int) -> float:
 class WorkerError(RuntimeError):
     """A worker is lost for good, and the engine with it; another engine can resume from a checkpoint."""
 
+    @property
+    def brief(self) -> bool:
+        """True if it has no traceback of a worker."""
+        return "\n" not in str(self)
+
 
 class StoppedError(Exception):
     """A run was asked to stop, and can be resumed."""
@@ -140,13 +145,7 @@ def _cancel_alarms(left: threading.Event) -> None:
 
 
 class Stopping:
-    """Notes the first signal; a second one interrupts at once.
-
-    Example:
-        >>> with Stopping() as stop:
-        ...     while stop.asked is None:
-        ...         do_a_little()
-    """
+    """Notes the first signal; a second one interrupts at once."""
 
     def __init__(self) -> None:
         self.asked: int | None = None
@@ -183,9 +182,9 @@ class Stopping:
 
 def raise_if_stopped(stop: Stopping, directory: Path) -> None:
     """End a run that was asked to stop."""
-    if stop.asked is not None:
-        words = f"stopped by {signal.Signals(stop.asked).name}; to resume: {resume_command(directory)}"
-        raise StoppedError(stop.asked, words)
+    if (number := stop.asked) is not None:
+        how = resume_command(directory)
+        raise StoppedError(number, f"stopped by {signal.Signals(number).name}; to resume: {how}")
 
 
 def resume_command(directory: Path) -> str:
@@ -259,9 +258,6 @@ class Recovery:
         Args:
             furthest: the latest update so far. A run that gets further each time is not stuck, though it may
                 be hit again before its next checkpoint.
-
-        Raises:
-            WorkerError: `error`: there is no checkpoint, or it has been tried often enough.
         """
         from accerl_lerobot.checkpoint.layout import newest_whole
 
@@ -303,11 +299,7 @@ def checkpoint_of(directory: Path, wanted: str, console: Console) -> Path | None
 
 
 def continued(config: RunConfig, directory: Path, checkpoint: Path) -> RunConfig:
-    """The run from its checkpoint on.
-
-    Raises:
-        InputError: it has low-rank adapters, and the policy that it began from is not here any more.
-    """
+    """The run from its checkpoint on."""
     from accerl_lerobot.checkpoint.layout import PRETRAINED
 
     if config.policy.tuning.mode != "lora":

@@ -31,15 +31,7 @@ _to_json = json.JSONEncoder(separators=(",", ":"), check_circular=False).encode
 
 
 class Encoded(NamedTuple):
-    """A message that is ready to be written; its arrays are still the sender's.
-
-    Example:
-        >>> encoded = encode([Request(observation={"task": "push"}, noise_seed=7)])
-        >>> buffer = bytearray(encoded.size)
-        >>> encoded.write(buffer, 0)
-        >>> decode(buffer)
-        [Request(observation={'task': 'push'}, noise_seed=7, explore=True)]
-    """
+    """A message that is ready to be written; its arrays are still the sender's."""
 
     header: bytes
     arrays: list[np.ndarray]

@@ -30,13 +30,7 @@ class ServiceStoppedError(RuntimeError):
 
 
 class Client(ABC):
-    """One connection to a service, for one thread at a time.
-
-    Example:
-        >>> first, second = inference.send([request]), inference.send([another])
-        >>> inference.done(timeout=0.5)  # as they come
-        [(1, [Decision(...)])]
-    """
+    """One connection to a service, for one thread at a time."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -44,9 +38,6 @@ class Client(ABC):
     @abstractmethod
     def send(self, message: Any) -> int:
         """Send a message without waiting for its reply.
-
-        Returns:
-            The ticket of the reply.
 
         Raises:
             ServiceStoppedError: the service is gone.
@@ -67,11 +58,7 @@ class Client(ABC):
         """End the connection and forget what is under way. Safe to call twice."""
 
     def ask(self, messages: Sequence[Any], timeout: float) -> list[Any]:
-        """Send messages and wait for all replies; nothing else may be under way.
-
-        Raises:
-            TimeoutError: some have not come; the connection is of no use any more.
-        """
+        """Send messages and wait for all replies; nothing else may be under way."""
         under_way: dict[int, int] = {}
         """Ticket → index of the message."""
         replies: dict[int, Any] = {}
@@ -136,13 +123,6 @@ class LocalRequest(PendingRequest):
 
 class Server:
     """A service for threads of its own process; transports add those of other processes.
-
-    Example:
-        >>> server = Server(lambda request: request.answer(len(request.message)))
-        >>> reply = server.call("four")   # on any thread
-        >>> server.poll(timeout=1.0)      # on the one that serves: hands it to the function above
-        >>> reply.result(timeout=1.0)
-        4
 
     Args:
         take: gets every message, on the thread that polls; answers then or later.

@@ -16,12 +16,7 @@ from accerl_lerobot.transport.shared_memory import Address, SharedMemoryClient, 
 
 @dataclass(frozen=True, kw_only=True)
 class Endpoint:
-    """Address of a service, which a worker needs in order to call it.
-
-    Example:
-        >>> inference = Endpoint(name="inference", method=actor.decide, address=address)
-        >>> client = inference.connect()  # in the process that calls
-    """
+    """Address of a service, which a worker needs in order to call it."""
 
     name: str
     """Name of the service, for messages."""
@@ -88,15 +83,6 @@ class ReconnectingClient(Client):
     For services without a state of their own: a request for a decision carries its noise, and the decision
     the version of its weights. While the service is away no replies come and nothing fails; the engine
     restarts it and says where it is. Messages must not change until they are answered.
-
-    Example:
-        >>> client = ReconnectingClient("inference")
-        >>> client.move(endpoint)      # on any thread; again whenever the service has been restarted
-        >>> ticket = client.send([request])
-        >>> client.done(timeout=0.5)   # empty while the service is away
-        []
-        >>> client.away_s  # since it was lost
-        0.5
     """
 
     def __init__(self, name: str) -> None:

@@ -83,11 +83,7 @@ class WeightPublisher:
             self._advance(reader)
 
     def flush(self, timeout_s: float = FLUSH_S) -> None:
-        """Wait until every replica has applied the newest set.
-
-        Raises:
-            TimeoutError: names one that has not.
-        """
+        """Wait until every replica has applied the newest set."""
         deadline = time.monotonic() + timeout_s
         while late := [reader for reader in self._readers if reader.under_way or self._is_behind(reader)]:
             if (left := deadline - time.monotonic()) <= 0:
