@@ -31,8 +31,7 @@ from accerl_lerobot.rollout import worker as rollout_worker
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
 from accerl_lerobot.trainer import worker as trainer_worker
 from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.transport.memfd import available
-from accerl_lerobot.transport.shared_memory import Address, this_node
+from accerl_lerobot.transport.shared_memory import Address, available, this_node
 from benchmarks.simulated_world import LatencyConfig
 from benchmarks.victims import alive
 from tests.light_workers import (

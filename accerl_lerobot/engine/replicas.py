@@ -43,7 +43,7 @@ from accerl_lerobot.rollout.plans import budgets, incarnation_after
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.rollout.worker import Report
 from accerl_lerobot.transport.endpoint import Endpoint
-from accerl_lerobot.transport.memfd import available
+from accerl_lerobot.transport.shared_memory import available
 
 logger = logging.getLogger(__name__)
 

@@ -18,9 +18,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from accerl_lerobot.checkpoint.snapshot import field_names, kind_named
-from accerl_lerobot.transport.memfd import aligned
 
 SIZE = struct.Struct("<I")
+ALIGNMENT = 64
+"""Alignment of arrays in shared memory, in bytes: a cache line."""
 NUMBERS = "biuf"
 """Dtypes that can be sent, see `numpy.dtype.kind`: none of them holds Python objects."""
 
@@ -28,6 +29,11 @@ ARRAY, SCALAR, LIST, TUPLE, KIND = range(5)
 """The first entry of every JSON list in a header. A dict is a JSON object."""
 _VALUES = frozenset((bool, int, float, str, type(None)))
 _to_json = json.JSONEncoder(separators=(",", ":"), check_circular=False).encode
+
+
+def aligned(offset: int) -> int:
+    """The next offset at which an array may begin."""
+    return -(-offset // ALIGNMENT) * ALIGNMENT
 
 
 class Encoded(NamedTuple):
@@ -39,7 +45,7 @@ class Encoded(NamedTuple):
     size: int
 
     def write(self, buffer: Any, start: int) -> None:
-        """Copy it into a writable buffer from `start` on, a multiple of `memfd.ALIGNMENT`."""
+        """Copy it into a writable buffer from `start` on, a multiple of `ALIGNMENT`."""
         SIZE.pack_into(buffer, start, len(self.header))
         head = start + SIZE.size
         buffer[head : head + len(self.header)] = self.header

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from accerl_lerobot.transport.contract import Client, ServiceStoppedError
-from accerl_lerobot.transport.memfd import available
-from accerl_lerobot.transport.shared_memory import Address, SharedMemoryClient, this_node
+from accerl_lerobot.transport.shared_memory import Address, SharedMemoryClient, available, this_node
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,14 +18,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from accerl_lerobot.transport import memfd, shared_memory
+from accerl_lerobot.transport import shared_memory
 from accerl_lerobot.transport.contract import Client, PendingRequest, ServiceStoppedError
-from accerl_lerobot.transport.memfd import (
+from accerl_lerobot.transport.shared_memory import (
     LEAST,
     SLOTS,
+    SharedMemoryClient,
+    SharedMemoryServer,
     available,
 )
-from accerl_lerobot.transport.shared_memory import SharedMemoryClient, SharedMemoryServer
 
 pytestmark = pytest.mark.skipif(not available(), reason="no memfd, epoll and eventfd here")
 LONG_S = 30.0
@@ -227,8 +228,8 @@ def test_threads_of_the_same_process_call_and_wake(stage):
 def test_other_users_are_refused_at_both_ends(stage, monkeypatch: pytest.MonkeyPatch):
     one = stage()
     end = one.raw()
-    assert memfd.same_user(end)
-    monkeypatch.setattr(memfd.os, "getuid", lambda: os.geteuid() + 1)
+    assert shared_memory.same_user(end)
+    monkeypatch.setattr(shared_memory.os, "getuid", lambda: os.geteuid() + 1)
     with pytest.raises(ServiceStoppedError, match="service: another user's process has taken its place"):
         one.caller()
     one.server.poll(LONG_S)

@@ -11,8 +11,7 @@ import ray
 from accerl_lerobot.transport import endpoint as module
 from accerl_lerobot.transport.contract import Client, ServiceStoppedError
 from accerl_lerobot.transport.endpoint import Endpoint, RayClient
-from accerl_lerobot.transport.memfd import available
-from accerl_lerobot.transport.shared_memory import Address
+from accerl_lerobot.transport.shared_memory import Address, available
 from tests.light_workers import light_ray
 from tests.transport.contract import CHECKS, Check, Service
 

@@ -13,8 +13,7 @@ import pytest
 
 from accerl_lerobot.transport.contract import PendingRequest, ServiceStoppedError
 from accerl_lerobot.transport.endpoint import Endpoint
-from accerl_lerobot.transport.memfd import available
-from accerl_lerobot.transport.shared_memory import SharedMemoryServer
+from accerl_lerobot.transport.shared_memory import SharedMemoryServer, available
 from accerl_lerobot.transport.weights import PublishDelay, Tensors, WeightPublisher, WeightUpdate
 from tests.transport.played import PlayedEndpoint
 
