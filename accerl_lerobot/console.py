@@ -65,11 +65,7 @@ class Console:
         """Announces a stage, shows its bar, and says how long it took."""
         self.say(f"{name} …")
         started = time.monotonic()
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TextColumn("{task.fields[text]}"),
-        )
+        columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[text]}"))
         with Progress(
             *columns, TimeElapsedColumn(), console=self.rich, transient=True,
             disable=not self.rich.is_terminal,

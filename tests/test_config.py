@@ -71,11 +71,7 @@ class TestOverrides:
             parse(RunConfig, [recipe, "--algorithm.type=ppo", "--algorithm.sigma=1"])
 
     def test_values_are_yaml(self) -> None:
-        arguments = [
-            "--trainer.betas=[0.8, 0.9]",
-            "--policy.rename_map={a: b}",
-            "--resume=true",
-        ]
+        arguments = ["--trainer.betas=[0.8, 0.9]", "--policy.rename_map={a: b}", "--resume=true"]
         config = parse(RunConfig, [*arguments, "--algorithm.sigma=.inf", "--job_name=a: b: c"])
         assert config.trainer.betas == (0.8, 0.9) and config.policy.rename_map == {"a": "b"}
         assert config.resume is True and math.isinf(config.algorithm.sigma)

@@ -200,10 +200,7 @@ def test_whatever_is_planned_fits():
         )
         sites = {name: rng.choice(["0", "all", str(rng.randrange(len(nodes)))]) for name in ROLES}
         config = run(
-            ranks=rng.choice([1, 1, 2, 3]),
-            services=rng.randint(1, 3),
-            rollouts=rng.randint(3, 8),
-            **sites,
+            ranks=rng.choice([1, 1, 2, 3]), services=rng.randint(1, 3), rollouts=rng.randint(3, 8), **sites
         )
         try:
             plan = plan_workers(nodes, config)

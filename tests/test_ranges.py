@@ -17,15 +17,13 @@ import pytest
 
 from accerl_lerobot.cli.verbs import CONFIGS
 from accerl_lerobot.config.parsing import choices_of, section_of
-from accerl_lerobot.config.ranges import Choice, Device, Positive, Range, Section, Share, check, hints_of
+from accerl_lerobot.config.ranges import Device, Pattern, Positive, Range, Section, Share, check, hints_of
 from accerl_lerobot.demos.backbone import BackboneConfig
 from accerl_lerobot.demos.sft import SFTConfig
 from accerl_lerobot.engine.config import PlacementConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.hub.card import PullConfig
-from accerl_lerobot.policies.config import (
-    TuningConfig,
-)
+from accerl_lerobot.policies.config import TuningConfig
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.timeline.read import TimelineConfig
 from accerl_lerobot.world_model.config import NetworkConfig, WorldModelConfig
@@ -139,7 +137,7 @@ def test_values_that_do_not_go_together_name_their_field(cls: type[Any], values:
         (list[str], [[]], ["ab", [1]]),
         (float, [1, -1e9], [math.inf, math.nan, "1"]),
         (Literal["a", "b"] | None, ["a", None], ["c", 1]),
-        (Annotated[str, Choice(["a"])], ["a"], ["b", []]),
+        (Annotated[str, Pattern("a", "a")], ["a"], ["b", []]),
         (Device, ["auto", "cpu", "cuda", "cuda:3"], ["foo", "cuda:999", "cuda:", "CPU", 0, ""]),
         (dict[str, Any], [{}], []),
     ],

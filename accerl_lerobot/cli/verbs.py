@@ -241,12 +241,7 @@ def _validated(
 ) -> int:
     """Does the work in a new folder and shows the validation that it ends with."""
     from accerl_lerobot.engine.run import discard_unused, make_output_dir
-    from accerl_lerobot.world_model.metrics import (
-        check_lines,
-        datasets_table,
-        depth_table,
-        has_several,
-    )
+    from accerl_lerobot.world_model.metrics import check_lines, datasets_table, depth_table, has_several
 
     directory = make_output_dir(config)
     (directory / CONFIG).write_text(yaml.safe_dump(encode(config), sort_keys=False))

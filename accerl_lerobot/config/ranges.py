@@ -20,7 +20,7 @@ import numbers
 import re
 import types
 import typing
-from collections.abc import Collection, Hashable, Iterable
+from collections.abc import Hashable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -61,16 +61,6 @@ class Range:
         else:
             return f" from {_plain(self.low)} to {_plain(self.high)}"
         return words if self._high_open else f"{words}, or inf"
-
-
-class Choice:
-    """One of several texts, where they are known only at run time; otherwise use ``typing.Literal``."""
-
-    def __init__(self, names: Collection[str]) -> None:
-        self.names = names
-
-    def __repr__(self) -> str:
-        return f"Choice({list(self.names)})"
 
 
 class Pattern:
@@ -177,8 +167,6 @@ def _fits(hint: Any, value: Any) -> bool:
         for mark in marks:
             if isinstance(mark, Range) and not (number and not isinstance(value, bool) and value in mark):
                 return False
-            if isinstance(mark, Choice) and value not in mark.names:
-                return False
             if isinstance(mark, Pattern) and not (isinstance(value, str) and mark.pattern.fullmatch(value)):
                 return False
         return kind in (int, float) or _fits(kind, value)
@@ -206,8 +194,6 @@ def wanted(hint: Any) -> str:
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin is Annotated:
         for mark in arguments[1:]:
-            if isinstance(mark, Choice):
-                return _either(mark.names)
             if isinstance(mark, Pattern):
                 return mark.words
             if isinstance(mark, Range):
@@ -220,7 +206,8 @@ def wanted(hint: Any) -> str:
     if hint in plain:
         return plain[hint]
     if origin is typing.Literal:
-        return _either(arguments)
+        *others, last = map(str, arguments)
+        return f"{', '.join(others)} or {last}" if others else last
     if origin is tuple and Ellipsis not in arguments:
         return f"a list of {len(arguments)}, each {wanted(arguments[0])}"
     if origin in (list, tuple):
@@ -236,8 +223,6 @@ def range_in_words(hint: Any) -> str:
     for mark in arguments[1:] if origin is Annotated else ():
         if isinstance(mark, Range):
             return mark.words.removeprefix(" of").strip()
-        if isinstance(mark, Choice):
-            return " | ".join(mark.names)
     if origin is typing.Literal:
         return " | ".join(map(str, arguments))
     return next((text for kind in arguments if (text := range_in_words(kind))), "")
@@ -251,11 +236,6 @@ def is_union(hint: Any) -> bool:
 def is_optional(hint: Any) -> bool:
     """True for ``X | None``."""
     return is_union(hint) and type(None) in typing.get_args(hint)
-
-
-def _either(names: Iterable[Any]) -> str:
-    *others, last = map(str, names)
-    return f"{', '.join(others)} or {last}" if others else last
 
 
 def _plain(number: float) -> str:

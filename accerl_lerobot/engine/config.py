@@ -11,12 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
-from accerl_lerobot.algorithms import (
-    AlgorithmConfig,
-    ChunkCriticConfig,
-    GIPOConfig,
-    OffPolicyConfig,
-)
+from accerl_lerobot.algorithms import AlgorithmConfig, ChunkCriticConfig, GIPOConfig, OffPolicyConfig
 from accerl_lerobot.config.parsing import decode, encode, parse
 from accerl_lerobot.config.ranges import (
     DatasetConfig,

@@ -35,13 +35,7 @@ from accerl_lerobot.engine.config import RunConfig, journal_folder, timeline_fol
 from accerl_lerobot.engine.loop import Engine, Progress, Saved
 from accerl_lerobot.engine.placement import actor_options, place_workers
 from accerl_lerobot.engine.ray_session import RaySession
-from accerl_lerobot.engine.replicas import (
-    START_S,
-    InferenceReplicas,
-    RolloutPlace,
-    RolloutWorkers,
-    Worker,
-)
+from accerl_lerobot.engine.replicas import START_S, InferenceReplicas, RolloutPlace, RolloutWorkers, Worker
 from accerl_lerobot.engine.stopping import WorkerError
 from accerl_lerobot.inference.batcher import BatcherStats
 from accerl_lerobot.policies.config import Load

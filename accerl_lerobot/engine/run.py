@@ -234,11 +234,7 @@ def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfi
 
 
 def execute(
-    config: RunConfig,
-    directory: Path,
-    console: Console,
-    wanted: str | None = None,
-    load: Load | None = None,
+    config: RunConfig, directory: Path, console: Console, wanted: str | None = None, load: Load | None = None
 ) -> dict[str, Any]:
     """Do all phases and return the summary, which is also in ``summary.json``."""
     started = time.monotonic()

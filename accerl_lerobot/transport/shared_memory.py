@@ -32,13 +32,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from accerl_lerobot.transport.codec import aligned, decode, encode
-from accerl_lerobot.transport.contract import (
-    Client,
-    PendingRequest,
-    Server,
-    ServiceStoppedError,
-    stopped,
-)
+from accerl_lerobot.transport.contract import Client, PendingRequest, Server, ServiceStoppedError, stopped
 
 logger = logging.getLogger(__name__)
 
