@@ -162,10 +162,11 @@ def demos(arguments: list[str]) -> int:
     config: DemosRun = parse(DemosRun, arguments, recipe_class=RunConfig)
     from accerl_lerobot.demos.record import record_demos
     from accerl_lerobot.engine.preflight import check_world
-    from accerl_lerobot.engine.sizes import check_disk, demos_bytes
+    from accerl_lerobot.engine.sizes import check_disk
 
     with redirect_stdout(sys.stderr):
-        check_disk(config.root, demos_bytes(config.demos, check_world(config.env)), "root")
+        check_disk(config.root, "root")
+        check_world(config.env)
         path = record_demos(config.env, config.demos, config.root, config.seed)
     sys.stdout.write(f"{path}\n")
     return 0
@@ -187,7 +188,7 @@ def sft(arguments: list[str]) -> int:
     policy = sft_policy(config.sft)
     spec = None if config.env is None else check_world(config.env)
     check_training_data(config.sft, config.dataset, policy, spec, {})
-    check_disk(config.output_dir, 0)
+    check_disk(config.output_dir)
     directory = make_output_dir(config)
     with redirect_stdout(sys.stderr), kept_traceback(directory):
         path = fine_tune(config.sft, config.dataset, directory, config.seed, device, Console())

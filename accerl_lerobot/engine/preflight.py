@@ -19,7 +19,7 @@ import draccus
 from accerl_lerobot.algorithms import OffPolicyConfig
 from accerl_lerobot.config.ranges import Range, check
 from accerl_lerobot.engine import ray_session
-from accerl_lerobot.engine.sizes import check_disk, check_memory, disk_bytes
+from accerl_lerobot.engine.sizes import check_disk, check_memory
 from accerl_lerobot.envs import EnvConfig, WorldSpec, make_world
 from accerl_lerobot.errors import InputError, check_absent, expanded
 from accerl_lerobot.policies.features import (
@@ -99,7 +99,7 @@ def check_start(config: RunConfig) -> int:
     history = int(policy.n_obs_steps)
     if off_policy and meta is not None:
         _say_if_unlike(config, spec, meta, history)
-    check_disk(config.output_dir, disk_bytes(config, spec, history))
+    check_disk(config.output_dir)
     return history
 
 
@@ -214,12 +214,8 @@ def policy_to_be(config: RunConfig) -> Any:
         except InputError as error:
             if error.field not in ("policy.path", "policy.type", "policy.n_obs_steps"):
                 raise
-            said = (
-                ""
-                if error.field == "policy.path"
-                else f"{error.field.removeprefix('policy.')}={error.value}: "
-            )
-            raise InputError("sft.init_path", start.path, said + error.remedy) from error
+            what = "" if error.field == "policy.path" else f"{error.field.partition('.')[2]}={error.value}: "
+            raise InputError("sft.init_path", start.path, what + error.remedy) from error
     policy_config = check_sft_policy(config.sft)
     kind = check_type(config.sft.policy["type"], "sft.policy.type", "RL needs a likelihood: ")
     sampler_config(config.policy, kind)

@@ -44,8 +44,6 @@ CONNECT_S = 5.0
 """Timeout for a TCP connection to a cluster."""
 ANSWER_S = 60.0
 """Timeout for ``ray status``, most of which is importing Ray."""
-RESPONDS_S = 20.0
-"""Timeout for Ray to start a process; after that it counts as broken."""
 LOOK_S = 0.5
 """Between two looks at Ray's processes."""
 HURRY_S = 2.0
@@ -293,13 +291,13 @@ class RaySession:
         return self._lost if self._watch is None else self._watch.look()
 
     def start(self) -> None:
-        """Start Ray unless it is there, or if it does not respond any more."""
+        """Start Ray unless it is there and none of its processes is lost."""
         import ray
 
         if ray.is_initialized():
-            if not self._started or (not self.lost and _responds()):
+            if not self._started or not self.lost:
                 return
-            logger.warning("Ray does not respond any more and is started again")
+            logger.warning("%s, and Ray is started again", self.lost)
             self.close()
         self._started, self._lost = True, ""
         start_ray(self._launch)
@@ -387,14 +385,3 @@ class RayWatch(threading.Thread):
         stopped_s = time.monotonic() - self._stopped.setdefault(process, time.monotonic())
         limit = min(HURRY_S, self._stall_s) if arrived() else self._stall_s
         return f"has been stopped for {stopped_s:.0f} s" if stopped_s > limit else ""
-
-
-def _responds() -> bool:
-    """True if Ray still starts a process."""
-    import ray
-    from ray.exceptions import RayError
-
-    try:
-        return bool(ray.get(ray.remote(lambda: True).options(num_cpus=0).remote(), timeout=RESPONDS_S))
-    except RayError:
-        return False

@@ -4,21 +4,17 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from accerl_lerobot.algorithms import RatioConfig
-from accerl_lerobot.checkpoint.layout import KEEP
 from accerl_lerobot.errors import InputError, expanded
 from accerl_lerobot.replay.pacing import decisions_under_way, lag_bound
 
 if TYPE_CHECKING:
-    from accerl_lerobot.demos.record import DemosConfig
     from accerl_lerobot.engine.config import RunConfig
-    from accerl_lerobot.envs import WorldSpec
 
 GIB = 2**30
 POLICY_PROCESS_GIB, ROLLOUT_PROCESS_GIB, RAY_GIB = 1.2, 0.4, 0.7
@@ -28,8 +24,8 @@ rollout process without its worlds, Ray's own processes, and, by type of environ
 task with its renderers."""
 ABSURD = 2
 """Times this machine's memory that a rough estimate may be; ``accerl doctor`` warns long before."""
-SLACK_BYTES = 128 * 2**20
-"""Disk space for metrics, the timeline, the journal and videos."""
+DISK_BYTES = 2**29
+"""Disk space that demonstrations, checkpoints and videos take at least."""
 
 
 def check_memory(config: RunConfig, *, weights: bool = True) -> None:
@@ -117,35 +113,14 @@ def memory_gib(entry: str) -> float | None:
     return found / GIB
 
 
-def demos_bytes(config: DemosConfig, spec: WorldSpec) -> int:
-    """Disk space that demonstrations take, if half of the env steps are made and PNG halves the images."""
-    return config.episodes * spec.max_steps * sum(map(math.prod, spec.images.values())) // 4
-
-
-def disk_bytes(config: RunConfig, spec: WorldSpec, history: int) -> int:
-    """Disk space that a run takes at least, as far as it is known before; weights made by SFT are not."""
-    picture = sum(map(math.prod, spec.images.values()))
-    replay = (config.replay.capacity + config.remembered) * history * picture
-    policies = 1 + bool(config.saves)
-    if config.save_every_updates:
-        policies = 2 + config.trainer.updates // config.save_every_updates
-    whole = 1 + min(KEEP, policies)  # one more than is kept while it is written
-    records = config.policy.path is None and config.dataset.repo_id is None
-    weights = 0
-    if (path := config.policy.path or config.sft.init_path) is not None:
-        weights = sum(f.stat().st_size for f in Path(path).expanduser().glob("*.safetensors"))
-    return records * demos_bytes(config.demos, spec) + whole * replay + policies * weights
-
-
-def check_disk(folder: str | None, needed: int, field: str = "output_dir") -> None:
-    """Refuse a folder on a disk with too little space for `needed` bytes and small files; blames `field`."""
+def check_disk(folder: str | None, field: str = "output_dir") -> None:
+    """Refuse a folder on a disk with less free space than any run takes; blames `field`."""
     path = expanded(folder or ".", field).absolute()
     while not path.exists():
         path = path.parent
-    free = shutil.disk_usage(path).free
-    if free < needed + SLACK_BYTES:
-        remedy = f"{(needed + SLACK_BYTES) / GIB:.2f} GiB are needed and {free / GIB:.2f} GiB are free"
-        raise InputError(field, folder, f"{remedy} on this disk; make room or choose another")
+    if (free := shutil.disk_usage(path).free) < DISK_BYTES:
+        remedy = f"{free / GIB:.2f} GiB are free on this disk, and {DISK_BYTES / GIB:.1f} are needed at least"
+        raise InputError(field, folder, f"{remedy}; make room or choose another")
 
 
 def lag_limits(config: RunConfig) -> tuple[int, int]:
