@@ -20,7 +20,7 @@ from accerl_lerobot.config.parsing import choices_of, section_of
 from accerl_lerobot.config.ranges import Device, Pattern, Positive, Range, Section, Share, check, hints_of
 from accerl_lerobot.demos.backbone import BackboneConfig
 from accerl_lerobot.demos.sft import SFTConfig
-from accerl_lerobot.engine.config import PlacementConfig
+from accerl_lerobot.engine.config import LaunchConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.hub.card import PullConfig
 from accerl_lerobot.policies.config import TuningConfig
@@ -110,7 +110,7 @@ RULES = [
     (NetworkConfig, {"channels": ()}, "world_model.model.network.channels="),
     (ReplayConfig, {"min_decisions": 5000}, "replay.min_decisions="),
     (ReplayConfig, {"ahead": 5000}, "replay.ahead="),
-    (PlacementConfig, {"rollout": " "}, "launch.placement.rollout=' ': use a node's number"),
+    (LaunchConfig, {"placement": {"rollout": " "}}, "launch.placement.rollout=' ': use one of"),
     (SFTConfig, {"policy": {"chunk_size": 4}}, "sft.policy="),
     (TimelineConfig, {"runs": ()}, "runs="),
     (TuningConfig, {"targets": "("}, "policy.tuning.targets='(': not a regular"),

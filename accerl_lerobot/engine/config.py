@@ -16,7 +16,6 @@ from accerl_lerobot.config.parsing import decode, encode, parse
 from accerl_lerobot.config.ranges import (
     DatasetConfig,
     NonNegative,
-    Pattern,
     Positive,
     Range,
     Section,
@@ -40,30 +39,7 @@ from accerl_lerobot.world_model.config import ImaginationConfig
 __all__ = ["DatasetConfig", "LaunchConfig", "RunConfig", "decode", "encode", "parse"]
 
 
-Nodes = Annotated[str, Pattern(r".*\S.*", "a node's number, a resource, or all")]
-
-
-@dataclass(frozen=True, kw_only=True)
-class PlacementConfig(Section, section="launch.placement"):
-    """Nodes of all workers; replay is where the run is started.
-
-    A node's number as ``accerl doctor`` prints it, 0 being the one where the run is started; the name of a
-    custom resource, as in ``ray start --resources='{"simulators": 1}'``; or all. None: node 0.
-    """
-
-    trainer: Nodes | None = None
-    """Nodes of the trainer's ranks."""
-    inference: Nodes | None = None
-    """Nodes of the inference replicas."""
-    imagination: Nodes | None = None
-    """Nodes of the worker that imagines, and of the one that trains the world model."""
-    rollout: Nodes | None = None
-    """Nodes of the rollout workers."""
-
-    @property
-    def elsewhere(self) -> bool:
-        """True if any worker may be on another node."""
-        return any(nodes not in (None, "0") for nodes in vars(self).values())
+ROLES = ("trainer", "inference", "imagination", "rollout")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,8 +52,10 @@ class LaunchConfig(Section, section="launch"):
     """HOST:PORT of a running Ray cluster to join, or auto: the one that ``ray start`` has started here. It
     must ask for a token, which is looked for where Ray does: RAY_AUTH_TOKEN, RAY_AUTH_TOKEN_PATH,
     ``~/.ray/auth_token``. None: a private Ray on this machine."""
-    placement: PlacementConfig = field(default_factory=PlacementConfig)
-    """Nodes of the workers."""
+    placement: dict[str, str] = field(default_factory=dict)
+    """Role (trainer, inference, imagination or rollout) → nodes of its workers: a number as ``accerl doctor``
+    prints it, 0 being the node where the run is started; the name of a custom resource, as in
+    ``ray start --resources='{"simulators": 1}'``; or all. Not given: node 0, where replay always is."""
     schedule: Schedule = ASYNCHRONOUS
     """asynchronous: no worker waits for another. synchronous: a batch is collected, by all environments in
     lock step, then learned from. overlap: the next one is collected meanwhile. The last two are for measuring
@@ -96,19 +74,21 @@ class LaunchConfig(Section, section="launch"):
         super().__post_init__()
         if self.engine == "local":
             one = "launch.engine=local is one process"
-            for name, default in (("schedule", ASYNCHRONOUS), ("address", None)):
+            for name, default in (("schedule", ASYNCHRONOUS), ("address", None), ("placement", {})):
                 if (value := getattr(self, name)) != default:
                     raise InputError(f"launch.{name}", value, f"{one}; leave it out")
-            if self.placement != PlacementConfig():
-                raise InputError("launch.placement", "…", f"{one}; leave it out")
+        for role, nodes in self.placement.items():
+            if role not in ROLES or not nodes.strip():
+                remedy = f"use one of {', '.join(ROLES)}, and a node's number, a resource, or all"
+                raise InputError(f"launch.placement.{role}", nodes, remedy)
         if self.address is not None and self.address != "auto":
             host, _, port = self.address.rpartition(":")
             if not host or not port.isdecimal() or not 0 < int(port) < 65536:
                 remedy = "use HOST:PORT as ray start --head prints it, or auto"
                 raise InputError("launch.address", self.address, remedy)
-        if self.address is None and self.placement.elsewhere:
+        if self.address is None and not {"0"}.issuperset(self.placement.values()):
             remedy = "a private Ray has one node; add --launch.address=auto, or leave the field out"
-            raise InputError("launch.placement", "…", remedy)
+            raise InputError("launch.placement", self.placement, remedy)
 
 
 @dataclass(frozen=True, kw_only=True)

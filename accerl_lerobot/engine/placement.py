@@ -70,7 +70,7 @@ class Role(NamedTuple):
     name: str
     workers: list[str]
     selector: str | None
-    """Nodes, see `PlacementConfig`."""
+    """Nodes, see `LaunchConfig.placement`; None: the one where the run is started."""
     network: bool = True
     """True if they need a share of a GPU, and files."""
 
@@ -138,10 +138,10 @@ def roles_of(config: RunConfig) -> list[Role]:
     imagining = ["imagination"] * bool(c.imagination.share) + ["world learning"] * c.imagination.learns
     rollouts = [f"rollout {i}" for i in range(c.rollout.workers)]
     roles = [
-        Role("trainer", ranks, placement.trainer),
-        Role("inference", numbered("inference", c.inference.workers), placement.inference),
-        Role("imagination", imagining, placement.imagination),
-        Role("rollout", rollouts, placement.rollout, network=False),
+        Role("trainer", ranks, placement.get("trainer")),
+        Role("inference", numbered("inference", c.inference.workers), placement.get("inference")),
+        Role("imagination", imagining, placement.get("imagination")),
+        Role("rollout", rollouts, placement.get("rollout"), network=False),
     ]
     return [role for role in roles if role.workers]
 
