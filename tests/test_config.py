@@ -136,7 +136,7 @@ MISTAKES: list[tuple[list[str], str]] = [
         ["--algorithm.discover_packages_path=a/b"],
         "algorithm.discover_packages_path='a/b': use the name of a package",
     ),
-    (["--env.type=vlabench"], "env.type='vlabench': use one of gym, lerobot, libero, metaworld, simulated;"),
+    (["--env.type=vlabench"], "env.type='vlabench': use one of gym, lerobot, libero, metaworld, simulated"),
     (["--seed=1", "--seed=2"], "seed=2: it is set to 1 already; give it once"),
     (["--job_name=" + "x" * 5000], "job_name='xxx"),
     (["--trainer..lr=1"], "argument='--trainer..lr=1': write --section.field=value"),

@@ -11,7 +11,7 @@ journal is left out and counted.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -83,7 +83,9 @@ def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
     if not (run / CONFIG).is_file():
         raise InputError("path", str(run), f"no run in it: there is no {CONFIG}")
     settings = _settings(run, config)
-    chosen = _picked(whole_episodes(read_journal(run / EPISODES)), config)
+    wanted, picks_all = config.pick == "successes", config.pick == "all"
+    episodes = whole_episodes(read_journal(run / EPISODES))
+    chosen = [parts for parts in episodes if picks_all or parts[-1].success is wanted]
     if not chosen:
         remedy = f"no whole episode in its {EPISODES} of those asked for ({config.pick})"
         raise InputError("path", str(run), remedy)
@@ -117,11 +119,6 @@ def _settings(run: Path, config: ExportConfig) -> RunConfig:
         env |= {"trust_remote_code": True, "kwargs": dict(env.get("kwargs") or {}) | {"hub_path": hub_path}}
     settings: RunConfig = decode(RunConfig, tree)
     return settings
-
-
-def _picked(episodes: Iterable[list[Done]], config: ExportConfig) -> list[list[Done]]:
-    wanted = config.pick == "successes"
-    return [parts for parts in episodes if config.pick == "all" or parts[-1].success is wanted]
 
 
 def _write(

@@ -30,7 +30,8 @@ from accerl_lerobot.checkpoint.layout import (
 )
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import RunConfig
-from accerl_lerobot.engine.stopping import Stopping, raise_if_stopped
+from accerl_lerobot.engine.resuming import raise_if_stopped
+from accerl_lerobot.engine.stopping import Stopping
 from accerl_lerobot.evaluation import before_after, evaluation_plans, success_curve, summarise
 from accerl_lerobot.metrics import MetricsLog, plain
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult

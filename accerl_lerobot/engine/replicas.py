@@ -455,37 +455,27 @@ class InferenceReplicas(Replicas[InferencePlace]):
         return actor.remote(*self._arguments, worker.name)
 
     def _restart(self, worker: InferencePlace, error: Exception) -> None:
-        again: Exception | None = error
-        while again is not None:
-            worker.count_restart(again, self._launch.max_restarts)
-            worker.end(again)
-            if (node := self._plan.places[worker.name].node).key not in alive_nodes():
-                raise WorkerError(f"{worker.name} worker is lost: {node} has left:\n{again}") from again
+        here, limit = self._plan.places[worker.name].node, self._launch.stall_s
+        while True:
+            worker.count_restart(error, self._launch.max_restarts)
+            worker.end(error)
+            if here.key not in alive_nodes():
+                raise WorkerError(f"{worker.name} worker is lost: {here} has left:\n{error}") from error
             self.restarts += 1
             time.sleep(pause_s(worker.restarts - 1))
             worker.occupy(self._new(worker))
-            again = self._come_up(worker)
-        logger.info("%s worker is up again", worker.name)
-
-    def _come_up(self, worker: InferencePlace) -> Exception | None:
-        """Wait until a new process serves with the trainer's newest weights, and tell its clients.
-
-        Returns:
-            The error, if it fails or takes too long.
-        """
-        here, limit = self._plan.places[worker.name].node.number == 0, self._launch.stall_s
-        try:
-            worker.await_start(worker.actor.ready.remote(), max(START_S, limit), here)
-            endpoint = self._serve(worker)
-            if worker.lock_step:
-                worker.call("lock_step", worker.lock_step, timeout=limit)
-            if self.trainer is not None:
-                self._await_weights(worker, endpoint)
-        except (RayError, TimeoutError, WorkerError) as error:
-            worker.since = math.inf
-            return error
+            try:  # to serve with the trainer's newest weights
+                worker.await_start(worker.actor.ready.remote(), max(START_S, limit), here.number == 0)
+                endpoint = self._serve(worker)
+                if worker.lock_step:
+                    worker.call("lock_step", worker.lock_step, timeout=limit)
+                if self.trainer is not None:
+                    self._await_weights(worker, endpoint)
+                break
+            except (RayError, TimeoutError, WorkerError) as again:
+                worker.since, error = math.inf, again
         self._moved(worker.index, endpoint)
-        return None
+        logger.info("%s worker is up again", worker.name)
 
     def _serve(self, worker: InferencePlace) -> Endpoint:
         endpoint = worker.endpoint("decide", self._launch.stall_s)

@@ -54,14 +54,10 @@ from accerl_lerobot.engine import ray_session
 from accerl_lerobot.engine.config import RunConfig, encode, parse, timeline_folder
 from accerl_lerobot.engine.loop import Engine, Loop, Outputs, Times, run_plans
 from accerl_lerobot.engine.preflight import check_placement, check_policy, check_start, check_world
-from accerl_lerobot.engine.sizes import check_memory
-from accerl_lerobot.engine.stopping import (
+from accerl_lerobot.engine.resuming import (
     LOCK,
     WARM_START,
     Recovery,
-    StoppedError,
-    Stopping,
-    WorkerError,
     checkpoint_of,
     continued,
     improving,
@@ -70,6 +66,8 @@ from accerl_lerobot.engine.stopping import (
     resume_command,
     resumed_run,
 )
+from accerl_lerobot.engine.sizes import check_memory
+from accerl_lerobot.engine.stopping import StoppedError, Stopping, WorkerError
 from accerl_lerobot.errors import InputError, check_absent, expanded, is_full, kept_traceback, make_folder
 from accerl_lerobot.evaluation import Rate, evaluation_plans
 from accerl_lerobot.experience import Observation, Request
@@ -108,10 +106,13 @@ def start(
     config: RunConfig, console: Console, recipe: Path | None = None, load: Load | None = None
 ) -> tuple[Path, dict[str, Any]]:
     """Do a new run, or with ``config.resume`` the rest of the one whose config is `recipe`."""
-    resumed = resumed_run(recipe, config) if config.resume else None
-    if load is None and resumed is None:
-        check_start(config)  # before there is a folder
-    directory = make_output_dir(config) if resumed is None else resumed.directory
+    wanted = None
+    if config.resume:
+        directory, wanted = resumed_run(recipe, config)
+    else:
+        if load is None:
+            check_start(config)  # before there is a folder
+        directory = make_output_dir(config)
     console.say(f"run {directory}")
     how = resume_command(directory)
     guardian.explain(remedy=f"to resume: {how}")
@@ -121,10 +122,9 @@ def start(
             kept_traceback(directory),
             locked(directory, "config_path", "another process resumes it"),
         ):
-            wanted = None if resumed is None else resumed.checkpoint
             return directory, execute(config, directory, console, wanted, load)
     except InputError:
-        if resumed is None:
+        if wanted is None:
             discard_unused(directory)
         raise
     except StoppedError:
