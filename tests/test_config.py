@@ -270,7 +270,10 @@ class TestPreflight:
                 "sft.policy.chunks=3: LeRobot's smolvla has no such field; did you",
             ),
             ({"type": "smolvla", "num_steps": "x"}, "sft.policy.num_steps='x': LeRobot says: "),
-            ({"type": "smolvla", "chunk_size": 0}, "sft.policy.chunk_size=0: use a whole number from 1 to"),
+            (
+                {"type": "smolvla", "chunk_size": 0},
+                "sft.policy.chunk_size=0: use a whole number in [1, 10000]",
+            ),
             (
                 {"type": "smolvla", "chunk_size": 10},
                 "sft.policy={'chunk_size': 10}: LeRobot says: The chunk size",
@@ -323,9 +326,9 @@ def test_every_field_has_a_name_on_the_command_line() -> None:
         (list[str], "a list such as [a, b], each text"),
         (dict[str, int], "a mapping such as {key: value}"),
         (Literal["a", "b"], "a or b"),
-        (Share, "a number from 0 to 1"),
-        (Positive | None, "a number above 0 or null"),
-        (Annotated[float, Range("[1, inf]")], "a number of at least 1, or inf"),
+        (Share, "a number in [0, 1]"),
+        (Positive | None, "a number in (0, inf) or null"),
+        (Annotated[float, Range("[1, inf]")], "a number in [1, inf]"),
         (Path, "Path"),
     ],
 )

@@ -174,5 +174,5 @@ def test_a_field_with_another_default_keeps_its_range():
         share: float = 0.7
 
     assert dataclasses.asdict(Mine(share=1)) == {"share": 1}
-    with pytest.raises(InputError, match=r"^mine\.share=2: use a number from 0 to 1$"):
+    with pytest.raises(InputError, match=r"^mine\.share=2: use a number in \[0, 1\]$"):
         Mine(share=2)

@@ -48,20 +48,6 @@ class Range:
         above = value > self.low if self._low_open else value >= self.low
         return bool(above and (value < self.high if self._high_open else value <= self.high))
 
-    @property
-    def words(self) -> str:
-        """The interval after the words "a number"."""
-        unbounded = self.high == math.inf
-        if unbounded and self._low_open:
-            words = f" above {self.low:,g}"
-        elif unbounded:
-            words = f" of at least {self.low:,g}"
-        elif self._low_open or self._high_open:
-            return f" in {self.text}"
-        else:
-            return f" from {_plain(self.low)} to {_plain(self.high)}"
-        return words if self._high_open else f"{words}, or inf"
-
 
 class Pattern:
     """Texts that match a regular expression; `words` says which these are."""
@@ -197,7 +183,7 @@ def wanted(hint: Any) -> str:
             if isinstance(mark, Pattern):
                 return mark.words
             if isinstance(mark, Range):
-                return f"{wanted(arguments[0])}{mark.words}"
+                return f"{wanted(arguments[0])} in {mark.text}"
         return wanted(arguments[0])
     if is_union(hint):
         parts = [wanted(kind) for kind in arguments if kind is not type(None)]
@@ -222,7 +208,7 @@ def range_in_words(hint: Any) -> str:
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     for mark in arguments[1:] if origin is Annotated else ():
         if isinstance(mark, Range):
-            return mark.words.removeprefix(" of").strip()
+            return f"in {mark.text}"
     if origin is typing.Literal:
         return " | ".join(map(str, arguments))
     return next((text for kind in arguments if (text := range_in_words(kind))), "")
@@ -236,10 +222,6 @@ def is_union(hint: Any) -> bool:
 def is_optional(hint: Any) -> bool:
     """True for ``X | None``."""
     return is_union(hint) and type(None) in typing.get_args(hint)
-
-
-def _plain(number: float) -> str:
-    return f"{int(number):,}" if number == int(number) else f"{number:g}"
 
 
 def unmarked(hint: Any) -> Any:
