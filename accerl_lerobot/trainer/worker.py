@@ -32,6 +32,8 @@ from accerl_lerobot.transport.weights import PublishDelay, WeightPublisher
 
 FIRST_S = 120.0
 """Timeout for the first weights to be published."""
+RESEND_S = 0.2
+"""Interval at which replicas that were busy are sent the newest weights while the trainer waits for a batch."""
 
 
 class TrainerWorker:
@@ -112,7 +114,8 @@ class TrainerWorker:
         asked = time.monotonic()
         while self._update.version < config.updates:
             self._clock.enter(WAIT_IN)
-            ray.wait([upcoming])
+            while not ray.wait([upcoming], timeout=RESEND_S)[0]:
+                publisher.resend()
             self._clock.enter(TRANSPORT)
             batch, segments = upcoming, ray.get(upcoming)
             if not segments:

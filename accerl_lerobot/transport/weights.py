@@ -57,7 +57,7 @@ class WeightPublisher:
     Example:
         >>> publisher = WeightPublisher([inference])
         >>> publisher.publish(1, tensors)   # copies them
-        >>> publisher.flush()               # before `tensors` change; so is `add`
+        >>> publisher.flush()               # before `tensors` change; so are `resend` and `add`
     """
 
     def __init__(self, readers: Iterable[Endpoint] = ()) -> None:
@@ -73,14 +73,19 @@ class WeightPublisher:
         except ServiceStoppedError as error:
             _end(endpoint, error)
             return
-        self._readers.append(reader)
-        self._advance(reader)
+        if self._advance(reader):
+            self._readers.append(reader)  # another thread may flush meanwhile
 
     def publish(self, version: int, tensors: Tensors) -> None:
         """Copy a set to every replica that has applied the one before the last."""
         self._newest = WeightUpdate(version, time.time(), tensors)
+        self.resend()
+
+    def resend(self) -> None:
+        """Copy the newest set to replicas that were busy when it was published."""
         for reader in list(self._readers):
-            self._advance(reader)
+            if not self._advance(reader):
+                self._readers.remove(reader)
 
     def flush(self, timeout_s: float = FLUSH_S) -> None:
         """Wait until every replica has applied the newest set."""
@@ -89,7 +94,8 @@ class WeightPublisher:
             if (left := deadline - time.monotonic()) <= 0:
                 names = ", ".join(reader.endpoint.name for reader in late)
                 raise TimeoutError(f"weights not applied within {timeout_s:g} s by {names}")
-            self._advance(late[0], left)
+            if not self._advance(late[0], left):
+                self._readers.remove(late[0])
 
     def close(self) -> None:
         """End all connections."""
@@ -100,8 +106,8 @@ class WeightPublisher:
     def _is_behind(self, reader: _Reader) -> bool:
         return self._newest is not None and reader.sent != self._newest.version
 
-    def _advance(self, reader: _Reader, wait_s: float = 0.0) -> None:
-        """Send the newest set if there is room, waiting for answers where there are any to wait for."""
+    def _advance(self, reader: _Reader, wait_s: float = 0.0) -> bool:
+        """Hear what a replica has applied, and send the newest set if there is room; False: it is gone."""
         try:
             if reader.under_way:
                 reader.under_way -= {ticket for ticket, _ in reader.client.done(wait_s)}
@@ -110,9 +116,10 @@ class WeightPublisher:
                 reader.under_way.add(reader.client.send(self._newest))
                 reader.sent = self._newest.version
         except ServiceStoppedError as error:
-            self._readers.remove(reader)
             reader.client.close()
             _end(reader.endpoint, error)
+            return False
+        return True
 
 
 def _end(endpoint: Endpoint, error: Exception) -> None:
