@@ -33,7 +33,7 @@ from accerl_lerobot.transport.weights import PublishDelay, WeightPublisher
 FIRST_S = 120.0
 """Timeout for the first weights to be published."""
 RESEND_S = 0.2
-"""Interval at which replicas that were busy are sent the newest weights while the trainer waits for a batch."""
+"""Interval at which replicas that were busy get the newest weights while the trainer waits for a batch."""
 
 
 class TrainerWorker:
