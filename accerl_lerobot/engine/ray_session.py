@@ -24,7 +24,7 @@ import threading
 import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import psutil
 
@@ -245,14 +245,7 @@ def check_cluster(launch: LaunchConfig) -> None:
             why = error.strerror or error
             remedy = f"nobody listens at {address} ({why}); is it what ray start --head printed?"
             raise InputError(FIELD, address, remedy) from error
-    command = [sys.executable, *STATUS, f"--address={address}"]
-    pipes: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
-    with (
-        subprocess.Popen(command, **pipes) as ours,
-        subprocess.Popen(command, env=without_token(), **pipes) as strangers,
-    ):
-        complaint, open_to_all = _complaint(ours), _complaint(strangers) is None
-    if complaint is not None:
+    if (complaint := _complaint(address)) is not None:
         if any(word in complaint for word in UNAUTHORISED):
             remedy = "it does not take the token that is configured here; see RAY_AUTH_TOKEN_PATH"
         elif address == "auto" and "ConnectionError" in complaint:
@@ -261,20 +254,20 @@ def check_cluster(launch: LaunchConfig) -> None:
             last = (complaint.strip().splitlines() or ["no answer"])[-1][:200]
             remedy = f"it does not answer as Ray does: {last}"
         raise InputError(FIELD, address, remedy)
-    if open_to_all:
+    if _complaint(address, without_token()) is None:
         remedy = "it asks for no token, so whoever reaches it runs code in its workers; start it with "
         remedy += "RAY_AUTH_MODE=token"
         raise InputError(FIELD, address, remedy)
 
 
-def _complaint(process: subprocess.Popen[str]) -> str | None:
-    """The stderr of a process that failed; None: it succeeded."""
+def _complaint(address: str, env: dict[str, str] | None = None) -> str | None:
+    """Why a cluster does not tell its status to somebody in this environment; None: it does."""
+    command = [sys.executable, *STATUS, f"--address={address}"]
     try:
-        _, complaint = process.communicate(timeout=ANSWER_S)
+        done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=ANSWER_S, check=False)
     except subprocess.TimeoutExpired:
-        process.kill()
         return f"no answer within {ANSWER_S:.0f} s"
-    return complaint if process.returncode else None
+    return done.stderr if done.returncode else None
 
 
 class RaySession:
@@ -308,14 +301,13 @@ class RaySession:
         """End Ray, if it was started here. Safe to call twice."""
         import ray
 
-        self._lost = self.lost
+        self._lost, watch, self._watch = self.lost, self._watch, None
         if self._started and ray.is_initialized():
-            if self._watch is not None and self._lost:
-                kill_ray(self._watch.processes)
+            if watch is not None and self._lost:
+                kill_ray(watch.processes)
             ray.shutdown()
-        if self._watch is not None:
-            self._watch.close()
-            self._watch = None
+        if watch is not None:
+            watch.close()
         self._started = False
 
 
