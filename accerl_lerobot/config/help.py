@@ -178,8 +178,8 @@ def _in_full(listed: list[Line]) -> list[str]:
         if not text or len(start) >= COLUMN:
             lines.append(start)
             start = ""
-        indents = {"initial_indent": start.ljust(COLUMN), "subsequent_indent": " " * COLUMN}
-        lines += textwrap.wrap(text, WIDTH, **indents)
+        first, others = start.ljust(COLUMN), " " * COLUMN
+        lines += textwrap.wrap(text, WIDTH, initial_indent=first, subsequent_indent=others)
     return lines
 
 

@@ -263,7 +263,7 @@ class RolloutWorkers(Replicas[RolloutPlace]):
             config, [RolloutPlace(i, budget) for i, budget in enumerate(budgets(config.rollout))]
         )
         self._tasks, self._history = tasks, history
-        self._past: Counter[str] = Counter(restarts=0.0)  # type: ignore[arg-type]
+        self._past: Counter[str] = Counter(restarts=0)
         """Counters of processes that have ended."""
         self._inference: list[Endpoint] = []
         self._replay: Endpoint | None = None
@@ -302,7 +302,7 @@ class RolloutWorkers(Replicas[RolloutPlace]):
         """Sums over all processes since the run began."""
         totals = self._past.copy()
         for worker in self._all:
-            totals.update(worker.report.counters if worker.report is not None else {})  # type: ignore[arg-type]
+            totals.update(worker.report.counters if worker.report is not None else {})
         return dict(totals)
 
     @property
@@ -362,7 +362,7 @@ class RolloutWorkers(Replicas[RolloutPlace]):
             worker.count_restart(error, self._launch.max_restarts)
         worker.end(error)
         self._past["restarts"] += 1
-        self._past.update(worker.report.counters if worker.report is not None else {})  # type: ignore[arg-type]
+        self._past.update(worker.report.counters if worker.report is not None else {})
         worker.incarnation = worker.next_incarnation
         worker.moved = None
         worker.unsent = list(worker.outstanding.values())
