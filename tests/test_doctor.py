@@ -240,14 +240,6 @@ class TestResources:
         text = "100 updates of 64 on about 1,600 decisions, at most 8,000 env steps"
         assert checks(config)["work"].text == text
 
-    def test_a_gpu_that_is_not_there(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        import torch
-
-        monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-        check = doctor.cuda(self.recipe(policy={"device": "cuda"}))
-        assert check.status == FAIL and "use auto or cpu" in check.text
-        assert doctor.cuda(None).status == OK
-
 
 def test_imagination_is_checked_where_there_is_any(capsys: pytest.CaptureFixture[str]) -> None:
     recipe = str(QUICKSTART.with_name("imagination.yaml"))

@@ -78,10 +78,16 @@ def main(arguments: list[str]) -> int:
     config, history, checks = _resolve(arguments) if arguments else (None, 1, [])
     checks += machine(config, history)
     if config is not None:
-        checks += [*pace(config), *imagination_checks(config), *placement(config), *policy_fits(config)]
-    for check in checks:
-        sys.stdout.write(f"{check.status:5} {check.name:10} {check.text}\n")
-    failed = sum(check.status == FAIL for check in checks)
+        more = {"imagination": imagination_checks, "placement": placement, "policy": policy_fits}
+        checks += pace(config)
+        for name, check in more.items():
+            try:
+                checks += check(config)
+            except InputError as error:
+                checks.append(Check(name, FAIL, str(error)))
+    for each in checks:
+        sys.stdout.write(f"{each.status:5} {each.name:10} {each.text}\n")
+    failed = sum(each.status == FAIL for each in checks)
     sys.stdout.write(f"\n{'all good' if not failed else f'{failed} of {len(checks)} checks failed'}\n")
     return 1 if failed else 0
 
@@ -90,8 +96,7 @@ def machine(config: RunConfig | None, history: int = 1) -> Iterator[Check]:
     """Checks that any run needs, and those of `config`; `history` is the policy's ``n_obs_steps``."""
     yield Check("python", OK, f"{platform.python_version()} in {sys.prefix}")
     yield packages()
-    yield ray_imports(joins=config is not None and config.launch.address is not None)
-    yield cuda(config)
+    yield from libraries(config)
     yield rendering(needed=config is None or config.env.type in ("metaworld", "libero"))
     yield from resources(config, history)
 
@@ -122,32 +127,28 @@ def packages() -> Check:
     return Check("packages", OK, text)
 
 
-def ray_imports(joins: bool = False) -> Check:
-    """Ray, with the environment a run would give it."""
+def libraries(config: RunConfig | None) -> Iterator[Check]:
+    """Ray, with the environment a run would give it, torch, and the GPUs that it sees."""
     from accerl_lerobot.engine import ray_session
 
-    ray_session.prepare(joins)
-    try:
-        import ray
-    except Exception as error:
-        return Check("ray", FAIL, f"cannot be imported ({brief(error)}); run make setup")
-    return Check("ray", OK, ray.__version__)
+    ray_session.prepare(joins=config is not None and config.launch.address is not None)
+    for name in ("ray", "torch"):
+        try:
+            text = importlib.import_module(name).__version__
+        except Exception as error:
+            yield Check(name, FAIL, f"cannot be imported ({brief(error)}); run make setup")
+            continue
+        if name == "torch":
+            text += f", {gpus}" if (gpus := gpu_names()) else ", no CUDA device; policies run on the CPU"
+        yield Check(name, OK, text)
 
 
-def cuda(config: RunConfig | None) -> Check:
-    """GPUs that torch sees, and whether the recipe insists on one."""
-    wish = config.policy.device if config is not None else "auto"
-    try:
-        import torch
-    except Exception as error:
-        return Check("torch", FAIL, f"cannot be imported ({brief(error)}); run make setup")
-    if torch.cuda.is_available():
-        gpus = f"{torch.cuda.device_count()} × {torch.cuda.get_device_name(0)}"
-        return Check("torch", OK, f"{torch.__version__}, {gpus}")
-    text = f"{torch.__version__}, no CUDA device"
-    if wish.startswith("cuda"):
-        return Check("torch", FAIL, f"{text}: policy.device={wish!r} cannot be had; use auto or cpu")
-    return Check("torch", OK, f"{text}; policies run on the CPU")
+def gpu_names() -> str:
+    """The GPUs that torch sees, as ``2 × NVIDIA H100``; empty: none."""
+    import torch
+
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    return f"{count} × {torch.cuda.get_device_name(0)}" if count else ""
 
 
 def rendering(*, needed: bool, script: str = DRAW) -> Check:
@@ -209,11 +210,7 @@ def imagination_checks(config: RunConfig) -> Iterator[Check]:
         return
     from accerl_lerobot.engine.imagination import check_imagination
 
-    try:
-        check_imagination(config)
-    except InputError as error:
-        yield Check("imagination", FAIL, str(error))
-        return
+    check_imagination(config)
     text = f"{imagination.share:.0%} of every batch; world model: {imagination.model}"
     yield Check("imagination", OK, text)
 
@@ -222,10 +219,7 @@ def placement(config: RunConfig) -> Iterator[Check]:
     """Where each worker would run; the cluster is asked if one is to be joined."""
     from accerl_lerobot.engine.preflight import check_placement
 
-    try:
-        yield from [Check("placement", OK, row) for row in check_placement(config)]
-    except InputError as error:
-        yield Check("placement", FAIL, str(error))
+    return (Check("placement", OK, row) for row in check_placement(config))
 
 
 def policy_fits(config: RunConfig) -> Iterator[Check]:
@@ -238,13 +232,9 @@ def policy_fits(config: RunConfig) -> Iterator[Check]:
     if config.policy.path is None or not config.trainer.updates:
         return
     trainer, ratio = config.trainer, isinstance(config.algorithm, RatioConfig)
-    try:
-        device = resolve_device(config.policy.device)
-        measure = partial(policy_memory, imitates=not ratio, checkpointing=trainer.activation_checkpointing)
-        memory = PolicyMemory(*rehearsed(config.policy, measure))
-    except InputError as error:
-        yield Check("policy", FAIL, str(error))
-        return
+    device = resolve_device(config.policy.device)
+    measure = partial(policy_memory, imitates=not ratio, checkpointing=trainer.activation_checkpointing)
+    memory = PolicyMemory(*rehearsed(config.policy, measure))
     batch = math.ceil(trainer.batch_decisions / trainer.ranks) if ratio else POLICY_BATCH
     decisions = min(batch, trainer.micro_batch)
     kept = memory.trainer(0, trained_copies(config)) / (trainer.ranks if trainer.zero else 1)

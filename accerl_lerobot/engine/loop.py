@@ -171,28 +171,22 @@ class Times:
         return (self.before_s or 0.0) + time.monotonic() - self.started
 
 
-class Outputs(NamedTuple):
-    """Where a run writes to."""
-
-    directory: Path
-    console: Console
-    log: MetricsLog
-
-
 class Loop:
     """Evaluates, trains, saves checkpoints, and writes the results; `stop` tells when to save and end."""
 
     def __init__(
         self,
         config: RunConfig,
-        outputs: Outputs,
+        directory: Path,
+        console: Console,
+        log: MetricsLog,
         engine: Engine,
         tasks: tuple[str, ...],
         times: Times,
         stop: Stopping,
     ) -> None:
         self.config, self.engine, self.tasks = config, engine, tasks
-        self.directory, self.console, self.log = outputs
+        self.directory, self.console, self.log = directory, console, log
         self.times, self.stop = times, stop
         self.before: dict[str, Any] | None = None
         """The evaluation before training, where there was one."""

@@ -52,7 +52,7 @@ from accerl_lerobot.console import Console
 from accerl_lerobot.demos.record import REPO_ID, record_demos
 from accerl_lerobot.engine import ray_session
 from accerl_lerobot.engine.config import RunConfig, encode, parse, timeline_folder
-from accerl_lerobot.engine.loop import Engine, Loop, Outputs, Times, run_plans
+from accerl_lerobot.engine.loop import Engine, Loop, Times, run_plans
 from accerl_lerobot.engine.preflight import check_placement, check_policy, check_start, check_world
 from accerl_lerobot.engine.resuming import (
     LOCK,
@@ -279,8 +279,8 @@ def execute(
                     raise_if_stopped(stop, directory)
                     raise
                 with contextlib.closing(engine):
-                    outputs = Outputs(directory, console, log)
-                    return Loop(config, outputs, engine, spec.tasks, times, stop).run(state)
+                    loop = Loop(config, directory, console, log, engine, spec.tasks, times, stop)
+                    return loop.run(state)
             except Exception as error:
                 lost = "" if session is None else session.lost  # whatever error that has led to
                 loss = WorkerError(lost) if lost else error
