@@ -25,12 +25,13 @@ class Stage:
 
     def update(self, done: int, status: str = "") -> None:
         """Moves the bar, and shows `status` beside it."""
+        self._progress.update(self._task.id, completed=done)
         total = self._task.total
         parts = [f"{done}/{total:.0f} ({done / total:.0%})" if total else str(done)]
         if seconds := self._task.time_remaining:
             parts.append(f"{datetime.timedelta(seconds=round(seconds))} left")
         text = " · ".join(parts + ([status] if status else []))
-        self._progress.update(self._task.id, completed=done, text=text)
+        self._progress.update(self._task.id, text=text)
         if not self._console.is_terminal and time.monotonic() - self._said > PLAIN_EVERY_S:
             self._said = time.monotonic()
             self._console.print(f"  {self._task.description} {text}", highlight=False, soft_wrap=True)
