@@ -142,7 +142,7 @@ def start(
 
 def play_evaluation(config: RunConfig, console: Console, filmed: int = 0) -> list[EpisodeResult]:
     """Play the evaluation episodes of a run with LeRobot's sampler, on seeds that are never trained on."""
-    check_memory(config, weights=False)
+    check_memory(config)
     spec = check_world(config.env)
     engine = make_engine(config, spec.tasks, check_policy(config, spec))
     with contextlib.closing(engine):

@@ -28,8 +28,8 @@ DISK_BYTES = 2**29
 """Disk space that demonstrations, checkpoints and videos take at least."""
 
 
-def check_memory(config: RunConfig, *, weights: bool = True) -> None:
-    """Refuse sizes far beyond this machine's memory, and `weights` that it cannot hold.
+def check_memory(config: RunConfig) -> None:
+    """Refuse sizes far beyond this machine's memory, and weights that it cannot hold.
 
     Nodes of a cluster that is joined may have more.
     """
@@ -42,7 +42,7 @@ def check_memory(config: RunConfig, *, weights: bool = True) -> None:
         remedy = f"the run needs about {needed:,.0f} GiB of memory, this machine has {total:.0f}; lower it"
         section, _, name = largest.partition(".")
         raise InputError(largest, getattr(getattr(config, section), name), remedy)
-    if weights and (need := policy_gib(config)) > total:
+    if (need := policy_gib(config)) > total:
         text = f"its weights take {need:.1f} GiB in the processes of this run, this machine has {total:.1f}"
         remedy = "use a smaller policy, a GPU, launch.engine=local or policy.tuning.mode=lora"
         raise InputError("policy.path", config.policy.path, f"{text}; {remedy}")
