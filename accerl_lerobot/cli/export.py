@@ -11,7 +11,7 @@ journal is left out and counted.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -124,9 +124,8 @@ def _settings(run: Path, config: ExportConfig) -> RunConfig:
 def _write(
     settings: RunConfig, config: ExportConfig, chosen: list[list[Done]], root: Path, console: Console
 ) -> dict[str, int]:
-    world = make_world(settings.env)
-    spec = world.spec
-    world.close()
+    with closing(make_world(settings.env)) as world:
+        spec = world.spec
     tally = {"episodes": 0, "frames": 0, "successes": 0, "unlike": 0}
     version = {VERSION: {"dtype": "int64", "shape": (1,), "names": None}}
     table = features(spec, settings.env.state_size) | version
@@ -142,8 +141,9 @@ def _write(
                 if episode is None:
                     tally["unlike"] += 1
                     continue
-                for frame in _versioned(episode, parts):
-                    dataset.add_frame(frame)
+                versions = np.concatenate([np.repeat(part.versions, part.steps) for part in parts])
+                for frame, policy in zip(frames(episode), versions, strict=True):
+                    dataset.add_frame(frame | {VERSION: np.array([policy], np.int64)})
                 dataset.save_episode()
                 tally["episodes"] += 1
                 tally["frames"] += len(episode)
@@ -151,12 +151,6 @@ def _write(
     if tally["unlike"]:
         console.say(f"{tally['unlike']} of {len(chosen)} episodes differed from the run and are left out")
     return tally
-
-
-def _versioned(episode: Episode, parts: list[Done]) -> Iterator[dict[str, Any]]:
-    versions = [v for part in parts for v, n in zip(part.versions, part.steps, strict=True) for _ in range(n)]
-    for frame, version in zip(frames(episode), versions, strict=True):
-        yield frame | {VERSION: np.array([version], np.int64)}
 
 
 _world: World

@@ -35,7 +35,7 @@ from accerl_lerobot.engine.config import RunConfig, journal_folder, timeline_fol
 from accerl_lerobot.engine.loop import Engine, Progress, Saved
 from accerl_lerobot.engine.placement import actor_options, place_workers
 from accerl_lerobot.engine.ray_session import RaySession
-from accerl_lerobot.engine.replicas import START_S, InferenceReplicas, RolloutPlace, RolloutWorkers, Worker
+from accerl_lerobot.engine.replicas import START_S, InferenceReplicas, RolloutSlot, RolloutWorkers, WorkerSlot
 from accerl_lerobot.engine.stopping import WorkerError
 from accerl_lerobot.inference.batcher import BatcherStats
 from accerl_lerobot.policies.config import Load
@@ -54,7 +54,7 @@ BLAME_S = 10.0
 """How long to wait for the failure that another failure is the consequence of."""
 
 
-def end(workers: Iterable[Worker], *, told: bool = True) -> None:
+def end(workers: Iterable[WorkerSlot], *, told: bool = True) -> None:
     """End workers and wait until they are gone, so that nothing writes any more when others start.
 
     Args:
@@ -71,7 +71,7 @@ def end(workers: Iterable[Worker], *, told: bool = True) -> None:
     psutil.wait_procs(left, timeout=GONE_S)
 
 
-def _fail(worker: Worker, error: Exception, text: str = "") -> None:
+def _fail(worker: WorkerSlot, error: Exception, text: str = "") -> None:
     """Restart a worker that has failed, or raise what ends the engine."""
     if worker.restart is None:
         raise WorkerError(text or f"{worker.name} worker failed for good:\n{error}") from error
@@ -103,9 +103,9 @@ class RayEngine(Engine):
         self._version = 0 if state is None else saved_version(state)
         self._rollouts = RolloutWorkers(config, tasks, history, state)
         self._inference = InferenceReplicas(config, self._version, state, load, self._move)
-        self._others: list[Worker] = []
+        self._others: list[WorkerSlot] = []
         """All other workers."""
-        self._imagining: list[Worker] = []
+        self._imagining: list[WorkerSlot] = []
         """The one that imagines, and the one that trains the world model."""
         self._updates: list[dict[str, float]] = []
         self._schedule: Schedule = ASYNCHRONOUS
@@ -214,7 +214,7 @@ class RayEngine(Engine):
         """Batches of the inference replicas so far."""
         return self._inference.batching()
 
-    def _everyone(self) -> Iterator[Worker]:
+    def _everyone(self) -> Iterator[WorkerSlot]:
         """All workers, those that others depend on first."""
         yield from self._inference.workers()
         yield from self._others
@@ -262,8 +262,8 @@ class RayEngine(Engine):
         self._replay.work = self._replay.actor.run.remote()
         self._rollouts.run(self._deciding, self._inserting)
 
-    def _add(self, name: str, actor: Any) -> Worker:
-        self._others.append(Worker(name, actor))
+    def _add(self, name: str, actor: Any) -> WorkerSlot:
+        self._others.append(WorkerSlot(name, actor))
         return self._others[-1]
 
     def _move(self, index: int, inference: Endpoint) -> None:
@@ -284,7 +284,7 @@ class RayEngine(Engine):
             if reference in ended and worker.work is reference:
                 self._ended(worker)
 
-    def _ended(self, worker: Worker) -> None:
+    def _ended(self, worker: WorkerSlot) -> None:
         """Handle the end of a worker's long call: restart it, finish, or raise."""
         reference, worker.work = worker.work, None
         try:
@@ -323,14 +323,14 @@ class RayEngine(Engine):
             answer = self._hear(worker)
             if worker is self._trainer:
                 self._updates += answer or []
-            elif answer is not None and isinstance(worker, RolloutPlace):
+            elif answer is not None and isinstance(worker, RolloutSlot):
                 episodes += worker.take(answer)
         if not self._real_ended and self._rollouts.spent:
             self._real_ended = True
             self._replay.call("end_real", timeout=self._limit)
         return episodes
 
-    def _hear(self, worker: Worker, timeout: float = 0.0) -> Any:
+    def _hear(self, worker: WorkerSlot, timeout: float = 0.0) -> Any:
         """An answer that has come."""
         try:
             return worker.answer(timeout)

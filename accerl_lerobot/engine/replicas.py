@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Supervision of the processes of an asynchronous run.
 
-    Worker               a place for one process after the other: a long call that must not end unasked,
+    WorkerSlot           a place for one process after the other: a long call that must not end unasked,
                          and one question at a time
     RolloutWorkers       restarted alone: a process loses its unfinished segments; planned episodes are
                          run again
@@ -62,7 +62,7 @@ ROLLOUT = "rollout"
 """Name of the rollout workers' part of a checkpoint."""
 
 
-class Worker:
+class WorkerSlot:
     """A place for one process after the other, each with a long call that must not end unasked.
 
     Questions are asked one at a time, without waiting, and answers picked up later, so a worker that hangs
@@ -162,7 +162,7 @@ class Worker:
         ray.kill(self.actor)
 
 
-class Replicas[W: Worker](ABC):
+class Replicas[W: WorkerSlot](ABC):
     """Workers of one kind that can be restarted alone, `LaunchConfig.max_restarts` times in a row each."""
 
     def __init__(self, config: RunConfig, workers: list[W]) -> None:
@@ -191,7 +191,7 @@ class Replicas[W: Worker](ABC):
         """Replace a process that has failed."""
 
 
-class RolloutPlace(Worker):
+class RolloutSlot(WorkerSlot):
     """A rollout worker, and what its next process has to know.
 
     Args:
@@ -253,15 +253,13 @@ class RolloutPlace(Worker):
         return ""
 
 
-class RolloutWorkers(Replicas[RolloutPlace]):
+class RolloutWorkers(Replicas[RolloutSlot]):
     """The rollout workers of a run."""
 
     def __init__(
         self, config: RunConfig, tasks: tuple[str, ...], history: int, state: Path | None = None
     ) -> None:
-        super().__init__(
-            config, [RolloutPlace(i, budget) for i, budget in enumerate(budgets(config.rollout))]
-        )
+        super().__init__(config, [RolloutSlot(i, left) for i, left in enumerate(budgets(config.rollout))])
         self._tasks, self._history = tasks, history
         self._past: Counter[str] = Counter(restarts=0)
         """Counters of processes that have ended."""
@@ -347,7 +345,7 @@ class RolloutWorkers(Replicas[RolloutPlace]):
             worker.spent = worker.budget == 0
             worker.assign(was["outstanding"])
 
-    def _new(self, worker: RolloutPlace) -> Any:
+    def _new(self, worker: RolloutSlot) -> Any:
         from accerl_lerobot.rollout.worker import RolloutWorker, WorkerShare
 
         c, place = self._config, self._plan.places[worker.name]
@@ -357,7 +355,7 @@ class RolloutWorkers(Replicas[RolloutPlace]):
         share = WorkerShare(worker.index, worker.incarnation, worker.budget)
         return actor.remote(c.env, c.rollout, self._tasks, c.seed, share, self._history, timeline)
 
-    def _restart(self, worker: RolloutPlace, error: Exception) -> None:
+    def _restart(self, worker: RolloutSlot, error: Exception) -> None:
         if not self._relocate(worker, error):  # that its node has left is not the worker's fault
             worker.count_restart(error, self._launch.max_restarts)
         worker.end(error)
@@ -369,7 +367,7 @@ class RolloutWorkers(Replicas[RolloutPlace]):
         worker.occupy(self._new(worker))
         self._run(worker)
 
-    def _relocate(self, worker: RolloutPlace, error: Exception) -> bool:
+    def _relocate(self, worker: RolloutSlot, error: Exception) -> bool:
         """Plan another node for a worker whose own has left; False if that is still there."""
         node, until = self._plan.places[worker.name].node, time.monotonic() + UNREACHABLE_S
         while isinstance(error, ActorUnavailableError) and node.number and time.monotonic() < until:
@@ -384,12 +382,12 @@ class RolloutWorkers(Replicas[RolloutPlace]):
         logger.warning("%s has left; its %s worker goes to %s", node, worker.name, target)
         return True
 
-    def _run(self, worker: RolloutPlace) -> None:
+    def _run(self, worker: RolloutSlot) -> None:
         inference = self._inference[worker.index % len(self._inference)]
         worker.work = worker.actor.run.remote(inference, self._replay)
 
 
-class InferencePlace(Worker):
+class InferenceSlot(WorkerSlot):
     """An inference replica."""
 
     def __init__(self, index: int, name: str) -> None:
@@ -399,7 +397,7 @@ class InferencePlace(Worker):
         """Worlds that are decided for together; 0: each for itself."""
 
 
-class InferenceReplicas(Replicas[InferencePlace]):
+class InferenceReplicas(Replicas[InferenceSlot]):
     """The inference replicas of a run; rollout worker i asks replica i modulo their number.
 
     Args:
@@ -418,7 +416,7 @@ class InferenceReplicas(Replicas[InferencePlace]):
         moved: Callable[[int, Endpoint], None],
     ) -> None:
         names = numbered("inference", config.inference.workers)
-        super().__init__(config, [InferencePlace(index, name) for index, name in enumerate(names)])
+        super().__init__(config, [InferenceSlot(index, name) for index, name in enumerate(names)])
         self._arguments = (config.policy, config.inference, version, state, load, timeline_folder(config))
         self._moved = moved
         self.restarts = 0
@@ -447,14 +445,14 @@ class InferenceReplicas(Replicas[InferencePlace]):
         """Batches of all replicas so far."""
         return merge_stats([worker.call("batching", timeout=self._launch.stall_s) for worker in self._all])
 
-    def _new(self, worker: InferencePlace) -> Any:
+    def _new(self, worker: InferenceSlot) -> Any:
         from accerl_lerobot.inference.worker import InferenceWorker
 
         options = actor_options(self._plan.places[worker.name])
         actor = ray.remote(InferenceWorker).options(**options, max_concurrency=1000)
         return actor.remote(*self._arguments, worker.name)
 
-    def _restart(self, worker: InferencePlace, error: Exception) -> None:
+    def _restart(self, worker: InferenceSlot, error: Exception) -> None:
         here, limit = self._plan.places[worker.name].node, self._launch.stall_s
         while True:
             worker.count_restart(error, self._launch.max_restarts)
@@ -477,12 +475,12 @@ class InferenceReplicas(Replicas[InferencePlace]):
         self._moved(worker.index, endpoint)
         logger.info("%s worker is up again", worker.name)
 
-    def _serve(self, worker: InferencePlace) -> Endpoint:
+    def _serve(self, worker: InferenceSlot) -> Endpoint:
         endpoint = worker.endpoint("decide", self._launch.stall_s)
         worker.work, worker.since = worker.actor.serve.remote(), time.monotonic()
         return endpoint
 
-    def _await_weights(self, worker: InferencePlace, endpoint: Endpoint) -> None:
+    def _await_weights(self, worker: InferenceSlot, endpoint: Endpoint) -> None:
         """Wait until a new replica has weights as new as the trainer's were when it joined."""
         limit = self._launch.stall_s
         deadline = time.monotonic() + limit
