@@ -58,6 +58,9 @@ class Pattern:
     def __repr__(self) -> str:
         return f"Pattern({self.pattern.pattern!r})"
 
+    def __contains__(self, value: Any) -> bool:
+        return self.pattern.fullmatch(value) is not None
+
 
 Share = Annotated[float, Range("[0, 1]")]
 Positive = Annotated[float, Range("(0, inf)")]
@@ -148,14 +151,8 @@ def check(hint: Any, value: Any, field: str) -> None:
 def _fits(hint: Any, value: Any) -> bool:
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin is Annotated:
-        kind, *marks = arguments
-        number = isinstance(value, numbers.Real) and (kind is not int or isinstance(value, numbers.Integral))
-        for mark in marks:
-            if isinstance(mark, Range) and not (number and not isinstance(value, bool) and value in mark):
-                return False
-            if isinstance(mark, Pattern) and not (isinstance(value, str) and mark.pattern.fullmatch(value)):
-                return False
-        return kind in (int, float) or _fits(kind, value)
+        kind, mark = arguments
+        return (_is_number(kind, value) if kind in (int, float) else _fits(kind, value)) and value in mark
     if is_union(hint):
         return any(_fits(kind, value) for kind in arguments)
     if origin is typing.Literal:
@@ -166,25 +163,24 @@ def _fits(hint: Any, value: Any) -> bool:
         if origin is list or Ellipsis in arguments:
             return all(_fits(arguments[0], entry) for entry in value)
         return len(value) == len(arguments) and all(map(_fits, arguments, value))
-    if hint is float:
-        return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
-    if hint is int:
-        return isinstance(value, numbers.Integral) and not isinstance(value, bool)
+    if hint in (int, float):
+        return _is_number(hint, value) and math.isfinite(value)
     if hint in (bool, str, type(None)):
         return isinstance(value, hint)
     return True
+
+
+def _is_number(kind: type, value: Any) -> bool:
+    numeric = numbers.Integral if kind is int else numbers.Real
+    return isinstance(value, numeric) and not isinstance(value, bool)
 
 
 def wanted(hint: Any) -> str:
     """Values that fit an annotation, in words."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin is Annotated:
-        for mark in arguments[1:]:
-            if isinstance(mark, Pattern):
-                return mark.words
-            if isinstance(mark, Range):
-                return f"{wanted(arguments[0])} in {mark.text}"
-        return wanted(arguments[0])
+        kind, mark = arguments
+        return mark.words if isinstance(mark, Pattern) else f"{wanted(kind)} in {mark.text}"
     if is_union(hint):
         parts = [wanted(kind) for kind in arguments if kind is not type(None)]
         return " or ".join(parts + (["null"] if is_optional(hint) else []))
@@ -206,9 +202,8 @@ def wanted(hint: Any) -> str:
 def range_in_words(hint: Any) -> str:
     """The range of an annotation as ``--help`` shows it; empty where there is none."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
-    for mark in arguments[1:] if origin is Annotated else ():
-        if isinstance(mark, Range):
-            return f"in {mark.text}"
+    if origin is Annotated:
+        return f"in {arguments[1].text}" if isinstance(arguments[1], Range) else ""
     if origin is typing.Literal:
         return " | ".join(map(str, arguments))
     return next((text for kind in arguments if (text := range_in_words(kind))), "")
