@@ -13,15 +13,7 @@ from typing import Annotated, Literal
 
 from accerl_lerobot.algorithms import AlgorithmConfig, ChunkCriticConfig, GIPOConfig, OffPolicyConfig
 from accerl_lerobot.config.parsing import decode, encode, parse
-from accerl_lerobot.config.ranges import (
-    DatasetConfig,
-    NonNegative,
-    Positive,
-    Range,
-    Section,
-    Seed,
-    Steps,
-)
+from accerl_lerobot.config.ranges import DatasetConfig, NonNegative, Positive, Range, Section, Seed, Steps
 from accerl_lerobot.demos.record import DemosConfig
 from accerl_lerobot.demos.sft import SFTConfig
 from accerl_lerobot.envs import EnvConfig, MetaWorldConfig
