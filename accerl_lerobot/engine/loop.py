@@ -15,19 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from accerl_lerobot.checkpoint import snapshot
-from accerl_lerobot.checkpoint.layout import (
-    CHECKPOINTS,
-    CONFIG,
-    PRETRAINED,
-    RUN_STATE,
-    SUMMARY,
-    TRAINING_STATE,
-    prune,
-    save_checkpoint,
-    saved_version,
-    write_atomically,
-)
+from accerl_lerobot.checkpoint import layout, snapshot
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.resuming import raise_if_stopped
@@ -213,7 +201,7 @@ class Loop:
         filmed: list[EpisodeResult] = []
         if state is not None:
             self._began_at = state.parent.name
-            self._restore(snapshot.load(state / RUN_STATE), saved_version(state))
+            self._restore(snapshot.load(state / layout.RUN_STATE), layout.saved_version(state))
             if (self.directory / f"{FILMED}.json").is_file():
                 filmed = snapshot.load(self.directory / FILMED)
         else:
@@ -232,10 +220,10 @@ class Loop:
             before_after(film, (filmed, self.before), (results, after), fps=20)
         success_curve(self.directory / "success_curve.png", self.evaluations, self.curve)
         summary = plain(self._summary(self.before, after, last))
-        write_atomically(self.directory / SUMMARY, json.dumps(summary, indent=2) + "\n")
+        layout.write_atomically(self.directory / layout.SUMMARY, json.dumps(summary, indent=2) + "\n")
         for left in self.directory.glob(f"{FILMED}.*"):
             left.unlink()
-        prune(self.directory / CHECKPOINTS)  # it has ended
+        layout.prune(self.directory / layout.CHECKPOINTS)  # it has ended
         return dict(summary)
 
     def _state(self) -> dict[str, Any]:
@@ -398,15 +386,15 @@ class Loop:
             self._record_updates(saved.updates)
             every = self.config.save_every_updates
             self.saved = saved.version // every if every else 0
-            shutil.copyfile(self.directory / CONFIG, folder / CONFIG)
-            snapshot.save(folder / TRAINING_STATE / RUN_STATE, self._state())
+            shutil.copyfile(self.directory / layout.CONFIG, folder / layout.CONFIG)
+            snapshot.save(folder / layout.TRAINING_STATE / layout.RUN_STATE, self._state())
             return saved.version
 
         with self.times.clock.during(CHECKPOINT):
-            path = save_checkpoint(self.directory / CHECKPOINTS, write)
-        prune(self.directory / CHECKPOINTS, needed=self._began_at)
+            path = layout.save_checkpoint(self.directory / layout.CHECKPOINTS, write)
+        layout.prune(self.directory / layout.CHECKPOINTS, needed=self._began_at)
         self._saved_at = time.monotonic()
-        self.console.say(f"checkpoint {path / PRETRAINED}")
+        self.console.say(f"checkpoint {path / layout.PRETRAINED}")
 
     def _since(self, progress: Progress, key: str) -> float:
         """A rollout counter since training began, evaluation episodes while training included."""

@@ -15,16 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from accerl_lerobot.checkpoint.layout import (
-    AWAY,
-    CHECKPOINTS,
-    CONFIG,
-    LAST,
-    PRETRAINED,
-    SUMMARY,
-    has_checkpoint,
-    newest_whole,
-)
+from accerl_lerobot.checkpoint import layout
 from accerl_lerobot.checkpoint.safety import Origin, check_folder, check_number, read_json
 from accerl_lerobot.config.parsing import CONSENT, read_recipe
 from accerl_lerobot.console import Console
@@ -55,7 +46,7 @@ def raise_if_stopped(stop: Stopping, directory: Path) -> None:
 
 def resume_command(directory: Path) -> str:
     """The command that resumes a run."""
-    return f"accerl train --resume=true --config_path={shlex.quote(str(directory / CONFIG))}"
+    return f"accerl train --resume=true --config_path={shlex.quote(str(directory / layout.CONFIG))}"
 
 
 def resumed_run(path: Path | None, config: RunConfig) -> tuple[Path, str]:
@@ -72,26 +63,26 @@ def resumed_run(path: Path | None, config: RunConfig) -> tuple[Path, str]:
     if path is None:
         raise InputError("resume", True, f"add --config_path: {how}")
     folders = path.absolute().parents
-    directory, checkpoint = folders[0], LAST
-    if len(folders) > 2 and folders[1].name == CHECKPOINTS:
+    directory, checkpoint = folders[0], layout.LAST
+    if len(folders) > 2 and folders[1].name == layout.CHECKPOINTS:
         directory, checkpoint = folders[2], folders[0].name
-    if not (directory / CONFIG).is_file() or not (directory / LOCK).is_file():
+    if not (directory / layout.CONFIG).is_file() or not (directory / LOCK).is_file():
         raise InputError("config_path", str(path), f"no run has been begun there; {how}")
     origin = Origin("config_path", str(path))
     check_folder(directory, origin)
-    before = decode(type(config), read_recipe(directory / CONFIG))
+    before = decode(type(config), read_recipe(directory / layout.CONFIG))
     for name, (was, now) in _differences(encode(before), encode(config), "").items():
         if not was and name.rpartition(".")[2] in CONSENT:
             continue  # a pull has dropped it, and the command line allows it anew
         if not any(name == free or name.startswith(f"{free}.") for free in CHANGEABLE):
             remedy = f"the run was begun with {was!r}; leave it so, or begin a new run with --policy.path"
             raise InputError(name, now, remedy)
-    summary, checkpoints = directory / SUMMARY, directory / CHECKPOINTS
-    newest = (checkpoints / checkpoint).resolve() == (checkpoints / LAST).resolve()
+    summary, checkpoints = directory / layout.SUMMARY, directory / layout.CHECKPOINTS
+    newest = (checkpoints / checkpoint).resolve() == (checkpoints / layout.LAST).resolve()
     # From an earlier checkpoint there are updates left to make.
     if newest and summary.is_file():
         made: Any = read_json(summary, origin).get("updates")
-        check_number(made, 0, 1e9, f"{SUMMARY}: updates", origin)
+        check_number(made, 0, 1e9, f"{layout.SUMMARY}: updates", origin)
         if made >= config.trainer.updates:
             remedy = f"the run {directory} has made them, and has ended; ask for more"
             raise InputError("trainer.updates", config.trainer.updates, remedy)
@@ -111,10 +102,8 @@ class Recovery:
             furthest: the latest update so far. A run that gets further each time is not stuck, though it may
                 be hit again before its next checkpoint.
         """
-        from accerl_lerobot.checkpoint.layout import newest_whole
-
         try:
-            path, passed = newest_whole(checkpoints)
+            path, passed = layout.newest_whole(checkpoints)
         except InputError:
             raise error from None
         stuck = path.name == self._begun and furthest <= self._furthest
@@ -134,13 +123,13 @@ class Recovery:
 
 def checkpoint_of(directory: Path, wanted: str, console: Console) -> Path | None:
     """The checkpoint to resume from; None if there is none yet."""
-    if not has_checkpoint(directory / CHECKPOINTS):
+    if not layout.has_checkpoint(directory / layout.CHECKPOINTS):
         console.say("there is no checkpoint yet: the run begins again after its warm start")
         for name in (METRICS, EPISODES):
             (directory / name).unlink(missing_ok=True)
         shutil.rmtree(directory / "tensorboard", ignore_errors=True)
         return None
-    path, passed = newest_whole(directory / CHECKPOINTS, wanted)
+    path, passed = layout.newest_whole(directory / layout.CHECKPOINTS, wanted)
     for why in passed:
         console.say(f"passed over checkpoint {why}")
     return path
@@ -149,21 +138,21 @@ def checkpoint_of(directory: Path, wanted: str, console: Console) -> Path | None
 def continued(config: RunConfig, directory: Path, checkpoint: Path) -> RunConfig:
     """The run from its checkpoint on."""
     if config.policy.tuning.mode != "lora":
-        return improving(config, checkpoint / PRETRAINED)
+        return improving(config, checkpoint / layout.PRETRAINED)
     # A checkpoint has low-rank adapters merged; apart from what they adapt they are in the training state.
     path, note = config.policy.path, directory / WARM_START
     if path is None and note.is_file():
         path = str(directory / json.loads(note.read_text())["policy"])
     if path is None or not _is_here(path):
         remedy = "the policy that this run began from is gone, and its low-rank adapters are of no other; "
-        remedy += f"put it back, or begin a new run with --policy.path={checkpoint / PRETRAINED}"
+        remedy += f"put it back, or begin a new run with --policy.path={checkpoint / layout.PRETRAINED}"
         raise InputError("policy.path", path, remedy)
     return improving(config, path)
 
 
 def _is_here(path: str) -> bool:
     """True for a folder of this machine that exists, and for a Hub id."""
-    on_the_hub = not path.startswith((".", "/", "~", f"{AWAY}/")) and path.count("/") <= 1
+    on_the_hub = not path.startswith((".", "/", "~", f"{layout.AWAY}/")) and path.count("/") <= 1
     return on_the_hub or Path(path).expanduser().is_dir()
 
 

@@ -37,16 +37,7 @@ import yaml
 
 from accerl_lerobot import guardian
 from accerl_lerobot.algorithms import ChunkCriticConfig, OffPolicyConfig
-from accerl_lerobot.checkpoint.layout import (
-    CHECKPOINTS,
-    CONFIG,
-    DEMOS,
-    LAST,
-    PRETRAINED,
-    TRAINING_STATE,
-    go_back_to,
-    write_atomically,
-)
+from accerl_lerobot.checkpoint import layout
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.record import REPO_ID, record_demos
@@ -98,7 +89,7 @@ def make_output_dir(config: Any) -> Path:
 
 def discard_unused(directory: Path) -> None:
     """Remove the folder of a run that was refused before it did anything, so that its name is free again."""
-    if {path.name for path in directory.iterdir()} <= {CONFIG, LOCK}:
+    if {path.name for path in directory.iterdir()} <= {layout.CONFIG, LOCK}:
         shutil.rmtree(directory)
 
 
@@ -184,7 +175,7 @@ def demonstrations_of(config: RunConfig) -> DatasetConfig | None:
     if config.dataset.repo_id is not None:
         root = config.dataset.root
         return replace(config.dataset, root=None if root is None else str(Path(root).expanduser().absolute()))
-    own = None if config.output_dir is None else Path(config.output_dir).absolute() / DEMOS
+    own = None if config.output_dir is None else Path(config.output_dir).absolute() / layout.DEMOS
     if own is None or not own.is_dir():
         return None
     return replace(config.dataset, repo_id=REPO_ID, root=str(own))
@@ -218,18 +209,18 @@ def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfi
         return config
     if note.is_file():
         return improving(config, directory / json.loads(note.read_text())["policy"])
-    for name in (DEMOS, f"{DEMOS}.partial", "sft"):
+    for name in (layout.DEMOS, f"{layout.DEMOS}.partial", "sft"):
         shutil.rmtree(directory / name, ignore_errors=True)
     dataset = config.dataset
     if dataset.repo_id is None:
-        root = str(directory / DEMOS)
+        root = str(directory / layout.DEMOS)
         with console.stage("demonstrations"):
             record_demos(config.env, config.demos, root, config.seed)
         dataset = replace(dataset, repo_id=REPO_ID, root=root)
     device = str(resolve_device(config.policy.device))
     path = fine_tune(config.sft, dataset, directory, config.seed, device, console)
     relative = Path(path).absolute().relative_to(directory.absolute())
-    write_atomically(note, json.dumps({"policy": str(relative)}) + "\n")
+    layout.write_atomically(note, json.dumps({"policy": str(relative)}) + "\n")
     return improving(config, path)
 
 
@@ -242,14 +233,14 @@ def execute(
     if wanted is not None and checkpoint is None and load is None:
         check_start(config)
     text = yaml.safe_dump(encode(replace(config, resume=False)), sort_keys=False)
-    write_atomically(directory / CONFIG, text)
+    layout.write_atomically(directory / layout.CONFIG, text)
     spec = check_world(config.env)
     check_placement(replace(config, output_dir=str(directory)))
     if checkpoint is None:
         _check_imagination(config, resuming=False)
         config = warm_start(config, directory, console)
     else:
-        go_back_to(checkpoint)
+        layout.go_back_to(checkpoint)
         config = continued(config, directory, checkpoint)
         if load is None:
             check_start(config)
@@ -270,7 +261,7 @@ def execute(
         while True:
             # A run, or what is left of it, by one set of workers.
             history = 1 if load is not None else check_policy(config, spec, own=True)
-            state = None if checkpoint is None else checkpoint / TRAINING_STATE
+            state = None if checkpoint is None else checkpoint / layout.TRAINING_STATE
             try:
                 try:
                     with console.stage("starting workers"), stop.at_once():
@@ -288,9 +279,9 @@ def execute(
                     raise
                 times.clock.enter(RECOVERY)
                 raise_if_stopped(stop, directory)
-                checkpoint = recovery.next(directory / CHECKPOINTS, console, loss, times.furthest)
+                checkpoint = recovery.next(directory / layout.CHECKPOINTS, console, loss, times.furthest)
                 raise_if_stopped(stop, directory)
-                go_back_to(checkpoint)
+                layout.go_back_to(checkpoint)
                 config = continued(config, directory, checkpoint)
 
 
@@ -386,7 +377,7 @@ def train(config: RunConfig) -> TrainResult:
 
 def resume(directory: str | Path, changes: Mapping[str, Any] | None = None) -> TrainResult:
     """Resumes a run that was stopped, from its last complete checkpoint."""
-    recipe = Path(directory) / CONFIG
+    recipe = Path(directory) / layout.CONFIG
     config = load_config(recipe, {**(changes or {}), "resume": True})
     return _result(*start(config, Console(), recipe))
 
@@ -446,7 +437,7 @@ def _result(directory: Path, summary: dict[str, Any]) -> TrainResult:
         before = Rate(successes=round(summary["success_before"] * summary["n_before"]), n=summary["n_before"])
     return TrainResult(
         directory=directory,
-        policy=directory / CHECKPOINTS / LAST / PRETRAINED,
+        policy=directory / layout.CHECKPOINTS / layout.LAST / layout.PRETRAINED,
         before=before,
         after=Rate(successes=round(summary["success_after"] * summary["n_after"]), n=summary["n_after"]),
         summary=summary,
