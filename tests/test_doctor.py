@@ -168,7 +168,7 @@ class TestResources:
     @pytest.fixture(autouse=True)
     def four_cores(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(4)), raising=False)
-        monkeypatch.setattr(doctor, "memory_gib", lambda entry: 16.0)
+        monkeypatch.setattr(engine_sizes, "memory_gib", lambda entry: 16.0)
 
     @pytest.mark.parametrize(
         ("sections", "name", "words"),
@@ -267,11 +267,11 @@ def test_a_policy_is_compared_with_its_device(
 ) -> None:
     sizes = {"weights": 2, "trained": 0.5, "acting_batch": 0.25, "acting": 0.125, "learning_batch": 0.5}
     memory = PolicyMemory(
-        **{name: int(doctor.GIB * size) for name, size in (sizes | {"learning": 0.25}).items()}
+        **{name: int(engine_sizes.GIB * size) for name, size in (sizes | {"learning": 0.25}).items()}
     )
     monkeypatch.setattr(loading, "rehearsed", lambda config, task: memory)
     monkeypatch.setattr(
-        doctor, "_device_memory", lambda config, device: (doctor.GIB * usable_gib, 1, "a GPU")
+        doctor, "_device_memory", lambda config, device: (engine_sizes.GIB * usable_gib, 1, "a GPU")
     )
     config = RunConfig(
         policy=PolicyConfig(path="p", device="cpu"),

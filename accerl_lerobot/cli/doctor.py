@@ -21,15 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from accerl_lerobot.checkpoint.safety import MIB, brief
-from accerl_lerobot.engine.sizes import (
-    GIB,
-    lag_limits,
-    memory_gib,
-    memory_parts_gib,
-    policy_gib,
-    trained_copies,
-    under_way,
-)
+from accerl_lerobot.engine import sizes
 from accerl_lerobot.errors import InputError
 
 if TYPE_CHECKING:
@@ -187,17 +179,17 @@ def resources(config: RunConfig | None, history: int = 1) -> Iterator[Check]:
         elif threads > cores:
             status, text = WARN, f"{text}: lower trainer.num_threads and inference.num_threads to {cores}"
     yield Check("cpu", status, text)
-    free = memory_gib("MemAvailable")
+    free = sizes.memory_gib("MemAvailable")
     if free is not None:
         text, status = f"{free:.1f} GiB free", OK
         if config is not None:
-            need = policy_gib(config) + sum(memory_parts_gib(config, history).values())
+            need = sizes.policy_gib(config) + sum(sizes.memory_parts_gib(config, history).values())
             text += f", about {need:.1f} GiB needed"
             if need > free:
                 remedy = "lower rollout.workers, rollout.worlds or replay.capacity, or use a smaller policy"
                 status, text = WARN, f"{text}: {remedy}"
         yield Check("memory", status, text)
-    disk = shutil.disk_usage(Path.cwd()).free / GIB
+    disk = shutil.disk_usage(Path.cwd()).free / sizes.GIB
     short = disk < DISK_GIB
     text = f"{disk:.0f} GiB free here" + (f"; a run may need {DISK_GIB:.0f}" if short else "")
     yield Check("disk", WARN if short else OK, text)
@@ -237,7 +229,7 @@ def policy_fits(config: RunConfig) -> Iterator[Check]:
     memory = PolicyMemory(*rehearsed(config.policy, measure))
     batch = math.ceil(trainer.batch_decisions / trainer.ranks) if ratio else POLICY_BATCH
     decisions = min(batch, trainer.micro_batch)
-    kept = memory.trainer(0, trained_copies(config)) / (trainer.ranks if trainer.zero else 1)
+    kept = memory.trainer(0, sizes.trained_copies(config)) / (trainer.ranks if trainer.zero else 1)
     acting = memory.replica(config.inference.max_batch)
     usable, replicas, place = _device_memory(config, device)
     need = kept + decisions * memory.learning + replicas * acting
@@ -261,8 +253,9 @@ def _device_memory(config: RunConfig, device: Any) -> tuple[float, int, str]:
 
     others = config.inference.workers if config.launch.engine != "local" else 0
     if device.type == "cpu":
-        rest = sum(memory_parts_gib(config).values())
-        return USABLE * ((memory_gib("MemAvailable") or math.inf) - rest) * GIB, others, "this machine"
+        free = sizes.memory_gib("MemAvailable") or math.inf
+        rest = free - sum(sizes.memory_parts_gib(config).values())
+        return USABLE * rest * sizes.GIB, others, "this machine"
     gpus = torch.cuda.device_count()
     rank, other = config.trainer.gpu_shares(gpus, others)
     beside = int((1 - rank) / other + 1e-6) if other else 0
@@ -271,16 +264,16 @@ def _device_memory(config: RunConfig, device: Any) -> tuple[float, int, str]:
 
 
 def _gib(size: float) -> str:
-    if size < GIB:
+    if size < sizes.GIB:
         return f"{size / MIB:.0f} MiB"
-    return f"{size / GIB:.1f} GiB" if size < 10 * GIB else f"{size / GIB:.0f} GiB"
+    return f"{size / sizes.GIB:.1f} GiB" if size < 10 * sizes.GIB else f"{size / sizes.GIB:.0f} GiB"
 
 
 def pace(config: RunConfig) -> Iterator[Check]:
     """How far apart collecting and learning may run under this recipe, and how much it collects."""
     replay, trainer = config.replay, config.trainer
-    in_flight = under_way(config)
-    bound, of_pace = lag_limits(config)
+    in_flight = sizes.under_way(config)
+    bound, of_pace = sizes.lag_limits(config)
     text = f"at most {bound} updates with {in_flight} decisions under way"
     if of_pace > bound:
         text += (

@@ -41,22 +41,10 @@ from accerl_lerobot.checkpoint import layout
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.record import REPO_ID, record_demos
-from accerl_lerobot.engine import ray_session
+from accerl_lerobot.engine import ray_session, resuming
 from accerl_lerobot.engine.config import RunConfig, encode, parse, timeline_folder
 from accerl_lerobot.engine.loop import Engine, Loop, Times, run_plans
 from accerl_lerobot.engine.preflight import check_placement, check_policy, check_start, check_world
-from accerl_lerobot.engine.resuming import (
-    LOCK,
-    WARM_START,
-    Recovery,
-    checkpoint_of,
-    continued,
-    improving,
-    locked,
-    raise_if_stopped,
-    resume_command,
-    resumed_run,
-)
 from accerl_lerobot.engine.sizes import check_memory
 from accerl_lerobot.engine.stopping import StoppedError, Stopping, WorkerError
 from accerl_lerobot.errors import InputError, check_absent, expanded, is_full, kept_traceback, make_folder
@@ -89,7 +77,7 @@ def make_output_dir(config: Any) -> Path:
 
 def discard_unused(directory: Path) -> None:
     """Remove the folder of a run that was refused before it did anything, so that its name is free again."""
-    if {path.name for path in directory.iterdir()} <= {layout.CONFIG, LOCK}:
+    if {path.name for path in directory.iterdir()} <= {layout.CONFIG, resuming.LOCK}:
         shutil.rmtree(directory)
 
 
@@ -99,19 +87,19 @@ def start(
     """Do a new run, or with ``config.resume`` the rest of the one whose config is `recipe`."""
     wanted = None
     if config.resume:
-        directory, wanted = resumed_run(recipe, config)
+        directory, wanted = resuming.resumed_run(recipe, config)
     else:
         if load is None:
             check_start(config)  # before there is a folder
         directory = make_output_dir(config)
     console.say(f"run {directory}")
-    how = resume_command(directory)
+    how = resuming.resume_command(directory)
     guardian.explain(remedy=f"to resume: {how}")
     try:
         with (
             redirect_stdout(sys.stderr),
             kept_traceback(directory),
-            locked(directory, "config_path", "another process resumes it"),
+            resuming.locked(directory, "config_path", "another process resumes it"),
         ):
             return directory, execute(config, directory, console, wanted, load)
     except InputError:
@@ -204,11 +192,11 @@ def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfi
     """
     from accerl_lerobot.policies.loading import resolve_device
 
-    note = directory / WARM_START
+    note = directory / resuming.WARM_START
     if config.policy.path is not None:
         return config
     if note.is_file():
-        return improving(config, directory / json.loads(note.read_text())["policy"])
+        return resuming.improving(config, directory / json.loads(note.read_text())["policy"])
     for name in (layout.DEMOS, f"{layout.DEMOS}.partial", "sft"):
         shutil.rmtree(directory / name, ignore_errors=True)
     dataset = config.dataset
@@ -221,7 +209,7 @@ def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfi
     path = fine_tune(config.sft, dataset, directory, config.seed, device, console)
     relative = Path(path).absolute().relative_to(directory.absolute())
     layout.write_atomically(note, json.dumps({"policy": str(relative)}) + "\n")
-    return improving(config, path)
+    return resuming.improving(config, path)
 
 
 def execute(
@@ -229,7 +217,7 @@ def execute(
 ) -> dict[str, Any]:
     """Do all phases and return the summary, which is also in ``summary.json``."""
     started = time.monotonic()
-    checkpoint = None if wanted is None else checkpoint_of(directory, wanted, console)
+    checkpoint = None if wanted is None else resuming.checkpoint_of(directory, wanted, console)
     if wanted is not None and checkpoint is None and load is None:
         check_start(config)
     text = yaml.safe_dump(encode(replace(config, resume=False)), sort_keys=False)
@@ -237,14 +225,14 @@ def execute(
     spec = check_world(config.env)
     check_placement(replace(config, output_dir=str(directory)))
     if checkpoint is None:
-        _check_imagination(config, resuming=False)
+        _check_imagination(config, resumed=False)
         config = warm_start(config, directory, console)
     else:
         layout.go_back_to(checkpoint)
-        config = continued(config, directory, checkpoint)
+        config = resuming.continued(config, directory, checkpoint)
         if load is None:
             check_start(config)
-        _check_imagination(config, resuming=True)
+        _check_imagination(config, resumed=True)
         console.say(f"going on from {checkpoint}")
     before_s = 0.0 if checkpoint is None else None
     config = replace(config, output_dir=str(directory))
@@ -257,7 +245,7 @@ def execute(
         if config.launch.engine != "local":
             ray_session.prepare(joins=config.launch.address is not None)
             session = stack.enter_context(contextlib.closing(ray_session.RaySession(config.launch)))
-        recovery = Recovery(config.launch.max_restarts)
+        recovery = resuming.Recovery(config.launch.max_restarts)
         while True:
             # A run, or what is left of it, by one set of workers.
             history = 1 if load is not None else check_policy(config, spec, own=True)
@@ -267,7 +255,7 @@ def execute(
                     with console.stage("starting workers"), stop.at_once():
                         engine = make_engine(config, spec.tasks, history, state, load, session)
                 except KeyboardInterrupt:
-                    raise_if_stopped(stop, directory)
+                    resuming.raise_if_stopped(stop, directory)
                     raise
                 with contextlib.closing(engine):
                     loop = Loop(config, directory, console, log, engine, spec.tasks, times, stop)
@@ -278,20 +266,20 @@ def execute(
                 if not isinstance(loss, WorkerError):
                     raise
                 times.clock.enter(RECOVERY)
-                raise_if_stopped(stop, directory)
+                resuming.raise_if_stopped(stop, directory)
                 checkpoint = recovery.next(directory / layout.CHECKPOINTS, console, loss, times.furthest)
-                raise_if_stopped(stop, directory)
+                resuming.raise_if_stopped(stop, directory)
                 layout.go_back_to(checkpoint)
-                config = continued(config, directory, checkpoint)
+                config = resuming.continued(config, directory, checkpoint)
 
 
-def _check_imagination(config: RunConfig, resuming: bool) -> None:
+def _check_imagination(config: RunConfig, resumed: bool) -> None:
     if not config.imagination.share:
         return
     from accerl_lerobot.engine.imagination import check_imagination
 
     path = config.imagination.path
-    if resuming and path is not None and not Path(path).expanduser().is_dir():
+    if resumed and path is not None and not Path(path).expanduser().is_dir():
         remedy = "no such folder; the first world model of a run is not in its checkpoints: put a copy there"
         raise InputError("imagination.path", path, remedy)
     check_imagination(config)
@@ -397,7 +385,7 @@ def evaluate(
         revision: commit of `policy` on the Hub.
     """
     if policy is not None:
-        config = improving(config, policy)
+        config = resuming.improving(config, policy)
         config = replace(config, policy=replace(config.policy, revision=revision))
     if episodes is not None:
         config = replace(config, evaluation=replace(config.evaluation, episodes=episodes))
