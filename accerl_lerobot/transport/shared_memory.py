@@ -16,7 +16,6 @@ other one is and talks to its own user only.
 from __future__ import annotations
 
 import asyncio
-import fcntl
 import functools
 import logging
 import mmap
@@ -38,8 +37,6 @@ logger = logging.getLogger(__name__)
 
 CONNECT_S = 30.0
 """Timeout for connecting to a service."""
-LARGEST = 2**40
-"""Bytes of a slot at most."""
 LEAST = 2**16
 """Bytes of a slot at least; the reply is written behind the message."""
 SLOTS = 64
@@ -63,17 +60,9 @@ def available() -> bool:
 
 
 def new_memory(size: int) -> int:
-    """Shared memory, as a file descriptor.
-
-    Its size is sealed: truncating it would end every process that has it mapped.
-    """
-    file = os.memfd_create("accerl", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
-    try:
-        os.ftruncate(file, size)
-        fcntl.fcntl(file, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL)
-    except BaseException:
-        os.close(file)
-        raise
+    """Shared memory, as a file descriptor."""
+    file = os.memfd_create("accerl", os.MFD_CLOEXEC)
+    os.ftruncate(file, size)
     return file
 
 
@@ -129,11 +118,8 @@ class Slot:
 
 
 def new_slot(size: int) -> int:
-    """Shared memory for at least `size` bytes, as a file descriptor."""
-    room = max(LEAST, 1 << (size - 1).bit_length())
-    if room > LARGEST:
-        raise TypeError(f"a message of {size} bytes cannot be sent; there is room for {LARGEST}")
-    return new_memory(room)
+    """Shared memory for at least `size` bytes; what is not written to takes none."""
+    return new_memory(max(LEAST, 1 << (size - 1).bit_length()))
 
 
 def send_token(connection: socket.socket, token: Token, file: int | None = None) -> None:
