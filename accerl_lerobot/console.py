@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 from rich.console import Console as RichConsole
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, Task, TextColumn, TimeElapsedColumn
 
 PLAIN_EVERY_S = 15.0
 """Seconds between two lines of one stage when the output is not a terminal."""
@@ -19,41 +19,26 @@ PLAIN_EVERY_S = 15.0
 class Stage:
     """One stage's bar."""
 
-    def __init__(
-        self, console: RichConsole, name: str, total: int | None, progress: Progress, task: TaskID
-    ) -> None:
-        self._console, self._name, self._total = console, name, total
-        self._progress, self._task = progress, task
+    def __init__(self, console: RichConsole, progress: Progress, task: Task) -> None:
+        self._console, self._progress, self._task = console, progress, task
         self._said = time.monotonic()
-        self._began: tuple[float, int] | None = None
 
     def update(self, done: int, status: str = "") -> None:
         """Moves the bar, and shows `status` beside it."""
-        now = time.monotonic()
-        self._began = self._began or (now, done)
-        share = f"{done}/{self._total} ({done / self._total:.0%})" if self._total else str(done)
-        text = " · ".join(filter(None, (share, self._left(now, done), status)))
-        self._progress.update(self._task, completed=done, text=text)
-        if not self._console.is_terminal and now - self._said > PLAIN_EVERY_S:
-            self._said = now
-            self._console.print(f"  {self._name} {text}", highlight=False, soft_wrap=True)
-
-    def _left(self, now: float, done: int) -> str:
-        """Time that is left at the pace since the first update of the bar."""
-        since, first = self._began or (now, done)
-        if not self._total or done <= first or done >= self._total:
-            return ""
-        seconds = round((now - since) / (done - first) * (self._total - done))
-        return f"{datetime.timedelta(seconds=seconds)} left"
+        self._progress.update(self._task.id, completed=done)
+        total = self._task.total
+        parts = [f"{done}/{total:.0f} ({done / total:.0%})" if total else str(done)]
+        if seconds := self._task.time_remaining:
+            parts.append(f"{datetime.timedelta(seconds=round(seconds))} left")
+        text = " · ".join(parts + ([status] if status else []))
+        self._progress.update(self._task.id, text=text)
+        if not self._console.is_terminal and time.monotonic() - self._said > PLAIN_EVERY_S:
+            self._said = time.monotonic()
+            self._console.print(f"  {self._task.description} {text}", highlight=False, soft_wrap=True)
 
 
 class Console:
-    """Where stages and results are announced.
-
-    Example:
-        >>> with console.stage("SFT", total=100) as stage:
-        ...     stage.update(25, "loss 0.9")
-    """
+    """Where stages and results are announced."""
 
     def __init__(self) -> None:
         self.rich = RichConsole(stderr=True)
@@ -70,17 +55,13 @@ class Console:
         """Announces a stage, shows its bar, and says how long it took."""
         self.say(f"{name} …")
         started = time.monotonic()
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TextColumn("{task.fields[text]}"),
-        )
+        columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[text]}"))
         with Progress(
             *columns, TimeElapsedColumn(), console=self.rich, transient=True,
-            disable=not self.rich.is_terminal,
+            disable=not self.rich.is_terminal, speed_estimate_period=600,
         ) as progress:  # fmt: skip
-            task = progress.add_task(name, total=total, text="")
-            yield Stage(self.rich, name, total, progress, task)
+            progress.add_task(name, total=total, text="")
+            yield Stage(self.rich, progress, progress.tasks[0])
         self.say(f"{name}: {time.monotonic() - started:.1f} s")
 
 

@@ -14,9 +14,9 @@ from pathlib import Path
 
 TOKEN = re.compile(r"\bhf_\w{6,}")
 """A token of the Hub, which somebody may have typed where it does not belong; it is not repeated."""
-LONGEST, LONGEST_REMEDY = 200, 1200
-"""Characters of a value and of a remedy that are shown; a whole section may have been given where a number
-belongs, and some remedies repeat a part of it."""
+LONGEST, LONGEST_REMEDY, MOST_SHOWN = 200, 1200, 600
+"""Characters that are shown of a value, of a remedy and of an unexpected error; a whole section may have been
+given where a number belongs, and some remedies repeat a part of it."""
 
 
 class InputError(ValueError):
@@ -28,9 +28,8 @@ class InputError(ValueError):
         accerl_lerobot.errors.InputError: env.task='push-v2': use one of: push-v3, reach-v3
 
     Args:
-        field: Dotted name of the offending field, as it is written on the command line.
-        value: What was given.
-        remedy: What to do instead, one sentence without a full stop.
+        field: dotted name, as it is written on the command line.
+        remedy: what to do instead, one sentence without a full stop.
     """
 
     def __init__(self, field: str, value: object, remedy: str) -> None:
@@ -128,19 +127,5 @@ def one_line(error: BaseException) -> str:
     lines = [line.strip() for line in str(cause).splitlines() if line.strip()]
     words = " … ".join(lines if len(lines) < 2 else [lines[0], lines[-1]])
     text = f"{type(cause).__name__}: {words}" if words else type(cause).__name__
-    hint = next((hint for kind, hint in HINTS.items() if isinstance(cause, kind)), "")
     notes = getattr(error, "__notes__", ()) or ("ACCERL_LOG=DEBUG shows the traceback",)
-    text = "; ".join(filter(None, (TOKEN.sub("<token>", text[:MOST_SHOWN]), hint, *notes)))
-    return " ".join(text.split())
-
-
-HINTS: dict[type[BaseException], str] = {
-    MemoryError: "use fewer rollout.workers or rollout.worlds, or a smaller batch or replay",
-    RecursionError: "something is nested too deeply",
-    ModuleNotFoundError: "accerl doctor says which packages are missing",
-    FileNotFoundError: "check the path",
-    PermissionError: "check who owns the path",
-    OSError: "check the path and the free space on its disk",
-}
-"""Kind of error → what to do, the most special first."""
-MOST_SHOWN = 600
+    return " ".join("; ".join([TOKEN.sub("<token>", text[:MOST_SHOWN]), *notes]).split())

@@ -19,7 +19,7 @@ from typing import Annotated, Any
 from rich.table import Table
 
 from accerl_lerobot.checkpoint.layout import DEMOS
-from accerl_lerobot.config.ranges import Choice, DatasetConfig, Range, Seed
+from accerl_lerobot.config.ranges import DatasetConfig, Pattern, Range, Seed
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.dataset_files import open_metadata
 from accerl_lerobot.demos.record import REPO_ID
@@ -63,7 +63,7 @@ class BenchEfficiencyConfig(StudyConfig):
     """Folder of the runs and of efficiency.json, .md and .png; finished cells in it are kept."""
     seeds: tuple[Seed, ...] = (0, 1, 2, 3, 4)
     """Each a warm start of its own."""
-    arms: tuple[Annotated[str, Choice(ARMS)], ...] = tuple(ARMS)
+    arms: tuple[Annotated[str, Pattern("|".join(ARMS), " or ".join(ARMS))], ...] = tuple(ARMS)
     """Compared world models: none, learned (is trained on), frozen (is not), oracle (a simulator), and
     the placebos copy (nothing moves) and shuffled (gets other actions)."""
     budgets: tuple[Annotated[int, Range("[1, 1000000]")], ...] = (16, 64, 256)

@@ -27,7 +27,7 @@ from accerl_lerobot.config.ranges import Range, Section, Seed, Steps
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.record import REPO_ID
 from accerl_lerobot.engine.config import RunConfig, encode, parse
-from accerl_lerobot.engine.stopping import locked
+from accerl_lerobot.engine.resuming import locked
 from accerl_lerobot.errors import InputError, expanded
 from accerl_lerobot.evaluation import Rate, drawing
 from benchmarks.records import mean_interval

@@ -27,7 +27,7 @@ import numpy as np
 from rich.table import Table
 
 from accerl_lerobot.bench import host, spread
-from accerl_lerobot.config.ranges import Choice, Range, Repeats, Section, Seed
+from accerl_lerobot.config.ranges import Pattern, Range, Repeats, Section, Seed
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine import ray_session
 from accerl_lerobot.errors import InputError, check_absent, make_folder
@@ -47,7 +47,7 @@ CHUNK, ACTIONS, LATENT = 50, 7, 32
 class BenchTransportConfig(Section):
     """Fields of ``python -m benchmarks transport``."""
 
-    sizes: tuple[Annotated[str, Choice(IMAGES)], ...] = tuple(IMAGES)
+    sizes: tuple[Annotated[str, Pattern("|".join(IMAGES), " or ".join(IMAGES))], ...] = tuple(IMAGES)
     """Observations: ``12 KB`` (64 pixels, one camera) and ``301 KB`` (224 pixels, two cameras)."""
     callers: tuple[Annotated[int, Range("[1, 1000]")], ...] = (1, 8)
     """Processes that ask at a time."""

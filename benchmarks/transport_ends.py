@@ -23,8 +23,13 @@ from accerl_lerobot.engine.ray_session import start_ray
 from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.transport.contract import Client
 from accerl_lerobot.transport.endpoint import Endpoint
-from accerl_lerobot.transport.memfd import listening, new_name, new_socket
-from accerl_lerobot.transport.shared_memory import Address, SharedMemoryServer
+from accerl_lerobot.transport.shared_memory import (
+    Address,
+    SharedMemoryServer,
+    listening,
+    new_name,
+    new_socket,
+)
 from benchmarks.transport import (
     FLOORS,
     MEMCPY,

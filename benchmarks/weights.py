@@ -15,7 +15,7 @@ reader processes; of each block the last publication counts, when all memory has
 from __future__ import annotations
 
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Annotated, Any
@@ -28,18 +28,17 @@ from accerl_lerobot.config.ranges import Range, Repeats, Section, Seed
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine import ray_session
 from accerl_lerobot.errors import check_absent, make_folder
-from accerl_lerobot.transport.endpoint import Transport
+from accerl_lerobot.transport.endpoint import Endpoint
+from accerl_lerobot.transport.weights import Tensors, WeightPublisher
 from benchmarks.records import as_markdown, write
 from benchmarks.study import named
 
-ARMS: dict[str, Transport] = {"shared memory": "auto", "Ray": "ray"}
-"""Arm → transport."""
+ARMS = ("shared memory", "Ray")
 FAR = ("Ray",)
 """Arms with readers on other nodes."""
 MB = 1 << 20
 WARM = 4
 """Publications of a block that do not count: until all slabs have been written to and mapped."""
-Tensors = dict[str, np.ndarray]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,10 +145,10 @@ def _measure(config: BenchWeightsConfig, size_mb: int, readers: int) -> list[dic
     copy = {name: np.zeros_like(tensor) for name, tensor in tensors.items()}
     arms = _arms(config.apart)
     blocks: dict[str, list[dict[str, float]]] = {arm: [] for arm in arms}
-    with reading(readers, config.tensors, elements, apart=config.apart) as handles:
+    with reading(readers, config.tensors, elements, apart=config.apart) as endpoints:
         for repeat in range(config.repeats):
             for arm in arms[:: -1 if repeat % 2 else 1]:
-                blocks[arm].append(_block(arm, handles, tensors, copy))
+                blocks[arm].append(_block(arm, endpoints, tensors, copy))
     return [_cell(size_mb, readers, arm, notes) for arm, notes in blocks.items()]
 
 
@@ -157,12 +156,13 @@ def _arms(apart: bool) -> list[str]:
     return list(FAR if apart else ARMS)
 
 
-def _block(arm: str, handles: list[Any], tensors: Tensors, copy: Tensors) -> dict[str, float]:
+def _block(arm: str, endpoints: list[Endpoint], tensors: Tensors, copy: Tensors) -> dict[str, float]:
     """Publishes a few times, each after an update, and notes the last."""
-    from accerl_lerobot.weights.factory import make_publisher
     from benchmarks.weights_readers import ask
 
-    publisher = make_publisher(handles, ARMS[arm])
+    near = arm != "Ray"
+    publisher = WeightPublisher([e if near else replace(e, address=None) for e in endpoints])
+    handles = [endpoint.actor for endpoint in endpoints]
     try:
         for version in range(WARM + 1):
             _update(tensors, 0.0)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,8 +14,10 @@ import ray
 
 from accerl_lerobot.engine.ray_session import check_private, start_ray
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.weights.publisher import Tensors, monotonic_clock
-from accerl_lerobot.weights.shared_memory import Received, SharedMemoryReader
+from accerl_lerobot.transport.contract import PendingRequest
+from accerl_lerobot.transport.endpoint import Endpoint
+from accerl_lerobot.transport.shared_memory import Address, SharedMemoryServer
+from accerl_lerobot.transport.weights import WeightUpdate
 
 _APART = "apart"
 """Resource of the node that is not this one."""
@@ -27,61 +30,46 @@ class ReadingWorker:
 
     def __init__(self, tensors: int, elements: int) -> None:
         self._parameters = {f"t{i}": np.zeros(elements, np.float32) for i in range(tensors)}
-        self._reader: SharedMemoryReader | None = None
-        self._error: BaseException | None = None
+        self._server = SharedMemoryServer(self._take, copy=False)
         self._notes: dict[int, dict[str, float]] = {}
+        threading.Thread(target=self._serve, daemon=True).start()
 
-    def ready(self) -> bool:
-        """Answers once it has its memory."""
-        return True
+    def ready(self) -> Address:
+        """Where it can be reached through shared memory, once it has its memory."""
+        return self._server.address
 
-    def open_weights(self, address: str) -> bool:
+    def decide(self, update: WeightUpdate) -> None:
         """See `InferenceWorker`."""
-        if self._reader is not None:
-            self._reader.close()
-        self._reader = SharedMemoryReader(address, self._apply, self._fail)
-        return True
-
-    def receive_weights(self, version: int, tensors: Tensors, published_s: float) -> int:
-        """See `InferenceWorker`; but this one returns when they are applied."""
-        nbytes = sum(tensor.nbytes for tensor in tensors.values())
-        published_s = monotonic_clock(published_s)
-        self._apply(Received(version=version, tensors=tensors, published_s=published_s, nbytes=nbytes))
-        return version
+        self._server.call(update).result()
 
     def note(self, version: int) -> dict[str, float]:
-        """When a set was applied, how long that took, and its bytes.
-
-        Raises:
-            RuntimeError: receiving has failed.
-        """
-        if self._error is not None:
-            raise RuntimeError(f"receiving weights failed: {self._error!r}") from self._error
+        """When a set was applied, how long that took, and its bytes."""
         return self._notes[version]
 
     def some(self) -> np.ndarray:
         """A few of its values, to be compared."""
         return np.stack([tensor[:: max(1, len(tensor) // 100)] for tensor in self._parameters.values()])
 
-    def _apply(self, received: Received) -> None:
-        started = time.monotonic()
-        for name, tensor in received.tensors.items():
-            np.copyto(self._parameters[name], tensor)
-        now = time.monotonic()
-        self._notes[received.version] = {
-            "applied_s": now - received.published_s,
-            "pause_s": now - started,
-            "bytes": float(received.nbytes),
-        }
-        received.release()
+    def _serve(self) -> None:
+        while True:
+            self._server.poll(1.0)
 
-    def _fail(self, error: BaseException) -> None:
-        self._error = error
+    def _take(self, asked: PendingRequest) -> None:
+        update: WeightUpdate = asked.message
+        started = time.monotonic()
+        for name, tensor in update.tensors.items():
+            np.copyto(self._parameters[name], tensor)
+        self._notes[update.version] = {
+            "applied_s": time.time() - update.published_s,
+            "pause_s": time.monotonic() - started,
+            "bytes": float(sum(tensor.nbytes for tensor in update.tensors.values())),
+        }
+        asked.answer(None)
 
 
 @contextmanager
-def reading(count: int, tensors: int, elements: int, *, apart: bool = False) -> Iterator[list[Any]]:
-    """So many of them, ready; they end with the block. Ray is started if it is not there.
+def reading(count: int, tensors: int, elements: int, *, apart: bool = False) -> Iterator[list[Endpoint]]:
+    """Endpoints of so many of them, ready; they end with the block. Ray is started if it is not there.
 
     Args:
         count: how many.
@@ -96,9 +84,10 @@ def reading(count: int, tensors: int, elements: int, *, apart: bool = False) -> 
     worker = ray.remote(ReadingWorker).options(num_cpus=0, max_concurrency=4, resources=there)
     handles = [worker.remote(tensors, elements) for _ in range(count)]
     try:
-        for handle in handles:
-            ask(handle, "ready")
-        yield handles
+        yield [
+            Endpoint(name=f"reader {i}", method=handle.decide, address=ask(handle, "ready"), actor=handle)
+            for i, handle in enumerate(handles)
+        ]
     finally:
         for handle in handles:
             ray.kill(handle)

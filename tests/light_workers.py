@@ -22,7 +22,9 @@ from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.inference.batcher import BatcherStats
 from accerl_lerobot.rollout.worker import Report, RolloutWorker, WorkerShare
 from accerl_lerobot.trainer.peers import LearnerSettings
+from accerl_lerobot.transport.endpoint import Endpoint
 from accerl_lerobot.transport.shared_memory import Address, serve_on_loop
+from accerl_lerobot.transport.weights import WeightPublisher, WeightUpdate
 
 
 @pytest.fixture(scope="session")
@@ -64,18 +66,15 @@ class LightInference:
     async def fail(self) -> None:
         self._broken.set_exception(ArithmeticError("the forward pass fell over"))
 
-    async def decide(self, requests: list[Request]) -> list[Decision]:
+    async def decide(self, message: list[Request] | WeightUpdate) -> list[Decision] | None:
         from accerl_lerobot.transport.contract import ServiceStoppedError
 
         if self._broken.done():
             raise ServiceStoppedError("the inference service has stopped")
-        return [_decision(request, self._version) for request in requests]
-
-    async def receive_weights(
-        self, version: int, tensors: dict[str, np.ndarray], published_s: float = 0.0
-    ) -> int:
-        self._version = version
-        return version
+        if isinstance(message, WeightUpdate):
+            self._version = message.version
+            return None
+        return [_decision(request, self._version) for request in message]
 
     async def metrics(self) -> dict[str, float]:
         others = dict.fromkeys(("busy_share", "swap_s", "publish_to_served_s"), 0.0)
@@ -129,12 +128,10 @@ class LightTrainer:
     def idle(self) -> None:
         self._idle = True
 
-    def run(self, replay: Any, readers: list[Any], *_: str) -> int:
+    def run(self, replay: Any, readers: list[Endpoint]) -> int:
         import ray
 
-        from accerl_lerobot.weights.factory import make_publisher
-
-        self._publisher = publisher = make_publisher(readers, "ray")
+        self._publisher = publisher = WeightPublisher(readers)
         publisher.publish(len(self._ledger), {})
         self._publishing.set()
         n = self._config.batch_decisions
@@ -155,7 +152,7 @@ class LightTrainer:
             publisher.flush()
         return self._config.updates
 
-    def join(self, reader: Any) -> int:
+    def join(self, reader: Endpoint) -> int:
         assert self._publishing.wait(60)
         newest = len(self._ledger)
         self._publisher.add(reader)

@@ -77,7 +77,7 @@ def test_help_of_a_section(capsys: pytest.CaptureFixture[str]) -> None:
     assert "--policy.sampler.noise_level" in out and "--policy.path" not in out
     assert cli.main(["train", "--help=trainer"]) == 0
     out = capsys.readouterr().out
-    assert "0 freezes it. In [0, 1)." in out and "From 1 to 1,000,000." in out and "--policy" not in out
+    assert "0 freezes it. In [0, 1)." in out and "In [1, 1000000]." in out and "--policy" not in out
     assert cli.main(["train", "--help=trainr"]) == 2
     assert "--help='trainr': use all or one of env, dataset" in capsys.readouterr().err
 
@@ -112,9 +112,8 @@ class RayTaskError(InputError):
             1,
             "RuntimeError: a worker … failed; ACCERL_LOG=DEBUG shows the",
         ),
-        (MemoryError(), 1, "MemoryError; use fewer rollout.workers or rollout.worlds, or a smaller"),
-        (RecursionError("too deep"), 1, "RecursionError: too deep; something is nested too deeply"),
-        (BrokenPipeError(32, "Broken pipe"), 1, "BrokenPipeError: [Errno 32] Broken pipe; check the path"),
+        (MemoryError(), 1, "MemoryError; ACCERL_LOG=DEBUG"),
+        (BrokenPipeError(32, "Broken pipe"), 1, "BrokenPipeError: [Errno 32] Broken pipe; ACCERL_LOG"),
     ],
     ids=lambda value: type(value).__name__,
 )

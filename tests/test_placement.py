@@ -13,7 +13,7 @@ import pytest
 
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine import placement
-from accerl_lerobot.engine.config import LaunchConfig, PlacementConfig, RunConfig
+from accerl_lerobot.engine.config import LaunchConfig, RunConfig
 from accerl_lerobot.engine.placement import Node, Plan, place_workers, plan_workers
 from accerl_lerobot.engine.run import execute
 from accerl_lerobot.engine.stopping import WorkerError
@@ -60,7 +60,7 @@ def run(
         inference=InferenceConfig(workers=services),
         rollout=RolloutConfig(workers=max(rollouts, services), worlds=1, segment_length=3),
         imagination=ImaginationConfig(share=0.5 if imagining else 0.0, model="oracle"),
-        launch=LaunchConfig(address="auto", placement=PlacementConfig(**placement)),
+        launch=LaunchConfig(address="auto", placement=placement),
     )
 
 
@@ -163,7 +163,7 @@ def test_a_rollout_worker_whose_node_has_left_goes_to_one_that_is_there():
             {"address": "auto", "engine": "local"},
             r"launch\.address='auto': launch\.engine=local is one process",
         ),
-        ({"placement": PlacementConfig(rollout="1")}, r"placement=.*a private Ray has one"),
+        ({"placement": {"rollout": "1"}}, r"placement=.*a private Ray has one"),
     ],
 )
 def test_a_cluster_that_is_none_is_refused_when_the_recipe_is_read(fields: dict[str, Any], match: str):
@@ -200,10 +200,7 @@ def test_whatever_is_planned_fits():
         )
         sites = {name: rng.choice(["0", "all", str(rng.randrange(len(nodes)))]) for name in ROLES}
         config = run(
-            ranks=rng.choice([1, 1, 2, 3]),
-            services=rng.randint(1, 3),
-            rollouts=rng.randint(3, 8),
-            **sites,
+            ranks=rng.choice([1, 1, 2, 3]), services=rng.randint(1, 3), rollouts=rng.randint(3, 8), **sites
         )
         try:
             plan = plan_workers(nodes, config)

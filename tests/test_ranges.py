@@ -17,15 +17,13 @@ import pytest
 
 from accerl_lerobot.cli.verbs import CONFIGS
 from accerl_lerobot.config.parsing import choices_of, section_of
-from accerl_lerobot.config.ranges import Choice, Device, Positive, Range, Section, Share, check, hints_of
+from accerl_lerobot.config.ranges import Device, Pattern, Positive, Range, Section, Share, check, hints_of
 from accerl_lerobot.demos.backbone import BackboneConfig
 from accerl_lerobot.demos.sft import SFTConfig
-from accerl_lerobot.engine.config import PlacementConfig
+from accerl_lerobot.engine.config import LaunchConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.hub.card import PullConfig
-from accerl_lerobot.policies.config import (
-    TuningConfig,
-)
+from accerl_lerobot.policies.config import TuningConfig
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.timeline.read import TimelineConfig
 from accerl_lerobot.world_model.config import NetworkConfig, WorldModelConfig
@@ -112,7 +110,7 @@ RULES = [
     (NetworkConfig, {"channels": ()}, "world_model.model.network.channels="),
     (ReplayConfig, {"min_decisions": 5000}, "replay.min_decisions="),
     (ReplayConfig, {"ahead": 5000}, "replay.ahead="),
-    (PlacementConfig, {"rollout": " "}, "launch.placement.rollout=' ': name a node"),
+    (LaunchConfig, {"placement": {"rollout": " "}}, "launch.placement.rollout=' ': use one of"),
     (SFTConfig, {"policy": {"chunk_size": 4}}, "sft.policy="),
     (TimelineConfig, {"runs": ()}, "runs="),
     (TuningConfig, {"targets": "("}, "policy.tuning.targets='(': not a regular"),
@@ -139,7 +137,7 @@ def test_values_that_do_not_go_together_name_their_field(cls: type[Any], values:
         (list[str], [[]], ["ab", [1]]),
         (float, [1, -1e9], [math.inf, math.nan, "1"]),
         (Literal["a", "b"] | None, ["a", None], ["c", 1]),
-        (Annotated[str, Choice(["a"])], ["a"], ["b", []]),
+        (Annotated[str, Pattern("a", "a")], ["a"], ["b", []]),
         (Device, ["auto", "cpu", "cuda", "cuda:3"], ["foo", "cuda:999", "cuda:", "CPU", 0, ""]),
         (dict[str, Any], [{}], []),
     ],
@@ -176,5 +174,5 @@ def test_a_field_with_another_default_keeps_its_range():
         share: float = 0.7
 
     assert dataclasses.asdict(Mine(share=1)) == {"share": 1}
-    with pytest.raises(InputError, match=r"^mine\.share=2: use a number from 0 to 1$"):
+    with pytest.raises(InputError, match=r"^mine\.share=2: use a number in \[0, 1\]$"):
         Mine(share=2)

@@ -303,29 +303,22 @@ def hidden(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ray_session, "ray_processes", dict)
 
 
-@pytest.mark.parametrize(
-    ("responds", "calls"), [(True, ["init", "shutdown"]), (False, ["init", "shutdown", "init", "shutdown"])]
-)
-def test_it_is_kept_for_those_who_come_later_while_it_responds(
-    hidden: None, responds: bool, calls: list[str], monkeypatch: pytest.MonkeyPatch
-):
+def test_it_is_kept_for_those_who_come_later(hidden: None, monkeypatch: pytest.MonkeyPatch):
     stand = Stand()
     monkeypatch.setitem(sys.modules, "ray", stand)
     monkeypatch.setattr(ray_session, "start_ray", stand.init)
-    monkeypatch.setattr(ray_session, "_responds", lambda: responds)
     own = RaySession(LaunchConfig())
     own.start()
     own.start()
     own.close()
     own.close()
-    assert stand.calls == calls and not stand.there
+    assert stand.calls == ["init", "shutdown"] and not stand.there
 
 
 def test_one_that_was_there_before_is_left_as_it_is(hidden: None, monkeypatch: pytest.MonkeyPatch):
     stand = Stand(there=True)
     monkeypatch.setitem(sys.modules, "ray", stand)
     monkeypatch.setattr(ray_session, "start_ray", stand.init)
-    monkeypatch.setattr(ray_session, "_responds", lambda: pytest.fail("it is not ours to judge"))
     own = RaySession(LaunchConfig())
     own.start()
     own.close()

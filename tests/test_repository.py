@@ -29,14 +29,7 @@ PACKAGE = ROOT / "accerl_lerobot"
 HEADER = "# SPDX-License-Identifier: Apache-2.0\n"
 LONGEST_FILE = 600
 ENGINE = {"launch.py", "placement.py", "ray_session.py", "replicas.py"}
-SHELLS = ENGINE | {
-    "doctor.py",
-    "worker.py",
-    "imagination.py",
-    "peers.py",
-    "factory.py",
-    "endpoint.py",
-}
+SHELLS = ENGINE | {"doctor.py", "worker.py", "imagination.py", "peers.py", "endpoint.py"}
 """Files that may import Ray; all others are testable without it."""
 DISTRIBUTED = {"rendezvous.py", "ranks.py", "sharding.py", "tensors.py"}
 """Files that may know of other processes of a `torch.distributed` group."""
@@ -52,7 +45,7 @@ LIGHT = [
     "accerl_lerobot.rollout.worker",
     "accerl_lerobot.timeline",
     "accerl_lerobot.trainer.config",
-    "accerl_lerobot.weights.factory",
+    "accerl_lerobot.transport.weights",
 ]
 """Modules of processes that hold no policy: torch and LeRobot would cost each 400 MB and four seconds."""
 

@@ -12,7 +12,7 @@ import pytest
 
 from accerl_lerobot.checkpoint.layout import saved_version
 from accerl_lerobot.console import Console
-from accerl_lerobot.engine import run, stopping
+from accerl_lerobot.engine import resuming, run
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig
 from accerl_lerobot.engine.loop import Engine, Progress, Saved
 from accerl_lerobot.engine.stopping import WorkerError
@@ -234,7 +234,7 @@ def losing(monkeypatch: pytest.MonkeyPatch, config: RunConfig, lost_at: list[int
 
     monkeypatch.setattr(run, "make_engine", make)
     monkeypatch.setattr(run, "check_policy", lambda config, spec, **_: 1)
-    monkeypatch.setattr(stopping, "pause_s", lambda times: 0.01 * times)
+    monkeypatch.setattr(resuming, "pause_s", lambda times: 0.01 * times)
     return made
 
 

@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from accerl_lerobot.engine.config import RunConfig
-from accerl_lerobot.engine.stopping import Stopping, arrived, continued, deferred
+from accerl_lerobot.engine.resuming import continued
+from accerl_lerobot.engine.stopping import Stopping, arrived, deferred
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import PolicyConfig, TuningConfig
 

@@ -12,7 +12,7 @@ import pytest
 
 from accerl_lerobot.engine import launch, replicas
 from accerl_lerobot.engine.launch import end
-from accerl_lerobot.engine.replicas import ActorHandle
+from accerl_lerobot.engine.replicas import WorkerSlot
 
 
 class Stand:
@@ -31,7 +31,7 @@ def test_only_a_process_of_this_node_is_ended_by_its_number(here: bool, monkeypa
         monkeypatch.setattr(module, "ray", Stand())
     monkeypatch.setattr(launch, "GONE_S", 0.2)
     with subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"]) as process:
-        worker = ActorHandle("somebody", None)
+        worker = WorkerSlot("somebody")
         worker.await_start(process.pid, 1.0, here)
         assert (worker.process == psutil.Process(process.pid)) is here
         end([worker])

@@ -28,7 +28,7 @@ from ray.cluster_utils import Cluster  # noqa: E402
 
 from accerl_lerobot.engine import launch  # noqa: E402
 from accerl_lerobot.engine import placement as planning  # noqa: E402
-from accerl_lerobot.engine.config import LaunchConfig, PlacementConfig  # noqa: E402
+from accerl_lerobot.engine.config import LaunchConfig  # noqa: E402
 from accerl_lerobot.engine.launch import RayEngine  # noqa: E402
 from accerl_lerobot.errors import InputError  # noqa: E402
 from accerl_lerobot.evaluation import evaluation_plans  # noqa: E402
@@ -71,13 +71,12 @@ def two_nodes() -> Iterator[tuple[Cluster, Any]]:
 
 def engine(address: str, nodes: str, updates: int) -> RayEngine:
     """A run with its rollout workers on these nodes."""
-    placement = PlacementConfig(rollout=nodes)
     config = tiny_run(
         Path("nowhere"),
         env=SLOW,
         rollout=FOUR,
         trainer=TrainerConfig(updates=updates, batch_decisions=16),
-        launch=LaunchConfig(address=address, placement=placement, stall_s=60.0, max_restarts=0),
+        launch=LaunchConfig(address=address, placement={"rollout": nodes}, stall_s=60.0, max_restarts=0),
     )
     return RayEngine(config, ("match",))
 
@@ -140,12 +139,12 @@ def what_does_not_fit_is_refused(made: Cluster, second: Any, monkeypatch: pytest
     key = next(n["NodeID"] for n in _nodes(address) if "sim" in n["Resources"])
     honest = planning.report_node
 
-    def report(policy: Path | None, marker: Path | None) -> Any:
+    def report(folders: list[Path]) -> Any:
         import ray
 
-        versions, *seen = honest(policy, marker)
+        versions, seen = honest(folders)
         there = ray.is_initialized() and ray.get_runtime_context().get_node_id() == key
-        return versions | ({"lerobot": "0.0"} if there else {}), *seen
+        return versions | ({"lerobot": "0.0"} if there else {}), seen
 
     with monkeypatch.context() as patch:
         patch.setattr(planning, "report_node", report)

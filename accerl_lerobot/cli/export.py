@@ -11,7 +11,7 @@ journal is left out and counted.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator
+from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -23,16 +23,7 @@ from accerl_lerobot.checkpoint.safety import Origin, check_folder
 from accerl_lerobot.config.parsing import DISCOVER, decode, drop_consents, read_recipe
 from accerl_lerobot.config.ranges import DatasetName, NewFolder, Range, Section
 from accerl_lerobot.console import Console
-from accerl_lerobot.demos.record import (
-    Episode,
-    appearing,
-    check_free,
-    features,
-    frames,
-    in_order,
-    new_dataset,
-    simulators,
-)
+from accerl_lerobot.demos import record
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.envs.base import EnvConfig, World
@@ -78,16 +69,18 @@ def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
     Returns:
         ``episodes``, ``frames``, ``successes``, and ``unlike``, those that differed and were left out.
     """
-    run, root = Path(str(config.path)).expanduser(), check_free(config.root)
+    run, root = Path(str(config.path)).expanduser(), record.check_free(config.root)
     check_folder(run, Origin("path", str(run)))
     if not (run / CONFIG).is_file():
         raise InputError("path", str(run), f"no run in it: there is no {CONFIG}")
     settings = _settings(run, config)
-    chosen = _picked(whole_episodes(read_journal(run / EPISODES)), config)
+    wanted, picks_all = config.pick == "successes", config.pick == "all"
+    episodes = whole_episodes(read_journal(run / EPISODES))
+    chosen = [parts for parts in episodes if picks_all or parts[-1].success is wanted]
     if not chosen:
         remedy = f"no whole episode in its {EPISODES} of those asked for ({config.pick})"
         raise InputError("path", str(run), remedy)
-    with appearing(root) as partial:
+    with record.appearing(root) as partial:
         tally = _write(settings, config, chosen, partial, console)
         if not tally["episodes"]:
             remedy = "none of its episodes could be repeated: this environment is not deterministic"
@@ -119,34 +112,29 @@ def _settings(run: Path, config: ExportConfig) -> RunConfig:
     return settings
 
 
-def _picked(episodes: Iterable[list[Done]], config: ExportConfig) -> list[list[Done]]:
-    wanted = config.pick == "successes"
-    return [parts for parts in episodes if config.pick == "all" or parts[-1].success is wanted]
-
-
 def _write(
     settings: RunConfig, config: ExportConfig, chosen: list[list[Done]], root: Path, console: Console
 ) -> dict[str, int]:
-    world = make_world(settings.env)
-    spec = world.spec
-    world.close()
+    with closing(make_world(settings.env)) as world:
+        spec = world.spec
     tally = {"episodes": 0, "frames": 0, "successes": 0, "unlike": 0}
     version = {VERSION: {"dtype": "int64", "shape": (1,), "names": None}}
-    table = features(spec, settings.env.state_size) | version
+    table = record.features(spec, settings.env.state_size) | version
     cost = settings.rollout.decision_cost
     with (
         console.stage("replaying episodes", total=len(chosen)) as stage,
-        simulators(config.processes, _start, settings.env, cost) as pool,
+        record.simulators(config.processes, _start, settings.env, cost) as pool,
     ):
-        repeated = in_order(pool, _replay, chosen, ahead=2 * config.processes)
-        with new_dataset(root, config.repo_id, spec.fps, settings.env.type, table) as dataset:
+        repeated = record.in_order(pool, _replay, chosen, ahead=2 * config.processes)
+        with record.new_dataset(root, config.repo_id, spec.fps, settings.env.type, table) as dataset:
             for number, (episode, parts) in enumerate(zip(repeated, chosen, strict=True), start=1):
                 stage.update(number, f"{tally['successes']} successes")
                 if episode is None:
                     tally["unlike"] += 1
                     continue
-                for frame in _versioned(episode, parts):
-                    dataset.add_frame(frame)
+                versions = np.concatenate([np.repeat(part.versions, part.steps) for part in parts])
+                for frame, policy in zip(record.frames(episode), versions, strict=True):
+                    dataset.add_frame(frame | {VERSION: np.array([policy], np.int64)})
                 dataset.save_episode()
                 tally["episodes"] += 1
                 tally["frames"] += len(episode)
@@ -154,12 +142,6 @@ def _write(
     if tally["unlike"]:
         console.say(f"{tally['unlike']} of {len(chosen)} episodes differed from the run and are left out")
     return tally
-
-
-def _versioned(episode: Episode, parts: list[Done]) -> Iterator[dict[str, Any]]:
-    versions = [v for part in parts for v, n in zip(part.versions, part.steps, strict=True) for _ in range(n)]
-    for frame, version in zip(frames(episode), versions, strict=True):
-        yield frame | {VERSION: np.array([version], np.int64)}
 
 
 _world: World
@@ -172,7 +154,7 @@ def _start(env: EnvConfig, cost: float) -> None:
     _world, _cost = make_world(env), cost
 
 
-def _replay(parts: list[Done]) -> Episode | None:
+def _replay(parts: list[Done]) -> record.Episode | None:
     """An episode with an observation at every step; None if it differs from the journal."""
     origin = parts[0].origin
     observation = _world.reset(origin.seed, origin.task)
@@ -189,7 +171,7 @@ def _replay(parts: list[Done]) -> Episode | None:
             success_at = i
     if not _matches(parts, np.array(rewards), success_at >= 0):
         return None
-    return Episode(
+    return record.Episode(
         observations={key: np.stack([row[key] for row in seen]) for key in seen[0] if key != "task"},
         actions=actions,
         rewards=np.asarray(rewards, np.float32),

@@ -30,7 +30,7 @@ from accerl_lerobot.config.ranges import Device, NewFolder, Section, Seed
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.record import DemosConfig
 from accerl_lerobot.demos.sft import SFTConfig
-from accerl_lerobot.engine.config import DatasetConfig, LaunchConfig, RunConfig, check_chunk, encode, parse
+from accerl_lerobot.engine.config import DatasetConfig, LaunchConfig, RunConfig, encode, parse
 from accerl_lerobot.envs import EnvConfig, MetaWorldConfig
 from accerl_lerobot.errors import InputError, check_absent, expanded, is_full, kept_traceback, make_folder
 from accerl_lerobot.evaluation import EvaluationConfig
@@ -79,11 +79,6 @@ class SFTRun(NewFolderRun):
     """When given, the dataset is checked against it first."""
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     sft: SFTConfig = field(default_factory=SFTConfig)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.sft.init_path is None:
-            check_chunk(self.sft.policy)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,7 +174,7 @@ def train(arguments: list[str], load: Load | None = None) -> int:
     """``accerl train``; `load` makes the policy's adapter, of LeRobot's checkpoint by default."""
     config: RunConfig = parse(RunConfig, arguments)
     from accerl_lerobot.engine import run
-    from accerl_lerobot.engine.stopping import StoppedError
+    from accerl_lerobot.engine.stopping import StoppedError, WorkerError
 
     console = Console()
     try:
@@ -188,26 +183,27 @@ def train(arguments: list[str], load: Load | None = None) -> int:
         console.say(str(stopped))
         return 128 + stopped.number
     except BaseException as error:
-        if is_full(error) or run.is_brief(error):
-            return 1
+        if is_full(error) or (isinstance(error, WorkerError) and error.brief):
+            return 1  # `start` has said it
         raise
     before = summary["success_before"]
     console.say(
         f"success {'' if before is None else f'{before:.1%} → '}{summary['success_after']:.1%} "
         f"in {summary['wall_s']:.0f} s; see {directory / 'success_curve.png'}"
     )
-    sys.stdout.write(json.dumps(summary, indent=2) + "\n")
-    return 0
+    return _told(summary)
 
 
 def demos(arguments: list[str]) -> int:
     """``accerl demos``."""
     config: DemosRun = parse(DemosRun, arguments, recipe_class=RunConfig)
     from accerl_lerobot.demos.record import record_demos
-    from accerl_lerobot.engine.preflight import check_disk, check_world, demos_bytes
+    from accerl_lerobot.engine.preflight import check_world
+    from accerl_lerobot.engine.sizes import check_disk
 
     with redirect_stdout(sys.stderr):
-        check_disk(config.root, demos_bytes(config.demos, check_world(config.env)), "root")
+        check_disk(config.root, "root")
+        check_world(config.env)
         path = record_demos(config.env, config.demos, config.root, config.seed)
     sys.stdout.write(f"{path}\n")
     return 0
@@ -220,33 +216,19 @@ def sft(arguments: list[str]) -> int:
         raise InputError("dataset.repo_id", None, NO_DATASET)
     if config.sft.steps == 0:
         raise InputError("sft.steps", 0, "use at least 1")
-    from accerl_lerobot.demos.dataset_files import task_texts
-    from accerl_lerobot.demos.sft import run_sft
-    from accerl_lerobot.engine import run
-    from accerl_lerobot.engine.preflight import check_disk, check_training_data, check_world, sft_policy
+    from accerl_lerobot.engine.preflight import check_training_data, check_world, sft_policy
+    from accerl_lerobot.engine.run import fine_tune, make_output_dir
+    from accerl_lerobot.engine.sizes import check_disk
     from accerl_lerobot.policies.loading import resolve_device
 
     device = str(resolve_device(config.device, "device"))
     policy = sft_policy(config.sft)
     spec = None if config.env is None else check_world(config.env)
-    meta = check_training_data(config.sft, config.dataset, policy, spec, {})
-    check_disk(config.output_dir, 0)
-    directory = run.make_output_dir(config)
-    console = Console()
-    with (
-        redirect_stdout(sys.stderr),
-        kept_traceback(directory),
-        console.stage("SFT", total=config.sft.steps) as stage,
-    ):
-        path = run_sft(
-            config.sft,
-            config.dataset,
-            directory / "sft",
-            config.seed,
-            device,
-            task_texts(meta),
-            on_step=lambda step, loss: stage.update(step, f"loss {loss:.3f}"),
-        )
+    check_training_data(config.sft, config.dataset, policy, spec, {})
+    check_disk(config.output_dir)
+    directory = make_output_dir(config)
+    with redirect_stdout(sys.stderr), kept_traceback(directory):
+        path = fine_tune(config.sft, config.dataset, directory, config.seed, device, Console())
     sys.stdout.write(f"{path}\n")
     return 0
 
@@ -315,12 +297,7 @@ def _validated(
 ) -> int:
     """Does the work in a new folder and shows the validation that it ends with."""
     from accerl_lerobot.engine.run import discard_unused, make_output_dir
-    from accerl_lerobot.world_model.metrics import (
-        check_lines,
-        datasets_table,
-        depth_table,
-        has_several,
-    )
+    from accerl_lerobot.world_model.metrics import check_lines, datasets_table, depth_table, has_several
 
     directory = make_output_dir(config)
     (directory / CONFIG).write_text(yaml.safe_dump(encode(config), sort_keys=False))
@@ -338,8 +315,7 @@ def _validated(
     for line in check_lines(found):
         console.say(line)
     console.say(f"{'passed' if found['passed'] else 'FAILED'}; see {directory / 'preview.mp4'}")
-    sys.stdout.write(json.dumps(found, indent=2) + "\n")
-    return 0 if found["passed"] else 1
+    return _told(found, 0 if found["passed"] else 1)
 
 
 def push(arguments: list[str]) -> int:
@@ -351,8 +327,7 @@ def push(arguments: list[str]) -> int:
         found = to_hub(config)
     done = "is there already, as" if found["unchanged"] else "is now"
     Console().say(f"{found['kind']} {done} {found['url']} at commit {found['commit']}")
-    sys.stdout.write(json.dumps(found, indent=2) + "\n")
-    return 0
+    return _told(found)
 
 
 def pull(arguments: list[str]) -> int:
@@ -366,8 +341,7 @@ def pull(arguments: list[str]) -> int:
     console.say(f"{found['kind']} {found['path']} is {found['commit']}, {found['checked']} files checked")
     for name, fields in found.get("dropped", {}).items():
         console.say(f"dropped from {name}, as it would let code run: {', '.join(fields)}")
-    sys.stdout.write(json.dumps(found, indent=2) + "\n")
-    return 0
+    return _told(found)
 
 
 def report(arguments: list[str]) -> int:
@@ -382,8 +356,7 @@ def timeline(arguments: list[str]) -> int:
     config: TimelineConfig = parse(TimelineConfig, arguments)
     found = show_timelines(config)
     Console().rich.print(timeline_table(found))
-    sys.stdout.write(json.dumps(found, indent=2) + "\n")
-    return 0
+    return _told(found)
 
 
 def export(arguments: list[str]) -> int:
@@ -394,8 +367,7 @@ def export(arguments: list[str]) -> int:
     console = Console()
     with redirect_stdout(sys.stderr):
         found = export_episodes(config, console)
-    sys.stdout.write(json.dumps(found, indent=2) + "\n")
-    return 0
+    return _told(found)
 
 
 def bench(arguments: list[str]) -> int:
@@ -414,8 +386,12 @@ def measure(module_name: str, config: Any) -> int:
     with redirect_stdout(sys.stderr):
         result = getattr(module, f"bench_{module_name.rpartition('.')[2]}")(config)
     Console().rich.print(module.table(result))
+    return _told(result)
+
+
+def _told(result: dict[str, Any], code: int = 0) -> int:
     sys.stdout.write(json.dumps(result, indent=2) + "\n")
-    return 0
+    return code
 
 
 CONFIGS: dict[str, type[Any]] = {

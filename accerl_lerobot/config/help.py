@@ -10,7 +10,7 @@ import sys
 import textwrap
 import typing
 from collections.abc import Collection, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import yaml
 
@@ -21,8 +21,6 @@ from accerl_lerobot.errors import InputError
 WIDTH = 110
 COLUMN = 44
 """Where explanations begin."""
-
-
 PAGE = 60
 """Lines that are shown at once; what is longer is shown by section."""
 COMMON = (
@@ -37,80 +35,53 @@ COMMON = (
 """Fields that people change."""
 
 
+class Line(NamedTuple):
+    """A field of a config, or the heading of a section."""
+
+    name: str
+    """Dotted."""
+    default: str | None
+    """As one would type it; None: a heading."""
+    text: str
+    choices: str = ""
+    """Its range."""
+
+
 def help_text(command: str, config_class: type[Any], what: str, section: str = "") -> str:
     """The text of ``--help``: all fields if they fit a page, otherwise those that people change.
 
     `what` says in one line what the command does; `section` is that of ``--help=SECTION``, or ``all``.
     """
-    lines = [
+    listed = _listed(config_class)
+    sections = {name: section_of(hint) for name, hint in hints_of(config_class).items()}
+    if section not in ("", "all"):
+        inside = [line for line in listed if f"{line.name}.".startswith(f"{section}.")]
+        if not inside:
+            names = ", ".join(name for name, kind in sections.items() if kind is not None)
+            raise InputError("--help", section, f"use all or one of {names}" if names else "use all")
+        return "\n".join(_in_full(inside))
+    head = [
         f"usage: {command} {_bare(config_class)} [--section.field=value …]",
         "",
         textwrap.fill(f"{what[0].upper()}{what[1:]}. Fields not given keep the value shown.", WIDTH),
         "",
     ]
-    every = _fields(config_class, "")
-    if section not in ("", "all"):
-        return "\n".join(_of_section(every, section, config_class))
-    if section == "all" or len(lines) + len(every) <= PAGE:
-        return "\n".join(lines + every)
-    lines += [line for name in COMMON for line in _brief(config_class, name)]
-    lines += ["", f"more: {command} --help=all, or --help=SECTION:"]
-    hints = hints_of(config_class)
-    for name, section_class in ((name, section_of(hint)) for name, hint in hints.items()):
-        if section_class is not None:
-            text = " | ".join(choices_of(section_class)) or _summary(section_class)
-            lines.append(f"  {name:12}{text}"[:WIDTH])
-    return "\n".join(lines)
+    full = _in_full(listed)
+    if section == "all" or len(head) + len(full) <= PAGE:
+        return "\n".join(head + full)
+    usual = {line.name: line for line in _listed(config_class, all_types=False)}
+    head += [_in_brief(usual[name]) for name in COMMON if name in usual]
+    head += ["", f"more: {command} --help=all, or --help=SECTION:"]
+    for name, kind in sections.items():
+        if kind is not None:
+            head.append(f"  {name:12}{' | '.join(choices_of(kind)) or _summary(kind)}"[:WIDTH])
+    return "\n".join(head)
 
 
 def brief(config_class: type[Any]) -> str:
     """The first sentence of the module that a config is in, on one line."""
     doc = sys.modules[config_class.__module__].__doc__ or ""
     return doc.partition("\n\n")[0].replace("\n", " ")
-
-
-def _of_section(every: list[str], section: str, config_class: type[Any]) -> list[str]:
-    """The lines that are about a section, such as ``trainer`` or ``policy.sampler``, and those below it."""
-    chosen, inside = [], False
-    for line in every:
-        if line and not line.startswith(" "):
-            name = line.partition(":")[0].partition(" ")[0].partition("=")[0].removesuffix(f".{TYPE}")
-            inside = name == section or name.startswith(f"{section}.")
-        if inside:
-            chosen.append(line)
-    if not chosen:
-        names = [name for name, hint in hints_of(config_class).items() if section_of(hint) is not None]
-        raise InputError("--help", section, f"use all or one of {', '.join(names)}" if names else "use all")
-    return chosen
-
-
-def _brief(config_class: type[Any], dotted: str) -> list[str]:
-    """A field in one line, if the config has it."""
-    cls: type[Any] | None = config_class
-    default: Any = None
-    *sections, last = dotted.split(".")
-    for depth, name in enumerate(sections):
-        field = next((f for f in dataclasses.fields(cls) if f.name == name), None) if cls else None
-        if cls is None or field is None:
-            return []
-        default, cls = _default(field, default), section_of(hints_of(cls)[name])
-        if cls is not None and last == TYPE and depth == len(sections) - 1:
-            return [_one_line(f"--{dotted}={getattr(default, TYPE, '')}", " | ".join(choices_of(cls)))]
-        cls = type(default) if default is not None else cls
-    field = next((f for f in dataclasses.fields(cls) if f.name == last), None) if cls else None
-    if cls is None or field is None:
-        return []
-    choices = range_in_words(hints_of(cls)[last])
-    text = choices if " | " in choices else docstrings(cls)[last]
-    return [_one_line(f"--{dotted}={_shown(_default(field, default))}", text)]
-
-
-def _one_line(flag: str, text: str) -> str:
-    """Its first sentence, shortened to a line."""
-    first = text.partition(". ")[0].removesuffix(".")
-    return textwrap.shorten(first, WIDTH - COLUMN, placeholder=" …").join(
-        [f"  {flag}".ljust(COLUMN - 1) + " ", ""]
-    )
 
 
 def _bare(config_class: type[Any]) -> str:
@@ -139,68 +110,84 @@ def docstrings(cls: type[Any]) -> dict[str, str]:
     return found
 
 
-def _fields(cls: type[Any], prefix: str, usual: Any = None, without: Collection[str] = ()) -> list[str]:
-    """Lines of its fields with their defaults: those of `usual`, which is one of it, or its own."""
-    hints = hints_of(cls)
-    lines: list[str] = []
-    sections: list[str] = []
+def _listed(
+    cls: type[Any], prefix: str = "", usual: Any = None, shared: Collection[Line] = (), all_types: bool = True
+) -> list[Line]:
+    """Fields of a config and of its sections, with the defaults of `usual`, which is one of it, or its own.
+
+    Args:
+        shared: fields that are listed already.
+        all_types: False: where there is a choice, the default alone, and the choice as a field.
+    """
+    hints, fields, sections = hints_of(cls), list[Line](), list[Line]()
     for field in dataclasses.fields(cls):
-        if field.name in without:
-            continue
-        name, section = f"{prefix}{field.name}", section_of(hints[field.name])
+        name, section, default = (
+            f"{prefix}{field.name}",
+            section_of(hints[field.name]),
+            _default(field, usual),
+        )
         if section is None:
-            lines += _field(cls, field, prefix, usual)
-            continue
-        choices, default = choices_of(section), _default(field, usual)
-        if choices:
+            line = Line(name, _shown(default), docstrings(cls)[field.name], range_in_words(hints[field.name]))
+            fields += [] if line in shared else [line]
+        elif not (choices := choices_of(section)):
+            note = "" if default is not None else " (off unless given)"
+            sections.append(Line(name, None, f"{name}{note}: {_summary(section)}"))
+            sections += _listed(section, f"{name}.", default, (), all_types)
+        elif all_types:
             sections += _types(choices, name, default)
-            continue
-        note = "" if default is not None else " (off unless given)"
-        sections += ["", f"{name}{note}: {_summary(section)}", *_fields(section, f"{name}.", default)]
-    return lines + sections
+        elif default is not None:
+            sections.append(Line(f"{name}.{TYPE}", getattr(default, TYPE), "", " | ".join(choices)))
+            sections += _listed(type(default), f"{name}.", default, (), all_types)
+    return fields + sections
 
 
-def _field(cls: type[Any], field: Any, prefix: str, usual: Any) -> list[str]:
-    """Lines of a field that is no section."""
-    text = docstrings(cls)[field.name]
-    span = range_in_words(hints_of(cls)[field.name])
-    if span and not all(choice in text for choice in span.split(" | ")):
-        text = f"{text} {span[0].upper()}{span[1:]}.".strip()
-    return _entry(f"--{prefix}{field.name}={_shown(_default(field, usual))}", text)
-
-
-def _types(choices: Mapping[str, type[Any]], name: str, default: Any) -> list[str]:
-    """Lines of the types of a choice: what they have in common, then each."""
+def _types(choices: Mapping[str, type[Any]], name: str, default: Any) -> list[Line]:
+    """Fields of the types of a choice: what they have in common, then each."""
     usual = {kind: default if getattr(default, TYPE, None) == kind else None for kind in choices}
-    owners: dict[tuple[str, ...], list[str]] = {}
+    owners: dict[Line, list[str]] = {}
     for kind, subclass in choices.items():
-        for field in dataclasses.fields(subclass):
-            if section_of(hints_of(subclass)[field.name]) is None:
-                entry = (field.name, *_field(subclass, field, f"{name}.", usual[kind]))
-                owners.setdefault(entry, []).append(kind)
-    common: dict[tuple[str, ...], list[tuple[str, ...]]] = {}
-    for entry, kinds in owners.items():
-        if len(kinds) > 1:
-            common.setdefault(tuple(kinds), []).append(entry)
-    lines: list[str] = []
-    for alike, entries in common.items():
-        lines += ["", f"{name}.{TYPE}={' | '.join(alike)}: Fields that these have in common."]
-        lines += [line for entry in entries for line in entry[1:]]
+        for line in _listed(subclass, f"{name}.", usual[kind]):
+            if "." not in line.name.removeprefix(f"{name}."):
+                owners.setdefault(line, []).append(kind)
+    common: dict[tuple[str, ...], list[Line]] = {}
+    for line, kinds in owners.items():
+        if len(kinds) > 1 and line.default is not None:
+            common.setdefault(tuple(kinds), []).append(line)
+    listed: list[Line] = []
+    for alike, lines in common.items():
+        title = f"{name}.{TYPE}={' | '.join(alike)}: Fields that these have in common."
+        listed += [Line(name, None, title), *lines]
     for kind, subclass in choices.items():
         note = "" if usual[kind] is None else " (default)"
-        shared = {entry[0] for entry, kinds in owners.items() if kind in kinds and len(kinds) > 1}
-        lines += ["", f"{name}.{TYPE}={kind}{note}: {_summary(subclass)}"]
-        lines += _fields(subclass, f"{name}.", usual[kind], shared)
+        listed.append(Line(name, None, f"{name}.{TYPE}={kind}{note}: {_summary(subclass)}"))
+        shared = [line for alike, lines in common.items() if kind in alike for line in lines]
+        listed += _listed(subclass, f"{name}.", usual[kind], shared)
+    return listed
+
+
+def _in_full(listed: list[Line]) -> list[str]:
+    lines: list[str] = []
+    for line in listed:
+        if line.default is None:
+            lines += ["", line.text]
+            continue
+        text = line.text
+        if line.choices and not all(choice in text for choice in line.choices.split(" | ")):
+            text = f"{text} {line.choices[0].upper()}{line.choices[1:]}.".strip()
+        start = f"  --{line.name}={line.default}"
+        if not text or len(start) >= COLUMN:
+            lines.append(start)
+            start = ""
+        first, others = start.ljust(COLUMN), " " * COLUMN
+        lines += textwrap.wrap(text, WIDTH, initial_indent=first, subsequent_indent=others)
     return lines
 
 
-def _entry(flag: str, text: str) -> list[str]:
-    start = f"  {flag}"
-    if not text:
-        return [start]
-    if len(start) < COLUMN:
-        return textwrap.wrap(text, WIDTH, initial_indent=start.ljust(COLUMN), subsequent_indent=" " * COLUMN)
-    return [start, *textwrap.wrap(text, WIDTH, initial_indent=" " * COLUMN, subsequent_indent=" " * COLUMN)]
+def _in_brief(line: Line) -> str:
+    """A field in one line: its choices, or the first sentence about it."""
+    text = line.choices if " | " in line.choices else line.text.partition(". ")[0].removesuffix(".")
+    start = f"  --{line.name}={line.default}".ljust(COLUMN - 1)
+    return f"{start} {textwrap.shorten(text, WIDTH - COLUMN, placeholder=' …')}"
 
 
 def _default(field: Any, usual: Any = None) -> Any:

@@ -57,39 +57,26 @@ RECIPES = "recipes"
 TYPE = "type"
 """The key that picks one config of several, as in ``env.type``."""
 LONGEST_KEY = 80
-_PUSH = "a run pushes nothing: leave it out, and use accerl push --path=RUN --repo_id=USER/NAME afterwards"
 LEROBOT = {
-    "steps": "use trainer.updates (RL) or sft.steps (fine-tuning)",
-    "batch_size": "use trainer.batch_decisions (RL) or sft.batch_size (fine-tuning)",
-    "num_workers": "use rollout.workers (RL) or sft.num_workers (fine-tuning)",
+    "steps": "use trainer.updates or sft.steps",
+    "batch_size": "use trainer.batch_decisions or sft.batch_size",
+    "num_workers": "use rollout.workers or sft.num_workers",
     "save_freq": "use save_every_updates or save_every_s",
-    "save_checkpoint": "use save_every_updates and save_every_s",
     "eval_freq": "use evaluation.every_updates",
-    "env_eval_freq": "use evaluation.every_updates",
     "eval.n_episodes": "use evaluation.episodes",
     "eval.batch_size": "use rollout.worlds and rollout.workers",
     "rename_map": "use policy.rename_map",
-    "optimizer.lr": "use trainer.lr (RL) or sft.lr (fine-tuning)",
+    "optimizer.lr": "use trainer.lr or sft.lr",
     "optimizer.betas": "use trainer.betas",
     "optimizer.grad_clip_norm": "use trainer.grad_clip",
     "policy.type": "use policy.path (a checkpoint) or sft.policy.type (a new policy)",
     "policy.pretrained_path": "use policy.path",
-    "policy.pretrained_revision": "use policy.revision",
     "policy.use_amp": "use policy.precision=bf16",
     "policy.use_peft": "use policy.tuning.mode=lora",
-    "policy.push_to_hub": _PUSH,
-    "policy.repo_id": _PUSH,
-    "push_to_hub": _PUSH,
-    "save_checkpoint_to_hub": _PUSH,
-    **{
-        f"env.type={name}": f"for LeRobot's {name} use env.type=lerobot --env.name={name}. Otherwise "
-        for name in (
-            "aloha", "isaaclab_arena", "libero_plus", "pusht", "robocasa", "robomme", "robotwin",
-            "vlabench",
-        )
-    },
-}  # fmt: skip
-"""LeRobot's names of what has another name here: field, or field=value → what to do."""
+    "policy.push_to_hub": "leave it out, and use accerl push --path=RUN --repo_id=USER/NAME afterwards",
+    "policy.repo_id": "leave it out, and use accerl push --path=RUN --repo_id=USER/NAME afterwards",
+}
+"""LeRobot's names of what has another name here → what to do."""
 REGISTERS = "registers"
 """In a field's metadata: the package that it names registers types of the section that the field is in."""
 CONSENT = frozenset(
@@ -232,21 +219,17 @@ def read_recipe(path: Path) -> dict[str, Any]:
         near = difflib.get_close_matches(str(path), names, n=3)
         hint = f"did you mean {' or '.join(near)}" if near else f"this package has {', '.join(shipped)}"
         raise InputError("config_path", str(path), f"no such file; {hint}")
+    if (size := path.stat().st_size) > LARGEST_RECIPE:
+        raise InputError("config_path", str(path), f"{size:,} bytes; a recipe has a few thousand")
     try:
-        if (size := path.stat().st_size) > LARGEST_RECIPE:
-            raise InputError("config_path", str(path), f"{size:,} bytes; a recipe has a few thousand")
         tree = _load_yaml(path.read_text())
-    except InputError:
-        raise
     except (yaml.YAMLError, ValueError) as error:
         raise InputError("config_path", str(path), f"not good YAML: {_where(error)}") from error
     except OSError as error:
         raise InputError("config_path", str(path), f"cannot be read: {error.strerror}") from error
-    if tree is None:
-        return {}
-    if not isinstance(tree, dict):
+    if not isinstance(tree, dict | None):
         raise InputError("config_path", str(path), "a recipe is a mapping such as 'env: {type: metaworld}'")
-    return tree
+    return tree or {}
 
 
 def section_of(hint: Any) -> type[Any] | None:
@@ -301,26 +284,20 @@ def _as_text(value: Any) -> str:
 
 def _where(error: Exception) -> str:
     mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
-    if mark is None or problem is None:
-        return str(error)
-    return f"line {mark.line + 1}: {problem}"
+    return str(error) if mark is None or problem is None else f"line {mark.line + 1}: {problem}"
 
 
 def _value(text: str) -> Any:
     """A value as YAML reads it; text that is not YAML is text."""
-    if text == "":
-        return text
     try:
-        return _load_yaml(text)
+        return _load_yaml(text) if text else text
     except yaml.YAMLError:
         return text
 
 
 def _set(tree: dict[str, Any], keys: list[str], value: Any, dotted: str) -> None:
     for key in keys[:-1]:
-        below = tree.get(key)
-        if below is None:
-            below = tree[key] = {}
+        below = tree.setdefault(key, {})
         if not isinstance(below, dict):
             raise InputError(dotted, value, f"{key} is set to {below!r} already")
         tree = below
@@ -361,11 +338,10 @@ def _discover(cls: type[Any], tree: dict[str, Any], path: tuple[str, ...]) -> No
 
 
 def _merged(tree: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
-    merged = dict(tree)
-    for key, value in given.items():
-        under = merged.get(key)
-        both = isinstance(under, dict) and isinstance(value, dict)
-        merged[key] = _merged(typing.cast(dict[str, Any], under), value) if both else value
+    merged = tree | given
+    for key in tree.keys() & given.keys():
+        if isinstance(tree[key], dict) and isinstance(given[key], dict):
+            merged[key] = _merged(tree[key], given[key])
     return merged
 
 
@@ -411,9 +387,11 @@ def _section(
     kind = value.get(TYPE, usual)
     if not isinstance(kind, str) or kind not in choices:
         near = difflib.get_close_matches(str(kind), choices, n=1)
-        hint = f"did you mean {near[0]}? Otherwise " if near else ""
-        hint = LEROBOT.get(f"{here[-1]}.{TYPE}={kind}", "") or hint
-        raise InputError(".".join((*here, TYPE)), kind, f"{hint}use one of {', '.join(sorted(choices))}")
+        remedy = f"did you mean {near[0]}? Otherwise " if near else ""
+        remedy += f"use one of {', '.join(sorted(choices))}"
+        if here == ("env",):
+            remedy += f"; one of LeRobot's own is --env.type=lerobot --env.name={kind}"
+        raise InputError(".".join((*here, TYPE)), kind, remedy)
     rest = {k: v for k, v in value.items() if k != TYPE}
     if kind == usual:
         rest = _merged(_apart(field, choices[kind]), rest)
@@ -431,8 +409,8 @@ def _leaf(hint: Any, value: Any, field: str) -> Any:
     )
     lists = [kind for kind in kinds if typing.get_origin(kind) in (list, tuple)]
     if isinstance(value, list) and len(lists) == 1:
-        (entry, *_) = typing.get_args(lists[0])
-        wrong = wrong or any(isinstance(v, bool) and entry not in (bool, Any) for v in value)
+        entry = typing.get_args(lists[0])[0]
+        wrong |= entry not in (bool, Any) and any(isinstance(v, bool) for v in value)
     try:
         decoded = None if wrong else draccus.decode(plain, value)
     except Exception:  # whatever draccus raises, the value does not fit
@@ -449,9 +427,7 @@ def _apart(field: Any, section: type[Any]) -> dict[str, Any]:
     draccus takes the class's word for all that is not given, so one field given would change the others.
     """
     default = None if field.default_factory is dataclasses.MISSING else field.default_factory()
-    if default is None or default == section():
-        return {}
-    return encode(default)
+    return {} if default is None or default == section() else encode(default)
 
 
 def _as_list(hint: Any, value: Any) -> Any:
@@ -491,16 +467,12 @@ def _unknown(key: str, value: Any, path: tuple[str, ...], names: list[str], whol
         dotted += f".{below}"
     if dotted in LEROBOT:
         return InputError(dotted, leaf, f"the name is LeRobot's; {LEROBOT[dotted]}")
+    here = ".".join((*path, key))
     near = [".".join((*path, name)) for name in difflib.get_close_matches(key, names, n=3)]
-    everywhere = list(dict.fromkeys(dotted_fields(whole)))
-    known = {*near, ".".join((*path, key))}
-    near += [f for f in everywhere if f.rpartition(".")[2] == key and f not in known]
-    if near:
-        remedy = f"no such field; did you mean {' or '.join(near[:4])}?"
-    else:
-        where = f"{'.'.join(path)} has" if path else "there are"
-        remedy = f"no such field; {where} {', '.join(names)}"
-    return InputError(".".join((*path, key)), value, remedy)
+    near += [name for name in dotted_fields(whole) if name.rpartition(".")[2] == key and name != here]
+    where = f"{'.'.join(path)} has" if path else "there are"
+    hint = f"did you mean {' or '.join(dict.fromkeys(near[:4]))}?" if near else f"{where} {', '.join(names)}"
+    return InputError(here, value, f"no such field; {hint}")
 
 
 def _names(cls: type[Any]) -> set[str]:

@@ -20,7 +20,7 @@ import numbers
 import re
 import types
 import typing
-from collections.abc import Collection, Hashable, Iterable
+from collections.abc import Hashable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -48,30 +48,6 @@ class Range:
         above = value > self.low if self._low_open else value >= self.low
         return bool(above and (value < self.high if self._high_open else value <= self.high))
 
-    @property
-    def words(self) -> str:
-        """The interval after the words "a number"."""
-        unbounded = self.high == math.inf
-        if unbounded and self._low_open:
-            words = f" above {self.low:,g}"
-        elif unbounded:
-            words = f" of at least {self.low:,g}"
-        elif self._low_open or self._high_open:
-            return f" in {self.text}"
-        else:
-            return f" from {_plain(self.low)} to {_plain(self.high)}"
-        return words if self._high_open else f"{words}, or inf"
-
-
-class Choice:
-    """One of several texts, where they are known only at run time; otherwise use ``typing.Literal``."""
-
-    def __init__(self, names: Collection[str]) -> None:
-        self.names = names
-
-    def __repr__(self) -> str:
-        return f"Choice({list(self.names)})"
-
 
 class Pattern:
     """Texts that match a regular expression; `words` says which these are."""
@@ -81,6 +57,9 @@ class Pattern:
 
     def __repr__(self) -> str:
         return f"Pattern({self.pattern.pattern!r})"
+
+    def __contains__(self, value: Any) -> bool:
+        return self.pattern.fullmatch(value) is not None
 
 
 Share = Annotated[float, Range("[0, 1]")]
@@ -172,16 +151,8 @@ def check(hint: Any, value: Any, field: str) -> None:
 def _fits(hint: Any, value: Any) -> bool:
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin is Annotated:
-        kind, *marks = arguments
-        number = isinstance(value, numbers.Real) and (kind is not int or isinstance(value, numbers.Integral))
-        for mark in marks:
-            if isinstance(mark, Range) and not (number and not isinstance(value, bool) and value in mark):
-                return False
-            if isinstance(mark, Choice) and value not in mark.names:
-                return False
-            if isinstance(mark, Pattern) and not (isinstance(value, str) and mark.pattern.fullmatch(value)):
-                return False
-        return kind in (int, float) or _fits(kind, value)
+        kind, mark = arguments
+        return (_is_number(kind, value) if kind in (int, float) else _fits(kind, value)) and value in mark
     if is_union(hint):
         return any(_fits(kind, value) for kind in arguments)
     if origin is typing.Literal:
@@ -192,27 +163,24 @@ def _fits(hint: Any, value: Any) -> bool:
         if origin is list or Ellipsis in arguments:
             return all(_fits(arguments[0], entry) for entry in value)
         return len(value) == len(arguments) and all(map(_fits, arguments, value))
-    if hint is float:
-        return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
-    if hint is int:
-        return isinstance(value, numbers.Integral) and not isinstance(value, bool)
+    if hint in (int, float):
+        return _is_number(hint, value) and math.isfinite(value)
     if hint in (bool, str, type(None)):
         return isinstance(value, hint)
     return True
+
+
+def _is_number(kind: type, value: Any) -> bool:
+    numeric = numbers.Integral if kind is int else numbers.Real
+    return isinstance(value, numeric) and not isinstance(value, bool)
 
 
 def wanted(hint: Any) -> str:
     """Values that fit an annotation, in words."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin is Annotated:
-        for mark in arguments[1:]:
-            if isinstance(mark, Choice):
-                return _either(mark.names)
-            if isinstance(mark, Pattern):
-                return mark.words
-            if isinstance(mark, Range):
-                return f"{wanted(arguments[0])}{mark.words}"
-        return wanted(arguments[0])
+        kind, mark = arguments
+        return mark.words if isinstance(mark, Pattern) else f"{wanted(kind)} in {mark.text}"
     if is_union(hint):
         parts = [wanted(kind) for kind in arguments if kind is not type(None)]
         return " or ".join(parts + (["null"] if is_optional(hint) else []))
@@ -220,7 +188,8 @@ def wanted(hint: Any) -> str:
     if hint in plain:
         return plain[hint]
     if origin is typing.Literal:
-        return _either(arguments)
+        *others, last = map(str, arguments)
+        return f"{', '.join(others)} or {last}" if others else last
     if origin is tuple and Ellipsis not in arguments:
         return f"a list of {len(arguments)}, each {wanted(arguments[0])}"
     if origin in (list, tuple):
@@ -233,11 +202,8 @@ def wanted(hint: Any) -> str:
 def range_in_words(hint: Any) -> str:
     """The range of an annotation as ``--help`` shows it; empty where there is none."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
-    for mark in arguments[1:] if origin is Annotated else ():
-        if isinstance(mark, Range):
-            return mark.words.removeprefix(" of").strip()
-        if isinstance(mark, Choice):
-            return " | ".join(mark.names)
+    if origin is Annotated:
+        return f"in {arguments[1].text}" if isinstance(arguments[1], Range) else ""
     if origin is typing.Literal:
         return " | ".join(map(str, arguments))
     return next((text for kind in arguments if (text := range_in_words(kind))), "")
@@ -251,15 +217,6 @@ def is_union(hint: Any) -> bool:
 def is_optional(hint: Any) -> bool:
     """True for ``X | None``."""
     return is_union(hint) and type(None) in typing.get_args(hint)
-
-
-def _either(names: Iterable[Any]) -> str:
-    *others, last = map(str, names)
-    return f"{', '.join(others)} or {last}" if others else last
-
-
-def _plain(number: float) -> str:
-    return f"{int(number):,}" if number == int(number) else f"{number:g}"
 
 
 def unmarked(hint: Any) -> Any:

@@ -9,25 +9,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from accerl_lerobot.algorithms import (
-    AlgorithmConfig,
-    ChunkCriticConfig,
-    GIPOConfig,
-    OffPolicyConfig,
-)
+from accerl_lerobot.algorithms import AlgorithmConfig, ChunkCriticConfig, GIPOConfig, OffPolicyConfig
 from accerl_lerobot.config.parsing import decode, encode, parse
-from accerl_lerobot.config.ranges import (
-    DatasetConfig,
-    NonNegative,
-    Positive,
-    Range,
-    Section,
-    Seed,
-    Steps,
-    check,
-)
+from accerl_lerobot.config.ranges import DatasetConfig, NonNegative, Positive, Range, Section, Seed, Steps
 from accerl_lerobot.demos.record import DemosConfig
 from accerl_lerobot.demos.sft import SFTConfig
 from accerl_lerobot.envs import EnvConfig, MetaWorldConfig
@@ -40,40 +26,12 @@ from accerl_lerobot.replay.pacing import ASYNCHRONOUS, ReplayConfig, Schedule
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.timeline import TIMELINE
 from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.transport.endpoint import Transport
 from accerl_lerobot.world_model.config import ImaginationConfig
 
-__all__ = ["DatasetConfig", "LaunchConfig", "RunConfig", "check_chunk", "decode", "encode", "parse"]
+__all__ = ["DatasetConfig", "LaunchConfig", "RunConfig", "decode", "encode", "parse"]
 
 
-@dataclass(frozen=True, kw_only=True)
-class PlacementConfig(Section, section="launch.placement"):
-    """Nodes of all workers; replay is where the run is started.
-
-    A node's number as ``accerl doctor`` prints it, 0 being the one where the run is started; the name of a
-    custom resource, as in ``ray start --resources='{"simulators": 1}'``; or all. None: node 0.
-    """
-
-    trainer: str | None = None
-    """Nodes of the trainer's ranks."""
-    inference: str | None = None
-    """Nodes of the inference replicas."""
-    imagination: str | None = None
-    """Nodes of the worker that imagines, and of the one that trains the world model."""
-    rollout: str | None = None
-    """Nodes of the rollout workers."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name, nodes in vars(self).items():
-            if nodes is not None and not nodes.strip():
-                remedy = "name a node's number or resource, or use all"
-                raise InputError(f"{self.SECTION}.{name}", nodes, remedy)
-
-    @property
-    def elsewhere(self) -> bool:
-        """True if any worker may be on another node."""
-        return any(nodes not in (None, "0") for nodes in vars(self).values())
+ROLES = ("trainer", "inference", "imagination", "rollout")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,15 +44,14 @@ class LaunchConfig(Section, section="launch"):
     """HOST:PORT of a running Ray cluster to join, or auto: the one that ``ray start`` has started here. It
     must ask for a token, which is looked for where Ray does: RAY_AUTH_TOKEN, RAY_AUTH_TOKEN_PATH,
     ``~/.ray/auth_token``. None: a private Ray on this machine."""
-    placement: PlacementConfig = field(default_factory=PlacementConfig)
-    """Nodes of the workers."""
+    placement: dict[str, str] = field(default_factory=dict)
+    """Role (trainer, inference, imagination or rollout) → nodes of its workers: a number as ``accerl doctor``
+    prints it, 0 being the node where the run is started; the name of a custom resource, as in
+    ``ray start --resources='{"simulators": 1}'``; or all. Not given: node 0, where replay always is."""
     schedule: Schedule = ASYNCHRONOUS
     """asynchronous: no worker waits for another. synchronous: a batch is collected, by all environments in
     lock step, then learned from. overlap: the next one is collected meanwhile. The last two are for measuring
     what the first gains; with several inference replicas, the environments of each are in step."""
-    transport: Transport = "auto"
-    """Transport of requests, segments and weights. auto: shared memory between processes of one node, if the
-    system has it, and Ray otherwise. ray: always Ray."""
     stall_s: Positive = 300.0
     """Timeout in seconds for an answer of a worker, a step of an environment, and any progress of the run.
 
@@ -109,19 +66,21 @@ class LaunchConfig(Section, section="launch"):
         super().__post_init__()
         if self.engine == "local":
             one = "launch.engine=local is one process"
-            for name, default in (("schedule", ASYNCHRONOUS), ("address", None)):
+            for name, default in (("schedule", ASYNCHRONOUS), ("address", None), ("placement", {})):
                 if (value := getattr(self, name)) != default:
                     raise InputError(f"launch.{name}", value, f"{one}; leave it out")
-            if self.placement != PlacementConfig():
-                raise InputError("launch.placement", "…", f"{one}; leave it out")
+        for role, nodes in self.placement.items():
+            if role not in ROLES or not nodes.strip():
+                remedy = f"use one of {', '.join(ROLES)}, and a node's number, a resource, or all"
+                raise InputError(f"launch.placement.{role}", nodes, remedy)
         if self.address is not None and self.address != "auto":
             host, _, port = self.address.rpartition(":")
             if not host or not port.isdecimal() or not 0 < int(port) < 65536:
                 remedy = "use HOST:PORT as ray start --head prints it, or auto"
                 raise InputError("launch.address", self.address, remedy)
-        if self.address is None and self.placement.elsewhere:
+        if self.address is None and not {"0"}.issuperset(self.placement.values()):
             remedy = "a private Ray has one node; add --launch.address=auto, or leave the field out"
-            raise InputError("launch.placement", "…", remedy)
+            raise InputError("launch.placement", self.placement, remedy)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -178,8 +137,6 @@ class RunConfig(Section):
         if self.policy.path is not None and self.sft.steps:
             remedy = "add --sft.steps=0 to improve this checkpoint, or fine-tune it first with sft.init_path"
             raise InputError("policy.path", self.policy.path, remedy)
-        if self.sft.steps and self.sft.init_path is None:
-            check_chunk(self.sft.policy)
         if isinstance(self.algorithm, OffPolicyConfig):
             self._check_off_policy()
         if self.trainer.hold_back >= self.replay.max_lag:
@@ -238,16 +195,3 @@ def timeline_folder(config: RunConfig) -> Path | None:
     """Where the timeline of a run's workers is kept; None: nowhere."""
     folder = journal_folder(config)
     return None if folder is None else folder / TIMELINE
-
-
-def check_chunk(policy: dict[str, Any]) -> None:
-    """Refuse sizes in ``sft.policy`` that no LeRobot policy can have.
-
-    Args:
-        policy: fields of a LeRobot policy config; LeRobot itself checks the others, see `preflight`.
-    """
-    for name in ("chunk_size", "n_action_steps", "num_steps", "max_state_dim", "max_action_dim"):
-        check(Annotated[int, Range("[1, 10000]")], policy.get(name, 1), f"sft.policy.{name}")
-    chunk, executed = policy.get("chunk_size"), policy.get("n_action_steps")
-    if chunk is not None and executed is not None and executed > chunk:
-        raise InputError("sft.policy.n_action_steps", executed, f"use 1 to sft.policy.chunk_size, {chunk}")

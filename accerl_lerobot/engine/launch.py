@@ -28,14 +28,14 @@ from typing import Any
 
 import psutil
 import ray
-from ray.exceptions import RayError, RayTaskError
+from ray.exceptions import RayActorError, RayError, RayTaskError
 
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE, saved_version
 from accerl_lerobot.engine.config import RunConfig, journal_folder, timeline_folder
 from accerl_lerobot.engine.loop import Engine, Progress, Saved
 from accerl_lerobot.engine.placement import actor_options, place_workers
 from accerl_lerobot.engine.ray_session import RaySession
-from accerl_lerobot.engine.replicas import START_S, ActorHandle, InferenceReplicas, RolloutWorkers
+from accerl_lerobot.engine.replicas import START_S, InferenceReplicas, RolloutSlot, RolloutWorkers, WorkerSlot
 from accerl_lerobot.engine.stopping import WorkerError
 from accerl_lerobot.inference.batcher import BatcherStats
 from accerl_lerobot.policies.config import Load
@@ -54,7 +54,7 @@ BLAME_S = 10.0
 """How long to wait for the failure that another failure is the consequence of."""
 
 
-def end(workers: Iterable[ActorHandle], *, told: bool = True) -> None:
+def end(workers: Iterable[WorkerSlot], *, told: bool = True) -> None:
     """End workers and wait until they are gone, so that nothing writes any more when others start.
 
     Args:
@@ -69,6 +69,13 @@ def end(workers: Iterable[ActorHandle], *, told: bool = True) -> None:
         with contextlib.suppress(psutil.NoSuchProcess):
             process.kill()
     psutil.wait_procs(left, timeout=GONE_S)
+
+
+def _fail(worker: WorkerSlot, error: Exception, text: str = "") -> None:
+    """Restart a worker that has failed, or raise what ends the engine."""
+    if worker.restart is None:
+        raise WorkerError(text or f"{worker.name} worker failed for good:\n{error}") from error
+    worker.restart(error)
 
 
 class RayEngine(Engine):
@@ -96,13 +103,11 @@ class RayEngine(Engine):
         self._version = 0 if state is None else saved_version(state)
         self._rollouts = RolloutWorkers(config, tasks, history, state)
         self._inference = InferenceReplicas(config, self._version, state, load, self._move)
-        self._others: list[ActorHandle] = []
+        self._others: list[WorkerSlot] = []
         """All other workers."""
-        self._imaginer: ActorHandle | None = None
-        self._learner: ActorHandle | None = None
+        self._imagining: list[WorkerSlot] = []
+        """The one that imagines, and the one that trains the world model."""
         self._updates: list[dict[str, float]] = []
-        self._metrics: dict[str, dict[str, float]] = {}
-        """Last metrics by worker; of inference as of one."""
         self._schedule: Schedule = ASYNCHRONOUS
         self._training = self._real_ended = self._done = self._closed = False
         self._last_change = time.monotonic()
@@ -123,15 +128,14 @@ class RayEngine(Engine):
     def train(self) -> None:
         self._training, self._last_change = True, time.monotonic()
         self.follow(self._config.launch.schedule)
-        readers = self._inference.publishing(self._trainer.actor)
-        self._trainer.work = self._trainer.actor.run.remote(
-            self._replay.actor, readers, self._config.launch.transport
-        )
-        if (imaginer := self._imaginer) is None:
-            return
-        imaginer.work = imaginer.actor.run.remote(self._imaginer_asks, self._inserting, self._replay.actor)
-        if self._learner is not None:
-            self._learner.work = self._learner.actor.run.remote(imaginer.actor, self._replay.actor)
+        self._inference.trainer = self._trainer.actor
+        self._trainer.work = self._trainer.actor.run.remote(self._replay.actor, self._deciding)
+        for worker in self._imagining[:1]:
+            # The last replica: the first ones may have one rollout worker more.
+            asks = self._deciding[-1]
+            worker.work = worker.actor.run.remote(asks, self._inserting, self._replay.actor)
+        for worker in self._imagining[1:]:
+            worker.work = worker.actor.run.remote(self._imagining[0].actor, self._replay.actor)
 
     def follow(self, schedule: Schedule) -> None:
         """Change the schedule of collecting and learning, see `replay.pacing`."""
@@ -147,10 +151,15 @@ class RayEngine(Engine):
     def poll(self) -> Progress:
         if lost := self._ray.lost:
             raise WorkerError(lost)
-        self._ask()
+        for worker in (*self._inference.workers(), *self._others):
+            worker.ask("metrics")
+        self._rollouts.ask(self._training and not self._done)
         self._await_end()
         episodes = self._listen()
-        self._check_hung()
+        # Inference last, since others are not listened to during its restart.
+        for worker in (*self._others, *self._rollouts.workers(), *self._inference.workers()):
+            if why := worker.hung(self._limit):
+                _fail(worker, RuntimeError(why), f"{worker.name} worker {why}")
         updates, self._updates = self._updates, []
         if updates:
             self._version = int(updates[-1]["update"])
@@ -160,9 +169,9 @@ class RayEngine(Engine):
             updates=updates,
             episodes=episodes,
             rollout=self._rollouts.counters(),
-            replay=self._metrics.get("replay", {}),
-            inference=self._metrics.get("inference", {}),
-            imagination=self._metrics.get(IMAGINATION, {}) | self._metrics.get(WORLD_LEARNING, {}),
+            replay=self._replay.told or {},
+            inference=self._inference.metrics(),
+            imagination={k: v for w in self._imagining for k, v in (w.told or {}).items()},
         )
         self._check_moving(progress)
         return progress
@@ -173,14 +182,13 @@ class RayEngine(Engine):
         # Records that the trainer has sent come first: `hold` returns the rest, up to its version.
         told = self._updates + (self._hear(self._trainer, self._limit) or [])
         self._updates = []
-        timeouts = {"timeout": max(START_S, self._limit), "silence": self._limit}  # files may be large
         version, records = self._trainer.call("hold", timeout=self._limit)  # it waits for an update at most
         # At once, so that little comes in that was decided by weights of later updates. The imaginer may
         # know of more than replay then; it is told anew of what comes after.
-        self._replay.call("save", state, version, **timeouts)
-        for worker in filter(None, (self._learner, self._imaginer)):
-            worker.call("save", directory, **timeouts)
-        self._trainer.call("write", directory, **timeouts)
+        self._replay.call("save", state, version, timeout=self._limit)
+        for worker in reversed(self._imagining):
+            worker.call("save", directory, timeout=self._limit)
+        self._trainer.call("write", directory, timeout=self._limit)
         self._rollouts.save(state)
         self._last_change = time.monotonic()
         return Saved(version, told + records)
@@ -206,7 +214,7 @@ class RayEngine(Engine):
         """Batches of the inference replicas so far."""
         return self._inference.batching()
 
-    def _everyone(self) -> Iterator[ActorHandle]:
+    def _everyone(self) -> Iterator[WorkerSlot]:
         """All workers, those that others depend on first."""
         yield from self._inference.workers()
         yield from self._others
@@ -240,40 +248,31 @@ class RayEngine(Engine):
         if imagination.share:
             from accerl_lerobot.engine.imagination import ImaginationWorker, WorldLearningWorker
 
-            imaginer = make(IMAGINATION, ImaginationWorker, 4, c, self._state, timeline)
-            self._imaginer = self._add(IMAGINATION, imaginer)
-            if imagination.learns:
-                learns = make(WORLD_LEARNING, WorldLearningWorker, 4, c, self._state, timeline)
-                self._learner = self._add(WORLD_LEARNING, learns)
+            kinds: dict[str, type] = {IMAGINATION: ImaginationWorker}
+            kinds |= {WORLD_LEARNING: WorldLearningWorker} if imagination.learns else {}
+            for name, kind in kinds.items():
+                self._imagining.append(self._add(name, make(name, kind, 4, c, self._state, timeline)))
         self._rollouts.start(plan)
         ready = [(worker, worker.actor.ready.remote()) for worker in self._everyone()]
         for worker, reference in ready:
             here = plan.places[worker.name].node.number == 0
             worker.await_start(reference, max(START_S, self._limit), here)
-        deciding = self._inference.open()
-        self._inserting = self._replay.endpoint("insert", c.launch.transport, self._limit)
-        # The last replica: the first ones may have one rollout worker more.
-        self._imaginer_asks = deciding[-1]
+        self._deciding = self._inference.open()  # the rollout workers share this list, see `_move`
+        self._inserting = self._replay.endpoint("insert", self._limit)
         self._replay.work = self._replay.actor.run.remote()
-        self._rollouts.run(deciding, self._inserting)
+        self._rollouts.run(self._deciding, self._inserting)
 
-    def _add(self, name: str, actor: Any) -> ActorHandle:
-        self._others.append(ActorHandle(name, actor))
+    def _add(self, name: str, actor: Any) -> WorkerSlot:
+        self._others.append(WorkerSlot(name, actor))
         return self._others[-1]
 
     def _move(self, index: int, inference: Endpoint) -> None:
         """Tell the clients of an inference replica its new endpoint."""
+        self._deciding[index] = inference
         self._rollouts.move(index, inference)
-        if self._imaginer is not None and index == self._config.inference.workers - 1:
-            self._imaginer_asks = inference
-            self._imaginer.call("move", inference, timeout=self._limit)
+        if self._imagining and index == len(self._deciding) - 1:
+            self._imagining[0].call("move", inference, timeout=self._limit)
         self._last_change = time.monotonic()  # a restart has timeouts of its own
-
-    def _ask(self) -> None:
-        self._inference.ask()
-        for worker in self._others:
-            worker.ask("metrics")
-        self._rollouts.ask(self._training and not self._done)
 
     def _await_end(self) -> None:
         """Wait a little, and handle every worker whose long call has ended."""
@@ -285,7 +284,7 @@ class RayEngine(Engine):
             if reference in ended and worker.work is reference:
                 self._ended(worker)
 
-    def _ended(self, worker: ActorHandle) -> None:
+    def _ended(self, worker: WorkerSlot) -> None:
         """Handle the end of a worker's long call: restart it, finish, or raise."""
         reference, worker.work = worker.work, None
         try:
@@ -293,12 +292,11 @@ class RayEngine(Engine):
         except RayError as error:
             if isinstance(error, RayTaskError) and isinstance(error.cause, RayError | ServiceStoppedError):
                 self._blame()
-            if self._inference.restart_worker(worker, error) or self._rollouts.restart_worker(worker, error):
-                return
-            raise WorkerError(f"{worker.name} worker failed for good:\n{error}") from error
+            _fail(worker, error)
+            return
         if worker is self._trainer:
             self._finish(int(result))
-        elif not (self._done and worker in (self._replay, self._learner, self._imaginer)):
+        elif not (self._done and worker in (self._replay, *self._imagining)):
             raise WorkerError(f"{worker.name} worker ended without being asked to")
 
     def _blame(self) -> None:
@@ -316,36 +314,31 @@ class RayEngine(Engine):
         self._updates += self._trainer.call("metrics", timeout=self._limit)
         self._replay.call("close", timeout=self._limit)
         self._hear(self._replay, self._limit)
-        self._metrics["replay"] = self._replay.call("metrics", timeout=self._limit)
+        self._replay.told = self._replay.call("metrics", timeout=self._limit)
 
     def _listen(self) -> list[EpisodeResult]:
         """Pick up the answers that have come; the episodes among them."""
-        for worker in self._others:
+        episodes: list[EpisodeResult] = []
+        for worker in self._everyone():
             answer = self._hear(worker)
             if worker is self._trainer:
                 self._updates += answer or []
-            elif answer:
-                self._metrics[worker.name] = answer
-        self._metrics["inference"] = self._inference.listen()
-        episodes = self._rollouts.listen()
+            elif answer is not None and isinstance(worker, RolloutSlot):
+                episodes += worker.take(answer)
         if not self._real_ended and self._rollouts.spent:
             self._real_ended = True
             self._replay.call("end_real", timeout=self._limit)
         return episodes
 
-    def _hear(self, worker: ActorHandle, timeout: float = 0.0) -> Any:
+    def _hear(self, worker: WorkerSlot, timeout: float = 0.0) -> Any:
+        """An answer that has come."""
         try:
             return worker.answer(timeout)
         except RayError as error:
-            raise WorkerError(f"{worker.name} worker failed for good:\n{error}") from error
-
-    def _check_hung(self) -> None:
-        """Restart a rollout worker or inference replica that hangs."""
-        for worker in self._others:
-            if worker.silent_s() > self._limit:
-                raise WorkerError(f"{worker.name} worker has not answered for {worker.silent_s():.0f} s")
-        self._rollouts.check_hung()
-        self._inference.check_hung()  # last, since others are not listened to during a restart
+            # Where a process has died, its long call has ended as well, which `_await_end` deals with.
+            if worker.restart is None or not isinstance(error, RayActorError):
+                _fail(worker, error)
+            return None
 
     def _check_moving(self, progress: Progress) -> None:
         """End a run in which every worker answers and nothing moves."""
@@ -353,7 +346,7 @@ class RayEngine(Engine):
         state = (progress.version, progress.rollout.get("decisions"), progress.rollout["restarts"], imagined)
         now = time.monotonic()
         waiting = self._rollouts.outstanding or (self._training and not self._done)
-        # Where one worker is to blame, `_check_hung` finds it a moment later.
+        # Where one worker is to blame, that is found a moment later.
         silent = max(worker.silent_s() for worker in self._everyone())
         suspect = max(silent, self._rollouts.stuck_s) > self._limit / 2
         if state != self._last_state or not waiting:

@@ -33,7 +33,7 @@ from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutRun
 from accerl_lerobot.seeds import global_generators, restore_global_generators
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, WEIGHT_SYNC, open_clock
 from accerl_lerobot.trainer.batch import keeping
-from accerl_lerobot.weights.publisher import PublishDelay
+from accerl_lerobot.transport.weights import PublishDelay
 from accerl_lerobot.world_model.config import IMAGINATION
 
 logger = logging.getLogger(__name__)

@@ -15,22 +15,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from accerl_lerobot.checkpoint import snapshot
-from accerl_lerobot.checkpoint.layout import (
-    CHECKPOINTS,
-    CONFIG,
-    PRETRAINED,
-    RUN_STATE,
-    SUMMARY,
-    TRAINING_STATE,
-    prune,
-    save_checkpoint,
-    saved_version,
-    write_atomically,
-)
+from accerl_lerobot.checkpoint import layout, snapshot
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import RunConfig
-from accerl_lerobot.engine.stopping import Stopping, raise_if_stopped
+from accerl_lerobot.engine.resuming import raise_if_stopped
+from accerl_lerobot.engine.stopping import Stopping
 from accerl_lerobot.evaluation import before_after, evaluation_plans, success_curve, summarise
 from accerl_lerobot.metrics import MetricsLog, plain
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
@@ -123,12 +112,10 @@ def episode_key(plan: EpisodePlan) -> tuple[str, int]:
 
 def check_new(plans: Sequence[EpisodePlan], outstanding: Container[tuple[str, int]]) -> None:
     """Check the argument of `Engine.plan`."""
-    keys: set[tuple[str, int]] = set()
-    for plan in plans:
-        key = episode_key(plan)
-        if key in keys or key in outstanding:
+    keys = [episode_key(plan) for plan in plans]
+    for plan, key in zip(plans, keys, strict=True):
+        if key in outstanding or keys.count(key) > 1:
             raise ValueError(f"episode {plan.index} of {plan.group!r} is planned twice")
-        keys.add(key)
 
 
 def run_plans(
@@ -172,28 +159,22 @@ class Times:
         return (self.before_s or 0.0) + time.monotonic() - self.started
 
 
-class Outputs(NamedTuple):
-    """Where a run writes to."""
-
-    directory: Path
-    console: Console
-    log: MetricsLog
-
-
 class Loop:
     """Evaluates, trains, saves checkpoints, and writes the results; `stop` tells when to save and end."""
 
     def __init__(
         self,
         config: RunConfig,
-        outputs: Outputs,
+        directory: Path,
+        console: Console,
+        log: MetricsLog,
         engine: Engine,
         tasks: tuple[str, ...],
         times: Times,
         stop: Stopping,
     ) -> None:
         self.config, self.engine, self.tasks = config, engine, tasks
-        self.directory, self.console, self.log = outputs
+        self.directory, self.console, self.log = directory, console, log
         self.times, self.stop = times, stop
         self.before: dict[str, Any] | None = None
         """The evaluation before training, where there was one."""
@@ -222,7 +203,7 @@ class Loop:
         filmed: list[EpisodeResult] = []
         if state is not None:
             self._began_at = state.parent.name
-            self._restore(snapshot.load(state / RUN_STATE), saved_version(state))
+            self._restore(snapshot.load(state / layout.RUN_STATE), layout.saved_version(state))
             if (self.directory / f"{FILMED}.json").is_file():
                 filmed = snapshot.load(self.directory / FILMED)
         else:
@@ -246,10 +227,10 @@ class Loop:
             before_after(film, (filmed, self.before), (results, after), fps=20)
         success_curve(self.directory / "success_curve.png", self.evaluations, self.curve)
         summary = plain(self._summary(self.before, after, last))
-        write_atomically(self.directory / SUMMARY, json.dumps(summary, indent=2) + "\n")
+        layout.write_atomically(self.directory / layout.SUMMARY, json.dumps(summary, indent=2) + "\n")
         for left in self.directory.glob(f"{FILMED}.*"):
             left.unlink()
-        prune(self.directory / CHECKPOINTS)  # it has ended
+        layout.prune(self.directory / layout.CHECKPOINTS)  # it has ended
         return dict(summary)
 
     def _state(self) -> dict[str, Any]:
@@ -275,7 +256,7 @@ class Loop:
         self, before: dict[str, Any] | None, after: dict[str, Any], last: Progress
     ) -> dict[str, Any]:
         before = before or {}
-        summary = {
+        return {
             "success_before": before.get("success"),
             "success_after": after["success"],
             "n": after["n"],
@@ -306,7 +287,6 @@ class Loop:
             "tasks": list(self.tasks),
             "seed": self.config.seed,
         }
-        return summary
 
     def _train(self) -> Progress:
         config = self.config
@@ -340,9 +320,8 @@ class Loop:
     def _is_due(self, version: int) -> bool:
         """True if a checkpoint is due."""
         updates, seconds = self.config.save_every_updates, self.config.save_every_s
-        if updates and version // updates > self.saved:
-            return True
-        return bool(seconds) and time.monotonic() - self._saved_at > seconds
+        by_time = bool(seconds) and time.monotonic() - self._saved_at > seconds
+        return by_time or bool(updates and version // updates > self.saved)
 
     def _record_updates(self, updates: list[dict[str, float]]) -> None:
         for metrics in updates:
@@ -415,15 +394,15 @@ class Loop:
             self._record_updates(saved.updates)
             every = self.config.save_every_updates
             self.saved = saved.version // every if every else 0
-            shutil.copyfile(self.directory / CONFIG, folder / CONFIG)
-            snapshot.save(folder / TRAINING_STATE / RUN_STATE, self._state())
+            shutil.copyfile(self.directory / layout.CONFIG, folder / layout.CONFIG)
+            snapshot.save(folder / layout.TRAINING_STATE / layout.RUN_STATE, self._state())
             return saved.version
 
         with self.times.clock.during(CHECKPOINT):
-            path = save_checkpoint(self.directory / CHECKPOINTS, write)
-        prune(self.directory / CHECKPOINTS, needed=self._began_at)
+            path = layout.save_checkpoint(self.directory / layout.CHECKPOINTS, write)
+        layout.prune(self.directory / layout.CHECKPOINTS, needed=self._began_at)
         self._saved_at = time.monotonic()
-        self.console.say(f"checkpoint {path / PRETRAINED}")
+        self.console.say(f"checkpoint {path / layout.PRETRAINED}")
 
     def _since(self, progress: Progress, key: str) -> float:
         """A rollout counter since training began, evaluation episodes while training included."""

@@ -13,14 +13,13 @@ is waited for without a word.
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import importlib.metadata
 import logging
 import math
 import os
 import platform
-import secrets
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -42,8 +41,6 @@ TINY = 1e-6
 """Rounding error of sums of GPU shares."""
 REPORT_S = 120.0
 """Timeout for a node to start a process and report what it has."""
-FREE_S = 30.0
-"""Timeout for the planned GPUs of a cluster to be free."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,9 +68,9 @@ class Role(NamedTuple):
     """The workers of a kind."""
 
     name: str
-    workers: tuple[str, ...]
+    workers: list[str]
     selector: str | None
-    """Nodes, see `PlacementConfig`."""
+    """Nodes, see `LaunchConfig.placement`; None: the one where the run is started."""
     network: bool = True
     """True if they need a share of a GPU, and files."""
 
@@ -87,13 +84,7 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True)
 class Plan:
-    """A place for every worker.
-
-    Example:
-        >>> plan = plan_workers(nodes, config)
-        >>> plan.places["trainer"].node.number
-        0
-    """
+    """A place for every worker."""
 
     nodes: tuple[Node, ...]
     places: dict[str, Place]
@@ -101,11 +92,11 @@ class Plan:
     def rows(self) -> Iterator[str]:
         """The plan as lines for people, one for each node."""
         for node in self.nodes:
-            here: dict[tuple[str, float], int] = {}
-            for name, place in self.places.items():
-                if place.node.number == node.number:
-                    kind = (name.rstrip("0123456789 "), place.gpus)
-                    here[kind] = here.get(kind, 0) + 1
+            here = Counter(
+                (name.rstrip("0123456789 "), place.gpus)
+                for name, place in self.places.items()
+                if place.node.number == node.number
+            )
             parts = [
                 (name if count == 1 else f"{count} {name}") + (f" × {gpus:g} GPU" if gpus else "")
                 for (name, gpus), count in here.items()
@@ -117,17 +108,18 @@ class Plan:
 
         It goes to the node with the fewest rollout workers for its cores, among node 0 and those that have
         any.
-
-        Raises:
-            WorkerError: none is left, as when Ray itself has been lost.
         """
-        used = [place.node for other, place in self.places.items() if other.startswith("rollout ")]
-        left = {node.number: node for node in [self.nodes[0], *used] if node.key in alive}
+        load = Counter({0: 0})
+        load.update(place.node.number for other, place in self.places.items() if other.startswith("rollout "))
+        left = [node for node in self.nodes if node.number in load and node.key in alive]
         if not left:
             raise WorkerError(f"{name} worker is lost, and no node is left where another could be started")
-        load = {number: sum(n.number == number for n in used) for number in left}
-        best = min(left, key=lambda number: (load[number] + 1) / max(left[number].cpus, 1.0))
-        return replace(self, places=self.places | {name: Place(left[best])})
+        return replace(self, places=self.places | {name: Place(_emptiest(left, load))})
+
+
+def _emptiest(nodes: Sequence[Node], load: Counter[int]) -> Node:
+    """The node with the fewest workers for its cores, one more counted."""
+    return min(nodes, key=lambda node: (load[node.number] + 1) / max(node.cpus, 1.0))
 
 
 def this_machine() -> Node:
@@ -142,16 +134,16 @@ def this_machine() -> Node:
 def roles_of(config: RunConfig) -> list[Role]:
     """The roles of a run besides replay, in the order in which they are placed."""
     placement, c = config.launch.placement, config
-    ranks = ("trainer", *(f"trainer rank {i}" for i in range(1, c.trainer.ranks)))
+    ranks = ["trainer", *(f"trainer rank {i}" for i in range(1, c.trainer.ranks))]
+    imagining = ["imagination"] * bool(c.imagination.share) + ["world learning"] * c.imagination.learns
+    rollouts = [f"rollout {i}" for i in range(c.rollout.workers)]
     roles = [
-        Role("trainer", ranks, placement.trainer),
-        Role("inference", tuple(numbered("inference", c.inference.workers)), placement.inference),
+        Role("trainer", ranks, placement.get("trainer")),
+        Role("inference", numbered("inference", c.inference.workers), placement.get("inference")),
+        Role("imagination", imagining, placement.get("imagination")),
+        Role("rollout", rollouts, placement.get("rollout"), network=False),
     ]
-    if c.imagination.share:
-        learns = ["world learning"] if c.imagination.learns else []
-        roles.append(Role("imagination", ("imagination", *learns), placement.imagination))
-    rollouts = tuple(f"rollout {i}" for i in range(c.rollout.workers))
-    return [*roles, Role("rollout", rollouts, placement.rollout, network=False)]
+    return [role for role in roles if role.workers]
 
 
 def candidates(nodes: Sequence[Node], role: Role) -> list[Node]:
@@ -160,10 +152,7 @@ def candidates(nodes: Sequence[Node], role: Role) -> list[Node]:
         return [nodes[0]]
     if role.selector == ALL:
         return list(nodes)
-    if role.selector.isdecimal():
-        chosen = [node for node in nodes if node.number == int(role.selector)]
-    else:
-        chosen = [node for node in nodes if role.selector in node.resources]
+    chosen = [node for node in nodes if role.selector in (str(node.number), *node.resources)]
     if not chosen:
         names = sorted({name for node in nodes for name in node.resources})
         known = f"numbers 0 to {len(nodes) - 1}" + (f" and resources {', '.join(names)}" if names else "")
@@ -173,44 +162,37 @@ def candidates(nodes: Sequence[Node], role: Role) -> list[Node]:
 
 
 def plan_workers(nodes: Sequence[Node], config: RunConfig) -> Plan:
-    """Place all workers of a run.
-
-    Raises:
-        InputError: a node is not there or does not see the run's files, or there are too few GPUs.
-    """
+    """Place all workers of a run."""
     roles = roles_of(config)
     sites = {role.name: _sites(nodes, role) for role in roles}
     shares = _gpu_shares(roles, sites, config)
     free = {node.number: [1.0] * round(node.gpus) for node in nodes}
-    load = dict.fromkeys(free, 0)
+    load: Counter[int] = Counter()
     """Workers without a GPU."""
     places: dict[str, Place] = {}
     for role in roles:
-        here, share = sites[role.name], shares.get(role.name, 0.0)
+        share = shares.get(role.name, 0.0)
         for name in role.workers:
             if share:
-                places[name] = Place(_take_gpu(here, free, share, role), share)
+                places[name] = Place(_take_gpu(sites[role.name], free, share, role), share)
             else:
-                node = min(here, key=lambda n: (load[n.number] + 1) / max(n.cpus, 1.0))
-                load[node.number] += 1
-                places[name] = Place(node)
+                places[name] = Place(_emptiest(sites[role.name], load))
+                load[places[name].node.number] += 1
     return Plan(tuple(nodes), places | {"replay": Place(nodes[0])})
 
 
 def _sites(nodes: Sequence[Node], role: Role) -> list[Node]:
     """The nodes that a role may be on, and that see the files it needs."""
     named = candidates(nodes, role)
-    if not role.network:
-        return named
-    seeing = [node for node in named if not node.unseen]
-    blind = [node for node in named if node.unseen]
-    if blind and (role.selector != ALL or not seeing):
-        remedy = (
-            f"{blind[0]} does not see {blind[0].unseen}, which its workers read or write; "
-            "share it under the same path, or leave the field out"
-        )
-        raise InputError(f"{SECTION}.{role.name}", role.selector, remedy)
-    return seeing
+    seeing = [node for node in named if not (role.network and node.unseen)]
+    if seeing == named or (role.selector == ALL and seeing):
+        return seeing
+    blind = next(node for node in named if node.unseen)
+    remedy = (
+        f"{blind} does not see {blind.unseen}, which its workers read or write; "
+        "share it under the same path, or leave the field out"
+    )
+    raise InputError(f"{SECTION}.{role.name}", role.selector, remedy)
 
 
 def _gpu_shares(roles: list[Role], sites: dict[str, list[Node]], config: RunConfig) -> dict[str, float]:
@@ -232,7 +214,7 @@ def _gpu_shares(roles: list[Role], sites: dict[str, list[Node]], config: RunConf
         if any(role.name == "trainer" for role in group):
             of_rank, of_other = config.trainer.gpu_shares(gpus, max(1, others))
         else:
-            of_other = 1 / math.ceil(others / gpus) if gpus else 0.0
+            of_rank, of_other = 0.0, 1 / math.ceil(others / gpus) if gpus else 0.0
         shares |= {role.name: of_rank if role.name == "trainer" else of_other for role in group}
     return shares
 
@@ -252,12 +234,7 @@ def _take_gpu(sites: list[Node], free: dict[int, list[float]], share: float, rol
 
 
 def place_workers(config: RunConfig) -> Plan:
-    """Plan where the workers of a run go on the nodes that Ray has now.
-
-    Raises:
-        InputError: they do not fit, or a node has other versions.
-        WorkerError: a node does not answer.
-    """
+    """Plan where the workers of a run go on the nodes that Ray has now."""
     known = alive_nodes()
     try:
         nodes = _nodes(config)
@@ -268,8 +245,6 @@ def place_workers(config: RunConfig) -> Plan:
     plan = plan_workers(nodes, config)
     for row in plan.rows():
         logger.info("%s", row)
-    if config.launch.address is not None:
-        _check_free(plan)
     return plan
 
 
@@ -277,13 +252,14 @@ def rehearse(config: RunConfig) -> list[str]:
     """The plan as lines, of a run that joins a cluster; leaves it as it was."""
     import ray
 
-    if ray.is_initialized():
-        return list(place_workers(config).rows())
-    start_ray(config.launch)
+    joined = ray.is_initialized()
+    if not joined:
+        start_ray(config.launch)
     try:
         return list(place_workers(config).rows())
     finally:
-        ray.shutdown()
+        if not joined:
+            ray.shutdown()
 
 
 def actor_options(place: Place) -> dict[str, Any]:
@@ -301,32 +277,8 @@ def alive_nodes() -> frozenset[str]:
     return frozenset(node["NodeID"] for node in ray.nodes() if node["Alive"])
 
 
-def _check_free(plan: Plan) -> None:
-    """Take the planned GPUs of every node for a moment."""
-    import ray
-    from ray.exceptions import GetTimeoutError
-
-    for node in plan.nodes:
-        gpus = sum(place.gpus for place in plan.places.values() if place.node.number == node.number)
-        if not gpus:
-            continue
-        whole = Place(node, math.ceil(gpus) if gpus > 1 else gpus)
-        taken = ray.remote(lambda: True).options(**actor_options(whole)).remote()
-        try:
-            ray.get(taken, timeout=FREE_S)
-        except GetTimeoutError as error:
-            ray.cancel(taken)
-            remedy = f"the plan takes {gpus:g} GPUs of {node}, part of which others hold; wait for them"
-            raise InputError(SECTION, "…", remedy) from error
-
-
 def _nodes(config: RunConfig) -> list[Node]:
-    """The nodes that are there, this one first, with what they report where a cluster was joined.
-
-    Raises:
-        InputError: a node that a worker may be on has other versions.
-        WorkerError: it does not answer.
-    """
+    """The nodes that are there, this one first, with what they report where a cluster was joined."""
     import ray
 
     here = ray.get_runtime_context().get_node_id()
@@ -348,8 +300,7 @@ def _nodes(config: RunConfig) -> list[Node]:
     if config.launch.address is None and len(nodes) == 1:
         return nodes
     wanted = {0}.union(*({n.number for n in candidates(nodes, role)} for role in roles_of(config)))
-    unseen = _check_nodes([node for node in nodes if node.number in wanted], config)
-    return [replace(node, unseen=unseen.get(node.key, "")) for node in nodes]
+    return _checked(nodes, wanted, config)
 
 
 def _is_custom(name: str) -> bool:
@@ -357,56 +308,45 @@ def _is_custom(name: str) -> bool:
     return name not in own and not name.startswith(("node:", "accelerator_type:"))
 
 
-def _check_nodes(nodes: list[Node], config: RunConfig) -> dict[str, str]:
-    """Compare the versions on nodes with ours; by key, a folder that a node does not see.
-
-    Raises:
-        InputError: they differ, or something is missing on a node.
-        WorkerError: a node does not answer.
-    """
+def _checked(nodes: list[Node], wanted: set[int], config: RunConfig) -> list[Node]:
+    """Compare the versions on the `wanted` nodes with ours, and ask whether they see the run's folders."""
     import ray
     from ray.exceptions import GetTimeoutError, RayError, RayTaskError
 
-    path = config.policy.path
-    policy = Path(path) if path and Path(path).is_dir() else None
-    unseen: dict[str, str] = {}
-    with _marker(config) as marker:
-        here, task = node_versions(), ray.remote(report_node)
-        asked = [(n, task.options(**actor_options(Place(n))).remote(policy, marker)) for n in nodes]
-        for node, reference in asked:
-            try:
-                versions, sees_policy, sees_marker = ray.get(reference, timeout=REPORT_S)
-            except GetTimeoutError as error:
-                raise WorkerError(f"{node} has not reported its versions within {REPORT_S:.0f} s") from error
-            except RayTaskError as error:
-                said = str(error).strip().splitlines()[-1]
-                remedy = f"{node} cannot say its versions ({said}); install the same on all"
-                raise InputError(FIELD, config.launch.address, remedy) from error
-            except RayError as error:
-                raise WorkerError(f"{node} could not report its versions:\n{error}") from error
-            for name, version in here.items():
-                if versions[name] != version:
-                    said = f"{node} has {name} {versions[name]}, and this is {version}"
-                    raise InputError(FIELD, config.launch.address, f"{said}; install the same on all")
-            if not sees_policy:
-                unseen[node.key] = f"policy.path, {policy}"
-            if not sees_marker:
-                unseen[node.key] = f"the run's folder, {config.output_dir}"
-    return unseen
-
-
-@contextlib.contextmanager
-def _marker(config: RunConfig) -> Iterator[Path | None]:
-    """A file in the run's folder while nodes look for it."""
-    if config.output_dir is None:
-        yield None
-        return
-    path = Path(config.output_dir).absolute() / f".seen-{secrets.token_hex(8)}"
-    path.touch()
-    try:
-        yield path
-    finally:
-        path.unlink(missing_ok=True)
+    folders = {"the run's folder": config.output_dir, "policy.path": config.policy.path}
+    files = [  # of folders that are here
+        (f"{name}, {folder}", Path(folder).absolute())
+        for name, folder in folders.items()
+        if folder is not None and Path(folder).is_dir()
+    ]
+    here, task = node_versions(), ray.remote(report_node)
+    asked = {
+        node.number: task.options(**actor_options(Place(node))).remote([path for _, path in files])
+        for node in nodes
+        if node.number in wanted
+    }
+    checked = []
+    for node in nodes:
+        if node.number not in asked:
+            checked.append(node)
+            continue
+        try:
+            versions, seen = ray.get(asked[node.number], timeout=REPORT_S)
+        except GetTimeoutError as error:
+            raise WorkerError(f"{node} has not reported its versions within {REPORT_S:.0f} s") from error
+        except RayTaskError as error:
+            last = str(error).strip().splitlines()[-1]
+            remedy = f"{node} cannot say its versions ({last}); install the same on all"
+            raise InputError(FIELD, config.launch.address, remedy) from error
+        except RayError as error:
+            raise WorkerError(f"{node} could not report its versions:\n{error}") from error
+        for name, version in here.items():
+            if versions[name] != version:
+                remedy = f"{node} has {name} {versions[name]}, and this is {version}; install the same on all"
+                raise InputError(FIELD, config.launch.address, remedy)
+        unseen = [name for (name, _), sees in zip(files, seen, strict=True) if not sees]
+        checked.append(replace(node, unseen=unseen[0] if unseen else ""))
+    return checked
 
 
 def node_versions() -> dict[str, str]:
@@ -419,7 +359,6 @@ def node_versions() -> dict[str, str]:
     return {"python": platform.python_version(), **versions, "code": code.hexdigest()[:12]}
 
 
-def report_node(policy: Path | None, marker: Path | None) -> tuple[dict[str, str], bool, bool]:
-    """On a node: its versions, and whether it sees the policy's folder and the marker."""
-    sees_policy = policy is None or (policy / "config.json").is_file()
-    return node_versions(), sees_policy, marker is None or marker.is_file()
+def report_node(folders: Sequence[Path]) -> tuple[dict[str, str], list[bool]]:
+    """On a node: its versions, and which of these folders it sees."""
+    return node_versions(), [folder.is_dir() for folder in folders]

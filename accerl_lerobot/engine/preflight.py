@@ -7,22 +7,19 @@
 from __future__ import annotations
 
 import copy
-import dataclasses
 import difflib
 import logging
 import math
 import os
-import shutil
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import draccus
 
-from accerl_lerobot.algorithms import OffPolicyConfig, RatioConfig
-from accerl_lerobot.checkpoint.layout import KEEP
+from accerl_lerobot.algorithms import OffPolicyConfig
 from accerl_lerobot.config.ranges import Range, check
 from accerl_lerobot.engine import ray_session
+from accerl_lerobot.engine.sizes import check_disk, check_memory
 from accerl_lerobot.envs import EnvConfig, JudgedWorld, RewardModelConfig, WorldSpec, make_world
 from accerl_lerobot.errors import InputError, check_absent, expanded
 from accerl_lerobot.policies.features import (
@@ -36,16 +33,9 @@ from accerl_lerobot.policies.features import (
     policy_features,
     resizes,
 )
-from accerl_lerobot.replay.pacing import decisions_under_way, lag_bound
-
-LARGEST_FIELD = 10**6
-"""Largest number in a policy config; LeRobot has no size or number of steps beyond."""
-ABSURD = 2
-"""Times this machine's memory that a rough estimate may be; ``accerl doctor`` warns long before."""
 
 if TYPE_CHECKING:
     from accerl_lerobot.algorithms import AlgorithmConfig
-    from accerl_lerobot.demos.record import DemosConfig
     from accerl_lerobot.demos.sft import SFTConfig
     from accerl_lerobot.engine.config import DatasetConfig, RunConfig
     from accerl_lerobot.metrics import WandBConfig
@@ -53,8 +43,8 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-SLACK_BYTES = 128 * 2**20
-"""Disk space for metrics, the timeline, the journal and videos."""
+SIZES = ("chunk_size", "n_action_steps", "num_steps", "max_state_dim", "max_action_dim")
+"""Fields of policy configs that are at least 1; LeRobot itself checks the others."""
 
 
 def check_world(env: EnvConfig, reward_model: RewardModelConfig | None = None) -> WorldSpec:
@@ -84,18 +74,12 @@ def check_policy(config: RunConfig, spec: WorldSpec, *, own: bool = False) -> in
 
 
 def check_start(config: RunConfig) -> int:
-    """Refuse a run that could not begin or whose outcome could not be used; what can be is checked here.
-
-    Raises:
-        InputError: no policy, dataset or device; parts that do not fit each other, see `check_features`; too
-            little memory; no login to wandb; too little disk space; also what `check_sft_policy` raises.
-    """
+    """Refuse a run that could not begin or whose outcome could not be used; what can be is checked here."""
     from accerl_lerobot.demos.dataset_files import open_metadata
     from accerl_lerobot.policies.loading import resolve_device
 
     if config.output_dir is not None and not config.resume:
         check_absent(expanded(config.output_dir, "output_dir"))
-    check_machine(config)
     if config.policy.path is None and not config.sft.steps:
         remedy = "give a LeRobot checkpoint, or sft.steps > 0 to make one; the recipe quickstart does"
         raise InputError("policy.path", None, remedy)
@@ -109,7 +93,7 @@ def check_start(config: RunConfig) -> int:
         )
     check_wandb(config.wandb)
     policy = policy_to_be(config)
-    check_weights_fit(config)
+    check_memory(config)
     spec = check_world(config.env, config.rollout.reward_model)
     off_policy = isinstance(config.algorithm, OffPolicyConfig)
     if off_policy:
@@ -125,7 +109,7 @@ def check_start(config: RunConfig) -> int:
     history = int(policy.n_obs_steps)
     if off_policy and meta is not None:
         _say_if_unlike(config, spec, meta, history)
-    check_disk(config.output_dir, disk_bytes(config, spec, history))
+    check_disk(config.output_dir)
     return history
 
 
@@ -145,7 +129,7 @@ def _say_if_unlike(config: RunConfig, spec: WorldSpec, meta: Any, history: int) 
 def check_training_data(
     sft: SFTConfig, dataset: DatasetConfig, policy: Any, spec: WorldSpec | None, rename_map: dict[str, str]
 ) -> Any:
-    """Compare dataset, policy and environment of an SFT."""
+    """Compare dataset, policy and environment of an SFT; returns the dataset's metadata, if there is one."""
     from accerl_lerobot.demos.dataset_files import open_metadata
 
     meta = None if dataset.repo_id is None else open_metadata(dataset)
@@ -198,93 +182,11 @@ def check_wandb(config: WandBConfig) -> None:
     """Refuse logging to Weights & Biases where nobody is logged in."""
     if not config.enable or os.environ.get("WANDB_MODE") in ("offline", "disabled", "dryrun"):
         return
-    try:
-        import wandb
-    except ImportError as error:
-        raise InputError("wandb.enable", True, "wandb is not installed; pip install wandb") from error
+    import wandb
+
     if not wandb.api.api_key:
         remedy = "this machine is not logged in: run wandb login, or set WANDB_API_KEY or WANDB_MODE=offline"
         raise InputError("wandb.enable", True, remedy)
-
-
-def demos_bytes(config: DemosConfig, spec: WorldSpec) -> int:
-    """Disk space that demonstrations take, if half of the env steps are made and PNG halves the images."""
-    return config.episodes * spec.max_steps * sum(map(math.prod, spec.images.values())) // 4
-
-
-def disk_bytes(config: RunConfig, spec: WorldSpec, history: int) -> int:
-    """Disk space that a run takes at least, as far as it is known before; weights made by SFT are not."""
-    picture = sum(map(math.prod, spec.images.values()))
-    replay = (config.replay.capacity + config.remembered) * history * picture
-    policies = 1 + bool(config.saves)
-    if config.save_every_updates:
-        policies = 2 + config.trainer.updates // config.save_every_updates
-    whole = 1 + min(KEEP, policies)  # one more than is kept while it is written
-    records = config.policy.path is None and config.dataset.repo_id is None
-    made = demos_bytes(config.demos, spec) if records else 0
-    weights = 0
-    for path in (config.policy.path, config.sft.init_path):
-        if path is not None:
-            weights = sum(f.stat().st_size for f in Path(path).expanduser().glob("*.safetensors"))
-    return made + whole * replay + policies * weights
-
-
-def check_disk(folder: str | None, needed: int, field: str = "output_dir") -> None:
-    """Refuse a folder on a disk with too little space for `needed` bytes and small files; blames `field`."""
-    path = expanded(folder or ".", field).absolute()
-    while not path.exists():
-        path = path.parent
-    free = shutil.disk_usage(path).free
-    if free < needed + SLACK_BYTES:
-        remedy = f"{(needed + SLACK_BYTES) / 2**30:.2f} GiB are needed and {free / 2**30:.2f} GiB are free"
-        raise InputError(field, folder, f"{remedy} on this disk; make room or choose another")
-
-
-def check_machine(config: RunConfig) -> None:
-    """Refuse sizes far beyond this machine's memory."""
-    if config.launch.address is not None:  # the other nodes may have more
-        return
-    from accerl_lerobot.cli.doctor import memory_parts_gib, total_memory_gib
-
-    parts, total = memory_parts_gib(config), total_memory_gib()
-    needed, largest = sum(parts.values()), max(parts, key=lambda name: parts[name])
-    if total is not None and needed > ABSURD * total:
-        remedy = f"the run needs about {needed:,.0f} GiB of memory, this machine has {total:.0f}; lower it"
-        section, _, name = largest.partition(".")
-        raise InputError(largest, getattr(getattr(config, section), name), remedy)
-
-
-def check_weights_fit(config: RunConfig) -> None:
-    """Refuse a policy whose weights this machine's memory cannot hold."""
-    from accerl_lerobot.cli.doctor import total_memory_gib
-
-    need, total = policy_gib(config), total_memory_gib()
-    if total is not None and need > total and config.launch.address is None:
-        remedy = "use a smaller policy, a GPU, launch.engine=local or policy.tuning.mode=lora"
-        said = f"its weights take {need:.1f} GiB in the processes of this run, this machine has {total:.1f}"
-        raise InputError("policy.path", config.policy.path, f"{said}; {remedy}")
-
-
-def policy_gib(config: RunConfig) -> float:
-    """Memory that the weights of ``policy.path`` take in all processes of a run; activations come on top.
-
-    On a GPU they are not in the machine's memory. Nothing is known of a policy that an SFT will make.
-    """
-    from accerl_lerobot.policies.loading import policy_sizes, rehearsed_config, resolve_device
-
-    if config.policy.path is None or resolve_device(config.policy.device).type != "cpu":
-        return 0.0
-    rehearsed_config(config.policy)
-    sizes, processes, copies = policy_sizes(config.policy), 1, trained_copies(config)
-    if config.launch.engine != "local":
-        processes = config.trainer.ranks + config.inference.workers
-        copies += 2  # two sets are published
-    return 4 * (sizes.policy * processes + sizes.trained * copies) / 2**30
-
-
-def trained_copies(config: RunConfig) -> int:
-    """Copies of the trained weights that a trainer keeps: gradient, Adam's two moments, weights to probe."""
-    return 3 + (isinstance(config.algorithm, RatioConfig) and config.trainer.probe_every > 0)
 
 
 def check_imitates(algorithm: AlgorithmConfig, config: PolicyConfig, policy: Any) -> None:
@@ -310,11 +212,7 @@ def _check_off_policy(config: RunConfig, spec: WorldSpec, policy: Any) -> None:
 
 
 def policy_to_be(config: RunConfig) -> Any:
-    """LeRobot's config of the policy that a run will act with, as far as it is known before an SFT.
-
-    Raises:
-        InputError: there is no such checkpoint; RL has no likelihood for it; what `check_sft_policy` raises.
-    """
+    """LeRobot's config of the policy that a run will act with, as far as it is known before an SFT."""
     from accerl_lerobot.policies.config import check_observations, check_type, override, sampler_config
     from accerl_lerobot.policies.loading import rehearsed_config
 
@@ -327,12 +225,8 @@ def policy_to_be(config: RunConfig) -> Any:
         except InputError as error:
             if error.field not in ("policy.path", "policy.type", "policy.n_obs_steps"):
                 raise
-            said = (
-                ""
-                if error.field == "policy.path"
-                else f"{error.field.removeprefix('policy.')}={error.value}: "
-            )
-            raise InputError("sft.init_path", start.path, said + error.remedy) from error
+            what = "" if error.field == "policy.path" else f"{error.field.partition('.')[2]}={error.value}: "
+            raise InputError("sft.init_path", start.path, what + error.remedy) from error
     policy_config = check_sft_policy(config.sft)
     kind = check_type(config.sft.policy["type"], "sft.policy.type", "RL needs a likelihood: ")
     sampler_config(config.policy, kind)
@@ -342,11 +236,7 @@ def policy_to_be(config: RunConfig) -> Any:
 
 
 def check_sft_policy(config: SFTConfig) -> Any:
-    """Let LeRobot build the policy config that the SFT would ask for, and returns it.
-
-    Raises:
-        InputError: LeRobot has no such policy, no such field, or refuses a value; or cannot fine-tune it.
-    """
+    """Let LeRobot build the policy config that the SFT would ask for, and returns it."""
     from lerobot.configs.policies import PreTrainedConfig
 
     from accerl_lerobot.demos.sft import policy_fields
@@ -364,11 +254,8 @@ def check_sft_policy(config: SFTConfig) -> Any:
             raise InputError(f"sft.policy.{key}", value, remedy)
     for key, value in fields.items():
         if isinstance(value, int):
-            check(
-                Annotated[int, Range(f"[-1, {LARGEST_FIELD}]")],
-                int(value),
-                f"sft.policy.{key}",
-            )
+            span = Range("[1, 10000]" if key in SIZES else "[-1, 1000000]")
+            check(Annotated[int, span], int(value), f"sft.policy.{key}")
     try:
         # Without a device LeRobot looks for one.
         return draccus.decode(PreTrainedConfig.get_choice_class(kind), {"device": "cpu"} | fields)
@@ -377,11 +264,7 @@ def check_sft_policy(config: SFTConfig) -> Any:
 
 
 def sft_policy(config: SFTConfig) -> Any:
-    """LeRobot's config of the policy that an SFT trains, of any of LeRobot's types.
-
-    Raises:
-        InputError: what `check_sft_policy` raises; the checkpoint to start from cannot be read.
-    """
+    """LeRobot's config of the policy that an SFT trains, of any of LeRobot's types."""
     if config.init_path is None:
         return check_sft_policy(config)
     from lerobot.configs.policies import PreTrainedConfig
@@ -413,11 +296,7 @@ def _as_input_error(error: BaseException, fields: dict[str, Any]) -> InputError:
 
 
 def check_placement(config: RunConfig) -> list[str]:
-    """Plan where the workers will be, so that what does not fit is refused before anything long; as lines.
-
-    Raises:
-        InputError: they do not fit, or the cluster that is to be joined is not as it has to be.
-    """
+    """Plan where the workers will be, so that what does not fit is refused before anything long; as lines."""
     if config.launch.engine == "local":
         return []
     if config.launch.address is None:
@@ -428,36 +307,3 @@ def check_placement(config: RunConfig) -> list[str]:
     from accerl_lerobot.engine.placement import rehearse
 
     return rehearse(config)
-
-
-def lag_limits(config: RunConfig) -> tuple[int, int]:
-    """The largest lag under this recipe, and what its pace alone would allow; in updates."""
-    trainer = config.trainer
-    ahead = 1 if config.launch.engine == "ray" else 0  # of publications under way, and of batches drawn early
-    bound, of_pace = (
-        lag_bound(
-            replay,
-            batch_decisions=trainer.batch_decisions,
-            in_flight=under_way(config),
-            pickup=ahead + trainer.hold_back,
-            prefetch=ahead,
-        )
-        for replay in (config.replay, dataclasses.replace(config.replay, max_lag=10**9))
-    )
-    return bound, of_pace
-
-
-def under_way(config: RunConfig) -> int:
-    """Decisions on their way to replay."""
-    rollout = config.rollout
-    return decisions_under_way(
-        workers=rollout.workers,
-        worlds=rollout.worlds,
-        segment_length=rollout.segment_length,
-    )
-
-
-def executed(config: RunConfig) -> int:
-    """Actions of a chunk that are executed; 0 if only the checkpoint says."""
-    of_sft = config.sft.steps and config.sft.policy.get("n_action_steps")
-    return int(config.policy.n_action_steps or of_sft or 0)

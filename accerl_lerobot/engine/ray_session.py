@@ -24,7 +24,7 @@ import threading
 import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import psutil
 
@@ -44,8 +44,6 @@ CONNECT_S = 5.0
 """Timeout for a TCP connection to a cluster."""
 ANSWER_S = 60.0
 """Timeout for ``ray status``, most of which is importing Ray."""
-RESPONDS_S = 20.0
-"""Timeout for Ray to start a process; after that it counts as broken."""
 LOOK_S = 0.5
 """Between two looks at Ray's processes."""
 HURRY_S = 2.0
@@ -67,7 +65,7 @@ FORWARDED = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "HF_HUB_OFFLINE", "TRANSFORMERS_O
 PRIVATE = {
     # Ray 2.60 moves a node at 127.0.0.1 to the machine's address and then listens on every interface, unless
     # it is told that there is no cluster to be part of. The name is historical: it is read on all systems.
-    "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
+    "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0"
 }
 _AUTH = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
 _NO_TOKEN = {"HF_TOKEN": "", "HUGGING_FACE_HUB_TOKEN": "", "HF_TOKEN_PATH": os.devnull}
@@ -186,12 +184,7 @@ def kill_ray(known: Iterable[psutil.Process] = ()) -> None:
 
 
 def start_ray(launch: LaunchConfig | None = None) -> None:
-    """Start a private Ray on this machine, or join the cluster of ``launch.address``.
-
-    Raises:
-        InputError: there is no such cluster, or this run should not join it.
-        WorkerError: a private Ray did not start in `STARTS` attempts.
-    """
+    """Start a private Ray on this machine, or join the cluster of ``launch.address``."""
     import ray
 
     with deferred():
@@ -252,14 +245,7 @@ def check_cluster(launch: LaunchConfig) -> None:
             why = error.strerror or error
             remedy = f"nobody listens at {address} ({why}); is it what ray start --head printed?"
             raise InputError(FIELD, address, remedy) from error
-    command = [sys.executable, *STATUS, f"--address={address}"]
-    pipes: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
-    with (
-        subprocess.Popen(command, **pipes) as ours,
-        subprocess.Popen(command, env=without_token(), **pipes) as strangers,
-    ):
-        complaint, open_to_all = _complaint(ours), _complaint(strangers) is None
-    if complaint is not None:
+    if (complaint := _complaint(address)) is not None:
         if any(word in complaint for word in UNAUTHORISED):
             remedy = "it does not take the token that is configured here; see RAY_AUTH_TOKEN_PATH"
         elif address == "auto" and "ConnectionError" in complaint:
@@ -268,31 +254,24 @@ def check_cluster(launch: LaunchConfig) -> None:
             last = (complaint.strip().splitlines() or ["no answer"])[-1][:200]
             remedy = f"it does not answer as Ray does: {last}"
         raise InputError(FIELD, address, remedy)
-    if open_to_all:
+    if _complaint(address, without_token()) is None:
         remedy = "it asks for no token, so whoever reaches it runs code in its workers; start it with "
         remedy += "RAY_AUTH_MODE=token"
         raise InputError(FIELD, address, remedy)
 
 
-def _complaint(process: subprocess.Popen[str]) -> str | None:
-    """The stderr of a process that failed; None: it succeeded."""
+def _complaint(address: str, env: dict[str, str] | None = None) -> str | None:
+    """Why a cluster does not tell its status to somebody in this environment; None: it does."""
+    command = [sys.executable, *STATUS, f"--address={address}"]
     try:
-        _, complaint = process.communicate(timeout=ANSWER_S)
+        done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=ANSWER_S, check=False)
     except subprocess.TimeoutExpired:
-        process.kill()
         return f"no answer within {ANSWER_S:.0f} s"
-    return complaint if process.returncode else None
+    return done.stderr if done.returncode else None
 
 
 class RaySession:
-    """Ray until it is closed. One that was there before is used and left running, and so is a cluster.
-
-    Example:
-        >>> session = RaySession(config.launch)
-        >>> session.start()     # for the first workers
-        >>> session.start()     # for their successors: checks whether it still responds
-        >>> session.close()
-    """
+    """Ray until it is closed. One that was there before is used and left running, and so is a cluster."""
 
     def __init__(self, launch: LaunchConfig) -> None:
         self._launch, self._started = launch, False
@@ -305,13 +284,13 @@ class RaySession:
         return self._lost if self._watch is None else self._watch.look()
 
     def start(self) -> None:
-        """Start Ray unless it is there, or if it does not respond any more."""
+        """Start Ray unless it is there and none of its processes is lost."""
         import ray
 
         if ray.is_initialized():
-            if not self._started or (not self.lost and _responds()):
+            if not self._started or not self.lost:
                 return
-            logger.warning("Ray does not respond any more and is started again")
+            logger.warning("%s, and Ray is started again", self.lost)
             self.close()
         self._started, self._lost = True, ""
         start_ray(self._launch)
@@ -322,14 +301,13 @@ class RaySession:
         """End Ray, if it was started here. Safe to call twice."""
         import ray
 
-        self._lost = self.lost
+        self._lost, watch, self._watch = self.lost, self._watch, None
         if self._started and ray.is_initialized():
-            if self._watch is not None and self._lost:
-                kill_ray(self._watch.processes)
+            if watch is not None and self._lost:
+                kill_ray(watch.processes)
             ray.shutdown()
-        if self._watch is not None:
-            self._watch.close()
-            self._watch = None
+        if watch is not None:
+            watch.close()
         self._started = False
 
 
@@ -399,14 +377,3 @@ class RayWatch(threading.Thread):
         stopped_s = time.monotonic() - self._stopped.setdefault(process, time.monotonic())
         limit = min(HURRY_S, self._stall_s) if arrived() else self._stall_s
         return f"has been stopped for {stopped_s:.0f} s" if stopped_s > limit else ""
-
-
-def _responds() -> bool:
-    """True if Ray still starts a process."""
-    import ray
-    from ray.exceptions import RayError
-
-    try:
-        return bool(ray.get(ray.remote(lambda: True).options(num_cpus=0).remote(), timeout=RESPONDS_S))
-    except RayError:
-        return False

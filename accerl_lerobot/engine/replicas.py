@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Supervision of the processes of an asynchronous run.
 
-    ActorHandle          one process: a long call that must not end unasked, and one question at a time
-    RolloutWorkers       restarted alone: a process loses its unfinished segments; planned episodes
-                         are run again
-    InferenceReplicas    restarted alone: nothing is lost, as a request carries its noise and clients ask the
-                         successor again
+    WorkerSlot           a place for one process after the other: a long call that must not end unasked,
+                         and one question at a time
+    RolloutWorkers       restarted alone: a process loses its unfinished segments; planned episodes are
+                         run again
+    InferenceReplicas    restarted alone: nothing is lost, as a request carries its noise and clients ask
+                         the successor again
 
 The engine waits for a restart, and the other workers go on meanwhile. Resuming a run works the same way.
 """
@@ -17,8 +18,10 @@ import logging
 import math
 import time
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +42,8 @@ from accerl_lerobot.policies.config import Load
 from accerl_lerobot.rollout.plans import budgets, incarnation_after
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.rollout.worker import Report
-from accerl_lerobot.transport.endpoint import Endpoint, Transport, uses_shared_memory
+from accerl_lerobot.transport.endpoint import Endpoint
+from accerl_lerobot.transport.shared_memory import available
 
 logger = logging.getLogger(__name__)
 
@@ -53,30 +57,37 @@ UNREACHABLE_S = 60.0
 """How long a process on another node may be out of reach before it is restarted, unless its node is found to
 have left, which Ray takes half of that to decide."""
 LOOK_S = 1.0
-"""Interval at which a process in a long call, or a node out of reach, is looked at."""
+"""Interval at which a node out of reach is looked at."""
 ROLLOUT = "rollout"
 """Name of the rollout workers' part of a checkpoint."""
 
 
-class ActorHandle:
-    """One long call that must not end unasked, and one question at a time.
+class WorkerSlot:
+    """A place for one process after the other, each with a long call that must not end unasked.
 
-    Questions are asked without waiting and answers picked up later, so a worker that hangs cannot hang the
-    engine, its silence has a length, and orders arrive in order, which Ray does not promise for an actor with
-    threads.
-
-    Example:
-        >>> worker = ActorHandle("trainer", actor)
-        >>> worker.work = actor.run.remote()    # `ray.wait` on it: its end is an event
-        >>> worker.ask("metrics")               # does nothing until the last answer was picked up
+    Questions are asked one at a time, without waiting, and answers picked up later, so a worker that hangs
+    cannot hang the engine, its silence has a length, and orders arrive in order, which Ray does not promise
+    for an actor with threads.
     """
 
-    def __init__(self, name: str, actor: Any) -> None:
-        self.name, self.actor = name, actor
+    def __init__(self, name: str, actor: Any = None) -> None:
+        self.name = name
+        self.restart: Callable[[Exception], None] | None = None
+        """Replaces the process after a failure; None: the run cannot go on without it."""
+        self.restarts = 0
+        """In a row."""
+        self.occupy(actor)
+
+    def occupy(self, actor: Any) -> None:
+        """Take in a new process, an actor handle; None: there is none yet."""
+        self.actor = actor
         self.work: Any = None
         self.process: psutil.Process | None = None
         """None: not known yet, or on another node."""
-        self.answered = False
+        self.told: Any = None
+        """Last answer."""
+        self.since = math.inf
+        """When it was at work, on `time.monotonic`."""
         self._question: Any = None
         self._asked = 0.0
 
@@ -91,10 +102,11 @@ class ActorHandle:
             with contextlib.suppress(psutil.NoSuchProcess):  # the next question will tell
                 self.process = psutil.Process(pid)
 
-    def endpoint(self, method: str, transport: Transport, timeout: float) -> Endpoint:
+    def endpoint(self, method: str, timeout: float) -> Endpoint:
         """Where other workers reach this method."""
-        address = self.call("listen", timeout=timeout) if uses_shared_memory(transport) else None
-        return Endpoint(name=self.name, method=getattr(self.actor, method), address=address)
+        address = self.call("listen", timeout=timeout) if available() else None
+        handle = getattr(self.actor, method)
+        return Endpoint(name=self.name, method=handle, address=address, actor=self.actor)
 
     def ask(self, method: str, *arguments: Any) -> bool:
         """Ask unless an answer is outstanding; returns True if it did."""
@@ -104,17 +116,12 @@ class ActorHandle:
         return True
 
     def answer(self, timeout: float = 0.0) -> Any:
-        """The answer to the last question, once; None if there is none yet.
-
-        Raises:
-            RayError: the call failed, or the process has died.
-        """
+        """The answer to the last question, once; None if there is none yet."""
         if self._question is None or not ray.wait([self._question], timeout=timeout)[0]:
             return None
         question, self._question = self._question, None
-        answer = ray.get(question)
-        self.answered = True
-        return answer
+        self.told = ray.get(question)
+        return self.told
 
     def silent_s(self) -> float:
         """Seconds for which an answer has been outstanding."""
@@ -122,20 +129,14 @@ class ActorHandle:
             return 0.0
         return time.monotonic() - self._asked
 
-    def call(self, method: str, *arguments: Any, timeout: float, silence: float | None = None) -> Any:
-        """Call a method and wait for its answer.
+    def hung(self, limit: float) -> str:
+        """Reason to give it up; empty: none."""
+        silent = self.silent_s()
+        return f"has not answered for {silent:.0f} s" if silent > limit else ""
 
-        Args:
-            timeout: seconds until the answer.
-            silence: seconds in which it must answer ``ready`` meanwhile; None: it need not.
-
-        Raises:
-            WorkerError: it failed, with its traceback, or did not answer in time.
-        """
-        reference = getattr(self.actor, method).remote(*arguments)
-        if silence is not None:
-            self._check_alive(reference, method, timeout, silence)
-        return self.result(reference, method, timeout)
+    def call(self, method: str, *arguments: Any, timeout: float) -> Any:
+        """Call a method and wait for its answer."""
+        return self.result(getattr(self.actor, method).remote(*arguments), method, timeout)
 
     def result(self, reference: Any, method: str, timeout: float) -> Any:
         """See `call`, for a call that has been made."""
@@ -146,138 +147,121 @@ class ActorHandle:
         except RayError as error:
             raise WorkerError(f"{self.name} worker failed in {method}:\n{error}") from error
 
-    def _check_alive(self, reference: Any, method: str, timeout: float, silence: float) -> None:
-        """Wait for an answer that may take long, from a process that must not hang."""
-        deadline = time.monotonic() + timeout
-        beat, asked = self.actor.ready.remote(), time.monotonic()
-        while not ray.wait([reference], timeout=min(LOOK_S, silence / 4))[0]:
-            now = time.monotonic()
-            if now > deadline:
-                return  # `result` reports it
-            if ray.wait([beat], timeout=0)[0]:
-                beat, asked = self.actor.ready.remote(), now
-            elif now - asked > silence:
-                raise WorkerError(f"{self.name} worker has not answered for {now - asked:.0f} s, in {method}")
+    def count_restart(self, error: Exception, max_restarts: int) -> None:
+        """Count a restart."""
+        if time.monotonic() - self.since > STEADY_S:
+            self.restarts = 0
+        if self.restarts >= max_restarts:
+            times = f" after {self.restarts} restarts" if self.restarts else ""
+            raise WorkerError(f"{self.name} worker failed for good{times}:\n{error}") from error
+        self.restarts += 1
+
+    def end(self, error: Exception) -> None:
+        """End a process that is to be replaced."""
+        logger.warning("%s worker is restarted: %s", self.name, str(error).strip().splitlines()[-1][:200])
+        ray.kill(self.actor)
 
 
-@dataclass(kw_only=True)
-class WorkerSlot:
-    """A place for one process after the other."""
-
-    index: int
-    name: str
-    worker: ActorHandle = None  # type: ignore[assignment]
-    """Set by `ReplicaSet.start`."""
-    restarts: int = 0
-    """In a row."""
-    since: float = math.inf
-    """When the process was at work, on `time.monotonic`."""
-
-
-class ReplicaSet[S: WorkerSlot](ABC):
+class Replicas[W: WorkerSlot](ABC):
     """Workers of one kind that can be restarted alone, `LaunchConfig.max_restarts` times in a row each."""
 
-    def __init__(self, config: RunConfig, slots: list[S]) -> None:
-        self._config, self._slots = config, slots
+    def __init__(self, config: RunConfig, workers: list[W]) -> None:
+        self._config, self._launch = config, config.launch
+        self._all = workers
         self._plan = Plan((), {})
+        for worker in workers:
+            worker.restart = partial(self._restart, worker)
 
     def start(self, plan: Plan) -> None:
-        """Start a process for each slot, where the plan says."""
+        """Start all processes, where the plan says."""
         self._plan = plan
-        for slot in self._slots:
-            slot.worker = self._new(slot)
+        for worker in self._all:
+            worker.occupy(self._new(worker))
 
-    def workers(self) -> Iterator[ActorHandle]:
+    def workers(self) -> Iterator[W]:
         """All workers of this kind, once they have been started."""
-        return (slot.worker for slot in self._slots if slot.worker is not None)
-
-    def restart_worker(self, worker: ActorHandle, error: Exception) -> bool:
-        """Restart a worker that has failed; False if it is not one of these.
-
-        Raises:
-            WorkerError: it has been restarted too often; carries its traceback.
-        """
-        for slot in self._slots:
-            if slot.worker is worker:
-                self._restart(slot, error)
-                return True
-        return False
+        return (worker for worker in self._all if worker.actor is not None)
 
     @abstractmethod
-    def _new(self, slot: S) -> ActorHandle:
-        """Start a process for a slot."""
+    def _new(self, worker: W) -> Any:
+        """Start a process; its actor handle."""
 
     @abstractmethod
-    def _restart(self, slot: S, error: Exception) -> None:
-        """Replace the process of a slot; see `restart_worker`."""
-
-    def _end_process(self, slot: S, error: Exception, *, free: bool = False) -> None:
-        """End the process of a slot and count the restart, unless it is `free`."""
-        if time.monotonic() - slot.since > STEADY_S:
-            slot.restarts = 0
-        if slot.restarts >= self._config.launch.max_restarts and not free:
-            times = f" after {slot.restarts} restarts" if slot.restarts else ""
-            raise WorkerError(f"{slot.name} worker failed for good{times}:\n{error}") from error
-        reason = str(error).strip().splitlines()[-1][:200]
-        logger.warning("%s worker is restarted: %s", slot.name, reason)
-        ray.kill(slot.worker.actor)
-        slot.restarts, slot.since = slot.restarts + (not free), math.inf
-
-    def _answers(self) -> Iterator[tuple[S, Any]]:
-        """Answers that have come. A worker whose answer is an error is restarted."""
-        for slot in self._slots:
-            try:
-                answer = slot.worker.answer()
-            except RayActorError:
-                continue  # its long call has ended as well, and the engine deals with that
-            except RayError as error:
-                self._restart(slot, error)
-                continue
-            if answer is not None:
-                yield slot, answer
+    def _restart(self, worker: W, error: Exception) -> None:
+        """Replace a process that has failed."""
 
 
-@dataclass(kw_only=True)
 class RolloutSlot(WorkerSlot):
-    """A rollout worker's place."""
+    """A rollout worker, and what its next process has to know.
 
-    incarnation: int = 0
-    """Grows with every process; part of its seeds and of its segments' keys."""
-    outstanding: dict[tuple[str, int], EpisodePlan] = field(default_factory=dict)
-    """Planned episodes without a result."""
-    unsent: list[EpisodePlan] = field(default_factory=list)
-    report: Report | None = None
-    """Last report of the process."""
-    moved: Endpoint | None = None
-    """New endpoint of its inference replica, until the process has been told."""
-    budget: int | None = None
-    """Exploring episodes left; None: no end."""
-    spent: bool = False
-    """True if replay has all of them."""
+    Args:
+        budget: exploring episodes left; None: no end.
+    """
+
+    def __init__(self, index: int, budget: int | None) -> None:
+        super().__init__(f"rollout {index}")
+        self.index, self.budget = index, budget
+        self.incarnation = 0
+        """Grows with every process; part of its seeds and of its segments' keys."""
+        self.outstanding: dict[tuple[str, int], EpisodePlan] = {}
+        """Planned episodes without a result."""
+        self.unsent: list[EpisodePlan] = []
+        self.moved: Endpoint | None = None
+        """New endpoint of its inference replica, until the process has been told."""
+        self.spent = budget == 0
+        """True if replay has all episodes of the budget."""
+
+    @property
+    def report(self) -> Report | None:
+        """Last report of the process."""
+        report: Report | None = self.told
+        return report
 
     @property
     def next_incarnation(self) -> int:
         """Incarnation of another process in this place."""
         return incarnation_after(self.incarnation, 0 if self.report is None else self.report.starts)
 
+    def take(self, report: Report) -> list[EpisodeResult]:
+        """Note a report; the episodes in it."""
+        self.spent, self.since = report.spent, min(self.since, time.monotonic())
+        if self.budget is not None:
+            self.budget -= sum(episode.plan.explore for episode in report.episodes)
+        return [
+            episode
+            for episode in report.episodes
+            if self.outstanding.pop(episode_key(episode.plan), None) is not None or episode.plan.explore
+        ]
 
-class RolloutWorkers(ReplicaSet[RolloutSlot]):
-    """The rollout workers of a run.
+    def assign(self, plans: list[EpisodePlan]) -> None:
+        """Add planned episodes."""
+        self.outstanding |= {episode_key(plan): plan for plan in plans}
+        self.unsent += plans
 
-    Raises:
-        InputError: the state is not of an asynchronous run with as many workers.
-    """
+    def hung(self, limit: float) -> str:
+        """Also a world that does not return, and inference that is not found."""
+        if (report := self.report) is None:
+            return super().hung(max(START_S, limit))
+        if why := super().hung(limit):
+            return why
+        if report.in_world_s > limit:
+            return f"its world has not returned for {report.in_world_s:.0f} s"
+        if report.stuck_s > limit:
+            return f"it has done nothing for {report.stuck_s:.0f} s"
+        if report.away_s > AWAY_S and self.moved is None:
+            return f"without inference, which is up, for {report.away_s:.0f} s: {report.away_why}"
+        return ""
+
+
+class RolloutWorkers(Replicas[RolloutSlot]):
+    """The rollout workers of a run."""
 
     def __init__(
         self, config: RunConfig, tasks: tuple[str, ...], history: int, state: Path | None = None
     ) -> None:
-        slots = [
-            RolloutSlot(index=index, name=f"rollout {index}", budget=budget, spent=budget == 0)
-            for index, budget in enumerate(budgets(config.rollout))
-        ]
-        super().__init__(config, slots)
+        super().__init__(config, [RolloutSlot(i, left) for i, left in enumerate(budgets(config.rollout))])
         self._tasks, self._history = tasks, history
-        self._past: dict[str, float] = {"restarts": 0.0}
+        self._past: Counter[str] = Counter(restarts=0)
         """Counters of processes that have ended."""
         self._inference: list[Endpoint] = []
         self._replay: Endpoint | None = None
@@ -289,181 +273,131 @@ class RolloutWorkers(ReplicaSet[RolloutSlot]):
     def run(self, inference: list[Endpoint], replay: Endpoint) -> None:
         """Have all workers step their worlds."""
         self._inference, self._replay = inference, replay
-        for slot in self._slots:
-            self._run(slot)
+        for worker in self._all:
+            self._run(worker)
 
     def move(self, replica: int, inference: Endpoint) -> None:
         """Tell the clients of an inference replica its new endpoint."""
-        self._inference[replica] = inference
-        for slot in self._slots[replica :: len(self._inference)]:
-            slot.moved = inference
+        for worker in self._all[replica :: len(self._inference)]:
+            worker.moved = inference
 
     def plan(self, plans: list[EpisodePlan]) -> None:
         """See `Engine.plan`."""
-        check_new(plans, {key for slot in self._slots for key in slot.outstanding})
-        for slot in self._slots:
-            self._assign(slot, plans[slot.index :: len(self._slots)])
+        check_new(plans, {key for worker in self._all for key in worker.outstanding})
+        for worker in self._all:
+            worker.assign(plans[worker.index :: len(self._all)])
 
     def ask(self, training: bool) -> None:
         """Ask each worker for a report, unless one is outstanding."""
-        for slot in self._slots:
-            if slot.worker.ask("report", training, slot.unsent, self.in_turn, slot.moved):
-                slot.unsent = []
-                if slot.moved is not None and slot.report is not None:
-                    slot.report = replace(slot.report, away_s=0.0)  # that was about the old endpoint
-                slot.moved = None
-
-    def listen(self) -> list[EpisodeResult]:
-        """Pick up reports; returns the episodes in them."""
-        episodes: list[EpisodeResult] = []
-        for slot, report in self._answers():
-            slot.report, slot.spent = report, report.spent
-            slot.since = min(slot.since, time.monotonic())
-            if slot.budget is not None:
-                slot.budget -= sum(e.plan.explore for e in report.episodes)
-            for episode in report.episodes:
-                planned = slot.outstanding.pop(episode_key(episode.plan), None)
-                if episode.plan.explore or planned is not None:
-                    episodes.append(episode)
-        return episodes
+        for worker in self._all:
+            if worker.ask("report", training, worker.unsent, self.in_turn, worker.moved):
+                worker.unsent = []
+                if worker.moved is not None and worker.report is not None:
+                    worker.told = replace(worker.report, away_s=0.0)  # that was about the old endpoint
+                worker.moved = None
 
     def counters(self) -> dict[str, float]:
         """Sums over all processes since the run began."""
-        totals = dict(self._past)
-        for slot in self._slots:
-            _add(totals, slot.report)
-        return totals
+        totals = self._past.copy()
+        for worker in self._all:
+            totals.update(worker.report.counters if worker.report is not None else {})
+        return dict(totals)
 
     @property
     def outstanding(self) -> bool:
         """True if a planned episode has no result yet."""
-        return any(slot.outstanding for slot in self._slots)
+        return any(worker.outstanding for worker in self._all)
 
     @property
     def spent(self) -> bool:
         """True if replay has all exploring episodes of the budget."""
-        return all(slot.spent for slot in self._slots)
+        return all(worker.spent for worker in self._all)
 
     @property
     def stuck_s(self) -> float:
         """How long the slowest worker or world has been at what it does now."""
-        reports = [slot.report for slot in self._slots if slot.report is not None]
+        reports = [worker.report for worker in self._all if worker.report is not None]
         return max((max(report.in_world_s, report.stuck_s) for report in reports), default=0.0)
-
-    def check_hung(self) -> None:
-        """Restart workers that do not answer or do nothing, whose world does not return, or that do not find
-        inference."""
-        for slot in self._slots:
-            if why := self._hung(slot):
-                self._restart(slot, RuntimeError(why))
 
     def save(self, directory: Path) -> None:
         """Write the rollout workers' part of ``training_state``."""
         slots = [
             {
-                "incarnation": slot.next_incarnation - 1,
-                "budget": slot.budget,
-                "outstanding": list(slot.outstanding.values()),
+                "incarnation": worker.next_incarnation - 1,
+                "budget": worker.budget,
+                "outstanding": list(worker.outstanding.values()),
             }
-            for slot in self._slots
+            for worker in self._all
         ]
         snapshot.save(directory / ROLLOUT, {"past": self.counters(), "slots": slots})
 
     def _restore(self, directory: Path) -> None:
         if not (directory / f"{ROLLOUT}.json").is_file():
             remedy = "this run was in one process; resume it with launch.engine=local"
-            raise InputError("launch.engine", self._config.launch.engine, remedy)
+            raise InputError("launch.engine", self._launch.engine, remedy)
         saved = snapshot.load(directory / ROLLOUT)
-        if len(saved["slots"]) != len(self._slots):
+        if len(saved["slots"]) != len(self._all):
             remedy = f"this run has {len(saved['slots'])}; leave the field out"
-            raise InputError("rollout.workers", len(self._slots), remedy)
-        self._past = saved["past"]
-        for slot, was in zip(self._slots, saved["slots"], strict=True):
-            slot.incarnation, slot.budget = was["incarnation"] + 1, was["budget"]
-            if slot.budget is not None:
-                slot.spent = slot.budget == 0
-            self._assign(slot, was["outstanding"])
+            raise InputError("rollout.workers", len(self._all), remedy)
+        self._past = Counter(saved["past"])
+        for worker, was in zip(self._all, saved["slots"], strict=True):
+            worker.incarnation, worker.budget = was["incarnation"] + 1, was["budget"]
+            worker.spent = worker.budget == 0
+            worker.assign(was["outstanding"])
 
-    def _assign(self, slot: RolloutSlot, plans: list[EpisodePlan]) -> None:
-        slot.outstanding |= {episode_key(plan): plan for plan in plans}
-        slot.unsent += plans
-
-    def _hung(self, slot: RolloutSlot) -> str:
-        """Reason to restart a worker; empty: none."""
-        limit, silent, report = self._config.launch.stall_s, slot.worker.silent_s(), slot.report
-        if silent > (limit if slot.worker.answered else max(START_S, limit)):
-            return f"no answer for {silent:.0f} s"
-        if report is None:
-            return ""
-        if report.in_world_s > limit:
-            return f"its world has not returned for {report.in_world_s:.0f} s"
-        if report.stuck_s > limit:
-            return f"it has done nothing for {report.stuck_s:.0f} s"
-        if report.away_s > AWAY_S and slot.moved is None:
-            return f"without inference, which is up, for {report.away_s:.0f} s: {report.away_why}"
-        return ""
-
-    def _new(self, slot: RolloutSlot) -> ActorHandle:
+    def _new(self, worker: RolloutSlot) -> Any:
         from accerl_lerobot.rollout.worker import RolloutWorker, WorkerShare
 
-        c, place = self._config, self._plan.places[slot.name]
+        c, place = self._config, self._plan.places[worker.name]
         actor = ray.remote(RolloutWorker).options(**actor_options(place), max_concurrency=4, **NO_HUB_TOKEN)
         # A node that does not see the run's folder would write a timeline that nobody finds.
         timeline = None if place.node.unseen else timeline_folder(c)
-        share = WorkerShare(slot.index, slot.incarnation, slot.budget)
-        made = actor.remote(c.env, c.rollout, self._tasks, c.seed, share, self._history, timeline)
-        return ActorHandle(slot.name, made)
+        share = WorkerShare(worker.index, worker.incarnation, worker.budget)
+        return actor.remote(c.env, c.rollout, self._tasks, c.seed, share, self._history, timeline)
 
-    def _restart(self, slot: RolloutSlot, error: Exception) -> None:
-        if isinstance(error, ActorUnavailableError):
-            self._await_verdict(slot.name)
-        moved = self._move(slot.name)
-        self._end_process(slot, error, free=moved)  # that its node has left is not the worker's fault
+    def _restart(self, worker: RolloutSlot, error: Exception) -> None:
+        if not self._relocate(worker, error):  # that its node has left is not the worker's fault
+            worker.count_restart(error, self._launch.max_restarts)
+        worker.end(error)
         self._past["restarts"] += 1
-        _add(self._past, slot.report)
-        slot.incarnation = slot.next_incarnation
-        slot.report, slot.moved = None, None
-        slot.worker = self._new(slot)
-        slot.unsent = list(slot.outstanding.values())
-        self._run(slot)
+        self._past.update(worker.report.counters if worker.report is not None else {})
+        worker.incarnation = worker.next_incarnation
+        worker.moved = None
+        worker.unsent = list(worker.outstanding.values())
+        worker.occupy(self._new(worker))
+        self._run(worker)
 
-    def _await_verdict(self, name: str) -> None:
-        """Wait until Ray has decided whether the node of a worker out of reach has left, if it is another."""
-        node, until = self._plan.places[name].node, time.monotonic() + UNREACHABLE_S
-        while node.number and node.key in alive_nodes() and time.monotonic() < until:
-            time.sleep(LOOK_S)
-
-    def _move(self, name: str) -> bool:
+    def _relocate(self, worker: RolloutSlot, error: Exception) -> bool:
         """Plan another node for a worker whose own has left; False if that is still there."""
-        there, node = alive_nodes(), self._plan.places[name].node
-        if node.key in there:
+        node, until = self._plan.places[worker.name].node, time.monotonic() + UNREACHABLE_S
+        while isinstance(error, ActorUnavailableError) and node.number and time.monotonic() < until:
+            if node.key not in alive_nodes():
+                break
+            time.sleep(LOOK_S)
+        if node.key in (alive := alive_nodes()):
             return False
-        self._plan = self._plan.moved(name, there)
-        self._past["moved"] = self._past.get("moved", 0.0) + 1
-        logger.warning("%s has left; its %s worker goes to %s", node, name, self._plan.places[name].node)
+        self._plan = self._plan.moved(worker.name, alive)
+        self._past["moved"] += 1
+        target = self._plan.places[worker.name].node
+        logger.warning("%s has left; its %s worker goes to %s", node, worker.name, target)
         return True
 
-    def _run(self, slot: RolloutSlot) -> None:
-        inference = self._inference[slot.index % len(self._inference)]
-        slot.worker.work = slot.worker.actor.run.remote(inference, self._replay)
+    def _run(self, worker: RolloutSlot) -> None:
+        inference = self._inference[worker.index % len(self._inference)]
+        worker.work = worker.actor.run.remote(inference, self._replay)
 
 
-def _add(totals: dict[str, float], report: Report | None) -> None:
-    """Add a report's counters to `totals`."""
-    for key, value in (report.counters if report is not None else {}).items():
-        totals[key] = totals.get(key, 0.0) + value
-
-
-@dataclass(kw_only=True)
 class InferenceSlot(WorkerSlot):
-    """An inference replica's place."""
+    """An inference replica."""
 
-    metrics: dict[str, float] = field(default_factory=dict)
-    lock_step: int = 0
-    """Worlds that are decided for together; 0: each for itself."""
+    def __init__(self, index: int, name: str) -> None:
+        super().__init__(name)
+        self.index = index
+        self.lock_step = 0
+        """Worlds that are decided for together; 0: each for itself."""
 
 
-class InferenceReplicas(ReplicaSet[InferenceSlot]):
+class InferenceReplicas(Replicas[InferenceSlot]):
     """The inference replicas of a run; rollout worker i asks replica i modulo their number.
 
     Args:
@@ -482,105 +416,76 @@ class InferenceReplicas(ReplicaSet[InferenceSlot]):
         moved: Callable[[int, Endpoint], None],
     ) -> None:
         names = numbered("inference", config.inference.workers)
-        super().__init__(config, [InferenceSlot(index=i, name=name) for i, name in enumerate(names)])
+        super().__init__(config, [InferenceSlot(index, name) for index, name in enumerate(names)])
         self._arguments = (config.policy, config.inference, version, state, load, timeline_folder(config))
         self._moved = moved
         self.restarts = 0
         """Restarts of all replicas since this engine began."""
-        self._trainer: Any = None
-        """Handle of the trainer; None: nothing is published yet."""
+        self.trainer: Any = None
+        """Handle of the trainer, once it publishes weights."""
 
     def open(self) -> list[Endpoint]:
         """Have all replicas serve, once they are ready; their endpoints."""
-        launch = self._config.launch
-        endpoints = [w.endpoint("decide", launch.transport, launch.stall_s) for w in self.workers()]
-        for slot in self._slots:
-            slot.worker.work, slot.since = slot.worker.actor.serve.remote(), time.monotonic()
-        return endpoints
-
-    def publishing(self, trainer: Any) -> list[Any]:
-        """Have replicas that come later join this trainer; handles of those that there are."""
-        self._trainer = trainer
-        return [worker.actor for worker in self.workers()]
+        return [self._serve(worker) for worker in self._all]
 
     def lock_step(self, in_turn: bool) -> None:
         """Have each replica decide for all its worlds together, or not any more."""
         rollout = self._config.rollout
-        clients = dealt(rollout.workers, len(self._slots))
-        for slot in self._slots:
-            slot.lock_step = clients[slot.index] * rollout.worlds if in_turn else 0
-            slot.worker.call("lock_step", slot.lock_step, timeout=self._config.launch.stall_s)
+        clients = dealt(rollout.workers, len(self._all))
+        for worker in self._all:
+            worker.lock_step = clients[worker.index] * rollout.worlds if in_turn else 0
+            worker.call("lock_step", worker.lock_step, timeout=self._launch.stall_s)
 
-    def ask(self) -> None:
-        """Ask each replica for its metrics, unless they are outstanding."""
-        for worker in self.workers():
-            worker.ask("metrics")
-
-    def listen(self) -> dict[str, float]:
-        """Pick up metrics; all replicas as one."""
-        for slot, metrics in self._answers():
-            slot.metrics = metrics
-        merged = merge_metrics([slot.metrics for slot in self._slots if slot.metrics])
+    def metrics(self) -> dict[str, float]:
+        """Last metrics, of all replicas as of one."""
+        merged = merge_metrics([worker.told for worker in self._all if worker.told])
         return merged | {"restarts": float(self.restarts)}
-
-    def check_hung(self) -> None:
-        """Restart replicas that do not answer."""
-        for slot in self._slots:
-            if (silent := slot.worker.silent_s()) > self._config.launch.stall_s:
-                self._restart(slot, RuntimeError(f"no answer for {silent:.0f} s"))
 
     def batching(self) -> BatcherStats:
         """Batches of all replicas so far."""
-        limit = self._config.launch.stall_s
-        return merge_stats([worker.call("batching", timeout=limit) for worker in self.workers()])
+        return merge_stats([worker.call("batching", timeout=self._launch.stall_s) for worker in self._all])
 
-    def _new(self, slot: InferenceSlot) -> ActorHandle:
+    def _new(self, worker: InferenceSlot) -> Any:
         from accerl_lerobot.inference.worker import InferenceWorker
 
-        options = actor_options(self._plan.places[slot.name])
+        options = actor_options(self._plan.places[worker.name])
         actor = ray.remote(InferenceWorker).options(**options, max_concurrency=1000)
-        return ActorHandle(slot.name, actor.remote(*self._arguments, slot.name))
+        return actor.remote(*self._arguments, worker.name)
 
-    def _restart(self, slot: InferenceSlot, error: Exception) -> None:
-        again: Exception | None = error
-        while again is not None:
-            self._end_process(slot, again)
-            if (node := self._plan.places[slot.name].node).key not in alive_nodes():
-                raise WorkerError(f"{slot.name} worker is lost: {node} has left:\n{again}") from again
+    def _restart(self, worker: InferenceSlot, error: Exception) -> None:
+        here, limit = self._plan.places[worker.name].node, self._launch.stall_s
+        while True:
+            worker.count_restart(error, self._launch.max_restarts)
+            worker.end(error)
+            if here.key not in alive_nodes():
+                raise WorkerError(f"{worker.name} worker is lost: {here} has left:\n{error}") from error
             self.restarts += 1
-            time.sleep(pause_s(slot.restarts - 1))
-            slot.worker, slot.metrics = self._new(slot), {}
-            again = self._come_up(slot)
-        logger.info("%s worker is up again", slot.name)
+            time.sleep(pause_s(worker.restarts - 1))
+            worker.occupy(self._new(worker))
+            try:  # to serve with the trainer's newest weights
+                worker.await_start(worker.actor.ready.remote(), max(START_S, limit), here.number == 0)
+                endpoint = self._serve(worker)
+                if worker.lock_step:
+                    worker.call("lock_step", worker.lock_step, timeout=limit)
+                if self.trainer is not None:
+                    self._await_weights(worker, endpoint)
+                break
+            except (RayError, TimeoutError, WorkerError) as again:
+                worker.since, error = math.inf, again
+        self._moved(worker.index, endpoint)
+        logger.info("%s worker is up again", worker.name)
 
-    def _come_up(self, slot: InferenceSlot) -> Exception | None:
-        """Wait until a new process serves with the trainer's newest weights, and tell its clients.
+    def _serve(self, worker: InferenceSlot) -> Endpoint:
+        endpoint = worker.endpoint("decide", self._launch.stall_s)
+        worker.work, worker.since = worker.actor.serve.remote(), time.monotonic()
+        return endpoint
 
-        Returns:
-            The error, if it fails or takes too long.
-        """
-        worker, launch = slot.worker, self._config.launch
-        here = self._plan.places[slot.name].node.number == 0
-        try:
-            worker.await_start(worker.actor.ready.remote(), max(START_S, launch.stall_s), here)
-            endpoint = worker.endpoint("decide", launch.transport, launch.stall_s)
-            worker.work = worker.actor.serve.remote()
-            if slot.lock_step:
-                worker.call("lock_step", slot.lock_step, timeout=launch.stall_s)
-            if self._trainer is not None:
-                self._await_weights(worker)
-        except (RayError, TimeoutError, WorkerError) as error:
-            return error
-        slot.since = time.monotonic()
-        self._moved(slot.index, endpoint)
-        return None
-
-    def _await_weights(self, worker: ActorHandle) -> None:
+    def _await_weights(self, worker: InferenceSlot, endpoint: Endpoint) -> None:
         """Wait until a new replica has weights as new as the trainer's were when it joined."""
-        limit = self._config.launch.stall_s
+        limit = self._launch.stall_s
         deadline = time.monotonic() + limit
         try:
-            newest = ray.get(self._trainer.join.remote(worker.actor), timeout=limit)
+            newest = ray.get(self.trainer.join.remote(endpoint), timeout=limit)
         except RayActorError as error:
             if isinstance(error, RayTaskError):  # the trainer says that the replica has died
                 raise

@@ -37,44 +37,16 @@ import yaml
 
 from accerl_lerobot import guardian
 from accerl_lerobot.algorithms import ChunkCriticConfig, OffPolicyConfig
-from accerl_lerobot.checkpoint.layout import (
-    CHECKPOINTS,
-    CONFIG,
-    DEMOS,
-    LAST,
-    PRETRAINED,
-    TRAINING_STATE,
-    go_back_to,
-    write_atomically,
-)
+from accerl_lerobot.checkpoint import layout
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.record import REPO_ID, record_demos
-from accerl_lerobot.engine import ray_session
+from accerl_lerobot.engine import ray_session, resuming
 from accerl_lerobot.engine.config import RunConfig, encode, parse, timeline_folder
-from accerl_lerobot.engine.loop import Engine, Loop, Outputs, Times, run_plans
-from accerl_lerobot.engine.preflight import (
-    check_machine,
-    check_placement,
-    check_policy,
-    check_start,
-    check_world,
-)
-from accerl_lerobot.engine.stopping import (
-    LOCK,
-    WARM_START,
-    Recovery,
-    StoppedError,
-    Stopping,
-    WorkerError,
-    checkpoint_of,
-    continued,
-    improving,
-    locked,
-    raise_if_stopped,
-    resume_command,
-    resumed_run,
-)
+from accerl_lerobot.engine.loop import Engine, Loop, Times, run_plans
+from accerl_lerobot.engine.preflight import check_placement, check_policy, check_start, check_world
+from accerl_lerobot.engine.sizes import check_memory
+from accerl_lerobot.engine.stopping import StoppedError, Stopping, WorkerError
 from accerl_lerobot.errors import InputError, check_absent, expanded, is_full, kept_traceback, make_folder
 from accerl_lerobot.evaluation import Rate, evaluation_plans
 from accerl_lerobot.experience import Observation, Request
@@ -84,6 +56,7 @@ from accerl_lerobot.rollout.runner import EpisodeResult
 from accerl_lerobot.timeline import RECOVERY, open_clock
 
 if TYPE_CHECKING:
+    from accerl_lerobot.demos.sft import SFTConfig
     from accerl_lerobot.engine.ray_session import RaySession
     from accerl_lerobot.policies.adapter import LeRobotAdapter
 
@@ -104,36 +77,33 @@ def make_output_dir(config: Any) -> Path:
 
 def discard_unused(directory: Path) -> None:
     """Remove the folder of a run that was refused before it did anything, so that its name is free again."""
-    if {path.name for path in directory.iterdir()} <= {CONFIG, LOCK}:
+    if {path.name for path in directory.iterdir()} <= {layout.CONFIG, resuming.LOCK}:
         shutil.rmtree(directory)
 
 
 def start(
     config: RunConfig, console: Console, recipe: Path | None = None, load: Load | None = None
 ) -> tuple[Path, dict[str, Any]]:
-    """Do a new run, or with ``config.resume`` the rest of the one whose config is `recipe`.
-
-    Raises:
-        InputError: the settings do not fit each other, the policy or the environment.
-        StoppedError: a signal has stopped it.
-    """
-    resumed = resumed_run(recipe, config) if config.resume else None
-    if load is None and resumed is None:
-        check_start(config)  # before there is a folder
-    directory = make_output_dir(config) if resumed is None else resumed.directory
+    """Do a new run, or with ``config.resume`` the rest of the one whose config is `recipe`."""
+    wanted = None
+    if config.resume:
+        directory, wanted = resuming.resumed_run(recipe, config)
+    else:
+        if load is None:
+            check_start(config)  # before there is a folder
+        directory = make_output_dir(config)
     console.say(f"run {directory}")
-    how = resume_command(directory)
+    how = resuming.resume_command(directory)
     guardian.explain(remedy=f"to resume: {how}")
     try:
         with (
             redirect_stdout(sys.stderr),
             kept_traceback(directory),
-            locked(directory, "config_path", "another process resumes it"),
+            resuming.locked(directory, "config_path", "another process resumes it"),
         ):
-            wanted = None if resumed is None else resumed.checkpoint
             return directory, execute(config, directory, console, wanted, load)
     except InputError:
-        if resumed is None:
+        if wanted is None:
             discard_unused(directory)
         raise
     except StoppedError:
@@ -141,7 +111,7 @@ def start(
     except BaseException as error:
         if is_full(error):
             console.say(f"the disk of {directory} is full; free some space, then {how}")
-        elif is_brief(error):
+        elif isinstance(error, WorkerError) and error.brief:
             console.say(f"{error}; to resume: {how}")
         else:
             verb = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
@@ -149,14 +119,9 @@ def start(
         raise
 
 
-def is_brief(error: BaseException) -> bool:
-    """True for the loss of a worker without a traceback of its own."""
-    return isinstance(error, WorkerError) and "\n" not in str(error)
-
-
 def play_evaluation(config: RunConfig, console: Console, filmed: int = 0) -> list[EpisodeResult]:
     """Play the evaluation episodes of a run with LeRobot's sampler, on seeds that are never trained on."""
-    check_machine(config)
+    check_memory(config)
     spec = check_world(config.env, config.rollout.reward_model)
     engine = make_engine(config, spec.tasks, check_policy(config, spec))
     with contextlib.closing(engine):
@@ -198,78 +163,76 @@ def demonstrations_of(config: RunConfig) -> DatasetConfig | None:
     if config.dataset.repo_id is not None:
         root = config.dataset.root
         return replace(config.dataset, root=None if root is None else str(Path(root).expanduser().absolute()))
-    own = None if config.output_dir is None else Path(config.output_dir).absolute() / DEMOS
+    own = None if config.output_dir is None else Path(config.output_dir).absolute() / layout.DEMOS
     if own is None or not own.is_dir():
         return None
     return replace(config.dataset, repo_id=REPO_ID, root=str(own))
 
 
-def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfig:
-    """Record demonstrations and run SFT where the config asks for it; set ``policy.path``."""
+def fine_tune(
+    sft: SFTConfig, dataset: DatasetConfig, directory: Path, seed: int, device: str, console: Console
+) -> Path:
+    """Run SFT in ``directory/sft`` and show its progress; the policy that comes of it."""
     from accerl_lerobot.demos.dataset_files import open_metadata, task_texts
     from accerl_lerobot.demos.sft import run_sft
+
+    texts = task_texts(open_metadata(dataset))
+    with console.stage("SFT", total=sft.steps) as stage:
+
+        def show(step: int, loss: float) -> None:
+            stage.update(step, f"loss {loss:.3f}")
+
+        return run_sft(sft, dataset, directory / "sft", seed, device, texts, on_step=show)
+
+
+def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfig:
+    """The run with its ``policy.path``, for which demonstrations are recorded and SFT is run if need be.
+
+    What has been done is not done again; what was stopped begins again.
+    """
     from accerl_lerobot.policies.loading import resolve_device
 
-    if not config.sft.steps:
-        remedy = "give a LeRobot checkpoint, or sft.steps > 0 to make one from demonstrations"
-        raise InputError("policy.path", None, remedy)
+    note = directory / resuming.WARM_START
+    if config.policy.path is not None:
+        return config
+    if note.is_file():
+        return resuming.improving(config, directory / json.loads(note.read_text())["policy"])
+    for name in (layout.DEMOS, f"{layout.DEMOS}.partial", "sft"):
+        shutil.rmtree(directory / name, ignore_errors=True)
     dataset = config.dataset
     if dataset.repo_id is None:
-        root = directory / DEMOS
+        root = str(directory / layout.DEMOS)
         with console.stage("demonstrations"):
-            record_demos(config.env, config.demos, str(root), config.seed)
-        dataset = replace(dataset, repo_id=REPO_ID, root=str(root))
-    meta = open_metadata(dataset)
-    with console.stage("SFT", total=config.sft.steps) as stage:
-        assert dataset.repo_id is not None
-        path = run_sft(
-            config.sft,
-            dataset,
-            directory / "sft",
-            config.seed,
-            str(resolve_device(config.policy.device)),
-            task_texts(meta),
-            on_step=lambda step, loss: stage.update(step, f"loss {loss:.3f}"),
-        )
-    return improving(config, path)
+            record_demos(config.env, config.demos, root, config.seed)
+        dataset = replace(dataset, repo_id=REPO_ID, root=root)
+    device = str(resolve_device(config.policy.device))
+    path = fine_tune(config.sft, dataset, directory, config.seed, device, console)
+    relative = Path(path).absolute().relative_to(directory.absolute())
+    layout.write_atomically(note, json.dumps({"policy": str(relative)}) + "\n")
+    return resuming.improving(config, path)
 
 
 def execute(
-    config: RunConfig,
-    directory: Path,
-    console: Console,
-    wanted: str | None = None,
-    load: Load | None = None,
+    config: RunConfig, directory: Path, console: Console, wanted: str | None = None, load: Load | None = None
 ) -> dict[str, Any]:
-    """Do all phases and return the summary, which is also in ``summary.json``.
-
-    Args:
-        directory: its folder; empty, if it is a new one.
-        wanted: the checkpoint to resume from, where the run has been begun before; see
-            `checkpoint.newest_whole`.
-        load: makes the policy's adapter, and may be given a path of its own; None: of LeRobot's checkpoint.
-
-    Raises:
-        InputError: the settings do not fit each other, or no checkpoint can be resumed from.
-        StoppedError: it was asked to stop, and has been saved.
-    """
+    """Do all phases and return the summary, which is also in ``summary.json``."""
     started = time.monotonic()
-    checkpoint = None if wanted is None else checkpoint_of(directory, wanted, console)
+    checkpoint = None if wanted is None else resuming.checkpoint_of(directory, wanted, console)
     if wanted is not None and checkpoint is None and load is None:
         check_start(config)
     text = yaml.safe_dump(encode(replace(config, resume=False)), sort_keys=False)
-    write_atomically(directory / CONFIG, text)
+    layout.write_atomically(directory / layout.CONFIG, text)
     spec = check_world(config.env)
     check_placement(replace(config, output_dir=str(directory)))
     if checkpoint is None:
-        _check_imagination(config, resuming=False)
-        config = _warm_started(config, directory, console)
+        _check_imagination(config, resumed=False)
+        config = warm_start(config, directory, console)
     else:
-        go_back_to(checkpoint)
-        config = continued(config, directory, checkpoint)
+        layout.go_back_to(checkpoint)
+        config = resuming.continued(config, directory, checkpoint)
         if load is None:
             check_start(config)
-        _check_imagination(config, resuming=True)
+        _check_imagination(config, resumed=True)
         console.say(f"going on from {checkpoint}")
     before_s = 0.0 if checkpoint is None else None
     config = replace(config, output_dir=str(directory))
@@ -282,61 +245,44 @@ def execute(
         if config.launch.engine != "local":
             ray_session.prepare(joins=config.launch.address is not None)
             session = stack.enter_context(contextlib.closing(ray_session.RaySession(config.launch)))
-        recovery = Recovery(config.launch.max_restarts)
+        recovery = resuming.Recovery(config.launch.max_restarts)
         while True:
             # A run, or what is left of it, by one set of workers.
             history = 1 if load is not None else check_policy(config, spec, own=True)
-            state = None if checkpoint is None else checkpoint / TRAINING_STATE
+            state = None if checkpoint is None else checkpoint / layout.TRAINING_STATE
             try:
                 try:
                     with console.stage("starting workers"), stop.at_once():
                         engine = make_engine(config, spec.tasks, history, state, load, session)
                 except KeyboardInterrupt:
-                    raise_if_stopped(stop, directory)
+                    resuming.raise_if_stopped(stop, directory)
                     raise
                 with contextlib.closing(engine):
-                    outputs = Outputs(directory, console, log)
-                    return Loop(config, outputs, engine, spec.tasks, times, stop).run(state)
+                    loop = Loop(config, directory, console, log, engine, spec.tasks, times, stop)
+                    return loop.run(state)
             except Exception as error:
                 lost = "" if session is None else session.lost  # whatever error that has led to
                 loss = WorkerError(lost) if lost else error
                 if not isinstance(loss, WorkerError):
                     raise
                 times.clock.enter(RECOVERY)
-                raise_if_stopped(stop, directory)
-                checkpoint = recovery.next(directory / CHECKPOINTS, console, loss, times.furthest)
-                raise_if_stopped(stop, directory)
-                go_back_to(checkpoint)
-                config = continued(config, directory, checkpoint)
+                resuming.raise_if_stopped(stop, directory)
+                checkpoint = recovery.next(directory / layout.CHECKPOINTS, console, loss, times.furthest)
+                resuming.raise_if_stopped(stop, directory)
+                layout.go_back_to(checkpoint)
+                config = resuming.continued(config, directory, checkpoint)
 
 
-def _warm_started(config: RunConfig, directory: Path, console: Console) -> RunConfig:
-    """Run the warm start, unless that has been done; one that was stopped begins again."""
-    note = directory / WARM_START
-    if config.policy.path is not None:
-        return config
-    if not note.is_file():
-        for name in (DEMOS, f"{DEMOS}.partial", "sft"):
-            shutil.rmtree(directory / name, ignore_errors=True)
-        warm = warm_start(config, directory, console)
-        path = Path(str(warm.policy.path)).absolute().relative_to(directory.absolute())
-        write_atomically(note, json.dumps({"policy": str(path)}) + "\n")
-        return warm
-    path = directory / json.loads(note.read_text())["policy"]
-    return improving(config, path)
+def _check_imagination(config: RunConfig, resumed: bool) -> None:
+    if not config.imagination.share:
+        return
+    from accerl_lerobot.engine.imagination import check_imagination
 
-
-def _check_imagination(config: RunConfig, resuming: bool) -> None:
-    if config.imagination.share:
-        from accerl_lerobot.engine.imagination import check_imagination
-
-        path = config.imagination.path
-        if resuming and path is not None and not Path(path).expanduser().is_dir():
-            remedy = (
-                "no such folder; the first world model of a run is not in its checkpoints: put a copy there"
-            )
-            raise InputError("imagination.path", path, remedy)
-        check_imagination(config)
+    path = config.imagination.path
+    if resumed and path is not None and not Path(path).expanduser().is_dir():
+        remedy = "no such folder; the first world model of a run is not in its checkpoints: put a copy there"
+        raise InputError("imagination.path", path, remedy)
+    check_imagination(config)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -419,7 +365,7 @@ def train(config: RunConfig) -> TrainResult:
 
 def resume(directory: str | Path, changes: Mapping[str, Any] | None = None) -> TrainResult:
     """Resumes a run that was stopped, from its last complete checkpoint."""
-    recipe = Path(directory) / CONFIG
+    recipe = Path(directory) / layout.CONFIG
     config = load_config(recipe, {**(changes or {}), "resume": True})
     return _result(*start(config, Console(), recipe))
 
@@ -439,7 +385,7 @@ def evaluate(
         revision: commit of `policy` on the Hub.
     """
     if policy is not None:
-        config = improving(config, policy)
+        config = resuming.improving(config, policy)
         config = replace(config, policy=replace(config.policy, revision=revision))
     if episodes is not None:
         config = replace(config, evaluation=replace(config.evaluation, episodes=episodes))
@@ -479,7 +425,7 @@ def _result(directory: Path, summary: dict[str, Any]) -> TrainResult:
         before = Rate(successes=round(summary["success_before"] * summary["n_before"]), n=summary["n_before"])
     return TrainResult(
         directory=directory,
-        policy=directory / CHECKPOINTS / LAST / PRETRAINED,
+        policy=directory / layout.CHECKPOINTS / layout.LAST / layout.PRETRAINED,
         before=before,
         after=Rate(successes=round(summary["success_after"] * summary["n_after"]), n=summary["n_after"]),
         summary=summary,

@@ -34,8 +34,7 @@ from accerl_lerobot.policies.config import Load, PolicyConfig, loader
 from accerl_lerobot.timeline import COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
 from accerl_lerobot.transport.contract import PendingRequest, Server, stopped
 from accerl_lerobot.transport.shared_memory import Address, SharedMemoryServer
-from accerl_lerobot.weights.publisher import monotonic_clock
-from accerl_lerobot.weights.shared_memory import Received, SharedMemoryReader
+from accerl_lerobot.transport.weights import WeightUpdate
 
 LOOK_S = 1.0
 """Longest wait of the serving thread before it checks whether it should end."""
@@ -79,12 +78,11 @@ class InferenceWorker:
         self._version = version
         if state is not None:
             self._adapter.load_trainable(snapshot.load(state / WEIGHTS))
-        self._received = -1
-        # Shared by two threads: appending and popping are atomic, and only the newest item is kept.
-        self._published: deque[Received] = deque(maxlen=1)
+        self._newest = -1
+        """Version of the last weights that were published to it."""
+        self._published: list[PendingRequest] = []
+        """Weights that have come since the last batch."""
         self._lock_step: deque[int] = deque(maxlen=1)
-        self._reader: SharedMemoryReader | None = None
-        self._broken: BaseException | None = None
         self._swap_s = self._publish_to_served_s = 0.0
         self._unserved_since: float | None = None
         self._failure: BaseException | None = None
@@ -104,43 +102,17 @@ class InferenceWorker:
         self._server = server = SharedMemoryServer(self._take, copy=False)
         return server.address
 
-    async def decide(self, requests: list[Request]) -> list[Decision]:
-        """Answer a client's requests, in order, as part of some batch.
+    async def decide(self, message: list[Request] | WeightUpdate) -> list[Decision] | None:
+        """Answer a client's requests, in order, as part of some batch; or use weights from the next batch on.
 
         Raises:
             ServiceStoppedError: `serve` has failed, before or after this call began.
         """
-        answer = self._server.call(requests)
+        answer = self._server.call(message)
         if self._failure is not None:  # after the call, as `serve` hands over once more when it fails
             raise stopped(self._failure)
-        decisions: list[Decision] = await asyncio.wrap_future(answer)
+        decisions: list[Decision] | None = await asyncio.wrap_future(answer)
         return decisions
-
-    async def receive_weights(self, version: int, tensors: dict[str, np.ndarray], published_s: float) -> int:
-        """Use a published set from the next batch on, if it is newer."""
-        published_s = monotonic_clock(published_s)
-        self._offer(Received(version=version, tensors=tensors, published_s=published_s))
-        return version
-
-    async def open_weights(self, address: str) -> bool:
-        """Receive weights through shared memory; False if that cannot be reached from here."""
-        try:
-            self._reader = SharedMemoryReader(address, deliver=self._offer, failed=self._break)
-        except OSError:
-            return False
-        return True
-
-    def _offer(self, received: Received) -> None:
-        if received.version > self._received:
-            self._received = received.version
-            self._published.append(received)
-            self._server.wake()
-        else:
-            received.release()
-
-    def _break(self, error: BaseException) -> None:
-        self._broken = error
-        self._server.wake()
 
     async def lock_step(self, observations: int) -> None:
         """See `Batcher.lock_step`."""
@@ -211,9 +183,8 @@ class InferenceWorker:
                     batch = []
         except BaseException as error:
             self._failure, self._iteration = error, None
-            if self._reader is not None:
-                self._reader.close()
             self._server.poll(0.0)
+            batch += self._published
             while waiting := batch or self._batcher.take(time.monotonic()):
                 for asked in waiting:
                     asked.fail(error)
@@ -222,6 +193,9 @@ class InferenceWorker:
             raise
 
     def _take(self, asked: PendingRequest) -> None:
+        if isinstance(asked.message, WeightUpdate):
+            self._published.append(asked)
+            return
         try:
             self._batcher.add(asked, asked.sent)
         except (TypeError, ValueError) as error:  # no list of requests, or an empty one
@@ -233,16 +207,21 @@ class InferenceWorker:
         return LOOK_S if deadline is None else max(0.0, deadline - time.monotonic())
 
     def _swap(self) -> None:
-        if self._broken is not None:
-            raise self._broken
-        if self._published:
+        """Use the newest weights that have come, if they are newer than those of now."""
+        if not self._published:
+            return
+        update: WeightUpdate = max((asked.message for asked in self._published), key=lambda u: u.version)
+        if update.version > self._newest:
             self._clock.enter(WEIGHT_SYNC)
-            received, started = self._published.popleft(), time.monotonic()
-            self._adapter.load_trainable(received.tensors)
-            received.release()
+            started = time.monotonic()
+            self._adapter.load_trainable(update.tensors)
             self._swap_s = time.monotonic() - started
-            self._version, self._unserved_since = received.version, received.published_s
+            self._newest = self._version = update.version
+            self._unserved_since = update.published_s
             fault_point("inference.swapped")
+        for asked in self._published:
+            asked.answer(None)
+        self._published.clear()
 
     def _serve_batch(self, batch: list[PendingRequest]) -> None:
         batch = [asked for asked in batch if not asked.gone]
@@ -257,7 +236,8 @@ class InferenceWorker:
         self._busy_s += now - started
         self._clock.enter(TRANSPORT)
         if self._unserved_since is not None:
-            self._publish_to_served_s, self._unserved_since = now - self._unserved_since, None
+            self._publish_to_served_s = max(0.0, time.time() - self._unserved_since)
+            self._unserved_since = None
         start = 0
         for asked in batch:
             asked.answer(decisions[start : start + len(asked)])

@@ -14,7 +14,7 @@ import yaml
 
 from accerl_lerobot.checkpoint.layout import SUMMARY
 from accerl_lerobot.console import count, duration, number, percent, rate
-from accerl_lerobot.engine.preflight import lag_limits
+from accerl_lerobot.engine.sizes import lag_limits
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.report.charts import COLOURS, Chart, Series, line, rates
 from accerl_lerobot.report.read import Record, Run, apart, column, differences, newest, resolved

@@ -27,9 +27,13 @@ from accerl_lerobot.replay.pacing import ASYNCHRONOUS, Schedule
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
 from accerl_lerobot.trainer.batch import keeping
 from accerl_lerobot.trainer.peers import Learner, LearnerSettings, Peers
-from accerl_lerobot.transport.endpoint import Transport
-from accerl_lerobot.weights.factory import CONNECT_S, WeightPublisher, make_publisher
-from accerl_lerobot.weights.publisher import PublishDelay
+from accerl_lerobot.transport.endpoint import Endpoint
+from accerl_lerobot.transport.weights import PublishDelay, WeightPublisher
+
+FIRST_S = 120.0
+"""Timeout for the first weights to be published."""
+RESEND_S = 0.2
+"""Interval at which replicas that were busy get the newest weights while the trainer waits for a batch."""
 
 
 class TrainerWorker:
@@ -65,14 +69,15 @@ class TrainerWorker:
         """Answers once the policy is loaded; returns this process's id."""
         return os.getpid()
 
-    def run(self, replay: Any, readers: list[Any], transport: Transport = "auto") -> int:
+    def run(self, replay: Any, readers: list[Endpoint]) -> int:
         """Trains; returns the number of updates made."""
         self._clock.enter(WEIGHT_SYNC)
-        publisher = make_publisher(readers, transport)
+        publisher = WeightPublisher(readers)
         try:
             # A checkpoint need not hold a critic: all start from this one.
             with self._lock:
-                self._hand_over(publisher, self._update.version, self._view())
+                first = self._export() if self._config.hold_back else self._view()
+                self._hand_over(publisher, self._update.version, first)
             self._publisher = publisher
             self._publishing.set()
             self._train(replay, publisher)
@@ -85,8 +90,8 @@ class TrainerWorker:
             self._clock.enter(WAIT_IN)
         return self._update.version
 
-    def join(self, reader: Any) -> int:
-        """Has another reader receive the weights, once `run` publishes any.
+    def join(self, reader: Endpoint) -> int:
+        """Has another replica receive the weights, once `run` publishes any.
 
         Returns:
             The newest version that has been published: it gets no older one.
@@ -94,12 +99,12 @@ class TrainerWorker:
         Raises:
             TimeoutError: none has been.
         """
-        if not self._publishing.wait(2 * CONNECT_S):
-            raise TimeoutError(f"the trainer has published no weights for {2 * CONNECT_S:g} s")
+        if not self._publishing.wait(FIRST_S):
+            raise TimeoutError(f"the trainer has published no weights for {FIRST_S:g} s")
         assert self._publisher is not None
-        newest = self._handed_over
-        self._publisher.add(reader)
-        return newest
+        with self._lock:  # the newest set is sent from where it was published from
+            self._publisher.add(reader)
+            return self._handed_over
 
     def _train(self, replay: Any, publisher: WeightPublisher) -> None:
         """Makes the updates."""
@@ -109,7 +114,8 @@ class TrainerWorker:
         asked = time.monotonic()
         while self._update.version < config.updates:
             self._clock.enter(WAIT_IN)
-            ray.wait([upcoming])
+            while not ray.wait([upcoming], timeout=RESEND_S)[0]:
+                publisher.resend()
             self._clock.enter(TRANSPORT)
             batch, segments = upcoming, ray.get(upcoming)
             if not segments:

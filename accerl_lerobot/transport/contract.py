@@ -30,13 +30,7 @@ class ServiceStoppedError(RuntimeError):
 
 
 class Client(ABC):
-    """One connection to a service, for one thread at a time.
-
-    Example:
-        >>> first, second = inference.send([request]), inference.send([another])
-        >>> inference.done(timeout=0.5)  # as they come
-        [(1, [Decision(...)])]
-    """
+    """One connection to a service, for one thread at a time."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -44,9 +38,6 @@ class Client(ABC):
     @abstractmethod
     def send(self, message: Any) -> int:
         """Send a message without waiting for its reply.
-
-        Returns:
-            The ticket of the reply.
 
         Raises:
             ServiceStoppedError: the service is gone.
@@ -67,11 +58,7 @@ class Client(ABC):
         """End the connection and forget what is under way. Safe to call twice."""
 
     def ask(self, messages: Sequence[Any], timeout: float) -> list[Any]:
-        """Send messages and wait for all replies; nothing else may be under way.
-
-        Raises:
-            TimeoutError: some have not come; the connection is of no use any more.
-        """
+        """Send messages and wait for all replies; nothing else may be under way."""
         under_way: dict[int, int] = {}
         """Ticket → index of the message."""
         replies: dict[int, Any] = {}
@@ -88,61 +75,47 @@ class Client(ABC):
         return [replies[index] for index in range(len(messages))]
 
 
-class PendingRequest(ABC):
-    """A message at the service; answered or failed once, on the thread that polls."""
+class PendingRequest:
+    """A message at the service; answered or failed once, on the thread that polls.
 
-    message: Any
-    """In shared memory, its arrays are only valid until the answer; see `decode`."""
-    sent: float
-    """On `time.monotonic`, which all processes of a node share."""
+    Args:
+        sent: on `time.monotonic`, which all processes of a node share.
+        gone: True once the answer is not awaited any more.
+        reply: sends a reply, or the error in its place.
+    """
+
+    def __init__(
+        self,
+        message: Any,
+        sent: float,
+        gone: Callable[[], bool],
+        reply: Callable[[Any, BaseException | None], None],
+    ) -> None:
+        self.message, self.sent = message, sent
+        self._gone, self._reply = gone, reply
 
     @property
-    @abstractmethod
     def gone(self) -> bool:
         """True if the answer is not awaited any more."""
+        return self._gone()
 
-    @abstractmethod
     def answer(self, reply: Any) -> None:
-        """Send the reply, unless it is not awaited any more."""
+        """Send the reply. In shared memory, the message's arrays are valid until then; see `decode`."""
+        if not self.gone:
+            self._reply(reply, None)
 
-    @abstractmethod
     def fail(self, error: BaseException) -> None:
         """Raise a `ServiceStoppedError` that names this error at the client."""
+        if not self.gone:
+            self._reply(None, error)
 
     def __len__(self) -> int:
         """Length of the message, where that is a list."""
         return len(self.message)
 
 
-class LocalRequest(PendingRequest):
-    """A message from another thread of this process, as Ray's calls are."""
-
-    def __init__(self, message: Any) -> None:
-        self.message, self.sent = message, time.monotonic()
-        self.future: Future[Any] = Future()
-
-    @property
-    def gone(self) -> bool:
-        return self.future.cancelled()
-
-    def answer(self, reply: Any) -> None:
-        if self.future.set_running_or_notify_cancel():
-            self.future.set_result(reply)
-
-    def fail(self, error: BaseException) -> None:
-        if self.future.set_running_or_notify_cancel():
-            self.future.set_exception(stopped(error))
-
-
 class Server:
     """A service for threads of its own process; transports add those of other processes.
-
-    Example:
-        >>> server = Server(lambda request: request.answer(len(request.message)))
-        >>> reply = server.call("four")   # on any thread
-        >>> server.poll(timeout=1.0)      # on the one that serves: hands it to the function above
-        >>> reply.result(timeout=1.0)
-        4
 
     Args:
         take: gets every message, on the thread that polls; answers then or later.
@@ -150,15 +123,24 @@ class Server:
 
     def __init__(self, take: Callable[[PendingRequest], None]) -> None:
         self._take = take
-        self._called: deque[LocalRequest] = deque()
+        self._called: deque[PendingRequest] = deque()
         self._woken = threading.Event()
 
     def call(self, message: Any) -> Future[Any]:
         """Ask from another thread of this process."""
-        request = LocalRequest(message)
-        self._called.append(request)
+        future: Future[Any] = Future()
+
+        def reply(value: Any, error: BaseException | None) -> None:
+            if not future.set_running_or_notify_cancel():
+                return
+            if error is None:
+                future.set_result(value)
+            else:
+                future.set_exception(stopped(error))
+
+        self._called.append(PendingRequest(message, time.monotonic(), future.cancelled, reply))
         self.wake()
-        return request.future
+        return future
 
     def wake(self) -> None:
         """Make the current or next `poll` return at once; from any thread."""

@@ -7,23 +7,15 @@ import threading
 import time
 from collections import deque
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 from accerl_lerobot.transport.contract import Client, ServiceStoppedError
-from accerl_lerobot.transport.memfd import available
-from accerl_lerobot.transport.shared_memory import Address, SharedMemoryClient, this_node
-
-Transport = Literal["auto", "ray"]
+from accerl_lerobot.transport.shared_memory import Address, SharedMemoryClient, available, this_node
 
 
 @dataclass(frozen=True, kw_only=True)
 class Endpoint:
-    """Address of a service, which a worker needs in order to call it.
-
-    Example:
-        >>> inference = Endpoint(name="inference", method=actor.decide, address=address)
-        >>> client = inference.connect()  # in the process that calls
-    """
+    """Address of a service, which a worker needs in order to call it."""
 
     name: str
     """Name of the service, for messages."""
@@ -31,17 +23,20 @@ class Endpoint:
     """Method of its Ray actor handle."""
     address: Address | None = None
     """Address of its shared memory; None: it can only be reached through Ray."""
+    actor: Any = None
+    """Ray's handle of its process."""
+
+    def kill(self) -> None:
+        """End its process."""
+        import ray
+
+        ray.kill(self.actor)
 
     def connect(self) -> Client:
         """Open a connection for this process."""
         if self.address is not None and available() and self.address.node == this_node():
             return SharedMemoryClient(self.name, self.address)
         return RayClient(self.name, self.method)
-
-
-def uses_shared_memory(transport: Transport) -> bool:
-    """True if services are to offer shared memory."""
-    return transport != "ray" and available()
 
 
 class RayClient(Client):
@@ -87,15 +82,6 @@ class ReconnectingClient(Client):
     For services without a state of their own: a request for a decision carries its noise, and the decision
     the version of its weights. While the service is away no replies come and nothing fails; the engine
     restarts it and says where it is. Messages must not change until they are answered.
-
-    Example:
-        >>> client = ReconnectingClient("inference")
-        >>> client.move(endpoint)      # on any thread; again whenever the service has been restarted
-        >>> ticket = client.send([request])
-        >>> client.done(timeout=0.5)   # empty while the service is away
-        []
-        >>> client.away_s  # since it was lost
-        0.5
     """
 
     def __init__(self, name: str) -> None:

@@ -6,46 +6,143 @@
 
 Tokens go through a Unix socket (SOCK_SEQPACKET); a slot's file descriptor goes with its first token. A
 message or reply that is too large for its slot replaces the slot by a larger one. When a process dies the
-kernel closes its socket, which the other end sees at once. Nothing has a name in a file system, see `memfd`.
+kernel closes its socket, which the other end sees at once.
+
+Memory is a memfd and a socket's name is in Linux's abstract namespace, so a process that is killed leaves
+neither behind. Other users could see a socket's name and connect; each end asks the kernel whose process the
+other one is and talks to its own user only.
 """
 
 from __future__ import annotations
 
 import asyncio
+import functools
 import logging
+import mmap
 import os
+import secrets
 import select
 import socket
+import struct
 import time
 from collections.abc import Awaitable, Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from accerl_lerobot.transport.codec import DamagedMessageError, decode, encode
-from accerl_lerobot.transport.contract import Client, PendingRequest, Server, ServiceStoppedError
-from accerl_lerobot.transport.memfd import (
-    ANSWER,
-    ASK,
-    FAIL,
-    LEAST,
-    SLOTS,
-    DamagedTokenError,
-    Slot,
-    Token,
-    aligned,
-    listening,
-    new_name,
-    new_slot,
-    new_socket,
-    receive_token,
-    same_user,
-    send_token,
-)
+from accerl_lerobot.transport.codec import aligned, decode, encode
+from accerl_lerobot.transport.contract import Client, PendingRequest, Server, ServiceStoppedError, stopped
 
 logger = logging.getLogger(__name__)
 
 CONNECT_S = 30.0
 """Timeout for connecting to a service."""
+LEAST = 2**16
+"""Bytes of a slot at least; the reply is written behind the message."""
+SLOTS = 64
+"""Slots of one client at most, and so messages that it may have under way. Their tokens fit into the buffers
+of the two sockets, so no end ever waits for the other one to read."""
+_TOKEN = struct.Struct("<BIQQQd")
+ASK, ANSWER, FAIL = range(3)
+"""Purpose of a token."""
+
+
+@functools.cache
+def available() -> bool:
+    """True if this system has memfd, epoll and eventfd."""
+    try:
+        os.close(new_memory(1))
+        select.epoll().close()
+        os.close(os.eventfd(0))
+    except (AttributeError, OSError):
+        return False
+    return True
+
+
+def new_memory(size: int) -> int:
+    """Shared memory, as a file descriptor."""
+    file = os.memfd_create("accerl", os.MFD_CLOEXEC)
+    os.ftruncate(file, size)
+    return file
+
+
+def new_name() -> str:
+    """A socket name that nobody can guess."""
+    return f"accerl-{secrets.token_hex(16)}"
+
+
+def new_socket() -> socket.socket:
+    """A socket whose messages keep their borders and order, and can carry file descriptors."""
+    return socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+
+
+def listening(name: str, backlog: int) -> socket.socket:
+    """A socket that others connect to by this name."""
+    listener = new_socket()
+    listener.bind(f"\0{name}")
+    listener.listen(backlog)
+    return listener
+
+
+def same_user(connection: socket.socket) -> bool:
+    """True if the process at the other end belongs to this user."""
+    size = struct.calcsize("3i")
+    _, user, _ = struct.unpack("3i", connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, size))
+    return bool(user == os.getuid())
+
+
+class Token(NamedTuple):
+    """Message on the socket. A file descriptor goes with it where the slot is new or has been replaced."""
+
+    purpose: int
+    slot: int
+    ticket: int
+    start: int
+    """First byte of the message in the slot."""
+    size: int
+    """Bytes of the message."""
+    sent: float
+    """On `time.monotonic`."""
+
+
+class Slot:
+    """Mapped shared memory of a fixed size, which lasts as long as something refers to it or a view of it.
+
+    Args:
+        file: descriptor, which can be closed afterwards.
+    """
+
+    def __init__(self, file: int) -> None:
+        self.size = os.fstat(file).st_size
+        self.memory = mmap.mmap(file, self.size)
+
+
+def new_slot(size: int) -> int:
+    """Shared memory for at least `size` bytes; what is not written to takes none."""
+    return new_memory(max(LEAST, 1 << (size - 1).bit_length()))
+
+
+def send_token(connection: socket.socket, token: Token, file: int | None = None) -> None:
+    """Send a token; a file descriptor goes with it and is closed here."""
+    if file is None:
+        connection.send(_TOKEN.pack(*token))
+        return
+    try:
+        socket.send_fds(connection, [_TOKEN.pack(*token)], [file])
+    finally:
+        os.close(file)
+
+
+def receive_token(connection: socket.socket) -> tuple[Token, Slot | None] | None:
+    """The next token, and the slot that came with it; None if the other end is gone."""
+    packet, files, _, _ = socket.recv_fds(connection, _TOKEN.size, 1, socket.MSG_CMSG_CLOEXEC)
+    if not packet:
+        return None
+    slot = None
+    if files:
+        slot = Slot(files[0])
+        os.close(files[0])
+    return Token._make(_TOKEN.unpack(packet)), slot
 
 
 class Address(NamedTuple):
@@ -108,7 +205,7 @@ class SharedMemoryClient(Client):
                 replies.append(self._read(*received))
                 if not self._under_way:
                     break
-        except (OSError, DamagedTokenError, DamagedMessageError) as error:
+        except OSError as error:
             raise self._gone(error) from error
         return replies
 
@@ -118,13 +215,11 @@ class SharedMemoryClient(Client):
 
     def _read(self, token: Token, slot: Slot | None) -> tuple[int, object]:
         """Copy a reply out, which frees its slot."""
-        index = self._under_way.pop(token.ticket, -1)
-        if index != token.slot:
-            raise self._gone(f"a reply to message {token.ticket}, which was not asked")
+        index = self._under_way.pop(token.ticket)
         if slot is not None:
             self._slots[index] = slot
         self._free.append(index)
-        reply = decode(self._slots[index].memory, token.start, token.size)
+        reply = decode(self._slots[index].memory, token.start)
         if token.purpose == FAIL:
             raise ServiceStoppedError(f"{self.name}: {reply}")
         return token.ticket, reply
@@ -220,19 +315,17 @@ class SharedMemoryServer(Server):
         self._epoll.register(end, select.EPOLLIN)
 
     def _receive(self, connection: _Connection) -> list[PendingRequest]:
-        """The client's next message; empty if it is gone, or has sent what no client sends."""
+        """The client's next message; empty if there is none, or it is gone."""
         try:
             received = receive_token(connection.socket)
-            if received is not None:
-                return connection.take(*received, self._copy)
         except BlockingIOError:
             return []
         except ConnectionError:
-            pass
-        except DamagedTokenError as error:
-            logger.warning("a client was dropped: %s", error)
-        self._drop(connection)
-        return []
+            received = None
+        if received is None:
+            self._drop(connection)
+            return []
+        return [connection.take(*received, self._copy)]
 
     def _drop(self, connection: _Connection) -> None:
         """Forget a client; its slots go with the last view of them."""
@@ -250,58 +343,29 @@ class _Connection:
         self.socket, self._drop = end, drop
         self.closed = False
         self.slots: dict[int, Slot] = {}
-        self._busy: set[int] = set()
 
-    def take(self, token: Token, slot: Slot | None, copy: bool) -> list[PendingRequest]:
-        """The message of a token; empty if it was answered here because it cannot be read."""
-        if slot is not None and token.slot < SLOTS and token.slot not in self._busy:
+    def take(self, token: Token, slot: Slot | None, copy: bool) -> PendingRequest:
+        """The message of a token."""
+        if slot is not None:
             self.slots[token.slot] = slot
-        known = token.purpose == ASK and token.slot in self.slots and token.slot not in self._busy
-        if not known or token.start + token.size > self.slots[token.slot].size:
-            raise DamagedTokenError(f"a token that makes no sense: {token}")
-        self._busy.add(token.slot)
-        request = _RemoteRequest(self, token)
-        try:
-            request.message = decode(self.slots[token.slot].memory, token.start, token.size, copy=copy)
-        except DamagedMessageError as error:
-            request.fail(error)
-            return []
-        return [request]
+        message = decode(self.slots[token.slot].memory, token.start, copy=copy)
+        sent = min(token.sent, time.monotonic())
+        return PendingRequest(message, sent, lambda: self.closed, partial(self._reply, token))
 
-    def reply(self, purpose: int, asked: Token, reply: object) -> None:
+    def _reply(self, asked: Token, reply: object, error: BaseException | None) -> None:
         """Write it behind the message, whose arrays it may consist of, or into a larger slot."""
-        encoded = encode(reply)
+        purpose = ANSWER if error is None else FAIL
+        encoded = encode(reply if error is None else str(stopped(error)))
         start, file = aligned(asked.start + asked.size), None
         if start + encoded.size > self.slots[asked.slot].size:
             file = new_slot(start + encoded.size)
             self.slots[asked.slot], start = Slot(file), 0
         encoded.write(self.slots[asked.slot].memory, start)
-        self._busy.discard(asked.slot)
         token = Token(purpose, asked.slot, asked.ticket, start, encoded.size, asked.sent)
         try:
             send_token(self.socket, token, file)
         except OSError:  # it has died, or does not read although it may have few messages under way
             self._drop(self)
-
-
-class _RemoteRequest(PendingRequest):
-    """A message from another process."""
-
-    def __init__(self, connection: _Connection, token: Token) -> None:
-        self._connection, self._token = connection, token
-        self.sent = min(token.sent, time.monotonic())
-
-    @property
-    def gone(self) -> bool:
-        return self._connection.closed
-
-    def answer(self, reply: object) -> None:
-        if not self.gone:
-            self._connection.reply(ANSWER, self._token, reply)
-
-    def fail(self, error: BaseException) -> None:
-        if not self.gone:
-            self._connection.reply(FAIL, self._token, f"the service has stopped: {error!r}")
 
 
 def serve_on_loop(answer: Callable[[Any], Awaitable[Any]]) -> SharedMemoryServer:

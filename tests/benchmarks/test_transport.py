@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from accerl_lerobot.transport.memfd import available
+from accerl_lerobot.transport.shared_memory import available
 from benchmarks.transport import (
     ARMS,
     FLOORS,

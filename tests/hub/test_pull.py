@@ -12,7 +12,6 @@ import pytest
 
 from accerl_lerobot import cli
 from accerl_lerobot.checkpoint.layout import defect, write_manifest
-from accerl_lerobot.cli import doctor
 from accerl_lerobot.hub import errors
 from accerl_lerobot.hub.card import MANIFEST
 from tests.hub.folders import write_policy_folder, write_run_folder
@@ -375,9 +374,7 @@ def test_no_run_that_was_pulled_lets_code_run(
         text = (tmp_path / "pulled" / name).read_text()
         assert "isaaclab_arena" in text and not any(w in text for w in ("trust", "hub_path", "them:6379"))
     assert defect(tmp_path / "pulled" / "checkpoints" / "000012") is None
-    doctor.main([str(tmp_path / "pulled" / "config.yaml"), "--policy.path=null"])
-    said = capsys.readouterr().out
-    assert "warn  pulled     without 'env.trust_remote_code', 'env.kwargs.hub_path', 'launch.ad" in said
+    capsys.readouterr()
     for verb in (["train", "--resume=true"], ["eval"], ["doctor"]):
         assert cli.main([*verb, f"--config_path={run / 'config.yaml'}"]) in (1, 2)
         assert "a file cannot allow this, only the command line can" in "".join(capsys.readouterr())

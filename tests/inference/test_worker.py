@@ -18,8 +18,8 @@ from accerl_lerobot.inference.worker import InferenceConfig, InferenceWorker
 from accerl_lerobot.policies import loading
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.transport.contract import ServiceStoppedError
-from accerl_lerobot.weights import shared_memory
-from accerl_lerobot.weights.shared_memory import SharedMemoryPublisher
+from accerl_lerobot.transport.endpoint import Endpoint
+from accerl_lerobot.transport.weights import WeightPublisher, WeightUpdate
 from tests.runs import HANGS_S
 
 NAMES = ("a", "b", "c")
@@ -88,6 +88,10 @@ def requests(*seeds: int) -> list[Request]:
 
 def weights(version: int) -> dict[str, np.ndarray]:
     return {name: np.array(float(version)) for name in NAMES}
+
+
+def update(version: int) -> WeightUpdate:
+    return WeightUpdate(version, time.time(), weights(version))
 
 
 Scene = Callable[[InferenceWorker, CountingAdapter], Awaitable[Any]]
@@ -161,7 +165,7 @@ def test_no_batch_sees_two_versions(play):
             for version in range(1, last + 1):
                 while len(adapter.batches) < version:
                     await asyncio.sleep(0.0002)
-                await worker.receive_weights(version, weights(version), time.time())
+                await worker.decide(update(version))
 
         async def ask(first: int) -> list[Decision]:
             answers = []
@@ -183,9 +187,8 @@ def test_no_batch_sees_two_versions(play):
 def test_weights_that_arrive_while_nobody_asks_are_loaded(play):
     async def scene(worker, adapter):
         await asyncio.sleep(0.01)
-        await worker.receive_weights(3, weights(3), time.time())
-        while adapter.loaded != [3]:
-            await asyncio.sleep(0.001)
+        await worker.decide(update(3))
+        assert adapter.loaded == [3]
         (decision,) = await worker.decide(requests(0))
         assert decision.version == 3 and set(decision.chunk.ravel()) == {3.0}
         assert (await worker.metrics())["version"] == 3
@@ -195,10 +198,10 @@ def test_weights_that_arrive_while_nobody_asks_are_loaded(play):
 
 def test_older_weights_are_ignored_even_while_newer_ones_are_loaded(play):
     async def scene(worker, adapter):
-        await worker.receive_weights(4, weights(4), time.time())
+        newer = asyncio.create_task(worker.decide(update(4)))
         while not adapter.entered.is_set():
             await asyncio.sleep(0.0005)
-        await worker.receive_weights(3, weights(3), time.time())  # version 4 is being written just now
+        await asyncio.gather(newer, worker.decide(update(3)))  # version 4 is being written just now
         versions = [(await worker.decide(requests(i)))[0].version for i in range(3)]
         assert versions == [4, 4, 4] and adapter.loaded == [4]
 
@@ -212,9 +215,8 @@ def test_a_failure_reaches_everyone_who_waits_and_everyone_after(play, weights_t
     async def scene(worker, adapter):
         # A batch holds one request, so that of those who wait only one is in the batch that fails.
         adapter.broken = ValueError("no such weights")
-        if weights_too:
-            await worker.receive_weights(1, weights(1), time.monotonic())
-        calls = [worker.decide(requests(i)) for i in range(5)]
+        calls = [worker.decide(update(1))] if weights_too else []
+        calls += [worker.decide(requests(i)) for i in range(5)]
         answers = await asyncio.gather(*calls, return_exceptions=True)
         assert all(isinstance(a, ServiceStoppedError) for a in answers), answers
         assert "no such weights" in str(answers[-1])
@@ -231,7 +233,7 @@ def test_weights_that_cannot_be_loaded_are_heard_of_by_those_who_wait_for_a_batc
         while len(worker._batcher) < 2:
             await asyncio.sleep(0.001)
         adapter.broken = ValueError("no such weights")
-        await worker.receive_weights(1, weights(1), 0.0)
+        waiting.append(worker.decide(update(1)))
         answers = await asyncio.gather(*waiting, return_exceptions=True)
         assert all(isinstance(a, ServiceStoppedError) and "no such weights" in str(a) for a in answers)
 
@@ -271,12 +273,22 @@ def test_a_caller_who_gave_up_does_not_disturb_the_others(play):
     play(scene, adapter, max_batch=2, max_wait_s=1.0)
 
 
-def test_weights_through_shared_memory_are_swapped_in_and_let_go_of(play):
-    publisher = SharedMemoryPublisher(1)
+class Near(Endpoint):
+    """A replica of this process, reached through shared memory; notes that it was ended."""
 
+    ended = False
+
+    def kill(self) -> None:
+        object.__setattr__(self, "ended", True)
+
+
+async def near(worker: InferenceWorker) -> Near:
+    return Near(name="inference", method=None, address=await worker.listen())
+
+
+def test_weights_through_shared_memory_are_swapped_in_and_let_go_of(play):
     async def scene(worker, adapter):
-        assert not await worker.open_weights("accerl-weights-nobody")
-        assert await worker.open_weights(publisher.address)
+        publisher = WeightPublisher([await near(worker)])
         for version in range(30):
             publisher.publish(version, weights(version))
             await asyncio.to_thread(publisher.flush, HANGS_S)  # applied, though nobody has asked
@@ -284,48 +296,23 @@ def test_weights_through_shared_memory_are_swapped_in_and_let_go_of(play):
             assert decision.version == version and set(decision.chunk.ravel()) == {version}
         metrics = await worker.metrics()
         assert metrics["publish_to_served_s"] >= metrics["swap_s"] > 0
+        publisher.close()
 
     play(scene, max_batch=1, max_wait_s=0.0)
-    publisher.close()
-
-
-def test_a_torn_set_ends_the_service_and_is_never_served(play, monkeypatch: pytest.MonkeyPatch):
-    publisher = SharedMemoryPublisher(1)
-    right = shared_memory.digest
-
-    def wrong(*of: Any) -> bytes:
-        return bytes(16) if threading.current_thread().name == "publisher" else right(*of)
-
-    monkeypatch.setattr(shared_memory, "digest", wrong)
-
-    async def scene(worker, adapter):
-        assert await worker.open_weights(publisher.address)
-        publisher.publish(1, weights(1))
-        with pytest.raises(ServiceStoppedError, match="version 1 are not what their digest says"):
-            while True:
-                (decision,) = await worker.decide(requests(0))
-                assert decision.version == 0
-        assert adapter.loaded == []
-        await asyncio.to_thread(publisher.flush, HANGS_S)  # it is a reader no more
-
-    play(scene, max_batch=1, max_wait_s=0.0)
-    publisher.close()
 
 
 def test_a_service_that_fails_is_let_go_of_by_the_trainer(play):
-    publisher = SharedMemoryPublisher(1)
-
     async def scene(worker, adapter):
-        assert await worker.open_weights(publisher.address)
+        endpoint = await near(worker)
+        publisher = WeightPublisher([endpoint])
         adapter.broken = ValueError("no such weights")
         publisher.publish(1, weights(1))
         await asyncio.to_thread(publisher.flush, HANGS_S)
-        assert publisher._readers == []
+        assert endpoint.ended
         with pytest.raises(ServiceStoppedError, match="no such weights"):
             await worker.decide(requests(0))
 
     play(scene, max_batch=1)
-    publisher.close()
 
 
 def test_a_service_that_hangs_is_silent(play, monkeypatch: pytest.MonkeyPatch):

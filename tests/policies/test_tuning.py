@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import pickle
-import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,10 +17,12 @@ from accerl_lerobot.policies.adapter import LeRobotAdapter, stack_observations
 from accerl_lerobot.policies.config import PolicyConfig, TuningConfig
 from accerl_lerobot.policies.saving import save_pretrained
 from accerl_lerobot.testing import check_ratio_one, log_ratio, perturb, stored
-from accerl_lerobot.weights.shared_memory import Received, SharedMemoryPublisher, SharedMemoryReader
+from accerl_lerobot.transport.codec import encode
+from accerl_lerobot.transport.weights import WeightPublisher, WeightUpdate
 from tests.policies.cases import CASES
 from tests.policies.tiny import adapter_at, requests
 from tests.rounding import assert_close
+from tests.transport.played import played
 
 BACKBONES = {
     "smolvla": "model.vlm_with_expert.vlm.",
@@ -140,20 +141,16 @@ def test_only_what_is_trained_travels_and_is_copied_once(path: Path):
     ]
     assert sizes[0] < 0.2 * sizes[1]
     assert all(views[k].ctypes.data == p.data_ptr() for k, p in parameters.items()), "their own memory"
-    publisher, arrived = SharedMemoryPublisher(1), threading.Event()
+    arrived: list[int] = []
 
-    def apply(received: Received) -> None:
-        assert received.tensors.keys() == parameters.keys()
-        assert received.nbytes < 64 * len(views) + sum(p.numel() * 4 for p in parameters.values())
-        reader.load_trainable(received.tensors)
-        arrived.set()
-        received.release()
+    def apply(update: WeightUpdate) -> None:
+        assert update.tensors.keys() == parameters.keys()
+        arrived.append(encode(update).size)
+        reader.load_trainable(update.tensors)
 
-    SharedMemoryReader(publisher.address, apply, lambda error: None)
     perturb(trainer, 0.3)
-    publisher.publish(1, trainer.view_trainable())
-    publisher.flush(60)
-    publisher.close()
-    assert arrived.is_set()
+    WeightPublisher([played(apply)]).publish(1, trainer.view_trainable())
+    assert len(arrived) == 1
+    assert arrived[0] < 256 * len(views) + sum(p.numel() * 4 for p in parameters.values())
     assert pickle.dumps(reader.decide(asked, 0)) == pickle.dumps(trainer.decide(asked, 0))
     assert not np.array_equal(reader.decide(asked, 0)[0].chunk, adapter_at(path).decide(asked, 0)[0].chunk)

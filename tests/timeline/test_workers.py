@@ -21,10 +21,11 @@ from accerl_lerobot.timeline.read import read_timeline
 from accerl_lerobot.trainer import worker as trainer
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.peers import LearnerSettings
-from accerl_lerobot.weights import factory
+from accerl_lerobot.transport.weights import WeightUpdate
 from tests.local_ray import Handle, Local
 from tests.replay.segments import make_segment
 from tests.trainer.linear import LinearAdapter, make_segments
+from tests.transport.played import played
 
 
 def states(run: Path) -> list[str]:
@@ -35,7 +36,6 @@ def states(run: Path) -> list[str]:
 
 def test_the_trainer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(trainer, "ray", Local)
-    monkeypatch.setattr(factory, "ray", Local)
     monkeypatch.setattr(loading, "load_adapter", lambda policy: LinearAdapter())
     config = TrainerConfig(updates=2, batch_decisions=7, warmup_updates=0, value_warmup_updates=0)
     settings = LearnerSettings(PolicyConfig(path="nowhere"), GIPOConfig(), config, 0)
@@ -43,7 +43,7 @@ def test_the_trainer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     replay = Handle(
         sample=lambda decisions, version: make_segments((4, 3), seed=version), learnt=lambda: None
     )
-    assert worker.run(replay, [Handle(receive_weights=lambda *published: None)], "ray") == 2
+    assert worker.run(replay, [played(lambda update: None)]) == 2
     worker.metrics()
     turn = ["wait_in", "transport", "checkpoint", "compute", "weights"]
     assert states(tmp_path) == ["recovery", "wait_in", "weights", *turn, *turn, "wait_in"]
@@ -66,9 +66,7 @@ def test_inference(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         serving = asyncio.create_task(worker.serve())
         request = Request(observation={TASK: "push"}, noise_seed=0)
         await worker.decide([request])
-        await worker.receive_weights(1, {}, 0.0)
-        while (await worker.metrics())["version"] < 1:
-            await asyncio.sleep(0)
+        await worker.decide(WeightUpdate(1, 0.0, {}))
         await worker.decide([request])
         serving.cancel()
         await asyncio.gather(serving, return_exceptions=True)

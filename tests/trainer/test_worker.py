@@ -21,22 +21,15 @@ from accerl_lerobot.trainer.batch import NonFiniteError
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.peers import LearnerSettings
 from accerl_lerobot.trainer.worker import TrainerWorker
-from accerl_lerobot.weights import factory
+from accerl_lerobot.transport.weights import WeightPublisher, WeightUpdate
 from tests.local_ray import Handle, Local
 from tests.trainer.linear import LinearAdapter, make_segments
+from tests.transport.played import played
 
 
 def copied(tensors: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Copies as a store would have made them."""
     return {name: tensor.copy() for name, tensor in tensors.items()}
-
-
-class Prompt(factory.RayPublisher):
-    """Skips nothing."""
-
-    def publish(self, version: int, tensors: Any) -> None:
-        super().publish(version, tensors)
-        self.flush()
 
 
 class Stage:
@@ -46,9 +39,7 @@ class Stage:
         self.asked: list[tuple[int, int]] = []
         self.received: list[tuple[int, dict[str, np.ndarray]]] = []
         self.replay = Handle(sample=self._sample, learnt=lambda: None)
-        self.reader = Handle(
-            receive_weights=lambda version, tensors, _: self.received.append((version, copied(tensors)))
-        )
+        self.reader = played(self._receive)
         self._batches = batches
         defaults = {"updates": 6, "batch_decisions": 7, "warmup_updates": 0, "value_warmup_updates": 0}
         trainer = TrainerConfig(**{**defaults, **config})
@@ -58,6 +49,9 @@ class Stage:
     def run(self) -> int:
         return self.worker.run(self.replay, [self.reader])
 
+    def _receive(self, update: WeightUpdate) -> None:
+        self.received.append((update.version, copied(update.tensors)))
+
     def _sample(self, decisions: int, version: int) -> list[Segment]:
         self.asked.append((decisions, version))
         return make_segments((4, 3), seed=len(self.asked)) if len(self.asked) <= self._batches else []
@@ -66,9 +60,7 @@ class Stage:
 @pytest.fixture(autouse=True)
 def _without_ray(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "ray", Local)
-    monkeypatch.setattr(module, "make_publisher", lambda readers, *_, **__: Prompt(readers))
-    monkeypatch.setattr(module, "CONNECT_S", 0.05)
-    monkeypatch.setattr(factory, "ray", Local)
+    monkeypatch.setattr(module, "FIRST_S", 0.05)
     monkeypatch.setattr(loading, "load_adapter", lambda policy: LinearAdapter())
 
 
@@ -187,11 +179,10 @@ def test_a_trainer_without_batches_ends_with_the_weights_it_began_with(settings:
 def test_in_turn_the_wait_for_a_batch_does_not_hold_that_for_the_readers(monkeypatch: pytest.MonkeyPatch):
     flushed: list[int] = []
     stage = Stage(updates=3)
-    monkeypatch.setattr(Prompt, "flush", lambda self: flushed.append(len(stage.worker._history)))
+    monkeypatch.setattr(WeightPublisher, "flush", lambda self: flushed.append(len(stage.worker._history)))
     stage.worker.follow("synchronous")
     stage.run()
-    # Twice for each version, of which one in turn: before its record is complete.
-    assert flushed == [0, 0, 0, 1, 1, 2, 2, 3]
+    assert flushed == [0, 1, 2, 3], "each version before its record is complete, and the last once more"
 
 
 def test_a_reader_that_comes_later_gets_the_weights_of_now_even_after_the_last_update():
@@ -200,9 +191,5 @@ def test_a_reader_that_comes_later_gets_the_weights_of_now_even_after_the_last_u
         stage.worker.join(stage.reader)
     stage.run()
     received: list[int] = []
-    late = Handle(receive_weights=lambda version, tensors, _: received.append(version))
-    assert stage.worker.join(late) == 3
-    assert stage.worker._publisher is not None
-    stage.worker._publisher.flush(60)
+    assert stage.worker.join(played(lambda update: received.append(update.version))) == 3
     assert received == [3]
-    stage.worker._publisher.close()

@@ -18,23 +18,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from accerl_lerobot.transport import memfd, shared_memory
-from accerl_lerobot.transport.codec import encode
+from accerl_lerobot.transport import shared_memory
 from accerl_lerobot.transport.contract import Client, PendingRequest, ServiceStoppedError
-from accerl_lerobot.transport.memfd import (
-    ANSWER,
-    ASK,
-    FAIL,
+from accerl_lerobot.transport.shared_memory import (
     LEAST,
     SLOTS,
-    Slot,
-    Token,
+    SharedMemoryClient,
+    SharedMemoryServer,
     available,
-    new_slot,
-    receive_token,
-    send_token,
 )
-from accerl_lerobot.transport.shared_memory import SharedMemoryClient, SharedMemoryServer
 
 pytestmark = pytest.mark.skipif(not available(), reason="no memfd, epoll and eventfd here")
 LONG_S = 30.0
@@ -236,8 +228,8 @@ def test_threads_of_the_same_process_call_and_wake(stage):
 def test_other_users_are_refused_at_both_ends(stage, monkeypatch: pytest.MonkeyPatch):
     one = stage()
     end = one.raw()
-    assert memfd.same_user(end)
-    monkeypatch.setattr(memfd.os, "getuid", lambda: os.geteuid() + 1)
+    assert shared_memory.same_user(end)
+    monkeypatch.setattr(shared_memory.os, "getuid", lambda: os.geteuid() + 1)
     with pytest.raises(ServiceStoppedError, match="service: another user's process has taken its place"):
         one.caller()
     one.server.poll(LONG_S)
@@ -254,89 +246,6 @@ def test_nothing_is_left_with_a_name(stage):
     other = SharedMemoryServer(one.asked.append, copy=False)
     assert other.address.name != one.server.address.name
     other.close()
-
-
-def asks(slot: int, start: int, size: int) -> Token:
-    return Token(ASK, slot, 1, start, size, time.monotonic())
-
-
-def unsealed() -> int:
-    file = os.memfd_create("accerl", os.MFD_ALLOW_SEALING)
-    os.ftruncate(file, LEAST)
-    return file
-
-
-NONSENSE: dict[str, Callable[[socket.socket], None]] = {
-    "short": lambda end: end.send(b"x"),
-    "long": lambda end: end.send(b"x" * 1000),
-    "no slot": lambda end: send_token(end, asks(0, 0, 100)),
-    "no such slot": lambda end: send_token(end, asks(SLOTS, 0, 100), new_slot(1)),
-    "no question": lambda end: send_token(end, asks(0, 0, 100)._replace(purpose=77), new_slot(1)),
-    "before the slot": lambda end: send_token(end, asks(0, 2**63, 100), new_slot(1)),
-    "beyond the slot": lambda end: send_token(end, asks(0, 0, LEAST + 1), new_slot(1)),
-    "far beyond": lambda end: send_token(end, asks(0, 64, 2**63), new_slot(1)),
-    "not sealed": lambda end: send_token(end, asks(0, 0, 100), unsealed()),
-    "too small": lambda end: send_token(end, asks(0, 0, 100), memfd.new_memory(100)),
-    "no memory": lambda end: send_token(end, asks(0, 0, 100), os.open("/dev/null", os.O_RDWR)),
-    "a folder": lambda end: send_token(end, asks(0, 0, 100), os.open("/", os.O_RDONLY)),
-}
-
-
-@pytest.mark.parametrize("nonsense", NONSENSE.values(), ids=NONSENSE.keys())
-def test_who_talks_nonsense_is_dropped_and_nobody_else(stage, nonsense: Callable[[socket.socket], None]):
-    one = stage()
-    caller, end = one.caller(), one.raw()
-    one.until(lambda: len(one.server._connections) == 2)
-    before = files()
-    nonsense(end)
-    caller.send("sense")
-    (asked,) = one.await_asked(1)
-    one.until(lambda: len(one.server._connections) == 1)
-    assert end.recv(1000) == b""
-    asked.answer("good")
-    assert caller.done(LONG_S)[0][1] == "good"
-    assert files() == before - 1, "the end of the connection is closed, and so is what came with the token"
-
-
-@pytest.mark.parametrize("place", [(0, 0), (0, 3), (0, 1000), (64, LEAST - 64)])
-def test_a_message_that_cannot_be_read_is_answered_so(stage, place: tuple[int, int]):
-    one = stage()
-    end = one.raw()
-    send_token(end, asks(0, *place), new_slot(1))
-    one.until(lambda: bool(one.server._connections))
-    one.server.poll(0.0)
-    received = receive_token(end)
-    assert received is not None and received[0].purpose == FAIL and not one.asked
-
-
-def test_a_slot_is_asked_once_at_a_time(stage):
-    one = stage()
-    end, encoded = one.raw(), encode("first")
-    slot = Slot(file := new_slot(1))
-    encoded.write(slot.memory, 0)
-    send_token(end, asks(0, 0, encoded.size), file)
-    (asked,) = one.await_asked(1)
-    send_token(end, asks(0, 0, encoded.size))
-    one.until(lambda: asked.gone)
-    assert end.recv(1000) == b""
-
-
-def test_a_caller_does_not_believe_a_strange_reply(stage):
-    one = stage()
-    caller = one.caller()
-    ticket = caller.send("question")
-    one.await_asked(1)
-    (connection,) = one.server._connections.values()
-    send_token(connection.socket, Token(ANSWER, 0, ticket + 5, 0, 10, 0.0))
-    with pytest.raises(ServiceStoppedError, match="a reply to message 6, which was not asked"):
-        caller.done(LONG_S)
-    other = one.caller()
-    ticket = other.send("question")
-    one.await_asked(1)
-    connection = list(one.server._connections.values())[-1]
-    send_token(connection.socket, Token(ANSWER, 0, ticket, 0, 2**40, 0.0))
-    with pytest.raises(ServiceStoppedError, match="a message that cannot be read"):
-        other.done(LONG_S)
 
 
 def test_a_service_that_takes_nothing_is_not_waited_for_for_ever(stage, monkeypatch: pytest.MonkeyPatch):

@@ -10,9 +10,8 @@ import ray
 
 from accerl_lerobot.transport import endpoint as module
 from accerl_lerobot.transport.contract import Client, ServiceStoppedError
-from accerl_lerobot.transport.endpoint import Endpoint, RayClient, uses_shared_memory
-from accerl_lerobot.transport.memfd import available
-from accerl_lerobot.transport.shared_memory import Address
+from accerl_lerobot.transport.endpoint import Endpoint, RayClient
+from accerl_lerobot.transport.shared_memory import Address, available
 from tests.light_workers import light_ray
 from tests.transport.contract import CHECKS, Check, Service
 
@@ -63,9 +62,3 @@ def test_ray_leads_to_another_node_and_where_nobody_listens(monkeypatch: pytest.
     if available():  # it does not fall back
         with pytest.raises(ServiceStoppedError, match="inference cannot be connected to"):
             end(HERE).connect()
-
-
-def test_shared_memory_is_offered_where_there_is_any_unless_ray_is_asked_for(monkeypatch: pytest.MonkeyPatch):
-    assert uses_shared_memory("auto") == available() and not uses_shared_memory("ray")
-    monkeypatch.setattr(module, "available", lambda: False)
-    assert not uses_shared_memory("auto") and not uses_shared_memory("ray")

@@ -116,7 +116,7 @@ def test_its_fields_are_fields_of_the_command_line():
     assert run.world_model.model == linear(gain=2.0)
     with pytest.raises(InputError, match=r"^world_model.model.gain=0\.?0?: use a positive number"):
         parse(WorldModelRun, [*NAMED, "--world_model.model.gain=0"])
-    with pytest.raises(InputError, match="^world_model.model.context=0: use a whole number from 1"):
+    with pytest.raises(InputError, match="^world_model.model.context=0: use a whole number in .1,"):
         linear(context=0)
     with pytest.raises(InputError, match="^world_model.model.heads=3: no such field; world_model.model has"):
         parse(WorldModelRun, [*NAMED, "--world_model.model.heads=3"])

@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Memory, disk space and lag of a run: rough estimates, and refusals of what this machine cannot hold."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from accerl_lerobot.algorithms import RatioConfig
+from accerl_lerobot.errors import InputError, expanded
+from accerl_lerobot.replay.pacing import decisions_under_way, lag_bound
+
+if TYPE_CHECKING:
+    from accerl_lerobot.engine.config import RunConfig
+
+GIB = 2**30
+POLICY_PROCESS_GIB, ROLLOUT_PROCESS_GIB, RAY_GIB = 1.2, 0.4, 0.7
+SIMULATOR_GIB = {"metaworld": 0.17, "libero": 0.17}
+"""Resident memory without a policy's weights, see `policy_gib`: a process with torch and LeRobot, a
+rollout process without its worlds, Ray's own processes, and, by type of environment, the simulator of one
+task with its renderers."""
+ABSURD = 2
+"""Times this machine's memory that a rough estimate may be; ``accerl doctor`` warns long before."""
+DISK_BYTES = 2**29
+"""Disk space that demonstrations, checkpoints and videos take at least."""
+
+
+def check_memory(config: RunConfig) -> None:
+    """Refuse sizes far beyond this machine's memory, and weights that it cannot hold.
+
+    Nodes of a cluster that is joined may have more.
+    """
+    total = memory_gib("MemTotal")
+    if total is None or config.launch.address is not None:
+        return
+    parts = memory_parts_gib(config)
+    needed, largest = sum(parts.values()), max(parts, key=lambda name: parts[name])
+    if needed > ABSURD * total:
+        remedy = f"the run needs about {needed:,.0f} GiB of memory, this machine has {total:.0f}; lower it"
+        section, _, name = largest.partition(".")
+        raise InputError(largest, getattr(getattr(config, section), name), remedy)
+    if (need := policy_gib(config)) > total:
+        text = f"its weights take {need:.1f} GiB in the processes of this run, this machine has {total:.1f}"
+        remedy = "use a smaller policy, a GPU, launch.engine=local or policy.tuning.mode=lora"
+        raise InputError("policy.path", config.policy.path, f"{text}; {remedy}")
+
+
+def memory_parts_gib(config: RunConfig, history: int = 1) -> dict[str, float]:
+    """Field → rough memory of what it sizes, without a policy's weights."""
+    from accerl_lerobot.evaluation import FILM
+
+    rollout, films, local = config.rollout, config.evaluation, config.launch.engine == "local"
+    tasks = len(getattr(config.env, "tasks", ("one",)))
+    simulator = tasks * SIMULATOR_GIB.get(config.env.type, 0.0)
+    pictures = history * observation_bytes(config) / GIB
+    loaded = 2 + config.trainer.ranks  # the driver, inference and the trainer each load torch
+    frames = min(films.videos, films.episodes) * config.env.max_steps / FILM[1]
+    return {
+        "trainer.ranks": POLICY_PROCESS_GIB if local else RAY_GIB + loaded * POLICY_PROCESS_GIB,
+        "inference.workers": 0.0 if local else (config.inference.workers - 1) * POLICY_PROCESS_GIB,
+        "rollout.workers": 0.0 if local else rollout.workers * ROLLOUT_PROCESS_GIB,
+        "rollout.worlds": rollout.workers * rollout.worlds * simulator,
+        "rollout.segment_length": under_way(config) * pictures,
+        "replay.capacity": config.replay.capacity * pictures,
+        **({"algorithm.memory": config.remembered * pictures} if config.remembered else {}),
+        "evaluation.videos": frames * 3 * FILM[0] ** 2 / GIB,
+    }
+
+
+def observation_bytes(config: RunConfig) -> int:
+    """Bytes of one env step's images; what else a decision holds is small beside them."""
+    env: Any = config.env
+    side = getattr(env, "image_size", 96)  # LeRobot's own environments differ; PushT's have 96 pixels
+    return 3 * side * side * len(getattr(env, "cameras", ("one",)))
+
+
+def policy_gib(config: RunConfig) -> float:
+    """Memory that the weights of ``policy.path`` take in all processes of a run; activations come on top.
+
+    On a GPU they are not in the machine's memory. Nothing is known of a policy that an SFT will make.
+    """
+    from accerl_lerobot.policies.loading import policy_sizes, rehearsed_config, resolve_device
+
+    if config.policy.path is None or resolve_device(config.policy.device).type != "cpu":
+        return 0.0
+    rehearsed_config(config.policy)
+    sizes, processes, copies = policy_sizes(config.policy), 1, trained_copies(config)
+    if config.launch.engine != "local":
+        processes = config.trainer.ranks + config.inference.workers
+        copies += 2 * config.inference.workers  # sets under way
+    return 4 * (sizes.policy * processes + sizes.trained * copies) / GIB
+
+
+def trained_copies(config: RunConfig) -> int:
+    """Copies of the trained weights that a trainer keeps: gradient, Adam's two moments, weights to probe."""
+    return 3 + (isinstance(config.algorithm, RatioConfig) and config.trainer.probe_every > 0)
+
+
+def memory_gib(entry: str) -> float | None:
+    """``MemTotal`` or ``MemAvailable`` of this machine within its container's limit; None: unknown."""
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+    except OSError:
+        return None
+    found = next((1024.0 * int(line.split()[1]) for line in lines if line.startswith(f"{entry}:")), 0.0)
+    group = Path("/sys/fs/cgroup")
+    with contextlib.suppress(OSError, ValueError):  # no such file, or no limit
+        limit, taken = (int((group / f"memory.{name}").read_text()) for name in ("max", "current"))
+        found = min(found, limit - taken * (entry == "MemAvailable"))
+    return found / GIB
+
+
+def check_disk(folder: str | None, field: str = "output_dir") -> None:
+    """Refuse a folder on a disk with less free space than any run takes; blames `field`."""
+    path = expanded(folder or ".", field).absolute()
+    while not path.exists():
+        path = path.parent
+    if (free := shutil.disk_usage(path).free) < DISK_BYTES:
+        remedy = f"{free / GIB:.2f} GiB are free on this disk, and {DISK_BYTES / GIB:.1f} are needed at least"
+        raise InputError(field, folder, f"{remedy}; make room or choose another")
+
+
+def lag_limits(config: RunConfig) -> tuple[int, int]:
+    """The largest lag under this recipe, and what its pace alone would allow; in updates."""
+    ahead = 1 if config.launch.engine == "ray" else 0  # of publications under way, and of batches drawn early
+    bound, of_pace = (
+        lag_bound(
+            replay,
+            batch_decisions=config.trainer.batch_decisions,
+            in_flight=under_way(config),
+            pickup=ahead + config.trainer.hold_back,
+            prefetch=ahead,
+        )
+        for replay in (config.replay, replace(config.replay, max_lag=10**9))
+    )
+    return bound, of_pace
+
+
+def under_way(config: RunConfig) -> int:
+    """Decisions on their way to replay."""
+    rollout = config.rollout
+    return decisions_under_way(
+        workers=rollout.workers, worlds=rollout.worlds, segment_length=rollout.segment_length
+    )
