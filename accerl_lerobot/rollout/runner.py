@@ -2,13 +2,16 @@
 """Several worlds, each somewhere between a decision and the next: the rollout worker without its process.
 
 A slot is one world. `start` resets it and `advance` executes a decision in it; both return the request for
-the next decision, and whoever drives the runner decides when that is answered: the Ray worker goes on with
-other slots meanwhile, the single-process mode answers at once.
+the next decision. The Ray worker goes on with other slots meanwhile, the local engine answers at once.
+
+`EpisodePlans` says which episode a free world runs next: planned evaluations first, then exploring ones, of
+each task in turn, with seeds of this worker's own (`seeds.py`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal
 
@@ -19,8 +22,10 @@ from accerl_lerobot.config.ranges import NonNegative, Range, Section, Steps
 from accerl_lerobot.envs.base import ChunkResult, World
 from accerl_lerobot.experience import Decision, Observation, Origin, Request, Segment
 from accerl_lerobot.rollout.segments import SegmentBuilder
-from accerl_lerobot.seeds import noise_seed
+from accerl_lerobot.seeds import noise_seed, train_seed
 
+STARTS_PER_INCARNATION = 1000
+"""By how much a restarted worker skips ahead in its training seeds, so as not to repeat its episodes."""
 _STATE = ("plan", "episode_return", "steps", "decisions", "versions", "frames", "chunks")
 
 
@@ -54,7 +59,10 @@ class Slot:
             observation = self.world.step_chunk(chunk).observation
         self.builder = SegmentBuilder(observation, segment_length, Origin(plan.task, plan.seed, decision=0))
         self.builder.restore(state["builder"])
-        if not _equal(observation, self.builder.latest):
+        latest = self.builder.latest
+        if observation.keys() != latest.keys() or not all(
+            np.array_equal(observation[key], latest[key]) for key in latest
+        ):
             raise RuntimeError(
                 f"{plan.task} with seed {plan.seed} does not show again what it had shown after "
                 f"{len(state['chunks'])} decisions, so its episodes cannot be gone on with in the middle; "
@@ -62,10 +70,6 @@ class Slot:
             )
         for name in _STATE:
             setattr(self, name, state[name])
-
-
-def _equal(one: Observation, other: Observation) -> bool:
-    return one.keys() == other.keys() and all(np.array_equal(one[key], other[key]) for key in one)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,12 +87,7 @@ class RolloutConfig(Section, section="rollout"):
     time_limit: Literal["truncate", "fail"] = "fail"
     """How the learner treats the end of an episode by its time limit. fail: like a termination, the return
     ends there. truncate: V of the last observation stands for what would have followed, as in tasks without
-    an end.
-
-    Where success is counted within a limit, a policy that gets stuck bootstraps from its own optimistic value
-    with `truncate`, and failures go unpunished: on door-open, success at update 100 fell from 0.82 to 0.50
-    (n = 20, one seed).
-    """
+    an end; where success is counted within a limit, failures then go unpunished."""
     episodes: Steps = 0
     """Exploring episodes in all; 0: as many as the updates need. Once they are played, learning goes on while
     replay has something to give, which is little unless more is imagined, and then ends.
@@ -111,6 +110,72 @@ class EpisodePlan:
     film: tuple[int, int] | None = None
     """Side in pixels and env steps per frame of a video for people; None: none. It executes a chunk in parts,
     which changes nothing else."""
+
+
+def budgets(config: RolloutConfig) -> list[int | None]:
+    """How many exploring episodes each worker plays; None: no end."""
+    if not config.episodes:
+        return [None] * config.workers
+    return [len(range(w, config.episodes, config.workers)) for w in range(config.workers)]
+
+
+def incarnation_after(incarnation: int, starts: int) -> int:
+    """Number of the process that takes a worker's place, such that it meets none of its seeds again.
+
+    Args:
+        incarnation: of the one before.
+        starts: where that one was in its seeds when it last said so; it may have gone on since.
+    """
+    return max(incarnation, (starts + STARTS_PER_INCARNATION // 2) // STARTS_PER_INCARNATION) + 1
+
+
+class EpisodePlans:
+    """The episodes of one worker, in order."""
+
+    def __init__(
+        self,
+        tasks: tuple[str, ...],
+        *,
+        seed: int,
+        worker: int = 0,
+        incarnation: int = 0,
+        budget: int | None = None,
+    ) -> None:
+        self._tasks, self._seed, self._worker, self._budget = tasks, seed, worker, budget
+        self.starts = incarnation * STARTS_PER_INCARNATION
+        """Where it is in the worker's seeds."""
+        # Filled and emptied on different threads: appending to and popping from a deque is atomic.
+        self._queued: deque[EpisodePlan] = deque()
+
+    def queue(self, plans: Iterable[EpisodePlan]) -> None:
+        """Plans evaluation episodes."""
+        self._queued.extend(plans)
+
+    def next(self, exploring: bool) -> EpisodePlan | None:
+        """The episode that a free world is to run; None: it has to wait."""
+        if self._queued:
+            return self._queued.popleft()
+        if not exploring or self.spent:
+            return None
+        if self._budget is not None:
+            self._budget -= 1
+        number, self.starts = self.starts, self.starts + 1
+        task = self._tasks[(number + self._worker) % len(self._tasks)]
+        return EpisodePlan(task=task, seed=train_seed(self._seed, self._worker, number), explore=True)
+
+    @property
+    def spent(self) -> bool:
+        """True if every exploring episode has been handed out."""
+        return self._budget is not None and self._budget <= 0
+
+    def state(self) -> dict[str, Any]:
+        """All that `restore` needs; see `snapshot`."""
+        return {"budget": self._budget, "starts": self.starts, "queued": list(self._queued)}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Goes on from what `state` gave."""
+        self._budget, self.starts = state["budget"], state["starts"]
+        self._queued.extend(state["queued"])
 
 
 @kind
@@ -214,9 +279,7 @@ class RolloutRunner:
         actions = np.clip(decision.chunk, spec.action_low, spec.action_high)
         builder.add(decision, actions, reward, result.steps, result.observation)
         if result.done or builder.full:
-            failed = result.truncated and self.config.time_limit == "fail"
-            ended = (result.terminated or failed, result.truncated and not failed)
-            self._emit(state, plan, builder, *ended, result.success)
+            self._emit(state, result)
         if result.done:
             self._finish(state, plan, result.success)
             return self.start(slot)
@@ -260,46 +323,37 @@ class RolloutRunner:
     def _request(self, state: Slot) -> Request:
         plan, builder = state.plan, state.builder
         assert plan is not None and builder is not None
-        seed = noise_seed(plan.seed, 0, state.decisions)
+        seed = noise_seed(plan.seed, state.decisions)
         return Request(observation=builder.latest, noise_seed=seed, explore=plan.explore)
 
-    def _emit(
-        self,
-        state: Slot,
-        plan: EpisodePlan,
-        builder: SegmentBuilder,
-        terminated: bool,
-        truncated: bool,
-        success: bool,
-    ) -> None:
-        self._sequence += 1
-        episode = {}
+    def _emit(self, state: Slot, result: ChunkResult) -> None:
+        plan, builder = state.plan, state.builder
+        assert plan is not None and builder is not None
+        failed = result.truncated and self.config.time_limit == "fail"
+        terminated, truncated = result.terminated or failed, result.truncated and not failed
+        episode: dict[str, float] = {}
         if terminated or truncated:
-            episode = {
-                "return": state.episode_return,
-                "steps": state.steps,
-                "decisions": state.decisions,
-                "success": float(success),
-            }
+            episode = {name: getattr(state, name) for name in ("steps", "decisions")}
+            episode = {"return": state.episode_return} | episode | {"success": float(result.success)}
+        self._sequence += 1
         key = f"{self.name}.{self._sequence}"
-        segment = builder.cut(key, terminated, truncated, success, episode)
+        segment = builder.cut(key, terminated, truncated, result.success, episode)
         if plan.explore:
             self._on_segment(segment)
 
     def _finish(self, state: Slot, plan: EpisodePlan, success: bool) -> None:
         self.counters.episodes += 1
         versions = state.versions or [0]
-        self._on_episode(
-            EpisodeResult(
-                plan=plan,
-                success=success,
-                episode_return=state.episode_return,
-                steps=state.steps,
-                decisions=state.decisions,
-                versions=(min(versions), max(versions)),
-                frames=state.frames,
-            )
+        result = EpisodeResult(
+            plan=plan,
+            success=success,
+            episode_return=state.episode_return,
+            steps=state.steps,
+            decisions=state.decisions,
+            versions=(min(versions), max(versions)),
+            frames=state.frames,
         )
+        self._on_episode(result)
 
 
 def _finite(observation: Observation) -> bool:

@@ -21,7 +21,7 @@ from accerl_lerobot.policies.family import Encoded
 from accerl_lerobot.policies.flow import FlowContext, FlowFamily, FlowShape
 from accerl_lerobot.policies.loading import load_adapter
 from accerl_lerobot.policies.teacher import TASK_BITS, Ensemble, Teacher, WithTeacher, state_of
-from accerl_lerobot.replay import ReplayConfig
+from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.seeds import noise_seed
 from accerl_lerobot.trainer.batch import NonFiniteError
@@ -170,7 +170,7 @@ class TestActing:
         assert adapter.teacher is not None
         observation = requests(adapter, 1)[0].observation
         asked = [
-            Request(observation=observation, noise_seed=noise_seed(episode, 0, decision), explore=explore)
+            Request(observation=observation, noise_seed=noise_seed(episode, decision), explore=explore)
             for episode in range(200)
             for decision in (0, 1)
             for explore in (True, False)
