@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The policy section of a recipe: the checkpoint, how it explores, what is trained. Free of torch.
-
-LeRobot policy types that have a likelihood here, and the families that suit them; free of torch.
-"""
+"""The policy section of a recipe, and the policy types that have a likelihood here. Free of torch."""
 
 from __future__ import annotations
 
@@ -174,11 +171,6 @@ PLUGINS = {"smolvla_bins": "accerl_lerobot.policies.bins_plugin"}
 """LeRobot policy type that is not LeRobot's own → the package that registers it with LeRobot."""
 USES_HISTORY = ("diffusion",)
 """Types that read the observations of ``n_obs_steps`` env steps; the others read one."""
-NO_DENSITY = {
-    "tdmpc": "it plans by sampling and has no action density; LeRobot trains it with its own RL objective",
-    "gaussian_actor": "it takes one action a decision and is trained by LeRobot's SAC; use act",
-    "vqbet": "LeRobot does not return its code log-probs; use smolvla",
-}
 
 
 def register_policy(policy_type: str, model: str, *families: str) -> None:
@@ -220,24 +212,15 @@ def discovery(policy_type: str | None) -> list[str]:
 
 
 def check_type(policy_type: Any, field: str, prefix: str = "") -> str:
-    """Refuses a LeRobot policy type that has no likelihood here; `prefix` begins the remedy.
-
-    Raises:
-        InputError: it has none.
-    """
+    """Refuses a LeRobot policy type that has no likelihood here; `prefix` begins the remedy."""
     if policy_type not in POLICIES:
         known = f"use one of {', '.join(POLICIES)}, or name its package: policy.discover_packages_path"
-        why = NO_DENSITY.get(policy_type, f"no likelihood for it here; {known}")
-        raise InputError(field, policy_type, prefix + why)
+        raise InputError(field, policy_type, f"{prefix}no likelihood for it here; {known}")
     return str(policy_type)
 
 
 def check_observations(policy_config: Any, field: str) -> None:
-    """Refuses an observation history that LeRobot's policy of this type does not read.
-
-    Raises:
-        InputError: as above.
-    """
+    """Refuses an observation history that LeRobot's policy of this type does not read."""
     if policy_config.n_obs_steps != 1 and policy_config.type not in USES_HISTORY:
         remedy = f"only {', '.join(USES_HISTORY)} looks back; a {policy_config.type} policy takes 1"
         raise InputError(field, policy_config.n_obs_steps, remedy)
@@ -251,8 +234,7 @@ def sampler_config(config: PolicyConfig, policy_type: str) -> SamplerConfig:
     """
     families = POLICIES[policy_type][1]
     if config.sampler is None:
-        default: SamplerConfig = SamplerConfig.get_choice_class(families[0])()
-        return default
+        return SamplerConfig.get_choice_class(families[0])()
     if config.sampler.type not in families:
         remedy = f"a {policy_type} policy explores by {' or '.join(families)}"
         raise InputError("policy.sampler.type", config.sampler.type, remedy)

@@ -119,8 +119,8 @@ def slow_flow(adapter: LeRobotAdapter, asked: Sequence[Request], latent: Latent)
 
     def read(x: np.ndarray, t: float, sample: int) -> np.ndarray:
         with torch.no_grad():
-            field = encoded[sample].context.velocity
-            return field(torch.from_numpy(x).float()[None], torch.tensor([t]).float())[0].double().numpy()
+            velocity = encoded[sample].context
+            return velocity(torch.from_numpy(x).float()[None], torch.tensor([t]).float())[0].double().numpy()
 
     x0, x = (part.numpy() for part in latent["path"].unbind(1))
     shape, std = adapter.family.shape, adapter.family.sampler.noise_level

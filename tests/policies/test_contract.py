@@ -294,7 +294,7 @@ def test_stock_lerobot_runs_what_is_saved(policy: Policy, tmp_path: Path):
     ours, theirs = adapter.policy.state_dict(), stock.state_dict()
     assert ours.keys() == theirs.keys() and all(torch.equal(ours[k], theirs[k]) for k in ours)
     observations = stack_observations(asked)
-    processing = Processing(pre, post, adapter.device)
+    processing = Processing(pre, post, adapter.device, {})
     batch, expected = (p.prepare(*observations) for p in (processing, adapter.processing))
     assert all(torch.equal(batch[k], v) for k, v in expected.items() if isinstance(v, Tensor))
     if stock.config.n_obs_steps > 1:  # LeRobot keeps the history itself

@@ -228,7 +228,7 @@ def test_decoding_is_lerobot_s_and_never_fails(fast: LeRobotAdapter, caplog: pyt
         "half a letter": padded(half),
     }
     with caplog.at_level(logging.WARNING):
-        pi0_fast._Undecodable.warned = False
+        pi0_fast._warn_undecodable.cache_clear()
         chunks = fast.model.chunk(torch.tensor(list(rows.values())))
     assert caplog.messages == ["tokens that FAST cannot decode were drawn; such a chunk is all zeros"]
     by_name = dict(zip(rows, chunks, strict=True))

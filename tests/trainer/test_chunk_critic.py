@@ -18,7 +18,7 @@ from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Origin, Request, 
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.config import FlowSamplerConfig, PolicyConfig
 from accerl_lerobot.policies.family import Encoded
-from accerl_lerobot.policies.flow import FlowContext, FlowFamily, FlowShape
+from accerl_lerobot.policies.flow import FlowFamily, FlowShape
 from accerl_lerobot.policies.loading import load_adapter
 from accerl_lerobot.policies.teacher import TASK_BITS, Ensemble, Teacher, WithTeacher, state_of
 from accerl_lerobot.replay.pacing import ReplayConfig
@@ -247,9 +247,7 @@ def test_imitation_is_flow_matching():
     family = FlowFamily(model, FlowSamplerConfig())
     for off in (0.0, 1.0):
         velocity = lambda x, t, off=off: (x - target) / t[:, None, None] + off  # noqa: E731
-        encoded = Encoded(
-            features=torch.zeros(64, 1, 1), mask=torch.ones(64, 1), context=FlowContext(velocity=velocity)
-        )
+        encoded = Encoded(features=torch.zeros(64, 1, 1), mask=torch.ones(64, 1), context=velocity)
         loss = family.imitation_loss(encoded, target[:, :3, :2])
         torch.testing.assert_close(loss, torch.full((64,), off), atol=1e-3, rtol=1e-3)
 
