@@ -7,11 +7,9 @@
 
 n is 4 decisions and m is ¼. s is the state of the simulator, ``observation.environment_state``; the policy
 never reads it, so the checkpoint stays a policy of images (asymmetric actor-critic, arXiv 1710.06542). The
-teacher μ is a small network of s: it learns in a hundred episodes what a policy that has to learn to see
-cannot, acts in part of the exploring episodes, and labels every observation in the memory, the policy's own
-ones too (DAgger, arXiv 1011.0686). h is a linear map that exists only while training: reading the state off
-the policy's features teaches them where things are. Related: TD3+BC (arXiv 2106.06860), RLPD (2302.02948),
-Q-chunking (2507.07969).
+teacher μ is a small network of s, acts in part of the exploring episodes, and labels every observation in
+the memory, the policy's own too (DAgger, arXiv 1011.0686). h is a linear map that exists only while training.
+Related: TD3+BC (arXiv 2106.06860), RLPD (2302.02948), Q-chunking (2507.07969).
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.replay.pacing import ASYNCHRONOUS, Schedule
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
 from accerl_lerobot.trainer.batch import keeping
-from accerl_lerobot.trainer.peers import Learner, LearnerSettings, Peers
+from accerl_lerobot.trainer.peers import LearnerSettings, Peers
 from accerl_lerobot.transport.endpoint import Transport
 from accerl_lerobot.weights.factory import CONNECT_S, WeightPublisher, make_publisher
 from accerl_lerobot.weights.publisher import PublishDelay
@@ -49,7 +49,7 @@ class TrainerWorker:
         self._clock = open_clock(timeline, "trainer")
         self._policy, self._config, self._directory = settings.policy, settings.trainer, directory
         self._peers = Peers(peers, self._config)
-        self._update = self._peers.begin(Learner(settings))
+        self._update = self._peers.begin(settings)
         self._lock = threading.Lock()
         self._kept: Any = None
         self._in_turn = False
@@ -72,7 +72,7 @@ class TrainerWorker:
         try:
             # A checkpoint need not hold a critic: all start from this one.
             with self._lock:
-                self._hand_over(publisher, self._update.version, self._view())
+                self._publish(publisher, PublishDelay(0), last=False)
             self._publisher = publisher
             self._publishing.set()
             self._train(replay, publisher)
@@ -146,16 +146,13 @@ class TrainerWorker:
 
     def _publish(self, publisher: WeightPublisher, held: PublishDelay, last: bool) -> None:
         """Hands the weights of now over, or those that are old enough."""
-        if not held.updates:
-            self._hand_over(publisher, self._update.version, self._view())
-            return
-        for due in held.push(self._update.version, self._export(), last=last):
-            self._hand_over(publisher, *due)
-
-    def _hand_over(self, publisher: WeightPublisher, version: int, tensors: dict[str, Any]) -> None:
-        fault_point("trainer.publish")
-        publisher.publish(version, tensors)
-        self._handed_over = version
+        adapter = self._update.adapter
+        with self._peers.lending("lend_weights"):
+            weights = adapter.export_trainable() if held.updates else adapter.view_trainable()
+        for version, tensors in held.push(self._update.version, weights, last=last):
+            fault_point("trainer.publish")
+            publisher.publish(version, tensors)
+            self._handed_over = version
 
     def metrics(self) -> list[dict[str, float]]:
         """One record per update since the last call."""
@@ -185,12 +182,3 @@ class TrainerWorker:
         self._update.adapter.save(directory / PRETRAINED, self._policy, weights)
         snapshot.save(directory / TRAINING_STATE / WEIGHTS, trained)
         snapshot.save(directory / TRAINING_STATE / "trainer", state)
-
-    def _view(self) -> dict[str, Any]:
-        """Trainable weights, to be copied before the next update."""
-        with self._peers.lending("lend_weights"):
-            return self._update.adapter.view_trainable()
-
-    def _export(self) -> dict[str, Any]:
-        with self._peers.lending("lend_weights"):
-            return self._update.adapter.export_trainable()
