@@ -2,8 +2,8 @@
 """Off-policy learning from a critic over (simulator state, executed chunk) and a teacher: the settings.
 
     critic   y = (1 − m)·[Σ_{j<n} γ^j r_j + γ^n (mean Q' − std Q')(s_n, μ(s_n))] + m·R   for each Q_i(s, c)
-    teacher  L = E[(std Q − mean Q)(s, μ(s))] / E|Q| + b·E_successes ‖μ(s) − c‖² / 0.3²
-    policy   L = E[imitation loss of π(o) on μ(s)] + p·E‖h(features(o)) − s‖²
+    teacher  L = E[(std Q − mean Q)(s, μ(s))] / E|Q| + ½·E_successes ‖μ(s) − c‖² / 0.3²
+    policy   L = E[imitation loss of π(o) on μ(s)] + ½·E‖h(features(o)) − s‖²
 
 n is 4 decisions and m is ¼. s is the state of the simulator, ``observation.environment_state``; the policy
 never reads it, so the checkpoint stays a policy of images (asymmetric actor-critic, arXiv 1710.06542). The
@@ -17,7 +17,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from accerl_lerobot.algorithms.contract import AlgorithmConfig, OffPolicyConfig
-from accerl_lerobot.config.ranges import NonNegative, Positive, Share
+from accerl_lerobot.config.ranges import Positive, Share
 
 
 @AlgorithmConfig.register_subclass("chunk_critic")
@@ -35,9 +35,5 @@ class ChunkCriticConfig(OffPolicyConfig):
     """Discount per decision."""
     critic_steps: Positive = 2.0
     """Gradient steps of the critic for each new decision; the teacher makes half as many."""
-    imitation: NonNegative = 0.5
-    """Weight of the teacher's distance from what succeeded."""
     teacher_episodes: Share = 0.5
     """Share of exploring episodes in which the teacher acts, after ``trainer.value_warmup_updates``."""
-    perception: NonNegative = 0.5
-    """Weight of reading the simulator's state off the policy's features."""

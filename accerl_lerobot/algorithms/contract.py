@@ -56,8 +56,6 @@ class RatioConfig(AlgorithmConfig):
     level: Level = "token"
     """Extent of one importance ratio: each log-prob factor, a token or, of a flow or Gaussian policy, an
     action (``token``), or the whole ``chunk``."""
-    value_coef: NonNegative = 0.5
-    """Weight of the critic's regression error."""
     kl_coef: NonNegative = 0.0
     """Weight of KL(μ‖π), the distance from the behaviour policy."""
     entropy_coef: NonNegative = 0.0

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Importance ratios, the terms that all objectives share, and the metrics that are logged about every update.
 
-L = L_policy + value_coef · E(V − R)² + kl_coef · KL(μ‖π) − entropy_coef · H
+L = L_policy + ½ · E(V − R)² + kl_coef · KL(μ‖π) − entropy_coef · H
 
 ρ = π(a|o) / μ(a|o). μ is the behaviour policy, the one that acted; its log-prob is stored with the sample.
 All ratios are handled as logs of shape (N, F), F ratios per decision:
@@ -167,11 +167,7 @@ class Samples:
 def lag_metrics(version: Tensor, trainer_version: int) -> dict[str, float]:
     """How stale a batch is, in updates; `version`, int (N,), is of the weights behind each decision."""
     lag = (trainer_version - version).float()
-    return {
-        "lag_mean": float(lag.mean()),
-        "lag_p95": float(lag.quantile(0.95)),
-        "lag_max": float(lag.max()),
-    }
+    return {"lag_mean": float(lag.mean()), "lag_p95": float(lag.quantile(0.95)), "lag_max": float(lag.max())}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -212,7 +208,7 @@ def assemble(
     value_loss = (inputs.value - inputs.returns).square().mean()
     mean_entropy = inputs.entropy.mean()
     kl = mean_over_ratios(kl_from_behaviour(log_ratio), inputs, config.level)
-    loss = policy_loss + config.value_coef * value_loss
+    loss = policy_loss + 0.5 * value_loss
     if config.kl_coef:
         loss = loss + config.kl_coef * kl
     if config.entropy_coef:  # an entropy that is not used may be non-finite

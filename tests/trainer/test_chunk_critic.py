@@ -24,6 +24,7 @@ from accerl_lerobot.policies.teacher import TASK_BITS, Ensemble, Teacher, WithTe
 from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.seeds import noise_seed
+from accerl_lerobot.trainer import chunk_critic
 from accerl_lerobot.trainer.batch import NonFiniteError
 from accerl_lerobot.trainer.chunk_critic import ChunkCriticUpdate, Critic
 from accerl_lerobot.trainer.config import TrainerConfig
@@ -262,10 +263,11 @@ def first_action(update: OffPolicyUpdate) -> float:
 
 
 @pytest.mark.slow
-def test_teacher_and_policy_go_where_the_critic_leads(tiny_checkpoint: Path):
+def test_teacher_and_policy_go_where_the_critic_leads(tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch):
     """Reward is how far the first action goes up; the state says nothing."""
     torch.manual_seed(0)
-    algorithm = ChunkCriticConfig(critic_steps=6.0, policy_steps=0.5, imitation=0.0)
+    monkeypatch.setattr(chunk_critic, "IMITATION", 0.0)
+    algorithm = ChunkCriticConfig(critic_steps=6.0, policy_steps=0.5)
     update = learner(tiny_checkpoint, algorithm, lr=1e-3, value_lr=1e-3, value_warmup_updates=2)
     rng, metrics = np.random.default_rng(0), {}
     before = first_action(update)
@@ -283,11 +285,12 @@ def test_teacher_and_policy_go_where_the_critic_leads(tiny_checkpoint: Path):
     assert metrics["explained_variance"] > 0.5 and metrics["memory_decisions"] == 10 * 32
 
 
-def test_a_success_holds_the_teacher_near_it(tiny_checkpoint: Path):
+def test_a_success_holds_the_teacher_near_it(tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch):
     distances = []
     for imitation in (0.0, 50.0):
         torch.manual_seed(0)
-        update = learner(tiny_checkpoint, ChunkCriticConfig(imitation=imitation, policy_steps=0.0))
+        monkeypatch.setattr(chunk_critic, "IMITATION", imitation)
+        update = learner(tiny_checkpoint, ChunkCriticConfig(policy_steps=0.0))
         rng, metrics = np.random.default_rng(0), {}
         for _ in range(4):
             actions = rng.uniform(-1, 1, (16, 1, 4, 2)).astype(np.float32)
