@@ -26,50 +26,26 @@ from accerl_lerobot.seeds import noise_seed, train_seed
 
 STARTS_PER_INCARNATION = 1000
 """By how much a restarted worker skips ahead in its training seeds, so as not to repeat its episodes."""
-_STATE = ("plan", "episode_return", "steps", "decisions", "versions", "frames", "chunks")
 
 
 @dataclass
-class Slot:
+class ActiveEpisode:
     """State of one episode under way in `RolloutRunner`."""
 
-    world: World
-    plan: EpisodePlan | None = None
-    builder: SegmentBuilder | None = None
+    plan: EpisodePlan
+    builder: SegmentBuilder
     episode_return: float = 0.0
     steps: int = 0
     decisions: int = 0
     versions: list[int] = field(default_factory=list)
     frames: list[np.ndarray] = field(default_factory=list)
     chunks: list[np.ndarray] = field(default_factory=list)
-    """All that was executed, by which `restore` brings the world back to where it was."""
+    """All that was executed, by which `RolloutRunner.restore` brings the world back to where it was."""
 
-    def state(self) -> dict[str, Any]:
-        """All that `restore` needs; see `snapshot`."""
-        builder = None if self.plan is None or self.builder is None else self.builder.state()
-        return {name: getattr(self, name) for name in _STATE} | {"builder": builder}
-
-    def restore(self, state: dict[str, Any], segment_length: int) -> None:
-        """Goes on from what `state` gave: the world is brought back by doing again what was done in it."""
-        plan: EpisodePlan | None = state["plan"]
-        if plan is None:
-            return
-        observation = self.world.reset(plan.seed, plan.task)
-        for chunk in state["chunks"]:
-            observation = self.world.step_chunk(chunk).observation
-        self.builder = SegmentBuilder(observation, segment_length, Origin(plan.task, plan.seed, decision=0))
-        self.builder.restore(state["builder"])
-        latest = self.builder.latest
-        if observation.keys() != latest.keys() or not all(
-            np.array_equal(observation[key], latest[key]) for key in latest
-        ):
-            raise RuntimeError(
-                f"{plan.task} with seed {plan.seed} does not show again what it had shown after "
-                f"{len(state['chunks'])} decisions, so its episodes cannot be gone on with in the middle; "
-                "use launch.engine=ray, which begins them anew"
-            )
-        for name in _STATE:
-            setattr(self, name, state[name])
+    def request(self) -> Request:
+        """Request of its next decision."""
+        seed = noise_seed(self.plan.seed, self.decisions)
+        return Request(observation=self.builder.latest, noise_seed=seed, explore=self.plan.explore)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -225,135 +201,145 @@ class RolloutRunner:
     ) -> None:
         self.config, self.name = config, name
         self.counters = Counters()
-        self._slots = [Slot(world) for world in worlds]
+        self._worlds = list(worlds)
+        self._episodes: list[ActiveEpisode | None] = [None] * len(worlds)
         self._next_plan, self._on_segment, self._on_episode = next_plan, on_segment, on_episode
         self._sequence = 0
 
     def __len__(self) -> int:
-        return len(self._slots)
+        return len(self._worlds)
 
     @property
     def exploring(self) -> bool:
         """True if an exploring episode is under way."""
-        return any(slot.plan is not None and slot.plan.explore for slot in self._slots)
+        return any(episode is not None and episode.plan.explore for episode in self._episodes)
 
     def start(self, slot: int) -> Request | None:
         """Begins the next planned episode in `slot`; None when nothing is planned."""
-        state, plan = self._slots[slot], self._next_plan()
+        plan = self._next_plan()
         if plan is None:
-            state.plan = None
+            self._episodes[slot] = None
             return None
-        observation = state.world.reset(plan.seed, plan.task)
+        observation = self._worlds[slot].reset(plan.seed, plan.task)
         if not _finite(observation):
             raise RuntimeError(f"{plan.task} with seed {plan.seed}: the first observation is not finite")
-        origin = Origin(plan.task, plan.seed, decision=0)
-        builder = SegmentBuilder(observation, self.config.segment_length, origin)
-        self._slots[slot] = Slot(state.world, plan, builder)
-        return self._request(self._slots[slot])
+        self._episodes[slot] = ActiveEpisode(plan, self._builder(plan, observation))
+        return self.request(slot)
 
     def advance(self, slot: int, decision: Decision) -> Request | None:
         """Executes `decision`; the request is about the same episode, or the first of the next one."""
-        state = self._slots[slot]
-        plan, builder = state.plan, state.builder
-        assert plan is not None and builder is not None
-        result = self._execute(state, plan, decision.chunk)
-        state.chunks.append(decision.chunk)
+        world, episode = self._worlds[slot], self._episodes[slot]
+        assert episode is not None
+        result = _execute(world, episode, decision.chunk)
+        episode.chunks.append(decision.chunk)
         self.counters.env_steps += result.steps
         self.counters.decisions += 1
         sound = np.isfinite(result.rewards).all() and _finite(result.observation)
         if result.info.get("nonfinite") or not sound:
-            self.counters.dropped_nonfinite += len(builder.decisions) + 1
-            if not plan.explore:  # an evaluation counts every episode it planned
-                self._finish(state, plan, success=False)
+            self.counters.dropped_nonfinite += len(episode.builder.decisions) + 1
+            if not episode.plan.explore:  # an evaluation counts every episode it planned
+                self._finish(episode, success=False)
             return self.start(slot)
         reward = float(result.rewards.sum())
-        if (
-            plan.explore
-        ):  # what the learner is to maximise; an evaluation reports the environment's own return
+        if episode.plan.explore:  # what is to be maximised; evaluation reports the environment's own return
             reward -= self.config.decision_cost
-        state.episode_return += reward
-        state.steps += result.steps
-        state.decisions += 1
-        state.versions.append(decision.version)
-        spec = state.world.spec
-        actions = np.clip(decision.chunk, spec.action_low, spec.action_high)
-        builder.add(decision, actions, reward, result.steps, result.observation)
-        if result.done or builder.full:
-            self._emit(state, result)
+        episode.episode_return += reward
+        episode.steps += result.steps
+        episode.decisions += 1
+        episode.versions.append(decision.version)
+        actions = np.clip(decision.chunk, world.spec.action_low, world.spec.action_high)
+        episode.builder.add(decision, actions, reward, result.steps, result.observation)
+        if result.done or episode.builder.full:
+            self._emit(episode, result)
         if result.done:
-            self._finish(state, plan, result.success)
+            self._finish(episode, result.success)
             return self.start(slot)
-        return self._request(state)
+        return episode.request()
 
     def request(self, slot: int) -> Request | None:
         """Request of the episode in `slot`; None if it waits for nothing."""
-        state = self._slots[slot]
-        return None if state.plan is None else self._request(state)
+        episode = self._episodes[slot]
+        return None if episode is None else episode.request()
 
     def state(self) -> dict[str, Any]:
         """All that `restore` needs; see `snapshot`."""
-        slots = [slot.state() for slot in self._slots]
-        return {"counters": replace(self.counters), "sequence": self._sequence, "slots": slots}
+        episodes = [None if e is None else vars(e) | {"builder": e.builder.state()} for e in self._episodes]
+        return {"counters": replace(self.counters), "sequence": self._sequence, "episodes": episodes}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Goes on from what `state` gave: worlds are brought back by doing again what was done in them."""
         self.counters, self._sequence = state["counters"], state["sequence"]
-        for slot, saved in zip(self._slots, state["slots"], strict=True):
-            slot.restore(saved, self.config.segment_length)
+        for slot, (world, saved) in enumerate(zip(self._worlds, state["episodes"], strict=True)):
+            if saved is None:
+                continue
+            plan: EpisodePlan = saved["plan"]
+            observation = world.reset(plan.seed, plan.task)
+            for chunk in saved["chunks"]:
+                observation = world.step_chunk(chunk).observation
+            builder = self._builder(plan, observation)
+            builder.restore(saved["builder"])
+            if not _equal(observation, builder.latest):
+                raise RuntimeError(
+                    f"{plan.task} with seed {plan.seed} does not show again what it had shown after "
+                    f"{len(saved['chunks'])} decisions, so its episodes cannot be resumed in the middle; "
+                    "use launch.engine=ray, which begins them anew"
+                )
+            self._episodes[slot] = ActiveEpisode(**saved | {"builder": builder})
 
     def close(self) -> None:
         """Closes the worlds."""
-        for state in self._slots:
-            state.world.close()
+        for world in self._worlds:
+            world.close()
 
-    def _execute(self, state: Slot, plan: EpisodePlan, actions: np.ndarray) -> ChunkResult:
-        """Executes a chunk; if it is filmed, part by part, with a frame of each."""
-        if plan.film is None:
-            return state.world.step_chunk(actions)
-        side, every = plan.film
-        rewards = []
-        for i in range(0, len(actions), every):
-            result = state.world.step_chunk(actions[i : i + every])
-            rewards.append(result.rewards)
-            state.frames.append(state.world.render(side, side))
-            if result.done:
-                break
-        return replace(result, rewards=np.concatenate(rewards))
+    def _builder(self, plan: EpisodePlan, observation: Observation) -> SegmentBuilder:
+        origin = Origin(plan.task, plan.seed, decision=0)
+        return SegmentBuilder(observation, self.config.segment_length, origin)
 
-    def _request(self, state: Slot) -> Request:
-        plan, builder = state.plan, state.builder
-        assert plan is not None and builder is not None
-        seed = noise_seed(plan.seed, state.decisions)
-        return Request(observation=builder.latest, noise_seed=seed, explore=plan.explore)
-
-    def _emit(self, state: Slot, result: ChunkResult) -> None:
-        plan, builder = state.plan, state.builder
-        assert plan is not None and builder is not None
+    def _emit(self, episode: ActiveEpisode, result: ChunkResult) -> None:
         failed = result.truncated and self.config.time_limit == "fail"
         terminated, truncated = result.terminated or failed, result.truncated and not failed
-        episode: dict[str, float] = {}
+        totals: dict[str, float] = {}
         if terminated or truncated:
-            episode = {name: getattr(state, name) for name in ("steps", "decisions")}
-            episode = {"return": state.episode_return} | episode | {"success": float(result.success)}
+            totals = {"return": episode.episode_return, "steps": episode.steps}
+            totals |= {"decisions": episode.decisions, "success": float(result.success)}
         self._sequence += 1
         key = f"{self.name}.{self._sequence}"
-        segment = builder.cut(key, terminated, truncated, result.success, episode)
-        if plan.explore:
+        segment = episode.builder.cut(key, terminated, truncated, result.success, totals)
+        if episode.plan.explore:
             self._on_segment(segment)
 
-    def _finish(self, state: Slot, plan: EpisodePlan, success: bool) -> None:
+    def _finish(self, episode: ActiveEpisode, success: bool) -> None:
         self.counters.episodes += 1
-        versions = state.versions or [0]
+        versions = episode.versions or [0]
         result = EpisodeResult(
-            plan=plan,
+            plan=episode.plan,
             success=success,
-            episode_return=state.episode_return,
-            steps=state.steps,
-            decisions=state.decisions,
+            episode_return=episode.episode_return,
+            steps=episode.steps,
+            decisions=episode.decisions,
             versions=(min(versions), max(versions)),
-            frames=state.frames,
+            frames=episode.frames,
         )
         self._on_episode(result)
+
+
+def _execute(world: World, episode: ActiveEpisode, actions: np.ndarray) -> ChunkResult:
+    """Executes a chunk; if it is filmed, part by part, with a frame of each."""
+    if episode.plan.film is None:
+        return world.step_chunk(actions)
+    side, every = episode.plan.film
+    rewards = []
+    for i in range(0, len(actions), every):
+        result = world.step_chunk(actions[i : i + every])
+        rewards.append(result.rewards)
+        episode.frames.append(world.render(side, side))
+        if result.done:
+            break
+    return replace(result, rewards=np.concatenate(rewards))
+
+
+def _equal(one: Observation, other: Observation) -> bool:
+    return one.keys() == other.keys() and all(np.array_equal(one[key], other[key]) for key in one)
 
 
 def _finite(observation: Observation) -> bool:
