@@ -26,24 +26,20 @@ SHORTEST_S = 1e-6
 class BatcherStats:
     """Counters of the batcher so far."""
 
-    batches: int = 0
-    requests: int = 0
-    observations: int = 0
-    batch_sizes: dict[int, int] = field(default_factory=dict)
+    batch_sizes: Counter[int] = field(default_factory=Counter)
     """Observations in a batch → batches."""
-    wait_sum_s: float = 0.0
-    """Seconds from `Batcher.add` to `Batcher.take`, summed over requests."""
-    wait_max_s: float = 0.0
-    """The longest such wait, in seconds."""
     waits: Counter[int] = field(default_factory=Counter)
-    """k → requests whose wait was about `GRAIN` to the k-th, in seconds."""
+    """k → requests that waited from `Batcher.add` to `Batcher.take` about `GRAIN` to the k-th, in seconds."""
+    wait_sum_s: float = 0.0
+    wait_max_s: float = 0.0
 
     def metrics(self) -> dict[str, float]:
         """Means for the log; 0 before the first batch."""
+        batches, sizes = self.batch_sizes.total(), self.batch_sizes.items()
         return {
-            "batches": float(self.batches),
-            "batch_size_mean": self.observations / max(self.batches, 1),
-            "wait_mean_s": self.wait_sum_s / max(self.requests, 1),
+            "batches": float(batches),
+            "batch_size_mean": sum(size * count for size, count in sizes) / max(batches, 1),
+            "wait_mean_s": self.wait_sum_s / max(self.waits.total(), 1),
             "wait_max_s": self.wait_max_s,
         }
 
@@ -117,16 +113,13 @@ class Batcher[R: Sized]:
             batch.append(request)
             size += len(request)
             wait_s, stats = now - since, self.stats
-            stats.requests += 1
             stats.wait_sum_s += wait_s
             stats.wait_max_s = max(stats.wait_max_s, wait_s)
             stats.waits[round(math.log(max(wait_s, SHORTEST_S), GRAIN))] += 1
         self._observations -= size
         self._left = max(0, self._left - size)
         if batch:
-            self.stats.batches += 1
-            self.stats.observations += size
-            self.stats.batch_sizes[size] = self.stats.batch_sizes.get(size, 0) + 1
+            self.stats.batch_sizes[size] += 1
         return batch
 
 
@@ -157,13 +150,9 @@ def merge_metrics(metrics: Sequence[dict[str, float]]) -> dict[str, float]:
 
 def merge_stats(stats: Sequence[BatcherStats]) -> BatcherStats:
     """Batches as of one replica."""
-    sizes: Counter[int] = sum((Counter(s.batch_sizes) for s in stats), Counter())
     return BatcherStats(
-        batches=sum(s.batches for s in stats),
-        requests=sum(s.requests for s in stats),
-        observations=sum(s.observations for s in stats),
-        batch_sizes=dict(sizes),
+        batch_sizes=sum((s.batch_sizes for s in stats), Counter()),
+        waits=sum((s.waits for s in stats), Counter()),
         wait_sum_s=sum(s.wait_sum_s for s in stats),
         wait_max_s=max(s.wait_max_s for s in stats),
-        waits=sum((s.waits for s in stats), Counter()),
     )

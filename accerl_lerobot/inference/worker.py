@@ -171,11 +171,7 @@ class InferenceWorker:
             self._server.wake()
 
     async def metrics(self) -> dict[str, float]:
-        """Batching statistics, the version served, the busy share since the last call, the seconds of the
-        last swap of weights, and those from their publication to their first batch.
-
-        Does not answer while the serving thread hangs.
-        """
+        """Numbers for the log; does not answer while the serving thread hangs."""
         while self._iteration is not None and time.monotonic() - self._iteration > 2 * LOOK_S:
             await asyncio.sleep(0.1)
         self._clock.beat()
@@ -194,7 +190,7 @@ class InferenceWorker:
         """Batches so far."""
         stats = self._batcher.stats
         # Copied in one go each: the other thread adds to them.
-        return replace(stats, batch_sizes=dict(stats.batch_sizes), waits=Counter(stats.waits))
+        return replace(stats, batch_sizes=Counter(stats.batch_sizes), waits=Counter(stats.waits))
 
     def _serve(self) -> None:
         batch: list[PendingRequest] = []

@@ -224,20 +224,6 @@ def test_a_failure_reaches_everyone_who_waits_and_everyone_after(play, weights_t
     play(scene, adapter, max_batch=1, max_wait_s=0.0)
 
 
-def test_weights_that_cannot_be_loaded_are_heard_of_by_those_who_wait_for_a_batch(play):
-    async def scene(worker, adapter):
-        worker._batcher.max_wait_s = 1e9
-        waiting = [asyncio.create_task(worker.decide(requests(i))) for i in range(2)]
-        while len(worker._batcher) < 2:
-            await asyncio.sleep(0.001)
-        adapter.broken = ValueError("no such weights")
-        await worker.receive_weights(1, weights(1), 0.0)
-        answers = await asyncio.gather(*waiting, return_exceptions=True)
-        assert all(isinstance(a, ServiceStoppedError) and "no such weights" in str(a) for a in answers)
-
-    play(scene, max_batch=4)
-
-
 def test_serve_ends_with_the_failure_itself(monkeypatch: pytest.MonkeyPatch):
     adapter = CountingAdapter()
     adapter.broken = ValueError("no such weights")
