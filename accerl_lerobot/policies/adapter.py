@@ -325,20 +325,16 @@ class LeRobotAdapter(PolicyAdapter):
         Raises:
             InputError: above `SELF_CHECK_TOLERANCE`, or LeRobot's internals have changed.
         """
+        cause: Exception | None = None
         try:
             batch = self.processing.prepare(observations, tasks)
             difference = self.family.difference(batch, self.model.encode(batch))
+            self.policy.reset()
+            if difference <= SELF_CHECK_TOLERANCE:
+                return difference
+            reason = f"differs from its sampler by {difference:.2e}"
         except (AttributeError, ImportError, KeyError, NotImplementedError, TypeError) as error:
-            raise self._incompatible(f"cannot drive it ({type(error).__name__}: {error})") from error
-        self.policy.reset()
-        if not difference <= SELF_CHECK_TOLERANCE:
-            raise self._incompatible(f"differs from its sampler by {difference:.2e}")
-        return difference
-
-    def _value(self, encoded: Encoded) -> Tensor:
-        return self.value_head(encoded.features, encoded.mask)
-
-    def _incompatible(self, reason: str) -> InputError:
+            cause, reason = error, f"cannot drive it ({type(error).__name__}: {error})"
         import lerobot
 
         remedy = (
@@ -346,4 +342,7 @@ class LeRobotAdapter(PolicyAdapter):
             "log-probs would be those of another policy; install the LeRobot version that this package pins, "
             "or correct the adapter"
         )
-        return InputError("lerobot", lerobot.__version__, remedy)
+        raise InputError("lerobot", lerobot.__version__, remedy) from cause
+
+    def _value(self, encoded: Encoded) -> Tensor:
+        return self.value_head(encoded.features, encoded.mask)

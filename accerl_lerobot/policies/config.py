@@ -174,14 +174,11 @@ USES_HISTORY = ("diffusion",)
 
 
 def register_policy(policy_type: str, model: str, *families: str) -> None:
-    """Gives a LeRobot policy type of another package a likelihood.
-
-    Call it where the type is registered with LeRobot, so that who imports the package has both.
+    """Gives a LeRobot policy type of another package a likelihood, where the type is registered with LeRobot.
 
     Args:
         policy_type: its name in LeRobot's registry.
-        model: ``module:class``, of that package, of its `FlowModel`, `GaussianModel`, or another
-            `family.Model`.
+        model: ``module:class``, of that package, of its `FlowModel` or another `family.Model`.
         families: names of the samplers that suit it, the default one first.
     """
     module = model.partition(":")[0]
@@ -190,10 +187,7 @@ def register_policy(policy_type: str, model: str, *families: str) -> None:
 
 
 def register_policies(wanted: str | None = None) -> None:
-    """Fills LeRobot's registry of policy types in this process: its own, and ours.
-
-    If `wanted` is none of them, LeRobot's installed plugins, such as ``lerobot_policy_*``, are imported.
-    """
+    """Fills LeRobot's registry of policy types; if `wanted` is still missing, from its installed plugins."""
     importlib.import_module("lerobot.policies")
     for package in PLUGINS.values():
         importlib.import_module(package)
@@ -227,11 +221,7 @@ def check_observations(policy_config: Any, field: str) -> None:
 
 
 def sampler_config(config: PolicyConfig, policy_type: str) -> SamplerConfig:
-    """How a policy of this type explores in this run.
-
-    Raises:
-        InputError: the configured sampler is of a family that does not suit it.
-    """
+    """How a policy of this type explores in this run; a sampler of another family is refused."""
     families = POLICIES[policy_type][1]
     if config.sampler is None:
         return SamplerConfig.get_choice_class(families[0])()

@@ -161,9 +161,7 @@ class Diffusion(Model):
             return diffusion.unet(x, t, global_cond=condition).float()
 
         return Encoded(
-            features=condition[:, None],
-            mask=condition.new_ones(len(condition), 1).bool(),
-            context=network,
+            features=condition[:, None], mask=condition.new_ones(len(condition), 1).bool(), context=network
         )
 
     def stock(self, batch: dict[str, Tensor], noise: Tensor) -> tuple[Tensor, Tensor]:

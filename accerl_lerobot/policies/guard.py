@@ -50,11 +50,7 @@ FILLS = frozenset((
 
 
 def fetched_checkpoint(path: str, revision: str | None, field: str) -> Path:
-    """Where a checkpoint's files are, once checked; those of a Hub repository are fetched.
-
-    Raises:
-        InputError: there is no checkpoint, or it is not to be trusted, see `check_checkpoint`.
-    """
+    """Where a checkpoint's files are, once checked; those of a Hub repository are fetched."""
     from huggingface_hub import snapshot_download
 
     from accerl_lerobot.hub.errors import guard_client
@@ -77,11 +73,7 @@ def fetched_checkpoint(path: str, revision: str | None, field: str) -> Path:
 def check_checkpoint(folder: Path, origin: Origin, *, fetched: bool = False) -> dict[str, Any]:
     """Checks all files of a LeRobot checkpoint that are read, before they are; returns its ``config.json``.
 
-    Args:
-        fetched: it is from the Hub, and must not name folders of this machine.
-
-    Raises:
-        InputError: a file is not what it says, leads elsewhere, or asks for what is not there.
+    One that was `fetched` from the Hub must not name folders of this machine.
     """
     config = read_json(safe_join(folder, CONFIG, origin), origin)
     for key, own in CONFIG_FOLDERS.items():

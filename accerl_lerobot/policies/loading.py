@@ -80,11 +80,7 @@ NAMED = 3
 
 
 def resolve_device(name: str, field: str = "policy.device") -> torch.device:
-    """``auto`` is CUDA when there is one.
-
-    Raises:
-        InputError: no such device; the error names `field`.
-    """
+    """The device of this name; ``auto`` is CUDA when there is one. The error names `field`."""
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
@@ -150,20 +146,12 @@ def rehearsed_config(config: PolicyConfig) -> Any:
 
 
 def policy_sizes(config: PolicyConfig) -> Sizes:
-    """`Sizes` of the policy of `rehearsed_config`, which has been called.
-
-    Raises:
-        InputError: there is no checkpoint any more.
-    """
+    """`Sizes` of the policy of `rehearsed_config`, which has been called."""
     return _rehearsed[_key(config, _checkpoint_folder(config))]
 
 
 def rehearsed[T](config: PolicyConfig, task: Callable[[LeRobotAdapter], T]) -> T:
-    """Result, which JSON can hold, of `task` with the policy of `rehearsed_config`, in a child process too.
-
-    Raises:
-        InputError: see `rehearsed_config`.
-    """
+    """Result, which JSON can hold, of `task` with the policy of `rehearsed_config`, in a child process."""
     there, origin = replace(config, device="cpu"), Origin("policy.path", config.path)
     return rehearse(lambda: task(load_adapter(there, rehearsal=True)), _checkpoint_folder(config), origin)
 
@@ -293,11 +281,7 @@ def _load_ours(adapter: LeRobotAdapter, folder: Path, origin: Origin) -> None:
 
 
 def _use_backbone(lerobot_config: Any, folder: Path, path: str | None) -> None:
-    """Points a LeRobot policy config at the checkpoint's own files, where it has them.
-
-    Raises:
-        InputError: the config names local ones that are gone.
-    """
+    """Points a LeRobot policy config at the checkpoint's own files, where it has them."""
     for field, own in CONFIG_FOLDERS.items():
         if not hasattr(lerobot_config, field):
             continue
@@ -336,8 +320,7 @@ def _keep_names(lerobot_config: Any, preprocessor: Any, folder: Path) -> None:
 
 
 def _stored_steps(folder: Path) -> list[dict[str, Any]]:
-    steps: list[dict[str, Any]] = json.loads((folder / PREPROCESSOR).read_text())["steps"]
-    return steps
+    return json.loads((folder / PREPROCESSOR).read_text())["steps"]
 
 
 class _Name(str):

@@ -52,8 +52,6 @@ class TokenContext:
 class TokenModel(Model):
     """A LeRobot policy that chooses tokens; `Encoded.context` is a `TokenContext`."""
 
-    parallel: bool
-    """All positions in one pass."""
     terminator: int | None
     """The token after which the others mean nothing; None: all L always count."""
     length: int
@@ -165,16 +163,16 @@ class TokenFamily(Family):
     def _decide(self, encoded: Encoded, explore: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
         """Tokens and their log-probs, each (B, L), in one pass or position by position."""
         context: TokenContext = encoded.context
-        model, temperature = self.model, self.sampler.temperature
+        terminator, temperature = self.model.terminator, self.sampler.temperature
 
         def pick(logits: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
             chosen = explore.view(-1, *[1] * (uniform.dim() - 1))
             tokens = torch.where(chosen, draw(logits, uniform, temperature), logits.argmax(-1))
             return tokens, token_log_prob(logits, tokens, temperature)
 
-        if model.parallel:
+        if context.generate is None:
             return pick(context.logits(torch.zeros_like(uniform, dtype=torch.long)), uniform)
-        fill = 0 if model.terminator is None else model.terminator
+        fill = 0 if terminator is None else terminator
         tokens = torch.full_like(uniform, fill, dtype=torch.long)
         log_prob = torch.zeros_like(uniform, dtype=torch.float32)
         running = torch.ones_like(explore)
@@ -183,10 +181,9 @@ class TokenFamily(Family):
             picked, each = pick(logits, uniform[:, position])
             tokens[:, position] = torch.where(running, picked, fill)
             log_prob[:, position] = each
-            if model.terminator is not None:
-                running.logical_and_(picked != model.terminator)
+            if terminator is not None:
+                running.logical_and_(picked != terminator)
             return tokens[:, position]
 
-        assert context.generate is not None
         context.generate(choose)
         return tokens, log_prob

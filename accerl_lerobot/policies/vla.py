@@ -50,6 +50,18 @@ from accerl_lerobot.policies.tokens import Choose, TokenContext, TokenModel
 logger = logging.getLogger(__name__)
 
 
+def _read(network: Any, embedded: Tensor, pad: Tensor, attention_mask: Tensor) -> tuple[Tensor, Any]:
+    """Hidden states and key-value cache of a prefix."""
+    (features, _), cache = network.forward(
+        attention_mask=attention_mask,
+        position_ids=torch.cumsum(pad, dim=1) - 1,
+        past_key_values=None,
+        inputs_embeds=[embedded, None],
+        use_cache=True,
+    )
+    return features, cache
+
+
 def _velocity(model: Any, pad: Tensor, cache: Any, **shown: Tensor) -> Velocity:
     """The velocity field that a LeRobot network has after its prefix; `shown` goes to the expert directly."""
 
@@ -71,9 +83,7 @@ class SmolVLA(FlowModel):
         config = policy.config
         refuse_options(config)
         if config.adapt_to_pi_aloha:
-            raise InputError(
-                "policy.adapt_to_pi_aloha", True, "not supported in RL; train a policy without it"
-            )
+            raise InputError("policy.adapt_to_pi_aloha", True, "not supported in RL; train one without it")
         self.policy = policy
         self.shape = flow_shape(config, config.num_steps)
         self.width = policy.model.vlm_with_expert.config.text_config.hidden_size
@@ -86,13 +96,7 @@ class SmolVLA(FlowModel):
             images, image_masks, batch[OBS_LANGUAGE_TOKENS], batch[OBS_LANGUAGE_ATTENTION_MASK],
             state=self.policy.prepare_state(batch),
         )  # fmt: skip
-        (features, _), cache = model.vlm_with_expert.forward(
-            attention_mask=make_att_2d_masks(pad, att),
-            position_ids=torch.cumsum(pad, dim=1) - 1,
-            past_key_values=None,
-            inputs_embeds=[embedded, None],
-            use_cache=True,
-        )
+        features, cache = _read(model.vlm_with_expert, embedded, pad, make_att_2d_masks(pad, att))
         return Encoded(features=features, mask=pad, context=_velocity(model, pad, cache))
 
 
@@ -100,7 +104,6 @@ class SmolVLABins(TokenModel):
     """Drives `bins_plugin`'s policy; queries of rows that are not executed have no token."""
 
     backbone = "model.vlm."
-    parallel = True
     terminator = None
 
     def __init__(self, policy: Any) -> None:
@@ -154,13 +157,8 @@ class Pi05(FlowModel):
         embedded, pad, att = model.embed_prefix(
             images, image_masks, batch[OBS_LANGUAGE_TOKENS], batch[OBS_LANGUAGE_ATTENTION_MASK]
         )
-        (features, _), cache = model.paligemma_with_expert.forward(
-            attention_mask=prepare_attention_masks_4d(make_att_2d_masks(pad, att)),
-            position_ids=torch.cumsum(pad, dim=1) - 1,
-            past_key_values=None,
-            inputs_embeds=[embedded, None],
-            use_cache=True,
-        )
+        mask = prepare_attention_masks_4d(make_att_2d_masks(pad, att))
+        features, cache = _read(model.paligemma_with_expert, embedded, pad, mask)
         shown = self._shown_to_expert(batch)
         # The critic reads the prefix: what is not in it stands beside every token, so their mean keeps it.
         for tensor in shown.values():
@@ -207,11 +205,7 @@ class FastTokenizer:
 
     @classmethod
     def from_pretrained(cls, name: str, **options: Any) -> FastTokenizer:
-        """Reads a folder, or the JSON files of a Hub repository; no option changes that.
-
-        Raises:
-            OSError: it is neither, or has no tokeniser in it.
-        """
+        """Reads a folder, or the JSON files of a Hub repository; no option changes that."""
         from huggingface_hub import snapshot_download
         from transformers import PreTrainedTokenizerFast
 
@@ -273,7 +267,6 @@ class _TextTokenizer:
 class Pi0Fast(TokenModel):
     """Drives LeRobot's `PI0FastPolicy`."""
 
-    parallel = False
     loading = staticmethod(data_only)
 
     def __init__(self, policy: Any) -> None:
@@ -308,13 +301,8 @@ class Pi0Fast(TokenModel):
             torch.cat([prompt, bos], 1),
             torch.cat([known, torch.ones_like(known[:, :1])], 1),
         )
-        (features, _), cache = network.forward(
-            attention_mask=prepare_attention_masks_4d(att, dtype=embedded.dtype),
-            position_ids=torch.cumsum(pad, dim=1) - 1,
-            past_key_values=None,
-            inputs_embeds=[embedded, None],
-            use_cache=True,
-        )
+        mask = prepare_attention_masks_4d(att, dtype=embedded.dtype)
+        features, cache = _read(network, embedded, pad, mask)
 
         def follow(tokens: Tensor, cache: Any, first: int) -> Tensor:
             """Hidden states (B, n, width) at the n positions from `first` on, whose tokens are (B, n)."""

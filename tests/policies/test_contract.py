@@ -18,11 +18,7 @@ from torch import Tensor
 
 from accerl_lerobot.experience import Request
 from accerl_lerobot.policies.adapter import LeRobotAdapter, Processing, stack_observations
-from accerl_lerobot.policies.config import (
-    POLICIES,
-    PolicyConfig,
-    SamplerConfig,
-)
+from accerl_lerobot.policies.config import POLICIES, PolicyConfig, SamplerConfig
 from accerl_lerobot.policies.saving import save_pretrained
 from accerl_lerobot.testing import check_batches, check_gradient, log_ratio, perturb, stored
 from tests.policies.cases import CASES, VARIANTS, Case

@@ -184,11 +184,7 @@ def test_entropy_is_the_mean_surprise_of_what_is_sampled():
     ("changes", "options", "sentence"),
     [
         ({}, {"num_steps": 21}, "policy.num_steps=21: use at most 20, as many as it was trained with"),
-        (
-            {},
-            {"n_action_steps": 9},
-            "policy.n_action_steps=9: use 1 to 8, the chunk the policy predicts",
-        ),
+        ({}, {"n_action_steps": 9}, "policy.n_action_steps=9: use 1 to 8, the chunk the policy predicts"),
         (
             {"n_obs_steps": 2},
             {"n_action_steps": 8},
