@@ -67,15 +67,7 @@ class _Entry:
 
 
 class Replay:
-    """Segments in, batches of segments out; no clock, no process, no policy.
-
-    Example:
-        >>> replay = Replay(ReplayConfig(capacity=4096, min_decisions=256, samples_per_insert=2.0))
-        >>> if replay.may_insert():
-        ...     replay.insert(segment)
-        >>> if replay.may_sample(256):
-        ...     segments = replay.sample(256, trainer_version=17, rng=np.random.default_rng(0))
-    """
+    """Segments in, batches of segments out; no clock, no process, no policy."""
 
     def __init__(self, config: ReplayConfig) -> None:
         self.config = config
@@ -111,8 +103,7 @@ class Replay:
     def insert(self, segment: Segment) -> bool:
         """Stores a segment, by reference, and evicts the oldest ones if room is needed.
 
-        Returns:
-            False for a non-finite segment, which is counted and not stored.
+        A non-finite one is counted and not stored: False.
         """
         n = len(segment)
         if n > self.config.capacity:
@@ -168,9 +159,8 @@ class Replay:
     def state(self, version: int | None = None) -> dict[str, Any]:
         """All that `restore` needs; see `snapshot`. Shares the segments, which nobody changes.
 
-        Args:
-            version: updates made by the trainer that this is to go with; what it has drawn for later ones
-                counts as not drawn. None: it has learnt from all it drew.
+        What the trainer has drawn for updates after `version` counts as not drawn; None: it has learnt from
+        all it drew.
         """
         late = [] if version is None else [entries for made, entries in self._drawn if made >= version]
         if late and len(late) == self._drawn.maxlen:

@@ -8,13 +8,9 @@ Everything is counted in decisions. On entering the store each segment gets a wh
     may_sample = stored ≥ min_decisions  and  available ≥ batch
     may_insert = stored < min_decisions  or   available < ahead
 
-*No deadlock*, whatever happened before: if stored < min_decisions, inserting is allowed. Otherwise either
-available ≥ batch, and sampling is allowed; or available < batch ≤ ahead, and inserting is. Nothing here
-depends on totals since the run began, so evicting, retiring or resuming cannot upset the pace.
-
-*No over-use*: no decision is trained on more than ⌈r⌉ times. *Bounded staleness*: see `lag_bound`. Rollouts
-wait on insert instead of having their segments thrown away later, because what is thrown away first is what
-took longest, and those are the failures.
+With batch ≤ ahead one of them holds at any time. Nothing depends on totals since the run began, so evicting,
+retiring or resuming cannot upset the pace. Rollouts wait on insert instead of having their segments thrown
+away later, because what is thrown away first is what took longest, and those are the failures.
 
     asynchronous   nobody waits for anybody, within the pace
     overlap        the next batch is collected while one is learned from, and then both wait for each other
@@ -111,15 +107,10 @@ def lag_bound(
         lag ≤ min(max_lag, pickup + drawn) + prefetch
         drawn = ⌊⌈samples_per_insert⌉ · (max(ahead, min_decisions) + 2·in_flight + capacity) / batch⌋ − 1
 
-    Take a segment's first decision, at time 0, and the moment it is drawn. The weights that decided were
-    `pickup` updates old at most. Each update since then has drawn a batch, each decision at most
-    ⌈samples_per_insert⌉ times, out of
-
-    * what was available at time 0, at most max(ahead, min_decisions) + in_flight;
-    * what was inserted since: in_flight until the segment itself was in, and capacity after that, or it
-      would have been evicted.
-
-    One batch is subtracted for the update that draws the segment.
+    Between a segment's first decision and its being drawn, each update has drawn a batch out of what was
+    available at first, at most max(ahead, min_decisions) + in_flight, and of what was inserted since:
+    in_flight until the segment itself was in, and capacity after that, or it would have been evicted. The
+    weights that decided were `pickup` updates old at most.
 
     Args:
         batch_decisions: decisions one update draws at least.

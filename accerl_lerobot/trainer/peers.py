@@ -4,9 +4,8 @@
     replay ──batch──► rank 0 ──its reference──► ranks 1, 2 …
                         ◄── torch.distributed: values, gradients, parts of weights ──►
 
-Whatever the first rank does that takes all of them it does within `Peers.joining`: the others are told, do
-the same, and are waited for. A rank that dies or hangs ends what the others are waiting for, at the latest
-after ``trainer.rank_timeout_s``, and is named in the error.
+What takes all ranks is done within `Peers.joining`: the others are told, do the same, and are waited for. One
+that dies or hangs ends the wait, at the latest after ``trainer.rank_timeout_s``, and is named in the error.
 """
 
 from __future__ import annotations
@@ -127,12 +126,7 @@ class TrainerRank:
 class Peers:
     """The others, as the first rank sees them.
 
-    Args:
-        actors: handles of `TrainerRank`, of rank 1, 2 …; none where there is one rank.
-
-    Example:
-        >>> with peers.joining("step", batch):   # they are told …
-        ...     update.step(ray.get(batch))      # … and have done it too when this is over
+    `actors` are handles of `TrainerRank`, of rank 1, 2 …; none where there is one rank.
     """
 
     def __init__(self, actors: Sequence[Any], config: TrainerConfig) -> None:

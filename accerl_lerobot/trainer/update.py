@@ -52,11 +52,6 @@ class Update:
     Args:
         adapter: the policy; its parameters are others afterwards where ranks keep parts of them.
         ranks: those that make each update; None: this process alone.
-
-    Example:
-        >>> update = Update(adapter, GIPOConfig(), TrainerConfig(lr=1e-4))
-        >>> metrics = update.step(replay.sample(128, update.version, rng))
-        >>> weights = adapter.export_trainable()        # to publish as version `update.version`
     """
 
     def __init__(

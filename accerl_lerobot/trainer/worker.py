@@ -86,14 +86,7 @@ class TrainerWorker:
         return self._update.version
 
     def join(self, reader: Any) -> int:
-        """Has another reader receive the weights, once `run` publishes any.
-
-        Returns:
-            The newest version that has been published: it gets no older one.
-
-        Raises:
-            TimeoutError: none has been.
-        """
+        """Has another reader receive the weights; it gets none older than the version that is returned."""
         if not self._publishing.wait(2 * CONNECT_S):
             raise TimeoutError(f"the trainer has published no weights for {2 * CONNECT_S:g} s")
         assert self._publisher is not None
@@ -126,16 +119,11 @@ class TrainerWorker:
                     metrics = self._update.step(segments)
                 updated = time.monotonic()
                 self._clock.enter(WEIGHT_SYNC)
-                version = self._update.version
-                self._publish(publisher, held, last=version == config.updates)
+                self._publish(publisher, held, last=self._update.version == config.updates)
                 if self._in_turn:
                     publisher.flush()
-                metrics |= {
-                    "update": float(self._update.version),
-                    "wait_s": waited,
-                    "update_s": updated - started,
-                    "publish_s": time.monotonic() - updated,
-                }
+                metrics |= {"update": float(self._update.version), "wait_s": waited}
+                metrics |= {"update_s": updated - started, "publish_s": time.monotonic() - updated}
                 self._history.append(metrics)
             asked = time.monotonic()
             replay.learnt.remote()
@@ -166,8 +154,7 @@ class TrainerWorker:
     def hold(self) -> tuple[int, list[dict[str, float]]]:
         """Keeps a copy of all that is to be saved, as it is between two updates, for `write`.
 
-        Returns:
-            Its version, and the records up to it that `metrics` has not given.
+        Returns its version, and the records up to it that `metrics` has not given.
         """
         with self._lock:
             with self._peers.lending("lend_state"):

@@ -98,10 +98,7 @@ class Simulation:
         self.rng = np.random.default_rng(self.seed)
         self.replay = Replay(self.config)
         self.bound = lag_bound(
-            self.config,
-            batch_decisions=self.batch,
-            in_flight=self.in_flight,
-            pickup=self.publish_every - 1,
+            self.config, batch_decisions=self.batch, in_flight=self.in_flight, pickup=self.publish_every - 1
         )
         self.started = 0
 

@@ -30,6 +30,7 @@ from accerl_lerobot.trainer.chunk_critic import ChunkCriticUpdate, Critic
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.memory import Memory
 from accerl_lerobot.trainer.off_policy import OffPolicyUpdate
+from tests.replay.segments import make_segment
 from tests.runs import tiny_run
 
 GAMMA = 0.9
@@ -40,7 +41,9 @@ def episode(rewards: list[float], *, first: float = 0.0, actions: np.ndarray | N
     """An episode whose environment state counts its decisions from `first`."""
     t = len(rewards)
     counts = first + np.arange(t + 1, dtype=np.float32)
-    return Segment(
+    return make_segment(
+        str(first),
+        t,
         observations={
             "observation.state": np.zeros((t + 1, 4), np.float32),
             "observation.images.front": np.zeros((t + 1, 32, 32, 3), np.uint8),
@@ -48,16 +51,11 @@ def episode(rewards: list[float], *, first: float = 0.0, actions: np.ndarray | N
         },
         task="Match the target",
         latent={},
-        log_prob=np.zeros((t, 4), np.float32),
-        value=np.zeros(t, np.float32),
         actions=np.zeros((t, 4, 2), np.float32) if actions is None else actions,
         reward=np.array(rewards, np.float32),
-        version=np.zeros(t, np.int64),
         steps=np.full(t, 4),
         terminated=True,
-        truncated=False,
         success=rewards[-1] > 0,
-        key=str(first),
         origin=Origin("match", 0, 0),
         episode={"return": sum(rewards)},
     )
