@@ -50,16 +50,18 @@ from accerl_lerobot.policies.tokens import Choose, TokenContext, TokenModel
 logger = logging.getLogger(__name__)
 
 
-def _read(network: Any, embedded: Tensor, pad: Tensor, attention_mask: Tensor) -> tuple[Tensor, Any]:
-    """Hidden states and key-value cache of a prefix."""
-    (features, _), cache = network.forward(
-        attention_mask=attention_mask,
-        position_ids=torch.cumsum(pad, dim=1) - 1,
-        past_key_values=None,
+def _run(
+    network: Any, embedded: Tensor, mask: Tensor, places: Tensor, cache: Any = None
+) -> tuple[Tensor, Any]:
+    """Hidden states of a language model on tokens at these places, and its key-value cache."""
+    (hidden, _), cache = network.forward(
+        attention_mask=mask,
+        position_ids=places,
+        past_key_values=cache,
         inputs_embeds=[embedded, None],
         use_cache=True,
     )
-    return features, cache
+    return hidden, cache
 
 
 def _velocity(model: Any, pad: Tensor, cache: Any, **shown: Tensor) -> Velocity:
@@ -96,7 +98,8 @@ class SmolVLA(FlowModel):
             images, image_masks, batch[OBS_LANGUAGE_TOKENS], batch[OBS_LANGUAGE_ATTENTION_MASK],
             state=self.policy.prepare_state(batch),
         )  # fmt: skip
-        features, cache = _read(model.vlm_with_expert, embedded, pad, make_att_2d_masks(pad, att))
+        mask, places = make_att_2d_masks(pad, att), torch.cumsum(pad, dim=1) - 1
+        features, cache = _run(model.vlm_with_expert, embedded, mask, places)
         return Encoded(features=features, mask=pad, context=_velocity(model, pad, cache))
 
 
@@ -158,7 +161,7 @@ class Pi05(FlowModel):
             images, image_masks, batch[OBS_LANGUAGE_TOKENS], batch[OBS_LANGUAGE_ATTENTION_MASK]
         )
         mask = prepare_attention_masks_4d(make_att_2d_masks(pad, att))
-        features, cache = _read(model.paligemma_with_expert, embedded, pad, mask)
+        features, cache = _run(model.paligemma_with_expert, embedded, mask, torch.cumsum(pad, dim=1) - 1)
         shown = self._shown_to_expert(batch)
         # The critic reads the prefix: what is not in it stands beside every token, so their mean keeps it.
         for tensor in shown.values():
@@ -302,7 +305,7 @@ class Pi0Fast(TokenModel):
             torch.cat([known, torch.ones_like(known[:, :1])], 1),
         )
         mask = prepare_attention_masks_4d(att, dtype=embedded.dtype)
-        features, cache = _read(network, embedded, pad, mask)
+        features, cache = _run(network, embedded, mask, torch.cumsum(pad, dim=1) - 1)
 
         def follow(tokens: Tensor, cache: Any, first: int) -> Tensor:
             """Hidden states (B, n, width) at the n positions from `first` on, whose tokens are (B, n)."""
@@ -312,14 +315,8 @@ class Pi0Fast(TokenModel):
             whole = pad[:, None].expand(-1, len(places), -1)
             attends = torch.cat([whole, seen.expand(len(pad), -1, -1)], 2)
             embedded = network.embed_language_tokens(tokens)
-            (hidden, _), _ = network.forward(
-                attention_mask=prepare_attention_masks_4d(attends, dtype=embedded.dtype),
-                position_ids=pad.sum(1, keepdim=True) + places,
-                past_key_values=cache,
-                inputs_embeds=[embedded, None],
-                use_cache=True,
-            )
-            return hidden
+            mask = prepare_attention_masks_4d(attends, dtype=embedded.dtype)
+            return _run(network, embedded, mask, pad.sum(1, keepdim=True) + places, cache)[0]
 
         def logits(tokens: Tensor) -> Tensor:
             states = features[:, -1:]

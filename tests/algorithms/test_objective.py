@@ -138,7 +138,7 @@ def metrics_of(
     keep: torch.Tensor = YES,
     clip: tuple[float, float] = (0.2, 0.28),
 ) -> dict[str, float]:
-    """Of four decisions with a ratio each."""
+    """Metrics of four decisions with a ratio each."""
     columns = {"log_ratio": torch.tensor(log_ratio)[:, None], "weight": torch.tensor(weight)[:, None]}
     rows = {"value": torch.tensor(value), "returns": torch.tensor(returns)}
     return {k: v.item() for k, v in Samples(**columns, **rows, keep=keep, clip=clip).metrics().items()}
