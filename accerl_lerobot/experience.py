@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The nouns that cross a process border.
+"""The types that cross processes.
 
 Shape letters: T decisions of a segment, K actions per chunk, A action dims, L log-prob factors of a decision.
 NumPy only: a rollout worker that imports this file stays free of torch and LeRobot.
@@ -49,12 +49,7 @@ class Request:
 @kind
 @dataclass(frozen=True, kw_only=True)
 class Decision:
-    """One policy call, as the inference service answers it.
-
-    Example:
-        A rollout worker submits an observation, gets a ``Decision``, hands ``chunk`` to ``World.step_chunk``
-        and keeps the rest for the segment. ``version`` says which weights decided.
-    """
+    """One policy call, as the inference service answers it."""
 
     chunk: np.ndarray
     """float32 (K, A), in the environment's action units (un-normalised); not clipped."""
@@ -133,9 +128,9 @@ class Segment:
             raise ValueError(f"segment {self.key}: holds no decision")
         if self.terminated and self.truncated:
             raise ValueError(f"segment {self.key}: terminated and truncated at once")
-        sizes = {"log_prob": len(self.log_prob), "value": len(self.value), "version": len(self.version)}
-        sizes["actions"] = len(self.actions)
-        sizes |= {"steps": len(self.steps)} | {f"latent.{k}": len(v) for k, v in self.latent.items()}
+        names = ("log_prob", "value", "version", "actions", "steps")
+        sizes = {name: len(getattr(self, name)) for name in names}
+        sizes |= {f"latent.{k}": len(v) for k, v in self.latent.items()}
         sizes |= {k: len(v) - 1 for k, v in self.observations.items()}
         wrong = {k: n for k, n in sizes.items() if n != t}
         if wrong:

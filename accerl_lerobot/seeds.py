@@ -16,19 +16,15 @@ DEMO_SEEDS = range(0, 1_000_000_000)
 TRAIN_SEEDS = range(1_000_000_000, 2_000_000_000)
 EVAL_SEEDS = range(2_000_000_000, 3_000_000_000)
 
-_DEMOS_PER_RUN = 1_000_000
 _WORKERS_PER_RUN = 1_000
 _PRIME = 999_999_937
 """The largest below 10**9, the size of a range."""
 _EVALUATIONS_PER_RUN = 10_000
-_ALL_SEEDS = 2**32
 _DECISIONS_PER_EPISODE = 1_000_003
 
 
 def demo_seed(run_seed: int, index: int) -> int:
     """Seed of the `index`-th demonstration tried by a recording with `run_seed`."""
-    if not 0 <= index < _DEMOS_PER_RUN:
-        raise ValueError(f"demonstration {index}: one recording has at most {_DEMOS_PER_RUN} tries")
     return _permuted(DEMO_SEEDS, run_seed, index)
 
 
@@ -49,16 +45,13 @@ def _permuted(seeds: range, run_seed: int, index: int) -> int:
     return seeds.start + ((1 + int(a) % (_PRIME - 1)) * index + int(b)) % _PRIME
 
 
-def noise_seed(episode_seed: int, member: int, decision: int) -> int:
-    """Seed of one decision's noise: of the episode and the decision, not of the slot or batch that runs it.
-
-    `member` tells episodes apart that start alike; else it is 0.
-    """
-    return (member * _ALL_SEEDS + episode_seed) * _DECISIONS_PER_EPISODE + decision
+def noise_seed(episode_seed: int, decision: int) -> int:
+    """Seed of one decision's noise: of the episode and the decision, not of the slot or batch."""
+    return episode_seed * _DECISIONS_PER_EPISODE + decision
 
 
 def episode_of(noise_seed: int) -> int:
-    """A number that all decisions of an episode share, and no others; from the `noise_seed` of one."""
+    """Seed of the episode that a decision with this `noise_seed` is of."""
     return noise_seed // _DECISIONS_PER_EPISODE
 
 

@@ -18,7 +18,7 @@ from accerl_lerobot.engine.config import LaunchConfig, RunConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.policies.config import Load, PolicyConfig
-from accerl_lerobot.replay import ReplayConfig
+from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
 from benchmarks.simulated_world import LatencyConfig

@@ -24,9 +24,9 @@ from accerl_lerobot.checkpoint.layout import save_checkpoint
 from accerl_lerobot.config.ranges import Range, Repeats, Section
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Origin, Segment
-from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.replay.buffer import MixedReplay
 from accerl_lerobot.replay.journal import EPISODES, Journal
+from accerl_lerobot.replay.pacing import ReplayConfig
 from benchmarks.records import floors
 
 CAMERA = "observation.images.front"

@@ -18,7 +18,7 @@ from accerl_lerobot.engine.run import make_engine
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.policies.config import PolicyConfig
-from accerl_lerobot.replay import ReplayConfig
+from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
 

@@ -28,8 +28,8 @@ from accerl_lerobot.engine.config import LaunchConfig, RunConfig
 from accerl_lerobot.envs import SimulatedConfig, make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Observation
-from accerl_lerobot.policies import flow
 from accerl_lerobot.policies.config import PLUGINS, POLICIES, PolicyConfig
+from accerl_lerobot.policies.flow import FlowFamily
 from accerl_lerobot.policies.loading import load_adapter, rehearsed_config
 from accerl_lerobot.testing import check_policy
 from tests.policies.checkpoints import write_policy
@@ -134,13 +134,13 @@ def test_mistakes_are_found(
 def test_a_density_that_leaves_out_executed_actions_is_found(
     checkpoint: Path, observations: list[Observation], monkeypatch: pytest.MonkeyPatch
 ):
-    whole = flow.row_log_prob
+    whole = FlowFamily._rows
 
     def first_row(*arguments: Any) -> Any:
         rows = whole(*arguments)
         return torch.cat([rows[:, :1], 0 * rows[:, 1:]], 1)
 
-    monkeypatch.setattr(flow, "row_log_prob", first_row)
+    monkeypatch.setattr(FlowFamily, "_rows", first_row)
     with pytest.raises(
         AssertionError, match="standard errors apart: the log-prob is not that of the actions"
     ):

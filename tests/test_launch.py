@@ -19,7 +19,7 @@ from accerl_lerobot.checkpoint.layout import PRETRAINED
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.loop import Progress
 from accerl_lerobot.evaluation import evaluation_plans
-from accerl_lerobot.replay import ReplayConfig, lag_bound
+from accerl_lerobot.replay.pacing import ReplayConfig, lag_bound
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
 from accerl_lerobot.timeline.read import ABSENT, read_timeline
 from accerl_lerobot.trainer.config import TrainerConfig

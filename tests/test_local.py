@@ -16,7 +16,7 @@ from accerl_lerobot.engine.loop import Engine, Progress
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.policies.config import FlowSamplerConfig, PolicyConfig
-from accerl_lerobot.replay import ReplayConfig
+from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
 from benchmarks.simulated_world import LatencyConfig

@@ -50,7 +50,8 @@ def test_an_environment_offers_what_a_policy_of_it_needs():
             {"observation.images.top": (3, 32, 32)},
             {},
             "policy.path='x': no observation.images.top in the environment, which offers "
-            "observation.images.front; choose env.camera (env.images of gym), or map names with policy.rename_map",
+            "observation.images.front; choose env.camera (env.images of gym), or map names with "
+            "policy.rename_map",
         ),
         ({FRONT: (3, 64, 64)}, {}, "its observation.images.front is (3, 64, 64), but (3, 32, 32) in the env"),
         ({STATE: (6,)}, {}, "policy.path='x': its observation.state is (6,), but (4,) in the environment"),

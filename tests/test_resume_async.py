@@ -23,7 +23,7 @@ from accerl_lerobot.engine.loop import Progress
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.inference import worker as inference_worker
-from accerl_lerobot.replay import ReplayConfig
+from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer import worker as trainer_worker
 from accerl_lerobot.trainer.config import TrainerConfig

@@ -19,7 +19,7 @@ from accerl_lerobot.engine.run import make_engine
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import evaluation_plans
-from accerl_lerobot.replay import ReplayConfig
+from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
 from tests.runs import drive, polls, tiny_run

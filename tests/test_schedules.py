@@ -22,8 +22,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.inference.batcher import dealt, merge_metrics
 from accerl_lerobot.inference.worker import InferenceConfig
-from accerl_lerobot.replay import ReplayConfig
-from accerl_lerobot.replay.pacing import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, Turns
+from accerl_lerobot.replay.pacing import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, ReplayConfig, Turns
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.world_model.config import ImaginationConfig

@@ -52,8 +52,8 @@ def test_runs_of_different_seeds_are_evaluated_on_different_starts():
     assert all(seed in EVAL_SEEDS for seed in set.union(*starts, {eval_seed(10**12, 5)}))
 
 
-def test_noise_differs_between_episodes_members_and_decisions():
-    corners = (0, 1, 2**32 - 1), (0, 1, 255), (0, 1, 999_999)
+def test_noise_differs_between_episodes_and_decisions():
+    corners = (0, 1, 2**32 - 1), (0, 1, 999_999)
     seeds = [noise_seed(*place) for place in itertools.product(*corners)]
     assert len(set(seeds)) == len(seeds) and min(seeds) == 0
-    assert noise_seed(7, 0, 5) == 7 * 1_000_003 + 5
+    assert noise_seed(7, 5) == 7 * 1_000_003 + 5

@@ -4,13 +4,6 @@
 To add one: write its config, a `RatioConfig` with a `loss`, and register it under `AlgorithmConfig`; in a
 package of your own, which ``--algorithm.discover_packages_path`` names, it needs no change here. No file that
 this package imports pulls in torch, so a run can be parsed before torch is loaded.
-
-Order of use inside an update::
-
-    advantages, returns = gae(...)                    # advantages.py, with values of the current critic
-    advantages = normalise(advantages, moments)       # moments summed over all ranks
-    output = config.loss(LossInputs(...))             # losses.py
-    output.loss.backward()
 """
 
 from __future__ import annotations

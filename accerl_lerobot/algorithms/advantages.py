@@ -13,9 +13,7 @@ critic that time limits are deaths.
 `values` and `bootstrap_value` must come from the critic of now: those stored with a sample are stale by its
 lag.
 
-*Normalisation* is over the global batch: each trainer rank calls `moments` on its part, sums the three
-numbers with those of the other ranks, and calls `normalise` with the sum. Normalising per rank or per
-micro-batch would compare a decision only with its neighbours.
+*Normalisation* is over the whole batch: per micro-batch it would compare a decision only with its neighbours.
 
 Shape letters: S segments, T decisions of the longest one.
 """
@@ -56,19 +54,8 @@ def gae(
 
     Returns:
         Advantages (S, T), not normalised, and returns (S, T), the targets of the critic; both 0 at padding.
-
-    Raises:
-        ValueError: shapes disagree or a length is outside 1..T.
     """
-    s, t = rewards.shape
-    shapes = {"values": (values, (s, t)), "bootstrap_value": (bootstrap_value, (s,))}
-    shapes |= {"terminated": (terminated, (s,)), "lengths": (lengths, (s,))}
-    for name, (tensor, shape) in shapes.items():
-        if tuple(tensor.shape) != shape:
-            raise ValueError(f"{name} has shape {tuple(tensor.shape)}, not {shape}")
-    if s and not bool(((lengths >= 1) & (lengths <= t)).all()):
-        raise ValueError(f"lengths {lengths.tolist()}: all must be from 1 to {t}")
-
+    t = rewards.shape[1]
     padding = ~decision_mask(lengths, t)
     rewards = rewards.detach().masked_fill(padding, 0.0)
     values = values.detach().masked_fill(padding, 0.0)
@@ -82,32 +69,23 @@ def gae(
     return advantages, (advantages + values).masked_fill(padding, 0.0)
 
 
-def moments(x: Tensor, mask: Tensor | None = None) -> Tensor:
-    """(sum, sum of squares, count) of the valid entries, float64 (3,); add them to merge batches.
+def moments(x: Tensor, mask: Tensor) -> Tensor:
+    """(sum, sum of squares, count) of the entries where `mask` is True, float64 (3,).
 
-    float64, because the variance is the difference of two nearly equal numbers when the mean is large.
-
-    Args:
-        x: any shape; padding may hold anything, NaN included.
-        mask: bool, same shape, or None.
+    float64, because the variance is the difference of two nearly equal numbers when the mean is large. Other
+    entries may hold anything, NaN included.
     """
-    wide = x.detach().double()
-    if mask is None:
-        count = wide.new_tensor(float(x.numel()))
-    else:
-        wide, count = wide.masked_fill(~mask, 0.0), mask.sum().double()
-    return torch.stack([wide.sum(), wide.square().sum(), count])
+    wide = x.detach().double().masked_fill(~mask, 0.0)
+    return torch.stack([wide.sum(), wide.square().sum(), mask.sum().double()])
 
 
-def normalise(x: Tensor, moments: Tensor, mask: Tensor | None = None) -> Tensor:
-    """(x − mean) / (std + `STD_EPSILON`), same shape and dtype as `x`; 0 at padding.
+def normalise(x: Tensor, moments: Tensor, mask: Tensor) -> Tensor:
+    """(x − mean) / (std + `STD_EPSILON`), same shape and dtype as `x`; 0 where `mask` is False.
 
-    Args:
-        moments: (3,), from `moments`, summed over everything that is compared with each other.
-        mask: bool, same shape as `x`, or None.
+    `moments` (3,) is of everything that is compared with each other.
     """
     total, squares, count = moments.unbind()
     mean = total / count.clamp(min=1.0)
     std = (squares / count.clamp(min=1.0) - mean.square()).clamp(min=0.0).sqrt()
     scaled = ((x.detach().double() - mean) / (std + STD_EPSILON)).to(x.dtype)
-    return scaled if mask is None else scaled.masked_fill(~mask, 0.0)
+    return scaled.masked_fill(~mask, 0.0)

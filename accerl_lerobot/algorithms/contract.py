@@ -56,8 +56,6 @@ class RatioConfig(AlgorithmConfig):
     level: Level = "token"
     """Extent of one importance ratio: each log-prob factor, a token or, of a flow or Gaussian policy, an
     action (``token``), or the whole ``chunk``."""
-    value_coef: NonNegative = 0.5
-    """Weight of the critic's regression error."""
     kl_coef: NonNegative = 0.0
     """Weight of KL(μ‖π), the distance from the behaviour policy."""
     entropy_coef: NonNegative = 0.0
@@ -122,9 +120,7 @@ class LossInputs:
     advantage: Tensor
     """(N,), normalised over the batch by the caller."""
     value: Tensor
-    """(N,), V of the current critic; measured, not trained."""
-    value_error: Tensor
-    """(N,), the critic's regression error against `returns`, e.g. (V − R)²; carries gradient."""
+    """(N,), V of the current critic; carries gradient."""
     returns: Tensor
     """(N,), what V is regressed to."""
     entropy: Tensor
@@ -138,15 +134,3 @@ class LossInputs:
     With it the losses of micro-batches, weighted by their decisions, add up to that of the whole batch. None:
     this is the whole batch.
     """
-
-    def __post_init__(self) -> None:
-        if self.log_prob_new.dim() != 2 or self.log_prob_new.shape != self.log_prob_old.shape:
-            new, old = tuple(self.log_prob_new.shape), tuple(self.log_prob_old.shape)
-            raise ValueError(f"log_prob_new {new} and log_prob_old {old}: both must be (N, L)")
-        n, width = self.log_prob_new.shape
-        flat = ("advantage", "value", "value_error", "returns", "entropy")
-        for name in (*flat, "factors"):
-            tensor: Tensor | None = getattr(self, name)
-            shape = (n,) if name in flat else (n, width)
-            if tensor is not None and tuple(tensor.shape) != shape:
-                raise ValueError(f"{name} has shape {tuple(tensor.shape)}, not {shape}")

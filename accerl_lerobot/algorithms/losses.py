@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The objectives with a likelihood ratio: GIPO and PPO.
+"""The objectives with a likelihood ratio, GIPO and PPO; E is the mean over all ratios of all decisions.
 
 GIPO: a Gaussian trust weight on the log-ratio instead of a clip (arXiv 2603.03955, used by AcceRL,
 2603.18464).
@@ -53,8 +53,7 @@ class GIPOConfig(RatioConfig):
     """Weight of KL(μ‖π), the distance from the behaviour policy."""
 
     def loss(self, inputs: LossInputs) -> LossOutput:
-        """See the top of the file. E is the mean over all ratios of all decisions."""
-        logs = at_level(inputs.log_prob_new - inputs.log_prob_old.detach(), inputs, self.level)
+        logs = at_level(inputs.log_prob_new - inputs.log_prob_old, inputs, self.level)
         weight = (-0.5 * (logs.detach() / self.sigma).square()).exp()
         weighted = weight * ratio(logs) * advantage_column(inputs)
         policy_loss = -mean_over_ratios(weighted, inputs, self.level)
@@ -72,8 +71,7 @@ class PPOConfig(RatioConfig):
     """How far ρ may rise above 1 before a sample with Â > 0 stops counting."""
 
     def loss(self, inputs: LossInputs) -> LossOutput:
-        """See the top of the file. E is the mean over all ratios of all decisions."""
-        logs = at_level(inputs.log_prob_new - inputs.log_prob_old.detach(), inputs, self.level)
+        logs = at_level(inputs.log_prob_new - inputs.log_prob_old, inputs, self.level)
         rho, advantage = ratio(logs), advantage_column(inputs)
         low, high = 1.0 - self.clip_low, 1.0 + self.clip_high
         surrogate = (rho * advantage).minimum(rho.clamp(low, high) * advantage)

@@ -26,10 +26,9 @@ from accerl_lerobot.envs import make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, REAL, Request, Segment
 from accerl_lerobot.policies.config import Load, loader
-from accerl_lerobot.replay import MixedReplay
+from accerl_lerobot.replay.buffer import MixedReplay
 from accerl_lerobot.replay.journal import EPISODES, Journal
-from accerl_lerobot.rollout.plans import EpisodePlans
-from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutRunner
+from accerl_lerobot.rollout.runner import EpisodePlan, EpisodePlans, EpisodeResult, RolloutRunner
 from accerl_lerobot.seeds import global_generators, restore_global_generators
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, WEIGHT_SYNC, open_clock
 from accerl_lerobot.trainer.batch import keeping
@@ -235,7 +234,8 @@ class LocalEngine(Engine):
             return
         learner, on = self._world_learner, self._imagination.on
         awaited = learner is not None and learner.may_promote(self._replay.real_ended)
-        self._replay.mix(self._config.imagination.share if on else 0.0, on or awaited)
+        self._replay.share = self._config.imagination.share if on else 0.0
+        self._replay.awaited = on or awaited
         if not self._exploring:
             return
         if self._replay.may_insert(IMAGINED) and (requests := self._imagination.requests()):
@@ -251,7 +251,7 @@ class LocalEngine(Engine):
         elif learner.validation_due(last) and (promotion := learner.promote(last)):
             self._imagination.swap(promotion)
             learner.mark_served()
-        self._replay.hold(learner.validation_due(last=False) and not last)
+        self._replay.held = learner.validation_due(last=False) and not last
 
     def _publish(self) -> None:
         """Give weights to the acting policy, which is the trainer's own unless they are delayed."""
@@ -277,7 +277,7 @@ class LocalEngine(Engine):
             if self._world_learner is not None:
                 self._world_learner.add(segment)
         if self._plans.spent and not self._outbox and not self._runner.exploring:
-            self._replay.end_real()
+            self._replay.real_ended = True
 
     def _imagined(self) -> dict[str, float]:
         learner = {} if self._world_learner is None else self._world_learner.metrics()

@@ -39,8 +39,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.inference.batcher import BatcherStats, dealt, merge_metrics, merge_stats
 from accerl_lerobot.metrics import numbered
 from accerl_lerobot.policies.config import Load
-from accerl_lerobot.rollout.plans import budgets, incarnation_after
-from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
+from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, budgets, incarnation_after
 from accerl_lerobot.rollout.worker import Report
 from accerl_lerobot.transport.endpoint import Endpoint
 from accerl_lerobot.transport.shared_memory import available

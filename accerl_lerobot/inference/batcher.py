@@ -2,17 +2,12 @@
 """Batching: requests wait until a batch is full, or until the oldest of them has waited long enough.
 
 Time is an argument, so tests need no clock. The wait of a batch starts with its *oldest* request: counting
-from the newest would let a steady trickle postpone the answer forever.
+from the newest would let a steady trickle postpone the answer forever. First in, first out: a request is
+neither split nor reordered nor forgotten. In lock step, requests wait until there is one for every
+environment, however long that takes, and are then served in as many batches as they need.
 
-In lock step, requests wait until there is one for every environment, however long that takes, and are then
-served in as many batches as they need.
-
-Invariants: first in, first out; a request is neither split nor reordered nor forgotten; a request waits for
-at most `max_wait_s` plus the time of the batches before it.
-
-Several inference replicas: which client asks which, and their statistics as of one.
-
-Rollout worker i asks replica i modulo their number, so the requests of a worker are batched together.
+Of several inference replicas rollout worker i asks replica i modulo their number, so the requests of a worker
+are batched together; their statistics are merged as of one.
 """
 
 from __future__ import annotations
@@ -31,31 +26,20 @@ SHORTEST_S = 1e-6
 class BatcherStats:
     """Counters of the batcher so far."""
 
-    batches: int = 0
-    requests: int = 0
-    observations: int = 0
-    batch_sizes: dict[int, int] = field(default_factory=dict)
+    batch_sizes: Counter[int] = field(default_factory=Counter)
     """Observations in a batch → batches."""
-    wait_sum_s: float = 0.0
-    """Seconds from `Batcher.add` to `Batcher.take`, summed over requests."""
-    wait_max_s: float = 0.0
-    """The longest such wait, in seconds."""
     waits: Counter[int] = field(default_factory=Counter)
-    """k → requests whose wait was about `GRAIN` to the k-th, in seconds."""
-
-    def note(self, wait_s: float) -> None:
-        """Count a request that is taken."""
-        self.requests += 1
-        self.wait_sum_s += wait_s
-        self.wait_max_s = max(self.wait_max_s, wait_s)
-        self.waits[round(math.log(max(wait_s, SHORTEST_S), GRAIN))] += 1
+    """k → requests that waited from `Batcher.add` to `Batcher.take` about `GRAIN` to the k-th, in seconds."""
+    wait_sum_s: float = 0.0
+    wait_max_s: float = 0.0
 
     def metrics(self) -> dict[str, float]:
         """Means for the log; 0 before the first batch."""
+        batches, sizes = self.batch_sizes.total(), self.batch_sizes.items()
         return {
-            "batches": float(self.batches),
-            "batch_size_mean": self.observations / max(self.batches, 1),
-            "wait_mean_s": self.wait_sum_s / max(self.requests, 1),
+            "batches": float(batches),
+            "batch_size_mean": sum(size * count for size, count in sizes) / max(batches, 1),
+            "wait_mean_s": self.wait_sum_s / max(self.waits.total(), 1),
             "wait_max_s": self.wait_max_s,
         }
 
@@ -73,21 +57,11 @@ def quantile(waits: Counter[int], share: float) -> float:
 class Batcher[R: Sized]:
     """Gathers requests into batches; ``len(request)`` is the number of observations it carries.
 
-    Example:
-        >>> batcher: Batcher[list[str]] = Batcher(max_batch=3, max_wait_s=0.01)
-        >>> batcher.add(["a", "b"], now=0.0)
-        >>> batcher.due(now=0.004), batcher.next_deadline()
-        (False, 0.01)
-        >>> batcher.add(["c", "d"], now=0.005)
-        >>> batcher.due(now=0.005)  # four observations wait and only three fit
-        True
-        >>> batcher.take(now=0.005), batcher.next_deadline()
-        ([['a', 'b']], 0.015)
+    Moments are seconds on a monotonic clock, the same for all calls.
     """
 
     def __init__(self, max_batch: int, max_wait_s: float) -> None:
-        self.max_batch = max_batch
-        self.max_wait_s = max_wait_s
+        self.max_batch, self.max_wait_s = max_batch, max_wait_s
         self.stats = BatcherStats()
         self._waiting: deque[tuple[R, float]] = deque()
         self._observations = 0
@@ -102,14 +76,10 @@ class Batcher[R: Sized]:
         return len(self._waiting)
 
     def add(self, request: R, now: float) -> None:
-        """Queue a request.
-
-        Args:
-            request: with at least one observation.
-            now: seconds on a monotonic clock, the same for all calls.
+        """Queues a request.
 
         Raises:
-            ValueError: the request is empty.
+            ValueError: it holds no observation.
         """
         if len(request) == 0:
             raise ValueError("a request without observations")
@@ -117,8 +87,7 @@ class Batcher[R: Sized]:
         self._observations += len(request)
 
     def due(self, now: float) -> bool:
-        """True if the next batch should be served: it cannot grow any more, or its oldest request has
-        waited."""
+        """True if the next batch should be served."""
         deadline = self.next_deadline()
         return deadline is not None and now >= deadline
 
@@ -129,9 +98,8 @@ class Batcher[R: Sized]:
             return None
         if self._together and not self._left:
             return self._waiting[0][1] if self._observations >= self._together else None
-        oldest = self._waiting[0][1]
-        now = self._left or self._observations >= self.max_batch
-        return oldest if now else oldest + self.max_wait_s
+        full = self._left or self._observations >= self.max_batch
+        return self._waiting[0][1] + (0.0 if full else self.max_wait_s)
 
     def take(self, now: float) -> list[R]:
         """Remove the next batch, due or not: the oldest requests, as many as fit, at least one."""
@@ -144,13 +112,14 @@ class Batcher[R: Sized]:
             request, since = self._waiting.popleft()
             batch.append(request)
             size += len(request)
-            self.stats.note(now - since)
+            wait_s, stats = now - since, self.stats
+            stats.wait_sum_s += wait_s
+            stats.wait_max_s = max(stats.wait_max_s, wait_s)
+            stats.waits[round(math.log(max(wait_s, SHORTEST_S), GRAIN))] += 1
         self._observations -= size
         self._left = max(0, self._left - size)
         if batch:
-            self.stats.batches += 1
-            self.stats.observations += size
-            self.stats.batch_sizes[size] = self.stats.batch_sizes.get(size, 0) + 1
+            self.stats.batch_sizes[size] += 1
         return batch
 
 
@@ -163,33 +132,27 @@ def dealt(workers: int, replicas: int) -> list[int]:
 
 
 def merge_metrics(metrics: Sequence[dict[str, float]]) -> dict[str, float]:
-    """Metrics as of one replica: sums of batches, means over batches and requests, the oldest version; {} for
-    none."""
+    """Metrics as of one replica: sums of batches, means over requests, the oldest version; {} for none."""
     if len(metrics) < 2:
         return dict(*metrics)
     batches = sum(m["batches"] for m in metrics)
     observations = [m["batches"] * m["batch_size_mean"] for m in metrics]
-    asked = max(sum(observations), 1.0)
     waited = sum(m["wait_mean_s"] * n for m, n in zip(metrics, observations, strict=True))
-    found = {
+    return {
         "batches": batches,
         "batch_size_mean": sum(observations) / max(batches, 1.0),
-        "wait_mean_s": waited / asked,
+        "wait_mean_s": waited / max(sum(observations), 1.0),
         "version": min(m["version"] for m in metrics),
         "busy_share": sum(m["busy_share"] for m in metrics) / len(metrics),
+        **{name: max(m[name] for m in metrics) for name in LARGEST},
     }
-    return found | {name: max(m[name] for m in metrics) for name in LARGEST}
 
 
 def merge_stats(stats: Sequence[BatcherStats]) -> BatcherStats:
     """Batches as of one replica."""
-    sizes: Counter[int] = sum((Counter(s.batch_sizes) for s in stats), Counter())
     return BatcherStats(
-        batches=sum(s.batches for s in stats),
-        requests=sum(s.requests for s in stats),
-        observations=sum(s.observations for s in stats),
-        batch_sizes=dict(sizes),
+        batch_sizes=sum((s.batch_sizes for s in stats), Counter()),
+        waits=sum((s.waits for s in stats), Counter()),
         wait_sum_s=sum(s.wait_sum_s for s in stats),
         wait_max_s=max(s.wait_max_s for s in stats),
-        waits=sum((s.waits for s in stats), Counter()),
     )

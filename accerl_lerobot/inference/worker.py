@@ -5,11 +5,12 @@
     produces    decisions, each stamped with the version of the weights that made it
     waits for   a full batch, or for the oldest request to have waited `max_wait_s`
     weights     are swapped between batches: no batch ever sees two versions
-    ends        with the process; an exception fails all requests, and the engine restarts the process
-    restarted   it has no state but weights, which the trainer gives it
+    ends        with the process; an exception fails all requests, and the engine restarts the process, which
+                has no state but weights
 
 One thread waits for clients and for the batcher's clock at once, runs the forward pass and replies. Ray's
-calls come in on the event loop beside it, which only hands them over."""
+calls come in on the event loop beside it, which only hands them over.
+"""
 
 from __future__ import annotations
 
@@ -124,9 +125,9 @@ class InferenceWorker:
         loop = asyncio.get_running_loop()
         ended: asyncio.Future[None] = loop.create_future()
 
-        def tell(error: BaseException | None) -> None:
+        def tell(error: BaseException) -> None:
             if not ended.done():
-                ended.set_exception(error) if error else ended.set_result(None)
+                ended.set_exception(error)
 
         def work() -> None:
             try:
@@ -142,11 +143,7 @@ class InferenceWorker:
             self._server.wake()
 
     async def metrics(self) -> dict[str, float]:
-        """Batching statistics, the version served, the busy share since the last call, the seconds of the
-        last swap of weights, and those from their publication to their first batch.
-
-        Does not answer while the serving thread hangs.
-        """
+        """Numbers for the log; does not answer while the serving thread hangs."""
         while self._iteration is not None and time.monotonic() - self._iteration > 2 * LOOK_S:
             await asyncio.sleep(0.1)
         self._clock.beat()
@@ -165,7 +162,7 @@ class InferenceWorker:
         """Batches so far."""
         stats = self._batcher.stats
         # Copied in one go each: the other thread adds to them.
-        return replace(stats, batch_sizes=dict(stats.batch_sizes), waits=Counter(stats.waits))
+        return replace(stats, batch_sizes=Counter(stats.batch_sizes), waits=Counter(stats.waits))
 
     def _serve(self) -> None:
         batch: list[PendingRequest] = []
@@ -173,7 +170,8 @@ class InferenceWorker:
             while not self._over:
                 self._iteration = time.monotonic()
                 self._clock.enter(WAIT_IN)
-                self._server.poll(self._wait_s())
+                deadline = self._batcher.next_deadline()
+                self._server.poll(LOOK_S if deadline is None else max(0.0, deadline - time.monotonic()))
                 if self._lock_step:
                     self._batcher.lock_step(self._lock_step.popleft())
                 self._swap()
@@ -200,11 +198,6 @@ class InferenceWorker:
             self._batcher.add(asked, asked.sent)
         except (TypeError, ValueError) as error:  # no list of requests, or an empty one
             asked.fail(error)
-
-    def _wait_s(self) -> float:
-        """Seconds to wait for something to come."""
-        deadline = self._batcher.next_deadline()
-        return LOOK_S if deadline is None else max(0.0, deadline - time.monotonic())
 
     def _swap(self) -> None:
         """Use the newest weights that have come, if they are newer than those of now."""

@@ -3,8 +3,6 @@
 
 `decide` acts, `evaluate` re-scores what was stored; both run the same code on the same weights, so the ratio
 at equal weights is 1.
-
-The critic: V(observation) from the policy's own features.
 """
 
 from __future__ import annotations
@@ -12,9 +10,8 @@ from __future__ import annotations
 import contextlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -22,15 +19,11 @@ from torch import Tensor, nn
 
 from accerl_lerobot.checkpoint.tensors import in_parts, part_of, whole
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import TASK, Decision, Request
+from accerl_lerobot.experience import TASK, Decision, Request, Segment
 from accerl_lerobot.policies import saving
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.family import Encoded, Family, Model, pooled
 from accerl_lerobot.policies.teacher import PREFIX, Teacher
-
-if TYPE_CHECKING:
-    from accerl_lerobot.experience import Segment
-
 
 HIDDEN = 128
 """Width of the critic's hidden layer."""
@@ -72,8 +65,7 @@ SELF_CHECK_TOLERANCE = 1e-5
 """Largest difference, in normalised action units, between our sampler and LeRobot's; fp32 noise is 1e-6."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Evaluation:
+class Evaluation(NamedTuple):
     """A batch of stored decisions under the current weights."""
 
     log_prob: Tensor
@@ -102,12 +94,9 @@ class PolicyAdapter(nn.Module, ABC):
     def evaluate(
         self, observations: dict[str, np.ndarray], tasks: Sequence[str], latent: dict[str, Tensor]
     ) -> Evaluation:
-        """Re-scores stored latents, differentiably.
+        """Re-scores stored latents, each (B, ...), differentiably.
 
-        Args:
-            observations: each (B, ...), raw, as in `Segment.observations`.
-            tasks: B instruction texts.
-            latent: each (B, ...), as `decide` returned them.
+        Observations, each (B, ...), are raw, as in `Segment.observations`; with them come B instructions.
         """
 
     @abstractmethod
@@ -146,7 +135,12 @@ class PolicyAdapter(nn.Module, ABC):
                 raise ValueError(f"published {name} has shape {shape}, not {tuple(parameter.shape)}")
         with torch.no_grad():
             for name, parameter in parameters.items():
-                _copy(parameter, tensors[name])
+                array, on_cpu = tensors[name], parameter.device.type == "cpu"
+                # Received arrays are read-only, which torch cannot express: NumPy copies, where it can.
+                if on_cpu and parameter.dtype == torch.float32 and not in_parts(parameter):
+                    np.copyto(parameter.detach().numpy(), array)
+                else:
+                    parameter.copy_(part_of(torch.tensor(array), parameter))
 
     def view_trainable(self) -> dict[str, np.ndarray]:
         """`trainable` as NumPy arrays, to be copied before the next update.
@@ -161,14 +155,6 @@ class PolicyAdapter(nn.Module, ABC):
         return {name: view.copy() for name, view in self.view_trainable().items()}
 
 
-def _copy(parameter: nn.Parameter, tensor: np.ndarray) -> None:
-    """Arrays that were received are read-only, which torch cannot express: NumPy copies where it can."""
-    if parameter.device.type == "cpu" and parameter.dtype == torch.float32 and not in_parts(parameter):
-        np.copyto(parameter.detach().numpy(), tensor)
-    else:
-        parameter.copy_(part_of(torch.tensor(tensor), parameter))
-
-
 def stack_observations(requests: Sequence[Request]) -> tuple[dict[str, np.ndarray], list[str]]:
     """Batches raw observations: each array (B, ...), and the B task texts."""
     keys = [k for k in requests[0].observation if k != TASK]
@@ -177,22 +163,13 @@ def stack_observations(requests: Sequence[Request]) -> tuple[dict[str, np.ndarra
 
 
 class Processing:
-    """LeRobot's pre- and post-processor, which tokenise and normalise, fed with raw observations.
-
-    Only observations and tasks pass through: a LeRobot preprocessor silently drops keys it does not know, so
-    log-probs, rewards and versions travel beside it.
-    """
+    """LeRobot's pre- and post-processor, which tokenise and normalise, fed with raw observations."""
 
     def __init__(
-        self,
-        preprocessor: Any,
-        postprocessor: Any,
-        device: torch.device,
-        rename_map: dict[str, str] | None = None,
+        self, preprocessor: Any, postprocessor: Any, device: torch.device, rename_map: dict[str, str]
     ) -> None:
         self.preprocessor, self.postprocessor = preprocessor, postprocessor
-        self.device = device
-        self.rename_map = rename_map or {}
+        self.device, self.rename_map = device, rename_map
 
     def prepare(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> dict[str, Tensor]:
         """Normalises and tokenises. Images go from uint8 (..., H, W, 3) to float (..., 3, H, W) in [0, 1]."""
@@ -225,17 +202,16 @@ def example_requests(policy_config: Any, rename_map: dict[str, str]) -> list[Req
 
     `rename_map`: environment feature name → policy feature name.
     """
-    rng = np.random.default_rng(0)
+    rng, steps = np.random.default_rng(0), policy_config.n_obs_steps
     env_name = {policy: env for env, policy in rename_map.items()}
+    batch = (2,) if steps == 1 else (2, steps)
     observations: dict[str, np.ndarray] = {}
     for key, feature in policy_config.input_features.items():
-        shape = tuple(feature.shape)
-        batch = (2,) if policy_config.n_obs_steps == 1 else (2, policy_config.n_obs_steps)
+        name, shape = env_name.get(key, key), tuple(feature.shape)
         if key.startswith(IMAGES) and ".empty_camera_" not in key:
-            size = (*batch, *shape[1:], shape[0])
-            observations[env_name.get(key, key)] = rng.integers(0, 256, size, dtype=np.uint8)
+            observations[name] = rng.integers(0, 256, (*batch, *shape[1:], shape[0]), dtype=np.uint8)
         elif key == OBS_STATE:
-            observations[env_name.get(key, key)] = rng.standard_normal((*batch, *shape), dtype=np.float32)
+            observations[name] = rng.standard_normal((*batch, *shape), dtype=np.float32)
     return [
         Request(observation={k: v[i] for k, v in observations.items()} | {TASK: task}, noise_seed=i)
         for i, task in enumerate(("Go", "Put the red cube on the plate"))
@@ -288,17 +264,16 @@ class LeRobotAdapter(PolicyAdapter):
         with self.autocast():
             encoded = self.encode(arrays, tasks)
             action = self.family.act(encoded, requests)
-        value = self._value(encoded).cpu().numpy()
         executed = action.chunk.float()
         if self.teacher is not None:
             executed = self.teacher.replace(executed, requests)
         chunk = self.processing.unnormalise(executed).cpu().numpy()
-        latent = {k: v.cpu().numpy() for k, v in action.latent.items()}
-        log_prob = action.log_prob.float().cpu().numpy()
+        value, log_prob = self._value(encoded).cpu().numpy(), action.log_prob.float().cpu().numpy()
+        latents = {k: v.cpu().numpy() for k, v in action.latent.items()}
         return [
             Decision(
                 chunk=chunk[i],
-                latent={k: v[i] for k, v in latent.items()},
+                latent={k: v[i] for k, v in latents.items()},
                 log_prob=log_prob[i],
                 value=float(value[i]),
                 version=version,
@@ -312,7 +287,7 @@ class LeRobotAdapter(PolicyAdapter):
         with self.autocast():
             encoded = self.encode(observations, tasks)
             score = self.family.score(encoded, {k: v.to(self.device) for k, v in latent.items()})
-        return Evaluation(log_prob=score.log_prob, entropy=score.entropy, value=self._value(encoded))
+        return Evaluation(score.log_prob, score.entropy, self._value(encoded))
 
     @torch.no_grad()
     def values(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Tensor:
@@ -350,21 +325,16 @@ class LeRobotAdapter(PolicyAdapter):
         Raises:
             InputError: above `SELF_CHECK_TOLERANCE`, or LeRobot's internals have changed.
         """
+        cause: Exception | None = None
         try:
             batch = self.processing.prepare(observations, tasks)
             difference = self.family.difference(batch, self.model.encode(batch))
+            self.policy.reset()
+            if difference <= SELF_CHECK_TOLERANCE:
+                return difference
+            reason = f"differs from its sampler by {difference:.2e}"
         except (AttributeError, ImportError, KeyError, NotImplementedError, TypeError) as error:
-            raise self._incompatible(f"cannot drive it ({type(error).__name__}: {error})") from error
-        self.policy.reset()
-        if not difference <= SELF_CHECK_TOLERANCE:
-            raise self._incompatible(f"differs from its sampler by {difference:.2e}")
-        return difference
-
-    def _value(self, encoded: Encoded) -> Tensor:
-        value: Tensor = self.value_head(encoded.features, encoded.mask)
-        return value
-
-    def _incompatible(self, reason: str) -> InputError:
+            cause, reason = error, f"cannot drive it ({type(error).__name__}: {error})"
         import lerobot
 
         remedy = (
@@ -372,4 +342,7 @@ class LeRobotAdapter(PolicyAdapter):
             "log-probs would be those of another policy; install the LeRobot version that this package pins, "
             "or correct the adapter"
         )
-        return InputError("lerobot", lerobot.__version__, remedy)
+        raise InputError("lerobot", lerobot.__version__, remedy) from cause
+
+    def _value(self, encoded: Encoded) -> Tensor:
+        return self.value_head(encoded.features, encoded.mask)

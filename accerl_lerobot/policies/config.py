@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The policy section of a recipe: the checkpoint, how it explores, what is trained. Free of torch.
-
-LeRobot policy types that have a likelihood here, and the families that suit them; free of torch.
-"""
+"""The policy section of a recipe, and the policy types that have a likelihood here. Free of torch."""
 
 from __future__ import annotations
 
@@ -174,22 +171,14 @@ PLUGINS = {"smolvla_bins": "accerl_lerobot.policies.bins_plugin"}
 """LeRobot policy type that is not LeRobot's own → the package that registers it with LeRobot."""
 USES_HISTORY = ("diffusion",)
 """Types that read the observations of ``n_obs_steps`` env steps; the others read one."""
-NO_DENSITY = {
-    "tdmpc": "it plans by sampling and has no action density; LeRobot trains it with its own RL objective",
-    "gaussian_actor": "it takes one action a decision and is trained by LeRobot's SAC; use act",
-    "vqbet": "LeRobot does not return its code log-probs; use smolvla",
-}
 
 
 def register_policy(policy_type: str, model: str, *families: str) -> None:
-    """Gives a LeRobot policy type of another package a likelihood.
-
-    Call it where the type is registered with LeRobot, so that who imports the package has both.
+    """Gives a LeRobot policy type of another package a likelihood, where the type is registered with LeRobot.
 
     Args:
         policy_type: its name in LeRobot's registry.
-        model: ``module:class``, of that package, of its `FlowModel`, `GaussianModel`, or another
-            `family.Model`.
+        model: ``module:class``, of that package, of its `FlowModel` or another `family.Model`.
         families: names of the samplers that suit it, the default one first.
     """
     module = model.partition(":")[0]
@@ -198,10 +187,7 @@ def register_policy(policy_type: str, model: str, *families: str) -> None:
 
 
 def register_policies(wanted: str | None = None) -> None:
-    """Fills LeRobot's registry of policy types in this process: its own, and ours.
-
-    If `wanted` is none of them, LeRobot's installed plugins, such as ``lerobot_policy_*``, are imported.
-    """
+    """Fills LeRobot's registry of policy types; if `wanted` is still missing, from its installed plugins."""
     importlib.import_module("lerobot.policies")
     for package in PLUGINS.values():
         importlib.import_module(package)
@@ -220,39 +206,25 @@ def discovery(policy_type: str | None) -> list[str]:
 
 
 def check_type(policy_type: Any, field: str, prefix: str = "") -> str:
-    """Refuses a LeRobot policy type that has no likelihood here; `prefix` begins the remedy.
-
-    Raises:
-        InputError: it has none.
-    """
+    """Refuses a LeRobot policy type that has no likelihood here; `prefix` begins the remedy."""
     if policy_type not in POLICIES:
         known = f"use one of {', '.join(POLICIES)}, or name its package: policy.discover_packages_path"
-        why = NO_DENSITY.get(policy_type, f"no likelihood for it here; {known}")
-        raise InputError(field, policy_type, prefix + why)
+        raise InputError(field, policy_type, f"{prefix}no likelihood for it here; {known}")
     return str(policy_type)
 
 
 def check_observations(policy_config: Any, field: str) -> None:
-    """Refuses an observation history that LeRobot's policy of this type does not read.
-
-    Raises:
-        InputError: as above.
-    """
+    """Refuses an observation history that LeRobot's policy of this type does not read."""
     if policy_config.n_obs_steps != 1 and policy_config.type not in USES_HISTORY:
         remedy = f"only {', '.join(USES_HISTORY)} looks back; a {policy_config.type} policy takes 1"
         raise InputError(field, policy_config.n_obs_steps, remedy)
 
 
 def sampler_config(config: PolicyConfig, policy_type: str) -> SamplerConfig:
-    """How a policy of this type explores in this run.
-
-    Raises:
-        InputError: the configured sampler is of a family that does not suit it.
-    """
+    """How a policy of this type explores in this run; a sampler of another family is refused."""
     families = POLICIES[policy_type][1]
     if config.sampler is None:
-        default: SamplerConfig = SamplerConfig.get_choice_class(families[0])()
-        return default
+        return SamplerConfig.get_choice_class(families[0])()
     if config.sampler.type not in families:
         remedy = f"use {' or '.join(families)}: the policy is of type {policy_type}"
         raise InputError("policy.sampler.type", config.sampler.type, remedy)

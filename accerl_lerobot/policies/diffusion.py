@@ -27,6 +27,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from lerobot.utils.constants import OBS_IMAGES, OBS_STATE
 from torch import Tensor
 
 from accerl_lerobot.errors import InputError
@@ -41,11 +42,12 @@ from accerl_lerobot.policies.family import (
     exploring,
     normal_entropy,
     normal_log_prob,
+    refuse_compiled,
     standard_normal,
-)
+)  # fmt: skip
 
 Network = Callable[[Tensor, int], Tensor]
-"""(x (B, H, A), timestep) → what the network predicts, (B, H, A)."""
+"""(x (B, H, A), timestep) → what the network predicts, fp32 (B, H, A), given the observations."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,102 +115,9 @@ class Schedule:
         of_noisy = remaining**0.5 * (1 - following) / noise_share
         return of_clean * clean + of_noisy * x, variance**0.5
 
-    def exploring_step(
-        self, k: int, x: Tensor, output: Tensor, config: DiffusionSamplerConfig
-    ) -> tuple[Tensor, Tensor]:
-        """Mean (B, H, A) and std (1, 1, 1) of step k while exploring; see `step`."""
-        mean, std = self.step(k, x, output, eta=1.0)
-        return mean, std.clamp(min=config.std_min).to(x).view(1, 1, 1)
-
-
-def factors(shape: DiffusionShape, schedule: Schedule) -> slice:
-    """L rows. Those without a density are left out: as constant factors they would dilute means."""
-    return shape.rows if len(schedule) == 1 else slice(0, shape.horizon)
-
-
-def sample(
-    network: Network,
-    x: Tensor,
-    eps: Tensor,
-    explore: Tensor,
-    shape: DiffusionShape,
-    schedule: Schedule,
-    config: DiffusionSamplerConfig,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Denoises a batch, some samples exploring and the others by LeRobot's own steps.
-
-    Args:
-        x: (B, H, A) initial noise.
-        eps: (B, N, H, A) standard normal, the step noise.
-        explore: (B,) bool.
-
-    Returns:
-        x_0 (B, H, A); the chain (B, N + 1, H, A); its log-prob (B, L), zero where not exploring.
-    """
-    path = [x]
-    logp = x.new_zeros(x.shape[:2])
-    for k, timestep in enumerate(schedule.timesteps):
-        output = network(x, timestep)
-        mean, std = schedule.step(k, x, output)
-        step = mean + std * eps[:, k]
-        mean, width = schedule.exploring_step(k, x, output, config)
-        x = torch.where(explore[:, None, None], mean + width * eps[:, k], step)
-        counted = gaussian_log_prob(x, mean, width, _mask(k, shape, schedule, x.device))
-        logp = logp + torch.where(explore[:, None], counted, 0.0)
-        path.append(x)
-    return x, torch.stack(path, 1), logp[:, factors(shape, schedule)]
-
-
-def log_prob(
-    network: Network,
-    path: Tensor,
-    shape: DiffusionShape,
-    schedule: Schedule,
-    config: DiffusionSamplerConfig,
-) -> Tensor:
-    """Log-density of stored chains (B, N + 1, H, A) under the current network, (B, L), differentiable."""
-    logp = path.new_zeros(len(path), shape.horizon)
-    for k, timestep in enumerate(schedule.timesteps):
-        x = path[:, k]
-        mean, std = schedule.exploring_step(k, x, network(x, timestep), config)
-        logp = logp + gaussian_log_prob(path[:, k + 1], mean, std, _mask(k, shape, schedule, x.device))
-    return logp[:, factors(shape, schedule)]
-
-
-def entropy(shape: DiffusionShape, schedule: Schedule, config: DiffusionSamplerConfig) -> float:
-    """Differential entropy of the steps; no weight changes it."""
-    zero = torch.zeros(1, 1, 1)
-    total = 0.0
-    for k in range(len(schedule)):
-        _, std = schedule.exploring_step(k, zero, zero, config)
-        entries = int(_mask(k, shape, schedule, zero.device).sum()) * shape.action_dim
-        total += entries * float(normal_entropy(std))
-    return total
-
-
-def gaussian_log_prob(x: Tensor, mean: Tensor, std: Tensor, mask: Tensor) -> Tensor:
-    """Log-density of each row (B, H), summed over the entries that `mask` (H, 1) keeps."""
-    return torch.where(mask, normal_log_prob(x, mean, std), 0.0).sum(-1)
-
-
-def _mask(k: int, shape: DiffusionShape, schedule: Schedule, device: torch.device) -> Tensor:
-    """bool (H, 1): rows of step k's outcome that belong to the density."""
-    last = k == len(schedule) - 1
-    mask = torch.full((shape.horizon, 1), not last, dtype=torch.bool, device=device)
-    mask[shape.rows] = True
-    return mask
-
-
-@dataclass(frozen=True, kw_only=True)
-class DiffusionContext:
-    """`Encoded.context` of a diffusion model."""
-
-    network: Network
-    """Conditioned on the observations; output in fp32."""
-
 
 class Diffusion(Model):
-    """LeRobot's `DiffusionPolicy`: reads the observations once, then runs its U-Net once per denoising step.
+    """LeRobot's `DiffusionPolicy`: reads observations once, then runs its U-Net once per step, the `context`.
 
     Never in training mode: batch norms keep their statistics, and the crop is the centre one. LeRobot's
     `predict_action_chunk` wants a time dimension that its preprocessor does not add; `stock` adds it.
@@ -216,9 +125,7 @@ class Diffusion(Model):
 
     def __init__(self, policy: Any) -> None:
         config = policy.config
-        if config.compile_model:
-            remedy = "a compiled sampler rounds unlike the re-scoring pass; set it to false in config.json"
-            raise InputError("policy.compile_model", True, remedy)
+        refuse_compiled(config)
         steps, most = policy.diffusion.num_inference_steps, config.num_train_timesteps
         if steps > most:
             raise InputError("policy.num_steps", steps, f"use at most {most}, as many as it was trained with")
@@ -229,7 +136,18 @@ class Diffusion(Model):
             first=config.n_obs_steps - 1,
             action_dim=config.action_feature.shape[0],
         )
-        self.schedule = _schedule(policy.diffusion.noise_scheduler, steps, config)
+        scheduler = policy.diffusion.noise_scheduler
+        scheduler.set_timesteps(steps)
+        timesteps = tuple(int(t) for t in scheduler.timesteps)
+        alphas = scheduler.alphas_cumprod.float().cpu()[list(timesteps)]
+        self.schedule = Schedule(
+            timesteps=timesteps,
+            alphas=alphas,
+            following=torch.cat([alphas[1:], torch.ones(1)]),
+            scheduler=config.noise_scheduler_type,
+            prediction=config.prediction_type,
+            clip=config.clip_sample_range if config.clip_sample else None,
+        )
         of_images = 2 * config.spatial_softmax_num_keypoints * len(config.image_features)
         self.width = config.n_obs_steps * (config.robot_state_feature.shape[0] + of_images)
 
@@ -240,13 +158,10 @@ class Diffusion(Model):
 
         def network(x: Tensor, timestep: int) -> Tensor:
             t = torch.full(x.shape[:1], timestep, dtype=torch.long, device=x.device)
-            output: Tensor = diffusion.unet(x, t, global_cond=condition)
-            return output.float()
+            return diffusion.unet(x, t, global_cond=condition).float()
 
         return Encoded(
-            features=condition[:, None],
-            mask=condition.new_ones(len(condition), 1).bool(),
-            context=DiffusionContext(network=network),
+            features=condition[:, None], mask=condition.new_ones(len(condition), 1).bool(), context=network
         )
 
     def stock(self, batch: dict[str, Tensor], noise: Tensor) -> tuple[Tensor, Tensor]:
@@ -267,8 +182,6 @@ class Diffusion(Model):
 
     def _with_time(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """As LeRobot's sampler wants it: state (B, O, S), images stacked (B, O, cameras, 3, H, W)."""
-        from lerobot.utils.constants import OBS_IMAGES, OBS_STATE
-
         config = self.policy.config
         inputs = {key: batch[key] for key in (OBS_STATE, *config.image_features)}
         if config.n_obs_steps == 1:
@@ -283,52 +196,83 @@ class Diffusion(Model):
         return inputs | {OBS_IMAGES: torch.stack(images, dim=-4)}
 
 
-def _schedule(scheduler: Any, steps: int, config: Any) -> Schedule:
-    """The schedule that LeRobot's sampler goes through in so many steps."""
-    scheduler.set_timesteps(steps)
-    timesteps = tuple(int(t) for t in scheduler.timesteps)
-    alphas = scheduler.alphas_cumprod.float().cpu()[list(timesteps)]
-    return Schedule(
-        timesteps=timesteps,
-        alphas=alphas,
-        following=torch.cat([alphas[1:], torch.ones(1)]),
-        scheduler=config.noise_scheduler_type,
-        prediction=config.prediction_type,
-        clip=config.clip_sample_range if config.clip_sample else None,
-    )
-
-
 class DiffusionFamily(Family):
-    """Diffusion policies explored by the noise of their denoising steps; the functions above do the work."""
+    """Diffusion policies explored by the noise of their steps. The latent is ``path``, (N + 1, H, A)."""
 
     def __init__(self, model: Diffusion, sampler: DiffusionSamplerConfig) -> None:
         super().__init__()
         self.model, self.sampler = model, sampler
         self.shape, self.schedule = model.shape, model.schedule
+        one_step = len(self.schedule) == 1
+        self._factors = self.shape.rows if one_step else slice(0, self.shape.horizon)
+        """L rows. Those without a density are left out: as constant factors they would dilute means."""
+        zero = torch.zeros(1, 1, 1)
+        stds = [self._exploring_step(k, zero, zero)[1] for k in range(len(self.schedule))]
+        entries = [int(self._mask(k, zero.device).sum()) * self.shape.action_dim for k in range(len(stds))]
+        self.entropy = sum(n * float(normal_entropy(std)) for n, std in zip(entries, stds, strict=True))
+        """Differential entropy of the steps; no weight changes it."""
 
     def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
         """Samples; without exploration a DDPM policy still draws step noise, as LeRobot's does."""
         size = (self.shape.horizon, self.shape.action_dim)
         device = encoded.features.device
         x, eps = standard_normal(requests, size, (len(self.schedule), *size), device=device)
-        explore = exploring(requests, device)
-        x, path, logp = sample(
-            encoded.context.network, x, eps, explore, self.shape, self.schedule, self.sampler
-        )
-        return Action(chunk=x[:, self.shape.rows], latent={"path": path}, log_prob=logp)
+        return self.sample(encoded.context, x, eps, exploring(requests, device))
+
+    def sample(self, network: Network, x: Tensor, eps: Tensor, explore: Tensor) -> Action:
+        """Denoises a batch, some samples exploring and the others by LeRobot's own steps.
+
+        Args:
+            x: (B, H, A) initial noise.
+            eps: (B, N, H, A) standard normal, the step noise.
+            explore: (B,) bool.
+        """
+        path, log_prob = [x], x.new_zeros(x.shape[:2])
+        for k, timestep in enumerate(self.schedule.timesteps):
+            output = network(x, timestep)
+            mean, std = self.schedule.step(k, x, output)
+            stock = mean + std * eps[:, k]
+            mean, std = self._exploring_step(k, x, output)
+            x = torch.where(explore[:, None, None], mean + std * eps[:, k], stock)
+            log_prob = log_prob + torch.where(explore[:, None], self._rows(k, x, mean, std), 0.0)
+            path.append(x)
+        return Action(x[:, self.shape.rows], {"path": torch.stack(path, 1)}, log_prob[:, self._factors])
+
+    def log_prob(self, network: Network, latent: dict[str, Tensor]) -> Tensor:
+        """Log-density of stored chains under the current network, (B, L), differentiable."""
+        path = latent["path"].unbind(1)
+        log_prob = path[0].new_zeros(path[0].shape[:2])
+        for k, timestep in enumerate(self.schedule.timesteps):
+            mean, std = self._exploring_step(k, path[k], network(path[k], timestep))
+            log_prob = log_prob + self._rows(k, path[k + 1], mean, std)
+        return log_prob[:, self._factors]
 
     def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> Score:
-        logp = log_prob(encoded.context.network, latent["path"], self.shape, self.schedule, self.sampler)
-        constant = entropy(self.shape, self.schedule, self.sampler)
-        return Score(log_prob=logp, entropy=logp.new_full((len(logp),), constant))
+        log_prob = self.log_prob(encoded.context, latent)
+        return Score(log_prob, entropy=log_prob.new_full((len(log_prob),), self.entropy))
 
     def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
         size = (len(encoded.features), self.shape.horizon, self.shape.action_dim)
         device = encoded.features.device
         noise = torch.randn(size, generator=torch.Generator().manual_seed(0)).to(device)
         stock, eps = self.model.stock(batch, noise)
-        not_exploring = torch.zeros(len(noise), dtype=torch.bool, device=device)
-        x, _, _ = sample(
-            encoded.context.network, noise, eps, not_exploring, self.shape, self.schedule, self.sampler
+        ours = self.sample(
+            encoded.context, noise, eps, torch.zeros(len(noise), dtype=torch.bool, device=device)
         )
-        return float((x[:, self.shape.rows] - stock).abs().max())
+        return float((ours.chunk - stock).abs().max())
+
+    def _exploring_step(self, k: int, x: Tensor, output: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean (B, H, A) and std (1, 1, 1) of step k while exploring."""
+        mean, std = self.schedule.step(k, x, output, eta=1.0)
+        return mean, std.clamp(min=self.sampler.std_min).to(x).view(1, 1, 1)
+
+    def _rows(self, k: int, x: Tensor, mean: Tensor, std: Tensor) -> Tensor:
+        """Log-density of each row (B, H) of step k's outcome x."""
+        return torch.where(self._mask(k, x.device), normal_log_prob(x, mean, std), 0.0).sum(-1)
+
+    def _mask(self, k: int, device: torch.device) -> Tensor:
+        """bool (H, 1): rows of step k's outcome that belong to the density."""
+        last = k == len(self.schedule) - 1
+        mask = torch.full((self.shape.horizon, 1), not last, dtype=torch.bool, device=device)
+        mask[self.shape.rows] = True
+        return mask

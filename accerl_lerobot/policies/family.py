@@ -15,12 +15,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Request
 
 
@@ -33,11 +34,10 @@ class Encoded:
     mask: Tensor
     """bool (B, P), True where a feature is of something real."""
     context: Any
-    """Input that the family samples from; each family's file defines it."""
+    """Input that the family samples from; each family's model defines it."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Action:
+class Action(NamedTuple):
     """A family's answer for a batch."""
 
     chunk: Tensor
@@ -48,8 +48,7 @@ class Action:
     """(B, L); zero where not exploring."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Score:
+class Score(NamedTuple):
     """Stored latents under the current weights."""
 
     log_prob: Tensor
@@ -109,6 +108,7 @@ class Family(nn.Module, ABC):
         raise NotImplementedError
 
     def factors(self, latent: dict[str, Tensor]) -> Tensor | None:
+        """See `PolicyAdapter.factors`."""
         return None
 
 
@@ -136,14 +136,18 @@ def standard_normal(
     requests: Sequence[Request], *sizes: tuple[int, ...], device: torch.device
 ) -> list[Tensor]:
     """Standard normal tensors, each (B, *size), row i from request i's own seed, whatever its batch."""
-    columns: list[list[np.ndarray]] = [[] for _ in sizes]
-    for request in requests:
-        rng = np.random.default_rng(request.noise_seed)
-        for column, size in zip(columns, sizes, strict=True):
-            column.append(rng.standard_normal(size, dtype=np.float32))
-    return [torch.from_numpy(np.stack(column)).to(device) for column in columns]
+    generators = [np.random.default_rng(request.noise_seed) for request in requests]
+    draws = [[rng.standard_normal(size, dtype=np.float32) for size in sizes] for rng in generators]
+    return [torch.from_numpy(np.stack(column)).to(device) for column in zip(*draws, strict=True)]
 
 
 def exploring(requests: Sequence[Request], device: torch.device) -> Tensor:
     """bool (B,)."""
     return torch.tensor([r.explore for r in requests], device=device)
+
+
+def refuse_compiled(config: Any) -> None:
+    """Refuses a LeRobot policy config whose sampler would be compiled."""
+    if config.compile_model:
+        remedy = "a compiled sampler rounds unlike the re-scoring pass; set it to false in config.json"
+        raise InputError("policy.compile_model", True, remedy)

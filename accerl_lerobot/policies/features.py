@@ -76,11 +76,9 @@ def check_features(
     value: object,
     offerer: str = "environment",
 ) -> None:
-    """Compares two parties of a run.
+    """Compares what a policy, or the policy that a dataset makes, needs with what is offered to it.
 
     Args:
-        needed: by a policy, or by the policy that a dataset makes.
-        offered: by an environment, or by the dataset that a policy is trained on.
         rename_map: offered name → needed name.
         field: named in the error, with its `value`.
 
@@ -113,28 +111,22 @@ def check_features(
         skip = 1 if image and needed.any_size else len(shape)
         if shapes[name][:skip] != shape[:skip]:
             remedy = "give both one image size" if image else "choose parties that were made for each other"
-            raise InputError(
-                field, value, f"its {name} is {shape}, but {shapes[name]} in the {offerer}; {remedy}"
-            )
+            sizes = f"its {name} is {shape}, but {shapes[name]} in the {offerer}"
+            raise InputError(field, value, f"{sizes}; {remedy}")
     if needed.fps and offered.fps and not math.isclose(needed.fps, offered.fps):
+        rates = f"recorded at {needed.fps:g} Hz, but the environment runs at {offered.fps:g} Hz"
         remedy = "its actions would be executed at another rate; use a dataset of this rate, or set env.fps"
-        raise InputError(field, value, f"recorded at {needed.fps:g} Hz, but the environment runs at "
-                         f"{offered.fps:g} Hz: {remedy}")  # fmt: skip
-    _check_tasks(needed.tasks, offered.tasks, field, value)
-
-
-def _check_tasks(recorded: tuple[str, ...], wanted: tuple[str, ...], field: str, value: object) -> None:
-    """Compares instructions; letter case, spaces and a full stop do not count."""
-    known = {_plain(text) for text in recorded}
-    missing = [text for text in wanted if _plain(text) not in known]
-    if not known or not missing:
-        return
-    has = ", ".join(map(repr, recorded[:4])) + (" …" if len(recorded) > 4 else "")
-    message = f"no episode of {', '.join(map(repr, missing[:4]))}, the environment's task: it has {has}"
-    if len(missing) == len(wanted):
-        raise InputError(field, value, f"{message}; choose env.task accordingly")
-    logger.warning("%s=%r: %s", field, value, message)
+        raise InputError(field, value, f"{rates}: {remedy}")
+    known = {_plain(text) for text in needed.tasks}
+    missing = [text for text in offered.tasks if _plain(text) not in known]
+    if known and missing:
+        has = ", ".join(map(repr, needed.tasks[:4])) + (" …" if len(needed.tasks) > 4 else "")
+        message = f"no episode of {', '.join(map(repr, missing[:4]))}, the environment's task: it has {has}"
+        if len(missing) == len(offered.tasks):
+            raise InputError(field, value, f"{message}; choose env.task accordingly")
+        logger.warning("%s=%r: %s", field, value, message)
 
 
 def _plain(text: str) -> str:
+    """An instruction without what does not count: letter case, spaces and a full stop."""
     return " ".join(text.lower().split()).rstrip(".")

@@ -16,7 +16,6 @@ N steps, L log-prob factors, one per executed row.
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -36,11 +35,12 @@ from accerl_lerobot.policies.family import (
     exploring,
     normal_entropy,
     normal_log_prob,
+    refuse_compiled,
     standard_normal,
-)
+)  # fmt: skip
 
 Velocity = Callable[[Tensor, Tensor], Tensor]
-"""(x (B, K, D), t (B,)) → v (B, K, D)."""
+"""(x (B, K, D), t (B,)) → v (B, K, D), conditioned on the observations; output in fp32."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,74 +62,23 @@ class FlowShape:
         """The executed entries (B, L, A) of (B, K, D)."""
         return x[:, : self.executed, : self.action_dim]
 
-
-def integrate(velocity: Velocity, x0: Tensor, shape: FlowShape) -> Tensor:
-    """LeRobot's Euler loop from noise (B, K, D) to actions (B, K, D), padding included."""
-    x, n = x0, shape.num_steps
-    for k in range(n):
-        t = 1.0 + k * (-1.0 / n)  # in double precision, as LeRobot counts it
-        x = x + (-1.0 / n) * velocity(x, x.new_full((len(x),), t))
-    return x
-
-
-def sample(
-    velocity: Velocity,
-    x0: Tensor,
-    eps: Tensor,
-    explore: Tensor,
-    shape: FlowShape,
-    config: FlowSamplerConfig,
-) -> tuple[Tensor, dict[str, Tensor], Tensor]:
-    """Denoises a batch, some samples exploring and the others by the stock ODE.
-
-    Args:
-        x0: (B, K, D) initial noise.
-        eps: (B, K, D) standard normal, the noise of the last step.
-        explore: (B,) bool; False samples take the stock path, equal to LeRobot's sampler.
-
-    Returns:
-        x_N (B, K, D); the latent that `log_prob` re-scores; its log-prob (B, L), zero where not exploring.
-    """
-    mean, std = integrate(velocity, x0, shape), x0.new_full((), config.noise_level)
-    x = torch.where(explore[:, None, None], mean + std * eps, mean)
-    counted = row_log_prob(x, mean, std, shape)
-    return x, {"path": torch.stack([x0, x], 1)}, torch.where(explore[:, None], counted, 0.0)
-
-
-def log_prob(
-    velocity: Velocity, latent: dict[str, Tensor], shape: FlowShape, config: FlowSamplerConfig
-) -> Tensor:
-    """Log-density of stored latents under the current velocity field, (B, L), differentiable."""
-    x0, x = latent["path"].unbind(1)
-    return row_log_prob(x, integrate(velocity, x0, shape), x0.new_full((), config.noise_level), shape)
-
-
-def row_log_prob(x: Tensor, mean: Tensor, std: Tensor, shape: FlowShape) -> Tensor:
-    """Log-density (B, L) of the executed entries of x (B, K, D)."""
-    return normal_log_prob(shape.executed_part(x), shape.executed_part(mean), std).sum(-1)
-
-
-def entropy(shape: FlowShape, config: FlowSamplerConfig) -> float:
-    """Differential entropy of the executed entries; no weight changes it."""
-    return shape.executed * shape.action_dim * float(normal_entropy(torch.tensor(config.noise_level)))
-
-
-@dataclass(frozen=True, kw_only=True)
-class FlowContext:
-    """`Encoded.context` of a flow model."""
-
-    velocity: Velocity
-    """Conditioned on the observations; output in fp32."""
+    def integrate(self, velocity: Velocity, x: Tensor) -> Tensor:
+        """LeRobot's Euler loop from noise (B, K, D) to actions (B, K, D), padding included."""
+        n = self.num_steps
+        for k in range(n):
+            t = 1.0 + k * (-1.0 / n)  # in double precision, as LeRobot counts it
+            x = x + (-1.0 / n) * velocity(x, x.new_full((len(x),), t))
+        return x
 
 
 class FlowModel(Model):
-    """A LeRobot policy that denoises a chunk with a velocity field; `Encoded.context` is a `FlowContext`."""
+    """A LeRobot policy that denoises a chunk with a velocity field; `Encoded.context` is a `Velocity`."""
 
     shape: FlowShape
 
-    @abstractmethod
     def stock(self, batch: dict[str, Tensor], noise: Tensor) -> Tensor:
         """LeRobot's own chunk (B, K, A) in normalised units from noise (B, K, D)."""
+        return self.policy.predict_action_chunk(batch, noise=noise)
 
 
 def flow_shape(config: Any, num_steps: int) -> FlowShape:
@@ -148,43 +97,56 @@ def refuse_options(config: Any) -> None:
     if config.rtc_config is not None and config.rtc_config.enabled:
         remedy = "real-time chunking changes the sampler's density; turn it off"
         raise InputError("policy.rtc_config.enabled", True, remedy)
-    if config.compile_model:
-        remedy = "a compiled sampler rounds unlike the re-scoring pass; set it to false in config.json"
-        raise InputError("policy.compile_model", True, remedy)
-
-
-def difference(model: FlowModel, batch: dict[str, Tensor], encoded: Encoded) -> float:
-    """Largest difference between `integrate` and LeRobot's own sampler on equal noise."""
-    shape = model.shape
-    size = (len(encoded.features), shape.chunk_size, shape.padded_dim)
-    x0 = torch.randn(size, generator=torch.Generator().manual_seed(0)).to(encoded.features.device)
-    stock = model.stock(batch, x0.clone())
-    ours = integrate(encoded.context.velocity, x0, shape)
-    return float((ours[..., : shape.action_dim] - stock).abs().max())
+    refuse_compiled(config)
 
 
 class FlowFamily(Family):
-    """Flow policies explored by noise in their denoising steps; the functions above do the work."""
+    """Flow policies explored by noise in their last denoising step. The latent is ``path``, (2, K, D)."""
 
     def __init__(self, model: FlowModel, sampler: FlowSamplerConfig) -> None:
         super().__init__()
         self.model, self.sampler, self.shape = model, sampler, model.shape
-        self.entropy = entropy(model.shape, sampler)
+        entries = self.shape.executed * self.shape.action_dim
+        self.entropy = entries * float(normal_entropy(torch.tensor(sampler.noise_level)))
+        """Differential entropy of the executed entries; no weight changes it."""
 
     def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
         n, size = self.shape.num_steps, (self.shape.chunk_size, self.shape.padded_dim)
         # Noise of every step is drawn, though only the last is noisy: recorded runs used these numbers.
         x0, eps = standard_normal(requests, size, (n, *size), device=encoded.features.device)
-        explore, velocity = exploring(requests, x0.device), encoded.context.velocity
-        x, latent, log_prob = sample(velocity, x0, eps[:, -1], explore, self.shape, self.sampler)
-        return Action(chunk=self.shape.executed_part(x), latent=latent, log_prob=log_prob)
+        return self.sample(encoded.context, x0, eps[:, -1], exploring(requests, x0.device))
+
+    def sample(self, velocity: Velocity, x0: Tensor, eps: Tensor, explore: Tensor) -> Action:
+        """Denoises a batch, some samples exploring and the others by the stock ODE.
+
+        Args:
+            x0: (B, K, D) initial noise.
+            eps: (B, K, D) standard normal, the noise of the last step.
+            explore: (B,) bool; False samples take the stock path, equal to LeRobot's sampler.
+        """
+        mean = self.shape.integrate(velocity, x0)
+        x = torch.where(explore[:, None, None], mean + self._std(x0) * eps, mean)
+        return Action(
+            chunk=self.shape.executed_part(x),
+            latent={"path": torch.stack([x0, x], 1)},
+            log_prob=torch.where(explore[:, None], self._rows(x, mean), 0.0),
+        )
+
+    def log_prob(self, velocity: Velocity, latent: dict[str, Tensor]) -> Tensor:
+        """Log-density of stored latents under the current velocity field, (B, L), differentiable."""
+        x0, x = latent["path"].unbind(1)
+        return self._rows(x, self.shape.integrate(velocity, x0))
 
     def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> Score:
-        logp = log_prob(encoded.context.velocity, latent, self.shape, self.sampler)
-        return Score(log_prob=logp, entropy=logp.new_full((len(logp),), self.entropy))
+        log_prob = self.log_prob(encoded.context, latent)
+        return Score(log_prob, entropy=log_prob.new_full((len(log_prob),), self.entropy))
 
     def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
-        return difference(self.model, batch, encoded)
+        size = (len(encoded.features), self.shape.chunk_size, self.shape.padded_dim)
+        x0 = torch.randn(size, generator=torch.Generator().manual_seed(0)).to(encoded.features.device)
+        stock = self.model.stock(batch, x0.clone())
+        ours = self.shape.integrate(encoded.context, x0)[..., : self.shape.action_dim]
+        return float((ours - stock).abs().max())
 
     def imitation_loss(self, encoded: Encoded, chunk: Tensor) -> Tensor:
         """Flow matching at a time from LeRobot's Beta(1.5, 1), executed entries only."""
@@ -195,5 +157,13 @@ class FlowFamily(Family):
         times = torch.distributions.Beta(1.5, 1.0, validate_args=False).sample((len(chunk),))
         t = times.to(chunk) * 0.999 + 0.001
         mixed = t[:, None, None] * noise + (1 - t[:, None, None]) * target
-        error = (encoded.context.velocity(mixed, t) - (noise - target)).square()
+        error = (encoded.context(mixed, t) - (noise - target)).square()
         return self.shape.executed_part(error).mean((1, 2))
+
+    def _std(self, like: Tensor) -> Tensor:
+        return like.new_full((), self.sampler.noise_level)
+
+    def _rows(self, x: Tensor, mean: Tensor) -> Tensor:
+        """Log-density (B, L) of the executed entries of x (B, K, D)."""
+        part = self.shape.executed_part
+        return normal_log_prob(part(x), part(mean), self._std(x)).sum(-1)

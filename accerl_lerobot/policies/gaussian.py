@@ -4,26 +4,21 @@
     a ~ N(m(o), s(o)²)
 
 Nothing that is sampled is fed back, so leaving out rows that are not executed marginalises them exactly. The
-std comes from `StdHead`, whose weights are the family's, as the policy itself is deterministic.
+std comes from `StdHead`, whose weights are the family's, as the policy itself is deterministic: at inference
+ACT's variational encoder is not run, and its batch norms are frozen in LeRobot's own code.
 
 Shapes: B batch, K rows of a chunk, A action dims, W width of a row's features; L = executed rows.
-
-ACT: one pass of LeRobot's transformer; its own forward is run, and watched at two places.
-
-At inference the variational encoder is not run and the latent is 0, so the policy is deterministic. The
-ResNet's batch norms are frozen in LeRobot's own code, and dropout is off, since a policy here is never in
-training mode: nothing but the observations and the weights moves the chunk.
 """
 
 from __future__ import annotations
 
 import math
-from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
+from lerobot.utils.constants import OBS_IMAGES
 from torch import Tensor, nn
 
 from accerl_lerobot.errors import InputError
@@ -39,7 +34,7 @@ from accerl_lerobot.policies.family import (
     normal_entropy,
     normal_log_prob,
     standard_normal,
-)
+)  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,9 +56,9 @@ class GaussianModel(Model):
     row_width: int
     """W."""
 
-    @abstractmethod
     def stock(self, batch: dict[str, Tensor]) -> Tensor:
         """LeRobot's own chunk (B, K, A)."""
+        return self.policy.predict_action_chunk(batch)
 
 
 class StdHead(nn.Module):
@@ -100,12 +95,12 @@ class GaussianFamily(Family):
         explore = exploring(requests, mean.device)
         u = torch.where(explore[:, None, None], mean + std * eps, mean)
         counted = normal_log_prob(u, mean, std).sum(-1)
-        return Action(chunk=u, latent={"u": u}, log_prob=torch.where(explore[:, None], counted, 0.0))
+        return Action(u, {"u": u}, torch.where(explore[:, None], counted, 0.0))
 
     def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> Score:
         mean, std = self._gaussian(encoded)
         log_prob = normal_log_prob(latent["u"], mean, std).sum(-1)
-        return Score(log_prob=log_prob, entropy=normal_entropy(std).sum((1, 2)))
+        return Score(log_prob, entropy=normal_entropy(std).sum((1, 2)))
 
     def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
         mean, _ = self._gaussian(encoded)
@@ -122,27 +117,22 @@ class GaussianFamily(Family):
 
 
 class ACT(GaussianModel):
-    """Drives LeRobot's `ACTPolicy`."""
+    """LeRobot's `ACTPolicy`: its own forward pass is run, and watched at two places."""
 
     idle = ("model.vae_encoder", "model.encoder_latent_input_proj.weight")
 
     def __init__(self, policy: Any) -> None:
         config = policy.config
-        if config.temporal_ensemble_coeff is not None:
+        if (coefficient := config.temporal_ensemble_coeff) is not None:
             remedy = "averaging over earlier chunks makes actions depend on more than the observation"
-            raise InputError(
-                "policy.temporal_ensemble_coeff", config.temporal_ensemble_coeff, f"{remedy}; set it to null"
-            )
+            raise InputError("policy.temporal_ensemble_coeff", coefficient, f"{remedy}; set it to null")
         self.policy = policy
         self.executed, self.action_dim = config.n_action_steps, config.action_feature.shape[0]
         self.width = self.row_width = config.dim_model
 
     def encode(self, batch: dict[str, Tensor]) -> Encoded:
         """The features are the encoder's output: latent, state, image positions."""
-        from lerobot.utils.constants import OBS_IMAGES
-
-        model: Any = self.policy.model
-        inputs: dict[str, Any] = dict(batch)
+        model, inputs = self.policy.model, dict[str, Any](batch)
         if self.policy.config.image_features:
             inputs[OBS_IMAGES] = [batch[key] for key in self.policy.config.image_features]
         seen: dict[str, Tensor] = {}
@@ -153,22 +143,14 @@ class ACT(GaussianModel):
         def head_starts(module: nn.Module, arguments: tuple[Tensor]) -> None:
             seen["rows"] = arguments[0]
 
-        hooks = [
+        with (
             model.encoder.register_forward_hook(encoder_done),
             model.action_head.register_forward_pre_hook(head_starts),
-        ]
-        try:
+        ):
             mean, _ = model(inputs)
-        finally:
-            for hook in hooks:
-                hook.remove()
         features = seen["features"]
         return Encoded(
             features=features,
             mask=features.new_ones(features.shape[:2]).bool(),
             context=GaussianContext(mean=mean.float(), rows=seen["rows"]),
         )
-
-    def stock(self, batch: dict[str, Tensor]) -> Tensor:
-        chunk: Tensor = self.policy.predict_action_chunk(batch)
-        return chunk

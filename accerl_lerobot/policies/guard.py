@@ -33,7 +33,7 @@ from accerl_lerobot.checkpoint.safety import (
     read_tensors,
     safe_join,
     tensor_shapes,
-)
+)  # fmt: skip
 from accerl_lerobot.errors import InputError
 
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
@@ -41,7 +41,6 @@ OURS, VALUE_HEAD, FAMILY = "accerl.json", "value_head.safetensors", "family.safe
 FILES = ("*.json", WEIGHTS, "*processor_step_*.safetensors", VALUE_HEAD, FAMILY, f"{BACKBONE}/*")
 """Files that are fetched of a checkpoint on the Hub."""
 PROCESSORS = (PREPROCESSOR, "policy_postprocessor.json")
-DEPTH_MOST = 20
 LARGE = 2**16
 """Numbers of a tensor that is not filled, see `Unfilled`."""
 FILLS = frozenset((
@@ -51,15 +50,7 @@ FILLS = frozenset((
 
 
 def fetched_checkpoint(path: str, revision: str | None, field: str) -> Path:
-    """Where a checkpoint's files are, once checked; those of a Hub repository are fetched.
-
-    Args:
-        path: a folder here, or a Hub id; `revision` is of the latter.
-        field: that named it, for the error.
-
-    Raises:
-        InputError: there is no checkpoint, or it is not to be trusted, see `check_checkpoint`.
-    """
+    """Where a checkpoint's files are, once checked; those of a Hub repository are fetched."""
     from huggingface_hub import snapshot_download
 
     from accerl_lerobot.hub.errors import guard_client
@@ -82,11 +73,7 @@ def fetched_checkpoint(path: str, revision: str | None, field: str) -> Path:
 def check_checkpoint(folder: Path, origin: Origin, *, fetched: bool = False) -> dict[str, Any]:
     """Checks all files of a LeRobot checkpoint that are read, before they are; returns its ``config.json``.
 
-    Args:
-        fetched: it is from the Hub, and must not name folders of this machine.
-
-    Raises:
-        InputError: a file is not what it says, leads elsewhere, or asks for what is not there.
+    One that was `fetched` from the Hub must not name folders of this machine.
     """
     config = read_json(safe_join(folder, CONFIG, origin), origin)
     for key, own in CONFIG_FOLDERS.items():
@@ -106,11 +93,7 @@ def check_checkpoint(folder: Path, origin: Origin, *, fetched: bool = False) -> 
 
 
 def check_processor(folder: Path, name: str, origin: Origin, *, fetched: bool = False) -> None:
-    """Checks one of a checkpoint's processor files, and the state files it names.
-
-    Raises:
-        InputError: a step is not one of LeRobot's registered ones, or names files elsewhere.
-    """
+    """Checks a processor file: only LeRobot's registered steps, with state files in this folder."""
     steps = read_json(folder / name, origin).get("steps")
     if not isinstance(steps, list):
         raise origin.refuse(name, "a list of steps is wanted")
@@ -139,11 +122,7 @@ def check_statistics(folder: Path, origin: Origin) -> None:
 
 
 def check_ours(ours: dict[str, Any], origin: Origin) -> None:
-    """Checks the content of ``accerl.json``.
-
-    Raises:
-        InputError: it is of another form than `loading.save_pretrained` writes.
-    """
+    """Checks the content of ``accerl.json``."""
     for key in ("sampler", "rename_map"):
         if not isinstance(ours.get(key, {}), dict):
             raise origin.refuse(f"{OURS}: {key}", "a mapping is wanted; remove the file to start without it")
@@ -155,7 +134,6 @@ def check_origin(name: Any, own: Path | None, what: str, origin: Origin, fetched
     Args:
         own: the checkpoint's own folder of it, where it may have one.
         what: file and key that say so, for the error.
-        fetched: the checkpoint is from the Hub, and must not name folders of this machine.
     """
     if name is None:
         return
@@ -173,30 +151,17 @@ def check_origin(name: Any, own: Path | None, what: str, origin: Origin, fetched
 
 def _check_beside(folder: Path, origin: Origin) -> None:
     """The backbone's own folder: links, what is no file, attention that is compiled code on the Hub."""
-    for path in _walk(safe_join(folder, BACKBONE, origin)):
-        name = path.relative_to(folder).as_posix()
-        file_size(safe_join(folder, name, origin), origin)
-        if path.name == CONFIG:
-            for key, value in _entries(read_json(path, origin)):
-                if "attn_implementation" in key and "/" in str(value):
-                    raise origin.refuse(name, f"{key} names code on the Hub; use sdpa or eager")
-
-
-def _walk(folder: Path) -> Iterator[Path]:
-    for directory, _, files in os.walk(folder):
-        yield from (Path(directory) / name for name in files)
-
-
-def _entries(content: Any, depth: int = 0) -> Iterator[tuple[str, Any]]:
-    if depth > DEPTH_MOST:
-        return
-    if isinstance(content, dict):
-        for key, value in content.items():
-            yield key, value
-            yield from _entries(value, depth + 1)
-    elif isinstance(content, list):
-        for value in content:
-            yield from _entries(value, depth + 1)
+    for directory, _, files in os.walk(safe_join(folder, BACKBONE, origin)):
+        for path in (Path(directory, name) for name in files):
+            name = path.relative_to(folder).as_posix()
+            file_size(safe_join(folder, name, origin), origin)
+            parts: list[Any] = [read_json(path, origin)] if path.name == CONFIG else []
+            while parts:
+                part = parts.pop()
+                for key, value in part.items() if isinstance(part, dict) else ():
+                    if "attn_implementation" in key and "/" in str(value):
+                        raise origin.refuse(name, f"{key} names code on the Hub; use sdpa or eager")
+                parts += part.values() if isinstance(part, dict) else part if isinstance(part, list) else ()
 
 
 @contextlib.contextmanager
@@ -269,9 +234,7 @@ class Unfilled(TorchFunctionMode):
 
 def input_error(error: BaseException) -> InputError | None:
     """The `InputError` that another error wraps, if there is one."""
-    link: BaseException | None = error
-    while link is not None:
-        if isinstance(link, InputError):
-            return link
-        link = link.__cause__ or link.__context__
-    return None
+    if isinstance(error, InputError):
+        return error
+    link = error.__cause__ or error.__context__
+    return None if link is None else input_error(link)

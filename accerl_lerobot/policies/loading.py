@@ -8,10 +8,11 @@ same tensors of the same shapes.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import string
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,7 +32,7 @@ from accerl_lerobot.policies.adapter import (
     ValueHead,
     example_requests,
     stack_observations,
-)
+)  # fmt: skip
 from accerl_lerobot.policies.config import (
     POLICIES,
     PolicyConfig,
@@ -41,7 +42,7 @@ from accerl_lerobot.policies.config import (
     override,
     register_policies,
     sampler_config,
-)
+)  # fmt: skip
 from accerl_lerobot.policies.family import Model
 from accerl_lerobot.policies.guard import (
     CONFIG,
@@ -54,7 +55,7 @@ from accerl_lerobot.policies.guard import (
     fetched_checkpoint,
     guarded,
     input_error,
-)
+)  # fmt: skip
 from accerl_lerobot.policies.saving import tune
 
 logger = logging.getLogger(__name__)
@@ -79,11 +80,7 @@ NAMED = 3
 
 
 def resolve_device(name: str, field: str = "policy.device") -> torch.device:
-    """``auto`` is CUDA when there is one.
-
-    Raises:
-        InputError: no such device; the error names `field`.
-    """
+    """The device of this name; ``auto`` is CUDA when there is one. The error names `field`."""
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
@@ -103,8 +100,8 @@ def resolve_device(name: str, field: str = "policy.device") -> torch.device:
 def no_tf32(device: torch.device) -> None:
     """Makes fp32 mean fp32 on a GPU, where torch convolves with 10 bits of mantissa unless told otherwise.
 
-    Acting and learning see the same observation in batches of different sizes, for which cuDNN chooses other
-    algorithms; what they round differently is divided by the std of the noise in every log-prob.
+    For batches of different sizes cuDNN chooses other algorithms; what they round differently is divided by
+    the std of the noise in every log-prob.
     """
     if device.type == "cuda":
         torch.backends.cudnn.allow_tf32 = False
@@ -120,16 +117,10 @@ def load_lerobot_config(config: PolicyConfig) -> Any:
     from lerobot.configs.policies import PreTrainedConfig
 
     folder = _checkpoint_folder(config)
-    name = _registered_type(config, folder)
-    try:
-        kind = check_type(name, "policy.type", f"{config.path} is of this type: ")
-        sampler_config(config, kind)
+    kind = _registered_type(config, folder)
+    with _refusing(config, "its config.json is not one of this LeRobot's policies"):
+        sampler_config(config, check_type(kind, "policy.type", f"{config.path} is of this type: "))
         lerobot_config = PreTrainedConfig.from_pretrained(folder)
-    except InputError:
-        raise
-    except Exception as error:  # LeRobot takes the file at its word, and may fail over any of it
-        remedy = f"its config.json is not one of this LeRobot's policies ({brief(error)})"
-        raise InputError("policy.path", config.path, remedy) from error
     lerobot_config.device = str(resolve_device(config.device))
     override(lerobot_config, config)
     check_observations(lerobot_config, "policy.n_obs_steps")
@@ -150,30 +141,19 @@ def rehearsed_config(config: PolicyConfig) -> Any:
     _registered_type(config, folder)  # before the fork: it imports all of LeRobot's policies
     key = _key(config, folder)
     if key not in _rehearsed:
-        there = replace(config, device="cpu", precision="fp32")
-        origin = Origin("policy.path", config.path)
-        sizes = rehearse(lambda: sizes_of(_load(there, rehearsal=True)), folder, origin)
-        _rehearsed[key] = Sizes(*sizes)
+        _rehearsed[key] = Sizes(*rehearsed(replace(config, precision="fp32"), sizes_of))
     return load_lerobot_config(config)
 
 
 def policy_sizes(config: PolicyConfig) -> Sizes:
-    """`Sizes` of the policy of `rehearsed_config`, which has been called.
-
-    Raises:
-        InputError: there is no checkpoint any more.
-    """
+    """`Sizes` of the policy of `rehearsed_config`, which has been called."""
     return _rehearsed[_key(config, _checkpoint_folder(config))]
 
 
 def rehearsed[T](config: PolicyConfig, task: Callable[[LeRobotAdapter], T]) -> T:
-    """Result, which JSON can hold, of `task` with the policy of `rehearsed_config`, in a child process too.
-
-    Raises:
-        InputError: see `rehearsed_config`, which has been called.
-    """
+    """Result, which JSON can hold, of `task` with the policy of `rehearsed_config`, in a child process."""
     there, origin = replace(config, device="cpu"), Origin("policy.path", config.path)
-    return rehearse(lambda: task(_load(there, rehearsal=True)), _checkpoint_folder(config), origin)
+    return rehearse(lambda: task(load_adapter(there, rehearsal=True)), _checkpoint_folder(config), origin)
 
 
 def _key(config: PolicyConfig, folder: Path) -> str:
@@ -187,30 +167,28 @@ def sizes_of(adapter: LeRobotAdapter) -> Sizes:
     return Sizes(*(sum(parameter.numel() for parameter in parameters) for parameters in of))
 
 
-def load_adapter(config: PolicyConfig) -> LeRobotAdapter:
+def load_adapter(config: PolicyConfig, *, rehearsal: bool = False) -> LeRobotAdapter:
     """Loads policy, processors and critic; proves that the sampler is LeRobot's.
+
+    Args:
+        rehearsal: the weights are not read, and a decision is made in place of that proof.
 
     Raises:
         InputError: see `load_lerobot_config`; weights or processors did not load, or do not act as LeRobot's
-            own sampler does, see `PolicyAdapter.self_check`.
+            own sampler does, see `LeRobotAdapter.self_check`.
     """
-    return _load(config)
-
-
-def _load(config: PolicyConfig, *, rehearsal: bool = False) -> LeRobotAdapter:
     from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 
     lerobot_config = load_lerobot_config(config)
     folder, origin = _checkpoint_folder(config), Origin("policy.path", config.path)
     model_class: type[Model] = imported(POLICIES[lerobot_config.type][0])
-    try:
-        with guarded("policy", config.code_revision), model_class.loading(), Unfilled():
-            policy = get_policy_class(lerobot_config.type)(lerobot_config)
-    except Exception as error:
-        if (ours := input_error(error)) is not None:
-            raise ours from error
-        remedy = f"its network cannot be built as its config.json says ({brief(error)})"
-        raise InputError("policy.path", config.path, remedy) from error
+    with (
+        _refusing(config, "its network cannot be built as its config.json says"),
+        guarded("policy", config.code_revision),
+        model_class.loading(),
+        Unfilled(),
+    ):
+        policy = get_policy_class(lerobot_config.type)(lerobot_config)
     load_weights(policy, model_class, folder / WEIGHTS, config.path, read=not rehearsal)
     device = torch.device(lerobot_config.device)
     policy.to(device).eval()
@@ -219,21 +197,16 @@ def _load(config: PolicyConfig, *, rehearsal: bool = False) -> LeRobotAdapter:
         no_tf32(device)
     overrides = {"device_processor": {"device": str(device)}}
     check_statistics(folder, origin)
-    try:
+    hint = f"; a tokeniser that cannot be had from the Hub goes into {BACKBONE}/ beside {CONFIG}"
+    hint = "" if (folder / BACKBONE).is_dir() else hint
+    with _refusing(config, "its LeRobot processors did not load", tokenizer_hint=hint):
         overrides |= _tokenizer_overrides(lerobot_config, folder)
         with guarded("policy", config.code_revision), model.loading():
             pre, post = make_pre_post_processors(
                 lerobot_config, pretrained_path=str(folder), preprocessor_overrides=overrides
             )
         _keep_names(lerobot_config, pre, folder)
-    except Exception as error:
-        if (ours := input_error(error)) is not None:
-            raise ours from error
-        remedy = f"its LeRobot processors did not load ({brief(error)})"
-        if "tokenizer_processor" in str(error) and not (folder / BACKBONE).is_dir():
-            remedy += f"; a tokeniser that cannot be had from the Hub goes into {BACKBONE}/ beside {CONFIG}"
-        raise InputError("policy.path", config.path, remedy) from error
-    try:
+    with _refusing(config, "it cannot act here"):
         processing = Processing(pre, post, device, config.rename_map)
         sampler = sampler_config(config, lerobot_config.type)
         family = imported(sampler.family)(model, sampler)
@@ -248,11 +221,21 @@ def _load(config: PolicyConfig, *, rehearsal: bool = False) -> LeRobotAdapter:
             observation = requests[0].observation | {TASK: TEXT}
             adapter.decide([replace(requests[0], observation=observation)], 0)
         tune(policy, model, config.tuning)
+    return adapter
+
+
+@contextlib.contextmanager
+def _refusing(config: PolicyConfig, what: str, tokenizer_hint: str = "") -> Iterator[None]:
+    """LeRobot takes files at their word, and may fail over any of it: one line for all that is raised."""
+    try:
+        yield
     except InputError:
         raise
-    except Exception as error:  # what its files say fits nowhere, and may fail over any of it
-        raise InputError("policy.path", config.path, f"it cannot act here ({brief(error)})") from error
-    return adapter
+    except Exception as error:
+        if (ours := input_error(error)) is not None:
+            raise ours from error
+        hint = tokenizer_hint if "tokenizer_processor" in str(error) else ""
+        raise InputError("policy.path", config.path, f"{what} ({brief(error)}){hint}") from error
 
 
 def _checkpoint_folder(config: PolicyConfig) -> Path:
@@ -298,11 +281,7 @@ def _load_ours(adapter: LeRobotAdapter, folder: Path, origin: Origin) -> None:
 
 
 def _use_backbone(lerobot_config: Any, folder: Path, path: str | None) -> None:
-    """Points a LeRobot policy config at the checkpoint's own files, where it has them.
-
-    Raises:
-        InputError: the config names local ones that are gone.
-    """
+    """Points a LeRobot policy config at the checkpoint's own files, where it has them."""
     for field, own in CONFIG_FOLDERS.items():
         if not hasattr(lerobot_config, field):
             continue
@@ -341,8 +320,7 @@ def _keep_names(lerobot_config: Any, preprocessor: Any, folder: Path) -> None:
 
 
 def _stored_steps(folder: Path) -> list[dict[str, Any]]:
-    steps: list[dict[str, Any]] = json.loads((folder / PREPROCESSOR).read_text())["steps"]
-    return steps
+    return json.loads((folder / PREPROCESSOR).read_text())["steps"]
 
 
 class _Name(str):

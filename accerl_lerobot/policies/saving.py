@@ -6,8 +6,6 @@ with a backbone's config and tokenisers, which LeRobot looks up by Hub id or abs
 first when one of our checkpoints is loaded: no Hub, and no gate such as PaliGemma's. Names in the files stay
 as they were where they are Hub ids, so that stock LeRobot loads the checkpoint as it loaded the original;
 local paths are set to the folder by `layout.relocate`.
-
-The trained part of a policy's weights, and low-rank adapters merged into plain weights.
 """
 
 from __future__ import annotations
@@ -54,22 +52,6 @@ def tune(policy: Any, model: Model, config: TuningConfig) -> None:
             parameter.requires_grad_(False)
 
 
-def merged_state_dict(policy: nn.Module) -> dict[str, Tensor] | None:
-    """The weights with low-rank adapters added in, under their plain names; None where there are none."""
-    if not any(".lora_" in name for name, _ in policy.named_parameters()):
-        return None
-    from peft.tuners.lora import Linear
-
-    # Under every name: a module that a policy holds twice is in its state twice.
-    modules = policy.named_modules(remove_duplicate=False)
-    layers = {name: m for name, m in modules if isinstance(m, Linear)}
-    state = {k: v for k, v in policy.state_dict().items() if ".lora_" not in k}
-    for name, layer in layers.items():
-        weight = state[f"{name}.base_layer.weight"]
-        state[f"{name}.base_layer.weight"] = weight + layer.get_delta_weight("default").to(weight)
-    return {k.replace(".base_layer.", "."): whole(v.detach()).cpu().contiguous() for k, v in state.items()}
-
-
 def _inject(policy: Any, config: TuningConfig) -> None:
     from peft import LoraConfig, inject_adapter_in_model
 
@@ -87,6 +69,22 @@ def _inject(policy: Any, config: TuningConfig) -> None:
     policy.requires_grad_(False)
     lora = LoraConfig(r=config.rank, lora_alpha=config.rank, target_modules=matching, lora_dropout=0.0)
     inject_adapter_in_model(lora, policy)
+
+
+def merged_state_dict(policy: nn.Module) -> dict[str, Tensor] | None:
+    """The weights with low-rank adapters added in, under their plain names; None where there are none."""
+    if not any(".lora_" in name for name, _ in policy.named_parameters()):
+        return None
+    from peft.tuners.lora import Linear
+
+    # Under every name: a module that a policy holds twice is in its state twice.
+    modules = policy.named_modules(remove_duplicate=False)
+    layers = {name: m for name, m in modules if isinstance(m, Linear)}
+    state = {k: v for k, v in policy.state_dict().items() if ".lora_" not in k}
+    for name, layer in layers.items():
+        weight = state[f"{name}.base_layer.weight"]
+        state[f"{name}.base_layer.weight"] = weight + layer.get_delta_weight("default").to(weight)
+    return {k.replace(".base_layer.", "."): whole(v.detach()).cpu().contiguous() for k, v in state.items()}
 
 
 class Weights(NamedTuple):
@@ -109,8 +107,7 @@ def save_pretrained(
 ) -> None:
     """Writes LeRobot's ``pretrained_model`` layout, and what is ours beside it, into `directory`.
 
-    Args:
-        weights: from `copy_weights`; None: the adapter's current ones.
+    `weights` are from `copy_weights`; None: the adapter's current ones.
     """
     weights = weights or copy_weights(adapter)
     directory.mkdir(parents=True, exist_ok=True)
@@ -122,10 +119,8 @@ def save_pretrained(
     for name, tensors in ((VALUE_HEAD, weights.value_head), (FAMILY, weights.family)):
         if tensors:
             save_file(tensors, directory / name)
-    ours = {
-        "sampler": draccus.encode(adapter.family.sampler, SamplerConfig),
-        "rename_map": config.rename_map,
-    }
+    sampler = draccus.encode(adapter.family.sampler, SamplerConfig)
+    ours = {"sampler": sampler, "rename_map": config.rename_map}
     (directory / OURS).write_text(json.dumps(ours, indent=2) + "\n")
 
 

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A teacher that sees the simulator's state and acts in part of the exploring episodes.
 
-The policy sees images. The teacher is a small network from the simulator's state to a chunk, learnt
-off-policy by `trainer.chunk_critic`; the policy imitates it wherever either has been (DAgger, arXiv
-1011.0686; asymmetric actor-critic, arXiv 1710.06542). It is never part of a checkpoint that LeRobot loads.
+It is learnt off-policy by `trainer.chunk_critic`, imitated by the policy, which sees images, and never part
+of a checkpoint that LeRobot loads.
 
 Shapes: M networks side by side, B rows, S numbers of a state, K actions of A dims.
 """
@@ -70,8 +69,8 @@ class Teacher(nn.Module):
         self.mean = nn.Parameter(torch.zeros(state), requires_grad=False)
         self.std = nn.Parameter(torch.ones(state), requires_grad=False)
         self.low = nn.Parameter(-torch.ones(chunk[1]), requires_grad=False)
-        """(A,), smallest action that it gives, in normalised units; with `high`, the range that was explored.
-        Beyond it the critic knows nothing, and where demonstrations hardly move, a unit is almost 0."""
+        """(A,), smallest action that it gives, in normalised units; with `high`, the range that was explored:
+        beyond it the critic knows nothing."""
         self.high = nn.Parameter(torch.ones(chunk[1]), requires_grad=False)
         self.ready = nn.Parameter(torch.zeros(()), requires_grad=False)
         """1 once it may act."""
@@ -123,11 +122,7 @@ def task_code(task: str) -> np.ndarray:
 
 @dataclass(frozen=True)
 class WithTeacher:
-    """Loads a policy and gives it an untrained teacher.
-
-    Args:
-        state: numbers of ``observation.environment_state``.
-    """
+    """Loads a policy and gives it an untrained teacher that reads `state` numbers of the simulator."""
 
     load: Load
     state: int

@@ -13,9 +13,6 @@ nothing left out.
 
 A token is drawn by inverting the distribution function at one uniform number per position, which comes from
 the request's own seed: what a request gets does not depend on its batch, and costs L random numbers, not L·V.
-
-GIPO's KL(μ‖π) would be exact over the V tokens if μ's logits were kept: V numbers per factor instead of one,
-57 kB a decision for 56 factors of 256 bins. They are not; it is estimated from samples as for every family.
 """
 
 from __future__ import annotations
@@ -55,8 +52,6 @@ class TokenContext:
 class TokenModel(Model):
     """A LeRobot policy that chooses tokens; `Encoded.context` is a `TokenContext`."""
 
-    parallel: bool
-    """All positions in one pass."""
     terminator: int | None
     """The token after which the others mean nothing; None: all L always count."""
     length: int
@@ -66,9 +61,9 @@ class TokenModel(Model):
     def chunk(self, tokens: Tensor) -> Tensor:
         """Tokens (B, L), terminators to the end after the first, to the executed (B, K, A), normalised."""
 
-    @abstractmethod
     def stock(self, batch: dict[str, Tensor]) -> Tensor:
         """LeRobot's own greedy chunk (B, K, A) in normalised units, executed rows only."""
+        return self.policy.predict_action_chunk(batch)
 
     def stock_tokens(self, batch: dict[str, Tensor]) -> Tensor | None:
         """The tokens (B, L) behind `stock`, where many of them decode to one chunk."""
@@ -106,7 +101,7 @@ def existing(tokens: Tensor, terminator: int | None) -> Tensor:
 
 
 class TokenFamily(Family):
-    """Token policies explored by sampling at a temperature; the functions above do the work.
+    """Token policies explored by sampling at a temperature.
 
     The latent is ``tokens``, int64 (L,), the terminator from the first one on."""
 
@@ -122,11 +117,7 @@ class TokenFamily(Family):
         uniform = torch.from_numpy(draws).to(device)
         tokens, log_prob = self._decide(encoded, explore, uniform)
         counted = explore[:, None] & existing(tokens, self.model.terminator)
-        return Action(
-            chunk=self.model.chunk(tokens),
-            latent={"tokens": tokens},
-            log_prob=torch.where(counted, log_prob, 0.0),
-        )
+        return Action(self.model.chunk(tokens), {"tokens": tokens}, torch.where(counted, log_prob, 0.0))
 
     def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> Score:
         """Re-scores; the entropy is that of the distributions the factors were drawn from."""
@@ -172,16 +163,16 @@ class TokenFamily(Family):
     def _decide(self, encoded: Encoded, explore: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
         """Tokens and their log-probs, each (B, L), in one pass or position by position."""
         context: TokenContext = encoded.context
-        model, temperature = self.model, self.sampler.temperature
+        terminator, temperature = self.model.terminator, self.sampler.temperature
 
         def pick(logits: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
             chosen = explore.view(-1, *[1] * (uniform.dim() - 1))
             tokens = torch.where(chosen, draw(logits, uniform, temperature), logits.argmax(-1))
             return tokens, token_log_prob(logits, tokens, temperature)
 
-        if model.parallel:
+        if context.generate is None:
             return pick(context.logits(torch.zeros_like(uniform, dtype=torch.long)), uniform)
-        fill = 0 if model.terminator is None else model.terminator
+        fill = 0 if terminator is None else terminator
         tokens = torch.full_like(uniform, fill, dtype=torch.long)
         log_prob = torch.zeros_like(uniform, dtype=torch.float32)
         running = torch.ones_like(explore)
@@ -190,10 +181,9 @@ class TokenFamily(Family):
             picked, each = pick(logits, uniform[:, position])
             tokens[:, position] = torch.where(running, picked, fill)
             log_prob[:, position] = each
-            if model.terminator is not None:
-                running.logical_and_(picked != model.terminator)
+            if terminator is not None:
+                running.logical_and_(picked != terminator)
             return tokens[:, position]
 
-        assert context.generate is not None
         context.generate(choose)
         return tokens, log_prob

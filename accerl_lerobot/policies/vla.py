@@ -1,48 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
 """LeRobot's vision-language-action policies: SmolVLA, smolvla_bins, π0, π0.5 and π0-FAST.
 
-They are driven by hand through LeRobot's internals, so each sampler is compared with the installed LeRobot's
-own whenever a policy is loaded.
+LeRobot's samplers run without gradient, so their parts are driven here: `embed_prefix`, the language model,
+`denoise_step`. Each sampler is compared with the installed LeRobot's own whenever a policy is loaded.
 
-SmolVLA: prefix once, then denoising steps against its key-value cache.
+*Flow.* Images and instruction are read once, into a key-value cache; `denoise_step` works on a copy that it
+makes itself, so one cache serves every step of a chunk.
 
-π0 and π0.5: PaliGemma reads images and instruction once, a smaller Gemma denoises against its cache.
-
-LeRobot's `sample_actions` runs without gradient, so its parts are driven here: `embed_prefix`, the language
-model, `denoise_step`. Each `denoise_step` works on a copy of the cache that it makes itself, so one cache
-serves every step of a chunk, and one velocity is one pass of the suffix (the action expert) alone.
-
-π0 shows the state to its action expert only, π0.5 writes it into the prompt. The critic, which reads the
-prefix, is therefore given π0's state beside every token: whatever the tokens are weighted with, their mean
-keeps it whole.
-
-*Precision.* Weights are held in float32 whatever the checkpoint's ``dtype`` says: steps of RL are smaller
-than bfloat16 resolves, and log-probs would differ between batches. ``policy.precision=bf16`` computes in
-bfloat16 instead. What is saved is float32 and says so; the 4.0 billion parameters of π0 take 16 GB.
-
-π0-FAST: PaliGemma writes a chunk of actions as tokens, one after the other.
-
-LeRobot's `sample_actions_fast_kv_cache` runs without gradient and throws tokens and logits away, so its parts
-are driven here. Both ways to the logits start from one pass over the prefix: images, prompt (which holds the
-state), BOS, all attending to each other. `generate` goes on token by token with the key-value cache;
-`logits` shows the cache all tokens at once, each attending to those before it.
-
-*Layout.* LeRobot trains with BOS as the first of the causal tokens and samples with BOS inside the
-bidirectional prefix. Scored in the layout of training, log-probs would be those of another policy: here it is
-the layout of sampling, at both ends.
+*Tokens of π0-FAST.* Both ways to the logits start from one pass over the prefix: images, prompt (which holds
+the state), BOS, all attending to each other. `generate` goes on token by token with the cache; `logits` shows
+the cache all tokens at once, each attending to those before it. LeRobot trains with BOS as the first of the
+causal tokens and samples with BOS inside the bidirectional prefix: log-probs in the layout of training would
+be another policy's, so here it is the layout of sampling, at both ends.
 
 *Decoding* is LeRobot's `detokenize_actions` on the tokens before the terminator ``|``. Tokens that mean
 nothing to FAST's tokeniser are skipped, missing coefficients are zeros, too many are cut off, and where
 decoding fails the chunk is zeros. Only the check that the text begins with ``Action:``, an assertion, is
 switched off in what is loaded and saved: a policy that explores will begin otherwise at times.
-
-Float32 weights as for π0, see above. Scoring takes a logit for each of the 257152 tokens of PaliGemma at each
-position: about 1 MB a token in float32, several times over for the gradient.
 """
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import logging
 import shutil
@@ -53,12 +33,46 @@ from typing import Any
 
 import numpy as np
 import torch
+from lerobot.policies.common.vla_utils import (
+    clone_past_key_values,
+    make_att_2d_masks,
+    prepare_attention_masks_4d,
+)  # fmt: skip
+from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
+from scipy.fft import dct
 from torch import Tensor
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.family import Encoded
-from accerl_lerobot.policies.flow import FlowContext, FlowModel, flow_shape, refuse_options
+from accerl_lerobot.policies.flow import FlowModel, Velocity, flow_shape, refuse_options
 from accerl_lerobot.policies.tokens import Choose, TokenContext, TokenModel
+
+logger = logging.getLogger(__name__)
+
+
+def _run(
+    network: Any, embedded: Tensor, mask: Tensor, places: Tensor, cache: Any = None
+) -> tuple[Tensor, Any]:
+    """Hidden states of a language model on tokens at these places, and its key-value cache."""
+    (hidden, _), cache = network.forward(
+        attention_mask=mask,
+        position_ids=places,
+        past_key_values=cache,
+        inputs_embeds=[embedded, None],
+        use_cache=True,
+    )
+    return hidden, cache
+
+
+def _velocity(model: Any, pad: Tensor, cache: Any, **shown: Tensor) -> Velocity:
+    """The velocity field that a LeRobot network has after its prefix; `shown` goes to the expert directly."""
+
+    def velocity(x: Tensor, t: Tensor) -> Tensor:
+        return model.denoise_step(
+            prefix_pad_masks=pad, past_key_values=cache, x_t=x, timestep=t.to(torch.float32), **shown
+        ).float()
+
+    return velocity
 
 
 class SmolVLA(FlowModel):
@@ -71,50 +85,28 @@ class SmolVLA(FlowModel):
         config = policy.config
         refuse_options(config)
         if config.adapt_to_pi_aloha:
-            raise InputError(
-                "policy.adapt_to_pi_aloha", True, "not supported in RL; train a policy without it"
-            )
+            raise InputError("policy.adapt_to_pi_aloha", True, "not supported in RL; train one without it")
         self.policy = policy
         self.shape = flow_shape(config, config.num_steps)
         self.width = policy.model.vlm_with_expert.config.text_config.hidden_size
 
     def encode(self, batch: dict[str, Tensor]) -> Encoded:
         """The features are the prefix's: images, instruction, state."""
-        from lerobot.policies.common.vla_utils import make_att_2d_masks
-        from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
-
         model = self.policy.model
         images, image_masks = self.policy.prepare_images(batch)
         embedded, pad, att = model.embed_prefix(
             images, image_masks, batch[OBS_LANGUAGE_TOKENS], batch[OBS_LANGUAGE_ATTENTION_MASK],
             state=self.policy.prepare_state(batch),
         )  # fmt: skip
-        (features, _), cache = model.vlm_with_expert.forward(
-            attention_mask=make_att_2d_masks(pad, att),
-            position_ids=torch.cumsum(pad, dim=1) - 1,
-            past_key_values=None,
-            inputs_embeds=[embedded, None],
-            use_cache=True,
-        )
-
-        def velocity(x: Tensor, t: Tensor) -> Tensor:
-            v: Tensor = model.denoise_step(
-                prefix_pad_masks=pad, past_key_values=cache, x_t=x, timestep=t.to(torch.float32)
-            )
-            return v.float()
-
-        return Encoded(features=features, mask=pad, context=FlowContext(velocity=velocity))
-
-    def stock(self, batch: dict[str, Tensor], noise: Tensor) -> Tensor:
-        chunk: Tensor = self.policy.predict_action_chunk(batch, noise=noise)
-        return chunk
+        mask, places = make_att_2d_masks(pad, att), torch.cumsum(pad, dim=1) - 1
+        features, cache = _run(model.vlm_with_expert, embedded, mask, places)
+        return Encoded(features=features, mask=pad, context=_velocity(model, pad, cache))
 
 
 class SmolVLABins(TokenModel):
     """Drives `bins_plugin`'s policy; queries of rows that are not executed have no token."""
 
     backbone = "model.vlm."
-    parallel = True
     terminator = None
 
     def __init__(self, policy: Any) -> None:
@@ -131,12 +123,10 @@ class SmolVLABins(TokenModel):
         return Encoded(features=hidden, mask=mask, context=TokenContext(logits=lambda tokens: logits))
 
     def chunk(self, tokens: Tensor) -> Tensor:
-        chunk: Tensor = self.policy.decode_tokens(tokens).view(len(tokens), self.rows, -1)
-        return chunk
+        return self.policy.decode_tokens(tokens).view(len(tokens), self.rows, -1)
 
     def stock(self, batch: dict[str, Tensor]) -> Tensor:
-        chunk: Tensor = self.policy.predict_action_chunk(batch)[:, : self.rows]
-        return chunk
+        return self.policy.predict_action_chunk(batch)[:, : self.rows]
 
 
 VLM = "model.paligemma_with_expert.paligemma."
@@ -144,7 +134,7 @@ LANGUAGE_MODEL = f"{VLM}model.language_model."
 
 
 class Pi05(FlowModel):
-    """Drives LeRobot's `PI05Policy`."""
+    """Drives LeRobot's `PI05Policy`: PaliGemma reads, a smaller Gemma, the action expert, denoises."""
 
     backbone = VLM
     unread = (f"{VLM}lm_head.weight", "model.paligemma_with_expert.gemma_expert.lm_head.weight")
@@ -165,36 +155,18 @@ class Pi05(FlowModel):
 
     def encode(self, batch: dict[str, Tensor]) -> Encoded:
         """The features are the prefix's: images and prompt."""
-        from lerobot.policies.common.vla_utils import make_att_2d_masks, prepare_attention_masks_4d
-        from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
-
         model = self.policy.model
         images, image_masks = self.policy._preprocess_images(batch)
         embedded, pad, att = model.embed_prefix(
             images, image_masks, batch[OBS_LANGUAGE_TOKENS], batch[OBS_LANGUAGE_ATTENTION_MASK]
         )
-        (features, _), cache = model.paligemma_with_expert.forward(
-            attention_mask=prepare_attention_masks_4d(make_att_2d_masks(pad, att)),
-            position_ids=torch.cumsum(pad, dim=1) - 1,
-            past_key_values=None,
-            inputs_embeds=[embedded, None],
-            use_cache=True,
-        )
+        mask = prepare_attention_masks_4d(make_att_2d_masks(pad, att))
+        features, cache = _run(model.paligemma_with_expert, embedded, mask, torch.cumsum(pad, dim=1) - 1)
         shown = self._shown_to_expert(batch)
-
-        def velocity(x: Tensor, t: Tensor) -> Tensor:
-            v: Tensor = model.denoise_step(
-                prefix_pad_masks=pad, past_key_values=cache, x_t=x, timestep=t.to(torch.float32), **shown
-            )
-            return v.float()
-
+        # The critic reads the prefix: what is not in it stands beside every token, so their mean keeps it.
         for tensor in shown.values():
             features = torch.cat([features, tensor[:, None].expand(-1, features.shape[1], -1)], -1)
-        return Encoded(features=features, mask=pad, context=FlowContext(velocity=velocity))
-
-    def stock(self, batch: dict[str, Tensor], noise: Tensor) -> Tensor:
-        chunk: Tensor = self.policy.predict_action_chunk(batch, noise=noise)
-        return chunk
+        return Encoded(features=features, mask=pad, context=_velocity(model, pad, cache, **shown))
 
     def _shown_to_expert(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """Observations (B, ...) that reach the action expert without passing the prefix."""
@@ -202,7 +174,7 @@ class Pi05(FlowModel):
 
 
 class Pi0(Pi05):
-    """Drives LeRobot's `PI0Policy`."""
+    """Drives LeRobot's `PI0Policy`, which shows the state to its action expert only."""
 
     def __init__(self, policy: Any) -> None:
         super().__init__(policy)
@@ -211,8 +183,6 @@ class Pi0(Pi05):
     def _shown_to_expert(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         return {"state": self.policy.prepare_state(batch)}
 
-
-logger = logging.getLogger(__name__)
 
 END = "|"
 
@@ -238,11 +208,7 @@ class FastTokenizer:
 
     @classmethod
     def from_pretrained(cls, name: str, **options: Any) -> FastTokenizer:
-        """Reads a folder, or the JSON files of a Hub repository; no option changes that.
-
-        Raises:
-            OSError: it is neither, or has no tokeniser in it.
-        """
+        """Reads a folder, or the JSON files of a Hub repository; no option changes that."""
         from huggingface_hub import snapshot_download
         from transformers import PreTrainedTokenizerFast
 
@@ -263,7 +229,7 @@ class FastTokenizer:
     def __call__(self, chunks: Any) -> list[list[int]]:
         """Tokens of each of the chunks (B, K, A)."""
         chunks = np.asarray(chunks, dtype=np.float64)
-        coefficients = np.around(_dct(chunks.shape[-2]) @ chunks * self.scale)
+        coefficients = np.around(dct(chunks, axis=-2, norm="ortho") * self.scale)
         characters = np.maximum(coefficients - self.min_token, 0).astype(int)
         texts = ["".join(map(chr, each.flatten())) for each in characters]
         return [self.bpe_tokenizer(text)["input_ids"] for text in texts]
@@ -301,24 +267,21 @@ class _TextTokenizer:
         return AutoTokenizer.from_pretrained(name, **options | {"trust_remote_code": False})
 
 
-def _dct(size: int) -> np.ndarray:
-    """Orthonormal DCT-II as a matrix (size, size): frequencies by times."""
-    times, frequencies = np.arange(size) + 0.5, np.arange(size)[:, None]
-    matrix = np.cos(np.pi / size * frequencies * times) * np.sqrt(2 / size)
-    matrix[0] /= np.sqrt(2)
-    return matrix
-
-
 class Pi0Fast(TokenModel):
     """Drives LeRobot's `PI0FastPolicy`."""
 
-    parallel = False
     loading = staticmethod(data_only)
 
     def __init__(self, policy: Any) -> None:
         config, tokenizer = policy.config, policy._paligemma_tokenizer
         refuse_options(config)
-        _refuse(config)
+        if config.temperature != 0:
+            remedy = "LeRobot's sampler has to be greedy here: set it to 0 in config.json; exploration has a "
+            raise InputError("policy.temperature", config.temperature, f"{remedy}policy.sampler.temperature")
+        if config.n_action_steps != (rows := config.chunk_size):
+            # The coefficients of K rows, read as those of fewer, are another, faster and larger movement.
+            remedy = f"LeRobot decodes so many rows from the coefficients of {rows}; use all of them"
+            raise InputError("policy.n_action_steps", config.n_action_steps, remedy)
         config.validate_action_token_prefix = False
         self.policy = policy
         self.length = config.max_decoding_steps
@@ -331,9 +294,6 @@ class Pi0Fast(TokenModel):
 
     def encode(self, batch: dict[str, Tensor]) -> Encoded:
         """The features are the prefix's: images, prompt, BOS."""
-        from lerobot.policies.common.vla_utils import clone_past_key_values, prepare_attention_masks_4d
-        from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
-
         model, network = self.policy.model, self.policy.model.paligemma_with_expert
         images, image_masks = self.policy._preprocess_images(batch)
         prompt, known = batch[OBS_LANGUAGE_TOKENS], batch[OBS_LANGUAGE_ATTENTION_MASK]
@@ -344,13 +304,8 @@ class Pi0Fast(TokenModel):
             torch.cat([prompt, bos], 1),
             torch.cat([known, torch.ones_like(known[:, :1])], 1),
         )
-        (features, _), cache = network.forward(
-            attention_mask=prepare_attention_masks_4d(att, dtype=embedded.dtype),
-            position_ids=torch.cumsum(pad, dim=1) - 1,
-            past_key_values=None,
-            inputs_embeds=[embedded, None],
-            use_cache=True,
-        )
+        mask = prepare_attention_masks_4d(att, dtype=embedded.dtype)
+        features, cache = _run(network, embedded, mask, torch.cumsum(pad, dim=1) - 1)
 
         def follow(tokens: Tensor, cache: Any, first: int) -> Tensor:
             """Hidden states (B, n, width) at the n positions from `first` on, whose tokens are (B, n)."""
@@ -360,22 +315,14 @@ class Pi0Fast(TokenModel):
             whole = pad[:, None].expand(-1, len(places), -1)
             attends = torch.cat([whole, seen.expand(len(pad), -1, -1)], 2)
             embedded = network.embed_language_tokens(tokens)
-            (hidden, _), _ = network.forward(
-                attention_mask=prepare_attention_masks_4d(attends, dtype=embedded.dtype),
-                position_ids=pad.sum(1, keepdim=True) + places,
-                past_key_values=cache,
-                inputs_embeds=[embedded, None],
-                use_cache=True,
-            )
-            states: Tensor = hidden
-            return states
+            mask = prepare_attention_masks_4d(attends, dtype=embedded.dtype)
+            return _run(network, embedded, mask, pad.sum(1, keepdim=True) + places, cache)[0]
 
         def logits(tokens: Tensor) -> Tensor:
             states = features[:, -1:]
             if tokens.shape[1] > 1:
                 states = torch.cat([states, follow(tokens[:, :-1], clone_past_key_values(cache), 0)], 1)
-            scores: Tensor = network.paligemma.lm_head(states)
-            return scores
+            return network.paligemma.lm_head(states)
 
         def generate(choose: Choose) -> None:
             own, state = clone_past_key_values(cache), features[:, -1]
@@ -388,60 +335,41 @@ class Pi0Fast(TokenModel):
         return Encoded(features=features, mask=pad, context=TokenContext(logits=logits, generate=generate))
 
     def chunk(self, tokens: Tensor) -> Tensor:
-        config = self.policy.config
+        rows, dims = self.policy.config.n_action_steps, self.policy.config.action_feature.shape[0]
         with _undecodable_once():
-            chunk: Tensor = self.policy.detokenize_actions(
-                tokens, action_horizon=config.n_action_steps, action_dim=config.action_feature.shape[0]
-            )
-        return chunk
+            return self.policy.detokenize_actions(tokens, action_horizon=rows, action_dim=dims)
 
     def stock(self, batch: dict[str, Tensor]) -> Tensor:
         with _undecodable_once():
-            chunk: Tensor = self.policy.predict_action_chunk(batch)
-        return chunk
+            return super().stock(batch)
 
     def stock_tokens(self, batch: dict[str, Tensor]) -> Tensor:
-        from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
-
-        tokens: Tensor = self.policy.model.sample_actions_fast_kv_cache(
+        return self.policy.model.sample_actions_fast_kv_cache(
             *self.policy._preprocess_images(batch),
             batch[OBS_LANGUAGE_TOKENS],
             batch[OBS_LANGUAGE_ATTENTION_MASK],
             max_decoding_steps=self.length,
         )
-        return tokens
 
 
-def _refuse(config: Any) -> None:
-    """Refuses settings under which LeRobot's own sampler is not what evaluation and the self-check need."""
-    if config.temperature != 0:
-        remedy = "LeRobot's sampler has to be greedy here: set it to 0 in config.json; exploration has a "
-        raise InputError("policy.temperature", config.temperature, f"{remedy}policy.sampler.temperature")
-    if config.n_action_steps != config.chunk_size:
-        # The coefficients of K rows, read as those of fewer, are another, faster and larger movement.
-        remedy = f"LeRobot decodes so many rows from the coefficients of {config.chunk_size}; use all of them"
-        raise InputError("policy.n_action_steps", config.n_action_steps, remedy)
+@functools.cache
+def _warn_undecodable() -> None:
+    logger.warning("tokens that FAST cannot decode were drawn; such a chunk is all zeros")
 
 
-class _Undecodable(logging.Filter):
-    """Passes LeRobot's complaint about a sequence it cannot decode once, in our words."""
-
-    warned = False
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        message = str(record.msg)
-        if message.startswith("Error decoding tokens") and not _Undecodable.warned:
-            _Undecodable.warned = True
-            logger.warning("tokens that FAST cannot decode were drawn; such a chunk is all zeros")
-        return not message.startswith(("Error decoding tokens", "Tokens: "))
+def _passes(record: logging.LogRecord) -> bool:
+    """Passes LeRobot's complaint about a sequence that it cannot decode once, in our words."""
+    complains = str(record.msg).startswith("Error decoding tokens")
+    if complains:
+        _warn_undecodable()
+    return not complains and not str(record.msg).startswith("Tokens: ")
 
 
 @contextlib.contextmanager
 def _undecodable_once() -> Iterator[None]:
     """LeRobot writes two lines for each such sequence, and a policy that explores draws many."""
-    quiet = _Undecodable()
-    logging.root.addFilter(quiet)
+    logging.root.addFilter(_passes)
     try:
         yield
     finally:
-        logging.root.removeFilter(quiet)
+        logging.root.removeFilter(_passes)

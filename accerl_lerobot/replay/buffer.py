@@ -1,28 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """A bounded store of segments, first in first out, that knows what became of each of them.
 
-What must hold, in segments and in decisions:
-
-    inserted = stored + evicted + retired
+    inserted = stored + evicted + retired        in segments and in decisions
 
 *evicted* made room for newer ones, *retired* were older than `max_lag` allows. A non-finite segment is
-counted but never inserted.
-
-The store survives its process: `state` is all of it, as it was before the batches that a trainer has drawn
-and not learnt from.
-
-Real and imagined experience side by side, each with its own size and pace.
-
-A batch takes its imagined share from one store and the rest from the other, and is drawn only when both can
-give. Two things end that:
-
-* the real episodes that were paid for have all been collected (`end_real`): from then on a batch takes what
-  draws they have left, and imagined ones for the rest;
-* nothing is imagined, yet or any more (`share` is 0): a batch is real. But where real episodes are counted,
-  they are not used up while a world model is learnt that is to imagine from them: as long as there is room
-  for more of them, they are let in and there is no batch.
-
-When neither can give, and neither ever will, the replay is *exhausted*.
+counted but never inserted. The store survives its process: `state` is all of it, as it was before the batches
+that a trainer has drawn and not learnt from.
 """
 
 from __future__ import annotations
@@ -36,15 +19,12 @@ import numpy as np
 from accerl_lerobot.checkpoint.snapshot import kind
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import REAL, Segment
-from accerl_lerobot.replay import pacing
 from accerl_lerobot.replay.journal import Journal
-from accerl_lerobot.replay.pacing import Pace, ReplayConfig
+from accerl_lerobot.replay.pacing import ReplayConfig, entitle
 
 DRAWS = 1024
-"""How many of the last draws are remembered, to be taken back in `Replay.state`.
-
-A trainer draws one batch ahead, and goes on for some moments while it is saved.
-"""
+"""Last draws that are remembered, to be taken back in `Replay.state`: a trainer draws one batch ahead, and
+goes on while it is saved."""
 
 
 @kind
@@ -72,19 +52,13 @@ class ReplayCounters:
     """Draws that left with their segments, in decisions: what pacing failed to use."""
 
 
-@dataclass(kw_only=True, eq=False)
 class _Entry:
-    segment: Segment | None
-    """None once it has left."""
-    size: int
-    """Decisions."""
-    oldest: int
-    """The smallest version."""
-    draws: int
-    """How often it may be drawn in all."""
-    uses: int = 0
-    left: str = ""
-    """How it has left."""
+    """A segment, which may be drawn `draws` times in all; once it has `left`, only the books of it."""
+
+    def __init__(self, segment: Segment, draws: int, uses: int = 0) -> None:
+        self.segment: Segment | None = segment
+        self.size, self.oldest = len(segment), int(segment.version.min())
+        self.draws, self.uses, self.left = draws, uses, ""
 
     @property
     def unspent(self) -> int:
@@ -93,15 +67,7 @@ class _Entry:
 
 
 class Replay:
-    """Segments in, batches of segments out; no clock, no process, no policy.
-
-    Example:
-        >>> replay = Replay(ReplayConfig(capacity=4096, min_decisions=256, samples_per_insert=2.0))
-        >>> if replay.may_insert():
-        ...     replay.insert(segment)
-        >>> if replay.may_sample(256):
-        ...     segments = replay.sample(256, trainer_version=17, rng=np.random.default_rng(0))
-    """
+    """Segments in, batches of segments out; no clock, no process, no policy."""
 
     def __init__(self, config: ReplayConfig) -> None:
         self.config = config
@@ -122,23 +88,22 @@ class Replay:
         return len(self._entries)
 
     @property
-    def pace(self) -> Pace:
-        """State of the buffer for the predicates of `pacing`."""
-        return Pace(stored=self._stored, available=self._available)
+    def available_decisions(self) -> int:
+        """Decisions of the segments with draws left."""
+        return self._available
 
     def may_insert(self) -> bool:
         """True if rollouts should bring another segment now; `insert` does not refuse one too many."""
-        return pacing.may_insert(self.config, self.pace)
+        return self.config.may_insert(self._stored, self._available)
 
     def may_sample(self, batch_decisions: int) -> bool:
         """True if the trainer should draw a batch now; `sample` itself does not wait for the warm start."""
-        return pacing.may_sample(self.config, self.pace, batch_decisions)
+        return self.config.may_sample(self._stored, self._available, batch_decisions)
 
     def insert(self, segment: Segment) -> bool:
         """Stores a segment, by reference, and evicts the oldest ones if room is needed.
 
-        Returns:
-            False for a non-finite segment, which is counted and not stored.
+        A non-finite one is counted and not stored: False.
         """
         n = len(segment)
         if n > self.config.capacity:
@@ -148,11 +113,8 @@ class Replay:
             return False
         while self._stored + n > self.config.capacity:
             self._depart(self._entries.popleft(), "evicted")
-        draws, self._carry = pacing.entitle(self.config.samples_per_insert, n, self._carry)
-        oldest = int(segment.version.min())
-        self._entries.append(_Entry(segment=segment, size=n, oldest=oldest, draws=draws))
-        self._stored += n
-        self._available += n
+        draws, self._carry = entitle(self.config.samples_per_insert, n, self._carry)
+        self._add(_Entry(segment, draws))
         self.counters.inserted_segments += 1
         self.counters.inserted_decisions += n
         return True
@@ -160,12 +122,8 @@ class Replay:
     def sample(self, num_decisions: int, trainer_version: int, rng: np.random.Generator) -> list[Segment]:
         """Draws the available segments that were used least, in random order; retires those too old first.
 
-        A segment that has been drawn as often as its share of ``samples_per_insert`` allows stays in the
-        store, but is not available any more.
-
         Args:
-            num_decisions: how many decisions are wanted; whole segments are drawn until there are at least
-                that many.
+            num_decisions: at least 1; whole segments are drawn until there are as many.
             trainer_version: updates made so far. No segment with a decision more than ``max_lag`` behind is
                 drawn.
             rng: decides among segments used equally often.
@@ -174,59 +132,50 @@ class Replay:
             The segments, none twice; empty, with nothing counted as used, if fewer decisions are available.
             That can happen although `may_sample` held, when segments were too old: try again later.
         """
-        if num_decisions < 1:
-            raise ValueError(f"sample of {num_decisions} decisions: ask for at least 1")
         self.retire(trainer_version)
         if self._available < num_decisions:
             return []
         available = [e for e in self._entries if e.unspent]
         shuffled = [available[i] for i in rng.permutation(len(available))]
         drawn: list[_Entry] = []
-        collected = 0
         for entry in sorted(shuffled, key=lambda e: e.uses):
-            self._use(entry)
+            self.counters.trained_decisions += entry.size
+            self.counters.unique_decisions += 0 if entry.uses else entry.size
+            entry.uses += 1
+            self._available -= 0 if entry.unspent else entry.size
             drawn.append(entry)
-            collected += entry.size
-            if collected >= num_decisions:
+            num_decisions -= entry.size
+            if num_decisions <= 0:
                 break
         self._drawn.append((trainer_version, drawn))
         return [entry.segment for entry in drawn if entry.segment is not None]
 
     def metrics(self) -> dict[str, float]:
         """Everything worth logging, by name."""
-        flat = {k: float(v) for k, v in asdict(self.counters).items()}
-        flat["stored_segments"], flat["stored_decisions"] = float(self.stored_segments), float(self._stored)
-        flat["available_decisions"] = float(self._available)
-        return flat
+        names = ("stored_segments", "stored_decisions", "available_decisions")
+        counts = asdict(self.counters) | {name: getattr(self, name) for name in names}
+        return {name: float(count) for name, count in counts.items()}
 
     def state(self, version: int | None = None) -> dict[str, Any]:
         """All that `restore` needs; see `snapshot`. Shares the segments, which nobody changes.
 
-        Args:
-            version: updates made by the trainer that this is to go with; what it has drawn for later ones
-                counts as not drawn. None: it has learnt from all it drew.
-
-        Raises:
-            RuntimeError: that is too many draws ago.
+        What the trainer has drawn for updates after `version` counts as not drawn; None: it has learnt from
+        all it drew.
         """
         late = [] if version is None else [entries for made, entries in self._drawn if made >= version]
         if late and len(late) == self._drawn.maxlen:
             raise RuntimeError(f"replay has given more than {DRAWS} batches since update {version}")
-        back: Counter[int] = Counter(id(entry) for entries in late for entry in entries)
+        back: Counter[_Entry] = Counter(entry for entries in late for entry in entries)
         counters = replace(self.counters)
-        for entry in {id(e): e for entries in late for e in entries}.values():
-            count = back[id(entry)]
+        for entry, count in back.items():
+            unused = count == entry.uses
             counters.trained_decisions -= count * entry.size
-            if count == entry.uses:
-                counters.unique_decisions -= entry.size
-            if not entry.left:
-                continue
-            unused = f"{entry.left}_unused"
-            counters.unspent_draws += count * entry.size
-            setattr(counters, unused, getattr(counters, unused) + (count == entry.uses))
-        entries = [
-            {"segment": e.segment, "draws": e.draws, "uses": e.uses - back[id(e)]} for e in self._entries
-        ]
+            counters.unique_decisions -= entry.size if unused else 0
+            if entry.left:
+                counters.unspent_draws += count * entry.size
+                name = f"{entry.left}_unused"
+                setattr(counters, name, getattr(counters, name) + unused)
+        entries = [{"segment": e.segment, "draws": e.draws, "uses": e.uses - back[e]} for e in self._entries]
         return {"counters": counters, "entries": entries, "carry": self._carry}
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -235,17 +184,7 @@ class Replay:
             raise RuntimeError("restore before the first insert")
         self.counters, self._carry = state["counters"], state["carry"]
         for held in state["entries"]:
-            segment: Segment = held["segment"]
-            entry = _Entry(
-                segment=segment,
-                size=len(segment),
-                oldest=int(segment.version.min()),
-                draws=held["draws"],
-                uses=held["uses"],
-            )
-            self._entries.append(entry)
-            self._stored += entry.size
-            self._available += entry.size if entry.unspent else 0
+            self._add(_Entry(**held))
 
     @property
     def segments(self) -> list[Segment]:
@@ -261,13 +200,10 @@ class Replay:
         for entry in old:
             self._depart(entry, "retired")
 
-    def _use(self, entry: _Entry) -> None:
-        n = entry.size
-        self.counters.trained_decisions += n
-        self.counters.unique_decisions += n if entry.uses == 0 else 0
-        entry.uses += 1
-        if not entry.unspent:
-            self._available -= n
+    def _add(self, entry: _Entry) -> None:
+        self._entries.append(entry)
+        self._stored += entry.size
+        self._available += entry.size if entry.unspent else 0
 
     def _depart(self, entry: _Entry, how: str) -> None:
         """Books a segment that has left under ``<how>_*``."""
@@ -294,9 +230,19 @@ ROOM = 0.9
 
 
 class MixedReplay:
-    """Segments in, batches of segments out, of which a `share` of decisions is imagined.
+    """Real and imagined experience side by side, each with its own size and pace.
 
-    `patient`: real episodes are counted. Real segments that are stored are noted in the journal.
+    A batch takes its imagined share from one store and the rest from the other, and is drawn only when both
+    can give. Two things end that:
+
+    * the real episodes that were paid for have all been collected (`real_ended`): from then on a batch takes
+      what draws they have left, and imagined ones for the rest;
+    * nothing is imagined, yet or any more (`share` is 0): a batch is real. But where real episodes are
+      counted (`patient`), they are not used up while a world model is learnt that is to imagine from them: as
+      long as there is room for more of them, they are let in and there is no batch.
+
+    When neither can give, and neither ever will, the replay is *exhausted*. Real segments that are stored are
+    noted in the journal.
     """
 
     def __init__(
@@ -310,10 +256,11 @@ class MixedReplay:
         self._patient, self._journal = patient, journal
         self.real, self.imagined, self.share = Replay(real), Replay(imagined), share
         self.real_ended = False
+        """True if no real segment will come any more."""
         self.awaited = share > 0
         """True if anything may be imagined later on, although nothing is now."""
         self.held = False
-        """True if real episodes, if they are counted, are to wait."""
+        """True if real episodes, if they are counted, wait: what is here is to be learnt from first."""
 
     def may_insert(self, source: str = REAL) -> bool:
         """True if another segment of this source should be brought now."""
@@ -328,10 +275,6 @@ class MixedReplay:
             self._journal.write(segment)
         return stored
 
-    def end_real(self) -> None:
-        """No real segment will come any more."""
-        self.real_ended = True
-
     def may_sample(self, batch_decisions: int) -> bool:
         """True if a batch should be drawn now."""
         return self._parts(batch_decisions) is not None
@@ -340,14 +283,6 @@ class MixedReplay:
         """True if there is no batch and never will be."""
         hopeless = self.real_ended and not self.share and not self.awaited
         return hopeless and not self.may_sample(batch_decisions)
-
-    def mix(self, share: float, awaited: bool) -> None:
-        """From now on, so much of a batch is imagined; `awaited`: or may be later on."""
-        self.share, self.awaited = share, awaited
-
-    def hold(self, held: bool) -> None:
-        """From now on real episodes are to wait, or not: what is here is to be learnt from first."""
-        self.held = held
 
     def sample(self, num_decisions: int, trainer_version: int, rng: np.random.Generator) -> list[Segment]:
         """See `Replay.sample`: empty, with nothing counted as used, if a part cannot be had."""
@@ -405,7 +340,7 @@ class MixedReplay:
             return None
         real = batch - round(self.share * batch)
         if self.real_ended:
-            left = self.real.pace.available
+            left = self.real.available_decisions
             if not self.share:
                 # Few episodes may be less than a batch: then they are one.
                 return (min(batch, left), 0) if left >= LEAST * batch else None

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Record of the episodes of real worlds, on disk: enough to repeat them, and to see them.
+"""Record of the real episodes, on disk: ``RUN/episodes.jsonl`` has a line per segment that replay has stored.
 
-``RUN/episodes.jsonl`` has one line per segment that replay has stored: where it begins, the actions that were
-executed, what they brought and whose they were. Pictures are not in it; a world that is given the same seed
-and actions shows the same again, at every env step and in any size. That is what `export.episodes` does.
+Pictures are not in it; a world that is given the same seed and actions shows the same again, at every env
+step and in any size. That is what `export.episodes` does.
 """
 
 from __future__ import annotations
@@ -59,21 +58,17 @@ class Journal:
 
     def write(self, segment: Segment) -> None:
         """Notes a real segment."""
-        size = segment.actions.shape[-1]
-        actions = np.concatenate(
-            [chunk[:steps] for chunk, steps in zip(segment.actions, segment.steps, strict=True)]
-        )
+        chunks = zip(segment.actions, segment.steps, strict=True)
+        actions = np.concatenate([chunk[:steps] for chunk, steps in chunks])
         line = {
             "key": segment.key,
-            "task": segment.origin.task,
-            "seed": segment.origin.seed,
-            "decision": segment.origin.decision,
+            **segment.origin._asdict(),  # task, seed, decision
             "steps": segment.steps.tolist(),
             "versions": segment.version.tolist(),
             "rewards": segment.reward.tolist(),
             "ended": segment.terminated or segment.truncated,
             "success": segment.success,
-            "action_dim": size,
+            "action_dim": segment.actions.shape[-1],
             "actions": base64.b64encode(actions.astype("<f4").tobytes()).decode(),
         }
         fault_point("replay.journal")
@@ -81,7 +76,7 @@ class Journal:
         self._file.flush()
 
     def cut(self, position: int) -> None:
-        """Forgets what was written after `position`."""
+        """Forgets all that was written after `position`."""
         cut_back(self._path, position)
 
 

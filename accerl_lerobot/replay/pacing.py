@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far rollouts and trainer may run apart: two predicates, and the staleness they imply.
+"""How far rollouts and trainer may run apart: two predicates, and the staleness they imply; whose turn it is.
 
 Everything is counted in decisions. On entering the store each segment gets a whole number of draws, ⌊r⌋ or
 ⌈r⌉ with r = samples_per_insert, such that the average is r (`entitle`). A segment with draws left is
@@ -8,27 +8,16 @@ Everything is counted in decisions. On entering the store each segment gets a wh
     may_sample = stored ≥ min_decisions  and  available ≥ batch
     may_insert = stored < min_decisions  or   available < ahead
 
-*No deadlock*, whatever happened before: if stored < min_decisions, inserting is allowed. Otherwise either
-available ≥ batch, and sampling is allowed; or available < batch ≤ ahead, and inserting is. The condition
-batch ≤ ahead is checked by `ReplayConfig.check`. Nothing here depends on totals since the run began, so
-evicting, retiring or resuming with an empty store cannot upset the pace.
+With batch ≤ ahead one of them holds at any time. Nothing depends on totals since the run began, so evicting,
+retiring or resuming cannot upset the pace. Rollouts wait on insert instead of having their segments thrown
+away later, because what is thrown away first is what took longest, and those are the failures.
 
-*No over-use*: trained ≤ samples_per_insert · inserted, and no decision is trained on more than
-⌈samples_per_insert⌉ times.
-
-*Bounded staleness*: see `lag_bound`. Rollouts wait at the door instead of having their segments thrown away
-later, because what is thrown away first is what took longest, and those are the failures.
-
-Whose turn it is: collecting and learning in turns, side by side in step, or each on its own.
-
-    asynchronous   nobody waits for anybody, within the pace (`pacing`)
+    asynchronous   nobody waits for anybody, within the pace
     overlap        the next batch is collected while one is learned from, and then both wait for each other
     synchronous    a batch is collected, then learned from, then the weights are handed over
 
 The last two are what asynchrony is measured against: the same workers, held back. All worlds are decided for
-together in them, as by a vectorised environment, so a step takes as long as its slowest world. An inference
-service that is lost while it has answered some of them leaves these a decision ahead: from then on some
-decisions are an update older than the schedule alone would have them.
+together in them, as by a vectorised environment, so a step takes as long as its slowest world.
 """
 
 from __future__ import annotations
@@ -43,12 +32,7 @@ from accerl_lerobot.errors import InputError
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayConfig(Section, section="replay"):
-    """Size and pace of one replay.
-
-    Example:
-        >>> config = ReplayConfig(capacity=4096, min_decisions=256, samples_per_insert=2.0, ahead=512)
-        >>> config.check(batch_decisions=256, segment_decisions=16)
-    """
+    """Size and pace of one replay."""
 
     capacity: Annotated[int, Range("[1, 100000000]")] = 4096
     """Decisions held at most; the oldest segments leave first. At least `ahead` plus one segment."""
@@ -74,16 +58,7 @@ class ReplayConfig(Section, section="replay"):
                 raise InputError(f"replay.{name}", getattr(self, name), remedy)
 
     def check(self, *, batch_decisions: int, segment_decisions: int) -> None:
-        """Refuses a pace that could stall or waste, once the batch size and the segment length are known.
-
-        Args:
-            batch_decisions: decisions one update asks for.
-            segment_decisions: T of the longest segment.
-
-        Raises:
-            InputError: both sides could wait for each other forever, or the trainer for the warm start, or
-                segments would be evicted or retired unused.
-        """
+        """Refuses a pace that could stall or waste, given an update's batch and the longest segment."""
         if self.ahead < batch_decisions:
             remedy = f"use at least one batch, {batch_decisions}, or both sides wait for each other"
             raise InputError("replay.ahead", self.ahead, remedy)
@@ -100,41 +75,23 @@ class ReplayConfig(Section, section="replay"):
             remedy = f"use at least {least}: the larger of min_decisions and ahead, and one segment"
             raise InputError("replay.capacity", self.capacity, remedy)
 
+    def may_sample(self, stored: int, available: int, batch_decisions: int) -> bool:
+        """True if the trainer may draw a batch now."""
+        return stored >= self.min_decisions and available >= batch_decisions
 
-@dataclass(frozen=True, kw_only=True)
-class Pace:
-    """Where collecting and learning stand, in decisions."""
-
-    stored: int
-    available: int
-    """Decisions among those whose segment has draws left."""
+    def may_insert(self, stored: int, available: int) -> bool:
+        """True if rollouts may bring another segment now."""
+        return stored < self.min_decisions or available < self.ahead
 
 
 def entitle(samples_per_insert: float, n: int, carry: float) -> tuple[int, float]:
-    """How often a new segment may be drawn, so that the average over decisions is `samples_per_insert`.
+    """How often a new segment of n decisions may be drawn, such that the average is `samples_per_insert`.
 
-    Args:
-        samples_per_insert: r ≥ 1.
-        n: decisions of the segment.
-        carry: draws, in decisions, that rounding has withheld so far.
-
-    Returns:
-        ⌊r⌋ or ⌈r⌉, and the new carry, in [0, longest segment]: the sum of draws · n never exceeds r ·
-        inserted.
+    `carry` is the draws, in decisions, that rounding has withheld so far; the new one is returned too.
     """
     carry += samples_per_insert * n
     draws = min(math.floor(carry / n), math.ceil(samples_per_insert))
     return draws, carry - draws * n
-
-
-def may_sample(config: ReplayConfig, pace: Pace, batch_decisions: int) -> bool:
-    """True if the trainer may draw a batch now."""
-    return pace.stored >= config.min_decisions and pace.available >= batch_decisions
-
-
-def may_insert(config: ReplayConfig, pace: Pace) -> bool:
-    """True if rollouts may bring another segment now."""
-    return pace.stored < config.min_decisions or pace.available < config.ahead
 
 
 def decisions_under_way(*, workers: int, worlds: int, segment_length: int) -> int:
@@ -143,36 +100,23 @@ def decisions_under_way(*, workers: int, worlds: int, segment_length: int) -> in
 
 
 def lag_bound(
-    config: ReplayConfig,
-    *,
-    batch_decisions: int,
-    in_flight: int,
-    pickup: int = 0,
-    prefetch: int = 0,
+    config: ReplayConfig, *, batch_decisions: int, in_flight: int, pickup: int = 0, prefetch: int = 0
 ) -> int:
     """The largest lag an update can see, in updates.
 
         lag ≤ min(max_lag, pickup + drawn) + prefetch
         drawn = ⌊⌈samples_per_insert⌉ · (max(ahead, min_decisions) + 2·in_flight + capacity) / batch⌋ − 1
 
-    The version counts the updates behind the weights. Take a segment's first decision, at time 0, and the
-    moment it is drawn. The weights that decided were `pickup` updates old at most. Each update since
-    then has drawn a batch, at most ⌈samples_per_insert⌉ times each, out of
-
-    * what was available at time 0, at most max(ahead, min_decisions) + in_flight: the door shuts at the
-      first term, and what was under way still comes in;
-    * what was inserted since: in_flight until the segment itself was in, and capacity after that, or it
-      would have been evicted.
-
-    One batch is subtracted for the update that draws the segment.
+    Between a segment's first decision and its being drawn, each update has drawn a batch out of what was
+    available at first, at most max(ahead, min_decisions) + in_flight, and of what was inserted since:
+    in_flight until the segment itself was in, and capacity after that, or it would have been evicted. The
+    weights that decided were `pickup` updates old at most.
 
     Args:
-        config: the replay.
         batch_decisions: decisions one update draws at least.
         in_flight: most decisions inserted, by all workers, from the first decision of a segment until it is
-            inserted itself, its own included, and not less than what may be under way when the door shuts.
-            With environments of about equal speed: `decisions_under_way`, twice that to be safe. One worker
-            that hangs breaks this assumption; `max_lag` then retires its segment.
+            inserted itself, its own included. With environments of about equal speed: `decisions_under_way`,
+            twice that to be safe. One worker that hangs breaks this; `max_lag` then retires its segment.
         pickup: updates made while a publication travels to the inference service, or is held back.
         prefetch: batches drawn ahead of the update that uses them.
     """
@@ -199,11 +143,7 @@ class Turns:
         self._drawn = self._learnt = 0
 
     def may_collect(self, ready: bool) -> bool:
-        """True if who has brought a segment may go on.
-
-        Args:
-            ready: whether the pace would let a batch be drawn now.
-        """
+        """True if who has brought a segment may go on; `ready`: the pace would let a batch be drawn now."""
         if self.schedule == SYNCHRONOUS:
             return not (ready or self._learning)
         return self.schedule == ASYNCHRONOUS or not (ready and self._learning)

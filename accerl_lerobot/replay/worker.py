@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The replay process: the door between collecting and learning.
+"""The replay process.
 
 consumes    segments from rollout workers and from imagination
 produces    batches of segments for the trainer
@@ -15,8 +15,8 @@ import copy
 import os
 import time
 from collections import deque
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -121,7 +121,11 @@ class ReplayWorker:
             self._clock.enter(COMPUTE)
             with self._failing():
                 for segment in segments:
-                    self._insert(segment)
+                    fault_point("replay.insert")
+                    if self._replay.insert(segment) and source == REAL:
+                        self._real.append(segment)
+                        self._real_count += 1
+                        self._episodes += [segment.episode] if segment.episode else []
             self._clock.enter(WAIT_IN)
             self._changed.notify_all()
             kept = time.monotonic()
@@ -132,18 +136,19 @@ class ReplayWorker:
 
     async def sample(self, num_decisions: int, trainer_version: int) -> list[Segment]:
         """A batch once the pace allows it; empty when the run is over, or nothing will come any more."""
+
+        def ended() -> bool:
+            return self._closed or self._replay.exhausted(num_decisions)
+
+        def ready() -> bool:
+            return self._replay.may_sample(num_decisions)
+
         started = time.monotonic()
         self._batch = num_decisions
         async with self._changed:
             while True:
-                await self._changed.wait_for(
-                    lambda: (
-                        self._closed
-                        or (self._turns.may_draw() and self._replay.may_sample(num_decisions))
-                        or self._replay.exhausted(num_decisions)
-                    )
-                )
-                if self._closed or self._replay.exhausted(num_decisions):
+                await self._changed.wait_for(lambda: ended() or (self._turns.may_draw() and ready()))
+                if ended():
                     return []
                 self._clock.enter(COMPUTE)
                 with self._failing():
@@ -156,17 +161,22 @@ class ReplayWorker:
                     self._sample_wait_s += time.monotonic() - started
                     return segments
 
+    @asynccontextmanager
+    async def _changing(self) -> AsyncIterator[None]:
+        """Lets everybody who waits look again at what is changed inside."""
+        async with self._changed:
+            yield
+            self._changed.notify_all()
+
     async def learnt(self) -> None:
         """The trainer's word that it has learned from a batch."""
-        async with self._changed:
+        async with self._changing():
             self._turns.learnt()
-            self._changed.notify_all()
 
     async def follow(self, schedule: Schedule) -> None:
         """From now on, turns are taken like this."""
-        async with self._changed:
+        async with self._changing():
             self._turns.schedule = schedule
-            self._changed.notify_all()
 
     async def news(self, cursor: int) -> News:
         """Real segments since the `cursor`-th; those that nobody asked for in time are left out."""
@@ -175,22 +185,19 @@ class ReplayWorker:
         return News(segments, self._real_count, self._replay.real_ended, self._closed)
 
     async def mix(self, share: float, awaited: bool) -> None:
-        """See `MixedReplay.mix`."""
-        async with self._changed:
-            self._replay.mix(share, awaited)
-            self._changed.notify_all()
+        """From now on, so much of a batch is imagined; `awaited`: or may be later on."""
+        async with self._changing():
+            self._replay.share, self._replay.awaited = share, awaited
 
     async def hold(self, held: bool) -> None:
-        """See `MixedReplay.hold`."""
-        async with self._changed:
-            self._replay.hold(held)
-            self._changed.notify_all()
+        """See `MixedReplay.held`."""
+        async with self._changing():
+            self._replay.held = held
 
     async def end_real(self) -> None:
         """Every real episode has been played and stored."""
-        async with self._changed:
-            self._replay.end_real()
-            self._changed.notify_all()
+        async with self._changing():
+            self._replay.real_ended = True
 
     async def save(self, directory: Path, version: int) -> None:
         """Writes its part of ``training_state``, as it was when the trainer had made `version` updates."""
@@ -203,14 +210,6 @@ class ReplayWorker:
         }
         self._clock.enter(WAIT_IN)
         await asyncio.to_thread(snapshot.save, directory / "replay", state)
-
-    def _insert(self, segment: Segment) -> None:
-        fault_point("replay.insert")
-        if self._replay.insert(segment) and segment.source == REAL:
-            self._real.append(segment)
-            self._real_count += 1
-            if segment.episode:
-                self._episodes.append(segment.episode)
 
     @contextmanager
     def _failing(self) -> Iterator[None]:
@@ -230,17 +229,14 @@ class ReplayWorker:
 
     async def close(self) -> None:
         """Ends all waiting; nothing is stored or drawn any more."""
-        async with self._changed:
+        async with self._changing():
             self._closed = True
-            self._changed.notify_all()
 
     async def metrics(self) -> dict[str, float]:
         """Counters and seconds waited at either door; episodes since the last call as means."""
         self._clock.beat()
         episodes, self._episodes = self._episodes, []
-        means = {
-            f"episode_{k}": float(np.mean([e[k] for e in episodes]))
-            for k in (episodes[0] if episodes else {})
-        }
+        names = episodes[0] if episodes else ()
+        means = {f"episode_{name}": float(np.mean([e[name] for e in episodes])) for name in names}
         waits = {"insert_wait_s": self._insert_wait_s, "sample_wait_s": self._sample_wait_s}
         return self._replay.metrics() | waits | means | {"episodes": float(len(episodes))}

@@ -11,13 +11,7 @@ from accerl_lerobot.experience import REAL, TASK, Decision, Observation, Origin,
 
 
 class SegmentBuilder:
-    """Collects the decisions of one episode and cuts them into segments of at most `length` decisions.
-
-    Example:
-        >>> builder = SegmentBuilder(observation, length=8, origin=Origin("door-open-v3", seed=3, decision=0))
-        >>> builder.add(decision, actions, reward=0.0, steps=10, following=next_observation)   # repeated
-        >>> segment = builder.cut(key="rollout0.0.17", terminated=True, success=True)
-    """
+    """Collects the decisions of one episode and cuts them into segments of at most `length` decisions."""
 
     def __init__(self, observation: Observation, length: int, origin: Origin, source: str = REAL) -> None:
         self.length, self.origin, self.source = length, origin, source
@@ -47,7 +41,7 @@ class SegmentBuilder:
     def add(
         self, decision: Decision, actions: np.ndarray, reward: float, steps: int, following: Observation
     ) -> None:
-        """Records one executed decision: what the world made of its chunk, and what was seen then."""
+        """Records one executed decision."""
         self.decisions.append(decision)
         self.actions.append(actions)
         self.rewards.append(reward)

@@ -27,10 +27,14 @@ import numpy as np
 from accerl_lerobot.envs import EnvConfig, make_world
 from accerl_lerobot.experience import Decision, Request, Segment
 from accerl_lerobot.fault_points import fault_point
-from accerl_lerobot.rollout.plans import EpisodePlans
-from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutConfig, RolloutRunner
+from accerl_lerobot.rollout.runner import (
+    EpisodePlan,
+    EpisodePlans,
+    EpisodeResult,
+    RolloutConfig,
+    RolloutRunner,
+)
 from accerl_lerobot.timeline import COMPUTE, TRANSPORT, WAIT_IN, WAIT_OUT, open_clock
-from accerl_lerobot.transport.contract import Client
 from accerl_lerobot.transport.endpoint import Endpoint, ReconnectingClient
 
 PARTS = 2
@@ -88,11 +92,7 @@ class RolloutWorker:
     ) -> None:
         self._clock = open_clock(timeline, f"rollout {share.index}")
         self._plans = EpisodePlans(
-            tasks,
-            seed=seed,
-            worker=share.index,
-            incarnation=share.incarnation,
-            budget=share.budget,
+            tasks, seed=seed, worker=share.index, incarnation=share.incarnation, budget=share.budget
         )
         self._spent = False
         self._at_the_door = AT_THE_DOOR
@@ -105,14 +105,8 @@ class RolloutWorker:
         self._deciding = ReconnectingClient("inference")
         worlds = [make_world(env, history, config.reward_model) for _ in range(config.worlds)]
         name = f"rollout{share.index}.{share.incarnation}"
-        self._runner = RolloutRunner(
-            worlds,
-            self._next,
-            config,
-            name,
-            self._outbox.append,
-            self._results.append,
-        )
+        callbacks = self._outbox.append, self._results.append
+        self._runner = RolloutRunner(worlds, self._next, config, name, *callbacks)
         self._clock.enter(WAIT_IN)
 
     def ready(self) -> int:
@@ -166,9 +160,17 @@ class RolloutWorker:
         while True:
             self._moved = time.monotonic()
             at_the_door -= {ticket for ticket, _ in door.done(patience)}
-            self._bring(door, at_the_door, size)
+            while self._outbox:
+                self._clock.enter(TRANSPORT)
+                if fault_point("rollout.send"):
+                    self._outbox[0].reward = self._outbox[0].reward * np.float32(np.nan)
+                at_the_door.add(door.send(self._outbox[:size]))
+                del self._outbox[:size]
             self._spent = self._plans.spent and not self._runner.exploring and not at_the_door
-            self._give_up(due, idle)
+            if not self._training.is_set():  # so that planned episodes need not wait for exploring ones
+                given_up = [slot for slot, request in due.items() if request.explore]
+                idle += given_up
+                due = {slot: request for slot, request in due.items() if slot not in given_up}
             idle = [slot for slot in idle if not self._begin(slot, due)]
             sendable = [slot for slot in due if len(at_the_door) < self._at_the_door or not due[slot].explore]
             for start in range(0, len(sendable), size):
@@ -181,15 +183,6 @@ class RolloutWorker:
             for ticket, decisions in deciding.done(0.5) if under_way else ():
                 for slot, decision in zip(under_way.pop(ticket), decisions, strict=True):
                     self._advance(slot, decision, due, idle)
-
-    def _bring(self, door: Client, at_the_door: set[int], size: int) -> None:
-        """Brings segments to replay, a few at a time."""
-        while self._outbox:
-            self._clock.enter(TRANSPORT)
-            if fault_point("rollout.send"):
-                self._outbox[0].reward = self._outbox[0].reward * np.float32(np.nan)
-            at_the_door.add(door.send(self._outbox[:size]))
-            del self._outbox[:size]
 
     def _next(self) -> EpisodePlan | None:
         plan = self._plans.next(exploring=self._training.is_set())
@@ -214,14 +207,6 @@ class RolloutWorker:
             idle.append(slot)
         else:
             due[slot] = request
-
-    def _give_up(self, due: dict[int, Request], idle: list[int]) -> None:
-        """Abandons training episodes once training has ended, so that planned ones need not wait for them."""
-        if self._training.is_set():
-            return
-        for slot in [slot for slot, request in due.items() if request.explore]:
-            del due[slot]
-            idle.append(slot)
 
     @contextmanager
     def _in_world(self) -> Iterator[None]:

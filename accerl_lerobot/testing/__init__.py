@@ -53,9 +53,8 @@ def check_policy(policy: PolicyConfig | Path | str, observations: Sequence[Obser
     4. The log-prob is the density of what is executed: E_μ[ρ f(a)] = E_π[f(a)].
     5. Its gradient is that of finite differences, and reaches every trained weight.
 
-    Args:
-        policy: a checkpoint's folder, or how to load it. A small one: it decides some 20,000 times.
-        observations: two or more, as the environment gives them.
+    `policy` is a checkpoint's folder, or how to load it, and a small one: it decides some 20,000 times.
+    `observations` are two or more, as the environment gives them.
     """
     config = policy if isinstance(policy, PolicyConfig) else PolicyConfig(path=str(policy), device="cpu")
     adapter = load_adapter(config)
@@ -74,10 +73,7 @@ def check_policy(policy: PolicyConfig | Path | str, observations: Sequence[Obser
 def check_batches(adapter: PolicyAdapter, asked: Sequence[Request], few: int) -> list[Decision]:
     """ρ = 1 whichever batch decides and whichever re-scores, and equal decisions; those made together.
 
-    Args:
-        adapter: of weights that are not fresh.
-        asked: at least ten; in one batch of all, one that is shorter, and alone.
-        few: how many are decided alone.
+    The weights must not be fresh; `asked` are at least ten, of which a `few` are decided alone.
     """
     together = adapter.decide(asked, 7)
     alone = [adapter.decide([request], 7)[0] for request in asked[:few]]
@@ -97,7 +93,10 @@ def check_ratio_one(adapter: PolicyAdapter, asked: Sequence[Request], decisions:
 
 def check_alike(found: Sequence[Decision], expected: Sequence[Decision]) -> None:
     """Chunks, latents and values are equal but for rounding."""
-    mine, theirs = ({"chunk": _chunks(of), "value": _values(of)} | stored(of)[0] for of in (found, expected))
+    mine, theirs = (
+        {"chunk": _chunks(of), "value": torch.tensor([d.value for d in of])} | stored(of)[0]
+        for of in (found, expected)
+    )
     for name, tensor in theirs.items():
         exact = not tensor.is_floating_point()
         error, size = float((mine[name] - tensor).abs().max()), float(tensor.abs().max())
@@ -106,11 +105,7 @@ def check_alike(found: Sequence[Decision], expected: Sequence[Decision]) -> None
 
 
 def check_stock_sampler(adapter: LeRobotAdapter, asked: Sequence[Request]) -> None:
-    """Without exploration: LeRobot's own sampler on equal noise, and nothing that could be scored.
-
-    Raises:
-        InputError: see `LeRobotAdapter.self_check`.
-    """
+    """Without exploration: LeRobot's own sampler on equal noise, and nothing that could be scored."""
     adapter.self_check(*stack_observations(asked))
     decisions = adapter.decide([replace(request, explore=False) for request in asked], 0)
     assert not any(d.log_prob.any() for d in decisions), "without exploration, log-probs must be 0"
@@ -121,10 +116,7 @@ def check_saved(
 ) -> LeRobotAdapter:
     """ρ = 1 for decisions, each made alone, re-scored by what was saved and loaded, which is returned.
 
-    Args:
-        adapter: of weights other than its checkpoint's, else nothing is shown.
-        config: what it was loaded by.
-        directory: where to save it, new.
+    The adapter, which `config` loaded, must have weights other than its checkpoint's; `directory` is new.
     """
     decisions = [adapter.decide([request], 0)[0] for request in asked]
     save_pretrained(adapter, directory, config)
@@ -226,7 +218,3 @@ def log_ratio(adapter: PolicyAdapter, asked: Sequence[Request], decisions: Seque
 
 def _chunks(decisions: Sequence[Decision]) -> Tensor:
     return torch.from_numpy(np.stack([d.chunk for d in decisions]))
-
-
-def _values(decisions: Sequence[Decision]) -> Tensor:
-    return torch.tensor([d.value for d in decisions])

@@ -32,24 +32,16 @@ Part = tuple[dict[str, np.ndarray], list[str], dict[str, Tensor]]
 class Batch:
     """Segments laid end to end: N rows of decisions, plus one bootstrap observation per segment."""
 
-    observations: dict[str, np.ndarray]
-    """Each (N, ...)."""
-    tasks: list[str]
-    latent: dict[str, Tensor]
-    """Each (N, ...)."""
-    log_prob: Tensor
-    """(N, L) of the behaviour policy."""
-    reward: Tensor
-    """(N,)."""
-    version: np.ndarray
-    """int64 (N,)."""
-    lengths: Tensor
-    """int64 (S,)."""
-    terminated: Tensor
-    """bool (S,)."""
-    last_observations: dict[str, np.ndarray]
-    """Each (S, ...)."""
-    segment_tasks: list[str]
+    observations: dict[str, np.ndarray]  # each (N, ...)
+    tasks: list[str]  # N
+    latent: dict[str, Tensor]  # each (N, ...)
+    log_prob: Tensor  # (N, L) of the behaviour policy
+    reward: Tensor  # (N,)
+    version: np.ndarray  # int64 (N,)
+    lengths: Tensor  # int64 (S,)
+    terminated: Tensor  # bool (S,)
+    last_observations: dict[str, np.ndarray]  # each (S, ...)
+    segment_tasks: list[str]  # S
 
     def __len__(self) -> int:
         return len(self.tasks)
@@ -99,14 +91,10 @@ def turns(rows: np.ndarray, size: int, rank: int, ranks: int) -> list[Turn]:
     no rows left repeats the first of all, and what comes of it is not counted.
     """
     shares = np.array_split(rows, ranks)
-    mine = [Turn(part, own=True) for part in split(shares[rank], size) if len(part)]
+    mine = shares[rank]
+    own = [Turn(mine[start : start + size], own=True) for start in range(0, len(mine), size)]
     most = math.ceil(len(shares[0]) / size)
-    return mine + [Turn(rows[:1], own=False)] * (most - len(mine))
-
-
-def split(rows: np.ndarray, size: int) -> list[np.ndarray]:
-    """Rows in parts of at most `size`."""
-    return np.split(rows, range(size, len(rows), size))
+    return own + [Turn(rows[:1], own=False)] * (most - len(own))
 
 
 MAX_NONFINITE = 5
@@ -123,11 +111,8 @@ def keeping(
 ) -> Iterator[None]:
     """Keeps the segments of an update, made inside, that raises `NonFiniteError`, for people to look at.
 
-    ``nonfinite-000123.json`` and ``.safetensors`` in the run's `directory` hold what would have made update
-    123; `snapshot.load` reads it. With None nothing is kept.
-
-    Raises:
-        NonFiniteError: what `Update.step` has raised, with the name of the file.
+    ``nonfinite-000123.json`` and ``.safetensors`` in the run's `directory`, if there is one, hold what would
+    have made update 123; `snapshot.load` reads it, and the error names it.
     """
     try:
         yield

@@ -3,10 +3,8 @@
 
     new episodes → memory → steps of critic and teacher → steps of the policy, so many for each new decision
 
-`algorithms.chunk_critic` has the formulas.
-
-Until ``trainer.value_warmup_updates`` the policy explores alone. Then the teacher first learns to do what has
-been done so far, and from there what the critic says.
+`algorithms.chunk_critic` has the formulas. Until ``trainer.value_warmup_updates`` the policy explores alone.
+Then the teacher first learns to do what has been done so far, and from there what the critic says.
 
 Shapes: M members of the ensemble, B rows, S numbers of a state, (K, A) of a chunk.
 """
@@ -41,8 +39,10 @@ TAU = 0.01
 """Share of the critic's weights that its slow copy takes over in a step."""
 SMOOTHING = 0.1
 """Std of the noise on the teacher's chunks within the critic's target, as in TD3."""
-DISTANCE = 0.3
-"""Normalised action units in which the teacher's distance from successes is measured."""
+DISTANCE, IMITATION = 0.3, 0.5
+"""Normalised action units in which the teacher's distance from successes is measured, and its weight."""
+PERCEPTION = 0.5
+"""Weight of reading the simulator's state off the policy's features."""
 TEACHER_LR = 3e-4
 READER_LR = 1e-3
 LAST = 50
@@ -67,8 +67,7 @@ class Critic(nn.Module):
 
     def forward(self, state: Tensor, chunk: Tensor) -> Tensor:
         """(B, S), scaled, and (B, K, A) to (M, B)."""
-        q: Tensor = self.network(torch.cat([state, chunk.flatten(1)], -1))[..., 0]
-        return q
+        return self.network(torch.cat([state, chunk.flatten(1)], -1))[..., 0]
 
 
 class ChunkCriticUpdate(OffPolicyUpdate):
@@ -124,22 +123,19 @@ class ChunkCriticUpdate(OffPolicyUpdate):
 
     @torch.no_grad()
     def target(self, rows: np.ndarray) -> Tensor:
-        chunk: Tensor = self.teacher(self.tensor("state", rows))
-        return chunk
+        return self.teacher(self.tensor("state", rows))
 
     def auxiliary(self, rows: np.ndarray, encoded: Encoded) -> dict[str, Tensor]:
-        weight = self.algorithm.perception
-        if not weight:
-            return {}
         features = pooled(encoded.features, encoded.mask)
         state = self.teacher.scaled(self.tensor("state", rows))
-        return {"perception_loss": weight * (self.reader(features) - state).square().mean()}
+        return {"perception_loss": PERCEPTION * (self.reader(features) - state).square().mean()}
 
     def state(self) -> dict[str, Any]:
-        networks = {name: copied(module) for name, module in self._networks().items()}
-        optimizers = {name: optimizer_state(optimizer) for name, optimizer in self.optimizers.items()}
-        outcomes = {name: list(last) for name, last in self._outcomes.items()}
-        return super().state() | {"networks": networks, "optimizers": optimizers, "outcomes": outcomes}
+        return super().state() | {
+            "networks": {name: copied(module) for name, module in self._networks().items()},
+            "optimizers": {name: optimizer_state(optimizer) for name, optimizer in self.optimizers.items()},
+            "outcomes": {name: list(last) for name, last in self._outcomes.items()},
+        }
 
     def restore(self, state: dict[str, Any]) -> None:
         super().restore(state)
@@ -219,7 +215,7 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         rows = won[torch.randint(len(won), (BATCH,)).numpy()]
         gap = self.teacher(self.tensor("state", rows)) - self.tensor("chunk", rows)
         distance = gap.square().mean() / DISTANCE**2
-        self._descend("teacher", loss + self.algorithm.imitation * distance)
+        self._descend("teacher", loss + IMITATION * distance)
         metrics = {"teacher_value": q.mean(), "disagreement": q.std(0).mean(), "distance": distance}
         return {name: float(value.detach()) for name, value in metrics.items()}
 

@@ -72,9 +72,7 @@ class TrainerConfig(Section, section="trainer"):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.ranks > self.batch_decisions:
-            remedy = (
-                f"use at most trainer.batch_decisions, {self.batch_decisions}: each rank needs a decision"
-            )
+            remedy = f"use at most trainer.batch_decisions, {self.batch_decisions}: a decision for each"
             raise InputError("trainer.ranks", self.ranks, remedy)
 
     @property
@@ -83,17 +81,10 @@ class TrainerConfig(Section, section="trainer"):
         return self.ranks > 1 and self.sharding != "ddp"
 
     def gpu_shares(self, gpus: float, others: int) -> tuple[float, float]:
-        """Share of a GPU for each rank, and for each other process with a network.
+        """Share of a GPU for each rank, and for each of the `others`, processes with a network.
 
         More than half a GPU each keeps two ranks off the same one, which NCCL refuses; where there are more
-        GPUs than ranks, the others have those that are left.
-
-        Args:
-            gpus: how many there are; 0: all run on the CPU.
-            others: processes with a network, beside the ranks.
-
-        Raises:
-            InputError: there are fewer GPUs than ranks.
+        GPUs than ranks, the others have those that are left. Without GPUs all run on the CPU.
         """
         if not gpus:
             return 0.0, 0.0
@@ -101,23 +92,15 @@ class TrainerConfig(Section, section="trainer"):
             share = 1 / math.ceil((1 + others) / gpus)
             return share, share
         if self.ranks > gpus:
-            remedy = (
-                f"each rank needs a GPU of its own, and {self.ranks} ranks on {gpus:g} GPUs leave "
-                f"{self.ranks - gpus:g} without; use at most {gpus:g}, or policy.device=cpu"
-            )
+            without = f"{self.ranks} ranks on {gpus:g} GPUs leave {self.ranks - gpus:g} without"
+            remedy = f"each needs one, and {without}; use at most {gpus:g}, or policy.device=cpu"
             raise InputError("trainer.ranks", self.ranks, remedy)
         if self.ranks == gpus:
             return 0.6, 0.4 / math.ceil(others / gpus)
         return 1.0, 1 / math.ceil(others / (gpus - self.ranks))
 
     def lr_share(self, update: int, *, start: int = 0, updates: int | None = None) -> float:
-        """Factor on a learning rate.
-
-        Args:
-            update: counted from 0.
-            start: the first update with this rate; 0 before it.
-            updates: over which the schedule falls; None: `updates` of the config.
-        """
+        """Factor on a rate that begins with update `start` and falls over `updates`, or the config's."""
         if update < start:
             return 0.0
         warm = start + self.warmup_updates

@@ -10,7 +10,6 @@ PyTorch's fake tensors, which have shapes and no data: π0 needs no 14 GiB to be
 from __future__ import annotations
 
 import weakref
-from collections.abc import Iterator
 from contextlib import nullcontext
 from functools import partial
 from typing import Any, NamedTuple
@@ -39,20 +38,16 @@ class PolicyMemory(NamedTuple):
     trained: int
     """Parameters that are trained, the critic's included."""
     acting_batch: int
-    """Highest memory while a batch is decided, whatever its size; copies of weights in bf16."""
+    """Most at a time while a batch is decided, whatever its size; copies of weights in bf16."""
     acting: int
-    """Further memory for each of its decisions."""
+    """The same, for each of its decisions."""
     learning_batch: int
-    """Memory of a batch that waits for its gradient, whatever its size."""
+    """A batch that waits for its gradient, whatever its size."""
     learning: int
-    """Further memory for each of its decisions."""
+    """The same, for each of its decisions."""
 
     def trainer(self, decisions: int, copies: int = 3) -> int:
-        """A rank that learns from `decisions` at a time.
-
-        Args:
-            copies: of the trained weights; the gradient and Adam's two moments.
-        """
+        """A rank that learns from `decisions` at a time; `copies` are the gradient and Adam's moments."""
         return self.weights + copies * self.trained + self.learning_batch + decisions * self.learning
 
     def replica(self, decisions: int) -> int:
@@ -61,12 +56,7 @@ class PolicyMemory(NamedTuple):
 
 
 class Counter(TorchDispatchMode):
-    """Bytes of the tensors that are made under it and still live.
-
-    Attributes:
-        now: of this moment.
-        peak: the most so far.
-    """
+    """Bytes of the tensors that are made under it and still live: `now`, and the most so far, `peak`."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -158,16 +148,12 @@ def _fake(adapter: LeRobotAdapter, mode: Any) -> None:
     def fake(tensor: Tensor) -> Tensor:
         if id(tensor) not in fakes:
             made = mode.from_tensor(tensor.detach())
-            parameter = partial(nn.Parameter, requires_grad=tensor.requires_grad)
-            fakes[id(tensor)] = parameter(made) if isinstance(tensor, nn.Parameter) else made
+            trained = tensor.requires_grad
+            fakes[id(tensor)] = nn.Parameter(made, trained) if isinstance(tensor, nn.Parameter) else made
         return fakes[id(tensor)]
 
+    modules = (m for root in (adapter.policy, adapter.family, adapter.value_head) for m in root.modules())
     with mode:
-        for named in _tensors(adapter):
-            named.update({name: fake(tensor) for name, tensor in named.items() if tensor is not None})
-
-
-def _tensors(adapter: LeRobotAdapter) -> Iterator[dict[str, Any]]:
-    for root in (adapter.policy, adapter.family, adapter.value_head):
-        for module in root.modules():
-            yield from (module._parameters, module._buffers)
+        for module in modules:
+            for named in (module._parameters, module._buffers):
+                named.update({name: fake(tensor) for name, tensor in named.items() if tensor is not None})

@@ -4,9 +4,8 @@
     replay ──batch──► rank 0 ──its reference──► ranks 1, 2 …
                         ◄── torch.distributed: values, gradients, parts of weights ──►
 
-Whatever the first rank does that takes all of them it does within `Peers.joining`: the others are told, do
-the same, and are waited for. A rank that dies or hangs ends what the others are waiting for, at the latest
-after ``trainer.rank_timeout_s``, and is named in the error.
+What takes all ranks is done within `Peers.joining`: the others are told, do the same, and are waited for. One
+that dies or hangs ends the wait, at the latest after ``trainer.rank_timeout_s``, and is named in the error.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ class RankError(RuntimeError):
 
 
 class LearnerSettings(NamedTuple):
-    """Inputs of every rank's `Learner`."""
+    """How each rank makes its policy, and the updates of it."""
 
     policy: PolicyConfig
     """The checkpoint to start from."""
@@ -60,26 +59,22 @@ class LearnerSettings(NamedTuple):
     load: Load | None = None
     """Makes the adapter; None: of LeRobot's checkpoint."""
 
-
-class Learner:
-    """A rank's policy, and the updates of it."""
-
-    def __init__(self, settings: LearnerSettings) -> None:
+    def adapter(self) -> Any:
+        """Loads the policy."""
         import torch
 
-        torch.set_num_threads(settings.trainer.num_threads)
-        torch.manual_seed(settings.seed)
-        self._algorithm, self._config, self._state = settings.algorithm, settings.trainer, settings.state
-        self.adapter: Any = loader(settings.load)(settings.policy)
+        torch.set_num_threads(self.trainer.num_threads)
+        torch.manual_seed(self.seed)
+        return loader(self.load)(self.policy)
 
-    def begin(self, ranks: Ranks) -> Update | OffPolicyUpdate:
+    def begin(self, adapter: Any, ranks: Ranks) -> Update | OffPolicyUpdate:
         """The updates, from the state on; what ranks share out is shared out then."""
         from accerl_lerobot.trainer.update import make_update
 
-        update = make_update(self.adapter, self._algorithm, self._config, ranks)
-        if self._state is not None:
-            self.adapter.load_trainable(snapshot.load(self._state / WEIGHTS))
-            update.restore(snapshot.load(self._state / "trainer"))
+        update = make_update(adapter, self.algorithm, self.trainer, ranks)
+        if self.state is not None:
+            adapter.load_trainable(snapshot.load(self.state / WEIGHTS))
+            update.restore(snapshot.load(self.state / "trainer"))
         return update
 
 
@@ -87,15 +82,14 @@ class TrainerRank:
     """Any rank but the first; becomes a Ray actor of one thread, so that calls are done in their order."""
 
     def __init__(self, rank: int, settings: LearnerSettings) -> None:
-        self._rank, self._learner = rank, Learner(settings)
-        self._config = settings.trainer
+        self._rank, self._settings, self._adapter = rank, settings, settings.adapter()
 
     def ready(self) -> int:
         """Answers once the policy is loaded; returns this process's id."""
         return os.getpid()
 
     def node(self) -> str:
-        """Which machine it is on."""
+        """Id of the machine that it is on."""
         return str(ray.get_runtime_context().get_node_id())
 
     def metrics(self) -> dict[str, float]:
@@ -105,16 +99,13 @@ class TrainerRank:
     def join(self, rendezvous: Rendezvous) -> None:
         """Meets the others."""
         from accerl_lerobot.trainer import ranks
-        from accerl_lerobot.trainer.ranks import LOOPBACK, join, use_only
 
-        config = self._config
-        here = rendezvous.address == LOOPBACK
-        use_only(LOOPBACK if here else ray.util.get_node_ip_address())
-        store = join(rendezvous, config.ranks, config.rank_timeout_s)
-        group = ranks.Group(
-            store, self._rank, config.ranks, self._learner.adapter.device, config.rank_timeout_s
-        )
-        self._update = self._learner.begin(group)
+        size, timeout_s = self._settings.trainer.ranks, self._settings.trainer.rank_timeout_s
+        here = rendezvous.address == ranks.LOOPBACK
+        ranks.use_only(ranks.LOOPBACK if here else ray.util.get_node_ip_address())
+        store = ranks.join(rendezvous, size, timeout_s)
+        group = ranks.Group(store, self._rank, size, self._adapter.device, timeout_s)
+        self._update = self._settings.begin(self._adapter, group)
 
     def step(self, segments: Sequence[Segment]) -> None:
         """Its part of an update."""
@@ -123,11 +114,11 @@ class TrainerRank:
 
     def lend_weights(self) -> None:
         """Its part of the trainable weights, for the first rank to export."""
-        self._learner.adapter.export_trainable()
+        self._adapter.export_trainable()
 
     def lend_state(self) -> None:
         """Its part of all that is saved, in the order in which the first rank asks for it."""
-        self._learner.adapter.copy_weights()
+        self._adapter.copy_weights()
         self.lend_weights()
         self._update.state()
 
@@ -135,34 +126,29 @@ class TrainerRank:
 class Peers:
     """The others, as the first rank sees them.
 
-    Args:
-        actors: handles of `TrainerRank`, of rank 1, 2 …; none where there is one rank.
-
-    Example:
-        >>> with peers.joining("step", batch):   # they are told …
-        ...     update.step(ray.get(batch))      # … and have done it too when this is over
+    `actors` are handles of `TrainerRank`, of rank 1, 2 …; none where there is one rank.
     """
 
     def __init__(self, actors: Sequence[Any], config: TrainerConfig) -> None:
         self._actors, self._config = list(actors), config
 
-    def begin(self, learner: Learner) -> Update | OffPolicyUpdate:
-        """Meets them, once they have loaded their policies."""
+    def begin(self, settings: LearnerSettings) -> Update | OffPolicyUpdate:
+        """Loads the first rank's policy and meets the others, once they have loaded theirs."""
         from accerl_lerobot.trainer import ranks
-        from accerl_lerobot.trainer.ranks import LOOPBACK, create, use_only
 
+        adapter = settings.adapter()
         if not self._actors:
-            return learner.begin(ranks.Ranks())
+            return settings.begin(adapter, ranks.Ranks())
         self._collect("ready", [actor.ready.remote() for actor in self._actors], LOAD_S)
         nodes = self._collect("node", [actor.node.remote() for actor in self._actors], LOAD_S)
-        address = LOOPBACK
+        address = ranks.LOOPBACK
         if set(nodes) != {str(ray.get_runtime_context().get_node_id())}:
             address = ray.util.get_node_ip_address()
-        use_only(address)
+        ranks.use_only(address)
         size, timeout_s = self._config.ranks, self._config.rank_timeout_s
-        store, rendezvous = create(address, size, timeout_s)
+        store, rendezvous = ranks.create(address, size, timeout_s)
         with self.joining("join", rendezvous):
-            return learner.begin(ranks.Group(store, 0, size, learner.adapter.device, timeout_s))
+            return settings.begin(adapter, ranks.Group(store, 0, size, adapter.device, timeout_s))
 
     @contextmanager
     def joining(self, method: str, *arguments: Any) -> Iterator[None]:
@@ -208,15 +194,17 @@ class Peers:
         done, silent = ray.wait(calls, num_returns=len(calls), timeout=BLAME_S)
         failures = {call: error for call in done if (error := _error(call)) is not None}
         # A process that is gone made the others fail; what they say of it is only that it is gone.
-        gone = [call for call, error in failures.items() if isinstance(error, RayActorError)]
-        if not gone and silent and silence:
+        guilty = [call for call, error in failures.items() if isinstance(error, RayActorError)]
+        if not guilty and silent and silence:
             return RankError(f"trainer {self._names(silent, calls)} did not do {method}: no answer")
-        alike = [
-            c for c, e in failures.items() if own is not None and type(getattr(e, "cause", None)) is type(own)
+        guilty = guilty or [
+            c for c, e in failures.items() if own is None or type(getattr(e, "cause", None)) is not type(own)
         ]
-        for call in gone or [c for c in failures if c not in alike]:
-            return RankError(f"trainer {self._names([call], calls)} failed in {method}:\n{failures[call]}")
-        return None
+        if not guilty:
+            return None
+        return RankError(
+            f"trainer {self._names(guilty[:1], calls)} failed in {method}:\n{failures[guilty[0]]}"
+        )
 
     def _names(self, some: Sequence[Any], calls: list[Any]) -> str:
         return ", ".join(f"rank {rank}" for rank, call in enumerate(calls, 1) if call in some)

@@ -1,17 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Do the process that acts and the one that learns agree on log-probs? Measured while both run.
 
-At equal weights log π = log μ is what everything else relies on. The two are never at equal weights when it
-could be compared, because samples are always a few versions old. So the trainer keeps a copy of one published
-version, waits for a batch with decisions of that version, scores those under the copy, and reports
-
-    logprob/mismatch_mean    mean of |Σ log π − Σ log μ| over these decisions, in nats
-    logprob/mismatch_max     the largest
-    logprob/mismatch_clip    share of them whose ratio is outside 1 ± 0.2
-
-which is rounding, or a mistake. Version 0 is equal everywhere at the start and is the first to be probed. A
-version may never have acted, because inference skipped it for a newer one: once most of a batch is newer,
-another one is taken. That is after `replay.max_lag` updates at the latest.
+At equal weights log π = log μ is what everything else relies on, but samples are always a few versions old.
+So the trainer keeps a copy of one published version, waits for a batch with decisions of it, and scores those
+under the copy: a difference is rounding, or a mistake. A version may never have acted, because inference
+skipped it for a newer one: once most of a batch is newer, another one is taken.
 """
 
 from __future__ import annotations
@@ -37,10 +30,7 @@ CLIP = 0.2
 
 
 class Probe:
-    """One copy of the policy's trainable weights after the other, without the critic's.
-
-    A copy lies on the same device and in the same parts as the weights, and is freed once it has been read.
-    """
+    """One copy of the policy's trainable weights after the other, without the critic's."""
 
     def __init__(self, adapter: PolicyAdapter, config: TrainerConfig, ranks: Ranks | None = None) -> None:
         self.adapter, self._config, self._ranks = adapter, config, ranks or Ranks()
@@ -84,12 +74,6 @@ class Probe:
         self._copy, self._version = [], None
         return metrics
 
-    @torch.no_grad()
-    def log_prob(self, part: Part) -> Tensor:
-        """log-probs (B, L) of stored latents under the copy, without gradient."""
-        with swapped_in(self.adapter, self._live, self._copy):
-            return self.adapter.evaluate(*part).log_prob
-
     def _measure(self, batch: Batch, rows: np.ndarray) -> dict[str, float]:
         apart = self._ranks.each(partial(self._apart, batch), rows, self._config.micro_batch)
         return {
@@ -97,6 +81,12 @@ class Probe:
             "logprob/mismatch_max": float(apart.abs().max()),
             "logprob/mismatch_clip": float((apart.expm1().abs() > CLIP).double().mean()),
         }
+
+    @torch.no_grad()
+    def log_prob(self, part: Part) -> Tensor:
+        """log-probs (B, L) of stored latents under the copy."""
+        with swapped_in(self.adapter, self._live, self._copy):
+            return self.adapter.evaluate(*part).log_prob
 
     def _apart(self, batch: Batch, rows: np.ndarray) -> Tensor:
         """Σ log π − Σ log μ of each row, float64."""

@@ -4,8 +4,6 @@
 Each rank has the whole batch and runs the network on its rows of it. What is said of rows is gathered, so
 that every rank knows it of all rows: targets, moments and numbers are computed from the same values, by the
 same code, everywhere, and nobody has to be told whether an update was finite. Only gradients are averaged.
-
-Where processes of `torch.distributed` find each other: on one address of a machine and on no other.
 """
 
 from __future__ import annotations
@@ -26,20 +24,13 @@ from accerl_lerobot.trainer.batch import turns
 
 
 class Ranks:
-    """A trainer that is one process; `Group` is one of several.
-
-    Example:
-        >>> ranks.each(lambda rows: scored(rows), np.arange(len(batch)), size=64)  # of all rows, everywhere
-    """
+    """A trainer that is one process; `Group` is one of several."""
 
     rank, size = 0, 1
 
     def gather(self, mine: Tensor, total: int) -> Tensor:
-        """Rows of all ranks, in order, from each one's own.
-
-        Args:
-            mine: (rows, ...), on the CPU; `np.array_split` of all rows says how many.
-        """
+        """Rows of all ranks, in order, from each one's own: (rows, ...), on the CPU, as `np.array_split` has
+        them."""
         return mine
 
     def average(self, parameters: Sequence[nn.Parameter]) -> None:
@@ -50,8 +41,10 @@ class Ranks:
 
     def each(self, score: Callable[[np.ndarray], Tensor], rows: np.ndarray, size: int) -> Tensor:
         """Results of `score` for rows, (rows, ...) on the CPU; a rank is asked of its own, `size` at once."""
-        said = [(turn.own, score(turn.rows).cpu()) for turn in turns(rows, size, self.rank, self.size)]
-        return self.gather(torch.cat([rows if own else rows[:0] for own, rows in said]), len(rows))
+        parts = turns(rows, size, self.rank, self.size)
+        return self.gather(
+            torch.cat([score(part).cpu()[: None if own else 0] for part, own in parts]), len(rows)
+        )
 
 
 class Group(Ranks):
@@ -98,22 +91,17 @@ class Rendezvous(NamedTuple):
 
 
 def create(address: str, size: int, timeout_s: float) -> tuple[dist.Store, Rendezvous]:
-    """Open a store on one of this machine's addresses, for `size` processes."""
+    """Opens a store on one of this machine's addresses, for `size` processes."""
     listener = socket.socket()
     listener.bind((address, 0))
     listener.listen()
     rendezvous = Rendezvous(address, listener.getsockname()[1])
     # A store that opens its own socket listens on every interface.
-    fd = listener.detach()
-    return _store(rendezvous, size, timeout_s, master_listen_fd=fd, is_master=True), rendezvous
+    return join(rendezvous, size, timeout_s, master_listen_fd=listener.detach(), is_master=True), rendezvous
 
 
-def join(rendezvous: Rendezvous, size: int, timeout_s: float) -> dist.Store:
-    """Connect to a store that another process has opened."""
-    return _store(rendezvous, size, timeout_s)
-
-
-def _store(rendezvous: Rendezvous, size: int, timeout_s: float, **options: bool | int) -> dist.Store:
+def join(rendezvous: Rendezvous, size: int, timeout_s: float, **options: bool | int) -> dist.Store:
+    """Connects to a store that another process has opened."""
     timeout = timedelta(seconds=timeout_s)
     return dist.TCPStore(*rendezvous, world_size=size, timeout=timeout, wait_for_workers=False, **options)
 

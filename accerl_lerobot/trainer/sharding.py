@@ -20,11 +20,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
+from torch.utils._pytree import tree_leaves
 from torch.utils.checkpoint import checkpoint
 
 from accerl_lerobot.checkpoint.tensors import in_parts
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.policies.adapter import Evaluation, PolicyAdapter
+from accerl_lerobot.policies.adapter import PolicyAdapter
 from accerl_lerobot.trainer.config import TrainerConfig
 
 
@@ -42,16 +43,21 @@ def arrange(adapter: PolicyAdapter, config: TrainerConfig) -> None:
     seen = Watch(adapter, partial(adapter.evaluate, *adapter.example()))
     if config.activation_checkpointing:
         forget(seen)
-    if config.zero:
-        _share_out(adapter, seen.blocks, config)
+    if not config.zero:
+        return
+    import torch.distributed as dist
+    from torch.distributed.device_mesh import init_device_mesh
+    from torch.distributed.fsdp import fully_shard, register_fsdp_forward_method
+
+    mesh = init_device_mesh(adapter.device.type, (dist.get_world_size(),))
+    for module in (*seen.blocks, adapter):
+        fully_shard(module, mesh=mesh, reshard_after_forward=config.sharding == "zero3")
+    for name in ("evaluate", "values"):
+        register_fsdp_forward_method(adapter, name)
 
 
 def forget(seen: Watch) -> None:
-    """Makes blocks compute again for the gradient what they computed before.
-
-    Raises:
-        InputError: see `arrange`.
-    """
+    """Makes blocks compute again for the gradient what they computed before; see `arrange`."""
     forgetful = [block for block in seen.blocks if list(block.children())]
     if not forgetful:
         remedy = "no block of this policy can be computed again by itself; leave the field out"
@@ -59,24 +65,6 @@ def forget(seen: Watch) -> None:
     for block in forgetful:
         # FSDP's hooks stand around this, at the module's call: weights are there when it is repeated.
         block.forward = partial(checkpoint, block.forward, use_reentrant=False)
-
-
-def _share_out(adapter: PolicyAdapter, blocks: Sequence[nn.Module], config: TrainerConfig) -> None:
-    import torch.distributed as dist
-    from torch.distributed.device_mesh import init_device_mesh
-    from torch.distributed.fsdp import fully_shard, register_fsdp_forward_method
-
-    if Evaluation not in torch.utils._pytree.SUPPORTED_NODES:
-        torch.export.register_dataclass(Evaluation)  # so that FSDP finds the tensors of which gradients begin
-    options: dict[str, Any] = {
-        "mesh": init_device_mesh(adapter.device.type, (dist.get_world_size(),)),
-        "reshard_after_forward": config.sharding == "zero3",
-    }
-    for block in blocks:
-        fully_shard(block, **options)
-    fully_shard(adapter, **options)
-    for name in ("evaluate", "values"):
-        register_fsdp_forward_method(adapter, name)
 
 
 def synchronise(adapter: PolicyAdapter, now: bool) -> None:
@@ -92,26 +80,23 @@ def swapped_in(
     """Parameters have other values inside, and their own again afterwards, whatever happens."""
     sharded = any(map(in_parts, live))
     own = [p.detach().clone() if sharded else p.data for p in live]
-    try:
-        _put(adapter, live, tensors, sharded)
-        yield
-    finally:
-        _put(adapter, live, own, sharded)
 
-
-@torch.no_grad()
-def _put(
-    adapter: PolicyAdapter, live: Sequence[nn.Parameter], tensors: Sequence[Tensor], sharded: bool
-) -> None:
-    for parameter, tensor in zip(live, tensors, strict=True):
-        if sharded:  # FSDP gathers from memory of its own, whatever a parameter points to
-            parameter.copy_(tensor)
-        else:
-            parameter.data = tensor
-    if sharded:
-        for module in adapter.modules():  # what has been gathered is of other values
+    @torch.no_grad()
+    def put(values: Sequence[Tensor]) -> None:
+        for parameter, tensor in zip(live, values, strict=True):
+            if sharded:  # FSDP gathers from memory of its own, whatever a parameter points to
+                parameter.copy_(tensor)
+            else:
+                parameter.data = tensor
+        for module in adapter.modules() if sharded else ():  # what has been gathered is of other values
             if hasattr(module, "reshard"):
                 module.reshard()
+
+    try:
+        put(tensors)
+        yield
+    finally:
+        put(own)
 
 
 class Watch(TorchFunctionMode):
@@ -141,19 +126,17 @@ class Watch(TorchFunctionMode):
         finally:
             for hook in hooks:
                 hook.remove()
-        self._owners = _owners(adapter)
+        self._owners: dict[Tensor, set[nn.Module]] = {}
+        """The modules that hold each parameter as their own; several where it is tied."""
+        for module in adapter.modules():
+            for parameter in module.parameters(recurse=False):
+                self._owners.setdefault(parameter, set()).add(module)
         self.blocks = list(dict.fromkeys(self._blocks(adapter, repeated=False)))
 
-    def __torch_function__(
-        self,
-        function: Any,
-        types: Any,
-        arguments: tuple[Any, ...] = (),
-        options: dict[str, Any] | None = None,
-    ) -> Any:
-        result = function(*arguments, **(options or {}))
-        if any(True for _ in _tensors(result)):  # else it has only been asked what it is like
-            for tensor in _tensors((arguments, options)):
+    def __torch_function__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        result = function(*args, **(kwargs or {}))
+        if _tensors(result):  # else it has only been asked what it is like
+            for tensor in _tensors((args, kwargs)):
                 if isinstance(tensor, nn.Parameter):
                     around = self._around.setdefault(tensor, set(self._stack))
                     around.intersection_update(self._stack)
@@ -186,23 +169,8 @@ class Watch(TorchFunctionMode):
         return all(module in self._around.get(p, (module,)) and self._owners[p] <= inside for p in parameters)
 
 
-def _owners(root: nn.Module) -> dict[Tensor, set[nn.Module]]:
-    """The modules that hold each parameter as their own; several where it is tied."""
-    owners: dict[Tensor, set[nn.Module]] = {}
-    for module in root.modules():
-        for parameter in module.parameters(recurse=False):
-            owners.setdefault(parameter, set()).add(module)
-    return owners
-
-
-def _tensors(value: Any) -> Iterator[Tensor]:
-    if isinstance(value, Tensor):
-        yield value
-    elif isinstance(value, dict):
-        yield from _tensors(tuple(value.values()))
-    elif isinstance(value, (tuple, list)):
-        for part in value:
-            yield from _tensors(part)
+def _tensors(value: Any) -> list[Tensor]:
+    return [leaf for leaf in tree_leaves(value) if isinstance(leaf, Tensor)]
 
 
 def _plain(value: Any) -> bool:

@@ -4,8 +4,7 @@
     values of the current critic (bootstraps too) → GAE → advantages normalised over the batch → loss → step
 
 Values stored with the samples are stale by their lag, so they are recomputed; the stored log-probs are not,
-since they are what the ratio divides by. Knows no process: the Ray worker and the single-process mode both
-call `Update.step`.
+since they are what the ratio divides by.
 
 Shapes: S segments, T decisions of the longest one, N decisions in all.
 """
@@ -44,8 +43,7 @@ def make_update(
 ) -> Update | OffPolicyUpdate:
     """The updates that belong to an algorithm; see `Update` for the arguments."""
     shared = [ranks] if isinstance(algorithm, RatioConfig) else []
-    update: Update | OffPolicyUpdate = imported(algorithm.update)(adapter, algorithm, config, *shared)
-    return update
+    return imported(algorithm.update)(adapter, algorithm, config, *shared)
 
 
 class Update:
@@ -54,11 +52,6 @@ class Update:
     Args:
         adapter: the policy; its parameters are others afterwards where ranks keep parts of them.
         ranks: those that make each update; None: this process alone.
-
-    Example:
-        >>> update = Update(adapter, GIPOConfig(), TrainerConfig(lr=1e-4))
-        >>> metrics = update.step(replay.sample(128, update.version, rng))
-        >>> weights = adapter.export_trainable()        # to publish as version `update.version`
     """
 
     def __init__(
@@ -72,9 +65,7 @@ class Update:
         self.ranks = ranks or Ranks()
         self.ranks.begin_alike(list(adapter.trainable().values()))
         arrange(adapter, config)
-        self.version = 0
-        self.skipped = 0
-        self._skipped_in_a_row = 0
+        self.version = self.skipped = self._skipped_in_a_row = 0
         self._moments = torch.zeros(3, dtype=torch.float64)
         self._probe = Probe(adapter, config, self.ranks)
         named = adapter.trainable()
@@ -109,17 +100,11 @@ class Update:
             self._skipped_in_a_row = 0
         else:
             self._skip(metrics["loss"], norm, value_norm)
-        lag = lag_metrics(torch.from_numpy(batch.version), self.version)
+        metrics |= mismatch | lag_metrics(torch.from_numpy(batch.version), self.version)
         self.version += 1
         self._probe.renew(self.version)
-        metrics |= mismatch | {name: float(value) for name, value in lag.items()}
-        return metrics | {
-            "grad_norm": norm,
-            "value_grad_norm": value_norm,
-            "lr": lr,
-            "value_lr": value_lr,
-            "skipped": float(self.skipped),
-        }
+        norms = {"grad_norm": norm, "value_grad_norm": value_norm}
+        return metrics | norms | {"lr": lr, "value_lr": value_lr, "skipped": float(self.skipped)}
 
     def state(self) -> dict[str, Any]:
         """A copy of all that `restore` needs, the policy's weights apart; see `snapshot`."""
@@ -169,71 +154,58 @@ class Update:
         if len(parts) > 1:  # a single micro-batch supplies the values that GAE needs by its own forward pass
             targets = self._targets(batch, self._values(batch.observations, batch.tasks), bootstrap)
         factors = self.adapter.factors(batch.latent)
-        ratios = None if factors is None else self._ratios_per_decision(factors)
+        ratios = None
+        if factors is not None:
+            ratios = float(present(factors, self.algorithm.level).sum()) / len(factors)
         means: dict[str, float] = {}
         samples: list[Tensor] = []
-        for number, turn in enumerate(parts, 1):
-            rows, part = turn.rows, batch.part(turn.rows)
-            evaluation = self.adapter.evaluate(*part)
+        for number, (rows, own) in enumerate(parts, 1):
+            evaluation = self.adapter.evaluate(*batch.part(rows))
+            counted = slice(None) if own else slice(0)
             if targets is None:
-                mine = evaluation.value.detach().cpu().float()
-                values = self.ranks.gather(mine if turn.own else mine[:0], len(batch))
-                targets = self._targets(batch, values, bootstrap)
+                mine = evaluation.value.detach().cpu().float()[counted]
+                targets = self._targets(batch, self.ranks.gather(mine, len(batch)), bootstrap)
             device = evaluation.log_prob.device
-            returns = targets[1][rows].to(device)
             inputs = LossInputs(
                 log_prob_new=evaluation.log_prob,
                 log_prob_old=batch.log_prob[rows].to(device),
                 advantage=targets[0][rows].to(device),
                 value=evaluation.value,
-                value_error=(evaluation.value - returns).square(),
-                returns=returns,
+                returns=targets[1][rows].to(device),
                 entropy=evaluation.entropy,
                 factors=None if factors is None else factors[rows].to(device),
                 ratios_per_decision=ratios,
             )
             output = self.algorithm.loss(inputs)
-            share = len(rows) / len(batch) if turn.own else 0.0
+            share = len(rows) / len(batch) if own else 0.0
             synchronise(self.adapter, number == len(parts))
             loss = output.loss * share * self.ranks.size  # a gradient is the mean over ranks
             (loss * math.nan if fault_point("trainer.loss") else loss).backward()
-            _add(means, {k: float(v) if turn.own else 0.0 for k, v in output.means.items()}, share)
-            rows_of_samples = output.samples.rows()
-            samples.append(rows_of_samples if turn.own else rows_of_samples[:0])
+            for name, mean in output.means.items():
+                weight = float(own) if name == "decisions" else share
+                means[name] = means.get(name, 0.0) + (weight * float(mean) if own else 0.0)
+            samples.append(output.samples.rows()[counted])
         if not self.config.zero:
             self.ranks.average(self._policy + self._value)
         assert targets is not None
+        share_of_means = torch.tensor([list(means.values())], dtype=torch.float64)
+        total = self.ranks.gather(share_of_means, self.ranks.size).sum(0).tolist()
         joined = output.samples.joined(self.ranks.gather(torch.cat(samples), len(batch)))
-        return (
-            self._sum(means)
-            | {k: float(v) for k, v in joined.metrics().items()}
-            | {
-                "return_mean": float(targets[1].mean()),
-                "reward_mean": float(batch.reward.mean()),
-            }
-        )
-
-    def _sum(self, means: dict[str, float]) -> dict[str, float]:
-        """Means over all ranks, from each one's share of them."""
-        mine = torch.tensor([list(means.values())], dtype=torch.float64)
-        return dict(zip(means, self.ranks.gather(mine, self.ranks.size).sum(0).tolist(), strict=True))
-
-    def _ratios_per_decision(self, factors: Tensor) -> float:
-        return float(present(factors, self.algorithm.level).sum()) / len(factors)
+        return {
+            **dict(zip(means, total, strict=True)),
+            **{name: float(value) for name, value in joined.metrics().items()},
+            "return_mean": float(targets[1].mean()),
+            "reward_mean": float(batch.reward.mean()),
+        }
 
     def _targets(self, batch: Batch, values: Tensor, bootstrap: Tensor) -> tuple[Tensor, Tensor]:
         """Normalised advantages, and returns, each (N,)."""
         mask = decision_mask(batch.lengths, int(batch.lengths.max()))
         padded = torch.zeros(mask.shape)
         reward, value = (padded.masked_scatter(mask, x.float()) for x in (batch.reward, values))
+        gamma, lam = self.algorithm.gamma, self.algorithm.lam
         advantages, returns = gae(
-            reward,
-            value,
-            bootstrap,
-            batch.terminated,
-            batch.lengths,
-            gamma=self.algorithm.gamma,
-            lam=self.algorithm.lam,
+            reward, value, bootstrap, batch.terminated, batch.lengths, gamma=gamma, lam=lam
         )
         total = self.config.advantage_memory * self._moments + moments(advantages, mask)
         if bool(torch.isfinite(total).all()):  # a batch that is not finite is skipped, and must be forgotten
@@ -247,9 +219,3 @@ class Update:
             return self.adapter.values(*pick(observations, tasks, rows)).float()
 
         return self.ranks.each(values, np.arange(len(tasks)), self.config.micro_batch)
-
-
-def _add(total: dict[str, float], means: dict[str, float], share: float) -> None:
-    """Adds a micro-batch's means, weighted by its share of the decisions; ``decisions`` is a count."""
-    for name, value in means.items():
-        total[name] = total.get(name, 0.0) + (value if name == "decisions" else share * value)

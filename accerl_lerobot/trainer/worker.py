@@ -26,7 +26,7 @@ from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.replay.pacing import ASYNCHRONOUS, Schedule
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
 from accerl_lerobot.trainer.batch import keeping
-from accerl_lerobot.trainer.peers import Learner, LearnerSettings, Peers
+from accerl_lerobot.trainer.peers import LearnerSettings, Peers
 from accerl_lerobot.transport.endpoint import Endpoint
 from accerl_lerobot.transport.weights import PublishDelay, WeightPublisher
 
@@ -53,7 +53,7 @@ class TrainerWorker:
         self._clock = open_clock(timeline, "trainer")
         self._policy, self._config, self._directory = settings.policy, settings.trainer, directory
         self._peers = Peers(peers, self._config)
-        self._update = self._peers.begin(Learner(settings))
+        self._update = self._peers.begin(settings)
         self._lock = threading.Lock()
         self._kept: Any = None
         self._in_turn = False
@@ -76,8 +76,7 @@ class TrainerWorker:
         try:
             # A checkpoint need not hold a critic: all start from this one.
             with self._lock:
-                first = self._export() if self._config.hold_back else self._view()
-                self._hand_over(publisher, self._update.version, first)
+                self._publish(publisher, PublishDelay(0), last=False)
             self._publisher = publisher
             self._publishing.set()
             self._train(replay, publisher)
@@ -91,14 +90,7 @@ class TrainerWorker:
         return self._update.version
 
     def join(self, reader: Endpoint) -> int:
-        """Has another replica receive the weights, once `run` publishes any.
-
-        Returns:
-            The newest version that has been published: it gets no older one.
-
-        Raises:
-            TimeoutError: none has been.
-        """
+        """Has another replica receive the weights; it gets none older than the version that is returned."""
         if not self._publishing.wait(FIRST_S):
             raise TimeoutError(f"the trainer has published no weights for {FIRST_S:g} s")
         assert self._publisher is not None
@@ -132,16 +124,11 @@ class TrainerWorker:
                     metrics = self._update.step(segments)
                 updated = time.monotonic()
                 self._clock.enter(WEIGHT_SYNC)
-                version = self._update.version
-                self._publish(publisher, held, last=version == config.updates)
+                self._publish(publisher, held, last=self._update.version == config.updates)
                 if self._in_turn:
                     publisher.flush()
-                metrics |= {
-                    "update": float(self._update.version),
-                    "wait_s": waited,
-                    "update_s": updated - started,
-                    "publish_s": time.monotonic() - updated,
-                }
+                metrics |= {"update": float(self._update.version), "wait_s": waited}
+                metrics |= {"update_s": updated - started, "publish_s": time.monotonic() - updated}
                 self._history.append(metrics)
             asked = time.monotonic()
             replay.learnt.remote()
@@ -152,16 +139,13 @@ class TrainerWorker:
 
     def _publish(self, publisher: WeightPublisher, held: PublishDelay, last: bool) -> None:
         """Hands the weights of now over, or those that are old enough."""
-        if not held.updates:
-            self._hand_over(publisher, self._update.version, self._view())
-            return
-        for due in held.push(self._update.version, self._export(), last=last):
-            self._hand_over(publisher, *due)
-
-    def _hand_over(self, publisher: WeightPublisher, version: int, tensors: dict[str, Any]) -> None:
-        fault_point("trainer.publish")
-        publisher.publish(version, tensors)
-        self._handed_over = version
+        adapter = self._update.adapter
+        with self._peers.lending("lend_weights"):
+            weights = adapter.export_trainable() if self._config.hold_back else adapter.view_trainable()
+        for version, tensors in held.push(self._update.version, weights, last=last):
+            fault_point("trainer.publish")
+            publisher.publish(version, tensors)
+            self._handed_over = version
 
     def metrics(self) -> list[dict[str, float]]:
         """One record per update since the last call."""
@@ -175,8 +159,7 @@ class TrainerWorker:
     def hold(self) -> tuple[int, list[dict[str, float]]]:
         """Keeps a copy of all that is to be saved, as it is between two updates, for `write`.
 
-        Returns:
-            Its version, and the records up to it that `metrics` has not given.
+        Returns its version, and the records up to it that `metrics` has not given.
         """
         with self._lock:
             with self._peers.lending("lend_state"):
@@ -191,12 +174,3 @@ class TrainerWorker:
         self._update.adapter.save(directory / PRETRAINED, self._policy, weights)
         snapshot.save(directory / TRAINING_STATE / WEIGHTS, trained)
         snapshot.save(directory / TRAINING_STATE / "trainer", state)
-
-    def _view(self) -> dict[str, Any]:
-        """Trainable weights, to be copied before the next update."""
-        with self._peers.lending("lend_weights"):
-            return self._update.adapter.view_trainable()
-
-    def _export(self) -> dict[str, Any]:
-        with self._peers.lending("lend_weights"):
-            return self._update.adapter.export_trainable()

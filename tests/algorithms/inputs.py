@@ -24,11 +24,10 @@ def make_inputs(
         "log_prob_old": old,
         "log_prob_new": (old + spread * normal(n, factors)).requires_grad_(),
         "advantage": normal(n),
-        "value": normal(n),
+        "value": normal(n).requires_grad_(),
         "returns": normal(n),
         "entropy": normal(n).abs().requires_grad_(),
     }
-    fields["value_error"] = (fields["value"] - fields["returns"]).square().requires_grad_()
     return LossInputs(**{**fields, **replace})
 
 
@@ -41,7 +40,6 @@ def one(log_ratio: float, advantage: float) -> LossInputs:
         log_prob_old=torch.zeros(1, 1, dtype=torch.float64),
         advantage=torch.tensor([advantage], dtype=torch.float64),
         value=zero,
-        value_error=zero,
         returns=zero,
         entropy=zero,
     )

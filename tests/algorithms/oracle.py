@@ -71,7 +71,7 @@ def ppo(logs: Ragged, advantage: np.ndarray, low: float, high: float) -> float:
 
 
 def shared(error: np.ndarray, logs: Ragged, entropy: np.ndarray, config: RatioConfig) -> float:
-    """value_coef · error + kl_coef · KL(μ‖π) − entropy_coef · H, where `logs` are log π/μ."""
+    """½ · error + kl_coef · KL(μ‖π) − entropy_coef · H, where `logs` are log π/μ."""
     kl = mean([math.exp(x) - 1 - x for row in logs for x in row])
-    total = config.value_coef * mean(list(error)) + config.kl_coef * kl
+    total = 0.5 * mean(list(error)) + config.kl_coef * kl
     return float(total - config.entropy_coef * mean(list(entropy)))

@@ -11,25 +11,15 @@ import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot.algorithms import (
-    AlgorithmConfig,
-    GIPOConfig,
-    PPOConfig,
-    RatioConfig,
-)
+from accerl_lerobot.algorithms import AlgorithmConfig, GIPOConfig, PPOConfig, RatioConfig
 from accerl_lerobot.algorithms.objective import (
     KL_LINEAR_ABOVE,
-    approx_kl,
+    Samples,
     at_level,
-    clip_fraction,
-    ess_share,
-    explained_variance,
     kl_from_behaviour,
     lag_metrics,
     mean_over_ratios,
     present,
-    quantiles,
-    share_below,
 )
 from tests.algorithms.inputs import gradient, make_inputs
 from tests.runs import ALGORITHMS
@@ -137,50 +127,58 @@ def test_kl_pulls_back_from_both_sides_with_a_bounded_slope() -> None:
 
 # ---- metrics
 
-
-def test_effective_sample_size() -> None:
-    assert ess_share(torch.ones(4, 1)).item() == 1.0
-    assert ess_share(torch.tensor([[1.0], [0.0], [0.0], [0.0]])).item() == 0.25
-    assert ess_share(torch.tensor([[3.0], [1.0]])).item() == pytest.approx(16 / 20)
-    assert ess_share(torch.zeros(4, 1)).item() == 0.0
-    mask = torch.tensor([[True], [True], [False]])
-    assert ess_share(torch.tensor([[3.0], [1.0], [9.0]]), mask).item() == pytest.approx(16 / 20)
+YES = torch.ones(4, 1, dtype=torch.bool)
 
 
-def test_approx_kl_is_zero_only_on_policy() -> None:
-    assert approx_kl(torch.zeros(3, 2)).item() == 0.0
-    assert approx_kl(torch.tensor([[math.log(2.0)]])).item() == pytest.approx(1 - math.log(2.0))
+def metrics_of(
+    log_ratio: list[float] = [0.0] * 4,
+    weight: list[float] = [1.0] * 4,
+    value: list[float] = [0.0] * 4,
+    returns: list[float] = [1.0] * 4,
+    keep: torch.Tensor = YES,
+    clip: tuple[float, float] = (0.2, 0.28),
+) -> dict[str, float]:
+    """Metrics of four decisions with a ratio each."""
+    columns = {"log_ratio": torch.tensor(log_ratio)[:, None], "weight": torch.tensor(weight)[:, None]}
+    rows = {"value": torch.tensor(value), "returns": torch.tensor(returns)}
+    return {k: v.item() for k, v in Samples(**columns, **rows, keep=keep, clip=clip).metrics().items()}
 
 
-def test_shares() -> None:
-    rho = torch.tensor([[0.7], [0.9], [1.2], [1.4]])
-    assert clip_fraction(rho, 0.2, 0.28).item() == 0.5
-    assert share_below(rho, 1.0).item() == 0.5
-    exists = torch.tensor([[True], [True], [True], [False]])
-    assert share_below(rho, 1.0, exists).item() == pytest.approx(2 / 3)
+@pytest.mark.parametrize(
+    ("weight", "expected"),
+    [([1.0] * 4, 1.0), ([1.0, 0, 0, 0], 0.25), ([3.0, 1, 3, 1], 16 / 20), ([0.0] * 4, 0.0)],
+)
+def test_effective_sample_size(weight: list[float], expected: float) -> None:
+    assert metrics_of(weight=weight)["ess"] == pytest.approx(expected)
 
 
-def test_explained_variance() -> None:
-    returns = torch.tensor([0.0, 1.0, 2.0, 3.0])
-    assert explained_variance(returns, returns).item() == 1.0
-    assert explained_variance(returns + 5.0, returns).item() == 1.0  # a constant offset is not variance
-    assert explained_variance(torch.zeros(4), returns).item() == 0.0
-    assert explained_variance(-returns, returns).item() == -3.0
-    assert explained_variance(returns, torch.ones(4)).item() == 0.0
+def test_shares_and_quantiles_are_of_the_ratios_that_exist() -> None:
+    logs = [math.log(rho) for rho in (0.7, 0.9, 1.2, 1.4)]
+    found = metrics_of(logs, weight=[0.0, 0.05, 1.0, 1.0])
+    assert (found["clip_fraction"], found["low_weight"]) == (0.5, 0.5)
+    assert found["log_ratio_p05"] == pytest.approx(np.quantile(logs, 0.05))
+    keep = torch.tensor([[True], [True], [True], [False]])
+    found = metrics_of(logs, weight=[0.0, 0.05, 1.0, 1.0], keep=keep)
+    assert (found["clip_fraction"], found["low_weight"]) == pytest.approx((1 / 3, 2 / 3))
+    assert found["log_ratio_p95"] == pytest.approx(np.quantile(logs[:3], 0.95))
+    assert found["approx_kl"] == pytest.approx(np.mean([math.exp(x) - 1 - x for x in logs[:3]]), abs=1e-6)
 
 
-def test_quantiles_skip_what_does_not_exist() -> None:
-    x = torch.randn(9, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    mask = (torch.arange(9) < 6)[:, None].expand(9, 4)
-    got = quantiles(x, {"q": 0.3}, mask)["q"].item()
-    assert got == pytest.approx(np.quantile(x[:6].numpy(), 0.3))
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    # A constant offset is not variance.
+    [([0.0, 1, 2, 3], 1.0), ([5.0, 6, 7, 8], 1.0), ([0.0] * 4, 0.0), ([0.0, -1, -2, -3], -3.0)],
+)
+def test_explained_variance(value: list[float], expected: float) -> None:
+    assert metrics_of(value=value, returns=[0.0, 1, 2, 3])["explained_variance"] == expected
+    assert metrics_of(value=value)["explained_variance"] == 0.0
 
 
 def test_lag() -> None:
-    lag = {k: v.item() for k, v in lag_metrics(torch.tensor([10, 9, 7]), 12).items()}
+    lag = lag_metrics(torch.tensor([10, 9, 7]), 12)
     assert lag["lag_mean"] == pytest.approx((2 + 3 + 5) / 3) and lag["lag_max"] == 5.0
     assert lag["lag_p95"] == pytest.approx(4.8)
-    assert lag_metrics(torch.tensor([3, 3]), 3)["lag_max"].item() == 0.0
+    assert lag_metrics(torch.tensor([3, 3]), 3)["lag_max"] == 0.0
 
 
 @pytest.mark.parametrize("config", [GIPOConfig(), PPOConfig()], ids=["gipo", "ppo"])
@@ -189,10 +187,3 @@ def test_on_policy_batches_look_on_policy(config: GIPOConfig | PPOConfig) -> Non
     for name in ("approx_kl", "kl", "clip_fraction", "low_weight", "ratio_max_dev", "log_ratio_p50"):
         assert metrics[name] == 0.0, name
     assert metrics["ess"] == pytest.approx(1.0) and metrics["decisions"] == 12.0
-
-
-def test_gipo_keeps_more_effective_samples_than_plain_importance_sampling() -> None:
-    inputs = make_inputs(n=4000, factors=1, spread=1.5)
-    wide, narrow = GIPOConfig(sigma=math.inf), GIPOConfig(sigma=0.5)
-    ess = [c.loss(inputs).metrics["ess"].item() for c in (wide, narrow)]
-    assert ess[1] > 2 * ess[0]

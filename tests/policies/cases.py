@@ -30,12 +30,7 @@ from accerl_lerobot.policies.config import (
 )
 from accerl_lerobot.testing import perturb
 from tests.policies import diffusion_oracle, oracle
-from tests.policies.checkpoints import (
-    write_act,
-    write_bins,
-    write_diffusion,
-    write_smolvla,
-)
+from tests.policies.checkpoints import write_act, write_bins, write_diffusion, write_smolvla
 from tests.policies.tiny import looking_back, requests
 from tests.policies.tiny_pi import small, write_pi
 
@@ -119,8 +114,8 @@ def slow_flow(adapter: LeRobotAdapter, asked: Sequence[Request], latent: Latent)
 
     def read(x: np.ndarray, t: float, sample: int) -> np.ndarray:
         with torch.no_grad():
-            field = encoded[sample].context.velocity
-            return field(torch.from_numpy(x).float()[None], torch.tensor([t]).float())[0].double().numpy()
+            velocity = encoded[sample].context
+            return velocity(torch.from_numpy(x).float()[None], torch.tensor([t]).float())[0].double().numpy()
 
     x0, x = (part.numpy() for part in latent["path"].unbind(1))
     shape, std = adapter.family.shape, adapter.family.sampler.noise_level
@@ -373,6 +368,6 @@ VARIANTS = {
         close=(1e-3, 2e-3),
         step=0.005,
         one_token=True,
-    ),
+    )
 }
 """Other families, and configurations that take another path through the code."""

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from accerl_lerobot.checkpoint.layout import BACKBONE, PRETRAINED
 from accerl_lerobot.config.ranges import DatasetConfig
@@ -77,69 +76,38 @@ def observed(count: int, seed: int = 0) -> dict[str, Any]:
     }
 
 
-def slow_hidden(policy: Any, image: Tensor, tokens: Tensor, state: Tensor) -> Tensor:
-    """The language model of one sample in double precision, by the formulas of a Llama, without padding.
-
-    Rotary embeddings, grouped heads, RMS norms, gated SiLU; who sees whom is written out pair by pair.
-    """
-    model = policy.model.double()
-    vlm, text = model.vlm, model.vlm.text_model
-    pixels = vlm.connector(vlm.vision_model(pixel_values=(2 * image - 1)[None].double()).last_hidden_state)[0]
-    words = text.embed_tokens.weight[tokens]
-    place = state.double() @ model.state_proj.weight.T + model.state_proj.bias
-    x = torch.cat([pixels, words, place[None], model.queries])
-    n, prefix, end = len(x), len(pixels) + len(words), len(pixels) + len(words) + 1
-    sees = torch.zeros(n, n, dtype=torch.bool)
-    for i in range(n):
-        for j in range(n):
-            sees[i, j] = j < prefix or (i >= prefix and j < end) or i >= end
-    config = text.config
-    size, heads, shared = config.head_dim, config.num_attention_heads, config.num_key_value_heads
-
-    def norm(x: Tensor, layer: Any) -> Tensor:
-        return x / torch.sqrt(x.square().mean(-1, keepdim=True) + config.rms_norm_eps) * layer.weight
-
-    def turned(x: Tensor) -> Tensor:
-        half = size // 2
-        angles = torch.arange(n)[:, None] / config.rope_parameters["rope_theta"] ** (
-            torch.arange(half) / half
-        )
-        cos, sin = (f(angles.double())[:, None] for f in (torch.cos, torch.sin))
-        a, b = x[..., :half], x[..., half:]
-        return torch.cat([a * cos - b * sin, b * cos + a * sin], -1)
-
-    for layer in text.layers:
-        y, attention = norm(x, layer.input_layernorm), layer.self_attn
-        q = turned((y @ attention.q_proj.weight.T).view(n, heads, size))
-        k = turned((y @ attention.k_proj.weight.T).view(n, shared, size))
-        v = (y @ attention.v_proj.weight.T).view(n, shared, size)
-        mixed = []
-        for head in range(heads):
-            mine = head // (heads // shared)
-            scores = (q[:, head] @ k[:, mine].T / size**0.5).masked_fill(~sees, -torch.inf)
-            mixed.append(torch.softmax(scores, -1) @ v[:, mine])
-        x = x + torch.cat(mixed, -1) @ attention.o_proj.weight.T
-        y, mlp = norm(x, layer.post_attention_layernorm), layer.mlp
-        gate = torch.nn.functional.silu(y @ mlp.gate_proj.weight.T)
-        x = x + (gate * (y @ mlp.up_proj.weight.T)) @ mlp.down_proj.weight.T
-    return norm(x, text.norm)[end:]
-
-
 @torch.no_grad()
-def test_the_network_is_the_formulas(loaded: tuple[Any, Any, Any]):
+def test_who_sees_whom(loaded: tuple[Any, Any, Any]):
+    """Prefix, state and queries see themselves and what is to the left; padding is seen by none."""
     policy, pre, _ = loaded
     draw = torch.Generator().manual_seed(3)
     for parameter in policy.parameters():  # fresh weights hardly attend to anything in particular
         parameter += 0.3 * torch.randn(parameter.shape, generator=draw)
-    batch = pre(observed(3))
-    tokens, mask = batch["observation.language.tokens"], batch["observation.language.attention_mask"].bool()
-    assert not mask.all()
+    batch, text = pre(observed(3)), policy.model.vlm.text_model
+    given: dict[str, Any] = {}
+    hook = text.register_forward_pre_hook(lambda m, a, k: given.update(k), with_kwargs=True)
     hidden = policy.hidden(batch)
-    for i in range(3):
-        image, state = batch["observation.images.front"][i], batch["observation.state"][i]
-        expected = slow_hidden(policy, image, tokens[i][mask[i]], state)
-        assert_close(hidden[i], expected)
+    hook.remove()
     assert hidden.shape == (3, CHUNK * DIMS, 32) and hidden.std() > 0.1
+    embedded, queries = given["inputs_embeds"], CHUNK * DIMS
+    real = torch.ones(embedded.shape[:2])
+    mask = batch["observation.language.attention_mask"].bool()
+    words = slice(embedded.shape[1] - queries - 1 - mask.shape[1], embedded.shape[1] - queries - 1)
+    real[:, words] = mask.float()
+    assert not mask.all() and torch.equal(given["position_ids"], (real.cumsum(1) - 1).clamp(min=0).long())
+
+    def reached(place: int) -> set[int]:
+        """Places whose hidden states change with the input at this one."""
+        other = embedded.clone()
+        other[0, place] += 1
+        before, after = (text(**given | {"inputs_embeds": x})[0][0] for x in (embedded, other))
+        return {i for i in range(len(before)) if (before[i] - after[i]).abs().max() > 1e-6}
+
+    every = set(range(embedded.shape[1]))
+    first, state, padding = 0, words.stop, words.start + int(mask[0].sum())
+    assert reached(first) == every and reached(padding) == {padding}
+    assert reached(state) == set(range(state, len(every)))
+    assert reached(len(every) - 1) == reached(state + 1) == set(range(state + 1, len(every)))
 
 
 def test_bins_by_hand(loaded: tuple[Any, Any, Any]):

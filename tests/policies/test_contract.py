@@ -18,11 +18,7 @@ from torch import Tensor
 
 from accerl_lerobot.experience import Request
 from accerl_lerobot.policies.adapter import LeRobotAdapter, Processing, stack_observations
-from accerl_lerobot.policies.config import (
-    POLICIES,
-    PolicyConfig,
-    SamplerConfig,
-)
+from accerl_lerobot.policies.config import POLICIES, PolicyConfig, SamplerConfig
 from accerl_lerobot.policies.saving import save_pretrained
 from accerl_lerobot.testing import check_batches, check_gradient, log_ratio, perturb, stored
 from tests.policies.cases import CASES, VARIANTS, Case
@@ -294,7 +290,7 @@ def test_stock_lerobot_runs_what_is_saved(policy: Policy, tmp_path: Path):
     ours, theirs = adapter.policy.state_dict(), stock.state_dict()
     assert ours.keys() == theirs.keys() and all(torch.equal(ours[k], theirs[k]) for k in ours)
     observations = stack_observations(asked)
-    processing = Processing(pre, post, adapter.device)
+    processing = Processing(pre, post, adapter.device, {})
     batch, expected = (p.prepare(*observations) for p in (processing, adapter.processing))
     assert all(torch.equal(batch[k], v) for k, v in expected.items() if isinstance(v, Tensor))
     if stock.config.n_obs_steps > 1:  # LeRobot keeps the history itself

@@ -6,6 +6,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,11 +20,10 @@ from accerl_lerobot.envs import SimulatedConfig, make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.experience import TASK, Request
-from accerl_lerobot.policies import diffusion
 from accerl_lerobot.policies.adapter import LeRobotAdapter, stack_observations
 from accerl_lerobot.policies.config import DiffusionSamplerConfig, PolicyConfig
-from accerl_lerobot.policies.diffusion import DiffusionShape, Schedule
-from accerl_lerobot.policies.family import standard_normal
+from accerl_lerobot.policies.diffusion import DiffusionFamily, DiffusionShape, Schedule
+from accerl_lerobot.policies.family import Action, standard_normal
 from accerl_lerobot.policies.loading import load_adapter
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.rollout.worker import RolloutWorker, WorkerShare
@@ -135,45 +135,37 @@ def schedule(scheduler: str) -> Schedule:
     )
 
 
-def act(
-    predict: Callable[[Tensor, int], Tensor], scheduler: str, config: DiffusionSamplerConfig, seed: int
-) -> tuple[Tensor, Tensor, Tensor]:
-    """(executed action (B,), chain, log-prob (B,))."""
+def family(scheduler: str, config: DiffusionSamplerConfig) -> DiffusionFamily:
+    return DiffusionFamily(SimpleNamespace(shape=SHAPE, schedule=schedule(scheduler)), config)
+
+
+def act(predict: Callable[[Tensor, int], Tensor], it: DiffusionFamily, seed: int) -> Action:
     generator = torch.Generator().manual_seed(seed)
     x = torch.randn(SAMPLES, 3, 1, generator=generator)
     eps = torch.randn(SAMPLES, 3, 3, 1, generator=generator)
-    explore = torch.ones(SAMPLES, dtype=torch.bool)
-    x, path, logp = diffusion.sample(predict, x, eps, explore, SHAPE, schedule(scheduler), config)
-    return x[:, 0, 0], path, logp.sum(1)
+    return it.sample(predict, x, eps, torch.ones(SAMPLES, dtype=torch.bool))
 
 
-def payoff(action: Tensor) -> Tensor:
-    return torch.tanh(2 * action + 0.5) + 0.2 * action**2
-
-
-def weighted(scheduler: str, config: DiffusionSamplerConfig) -> tuple[Tensor, Tensor]:
-    """Samples of μ: ρ (B,) and ρ·f(a) (B,)."""
-    action, path, behaviour = act(MU, scheduler, config, 11)
-    new = diffusion.log_prob(PI, path, SHAPE, schedule(scheduler), config).sum(1)
-    ratio = (new - behaviour).exp()
-    return ratio, ratio * payoff(action)
+def payoff(action: Action) -> Tensor:
+    executed = action.chunk[:, 0, 0]
+    return torch.tanh(2 * executed + 0.5) + 0.2 * executed**2
 
 
 @pytest.mark.parametrize("scheduler", ["DDPM", "DDIM"])
 def test_weighted_samples_of_mu_are_samples_of_pi(scheduler: str):
-    config = DiffusionSamplerConfig(std_min=0.3)
-    ratio, product = weighted(scheduler, config)
-    new, old = (payoff(act(p, scheduler, config, seed)[0]) for p, seed in ((PI, 12), (MU, 13)))
+    it = family(scheduler, DiffusionSamplerConfig(std_min=0.3))
+    acted = act(MU, it, 11)
+    ratio = (it.log_prob(PI, acted.latent) - acted.log_prob).sum(1).exp()
+    new, old = (payoff(act(p, it, seed)) for p, seed in ((PI, 12), (MU, 13)))
     assert deviation(old, new) > WRONG, "the weights must matter, or the test shows nothing"
     assert deviation(ratio, torch.ones(2)) < EXACT
-    assert deviation(product, new) < EXACT
+    assert deviation(ratio * payoff(acted), new) < EXACT
 
 
 def test_exploration_keeps_to_the_least_std():
-    config = DiffusionSamplerConfig(std_min=0.4)
     x, eps = torch.zeros(1, 3, 1), torch.ones(1, 3, 3, 1)
-    plan = schedule("DDPM")
-    _, path, _ = diffusion.sample(MU, x, eps, torch.tensor([True]), SHAPE, plan, config)
+    it = family("DDPM", DiffusionSamplerConfig(std_min=0.4))
+    plan, path = it.schedule, it.sample(MU, x, eps, torch.tensor([True])).latent["path"]
     for k, timestep in enumerate((12, 6, 0)):
         mean, std = plan.step(k, path[:, k], MU(path[:, k], timestep))
         assert_close(path[:, k + 1], mean + max(float(std), 0.4))
@@ -181,9 +173,8 @@ def test_exploration_keeps_to_the_least_std():
 
 
 def test_entropy_is_the_mean_surprise_of_what_is_sampled():
-    config = DiffusionSamplerConfig(std_min=0.3)
-    logp = act(MU, "DDPM", config, 1)[2]
-    assert deviation(-logp, torch.full((2,), diffusion.entropy(SHAPE, schedule("DDPM"), config))) < EXACT
+    it = family("DDPM", DiffusionSamplerConfig(std_min=0.3))
+    assert deviation(-act(MU, it, 1).log_prob.sum(1), torch.full((2,), it.entropy)) < EXACT
 
 
 # ---- loading and saving
@@ -193,11 +184,7 @@ def test_entropy_is_the_mean_surprise_of_what_is_sampled():
     ("changes", "options", "sentence"),
     [
         ({}, {"num_steps": 21}, "policy.num_steps=21: use at most 20, as many as it was trained with"),
-        (
-            {},
-            {"n_action_steps": 9},
-            "policy.n_action_steps=9: use 1 to 8, the chunk the policy predicts",
-        ),
+        ({}, {"n_action_steps": 9}, "policy.n_action_steps=9: use 1 to 8, the chunk the policy predicts"),
         (
             {"n_obs_steps": 2},
             {"n_action_steps": 8},

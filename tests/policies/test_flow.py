@@ -5,15 +5,15 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from accerl_lerobot.policies import flow
 from accerl_lerobot.policies.config import FlowSamplerConfig
-from accerl_lerobot.policies.flow import FlowShape, Velocity
+from accerl_lerobot.policies.flow import FlowFamily, FlowShape, Velocity
 from accerl_lerobot.testing import stored
 from tests.policies import oracle
 from tests.policies.cases import CASES
@@ -30,6 +30,10 @@ DIM_MIX = np.array(
 def sizes(num_steps: int) -> FlowShape:
     """Three rows of which two are executed, two real dims and two padded ones."""
     return FlowShape(num_steps=num_steps, chunk_size=3, executed=2, padded_dim=4, action_dim=2)
+
+
+def family(shape: FlowShape, config: FlowSamplerConfig = CONFIG) -> FlowFamily:
+    return FlowFamily(SimpleNamespace(shape=shape), config)
 
 
 def velocity(x: Tensor, t: Tensor) -> Tensor:
@@ -65,13 +69,15 @@ def plain_ode(x: Tensor, num_steps: int) -> Tensor:
 def test_the_action_and_its_density_are_the_oracle_s(num_steps: int):
     shape = sizes(num_steps)
     x0, eps = draws(shape)
-    x, latent, log_prob = flow.sample(velocity, x0, eps, explore_all(x0), shape, CONFIG)
+    flow = family(shape)
+    _, latent, log_prob = flow.sample(velocity, x0, eps, explore_all(x0))
+    x = latent["path"][:, 1]
     expected = oracle.log_prob(slow_velocity, x0.numpy(), x.numpy(), shape, STD)
     mean = oracle.integrate(slow_velocity, x0.numpy(), shape)
     assert np.allclose(x.numpy(), mean + STD * eps.numpy(), atol=1e-12)
     assert log_prob.shape == (6, shape.executed)
     assert np.allclose(log_prob.sum(1), expected, atol=1e-10)
-    assert torch.allclose(flow.log_prob(velocity, latent, shape, CONFIG), log_prob, rtol=0, atol=1e-12)
+    assert torch.allclose(flow.log_prob(velocity, latent), log_prob, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("num_steps", [1, 2, 3, 4])
@@ -80,11 +86,15 @@ def test_not_exploring_is_the_stock_sampler_bit_for_bit(num_steps: int):
     x0, eps = draws(shape, dtype=torch.float32)
     stock = plain_ode(x0, num_steps)
     still, everyone = torch.zeros(6, dtype=torch.bool), explore_all(x0)
-    x, _, log_prob = flow.sample(velocity, x0, eps, still, shape, CONFIG)
+
+    def sample(explore: Tensor) -> tuple[Tensor, Tensor]:
+        _, latent, log_prob = family(shape).sample(velocity, x0, eps, explore)
+        return latent["path"][:, 1], log_prob
+
+    x, log_prob = sample(still)
     assert torch.equal(x, stock) and not log_prob.any()
     some = torch.tensor([True, False, False, True, False, True])
-    mixed, _, mixed_log_prob = flow.sample(velocity, x0, eps, some, shape, CONFIG)
-    exploring, _, exploring_log_prob = flow.sample(velocity, x0, eps, everyone, shape, CONFIG)
+    (mixed, mixed_log_prob), (exploring, exploring_log_prob) = sample(some), sample(everyone)
     assert torch.equal(mixed[~some], stock[~some]) and torch.equal(mixed[some], exploring[some])
     assert torch.equal(mixed_log_prob[some], exploring_log_prob[some])
     assert not mixed_log_prob[~some].any()
@@ -94,13 +104,13 @@ def test_not_exploring_is_the_stock_sampler_bit_for_bit(num_steps: int):
 def test_gradient_against_finite_differences():
     shape = sizes(3)
     x0, eps = draws(shape, count=3)
-    _, latent, _ = flow.sample(velocity, x0, eps, explore_all(x0), shape, CONFIG)
+    latent = family(shape).sample(velocity, x0, eps, explore_all(x0)).latent
 
     def score(rows: Tensor, dims: Tensor, shift: Tensor) -> Tensor:
         def parametrised(x: Tensor, t: Tensor) -> Tensor:
             return torch.tanh(rows @ x @ dims + t[:, None, None] * shift) + 0.2 * x
 
-        return flow.log_prob(parametrised, latent, shape, CONFIG)
+        return family(shape).log_prob(parametrised, latent)
 
     parameters = [torch.from_numpy(ROW_MIX), torch.from_numpy(DIM_MIX), torch.ones(4, dtype=torch.float64)]
     assert torch.autograd.gradcheck(score, [p.clone().requires_grad_() for p in parameters], atol=1e-6)
@@ -109,9 +119,9 @@ def test_gradient_against_finite_differences():
 def test_entropy_is_minus_the_expected_log_density():
     shape, count = sizes(2), 4000
     x0, eps = draws(shape, count=count)
-    _, _, log_prob = flow.sample(velocity, x0, eps, explore_all(x0), shape, CONFIG)
+    log_prob = family(shape).sample(velocity, x0, eps, explore_all(x0)).log_prob
     error = log_prob.sum(1).std().item() / math.sqrt(count)
-    assert flow.entropy(shape, CONFIG) == pytest.approx(-log_prob.sum(1).mean().item(), abs=4 * error)
+    assert family(shape).entropy == pytest.approx(-log_prob.sum(1).mean().item(), abs=4 * error)
 
 
 # ---- importance weights: E_μ[ρ f(a)] = E_π[f(a)] for the action the environment executes. "ρ = 1 at equal
@@ -152,8 +162,8 @@ def act(velocity: Velocity, seed: int) -> tuple[Tensor, dict[str, Tensor], Tenso
     generator = torch.Generator().manual_seed(seed)
     size = (SAMPLES, SHAPE.chunk_size, SHAPE.padded_dim)
     x0, eps = (torch.randn(size, generator=generator) for _ in range(2))
-    x, latent, log_prob = flow.sample(velocity, x0, eps, explore_all(x0), SHAPE, WIDE)
-    return x[:, 0, 0], latent, log_prob.sum(1)
+    chunk, latent, log_prob = family(SHAPE, WIDE).sample(velocity, x0, eps, explore_all(x0))
+    return chunk[:, 0, 0], latent, log_prob.sum(1)
 
 
 def payoff(action: Tensor) -> Tensor:
@@ -162,7 +172,7 @@ def payoff(action: Tensor) -> Tensor:
 
 def test_weighted_samples_of_mu_are_samples_of_pi():
     action, latent, behaviour = act(MU, 11)
-    ratio = (flow.log_prob(PI, latent, SHAPE, WIDE).sum(1) - behaviour).exp()
+    ratio = (family(SHAPE, WIDE).log_prob(PI, latent).sum(1) - behaviour).exp()
     new, old = payoff(act(PI, 12)[0]), payoff(act(MU, 13)[0])
     assert deviation(old, new) > WRONG, "the weights must matter, or the test shows nothing"
     assert deviation(ratio, torch.ones(2)) < EXACT

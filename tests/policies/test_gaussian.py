@@ -32,9 +32,6 @@ class Small(GaussianModel):
     def encode(self, batch: dict[str, Tensor]) -> Encoded:
         raise NotImplementedError
 
-    def stock(self, batch: dict[str, Tensor]) -> Tensor:
-        raise NotImplementedError
-
     def under(self, weights: float, count: int) -> Encoded:
         """Mean and rows as a function of the policy's weights, here one number."""
         mean = torch.linspace(-0.5, 0.8, 6).view(1, 3, 2) + 0.3 * weights

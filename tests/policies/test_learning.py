@@ -29,7 +29,7 @@ from accerl_lerobot.policies.config import (
     PolicyConfig,
     SamplerConfig,
 )
-from accerl_lerobot.replay import ReplayConfig
+from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.testing import TOLERANCE
 from accerl_lerobot.trainer.config import TrainerConfig

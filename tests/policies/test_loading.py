@@ -108,17 +108,12 @@ def test_a_path_to_nothing(path: str | None, sentence: str):
     assert str(caught.value).startswith(sentence) and "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("kind", "why"),
-    [
-        ("tdmpc", "it plans by sampling and has no action density"),
-        ("my_policy", "no likelihood for it here; use one of smolvla, "),
-    ],
-)
-def test_a_policy_without_a_likelihood(damaged: Any, kind: str, why: str):
+@pytest.mark.parametrize("kind", ["tdmpc", "my_policy"])
+def test_a_policy_without_a_likelihood(damaged: Any, kind: str):
     path = damaged("act")
     edit_config(path, type=kind)
-    refused(path, f"policy.type='{kind}': {path} is of this type: {why}")
+    why = f"{path} is of this type: no likelihood for it here; use one of smolvla, "
+    refused(path, f"policy.type='{kind}': {why}")
 
 
 @pytest.mark.parametrize(
@@ -148,7 +143,7 @@ def test_a_config_of_something_else(damaged: Any, text: str | None, why: str):
         ("pi0_fast", {"n_action_steps": 3}, {}, "policy.n_action_steps=3: LeRobot decodes so many rows from"),
         ("pi0_fast", {}, {"num_steps": 3}, "policy.num_steps=3: a pi0_fast policy does not denoise"),
         ("smolvla", {}, {"n_action_steps": 5}, "policy.n_action_steps=5: use 1 to 4, the chunk the policy"),
-        ("act", {}, {"sampler": FlowSamplerConfig()}, "policy.sampler.type='flow': use gaussian: the policy is of type act"),
+        ("act", {}, {"sampler": FlowSamplerConfig()}, "policy.sampler.type='flow': use gaussian: "),
     ],
 )  # fmt: skip
 def test_options_under_which_its_density_would_be_another(

@@ -14,10 +14,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from accerl_lerobot.policies import flow
 from accerl_lerobot.policies import vla as pi0_fast
 from accerl_lerobot.policies.adapter import LeRobotAdapter, stack_observations
 from accerl_lerobot.policies.config import FlowSamplerConfig, PolicyConfig, TokenSamplerConfig
+from accerl_lerobot.policies.flow import FlowFamily
 from accerl_lerobot.policies.saving import save_pretrained
 from accerl_lerobot.testing import check_ratio_one, perturb, stored
 from tests.policies.cases import CASES
@@ -60,7 +60,8 @@ def test_the_first_decision_of_a_process_is_lerobot_s_too(path: Path):
     assert config._attn_implementation == "eager"
     batch = adapter.processing.prepare(*stack_observations(asked))
     with torch.no_grad():
-        assert flow.difference(model, batch, model.encode(batch)) == 0.0
+        family = FlowFamily(model, FlowSamplerConfig())
+        assert family.difference(batch, model.encode(batch)) == 0.0
 
 
 def test_one_cache_serves_every_step(path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -228,7 +229,7 @@ def test_decoding_is_lerobot_s_and_never_fails(fast: LeRobotAdapter, caplog: pyt
         "half a letter": padded(half),
     }
     with caplog.at_level(logging.WARNING):
-        pi0_fast._Undecodable.warned = False
+        pi0_fast._warn_undecodable.cache_clear()
         chunks = fast.model.chunk(torch.tensor(list(rows.values())))
     assert caplog.messages == ["tokens that FAST cannot decode were drawn; such a chunk is all zeros"]
     by_name = dict(zip(rows, chunks, strict=True))

@@ -27,7 +27,7 @@ END = 3
 class Recurrent(TokenModel):
     """Autoregressive: h ← tanh(h + E[token]), logits = U h; the observation is the first h."""
 
-    parallel, terminator, length, width = False, END, LENGTH, WIDTH
+    terminator, length, width = END, LENGTH, WIDTH
 
     def __init__(self, perturbation: float = 0.0, late: bool = False) -> None:
         draw = torch.Generator().manual_seed(1)
@@ -79,7 +79,7 @@ class Recurrent(TokenModel):
 class Parallel(TokenModel):
     """All logits at once, from the observation alone."""
 
-    parallel, terminator, length, width = True, None, LENGTH, WIDTH
+    terminator, length, width = None, LENGTH, WIDTH
 
     def __init__(self, perturbation: float = 0.0) -> None:
         draw = torch.Generator().manual_seed(2)

@@ -10,8 +10,8 @@ import pytest
 
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.replay import Replay, ReplayConfig
-from accerl_lerobot.replay.buffer import DRAWS
+from accerl_lerobot.replay.buffer import DRAWS, Replay
+from accerl_lerobot.replay.pacing import ReplayConfig
 from tests.replay.segments import make_segment
 
 
@@ -103,8 +103,6 @@ def test_whole_segments_until_there_are_enough() -> None:
     assert replay.sample(7, 0, np.random.default_rng(0)) == []  # 6 are left
     assert replay.counters.trained_decisions == 9
     assert len(replay.sample(6, 0, np.random.default_rng(0))) == 2
-    with pytest.raises(ValueError, match="at least 1"):
-        replay.sample(0, 0, np.random.default_rng(0))
 
 
 @pytest.mark.parametrize(("per_insert", "expected"), [(1.0, [1] * 8), (2.0, [2] * 8), (1.5, [1, 2] * 4)])
@@ -116,7 +114,7 @@ def test_each_segment_is_drawn_as_often_as_its_share(per_insert: float, expected
     while replay.sample(4, 0, rng):
         pass
     assert [e.uses for e in replay._entries] == expected
-    assert replay.pace.available == 0 and replay.stored_decisions == 32
+    assert replay.available_decisions == 0 and replay.stored_decisions == 32
     assert replay.counters.trained_decisions == per_insert * 32
 
 
@@ -155,7 +153,7 @@ def test_books_balance_under_random_use() -> None:
         assert_books_balance(replay)
         c = replay.counters
         entries = replay._entries
-        assert replay.pace.available == sum(len(e.segment) for e in entries if e.uses < e.draws)
+        assert replay.available_decisions == sum(len(e.segment) for e in entries if e.uses < e.draws)
         assert all(e.uses <= e.draws <= 2 for e in entries)
         entitled = c.trained_decisions + c.unspent_draws + sum(e.unspent for e in entries)
         assert -1e-6 < 1.7 * c.inserted_decisions - entitled < 6 + 1e-6

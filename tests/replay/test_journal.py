@@ -12,8 +12,9 @@ import pytest
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, Origin, Segment
-from accerl_lerobot.replay import MixedReplay, ReplayConfig
+from accerl_lerobot.replay.buffer import MixedReplay
 from accerl_lerobot.replay.journal import Journal, read_journal, whole_episodes
+from accerl_lerobot.replay.pacing import ReplayConfig
 from tests.replay.segments import make_segment
 
 

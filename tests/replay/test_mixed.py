@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from accerl_lerobot.experience import IMAGINED, REAL
-from accerl_lerobot.replay import MixedReplay, ReplayConfig
+from accerl_lerobot.replay.buffer import MixedReplay
+from accerl_lerobot.replay.pacing import ReplayConfig
 from tests.replay.segments import make_segment
 
 
@@ -59,7 +60,7 @@ def test_once_all_real_episodes_are_in_they_are_used_up_and_dreams_go_on():
     fill(replay, REAL, 1)
     fill(replay, IMAGINED, 4)
     assert not replay.may_sample(8), "fewer than the warm start asks for"
-    replay.end_real()
+    replay.real_ended = True
     assert drawn(replay, 8) == {REAL: 4, IMAGINED: 4}
     assert drawn(replay, 8) == {REAL: 4, IMAGINED: 4}, "twice, as samples_per_insert says"
     assert drawn(replay, 8) == {REAL: 0, IMAGINED: 8}
@@ -70,19 +71,19 @@ def test_where_real_episodes_are_counted_they_are_kept_for_when_there_are_dreams
     for patient in (False, True):
         replay = mixed(patient=patient)
         fill(replay, REAL, 4)
-        replay.mix(0.0, awaited=True)
+        replay.share, replay.awaited = 0.0, True
         assert replay.may_sample(16) is not patient and not replay.exhausted(16)
         assert replay.may_insert(REAL) is patient, "more are let in meanwhile"
         fill(replay, IMAGINED, 2)
-        replay.mix(0.5, awaited=True)
+        replay.share, replay.awaited = 0.5, True
         assert drawn(replay, 16) == {REAL: 8, IMAGINED: 8}
-        replay.mix(0.0, awaited=False)
+        replay.share, replay.awaited = 0.0, False
         assert drawn(replay, 16) == {REAL: 16, IMAGINED: 0}, "none will come"
 
 
 def test_patience_ends_when_there_is_no_room_for_more():
     replay = mixed(patient=True)
-    replay.mix(0.0, awaited=True)
+    replay.share, replay.awaited = 0.0, True
     inserted = 0
     while not replay.may_sample(16):
         assert replay.may_insert(REAL) and inserted < 40
@@ -96,18 +97,18 @@ def test_it_is_exhausted_when_nothing_will_come():
     replay = mixed(share=0.0)
     fill(replay, REAL, 3)
     assert not replay.exhausted(12)
-    replay.end_real()
+    replay.real_ended = True
     for _ in range(2):
         assert not replay.exhausted(12) and drawn(replay, 12) == {REAL: 12, IMAGINED: 0}
     assert replay.exhausted(12) and drawn(replay, 12) == {REAL: 0, IMAGINED: 0}
     imagining = mixed()
-    imagining.end_real()
+    imagining.real_ended = True
     assert not imagining.exhausted(8)
-    imagining.mix(0.0, awaited=True)  # the world model is being learnt
+    imagining.share, imagining.awaited = 0.0, True  # the world model is being learnt
     assert not imagining.exhausted(8)
-    imagining.mix(0.0, awaited=False)  # the kill switch
+    imagining.share, imagining.awaited = 0.0, False  # the kill switch
     assert imagining.exhausted(8)
-    imagining.mix(0.5, awaited=True)
+    imagining.share, imagining.awaited = 0.5, True
     assert not imagining.exhausted(8)
 
 
@@ -130,9 +131,9 @@ def test_real_episodes_that_are_counted_wait_for_what_has_to_learn_from_those_be
         replay = mixed(patient=patient)
         fill(replay, REAL, 1)
         assert replay.may_insert(REAL)
-        replay.hold(True)
+        replay.held = True
         assert replay.may_insert(REAL) is not patient and replay.may_insert(IMAGINED)
-        replay.hold(False)
+        replay.held = False
         assert replay.may_insert(REAL)
 
 
@@ -140,11 +141,11 @@ def test_the_last_of_few_real_episodes_are_a_batch_although_a_smaller_one():
     replay = mixed(share=0.0)
     fill(replay, REAL, 3)
     assert not replay.may_sample(16), "more may come"
-    replay.end_real()
+    replay.real_ended = True
     assert replay.may_sample(16) and drawn(replay, 16) == {REAL: 12, IMAGINED: 0}
     assert drawn(replay, 16) == {REAL: 12, IMAGINED: 0}, "twice, as samples_per_insert says"
     assert replay.exhausted(16)
     least = mixed(share=0.0)
     fill(least, REAL, 1)
-    least.end_real()
+    least.real_ended = True
     assert not least.may_sample(16) and least.exhausted(16), "a quarter is none"

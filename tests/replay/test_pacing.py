@@ -10,27 +10,20 @@ import numpy as np
 import pytest
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.replay import (
-    Pace,
-    Replay,
-    ReplayConfig,
-    lag_bound,
-    may_insert,
-    may_sample,
-)
-from accerl_lerobot.replay.pacing import entitle
+from accerl_lerobot.replay.buffer import Replay
+from accerl_lerobot.replay.pacing import ReplayConfig, entitle, lag_bound
 from tests.replay.segments import make_segment
 
 CONFIG = ReplayConfig(capacity=100, min_decisions=10, samples_per_insert=2.0, ahead=30)
 
 
 def test_the_door_and_the_warm_start() -> None:
-    assert may_insert(CONFIG, Pace(stored=9, available=9))
-    assert may_insert(CONFIG, Pace(stored=50, available=29))
-    assert not may_insert(CONFIG, Pace(stored=50, available=30))
-    assert not may_sample(CONFIG, Pace(stored=9, available=9), 8)
-    assert may_sample(CONFIG, Pace(stored=10, available=8), 8)
-    assert not may_sample(CONFIG, Pace(stored=50, available=7), 8)
+    assert CONFIG.may_insert(9, 9)
+    assert CONFIG.may_insert(50, 29)
+    assert not CONFIG.may_insert(50, 30)
+    assert not CONFIG.may_sample(9, 9, 8)
+    assert CONFIG.may_sample(10, 8, 8)
+    assert not CONFIG.may_sample(50, 7, 8)
 
 
 def test_one_side_may_always_move_in_every_state() -> None:
@@ -39,14 +32,13 @@ def test_one_side_may_always_move_in_every_state() -> None:
         config.check(batch_decisions=batch, segment_decisions=4)
         for stored in range(41):
             for available in range(stored + 1):
-                pace = Pace(stored=stored, available=available)
-                assert may_insert(config, pace) or may_sample(config, pace, batch)
+                inserting = config.may_insert(stored, available)
+                assert inserting or config.may_sample(stored, available, batch)
 
 
 def test_without_the_checked_condition_both_sides_wait() -> None:
     config = ReplayConfig(capacity=40, min_decisions=7, ahead=10)
-    pace = Pace(stored=20, available=11)
-    assert not may_insert(config, pace) and not may_sample(config, pace, 12)
+    assert not config.may_insert(20, 11) and not config.may_sample(20, 11, 12)
     with pytest.raises(InputError) as caught:
         config.check(batch_decisions=12, segment_decisions=4)
     assert caught.value.field == "replay.ahead"
@@ -106,10 +98,7 @@ class Simulation:
         self.rng = np.random.default_rng(self.seed)
         self.replay = Replay(self.config)
         self.bound = lag_bound(
-            self.config,
-            batch_decisions=self.batch,
-            in_flight=self.in_flight,
-            pickup=self.publish_every - 1,
+            self.config, batch_decisions=self.batch, in_flight=self.in_flight, pickup=self.publish_every - 1
         )
         self.started = 0
 
@@ -138,10 +127,10 @@ class Simulation:
     def update(self) -> None:
         if not self.replay.may_sample(self.batch):
             return
-        available = self.replay.pace.available
+        available = self.replay.available_decisions
         drawn = self.replay.sample(self.batch, self.version, self.rng)
         if not drawn:  # too old ones were retired: that is progress as well
-            assert self.replay.pace.available < available
+            assert self.replay.available_decisions < available
             return
         self.worst_lag = max(self.worst_lag, *(self.version - int(s.version.min()) for s in drawn))
         self.version += 1

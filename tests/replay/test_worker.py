@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from accerl_lerobot.experience import IMAGINED, Segment
-from accerl_lerobot.replay import ReplayConfig
+from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.replay.worker import ReplayWorker
 from accerl_lerobot.transport.contract import ServiceStoppedError
 from tests.replay.segments import make_segment

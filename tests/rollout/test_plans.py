@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
-from accerl_lerobot.rollout.plans import (
+from accerl_lerobot.rollout.runner import (
     STARTS_PER_INCARNATION,
+    EpisodePlan,
     EpisodePlans,
+    RolloutConfig,
     budgets,
     incarnation_after,
 )
-from accerl_lerobot.rollout.runner import EpisodePlan, RolloutConfig
 from accerl_lerobot.seeds import train_seed
 from tests.rollout.worlds import evaluate
 

@@ -14,7 +14,7 @@ from accerl_lerobot.experience import TASK, Decision, Request
 from accerl_lerobot.inference.worker import InferenceConfig, InferenceWorker
 from accerl_lerobot.policies import loading
 from accerl_lerobot.policies.config import PolicyConfig
-from accerl_lerobot.replay import ReplayConfig
+from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.replay.worker import ReplayWorker
 from accerl_lerobot.timeline import STATES, TIMELINE
 from accerl_lerobot.timeline.read import read_timeline

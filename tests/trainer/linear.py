@@ -12,9 +12,10 @@ import torch
 from torch import Tensor, nn
 
 from accerl_lerobot.checkpoint import snapshot
-from accerl_lerobot.experience import Decision, Origin, Request, Segment
+from accerl_lerobot.experience import Decision, Request, Segment
 from accerl_lerobot.policies.adapter import Evaluation, PolicyAdapter
 from accerl_lerobot.policies.config import PolicyConfig
+from tests.replay.segments import make_segment
 
 STATE = "observation.state"
 STD = 0.5
@@ -88,25 +89,15 @@ def decided_by(adapter: LinearAdapter, segments: Sequence[Segment], version: int
 
 def make_segments(lengths: Sequence[int], version: int = 0, seed: int = 0, **replace: Any) -> list[Segment]:
     """Segments with random content; log-probs are those of a policy a little off from the current one."""
-    rng = np.random.default_rng(seed)
-    return [_segment(rng, n, f"{seed}.{i}", version, replace) for i, n in enumerate(lengths)]
-
-
-def _segment(rng: np.random.Generator, n: int, key: str, version: int, replace: dict[str, Any]) -> Segment:
-    fields: dict[str, Any] = {
-        "observations": {STATE: rng.standard_normal((n + 1, 3), dtype=np.float32)},
-        "task": f"task {key}",
-        "latent": {"x": rng.standard_normal((n, 2), dtype=np.float32)},
-        "log_prob": rng.standard_normal((n, 2), dtype=np.float32) - 2.0,
-        "value": np.full(n, 100.0, np.float32),  # stale: no critic here says so
-        "reward": rng.standard_normal(n, dtype=np.float32),
-        "version": np.full(n, version, np.int64),
-        "actions": np.zeros((n, 1, 1), np.float32),
-        "steps": np.ones(n, np.int64),
-        "origin": Origin("push-v3", seed=0, decision=0),
-        "terminated": False,
-        "truncated": False,
-        "success": False,
-        "key": key,
-    }
-    return Segment(**{**fields, **replace})
+    rng, made = np.random.default_rng(seed), []
+    for i, n in enumerate(lengths):
+        fields: dict[str, Any] = {
+            "observations": {STATE: rng.standard_normal((n + 1, 3), dtype=np.float32)},
+            "task": f"task {seed}.{i}",
+            "latent": {"x": rng.standard_normal((n, 2), dtype=np.float32)},
+            "log_prob": rng.standard_normal((n, 2), dtype=np.float32) - 2.0,
+            "value": np.full(n, 100.0, np.float32),  # stale: no critic here says so
+            "reward": rng.standard_normal(n, dtype=np.float32),
+        }
+        made.append(make_segment(f"{seed}.{i}", n, version, **fields | replace))
+    return made

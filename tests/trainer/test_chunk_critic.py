@@ -18,17 +18,19 @@ from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Origin, Request, 
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.config import FlowSamplerConfig, PolicyConfig
 from accerl_lerobot.policies.family import Encoded
-from accerl_lerobot.policies.flow import FlowContext, FlowFamily, FlowShape
+from accerl_lerobot.policies.flow import FlowFamily, FlowShape
 from accerl_lerobot.policies.loading import load_adapter
 from accerl_lerobot.policies.teacher import TASK_BITS, Ensemble, Teacher, WithTeacher, state_of
-from accerl_lerobot.replay import ReplayConfig
+from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.seeds import noise_seed
+from accerl_lerobot.trainer import chunk_critic
 from accerl_lerobot.trainer.batch import NonFiniteError
 from accerl_lerobot.trainer.chunk_critic import ChunkCriticUpdate, Critic
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.memory import Memory
 from accerl_lerobot.trainer.off_policy import OffPolicyUpdate
+from tests.replay.segments import make_segment
 from tests.runs import tiny_run
 
 GAMMA = 0.9
@@ -39,7 +41,9 @@ def episode(rewards: list[float], *, first: float = 0.0, actions: np.ndarray | N
     """An episode whose environment state counts its decisions from `first`."""
     t = len(rewards)
     counts = first + np.arange(t + 1, dtype=np.float32)
-    return Segment(
+    return make_segment(
+        str(first),
+        t,
         observations={
             "observation.state": np.zeros((t + 1, 4), np.float32),
             "observation.images.front": np.zeros((t + 1, 32, 32, 3), np.uint8),
@@ -47,16 +51,11 @@ def episode(rewards: list[float], *, first: float = 0.0, actions: np.ndarray | N
         },
         task="Match the target",
         latent={},
-        log_prob=np.zeros((t, 4), np.float32),
-        value=np.zeros(t, np.float32),
         actions=np.zeros((t, 4, 2), np.float32) if actions is None else actions,
         reward=np.array(rewards, np.float32),
-        version=np.zeros(t, np.int64),
         steps=np.full(t, 4),
         terminated=True,
-        truncated=False,
         success=rewards[-1] > 0,
-        key=str(first),
         origin=Origin("match", 0, 0),
         episode={"return": sum(rewards)},
     )
@@ -170,7 +169,7 @@ class TestActing:
         assert adapter.teacher is not None
         observation = requests(adapter, 1)[0].observation
         asked = [
-            Request(observation=observation, noise_seed=noise_seed(episode, 0, decision), explore=explore)
+            Request(observation=observation, noise_seed=noise_seed(episode, decision), explore=explore)
             for episode in range(200)
             for decision in (0, 1)
             for explore in (True, False)
@@ -247,9 +246,7 @@ def test_imitation_is_flow_matching():
     family = FlowFamily(model, FlowSamplerConfig())
     for off in (0.0, 1.0):
         velocity = lambda x, t, off=off: (x - target) / t[:, None, None] + off  # noqa: E731
-        encoded = Encoded(
-            features=torch.zeros(64, 1, 1), mask=torch.ones(64, 1), context=FlowContext(velocity=velocity)
-        )
+        encoded = Encoded(features=torch.zeros(64, 1, 1), mask=torch.ones(64, 1), context=velocity)
         loss = family.imitation_loss(encoded, target[:, :3, :2])
         torch.testing.assert_close(loss, torch.full((64,), off), atol=1e-3, rtol=1e-3)
 
@@ -264,10 +261,11 @@ def first_action(update: OffPolicyUpdate) -> float:
 
 
 @pytest.mark.slow
-def test_teacher_and_policy_go_where_the_critic_leads(tiny_checkpoint: Path):
+def test_teacher_and_policy_go_where_the_critic_leads(tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch):
     """Reward is how far the first action goes up; the state says nothing."""
     torch.manual_seed(0)
-    algorithm = ChunkCriticConfig(critic_steps=6.0, policy_steps=0.5, imitation=0.0)
+    monkeypatch.setattr(chunk_critic, "IMITATION", 0.0)
+    algorithm = ChunkCriticConfig(critic_steps=6.0, policy_steps=0.5)
     update = learner(tiny_checkpoint, algorithm, lr=1e-3, value_lr=1e-3, value_warmup_updates=2)
     rng, metrics = np.random.default_rng(0), {}
     before = first_action(update)
@@ -285,11 +283,12 @@ def test_teacher_and_policy_go_where_the_critic_leads(tiny_checkpoint: Path):
     assert metrics["explained_variance"] > 0.5 and metrics["memory_decisions"] == 10 * 32
 
 
-def test_a_success_holds_the_teacher_near_it(tiny_checkpoint: Path):
+def test_a_success_holds_the_teacher_near_it(tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch):
     distances = []
     for imitation in (0.0, 50.0):
         torch.manual_seed(0)
-        update = learner(tiny_checkpoint, ChunkCriticConfig(imitation=imitation, policy_steps=0.0))
+        monkeypatch.setattr(chunk_critic, "IMITATION", imitation)
+        update = learner(tiny_checkpoint, ChunkCriticConfig(policy_steps=0.0))
         rng, metrics = np.random.default_rng(0), {}
         for _ in range(4):
             actions = rng.uniform(-1, 1, (16, 1, 4, 2)).astype(np.float32)

@@ -118,16 +118,6 @@ def test_nothing_is_probed_when_it_is_off_nor_after_the_last_update():
     assert readings(update, 3) == [1] and not update._probe._copy
 
 
-def test_the_copy_is_freed_when_it_has_been_read():
-    update = make_update()
-    assert update._probe._copy
-    update.step(fresh(update))
-    assert not update._probe._copy
-    update.step(fresh(update))
-    update.step(fresh(update))
-    assert update._probe._copy
-
-
 def test_a_version_that_never_acted_is_given_up_for_the_newest():
     update = make_update()
     later = [decided_by(update.adapter, make_segments((4, 4, 4), seed=i), 0) for i in range(2)]
@@ -172,16 +162,6 @@ def moved(adapter: LinearAdapter, by: float) -> None:
     with torch.no_grad():
         for parameter in adapter.trainable().values():
             parameter.add_(by)
-
-
-def test_log_probs_are_those_of_the_copied_weights_whatever_happens_to_the_live_ones():
-    adapter, part = LinearAdapter(), whole(make_segments(LENGTHS))
-    probe = Probe(adapter, CONFIG)
-    then = adapter.evaluate(*part).log_prob.detach()
-    for _ in range(2):
-        moved(adapter, 0.3)
-        assert torch.equal(probe.log_prob(part), then)
-        assert not torch.equal(adapter.evaluate(*part).log_prob, then)
 
 
 def test_the_live_weights_are_back_afterwards_in_their_own_memory():

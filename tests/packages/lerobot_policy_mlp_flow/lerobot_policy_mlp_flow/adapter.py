@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from accerl_lerobot.policies.family import Encoded
-from accerl_lerobot.policies.flow import FlowContext, FlowModel, FlowShape
+from accerl_lerobot.policies.flow import FlowModel, FlowShape
 
 
 class MLPFlow(FlowModel):
@@ -31,8 +31,5 @@ class MLPFlow(FlowModel):
         return Encoded(
             features=features[:, None],  # one token, for the critic
             mask=torch.ones(len(features), 1, dtype=torch.bool, device=features.device),
-            context=FlowContext(velocity=velocity),
+            context=velocity,
         )
-
-    def stock(self, batch: dict[str, Tensor], noise: Tensor) -> Tensor:
-        return self.policy.predict_action_chunk(batch, noise=noise)
