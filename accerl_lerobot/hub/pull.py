@@ -3,16 +3,14 @@
 
 Files are fetched into a folder beside the one that was asked for, which keeps what an interrupted pull has
 fetched, and is renamed when it has been checked. The server is not trusted: no name that it lists leads out
-of that folder, no file may be longer than it says, and nothing that came may let code run.
+of that folder, every file must have its size and hash, and nothing that came may let code run.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import re
 import shutil
-import unicodedata
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
@@ -42,22 +40,14 @@ from accerl_lerobot.hub.card import (
     PullConfig,
     recognise,
 )
-from accerl_lerobot.hub.errors import (
-    ANSWERS_MOST,
-    ANSWERS_S,
-    REQUESTS_MOST,
-    SLOWEST,
-    check_commit,
-    hub_errors,
-)
+from accerl_lerobot.hub.errors import check_commit, hub_errors
 
 CACHE, ATTRIBUTES = ".cache", ".gitattributes"
 """Folder in which the client keeps its books while it fetches, and git's own file."""
 CODE = (".py", ".pyc", ".pyd", ".so")
 """Suffixes of files that Python imports: a recipe beside one could name it as ``discover_packages_path``."""
-FILES_MOST, SIZE_MOST = 100_000, 2**53
+FILES_MOST = 100_000
 THREADS = 8
-SHA256 = re.compile(r"[0-9a-f]{64}")
 BROKEN = (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError)
 """Errors of reading JSON that is not what it should be."""
 
@@ -69,16 +59,14 @@ def pull(config: PullConfig) -> dict[str, Any]:
     """
     repo_id, home = config.repo_id, expanded(config.output_dir, "output_dir").absolute()
     check_absent(home)
-    with hub_errors(repo_id, config.revision, writing=False) as limits:
+    with hub_errors(repo_id, config.revision, writing=False):
         repo_type, commit = _resolve(HfApi(), config)
         listed = HfApi().list_repo_tree(repo_id, recursive=True, revision=commit, repo_type=repo_type)
-        files = {file.path: file for file in _checked(listed, repo_id)}
+        files = _checked(listed, repo_id)
         # Named after the commit, so that an interrupted pull resumes and no other one's files are in it.
         temporary = home.parent / f".pulling-{commit[:16]}-{home.name}"
-        size = sum(file.size for file in files.values())
-        _make_room(home, temporary, size)
-        limits.set(ANSWERS_MOST + 2 * size, REQUESTS_MOST + 20 * len(files), ANSWERS_S + size / SLOWEST)
-        # Names have been checked; `snapshot_download` would ask for them again.
+        _make_room(home, temporary, sum(file.size for file in files.values()))
+        # `snapshot_download` would ask for the names again, and these have been checked.
         temporary.mkdir(exist_ok=True)
         pool = ThreadPoolExecutor(THREADS)
         options = {"repo_type": repo_type, "revision": commit, "local_dir": temporary}
@@ -91,13 +79,12 @@ def pull(config: PullConfig) -> dict[str, Any]:
         record = _receive(temporary, home, files, repo_id) | record
         (temporary / RECORD).write_text(json.dumps(record, indent=2) + "\n")
         temporary.rename(home)
-    except InputError:
-        shutil.rmtree(temporary)  # resuming would not make it better
-        raise
     except OSError as error:
         raise _not_writable(home, error) from error
     except BROKEN as error:
-        shutil.rmtree(temporary)
+        shutil.rmtree(temporary)  # resuming would not make it better
+        if isinstance(error, InputError):
+            raise
         why = f"one of its files is not what its name says ({type(error).__name__}: {brief(error)})"
         raise InputError("repo_id", repo_id, f"{why}; push it anew") from error
     return record | {"path": str(home)}
@@ -119,47 +106,23 @@ def _resolve(api: HfApi, config: PullConfig) -> tuple[str, str]:
     ((repo_type, commit),) = commits.items()
     if config.revision is not None:
         commit = api.repo_info(repo_id, repo_type=repo_type, revision=config.revision).sha
-    return repo_type, check_commit(commit, repo_id)
+    return repo_type, check_commit(commit)
 
 
-def _checked(listed: Iterable[Any], repo_id: str) -> list[RepoFile]:
-    """Files that a server lists, once all names, sizes and hashes are good."""
+def _checked(listed: Iterable[Any], repo_id: str) -> dict[str, RepoFile]:
+    """Files that a server lists, by name; one with which it could write elsewhere is refused."""
     files = list(islice((item for item in listed if isinstance(item, RepoFile)), FILES_MOST + 1))
     if len(files) > FILES_MOST:
         raise InputError("repo_id", repo_id, f"it has more than {FILES_MOST} files; split it")
     for file in files:
-        digest, pattern = (file.lfs.sha256, SHA256) if file.lfs else (file.blob_id, REVISION)
-        good = isinstance(file.path, str) and type(file.size) is int and 0 <= file.size <= SIZE_MOST
-        if not good or not isinstance(digest, str) or not pattern.fullmatch(digest):
-            size, digest = str(file.size)[:40], ascii(digest)[:80]
-            why = f"{ascii(file.path)[:99]} is listed with size {size} and hash {digest}"
-            raise InputError("repo_id", repo_id, f"{why}, which no file has; use another server")
-    names = [file.path for file in files]
-    _check_names([*names, *({RECORD} - set(names))], repo_id)
-    return files
-
-
-def _check_names(names: Iterable[str], repo_id: str) -> None:
-    """Refuses names by which a server could write elsewhere, or write one file over another."""
-    files: set[str] = set()
-    folders: dict[str, str] = {}
-    for name in names:
-        parts = PurePosixPath(name).parts if not unsafe_name(name) else ()
+        name, parts = file.path, PurePosixPath(file.path).parts if not unsafe_name(file.path) else ()
         if not parts or name != "/".join(parts) or parts[0] in (CACHE, ".git") or "." in parts:
             why = f"it has a file named {ascii(name)[:200]}, which is not safe to write"
             raise InputError("repo_id", repo_id, why)
-        above = ["/".join(parts[:depth]) for depth in range(1, len(parts))]
-        clash = (same := _folded(name)) in files or same in folders
-        clash |= any(_folded(f) in files or folders.setdefault(_folded(f), f) != f for f in above)
-        if clash:
-            why = f"{ascii(name)[:200]} and another file of it cannot both be written"
+        if type(file.size) is not int or file.size < 0:
+            why = f"{ascii(name)[:99]} is listed with size {str(file.size)[:40]}; use another server"
             raise InputError("repo_id", repo_id, why)
-        files.add(same)
-
-
-def _folded(name: str) -> str:
-    """The name as a file system that ignores case, or composes letters, takes it."""
-    return unicodedata.normalize("NFC", name.casefold())
+    return {file.path: file for file in files}
 
 
 def _make_room(home: Path, temporary: Path, size: int) -> None:

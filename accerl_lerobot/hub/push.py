@@ -121,8 +121,8 @@ def _upload(config: PushConfig, artifact: str, files: Files, own_card: bool) -> 
         logger.warning("the README.md on the Hub is left as it is, somebody wrote it")
         files[CARD] = card
     entries = {name: layout.entry(content) for name, content in files.items() if name != CARD}
-    manifest = {"format": MANIFEST_FORMAT, "kind": artifact, "files": dict(sorted(entries.items()))}
-    files = files | {MANIFEST: (json.dumps(manifest, indent=1) + "\n").encode()}
+    manifest = layout.manifest_text(entries, format=MANIFEST_FORMAT, kind=artifact)
+    files = files | {MANIFEST: manifest.encode()}
     operations = [CommitOperationAdd(name, content) for name, content in files.items()]
     gone = previous - files.keys()
     gone &= set(api.list_repo_files(revision=parent, **where)) if gone else set()
@@ -160,7 +160,7 @@ def _parent(api: HfApi, config: PushConfig, artifact: str) -> str:
     if config.private and info.private is False:
         remedy = "this repository is public: add --private=false, or choose another name"
         raise InputError("private", True, remedy)
-    return check_commit(info.sha, repo_id)
+    return check_commit(info.sha)
 
 
 def _previous_files(manifest: bytes | None, artifact: str, repo_id: str) -> set[str]:
