@@ -24,7 +24,7 @@ from huggingface_hub.hf_api import RepoFile
 
 from accerl_lerobot.checkpoint import layout
 from accerl_lerobot.checkpoint.layout import CHECKPOINTS, PRETRAINED, relocate
-from accerl_lerobot.checkpoint.safety import REVISION, brief, unsafe_name
+from accerl_lerobot.checkpoint.safety import brief, unsafe_name
 from accerl_lerobot.config.parsing import drop_consents, read_recipe
 from accerl_lerobot.engine.stopping import LOCK
 from accerl_lerobot.errors import InputError, check_absent, expanded
