@@ -51,8 +51,7 @@ def bench_latency(config: BenchLatencyConfig) -> dict[str, Any]:
     """Plays and times.
 
     Returns:
-        ``decision_ms`` and ``reset_ms`` (None without any), see `described`; ``neighbours`` (correlation of
-        one decision's duration with the next, None where they do not vary), ``trace`` (the file), ``config``
+        ``decision_ms`` and ``reset_ms`` (None without any), see `described`; ``trace`` (the file), ``config``
         and ``host``.
     """
     console, root = Console(), output_folder(config.output_dir)
@@ -64,12 +63,9 @@ def bench_latency(config: BenchLatencyConfig) -> dict[str, Any]:
     finally:
         world.close()
     decisions, resets = (np.asarray([s for s, reset in lines if reset is kind]) for kind in (False, True))
-    one, other = decisions[:-1], decisions[1:]
-    varied = len(one) > 1 and one.std() > 0 and other.std() > 0
     result = {
         "decision_ms": described(decisions),
         "reset_ms": described(resets) if len(resets) else None,
-        "neighbours": float(np.corrcoef(one, other)[0, 1]) if varied else None,
         "trace": str(root / TRACE),
         "config": asdict(config),
         "host": host(),

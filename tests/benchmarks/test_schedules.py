@@ -10,12 +10,10 @@ from pathlib import Path
 import pytest
 
 from accerl_lerobot.bench import Processors, host, spread
-from accerl_lerobot.bench.throughput import BenchThroughputConfig, Block, bench_throughput, books
+from accerl_lerobot.bench.throughput import BenchThroughputConfig, Block, bench_throughput
 from accerl_lerobot.bench.throughput import table as throughput_table
 from accerl_lerobot.console import Console
-from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.rollout.runner import RolloutConfig
 from benchmarks import async_vs_sync
 from benchmarks.async_vs_sync import ARMS, BenchAsyncVsSyncConfig, bench_async_vs_sync
 from benchmarks.async_vs_sync import compare as compare_schedules
@@ -90,16 +88,6 @@ def test_efficiency_is_relative_to_the_first_count():
     assert found[1]["bound"] == pytest.approx(2 * found[0]["bound"])
 
 
-def test_books_that_do_not_add_up_are_an_error():
-    run = RunConfig(rollout=RolloutConfig(workers=2, worlds=2, segment_length=4))
-    rollout = {"decisions": 100.0, "dropped_nonfinite": 3.0}
-    found = books(run, rollout, {"inserted_decisions": 90.0, "dropped_nonfinite": 1.0})
-    assert found == {"generated": 100.0, "committed": 90.0, "dropped": 4.0, "under_way": 6.0}
-    for inserted in (20.0, 170.0):
-        with pytest.raises(RuntimeError, match="missing, or there twice"):
-            books(run, rollout, {"inserted_decisions": inserted, "dropped_nonfinite": 0.0})
-
-
 @pytest.mark.slow
 def test_a_small_run_of_everything(light_ray: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     small = {"worlds": 2, "latency_ms": 5.0, "update_ms": 20.0, "image_size": 16, "decide_ms": 1.0}
@@ -160,7 +148,7 @@ def test_a_recipe_is_measured_under_two_schedules(tiny_checkpoint: Path, tmp_pat
     assert [len(found["blocks"]) for found in result["schedules"].values()] == [2, 2]
     assert all(found["decisions_per_s"]["min"] > 0 for found in result["schedules"].values())
     shown = throughput_table(result)
-    assert " decisions generated = " in str(shown.title) and shown.row_count == 2
+    assert shown.row_count == 2
 
 
 def test_the_machine_is_described():
