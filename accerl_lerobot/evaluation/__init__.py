@@ -7,7 +7,7 @@ A rate is never reported without n and an interval.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -206,19 +206,13 @@ def success_curve(
         axes.legend(loc="lower right")
 
 
-def write_video(
-    path: Path,
-    rows: Sequence[Sequence[Sequence[np.ndarray]]],
-    fps: int,
-    above: Callable[[int], np.ndarray] | None = None,
-) -> None:
-    """Writes a grid of clips; one that ends early holds its last frame.
+def write_video(path: Path, rows: Sequence[Sequence[Sequence[np.ndarray]]], fps: int) -> None:
+    """Writes a grid of clips as MP4; one that ends early holds its last frame.
 
     Args:
-        path: .mp4 to write.
-        rows: rows of clips, as many in each; frames of a clip are uint8 (H, W, 3), all of one size in a row.
+        path: file to write.
+        rows: rows of clips, of equal width; frames of a clip are uint8 (H, W, 3), all of one height in a row.
         fps: frames per second.
-        above: number of a frame → what is put above the grid in it, as wide as that.
     """
     import imageio.v2 as imageio
 
@@ -230,7 +224,7 @@ def write_video(
     with writer:
         for i in range(length + fps):
             lines = [_joined([clip[min(i, len(clip) - 1)] for clip in row], axis=1) for row in rows]
-            picture = _joined([*([] if above is None else [above(i)]), *lines], axis=0)
+            picture = _joined(lines, axis=0)
             writer.append_data(picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2])
 
 
@@ -242,9 +236,9 @@ def before_after(
 ) -> None:
     """Films the same episodes twice, before training on the left and after it on the right.
 
-    Above each half stand the evaluation's numbers, and how many of the filmed episodes have succeeded so far;
-    the frame of an episode that has ended is green for a success and red for a failure. Nothing is written
-    when no episode was filmed. `before` and `after` are results of the same plans, and their summaries.
+    Above each half stand the evaluation's numbers; the frame of an episode that has ended is green for a
+    success and red for a failure. Nothing is written when no episode was filmed. `before` and `after` are
+    results of the same plans, and their summaries.
     """
     filmed = [{r.plan.index: r for r in results if r.frames} for results, _ in (before, after)]
     both = sorted(filmed[0].keys() & filmed[1].keys())
@@ -252,25 +246,16 @@ def before_after(
         return
     columns = math.ceil(math.sqrt(len(both)))
     blank = np.full_like(filmed[0][both[0]].frames[0], 255)
-    gap = np.full((len(blank), 2 * GAP, 3), 255, np.uint8)
-    halves = [
-        [_with_outcome(half[i].frames, half[i].success) for i in both]
-        + [[blank]] * (-len(both) % columns)
-        for half in filmed
-    ]  # fmt: skip
-    left, right = ([half[i : i + columns] for i in range(0, len(half), columns)] for half in halves)
-    rows = [[*one, [gap], *two] for one, two in zip(left, right, strict=True)]
     width = columns * (blank.shape[1] + GAP) - GAP
-
-    def above(number: int) -> np.ndarray:
-        lines = []
-        for name, half, (_, summary) in zip(("before", "after"), filmed, (before, after), strict=True):
-            ended = sum(half[i].success and number >= len(half[i].frames) for i in both)
-            count = f"{ended} of these {len(both)} succeeded"
-            lines.append([f"{name} RL: {_rate_text(summary)}", count])
-        return _caption(lines, width, gap.shape[1] + 2 * GAP)
-
-    write_video(path, rows, fps, above)
+    halves = []
+    for name, half, (_, summary) in zip(("before", "after"), filmed, (before, after), strict=True):
+        clips = [_with_outcome(half[i].frames, half[i].success) for i in both]
+        clips += [[blank]] * (-len(both) % columns)
+        lines = [clips[i : i + columns] for i in range(0, len(clips), columns)]
+        halves.append([[[_caption(f"{name} RL: {_rate_text(summary)}", width)]], *lines])
+    between = [np.full((len(left[0][0]), 2 * GAP, 3), 255, np.uint8) for left in halves[0]]
+    rows = [[*left, [gap], *right] for left, gap, right in zip(halves[0], between, halves[1], strict=True)]
+    write_video(path, rows, fps)
 
 
 def _rate_text(summary: dict[str, Any] | None) -> str:
@@ -280,23 +265,13 @@ def _rate_text(summary: dict[str, Any] | None) -> str:
     return f"{summary['success']:.0%} success [{low:.0%}, {high:.0%}], n = {summary['n']}"
 
 
-def _caption(halves: Sequence[Sequence[str]], width: int, gap: int) -> np.ndarray:
-    """Lines of black text over each half of a picture, 8 to 20 pixels high, as large as they fit.
-
-    Width of a half, and the gap between them, are in pixels.
-    """
+def _caption(text: str, width: int) -> np.ndarray:
+    """Black text, 8 to 20 pixels high, in a picture as wide as asked."""
     from PIL import Image, ImageDraw, ImageFont
 
-    longest = max((line for lines in halves for line in lines), key=len)
-    size = 20
-    while size > 8 and ImageFont.load_default(size).getlength(longest) > width - 8:
-        size -= 1
-    step, font = size + 6, ImageFont.load_default(size)
-    image = Image.new("RGB", (len(halves) * (width + gap) - gap, step * len(halves[0]) + 6), "white")
-    draw = ImageDraw.Draw(image)
-    for half, lines in enumerate(halves):
-        for i, line in enumerate(lines):
-            draw.text((half * (width + gap) + 4, 4 + step * i), line, fill="black", font=font)
+    font = ImageFont.load_default(min(20, max(8, 2 * width // len(text))))
+    image = Image.new("RGB", (width, round(font.size) + 12), "white")
+    ImageDraw.Draw(image).text((4, 4), text, fill="black", font=font)
     return np.asarray(image)
 
 

@@ -93,14 +93,14 @@ class TestVideo:
         captions: list[Any] = []
         caption = evaluation._caption
         monkeypatch.setattr(
-            evaluation, "_caption", lambda halves, *sizes: captions.append(halves) or caption(halves, *sizes)
+            evaluation, "_caption", lambda text, width: captions.append(text) or caption(text, width)
         )
         numbers = evaluated(0, 46, 100), evaluated(1, 98, 100)
         before_after(tmp_path / "film.mp4", (before, numbers[0]), (after, numbers[1]), fps=4)
         film = read(tmp_path / "film.mp4").astype(int)
         half = 2 * 64 + GAP
         head = film.shape[1] - GAP - half
-        assert 20 < head < 60 and film.shape[2] == 2 * half + 4 * GAP
+        assert 15 < head < 60 and film.shape[2] == 2 * half + 4 * GAP
 
         def edge(frame: int, row: int, column: int) -> str:
             top, left = (
@@ -114,9 +114,9 @@ class TestVideo:
         ends = [edge(-1, r, c) for r in (0, 1) for c in range(4)]
         assert ends == ["green", "red", "green", "green", "red", "none", "red", "none"]
         assert (film[:, head + GAP + 80 :, 80:half] > 150).all(), "no fourth episode"
-        assert captions[0][0] == ["before RL: 46% success [37%, 56%], n = 100", "0 of these 3 succeeded"]
-        assert captions[-1][0][1] == "1 of these 3 succeeded"
-        assert captions[-1][1] == ["after RL: 98% success [93%, 99%], n = 100", "2 of these 3 succeeded"]
+        assert captions == [
+            "before RL: 46% success [37%, 56%], n = 100", "after RL: 98% success [93%, 99%], n = 100",
+        ]  # fmt: skip
 
     def test_without_frames_there_is_no_video(self, tmp_path: Path) -> None:
         before_after(tmp_path / "film.mp4", ([], None), ([], None), fps=4)
