@@ -31,7 +31,6 @@ SMOLVLM2_500M = BackboneSizes(
     vision_hidden=768, vision_layers=12, vision_heads=12, vision_intermediate=3072,
     patch=16, image=512, shuffle=4,
 )  # fmt: skip
-"""The sizes of SmolVLM2-500M, the backbone of ``lerobot/smolvla_base``."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -46,9 +46,7 @@ class Block:
     batch_size: float
     """Observations of a forward pass."""
     inference_busy: float
-    """Share of its time in which the inference worker decided."""
     processors: float
-    """Busy share of all cores, whoever used them."""
 
 
 class Measured:

@@ -30,14 +30,11 @@ from accerl_lerobot.fault_points import fault_point
 
 PRETRAINED, TRAINING_STATE, WORLD_MODEL = "pretrained_model", "training_state", "world_model"
 CHECKPOINTS, DEMOS = "checkpoints", "demos"
-"""Folders of a run: its checkpoints, and demonstrations that it has recorded."""
 CONFIG, SUMMARY = "config.yaml", "summary.json"
-"""Files of a run: its config, and its results once it has ended."""
 MANIFEST, LAST = "manifest.json", "last"
 KEEP = 2
 """Newest checkpoints that can be resumed from; the others keep their policies only."""
 WRITING, REPLACED = ".writing-", ".replaced-"
-"""Prefixes of checkpoints that are being written, and of those that are being replaced."""
 RUN_STATE, WEIGHTS = "run", "weights"
 """Names of states in `TRAINING_STATE`: the progress of the run, and the exact trained weights."""
 STEP = "training_step.json"
@@ -58,7 +55,6 @@ STEP_FOLDERS = {
 }
 """LeRobot processor step → its option that names files, and our folder for them."""
 PREPROCESSOR = "policy_preprocessor.json"
-"""LeRobot's file of the processor steps before the policy."""
 
 
 def save_checkpoint(checkpoints: Path, write: Callable[[Path], int]) -> Path:

@@ -48,9 +48,7 @@ class Origin:
     """
 
     field: str
-    """Dotted name of the field that named it."""
     value: str | None
-    """Value that it returned."""
 
     def refuse(self, file: str, why: str) -> InputError:
         """The error to raise: a file or a key in it, and what is wrong and what to do."""
@@ -82,7 +80,6 @@ def _check_link(path: Path, root: Path, name: str, origin: Origin) -> None:
 
 
 RUN_FILES = {".yaml", ".json", ".jsonl", ".bin", ".safetensors"}
-"""Suffixes of a run's files."""
 
 
 def check_folder(folder: Path, origin: Origin) -> None:

@@ -29,7 +29,6 @@ class BackboneSizes:
     hidden: int = 96
     """Width of the language model; a multiple of 2·`heads`."""
     layers: int = 2
-    """Language-model layers; the action expert has as many."""
     heads: int = 4
     kv_heads: int = 2
     """Key and value heads; a divisor of `heads`."""

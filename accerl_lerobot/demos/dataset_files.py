@@ -43,10 +43,8 @@ INFO, STATS, TASKS, EPISODES, DATA = (
 )  # fmt: skip
 STATS_MOST = 32 * MIB
 SIDE_MOST = 8192
-"""Pixels of an image's side."""
 INDEX = r"\{(chunk_index|file_index)(:0?[1-9]?d)?\}"
 PLACES = {"data_path": INDEX, "video_path": rf"{INDEX}|\{{video_key\}}"}
-"""Key of ``info.json`` → the placeholders that its template may have."""
 COUNTS = ("total_episodes", "total_frames", "total_tasks")
 DTYPES = {
     "image", "video", "string", "bool", "language", "int8", "int16", "int32", "int64", "uint8", "uint16",

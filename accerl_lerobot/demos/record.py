@@ -69,11 +69,8 @@ class Episode:
     actions: np.ndarray
     """float32 (T, A), as executed: noise included, clipped to the world's bounds."""
     rewards: np.ndarray
-    """float32 (T,)."""
     task: str
-    """The instruction text."""
     done: bool
-    """True if the last step ended the episode."""
     success_at: int
     """Index of the first step after which the task was achieved; -1 for never."""
     seed: int

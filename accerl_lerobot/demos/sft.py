@@ -32,7 +32,6 @@ from accerl_lerobot.policies.config import discovery, register_policies
 logger = logging.getLogger(__name__)
 
 CODE_REVISION = "--code_revision="
-"""Our argument of the trainer."""
 HELD_OUT = re.compile(r"\bstep (\d+): eval_loss=(\S+)")
 """LeRobot's report of a loss on held-out episodes."""
 CANDIDATES = 10
@@ -40,7 +39,6 @@ CANDIDATES = 10
 REFUSED = "accerl refuses: "
 """Begins the last line of a trainer that met something it must not use; JSON follows."""
 LOG_EVERY = 25
-"""Optimiser steps between two lines of progress."""
 NO_SFT = {"gaussian_actor": "only LeRobot's SAC trains it, lerobot-train does not; use act"}
 """LeRobot policy types that ``lerobot-train`` cannot fine-tune → why, and what to do."""
 

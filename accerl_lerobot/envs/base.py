@@ -103,7 +103,6 @@ class Step(NamedTuple):
     """Outcome of one env step."""
 
     success: bool
-    """True if the task is achieved now."""
     ended: bool
     """True if the task is over, which `success` alone need not mean."""
     reward: float | None = None

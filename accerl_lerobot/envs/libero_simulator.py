@@ -26,7 +26,6 @@ SETTLING = 10
 MAX_OBJECTS = 4
 """Most objects that a task names as those it is about."""
 MAX_FACES = 2000
-"""Faces that ``rendering=fast`` keeps of a mesh."""
 ARENA = "64M"
 """Memory of a simulation's contacts and constraints; some 6 MB are used."""
 ROBOT_NUMBERS, OBJECT_NUMBERS = 25, 8

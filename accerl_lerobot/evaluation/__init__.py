@@ -161,9 +161,7 @@ def evaluation_plans(
 
 
 GAP = 4
-"""Pixels of white between two clips."""
 BORDER = 5
-"""Width, in pixels, of the frame that tells how an episode ended."""
 
 
 @contextmanager

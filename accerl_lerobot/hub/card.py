@@ -47,7 +47,6 @@ NEEDED = {
     DATASET: (INFO, "meta/tasks.parquet", "meta/episodes", "data"),
     RUN: (RECIPE, SUMMARY, LAST),
 }
-"""Artifact type → files and folders that it has at least."""
 CODEBASE_VERSION = "v3.0"
 """Version of LeRobotDatasets, and the tag under which LeRobot looks for them on the Hub."""
 REPO_ID = r"(?=.{3,192}\Z)(?!.*\.\.)[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*"

@@ -43,13 +43,11 @@ from accerl_lerobot.hub.card import (
 from accerl_lerobot.hub.errors import check_commit, hub_errors
 
 CACHE, ATTRIBUTES = ".cache", ".gitattributes"
-"""Folder in which the client keeps its books while it fetches, and git's own file."""
 CODE = (".py", ".pyc", ".pyd", ".so")
 """Suffixes of files that Python imports: a recipe beside one could name it as ``discover_packages_path``."""
 FILES_MOST = 100_000
 THREADS = 8
 BROKEN = (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError)
-"""Errors of reading JSON that is not what it should be."""
 
 
 def pull(config: PullConfig) -> dict[str, Any]:

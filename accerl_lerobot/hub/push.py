@@ -59,7 +59,6 @@ logger = logging.getLogger(__name__)
 BRANCH = "main"
 NOT_CONTENTS = (CARD, MANIFEST, RECORD, ".gitattributes")
 RESULTS = (".yaml", ".json", ".jsonl", ".png", ".jpg", ".gif", ".svg", ".mp4", ".html")
-"""Suffixes of files at the top of a run that are pushed."""
 WEIGHTS = (".safetensors", ".bin", ".pt", ".pth")
 RECORDS = (".json", ".jsonl", ".yaml", ".yml", ".md", ".txt", ".log", ".csv", ".html")
 VOCABULARIES = ("tokenizer.json", "vocab.json", "merges.txt", "added_tokens.json", "special_tokens_map.json")

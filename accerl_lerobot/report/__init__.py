@@ -23,7 +23,6 @@ from accerl_lerobot.errors import InputError, check_output, expanded
 
 NAME = "report.html"
 VIDEO_MB = 20
-"""Videos up to so many megabytes each are put into the page, larger ones are linked."""
 MARK = '<meta name="generator" content="accerl report'
 """Tells a page of ours from any other file; within its first 1000 characters."""
 

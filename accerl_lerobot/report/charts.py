@@ -15,7 +15,6 @@ import numpy as np
 from accerl_lerobot.console import number, percent
 
 POINTS = 100
-"""Points of a line at most, see `line`."""
 COLOURS = ("#1f5fd6", "#d9570b", "#0b8a7d", "#9a3fc2", "#5c8a0a", "#c2255c", "#8a5a12", "#7b8494")
 TEXT, GRID = "#586172", "#e9ecf1"
 STYLE = {
@@ -47,16 +46,13 @@ class Chart:
 
     title: str
     note: str
-    """Meaning of the chart, one sentence."""
     x_label: str
     series: Sequence[Series]
     unit: str = ""
     limit: float | None = None
-    """A value that is drawn as a dashed line across."""
     bottom: float | None = None
     top: float | None = None
     share: bool = False
-    """True if y is a share, shown in per cent."""
     bands: bool = True
     """False draws no bands and intervals, which hide each other where there are many series."""
     wide: bool = False

@@ -22,7 +22,6 @@ from accerl_lerobot.timeline import STATES
 from accerl_lerobot.timeline.read import read_timeline
 
 RECENT_S = 120.0
-"""A run that has written something since is taken to be still going."""
 FEW = 25
 """Exploring episodes below which their success says nothing; the first to end are the short ones."""
 STATE_COLOURS = dict(zip(STATES, (0, 7, 1, 3, 2, 6, 5, 4, 4), strict=True))

@@ -44,11 +44,9 @@ class Run:
     result: Record | None
     """summary.json; None: not finished."""
     truncated: bool
-    """True if the last line of metrics.jsonl is incomplete."""
     sessions: int
     """1 + the number of times that it was resumed."""
     written: float
-    """When something was last written, in seconds since 1970."""
     videos: tuple[Path, ...]
 
     @property

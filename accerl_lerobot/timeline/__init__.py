@@ -35,9 +35,7 @@ STATES = (
     len(STATES)
 )
 ROLES = ("driver", "local", "rollout", "imagination", "inference", "replay", "trainer", "world learning")
-"""In the order in which they are shown."""
 TIMELINE = "timeline"
-"""Name of the folder in a run's."""
 
 
 def role_of(worker: str) -> str:
@@ -52,9 +50,7 @@ def bubble(shares: Mapping[str, float]) -> float:
 
 FORMAT = 1
 BITS = 4
-"""Bits of an entry that hold the state."""
 BATCH = 512
-"""Entries that are written at once."""
 FLUSH_NS = 1_000_000_000
 """An entry is on its way to the disk after so long, if another follows or `Clock.beat` is called."""
 PART_BYTES = 4_000_000
@@ -64,14 +60,11 @@ BOOT = Path("/proc/sys/kernel/random/boot_id")
 
 
 class Moment(NamedTuple):
-    """A moment by two clocks."""
+    """A moment by the monotonic clock of a node and by the calendar, in nanoseconds."""
 
     node: str
-    """Whose monotonic clock it is."""
     clock_ns: int
-    """By that."""
     wall_ns: int
-    """By the calendar, in nanoseconds since 1970."""
 
 
 class Clock:

@@ -78,7 +78,6 @@ class Timeline:
 
     run: Path
     rows: tuple[Row, ...]
-    """By role, then by number."""
 
     @property
     def seconds(self) -> float:
@@ -210,7 +209,6 @@ def _place(row: Row) -> tuple[int, int, str]:
 
 
 PICTURE, TRACE = "timeline.png", "timeline.json"
-"""Names in a run's folder."""
 MARK = "accerl timeline"
 """In a picture's metadata: made by us, and may be replaced."""
 TRACE_S = 60.0
@@ -220,7 +218,6 @@ COLOURS = {
     "weights": "#9b5de5", "checkpoint": "#8d6e63", "recovery": "#d64545", "training": "#a8c8a0",
     "evaluation": "#7fb8c9",
 }  # fmt: skip
-"""State → its colour in the picture."""
 COLUMNS = 1600
 """Columns of the picture; an interval that is shorter than one colours it in proportion."""
 
