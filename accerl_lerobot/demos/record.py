@@ -97,7 +97,7 @@ def play(
 ) -> Episode:
     """Plays one episode to its end; equal arguments give equal episodes.
 
-    With `fail`, actions are a random drift from a random early step on. `noise` and `push`: see `DemosConfig`.
+    With `fail`, actions are a random drift from a random early step on; for the others see `DemosConfig`.
     """
     rng = np.random.default_rng((seed, 1))
     low, high = world.spec.action_low, world.spec.action_high
