@@ -26,7 +26,7 @@ from benchmarks.fault_injection import POINTS
 from benchmarks.faults import BenchFaultsConfig, bench_faults
 from benchmarks.hits import ANYWHERE, FAULTS, places
 from benchmarks.light_run import light_config
-from benchmarks.soak import BenchSoakConfig, compare, costs
+from benchmarks.soak import compare, costs
 from benchmarks.victims import CLASSES, LIGHT, Victim, await_hit, descendants, hit, title
 from tests.replay.segments import make_segment
 
@@ -119,22 +119,6 @@ def test_segments_that_counted_are_in_the_journal_once(kept: Path):
     assert not list(kept.glob(".*")), "nothing is left there"
 
 
-@pytest.mark.parametrize(
-    ("spoil", "lost", "doubled"),
-    [
-        (lambda lines: [lines[0], *lines[2:4], *lines[4:]], 0, 0),  # the last one moves into the place of b
-        (lambda lines: lines[:3], 1, 0),
-        (lambda lines: [lines[0], lines[0], *lines[2:]], 1, 1),
-    ],
-)
-def test_segments_that_are_missing_or_there_twice_are_found(kept: Path, spoil: Any, lost: int, doubled: int):
-    lines = (kept / EPISODES).read_bytes().splitlines(keepends=True)
-    (kept / EPISODES).write_bytes(b"".join(spoil(lines)))
-    found = audit_segments(kept)
-    lost = lost or 1  # b is stored and not in the journal
-    assert (found["segments_lost"], found["segments_doubled"]) == (lost, doubled)
-
-
 def test_every_point_is_somewhere_that_a_target_can_be_hit():
     targets = [*CLASSES, "driver", "everything"]
     found = {place for target in targets for fault in FAULTS for place in places(target, fault)}
@@ -144,20 +128,6 @@ def test_every_point_is_somewhere_that_a_target_can_be_hit():
     assert places("trainer", "nans") == places("trainer", "nan") == ["trainer.loss"]
     assert places("inference", "nans") == [], "a decision or two that replay refuses end nobody"
     assert ANYWHERE not in places("driver", "kill")[1:] and places("driver", "stop") == []
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"targets": ("everyone",)}, r"targets=\('everyone',\): use some of rollout, inference"),
-        ({"targets": ()}, "use some of"),
-        ({"faults": ("kill", "kill")}, "none twice"),
-        ({"targets": ("everything",), "faults": ("nan", "torn")}, "none of them can befall everything"),
-    ],
-)
-def test_what_cannot_be_done_is_refused(options: dict[str, Any], message: str):
-    with pytest.raises(InputError, match=message):
-        BenchFaultsConfig(**options)
 
 
 def test_nothing_is_begun_where_something_is(tmp_path: Path):
@@ -221,16 +191,3 @@ def test_a_soak_compares_each_block_with_its_neighbour():
     found = compare(blocks)
     assert found["left"]["updates"]["blocks"] == [0.9, 0.5]
     assert found["rates"]["decisions"]["quiet"]["median"] == 16 * 11.0
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"minutes": 3.0}, "minutes=3.0: use at least 4"),
-        ({"targets": ("driver",)}, "leave out driver"),
-        ({"targets": ("rollout", "replay"), "faults": ("nan",)}, "add kill"),
-    ],
-)
-def test_a_soak_that_says_nothing_is_refused(options: dict[str, Any], message: str):
-    with pytest.raises(InputError, match=message):
-        BenchSoakConfig(**options)
