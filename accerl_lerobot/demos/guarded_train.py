@@ -61,11 +61,6 @@ class CachedDataset(Dataset[Any]):
         return getattr(self._dataset, name)
 
 
-def item_bytes(meta: Any) -> int:
-    """Memory of one item's images, as float32."""
-    return sum(4 * math.prod(meta.features[key]["shape"]) for key in meta.camera_keys)
-
-
 def _adapted(stock: Any) -> Any:
     """LeRobot's function that makes datasets, without a simulator's state beside the images to train on, and
     with a `CachedDataset` where that is possible."""
@@ -75,8 +70,8 @@ def _adapted(stock: Any) -> Any:
         if train.meta.camera_keys:
             train.meta.features.pop(ENVIRONMENT_STATE, None)
         fixed = not cfg.dataset.image_transforms.enable and not cfg.dataset.streaming
-        size = item_bytes(train.meta) * cfg.policy.n_obs_steps
-        if fixed and len(train) * size <= MAX_BYTES:
+        item = sum(4 * math.prod(train.meta.features[key]["shape"]) for key in train.meta.camera_keys)
+        if fixed and len(train) * item * cfg.policy.n_obs_steps <= MAX_BYTES:
             train = CachedDataset(train)
         return train, evaluation
 

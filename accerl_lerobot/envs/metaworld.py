@@ -11,6 +11,7 @@ Also the offscreen OpenGL of every MuJoCo world: MuJoCo reads ``MUJOCO_GL`` once
 from __future__ import annotations
 
 import atexit
+import contextlib
 import ctypes
 import functools
 import importlib
@@ -132,8 +133,10 @@ def choose_backend() -> str | None:
         return None
     order = ("egl", "osmesa") if any(Path(node).exists() for node in _GPU_NODES) else ("osmesa", "egl")
     for backend in order:
-        if any(_loads(library) for library in _LIBRARIES[backend]):
-            return backend
+        for library in _LIBRARIES[backend]:
+            with contextlib.suppress(OSError):
+                ctypes.CDLL(library)
+                return backend
     raise InputError("MUJOCO_GL", "", REMEDY)
 
 
@@ -191,14 +194,6 @@ def _close_all() -> None:
 
 def _headless() -> bool:
     return sys.platform == "linux" and not any(os.environ.get(k) for k in ("DISPLAY", "WAYLAND_DISPLAY"))
-
-
-def _loads(library: str) -> bool:
-    try:
-        ctypes.CDLL(library)
-    except OSError:
-        return False
-    return True
 
 
 CAMERAS = ("topview", "corner", "corner2", "corner3", "corner4", "behindGripper", "gripperPOV")

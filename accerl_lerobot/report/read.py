@@ -248,9 +248,8 @@ def _default(field: dataclasses.Field[Any]) -> Any:
 def apart(trees: list[dict[str, Any]]) -> list[tuple[str, list[Any]]]:
     """Fields in which runs differ, with each run's value; a dash where one does not have it."""
     flats = [flat(tree) for tree in trees]
-    keys = dict.fromkeys(key for one in flats for key in one if key not in PLACES)
-    rows = [(key, [one.get(key, ABSENT) for one in flats]) for key in keys]
-    return [(key, values) for key, values in rows if any(v != values[0] for v in values)]
+    rows = {key: [one.get(key, ABSENT) for one in flats] for one in flats for key in one}
+    return [(key, row) for key, row in rows.items() if key not in PLACES and any(v != row[0] for v in row)]
 
 
 def resolved(tree: dict[str, Any]) -> tuple[RunConfig | None, str]:

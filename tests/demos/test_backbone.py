@@ -39,13 +39,6 @@ def test_the_vocabulary_is_bounded_and_ids_are_those_of_the_config(tmp_path: Pat
     assert all(len(tokenizer(token).input_ids) == 1 for token in SPECIAL_TOKENS)
 
 
-def test_equal_texts_give_equal_files(tmp_path: Path):
-    one = write_backbone(tmp_path / "one", BackboneSizes(), TEXTS)
-    other = write_backbone(tmp_path / "deep" / "other", BackboneSizes(), [*reversed(TEXTS), TEXTS[0]])
-    for file in one.iterdir():
-        assert file.read_bytes() == (other / file.name).read_bytes(), file.name
-
-
 def test_the_vision_tower_has_the_sizes_asked_for(tmp_path: Path):
     from transformers import AutoConfig
 

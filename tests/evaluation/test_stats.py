@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import io
-import json
 import math
 
 import pytest
@@ -44,15 +43,6 @@ def test_wilson_ends_solve_the_score_equation() -> None:
             assert distance == pytest.approx(1.959964, abs=1e-6)
 
 
-def test_wilson_is_symmetric_nested_and_contains_the_rate() -> None:
-    for n in (1, 3, 17, 100):
-        for k in range(n + 1):
-            narrow, wide = wilson_interval(k, n, 0.8), wilson_interval(k, n, 0.99)
-            mirror = wilson_interval(n - k, n, 0.8)
-            assert 0.0 <= wide.low <= narrow.low <= k / n <= narrow.high <= wide.high <= 1.0
-            assert narrow.low == pytest.approx(1 - mirror.high, abs=1e-12)
-
-
 def test_knowing_nothing() -> None:
     interval = wilson_interval(0, 0)
     assert (interval.low, interval.high) == (0.0, 1.0)
@@ -65,12 +55,6 @@ def test_knowing_nothing() -> None:
 )
 def test_a_rate_as_text(successes: int, n: int, text: str) -> None:
     assert str(Rate(successes=successes, n=n)) == f"{text} n={n}"
-
-
-def test_nonsense_is_refused() -> None:
-    for successes, n in [(-1, 5), (6, 5)]:
-        with pytest.raises(ValueError, match="episodes"):
-            wilson_interval(successes, n)
 
 
 def result(task: str, seed: int, success: bool, versions: tuple[int, int] = (3, 3)) -> EpisodeResult:
@@ -113,10 +97,6 @@ class TestSummarise:
         task = summarise(RESULTS)["tasks"]["door"]
         assert task["seeds"] == [0, 9] and task["failed_seeds"] == [8, 9]
 
-    def test_is_json(self) -> None:
-        summary = summarise(RESULTS)
-        assert json.loads(json.dumps(summary)) == summary
-
 
 def test_a_table_has_a_row_per_task_and_one_for_all() -> None:
     def printed(results: list[EpisodeResult]) -> str:
@@ -137,10 +117,6 @@ class TestPlans:
         after = evaluation_plans(("a", "b"), 10, "after")
         assert [(p.task, p.seed) for p in before] == [(p.task, p.seed) for p in after]
         assert len({(p.task, p.seed) for p in before}) == 10
-
-    def test_another_seed_has_other_starts(self) -> None:
-        seeds = [{p.seed for p in evaluation_plans(("a", "b"), 10, "x", seed=seed)} for seed in (0, 1)]
-        assert len(seeds[0]) == len(seeds[1]) == 5 and not seeds[0] & seeds[1]
 
     def test_smaller_evaluations_are_the_beginning_of_larger_ones(self) -> None:
         few, many = (evaluation_plans(("a", "b"), n, "x") for n in (6, 12))

@@ -303,14 +303,6 @@ def test_names_of_which_one_would_be_written_over_the_other(
     assert not (tmp_path / "pulled").exists()
 
 
-def test_redirects_in_a_circle(hub: HubServer, policy: Path, refused: Refusal):
-    def change(answer: Answer) -> None:
-        answer.status, answer.headers["Location"] = 302, f"{hub.url}{answer.path}"
-
-    hub.change = changed("", change)
-    assert "Exceeded maximum allowed redirects" in refused()
-
-
 @pytest.mark.parametrize("data", [b"{", b"[" * 100_000, b"\xff", b"null", b"[[1]]"])
 def test_answers_that_are_no_answers(hub: HubServer, policy: Path, refused: Refusal, data: bytes):
     hub.change = changed("/api/", lambda answer: body(answer, data))
