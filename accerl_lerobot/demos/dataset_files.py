@@ -91,10 +91,7 @@ def open_metadata(dataset: DatasetConfig) -> Any:
 def opened(dataset: DatasetConfig, meta: Any, episodes: Sequence[int] | None = None) -> Iterator[Any]:
     """A LeRobotDataset, whose files are checked as long as the context lasts.
 
-    Args:
-        dataset: on the Hub or in a folder.
-        meta: what `open_metadata` gave for it.
-        episodes: indices of those that are read; None: all.
+    `meta` is what `open_metadata` gave for it, `episodes` are indices of those that are read; None: all.
     """
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
@@ -134,9 +131,7 @@ def task_texts(meta: Any) -> list[str]:
 def checked(origin: Origin, whole: bool = False) -> Iterator[None]:
     """In this context LeRobot has a dataset's files checked before it reads them.
 
-    Args:
-        origin: what named the dataset.
-        whole: refuse missing files and rows; otherwise LeRobot fetches them.
+    With `whole`, missing files and rows are refused; otherwise LeRobot fetches them.
     """
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
     from lerobot.datasets.dataset_reader import DatasetReader

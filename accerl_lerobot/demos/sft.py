@@ -149,16 +149,10 @@ def run_sft(
     texts: Sequence[str] = (),
     on_step: Callable[[int, float], None] | None = None,
 ) -> Path:
-    """Trains and returns the ``pretrained_model`` folder.
+    """Trains and returns the ``pretrained_model`` folder; the parent of `output_dir` gets ``sft.log``.
 
-    Args:
-        config: what to train, and for how long.
-        dataset: what to train on.
-        output_dir: must not exist; its parent gets ``sft.log``.
-        seed: of LeRobot's trainer.
-        device: cpu or cuda.
-        texts: the dataset's instructions, for a new backbone's tokeniser.
-        on_step: receives step and loss as progress is reported, from 1000 on rounded to thousands.
+    A new backbone's tokeniser learns `texts`, the dataset's instructions. `on_step` receives step and loss as
+    progress is reported, from 1000 on rounded to thousands.
 
     Raises:
         InputError: `output_dir` exists; the checkpoint to start from, or the dataset, is not to be trusted.

@@ -30,10 +30,6 @@ class GymConfig(EnvConfig):
     """A Gymnasium environment, and which of its observations become which features.
 
     Keys of nested observations are joined by dots. An episode ends with its first success.
-
-    Example:
-        >>> GymConfig(id="gym_pusht/PushT-v0", state=("agent_pos",), images={"image": "pixels"},
-        ...           kwargs={"obs_type": "pixels_agent_pos"}, discover_packages_path="gym_pusht")
     """
 
     world = "accerl_lerobot.envs.gym_env:GymWorld"
@@ -81,12 +77,7 @@ class GymConfig(EnvConfig):
 
 
 class GymWorld(EpisodeWorld):
-    """One Gymnasium environment.
-
-    Raises:
-        InputError: Gymnasium does not know it or refuses its arguments; an observation that `config` names is
-            missing or has another shape; actions are not a vector with bounds.
-    """
+    """One Gymnasium environment."""
 
     def __init__(self, config: GymConfig) -> None:
         import gymnasium

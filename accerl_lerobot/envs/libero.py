@@ -42,10 +42,6 @@ class LiberoConfig(EnvConfig):
 
     Evaluation begins at the 50 recorded states of a task, demonstrations and exploration at placements drawn
     from the task's own regions, so that no evaluated start is trained on.
-
-    Example:
-        >>> LiberoConfig(task="libero_object/0,libero_object/3").tasks
-        ('libero_object/0', 'libero_object/3')
     """
 
     expert = "accerl_lerobot.demos.libero_expert:libero_expert"

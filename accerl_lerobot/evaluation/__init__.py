@@ -34,12 +34,7 @@ class Interval(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Rate:
-    """Successes out of n.
-
-    Example:
-        >>> str(Rate(successes=93, n=100))
-        '93.0 % [86.3, 96.6] n=100'
-    """
+    """Successes out of n; as text ``93.0 % [86.3, 96.6] n=100``."""
 
     successes: int
     n: int

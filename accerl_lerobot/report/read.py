@@ -216,12 +216,8 @@ def differences(config: Any, default: Any = None, prefix: str = "") -> Iterator[
     """Dotted field, value and default, where the two differ.
 
     Defaults are those of the types that were chosen: GIPO's for a run of GIPO. That it was chosen is a
-    difference too, and so is a section that is off unless it is given.
-
-    Args:
-        config: a section, or all of it.
-        default: its default; None, or one of another type: the defaults of its fields.
-        prefix: name of the section with a dot.
+    difference too, and so is a section that is off unless it is given. Without a `default` of its type,
+    those of a section's fields count.
     """
     for field in dataclasses.fields(config):
         name, value = f"{prefix}{field.name}", getattr(config, field.name)

@@ -70,15 +70,8 @@ class Moment(NamedTuple):
 class Clock:
     """One worker's recorder; begins in the state `RECOVERY`, which is to get ready for work.
 
-    Example:
-        >>> clock = open_clock(folder, "trainer")
-        >>> clock.enter(WAIT_IN)         # from one thread
-        >>> clock.beat()                 # from any: entries so far are written, up to now
-
-    Args:
-        folder: of the timeline; made if it is not there.
-        worker: its name; the part before a number is its role.
-        begins: when its process does; None: now.
+    States are entered from one thread; `beat`, from any, writes entries so far, up to now. The part of
+    `worker` before a number is its role; its process `begins` now, unless it is said.
     """
 
     def __init__(
