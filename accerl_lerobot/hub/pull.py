@@ -28,18 +28,7 @@ from accerl_lerobot.checkpoint.safety import brief, unsafe_name
 from accerl_lerobot.config.parsing import drop_consents, read_recipe
 from accerl_lerobot.engine.stopping import LOCK
 from accerl_lerobot.errors import InputError, check_absent, expanded
-from accerl_lerobot.hub.card import (
-    CARD,
-    MANIFEST,
-    MANIFEST_FORMAT,
-    POLICY,
-    RECIPE,
-    RECORD,
-    REPO_TYPES,
-    RUN,
-    PullConfig,
-    recognise,
-)
+from accerl_lerobot.hub import card
 from accerl_lerobot.hub.errors import check_commit, hub_errors
 
 CACHE, ATTRIBUTES = ".cache", ".gitattributes"
@@ -50,7 +39,7 @@ THREADS = 8
 BROKEN = (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError)
 
 
-def pull(config: PullConfig) -> dict[str, Any]:
+def pull(config: card.PullConfig) -> dict[str, Any]:
     """Pulls all files but Python's code; returns the commit and the content, as plain JSON.
 
     There is no new folder if it is refused.
@@ -75,7 +64,7 @@ def pull(config: PullConfig) -> dict[str, Any]:
     record = {"repo_id": repo_id, "repo_type": repo_type, "revision": config.revision, "commit": commit}
     try:
         record = _receive(temporary, home, files, repo_id) | record
-        (temporary / RECORD).write_text(json.dumps(record, indent=2) + "\n")
+        (temporary / card.RECORD).write_text(json.dumps(record, indent=2) + "\n")
         temporary.rename(home)
     except OSError as error:
         raise _not_writable(home, error) from error
@@ -88,11 +77,11 @@ def pull(config: PullConfig) -> dict[str, Any]:
     return record | {"path": str(home)}
 
 
-def _resolve(api: HfApi, config: PullConfig) -> tuple[str, str]:
+def _resolve(api: HfApi, config: card.PullConfig) -> tuple[str, str]:
     """Repository type, and the commit that the revision resolves to now."""
     repo_id, commits = config.repo_id, {}
     missing: Exception | None = None
-    for repo_type in REPO_TYPES if config.repo_type is None else (config.repo_type,):
+    for repo_type in card.REPO_TYPES if config.repo_type is None else (config.repo_type,):
         try:
             commits[repo_type] = api.repo_info(repo_id, repo_type=repo_type).sha
         except RepositoryNotFoundError as error:
@@ -155,27 +144,27 @@ def _receive(folder: Path, home: Path, files: dict[str, RepoFile], repo_id: str)
         if not _is_listed(folder / name, file):
             raise refuse(f"{name} is not what the server lists: its hash is another")
     pushed: dict[str, Any] = {}
-    if (folder / MANIFEST).is_file():
-        if (why := layout.defect(folder, MANIFEST, MANIFEST_FORMAT)) is not None:
+    if (folder / card.MANIFEST).is_file():
+        if (why := layout.defect(folder, card.MANIFEST, card.MANIFEST_FORMAT)) is not None:
             raise refuse(f"it is not what was pushed: {why}")
-        pushed = layout.read_manifest(folder, MANIFEST)
-        (folder / MANIFEST).unlink()  # paths are set below, and then it does not hold any more
+        pushed = layout.read_manifest(folder, card.MANIFEST)
+        (folder / card.MANIFEST).unlink()  # paths are set below, and then it does not hold any more
     (folder / ATTRIBUTES).unlink(missing_ok=True)
     numbers = sorted(p.name for p in folder.glob(f"{CHECKPOINTS}/*") if p.is_dir())
     if numbers and layout.LAST not in numbers:  # a repository has no links
         (folder / CHECKPOINTS / layout.LAST).symlink_to(numbers[-1])
-    artifact = recognise(folder, "repo_id")
+    artifact = card.recognise(folder, "repo_id")
     if artifact != (kind := pushed.get("kind", artifact)):
-        raise refuse(f"its {MANIFEST} says {ascii(kind)[:80]}, but this is a {artifact}")
-    checkpoints = [folder / CHECKPOINTS / number for number in numbers if artifact == RUN]
+        raise refuse(f"its {card.MANIFEST} says {ascii(kind)[:80]}, but this is a {artifact}")
+    checkpoints = [folder / CHECKPOINTS / number for number in numbers if artifact == card.RUN]
     own = [checkpoint for checkpoint in checkpoints if (checkpoint / layout.MANIFEST).is_file()]
     for checkpoint in own:
         if (why := layout.defect(checkpoint)) is not None:
             raise refuse(f"its checkpoint {checkpoint.name} is broken: {why}")
-    policies = [folder] if artifact == POLICY else [checkpoint / PRETRAINED for checkpoint in checkpoints]
+    policies = [folder] if artifact == card.POLICY else [each / PRETRAINED for each in checkpoints]
     for policy in policies:
         relocate(policy, home / policy.relative_to(folder))
-    if artifact == RUN:
+    if artifact == card.RUN:
         (folder / LOCK).touch()  # marks a run that can be resumed
     dropped = _drop_consents(folder)
     code = sorted(path for path in folder.rglob("*") if path.name.endswith(CODE) and path.is_file())
@@ -186,7 +175,7 @@ def _receive(folder: Path, home: Path, files: dict[str, RepoFile], repo_id: str)
         layout.write_manifest(checkpoint)
     checked = pushed.get("files", {}).keys()
     counts = {"files": len(files), "checked": len(checked)}
-    counts["unchecked"] = len(files.keys() - checked - {CARD, MANIFEST, ATTRIBUTES})
+    counts["unchecked"] = len(files.keys() - checked - {card.CARD, card.MANIFEST, ATTRIBUTES})
     left = {"left_out": left_out, "dropped": dropped}
     return {"kind": artifact} | counts | {name: value for name, value in left.items() if value}
 
@@ -203,7 +192,7 @@ def _is_listed(path: Path, file: RepoFile) -> bool:
 def _drop_consents(folder: Path) -> dict[str, dict[str, Any]]:
     """Removes from all configs of runs what would let code run; returns it, by file."""
     dropped: dict[str, dict[str, Any]] = {}
-    for path in sorted(p for p in folder.rglob(RECIPE) if p.is_file() and not p.is_symlink()):
+    for path in sorted(p for p in folder.rglob(card.RECIPE) if p.is_file() and not p.is_symlink()):
         try:
             tree = read_recipe(path)
         except InputError:
