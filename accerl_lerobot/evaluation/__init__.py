@@ -262,9 +262,9 @@ def _caption(text: str, width: int) -> np.ndarray:
     """Black text, 8 to 20 pixels high, in a picture as wide as asked."""
     from PIL import Image, ImageDraw, ImageFont
 
-    font = ImageFont.load_default(min(20, max(8, 2 * width // len(text))))
-    image = Image.new("RGB", (width, round(font.size) + 12), "white")
-    ImageDraw.Draw(image).text((4, 4), text, fill="black", font=font)
+    size = min(20, max(8, 2 * width // len(text)))
+    image = Image.new("RGB", (width, size + 12), "white")
+    ImageDraw.Draw(image).text((4, 4), text, fill="black", font=ImageFont.load_default(size))
     return np.asarray(image)
 
 
