@@ -165,7 +165,7 @@ def run_sft(
         config = replace(config, init_path=str(fetched_checkpoint(config.init_path, None, "sft.init_path")))
     output_dir.parent.mkdir(parents=True, exist_ok=True)
     if config.init_path is None and config.backbone is not None:
-        write_backbone(output_dir.parent / "backbone", config.backbone.sizes, texts)
+        write_backbone(output_dir.parent / "backbone", texts, **vars(config.backbone))
     config = _with_backbone_in_place(config, output_dir.parent / "init")
     command = sft_command(config, dataset, output_dir, seed, device, picked(dataset, config.pick))
     logger.info("%s", shlex.join(command))
