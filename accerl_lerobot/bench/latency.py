@@ -1,10 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Time of an environment from a decision to its next observation, and of a reset, under random actions.
 
-    accerl bench latency --env.type=metaworld --env.task=door-open-v3
-    python -m benchmarks async_vs_sync --traces='[outputs/latency/trace.txt]'
-
-The second command measures what asynchrony gains where many environments take these times.
+``python -m benchmarks async_vs_sync --traces=…`` measures what asynchrony gains with these times.
 """
 
 from __future__ import annotations
@@ -48,12 +45,7 @@ class BenchLatencyConfig(Section):
 
 
 def bench_latency(config: BenchLatencyConfig) -> dict[str, Any]:
-    """Plays and times.
-
-    Returns:
-        ``decision_ms`` and ``reset_ms`` (None without any), see `described`; ``trace`` (the file), ``config``
-        and ``host``.
-    """
+    """Plays and times: ``decision_ms`` and ``reset_ms`` (None without any), see `described`; ``trace``."""
     console, root = Console(), output_folder(config.output_dir)
     world = make_world(config.env)
     try:

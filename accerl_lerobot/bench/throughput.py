@@ -146,12 +146,7 @@ class BenchThroughputConfig(Section):
 
 
 def bench_throughput(config: BenchThroughputConfig) -> dict[str, Any]:
-    """Measures all schedules.
-
-    Returns:
-        ``schedules``: for each, env steps, decisions and updates per second and the rest of `Block`;
-        ``config`` and ``host``.
-    """
+    """Measures all schedules: env steps, decisions and updates per second, and the rest of `Block`."""
     from accerl_lerobot.engine.preflight import check_policy, check_world
 
     console = Console()

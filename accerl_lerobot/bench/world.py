@@ -67,10 +67,8 @@ class BenchWorldConfig(Section):
 def bench_world(config: BenchWorldConfig) -> dict[str, Any]:
     """Measures all three arms.
 
-    Returns:
-        ``arms[name]`` with ``env_steps_per_s`` and ``decisions_per_s``, each median, min, max and blocks;
-        ``ratio``, our env steps per second over LeRobot's, median of the blocks' pairs and their range;
-        ``config`` and ``host``.
+    Returns: ``arms[name]`` with ``env_steps_per_s`` and ``decisions_per_s``, and ``ratio``, our env
+    steps per second over LeRobot's, of the blocks' pairs; see `spread`.
     """
     blocks: dict[str, list[tuple[float, float]]] = {name: [] for name in _ARMS}
     with contextlib.ExitStack() as stack:

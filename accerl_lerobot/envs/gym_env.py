@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Any registered Gymnasium environment with continuous actions, its observation mapped to LeRobot's features.
-
-    accerl train RECIPE --env.type=gym --env.id=mine/Reach-v0 --env.discover_packages_path=my_package
+"""Any registered Gymnasium environment with continuous actions, with LeRobot's features.
 
 Importing this file loads no Gymnasium; making the world does.
 """

@@ -8,8 +8,6 @@ calendar time at which a process began is noted too.
 ``RUN/timeline/rollout-0.1.3.bin`` is part 3 of the second process (1) of ``rollout 0``: a line of JSON, then
 8 bytes per entry, nanoseconds since the process began << 4 | state, little-endian. The newest two parts are
 kept. Nothing is overwritten: a killed process leaves at worst half an entry, which is not read.
-
-The states of a worker, which is in exactly one at any time; see ``docs/metrics.md``.
 """
 
 from __future__ import annotations

@@ -250,8 +250,7 @@ def show_timelines(config: TimelineConfig) -> dict[str, Any]:
     """Reads the runs, writes picture and traces.
 
     Returns:
-        ``picture``, and for each run, in ``runs``, ``run``, ``trace``, ``window_s`` (what is drawn),
-        ``training_s`` (when it trained, for each start), ``shares`` and ``bubble`` of the training by role.
+        ``picture`` and ``runs``: of each, what is drawn, when it trained, and how its roles spent that time.
     """
     picture = None if config.output is None else expanded(config.output, "output")
     timelines = [read_timeline(Path(name).expanduser()) for name in config.runs]
