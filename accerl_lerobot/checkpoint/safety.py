@@ -100,19 +100,6 @@ def check_name(name: object, what: str, origin: Origin) -> str:
     return str(name)
 
 
-def read_bytes(path: Path, most: int, origin: Origin) -> bytes:
-    """A regular file's content, if it has at most `most` bytes."""
-    size = file_size(path, origin)
-    if size > most:
-        remedy = f"{size} bytes, more than the {most} that such a file may have; it is not what it says"
-        raise origin.refuse(path.name, remedy)
-    try:
-        with path.open("rb") as file:
-            return file.read(most + 1)
-    except OSError as error:
-        raise origin.refuse(path.name, f"cannot be read ({error.strerror})") from error
-
-
 def file_size(path: Path, origin: Origin) -> int:
     """Bytes of a regular file; a pipe or a device is refused, since reading it may never end."""
     try:
@@ -126,9 +113,14 @@ def file_size(path: Path, origin: Origin) -> int:
 
 def read_json(path: Path, origin: Origin, most: int = JSON_MOST) -> dict[str, Any]:
     """The mapping in a JSON file of at most `most` bytes."""
-    raw = read_bytes(path, most, origin)
+    if (size := file_size(path, origin)) > most:
+        remedy = f"{size} bytes, more than the {most} that such a file may have; it is not what it says"
+        raise origin.refuse(path.name, remedy)
     try:
-        content = json.loads(raw.decode())
+        with path.open("rb") as file:
+            content = json.loads(file.read(most + 1).decode())
+    except OSError as error:
+        raise origin.refuse(path.name, f"cannot be read ({error.strerror})") from error
     except RecursionError as error:
         raise origin.refuse(path.name, "nested too deeply; it is not what it says") from error
     except ValueError as error:

@@ -44,9 +44,9 @@ class Rate:
         """The observed fraction; NaN for n = 0."""
         return self.successes / self.n if self.n else math.nan
 
-    def interval(self, confidence: float = 0.95) -> Interval:
+    def interval(self) -> Interval:
         """`wilson_interval` of this rate."""
-        return wilson_interval(self.successes, self.n, confidence)
+        return wilson_interval(self.successes, self.n)
 
     def __str__(self) -> str:
         if self.n == 0:
@@ -55,11 +55,10 @@ class Rate:
         return f"{100 * self.value:.1f} % [{100 * low:.1f}, {100 * high:.1f}] n={self.n}"
 
 
-def wilson_interval(successes: int, n: int, confidence: float = 0.95) -> Interval:
-    """Wilson's score interval of a proportion (Wilson 1927; Brown, Cai and DasGupta 2001, section 3.1.1).
+def wilson_interval(successes: int, n: int) -> Interval:
+    """Wilson's score interval of 95 % (Wilson 1927; Brown, Cai and DasGupta 2001, section 3.1.1).
 
-        z = Φ⁻¹((1 + confidence) / 2),  p = successes / n
-        (p + z²/2n ± z √(p(1 − p)/n + z²/4n²)) / (1 + z²/n)
+        (p + z²/2n ± z √(p(1 − p)/n + z²/4n²)) / (1 + z²/n),  p = successes / n
 
     Unlike p ± z√(p(1 − p)/n) it has width at 0 and at n successes and stays inside [0, 1]. For n = 0 it is
     [0, 1], as nothing is known.
@@ -68,7 +67,7 @@ def wilson_interval(successes: int, n: int, confidence: float = 0.95) -> Interva
         raise ValueError(f"{successes} successes in {n} episodes")
     if n == 0:
         return Interval(0.0, 1.0)
-    z = NormalDist().inv_cdf((1 + confidence) / 2)
+    z = NormalDist().inv_cdf(0.975)
     p, share = successes / n, z * z / n
     centre = (p + share / 2) / (1 + share)
     half = z * math.sqrt(p * (1 - p) / n + share / (4 * n)) / (1 + share)
@@ -130,13 +129,7 @@ class EvaluationConfig(Section, section="evaluation"):
 
 
 def evaluation_plans(
-    tasks: Sequence[str],
-    episodes: int,
-    group: str,
-    *,
-    seed: int = 0,
-    filmed: int = 0,
-    film: tuple[int, int] = FILM,
+    tasks: Sequence[str], episodes: int, group: str, *, seed: int = 0, filmed: int = 0
 ) -> list[EpisodePlan]:
     """`episodes` plans of an evaluation called `group`, spread evenly over `tasks`; the first are `filmed`.
 
@@ -149,7 +142,7 @@ def evaluation_plans(
             explore=False,
             index=i,
             group=group,
-            film=film if i < filmed else None,
+            film=FILM if i < filmed else None,
         )
         for i in range(episodes)
     ]
