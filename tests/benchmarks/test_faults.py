@@ -8,16 +8,13 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import CHECKPOINTS, TRAINING_STATE, save_checkpoint
-from accerl_lerobot.engine.config import encode
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.replay import MixedReplay, ReplayConfig
 from accerl_lerobot.replay.journal import EPISODES, Journal
@@ -25,9 +22,8 @@ from benchmarks.audit import audit_segments, audit_updates
 from benchmarks.fault_injection import POINTS
 from benchmarks.faults import BenchFaultsConfig, bench_faults
 from benchmarks.hits import ANYWHERE, FAULTS, places
-from benchmarks.light_run import light_config
 from benchmarks.soak import compare, costs
-from benchmarks.victims import CLASSES, LIGHT, Victim, await_hit, descendants, hit, title
+from benchmarks.victims import CLASSES, Victim, await_hit, descendants, hit, title
 from tests.replay.segments import make_segment
 
 SLEEPS = """
@@ -160,26 +156,6 @@ def test_a_run_of_time_survives_what_is_done_to_it(tmp_path: Path):
     assert len(spent) == 5 and all(0 < share < 1 for share in spent.values()), spent
     written = json.loads((root / "faults.json").read_text())
     assert written["hits"] == result["hits"] and (root / "faults.png").stat().st_size > 1000
-
-
-@pytest.mark.slow
-def test_a_service_comes_back_long_after_the_run_was_taken_back(tmp_path: Path):
-    """Where it begins again is still there, whatever has been saved since."""
-    light = tmp_path / "light.yaml"
-    config = replace(light_config(updates=1_000_000), save_every_s=0.0, save_every_updates=1)
-    light.write_text(yaml.safe_dump(encode(config), sort_keys=False))
-    victim = Victim(tmp_path / "run", [f"--config_path={light}"], tmp_path / "run.log", LIGHT)
-    try:
-        for target, updates in (("trainer", 4), ("inference", 20)):
-            victim.await_update(max(victim.updates(), default=0) + updates, 120.0)
-            (pid,) = victim.pids(target)
-            assert hit(pid, signal.SIGKILL)
-            victim.await_successors(target, pid, 1, 120.0)
-        before = set(victim.pids("trainer"))
-        victim.await_update(max(victim.updates()) + 20, 120.0)
-        assert set(victim.pids("trainer")) == before
-    finally:
-        victim.kill()
 
 
 def test_a_soak_compares_each_block_with_its_neighbour():

@@ -176,9 +176,3 @@ def test_an_environment_is_run_at_its_commit(arena):
     with pytest.raises(OSError, match="ran"):
         make_world(LeRobotEnvConfig(name="isaaclab_arena", kwargs=kwargs, trust_remote_code=True))
     assert arena.exists()
-
-
-@pytest.mark.parametrize("name", ["libero", "libero_plus"])
-def test_libero_has_a_type_of_its_own(name: str):
-    with pytest.raises(InputError, match=f"env.name='{name}': .* use env.type=libero"):
-        LeRobotEnvConfig(name=name)

@@ -64,12 +64,6 @@ def test_the_picture_shows_the_numbers_and_no_text_of_a_run() -> None:
     assert "hostile" not in svg and "updates" in svg and "100\xa0%" in svg
 
 
-def test_pictures_of_one_page_share_no_ids() -> None:
-    series = Series("a", np.arange(2.0), np.arange(2.0), 0, np.zeros(2), np.ones(2), points=True)
-    ids = [re.findall(r'id="([^"]*)"', Chart(title, "", "x", [series]).svg()) for title in ("One", "Other")]
-    assert ids[0] and not set(ids[0]) & set(ids[1])
-
-
 def test_the_legend_has_first_and_last_values_and_dashes_beyond_the_palette() -> None:
     x, y = np.arange(3.0), np.array([0.1, 0.9, 0.5])
     legend = chart(line("mean", x, y), line("ninth", x, y, len(COLOURS)), line("none", x[:0], y[:0])).legend

@@ -230,25 +230,3 @@ def test_results_of_another_version_are_one_line(tmp_path: Path, summary: str) -
     with pytest.raises(InputError, match="results in it are damaged, or of another version") as caught:
         page_of(folder)
     assert "\n" not in str(caught.value)
-
-
-class TestPlace:
-    """Where the page goes; what is there already is not damaged."""
-
-    def test_another_file_is_left_alone(self, tmp_path: Path) -> None:
-        folder = write_run(tmp_path / "run")
-        (folder / "report.html").write_text("<html>somebody's own</html>")
-        with pytest.raises(InputError, match="there is another file or folder of this name"):
-            page_of(folder)
-        assert (folder / "report.html").read_text() == "<html>somebody's own</html>"
-
-    def test_no_such_place(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        runs = [write_run(tmp_path / name) for name in ("a", "b")]
-        with pytest.raises(InputError, match="there is no folder"):
-            page_of(runs[0], output=str(tmp_path / "nowhere" / "page.html"))
-        with pytest.raises(InputError, match="there is another file or folder of this name"):
-            page_of(runs[0], output=str(tmp_path))
-        (tmp_path / "here").mkdir()
-        monkeypatch.chdir(tmp_path / "here")
-        page_of(*runs)
-        assert (tmp_path / "here" / "report.html").is_file(), "several runs make a page here"
