@@ -257,6 +257,6 @@ def lerobot_config(config: BenchPolicyConfig, directory: Path) -> Any:
     outputs = {"action": PolicyFeature(type=FeatureType.ACTION, shape=(ACTION_DIM,))}
     fields: dict[str, Any] = {"input_features": inputs, "output_features": outputs, "push_to_hub": False}
     if config.type == "smolvla":
-        backbone = write_backbone(directory / "backbone", **SMOLVLM2_500M)
+        backbone = write_backbone(directory / "backbone", [], **SMOLVLM2_500M)
         fields |= {"vlm_model_name": str(backbone), "load_vlm_weights": False, "num_vlm_layers": 16}
     return make_policy_config(config.type, **fields, device="cpu")

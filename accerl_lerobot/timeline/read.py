@@ -117,7 +117,7 @@ class Part(NamedTuple):
 
     worker: str
     number: tuple[int, int]
-    """Of the process and of the part."""
+    """Numbers of the process and of the part."""
     begins: Moment
     """When the process did."""
     times: np.ndarray
