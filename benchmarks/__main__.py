@@ -21,10 +21,8 @@ from benchmarks.lag import BenchLagConfig
 from benchmarks.replay import BenchReplayConfig
 from benchmarks.scaling import BenchScalingConfig
 from benchmarks.soak import BenchSoakConfig
-from benchmarks.timeline import BenchTimelineConfig
 from benchmarks.transport import BenchTransportConfig
 from benchmarks.weights import BenchWeightsConfig
-from benchmarks.world_model import BenchWorldModelConfig
 
 CONFIGS: dict[str, type[Any]] = {
     "few_shot": BenchFewShotConfig,
@@ -36,10 +34,8 @@ CONFIGS: dict[str, type[Any]] = {
     "scaling": BenchScalingConfig,
     "batching": BenchBatchingConfig,
     "replay": BenchReplayConfig,
-    "timeline": BenchTimelineConfig,
     "transport": BenchTransportConfig,
     "weights": BenchWeightsConfig,
-    "world_model": BenchWorldModelConfig,
     "gpu": BenchGpuConfig,
 }
 """Module with a function ``bench_NAME`` and a ``table`` of what it returns → its fields."""

@@ -60,10 +60,7 @@ class Answer:
     path: str
     status: int
     headers: dict[str, str]
-    pieces: list[bytes]
-    """Pieces of the body;"""
-    pause_s: float = 0.0
-    """after each of them, so long."""
+    body: bytes
 
 
 @dataclass
@@ -227,7 +224,7 @@ class Handler(BaseHTTPRequestHandler):
         if self.fault is not None and self.fault.spoil and data:
             data = data[:-1] + bytes([data[-1] ^ 1])
         headers = {"Content-Length": str(len(data))} | headers
-        answer = Answer(unquote(urlsplit(self.path).path), status, headers, [data])
+        answer = Answer(unquote(urlsplit(self.path).path), status, headers, data)
         if self.server.change is not None:
             answer = self.server.change(answer)
             answer.headers["Connection"] = "close"  # its length may be wrong
@@ -236,11 +233,8 @@ class Handler(BaseHTTPRequestHandler):
         for key, value in answer.headers.items():
             self.send_header(key, value)
         self.end_headers()
-        for piece in answer.pieces if self.command != "HEAD" else ():
-            self.wfile.write(piece)
-            if answer.pause_s:
-                self.wfile.flush()
-                time.sleep(answer.pause_s)
+        if self.command != "HEAD":
+            self.wfile.write(answer.body)
 
     def _json(self, value: Any, status: int = 200) -> None:
         self._send(status, json.dumps(value).encode(), {"Content-Type": "application/json"})

@@ -110,12 +110,6 @@ def test_going_back_puts_aside_what_came_after(tmp_path: Path):
     assert (tmp_path / "abandoned-000030" / PRETRAINED / "model.safetensors").is_file()
 
 
-def test_nothing_but_a_half_written_one_is_none(tmp_path: Path):
-    assert not has_checkpoint(tmp_path / "checkpoints")
-    (tmp_path / ".writing-77" / PRETRAINED).mkdir(parents=True)
-    assert not has_checkpoint(tmp_path) and listing(tmp_path) == []
-
-
 def state_writer(version: int) -> Callable[[Path], int]:
     def write(directory: Path) -> int:
         snapshot.save(directory / TRAINING_STATE / RUN_STATE, {"version": version, "array": np.arange(50)})
@@ -183,19 +177,6 @@ def test_only_the_newest_keep_their_training_state(tmp_path: Path):
         newest_whole(tmp_path, "000006")
     prune(tmp_path)
     assert not (tmp_path / "000002" / TRAINING_STATE).exists()
-
-
-def test_pruning_a_broken_checkpoint_leaves_it_broken(tmp_path: Path):
-    for version in (1, 2, 3):
-        save_checkpoint(tmp_path, state_writer(version))
-    (tmp_path / "000001" / PRETRAINED / "model.safetensors").write_text("WEIGHTS")
-    prune(tmp_path)
-    assert defect(tmp_path / "000001") == "pretrained_model/model.safetensors is not what was written"
-    save_checkpoint(tmp_path, state_writer(4))
-    (tmp_path / "000002" / "manifest.json").write_text("{")
-    prune(tmp_path)
-    assert not (tmp_path / "000002" / TRAINING_STATE).exists()
-    assert "is broken" in str(defect(tmp_path / "000002"))
 
 
 def test_pruning_that_was_interrupted_is_completed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -1,14 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The machine of a measurement, and timing, memory and tables of measurements."""
+"""The machine of a measurement, and spreads and tables of measurements."""
 
 from __future__ import annotations
 
 import os
 import platform
-import resource
 import statistics
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib.metadata import version
 from typing import Any
 
@@ -52,46 +50,6 @@ def spread(values: list[float]) -> dict[str, Any]:
 def ranged(values: dict[str, Any], form: str) -> str:
     """Formats the outcome of `spread`: median and range in this form."""
     return f"{values['median']:{form}} ({values['min']:{form}} to {values['max']:{form}})"
-
-
-def timed(work: Callable[[], Any], repeats: int, device: Any) -> dict[str, Any]:
-    """Seconds that some work takes on a torch device, after a first time that does not count."""
-    import torch
-
-    seconds = []
-    for _ in range(repeats + 1):
-        started = time.perf_counter()
-        work()
-        if device.type == "cuda":
-            torch.cuda.synchronize()
-        seconds.append(time.perf_counter() - started)
-    counted = seconds[1:]
-    return {"median": statistics.median(counted), "min": min(counted), "max": max(counted), "all": counted}
-
-
-class Memory:
-    """Peak memory of a torch device, in GB, at moments that have a name."""
-
-    def __init__(self, device: Any) -> None:
-        self.device = device
-        self.notes: dict[str, float] = {}
-
-    def note(self, stage: str) -> None:
-        """The peak since the last moment; on a CPU, of the whole process since it began."""
-        import torch
-
-        if self.device.type == "cuda":
-            self.notes[stage] = torch.cuda.max_memory_allocated() / 1e9
-            torch.cuda.reset_peak_memory_stats()
-        else:
-            self.notes[stage] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
-
-
-def device_name(device: Any) -> str:
-    """Name of the GPU, or cpu."""
-    import torch
-
-    return torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu"
 
 
 def as_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:

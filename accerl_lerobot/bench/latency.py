@@ -1,10 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Time of an environment from a decision to its next observation, and of a reset, under random actions.
 
-    accerl bench latency --env.type=metaworld --env.task=door-open-v3
-    python -m benchmarks async_vs_sync --traces='[outputs/latency/trace.txt]'
-
-The second command measures what asynchrony gains where many environments take these times.
+``python -m benchmarks async_vs_sync --traces=…`` measures what asynchrony gains with these times.
 """
 
 from __future__ import annotations
@@ -48,13 +45,7 @@ class BenchLatencyConfig(Section):
 
 
 def bench_latency(config: BenchLatencyConfig) -> dict[str, Any]:
-    """Plays and times.
-
-    Returns:
-        ``decision_ms`` and ``reset_ms`` (None without any), see `described`; ``neighbours`` (correlation of
-        one decision's duration with the next, None where they do not vary), ``trace`` (the file), ``config``
-        and ``host``.
-    """
+    """Plays and times: ``decision_ms`` and ``reset_ms`` (None without any), see `described`; ``trace``."""
     console, root = Console(), output_folder(config.output_dir)
     world = make_world(config.env)
     try:
@@ -64,12 +55,9 @@ def bench_latency(config: BenchLatencyConfig) -> dict[str, Any]:
     finally:
         world.close()
     decisions, resets = (np.asarray([s for s, reset in lines if reset is kind]) for kind in (False, True))
-    one, other = decisions[:-1], decisions[1:]
-    varied = len(one) > 1 and one.std() > 0 and other.std() > 0
     result = {
         "decision_ms": described(decisions),
         "reset_ms": described(resets) if len(resets) else None,
-        "neighbours": float(np.corrcoef(one, other)[0, 1]) if varied else None,
         "trace": str(root / TRACE),
         "config": asdict(config),
         "host": host(),

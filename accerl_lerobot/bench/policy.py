@@ -7,9 +7,10 @@ Weights are random, sizes those of the published checkpoint, inputs generated: n
 from __future__ import annotations
 
 import platform
+import resource
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -17,30 +18,19 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from rich.table import Table
 
-from accerl_lerobot.bench import Memory, as_table, device_name, ranged, timed
+from accerl_lerobot.bench import as_table, ranged, spread
 from accerl_lerobot.config.ranges import Device, Range, Repeats, Section
-from accerl_lerobot.demos.backbone import BackboneSizes, write_backbone
+from accerl_lerobot.demos.backbone import write_backbone
 from accerl_lerobot.policies.config import TuningConfig
 
 STATE = "observation.state"
 STATE_DIM, ACTION_DIM, TOKENS = 8, 7, 48
 """LIBERO's sizes: end-effector state, end-effector action; length of a padded instruction."""
-SMOLVLM2_500M = BackboneSizes(
-    hidden=960,
-    layers=32,
-    heads=15,
-    kv_heads=5,
-    vision_hidden=768,
-    vision_layers=12,
-    vision_heads=12,
-    patch=16,
-    image=512,
-    embeddings=49280,
-    intermediate=2560,
-    vision_intermediate=3072,
-    shuffle=4,
-)
-"""The sizes of SmolVLM2-500M, the backbone of ``lerobot/smolvla_base``."""
+SMOLVLM2_500M = {
+    "hidden": 960, "layers": 32, "heads": 15, "kv_heads": 5, "intermediate": 2560, "embeddings": 49280,
+    "vision_hidden": 768, "vision_layers": 12, "vision_heads": 12, "vision_intermediate": 3072,
+    "patch": 16, "image": 512, "shuffle": 4,
+}  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,7 +79,7 @@ def bench_policy(config: BenchPolicyConfig) -> dict[str, Any]:
     from accerl_lerobot.trainer.footprint import policy_memory
 
     device = resolve_device("cpu" if config.memory_only else config.device, "device")
-    memory = Memory(device)
+    memory: dict[str, float] = {}
     started = time.perf_counter()
     with tempfile.TemporaryDirectory() as directory, Unfilled() if config.memory_only else nullcontext():
         adapter = _adapter(config, device, Path(directory))
@@ -98,7 +88,7 @@ def bench_policy(config: BenchPolicyConfig) -> dict[str, Any]:
         "config": asdict(config),
         "parameters": {"all": sizes.policy, "trained": sizes.trained},
         "host": {
-            "device": device_name(device),
+            "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
             "machine": platform.machine(),
             "threads": torch.get_num_threads(),
         },
@@ -106,14 +96,14 @@ def bench_policy(config: BenchPolicyConfig) -> dict[str, Any]:
     if config.memory_only:
         return result | {"estimate": policy_memory(adapter, imitates=config.imitates)._asdict()}
     built = time.perf_counter() - started
-    memory.note("built")
+    memory["built"] = _peak_gb(device)
     requests = [
         Request(observation={STATE: np.full(1, i, np.float32), TASK: "do it"}, noise_seed=i)
         for i in range(config.batch)
     ]
-    one = timed(lambda: adapter.decide(requests[:1], 0), config.repeats, device)
-    many = timed(lambda: adapter.decide(requests, 0), config.repeats, device)
-    memory.note("decided")
+    one = _timed(lambda: adapter.decide(requests[:1], 0), config.repeats, device)
+    many = _timed(lambda: adapter.decide(requests, 0), config.repeats, device)
+    memory["decided"] = _peak_gb(device)
     # One at a time, and re-scored together: rounding depends on the batch, and this is what a run does.
     decisions = [adapter.decide([request], 0)[0] for request in requests]
     latent, old = stored(decisions)
@@ -124,7 +114,7 @@ def bench_policy(config: BenchPolicyConfig) -> dict[str, Any]:
         with torch.no_grad():
             return adapter.evaluate(*observations, latent).log_prob
 
-    scored = timed(score, config.repeats, device)
+    scored = _timed(score, config.repeats, device)
     change = (score() - old.to(device)).sum(1)
     gap, ratio = change.abs(), change.exp()
     optimizer = torch.optim.AdamW(adapter.trainable().values(), lr=1e-6)
@@ -141,15 +131,40 @@ def bench_policy(config: BenchPolicyConfig) -> dict[str, Any]:
         (ratio.mean() + (evaluation.value - 1).square().mean()).backward()
         optimizer.step()
 
-    updated = timed(update, config.repeats, device)
-    memory.note("updated")
+    updated = _timed(update, config.repeats, device)
+    memory["updated"] = _peak_gb(device)
     clipped = ((ratio > 1.2) | (ratio < 0.8)).float().mean()
     return result | {
         "seconds": {"build": built, "decide_one": one, "decide": many, "score": scored, "update": updated},
-        "memory_gb": memory.notes,
+        "memory_gb": memory,
         "mismatch": {"mean": float(gap.mean()), "max": float(gap.max()), "clip": float(clipped)},
         "estimate": policy_memory(adapter, imitates=config.imitates)._asdict(),
     }
+
+
+def _timed(work: Callable[[], Any], repeats: int, device: Any) -> dict[str, Any]:
+    """Seconds that some work takes on a torch device, after a first time that does not count."""
+    import torch
+
+    seconds = []
+    for _ in range(repeats + 1):
+        started = time.perf_counter()
+        work()
+        if device.type == "cuda":
+            torch.cuda.synchronize()
+        seconds.append(time.perf_counter() - started)
+    return spread(seconds[1:])
+
+
+def _peak_gb(device: Any) -> float:
+    """Peak of a GPU's memory since the last question; on a CPU, of the whole process since it began."""
+    import torch
+
+    if device.type != "cuda":
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
+    peak = torch.cuda.max_memory_allocated() / 1e9
+    torch.cuda.reset_peak_memory_stats()
+    return float(peak)
 
 
 def table(result: dict[str, Any]) -> Table:
@@ -242,6 +257,6 @@ def lerobot_config(config: BenchPolicyConfig, directory: Path) -> Any:
     outputs = {"action": PolicyFeature(type=FeatureType.ACTION, shape=(ACTION_DIM,))}
     fields: dict[str, Any] = {"input_features": inputs, "output_features": outputs, "push_to_hub": False}
     if config.type == "smolvla":
-        backbone = write_backbone(directory / "backbone", SMOLVLM2_500M)
+        backbone = write_backbone(directory / "backbone", [], **SMOLVLM2_500M)
         fields |= {"vlm_model_name": str(backbone), "load_vlm_weights": False, "num_vlm_layers": 16}
     return make_policy_config(config.type, **fields, device="cpu")

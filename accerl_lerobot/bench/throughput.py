@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Speed of a recipe on this machine, collecting and learning, under each schedule.
 
-Environments, policy and engine are those of the run. Each decision is accounted for: it is in the replay
-buffer, was dropped for a reason that is counted, or is under way.
+Environments, policy and engine are those of the run.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from accerl_lerobot.engine.config import RunConfig, parse
 from accerl_lerobot.engine.loop import Progress
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import Load
-from accerl_lerobot.replay.pacing import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, Schedule, decisions_under_way
+from accerl_lerobot.replay.pacing import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, Schedule
 
 SETTLE = 2
 """Updates after a change that are not counted, beside those that need nothing new."""
@@ -47,9 +46,7 @@ class Block:
     batch_size: float
     """Observations of a forward pass."""
     inference_busy: float
-    """Share of its time in which the inference worker decided."""
     processors: float
-    """Busy share of all cores, whoever used them."""
 
 
 class Measured:
@@ -149,12 +146,7 @@ class BenchThroughputConfig(Section):
 
 
 def bench_throughput(config: BenchThroughputConfig) -> dict[str, Any]:
-    """Measures all schedules.
-
-    Returns:
-        ``schedules``: for each, env steps, decisions and updates per second and the rest of `Block`;
-        ``books``: what became of all decisions; ``config`` and ``host``.
-    """
+    """Measures all schedules: env steps, decisions and updates per second, and the rest of `Block`."""
     from accerl_lerobot.engine.preflight import check_policy, check_world
 
     console = Console()
@@ -168,49 +160,25 @@ def bench_throughput(config: BenchThroughputConfig) -> dict[str, Any]:
     result: dict[str, Any] = {"config": asdict(config), "host": host()}
     order = config.rounds * (*config.schedules, *reversed(config.schedules))
     blocks: list[Block] = []
-    with Measured(run, tasks, history) as engine:
-        with console.stage("blocks", total=len(order)) as stage:
-            for schedule in order:
-                blocks.append(engine.block(schedule, config.seconds))
-                stage.update(len(blocks), f"{schedule}: {blocks[-1].env_steps_per_s:.0f} env steps/s")
-        progress = engine.engine.poll()
-    result["books"] = books(run, progress.rollout, progress.replay)
+    with Measured(run, tasks, history) as engine, console.stage("blocks", total=len(order)) as stage:
+        for schedule in order:
+            blocks.append(engine.block(schedule, config.seconds))
+            stage.update(len(blocks), f"{schedule}: {blocks[-1].env_steps_per_s:.0f} env steps/s")
     schedules = {name: [b for b in blocks if b.schedule == name] for name in config.schedules}
     result["schedules"] = {name: _summarised(own) for name, own in schedules.items()}
     result["host_after"] = host()
     return result
 
 
-def books(run: RunConfig, rollout: dict[str, float], replay: dict[str, float]) -> dict[str, float]:
-    """Accounts for all decisions that were made; fails where more are under way than can be."""
-    found = {
-        "generated": rollout["decisions"],
-        "committed": replay["inserted_decisions"],
-        "dropped": rollout["dropped_nonfinite"] + replay["dropped_nonfinite"],
-    }
-    found["under_way"] = found["generated"] - found["committed"] - found["dropped"]
-    r = run.rollout
-    # Two reports are not of the same moment: what a segment's time brings may be in one and not in the other.
-    most = 3 * decisions_under_way(workers=r.workers, worlds=r.worlds, segment_length=r.segment_length)
-    if not -most <= found["under_way"] <= most:
-        raise RuntimeError(f"decisions are missing, or there twice: {found}; at most {most} can be under way")
-    return found
-
-
 def table(result: dict[str, Any]) -> Table:
     """`result` for people."""
-    found = result["books"]
-    title = (
-        f"{found['generated']:.0f} decisions generated = {found['committed']:.0f} committed + "
-        f"{found['under_way']:.0f} under way + {found['dropped']:.0f} dropped"
-    )
     columns = ("schedule", "env steps/s", "decisions/s learned from", "updates/s", "lag", "trainer waits")
     rows = []
     for name, one in result["schedules"].items():
         counts = (ranged(one[key], ".0f") for key in ("env_steps_per_s", "decisions_per_s"))
         shares = (f"{one[key]:.0%}" for key in ("trainer_waits", "inference_busy", "processors"))
         rows.append([name, *counts, f"{one['updates_per_s']:.2f}", f"{one['lag_mean']:.1f}", *shares])
-    return as_table(title, (*columns, "inference busy", "processors"), rows)
+    return as_table(result["config"]["recipe"], (*columns, "inference busy", "processors"), rows)
 
 
 def _summarised(blocks: list[Block]) -> dict[str, Any]:

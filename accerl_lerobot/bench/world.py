@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Speed of our MetaWorld or LIBERO next to LeRobot's: both step random actions, in turns, on one machine.
 
-    accerl bench world --env.type=libero --env.task=libero_object/0 --env.image_size=128 --env.rendering=fast
-
 Three arms: ``ours`` (a picture per decision), ``ours_every_step`` (chunks of one, so a picture per step) and
 ``stock`` (LeRobot's own environment, a picture per step: of MetaWorld 480 pixels with default lights, of
 LIBERO two of our size). Blocks go forth and back (A B C C B A), so that a machine that slows down slows every
@@ -69,10 +67,8 @@ class BenchWorldConfig(Section):
 def bench_world(config: BenchWorldConfig) -> dict[str, Any]:
     """Measures all three arms.
 
-    Returns:
-        ``arms[name]`` with ``env_steps_per_s`` and ``decisions_per_s``, each median, min, max and blocks;
-        ``ratio``, our env steps per second over LeRobot's, median of the blocks' pairs and their range;
-        ``config`` and ``host``.
+    Returns: ``arms[name]`` with ``env_steps_per_s`` and ``decisions_per_s``, and ``ratio``, our env
+    steps per second over LeRobot's, of the blocks' pairs; see `spread`.
     """
     blocks: dict[str, list[tuple[float, float]]] = {name: [] for name in _ARMS}
     with contextlib.ExitStack() as stack:

@@ -2,11 +2,8 @@
 """Rehearsal of a load in a child process with a memory limit and a time limit.
 
 A config of a hundred bytes can ask for a terabyte, a tokenizer can loop for hours, and a native library can
-abort its process. The child does what the caller is about to do with files from an untrusted source. However
-it ends, the caller lives, and gets one line.
-
-The child is forked, since importing LeRobot again would take longer than most loads. It runs one thread, as
-PyTorch's data loaders do, and does not touch a GPU.
+abort its process. The child is forked, since importing LeRobot again would take longer than most loads; it
+runs one thread, as PyTorch's data loaders do, and does not touch a GPU.
 """
 
 from __future__ import annotations
@@ -54,12 +51,8 @@ PR_SET_PDEATHSIG = 1
 def rehearse[T](task: Callable[[], T], folder: Path, origin: Origin, pattern: str = "**/*.safetensors") -> T:
     """Runs `task` in a child process and returns its result, which JSON can hold.
 
-    Where there is no ``/proc``, as on macOS, limits cannot be set, and it runs in this process.
-
-    Args:
-        task: loads what is in `folder`, on the CPU.
-        folder: its files that match `pattern` set the limits.
-        origin: what named the folder, for the error.
+    `task` loads what is in `folder`, on the CPU; files there that match `pattern` set the limits. Where
+    there is no ``/proc``, as on macOS, limits cannot be set, and it runs in this process.
     """
     if not sys.platform.startswith("linux"):
         return task()

@@ -30,14 +30,11 @@ from accerl_lerobot.fault_points import fault_point
 
 PRETRAINED, TRAINING_STATE, WORLD_MODEL = "pretrained_model", "training_state", "world_model"
 CHECKPOINTS, DEMOS = "checkpoints", "demos"
-"""Folders of a run: its checkpoints, and demonstrations that it has recorded."""
 CONFIG, SUMMARY = "config.yaml", "summary.json"
-"""Files of a run: its config, and its results once it has ended."""
 MANIFEST, LAST = "manifest.json", "last"
 KEEP = 2
 """Newest checkpoints that can be resumed from; the others keep their policies only."""
 WRITING, REPLACED = ".writing-", ".replaced-"
-"""Prefixes of checkpoints that are being written, and of those that are being replaced."""
 RUN_STATE, WEIGHTS = "run", "weights"
 """Names of states in `TRAINING_STATE`: the progress of the run, and the exact trained weights."""
 STEP = "training_step.json"
@@ -58,21 +55,14 @@ STEP_FOLDERS = {
 }
 """LeRobot processor step → its option that names files, and our folder for them."""
 PREPROCESSOR = "policy_preprocessor.json"
-"""LeRobot's file of the processor steps before the policy."""
 
 
 def save_checkpoint(checkpoints: Path, write: Callable[[Path], int]) -> Path:
     """Writes one checkpoint and points ``last`` at it; both survive a loss of power once this returns.
 
-    If `write` raises, older checkpoints and ``last`` are as before.
-
-    Args:
-        checkpoints: the run's ``checkpoints`` folder.
-        write: creates and fills ``pretrained_model``, and other folders as needed, in the folder it is given,
-            and returns the number of updates behind what it wrote.
-
-    Returns:
-        ``checkpoints/NNNNNN``; an existing one of that version is replaced.
+    `write` creates and fills ``pretrained_model``, and other folders as needed, in the folder it is given,
+    and returns the number of updates behind what it wrote; a checkpoint of that version is replaced. If it
+    raises, older checkpoints and ``last`` are as before.
     """
     checkpoints.mkdir(parents=True, exist_ok=True)
     _tidy(checkpoints)
@@ -233,10 +223,8 @@ def saved_version(state: Path) -> int:
 def prune(checkpoints: Path, *, needed: str | None = None) -> None:
     """Removes the training state of all but the newest `KEEP` checkpoints; their policies stay.
 
-    Args:
-        checkpoints: their folder.
-        needed: name of one whose weights are kept as well, although it cannot be resumed from any more: an
-            inference replica that is lost starts again where all workers did.
+    The weights of the one named `needed` are kept too, although it cannot be resumed from any more: an
+    inference replica that is lost starts again where all workers did.
     """
     having = [path for path in _numbered(checkpoints) if (path / TRAINING_STATE).is_dir()]
     for path in having[:-KEEP]:

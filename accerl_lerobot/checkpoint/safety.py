@@ -48,9 +48,7 @@ class Origin:
     """
 
     field: str
-    """Dotted name of the field that named it."""
     value: str | None
-    """Value that it returned."""
 
     def refuse(self, file: str, why: str) -> InputError:
         """The error to raise: a file or a key in it, and what is wrong and what to do."""
@@ -81,25 +79,17 @@ def _check_link(path: Path, root: Path, name: str, origin: Origin) -> None:
         raise origin.refuse(name, "a link that leads out of the folder; put the file itself there")
 
 
-RUN_FILES = {".yaml", ".json", ".jsonl", ".bin", ".safetensors"}
-"""Suffixes of a run's files."""
-
-
 def check_folder(folder: Path, origin: Origin) -> None:
-    """Refuses what is no folder, or has a link that leads out, a pipe or device, or a folder for a file."""
+    """Refuses what is no folder, or has a link that leads out, a pipe or a device."""
     if not folder.is_dir():
         remedy = "a file; name the folder of a run" if folder.exists() else "no such folder"
         raise InputError(origin.field, origin.value, remedy)
-    for at, folders, files in os.walk(folder):
-        for path in (Path(at, name) for name in (*folders, *files)):
-            name = path.relative_to(folder).as_posix()
-            _check_link(path, folder, name, origin)
-            with contextlib.suppress(FileNotFoundError):  # the run may still be going on
-                if path.is_dir():
-                    if path.suffix in RUN_FILES:
-                        raise origin.refuse(name, "a folder where a file belongs; remove it")
-                elif not stat.S_ISREG(path.stat().st_mode):
-                    raise origin.refuse(name, "neither a file nor a folder; remove it")
+    for path in (Path(at, name) for at, folders, files in os.walk(folder) for name in (*folders, *files)):
+        name = path.relative_to(folder).as_posix()
+        _check_link(path, folder, name, origin)
+        with contextlib.suppress(FileNotFoundError):  # the run may still be going on
+            if not path.is_dir() and not stat.S_ISREG(path.stat().st_mode):
+                raise origin.refuse(name, "neither a file nor a folder; remove it")
 
 
 def check_name(name: object, what: str, origin: Origin) -> str:
@@ -108,19 +98,6 @@ def check_name(name: object, what: str, origin: Origin) -> str:
     if why:
         raise origin.refuse(what, f"the name {_shown(str(name))!r} cannot be part of a path: {why}")
     return str(name)
-
-
-def read_bytes(path: Path, most: int, origin: Origin) -> bytes:
-    """A regular file's content, if it has at most `most` bytes."""
-    size = file_size(path, origin)
-    if size > most:
-        remedy = f"{size} bytes, more than the {most} that such a file may have; it is not what it says"
-        raise origin.refuse(path.name, remedy)
-    try:
-        with path.open("rb") as file:
-            return file.read(most + 1)
-    except OSError as error:
-        raise origin.refuse(path.name, f"cannot be read ({error.strerror})") from error
 
 
 def file_size(path: Path, origin: Origin) -> int:
@@ -136,9 +113,14 @@ def file_size(path: Path, origin: Origin) -> int:
 
 def read_json(path: Path, origin: Origin, most: int = JSON_MOST) -> dict[str, Any]:
     """The mapping in a JSON file of at most `most` bytes."""
-    raw = read_bytes(path, most, origin)
+    if (size := file_size(path, origin)) > most:
+        remedy = f"{size} bytes, more than the {most} that such a file may have; it is not what it says"
+        raise origin.refuse(path.name, remedy)
     try:
-        content = json.loads(raw.decode())
+        with path.open("rb") as file:
+            content = json.loads(file.read(most + 1).decode())
+    except OSError as error:
+        raise origin.refuse(path.name, f"cannot be read ({error.strerror})") from error
     except RecursionError as error:
         raise origin.refuse(path.name, "nested too deeply; it is not what it says") from error
     except ValueError as error:

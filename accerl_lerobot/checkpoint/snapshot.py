@@ -144,5 +144,4 @@ def field_names(cls: type[Any]) -> tuple[str, ...]:
     """Fields of a dataclass or named tuple, in order."""
     if dataclasses.is_dataclass(cls):
         return tuple(field.name for field in dataclasses.fields(cls))
-    names: tuple[str, ...] = cls._fields
-    return names
+    return tuple(cls._fields)

@@ -23,35 +23,6 @@ SPECIAL_TOKENS = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class BackboneSizes:
-    """All sizes of a SmolVLM; the defaults make a SmolVLA of about 0.4 M parameters."""
-
-    hidden: int = 96
-    """Width of the language model; a multiple of 2·`heads`."""
-    layers: int = 2
-    """Language-model layers; the action expert has as many."""
-    heads: int = 4
-    kv_heads: int = 2
-    """Key and value heads; a divisor of `heads`."""
-    vision_hidden: int = 64
-    """Width of the image encoder; a multiple of `vision_heads`."""
-    vision_layers: int = 2
-    vision_heads: int = 4
-    patch: int = 16
-    image: int = 64
-    vocabulary: int = 512
-    """Most tokens the tokeniser has; 264 are bytes and special tokens."""
-    embeddings: int = 0
-    """Rows of the embedding table; 0: as many as the tokeniser has tokens."""
-    intermediate: int = 0
-    """Width inside the language model's MLPs; 0: twice `hidden`."""
-    vision_intermediate: int = 0
-    """Width inside the image encoder's; 0: twice `vision_hidden`."""
-    shuffle: int = 2
-    """Side of the square of image tokens that become one token of the language model."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class BackboneConfig(Section, section="sft.backbone"):
     """Sizes of a random SmolVLM. The defaults give a SmolVLA of about 0.4 M parameters."""
 
@@ -70,17 +41,33 @@ class BackboneConfig(Section, section="sft.backbone"):
         if self.hidden % 8:  # four heads, which rotary embeddings halve
             raise InputError("sft.backbone.hidden", self.hidden, "use a multiple of 8")
 
-    @property
-    def sizes(self) -> BackboneSizes:
-        """These, and the defaults of the others."""
-        return BackboneSizes(**vars(self))
 
-
-def write_backbone(directory: Path, sizes: BackboneSizes, texts: Sequence[str] = ()) -> Path:
+def write_backbone(
+    directory: Path,
+    texts: Sequence[str] = (),
+    *,
+    hidden: int = 96,
+    layers: int = 2,
+    heads: int = 4,
+    kv_heads: int = 2,
+    intermediate: int = 0,
+    vision_hidden: int = 64,
+    vision_layers: int = 2,
+    vision_heads: int = 4,
+    vision_intermediate: int = 0,
+    patch: int = 16,
+    image: int = 64,
+    shuffle: int = 2,
+    vocabulary: int = 512,
+    embeddings: int = 0,
+) -> Path:
     """Writes config, tokeniser and image processor into `directory`; no weights.
 
-    The tokeniser merges bytes on `texts`, so that these instructions become a few tokens instead of one per
-    byte; any other text still encodes, byte by byte.
+    The tokeniser merges bytes on `texts` into at most `vocabulary` tokens, so that these instructions
+    become a few tokens instead of one per byte; any other text still encodes, byte by byte. `embeddings`
+    are rows of the table, by default as many as there are tokens; ``intermediate`` widths are by default
+    twice the others. `shuffle` is the side of the square of image tokens that become one token of the
+    language model.
     """
     from tokenizers import Tokenizer, decoders, models, pre_tokenizers, trainers
     from transformers import (
@@ -95,13 +82,13 @@ def write_backbone(directory: Path, sizes: BackboneSizes, texts: Sequence[str] =
     raw.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
     raw.decoder = decoders.ByteLevel()
     trainer = trainers.BpeTrainer(
-        vocab_size=sizes.vocabulary,
+        vocab_size=vocabulary,
         special_tokens=list(SPECIAL_TOKENS),
         initial_alphabet=sorted(pre_tokenizers.ByteLevel.alphabet()),
         show_progress=False,
     )
     raw.train_from_iterator(sorted(set(texts)), trainer)
-    vocabulary = raw.get_vocab()
+    ids = raw.get_vocab()
     tokenizer = PreTrainedTokenizerFast(
         tokenizer_object=raw,
         pad_token="<|pad|>",
@@ -116,27 +103,27 @@ def write_backbone(directory: Path, sizes: BackboneSizes, texts: Sequence[str] =
         },
     )
     architecture = SmolVLMConfig(
-        image_token_id=vocabulary["<image>"],
-        pad_token_id=vocabulary["<|pad|>"],
-        scale_factor=sizes.shuffle,
+        image_token_id=ids["<image>"],
+        pad_token_id=ids["<|pad|>"],
+        scale_factor=shuffle,
         vision_config={
-            "hidden_size": sizes.vision_hidden,
-            "intermediate_size": sizes.vision_intermediate or 2 * sizes.vision_hidden,
-            "num_hidden_layers": sizes.vision_layers,
-            "num_attention_heads": sizes.vision_heads,
-            "image_size": sizes.image,
-            "patch_size": sizes.patch,
+            "hidden_size": vision_hidden,
+            "intermediate_size": vision_intermediate or 2 * vision_hidden,
+            "num_hidden_layers": vision_layers,
+            "num_attention_heads": vision_heads,
+            "image_size": image,
+            "patch_size": patch,
         },
         text_config={
             "model_type": "llama",
-            "hidden_size": sizes.hidden,
-            "intermediate_size": sizes.intermediate or 2 * sizes.hidden,
-            "num_hidden_layers": sizes.layers,
-            "num_attention_heads": sizes.heads,
-            "num_key_value_heads": sizes.kv_heads,
-            "head_dim": sizes.hidden // sizes.heads,
-            "vocab_size": max(sizes.embeddings, len(vocabulary)),
-            "pad_token_id": vocabulary["<|pad|>"],
+            "hidden_size": hidden,
+            "intermediate_size": intermediate or 2 * hidden,
+            "num_hidden_layers": layers,
+            "num_attention_heads": heads,
+            "num_key_value_heads": kv_heads,
+            "head_dim": hidden // heads,
+            "vocab_size": max(embeddings, len(ids)),
+            "pad_token_id": ids["<|pad|>"],
             "max_position_embeddings": 1024,
             "rms_norm_eps": 1e-5,
         },
@@ -148,7 +135,7 @@ def write_backbone(directory: Path, sizes: BackboneSizes, texts: Sequence[str] =
         image_processor=SmolVLMImageProcessor(),
         tokenizer=tokenizer,
         video_processor=SmolVLMVideoProcessor(),
-        image_seq_len=(sizes.image // sizes.patch // sizes.shuffle) ** 2,
+        image_seq_len=(image // patch // shuffle) ** 2,
         chat_template="{% for m in messages %}{{ m['content'] }}{% endfor %}",
     ).save_pretrained(directory)
     return directory

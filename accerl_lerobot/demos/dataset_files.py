@@ -4,7 +4,8 @@
 LeRobot fills the templates of ``meta/info.json`` in with `str.format` and joins the result to the folder.
 Where an image's ``bytes`` are missing, Hugging Face's `datasets` opens the file or address that its ``path``
 names, and Pillow has Ghostscript draw PostScript. In the context of `checked`, LeRobot's own classes have
-files checked first, wherever they come from. A child process does it, within limits of memory and time.
+files checked first, wherever they come from. A child process does it, and then loads them with LeRobot,
+within limits of memory and time.
 """
 
 from __future__ import annotations
@@ -25,7 +26,6 @@ from accerl_lerobot.checkpoint.safety import (
     Origin,
     brief,
     check_name,
-    check_number,
     file_size,
     read_json,
     safe_join,
@@ -43,15 +43,9 @@ INFO, STATS, TASKS, EPISODES, DATA = (
 )  # fmt: skip
 STATS_MOST = 32 * MIB
 SIDE_MOST = 8192
-"""Pixels of an image's side."""
 INDEX = r"\{(chunk_index|file_index)(:0?[1-9]?d)?\}"
 PLACES = {"data_path": INDEX, "video_path": rf"{INDEX}|\{{video_key\}}"}
-"""Key of ``info.json`` → the placeholders that its template may have."""
-COUNTS = {
-    "total_episodes": 0, "total_frames": 0, "total_tasks": 0, "chunks_size": 1, "data_files_size_in_mb": 1,
-    "video_files_size_in_mb": 1,
-}  # fmt: skip
-"""Key of ``info.json`` → its smallest value."""
+COUNTS = ("total_episodes", "total_frames", "total_tasks")
 DTYPES = {
     "image", "video", "string", "bool", "language", "int8", "int16", "int32", "int64", "uint8", "uint16",
     "uint32", "uint64", "float16", "float32", "float64",
@@ -86,10 +80,10 @@ def open_metadata(dataset: DatasetConfig) -> Any:
             f"its format is not {CODEBASE_VERSION}, which this LeRobot reads; from v2.1 convert with: {tool}"
         )
         raise InputError("dataset.repo_id", name, remedy) from error
-    except (OSError, ValueError) as error:
-        remedy = f"not found locally nor on the Hub ({brief(error)})"
-        raise InputError("dataset.repo_id", name, remedy) from error
     except Exception as error:  # LeRobot may fail over anything in the files
+        if root is None and isinstance(error, (OSError, ValueError)):
+            remedy = f"not found locally nor on the Hub ({brief(error)})"
+            raise InputError("dataset.repo_id", name, remedy) from error
         raise origin_of(dataset).refuse("meta", f"LeRobot cannot read it ({brief(error)})") from error
 
 
@@ -97,10 +91,7 @@ def open_metadata(dataset: DatasetConfig) -> Any:
 def opened(dataset: DatasetConfig, meta: Any, episodes: Sequence[int] | None = None) -> Iterator[Any]:
     """A LeRobotDataset, whose files are checked as long as the context lasts.
 
-    Args:
-        dataset: on the Hub or in a folder.
-        meta: what `open_metadata` gave for it.
-        episodes: indices of those that are read; None: all.
+    `meta` is what `open_metadata` gave for it, `episodes` are indices of those that are read; None: all.
     """
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
@@ -140,9 +131,7 @@ def task_texts(meta: Any) -> list[str]:
 def checked(origin: Origin, whole: bool = False) -> Iterator[None]:
     """In this context LeRobot has a dataset's files checked before it reads them.
 
-    Args:
-        origin: what named the dataset.
-        whole: refuse missing files and rows; otherwise LeRobot fetches them.
+    With `whole`, missing files and rows are refused; otherwise LeRobot fetches them.
     """
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
     from lerobot.datasets.dataset_reader import DatasetReader
@@ -151,7 +140,7 @@ def checked(origin: Origin, whole: bool = False) -> Iterator[None]:
     from datasets import Image
 
     load_metadata, load_data = LeRobotDatasetMetadata._load_metadata, DatasetReader._load_hf_dataset
-    index, decode = DatasetReader._build_index_mapping, Image.decode_example
+    decode = Image.decode_example
 
     def checked_metadata(self: Any) -> None:
         root = Path(self.root)
@@ -171,14 +160,21 @@ def checked(origin: Origin, whole: bool = False) -> Iterator[None]:
     def checked_data(self: Any) -> Any:
         root = Path(self.root)
         info = read_json(root / INFO, origin)
-        complete = whole and self.episodes is None
-        rehearse(lambda: check_data(root, info, origin, complete), root, origin, "data/**/*")
-        return load_data(self)
 
-    def checked_index(self: Any) -> None:
-        if self.episodes is None and len(self.hf_dataset) < self._meta.total_frames:
-            raise origin.refuse(DATA, _fewer(len(self.hf_dataset), self._meta.total_frames))
-        index(self)
+        def check() -> None:
+            check_data(root, info, origin)
+            try:
+                rows = load_data(self)
+            except MemoryError:
+                raise
+            except (FileNotFoundError, NotADirectoryError):
+                return  # LeRobot fetches them
+            except Exception as error:
+                raise origin.refuse(DATA, f"LeRobot cannot load it ({_cause(error)}); {AGAIN}") from error
+            check_rows(rows, info, origin, whole and self.episodes is None)
+
+        rehearse(check, root, origin, "data/**/*")
+        return load_data(self)
 
     def checked_decode(self: Any, value: Any, token_per_repo_id: Any = None) -> Any:
         try:
@@ -190,14 +186,17 @@ def checked(origin: Origin, whole: bool = False) -> Iterator[None]:
     Image.decode_example = checked_decode
     LeRobotDatasetMetadata._load_metadata = checked_metadata
     DatasetReader._load_hf_dataset = checked_data
-    DatasetReader._build_index_mapping = checked_index
     try:
         yield
     finally:
         LeRobotDatasetMetadata._load_metadata = load_metadata
         DatasetReader._load_hf_dataset = load_data
-        DatasetReader._build_index_mapping = index
         Image.decode_example = decode
+
+
+def _cause(error: BaseException) -> str:
+    """The words of the first error, which `datasets` hides behind one of its own."""
+    return _cause(error.__cause__) if error.__cause__ else brief(error)
 
 
 def check_metadata(root: Path, origin: Origin, whole: bool = False) -> None:
@@ -227,15 +226,10 @@ def check_metadata(root: Path, origin: Origin, whole: bool = False) -> None:
 
 
 def check_info(info: dict[str, Any], origin: Origin) -> None:
-    """Refuses an ``info.json`` that would lead LeRobot out of the folder, or that it cannot use."""
-    version = info.get("codebase_version")
-    if not isinstance(version, str) or not 0 < len(version) <= 32:
-        raise origin.refuse(f"{INFO}: codebase_version", "a version such as v3.0 is wanted")
-    check_number(info.get("fps"), 1, 10_000, f"{INFO}: fps", origin)
-    for key, least in COUNTS.items():
-        value = info.get(key, least)
-        if type(value) is not int or not least <= value < 2**53:
-            raise origin.refuse(f"{INFO}: {key}", f"{str(value)[:40]!r}; use a whole number from {least}")
+    """Refuses an ``info.json`` that would lead LeRobot out of the folder, or that we cannot use."""
+    for key in COUNTS:
+        if type(info.get(key, 0)) is not int:
+            raise origin.refuse(f"{INFO}: {key}", f"{str(info[key])[:40]!r}; use a whole number")
     for key, places in PLACES.items():
         template = info.get(key)
         if template is None and (key == "video_path" or key not in info):
@@ -248,34 +242,25 @@ def check_info(info: dict[str, Any], origin: Origin) -> None:
     if not isinstance(features, dict) or not features:
         raise origin.refuse(f"{INFO}: features", "named features are wanted")
     for name, feature in features.items():
-        _check_feature(name, feature, origin)
-    if not isinstance(info.get("splits", {}), dict) or not isinstance(info.get("tools"), list | None):
-        raise origin.refuse(INFO, "splits is a mapping and tools a list; record the dataset again")
-
-
-def _check_feature(name: str, feature: Any, origin: Origin) -> None:
-    where = f"{INFO}: features.{name[:60]}"
-    check_name(name, where, origin)
-    if not isinstance(feature, dict) or str(feature.get("dtype")) not in DTYPES:
-        raise origin.refuse(where, f"a dtype is wanted, one of {', '.join(sorted(DTYPES))}")
-    for key in ("info", "video_info"):
-        if not isinstance(feature.get(key), dict | None):
-            raise origin.refuse(where, f"{key} is a mapping; record the dataset again")
-    shape: Any = feature.get("shape")
-    is_image = feature["dtype"] in ("image", "video")
-    good = isinstance(shape, list) and all(type(side) is int and 0 < side < 2**31 for side in shape)
-    if not good or (is_image and (len(shape) != 3 or max(shape) > SIDE_MOST)):
-        wanted = f"an image has 3 sides of at most {SIDE_MOST}" if is_image else "use a list of lengths"
-        raise origin.refuse(where, f"shape {str(shape)[:80]}; {wanted}")
+        where = f"{INFO}: features.{name[:60]}"
+        check_name(name, where, origin)
+        if not isinstance(feature, dict) or str(feature.get("dtype")) not in DTYPES:
+            raise origin.refuse(where, f"a dtype is wanted, one of {', '.join(sorted(DTYPES))}")
+        shape: Any = feature.get("shape")
+        is_image = feature["dtype"] in ("image", "video")
+        good = isinstance(shape, list) and all(type(side) is int and 0 < side < 2**31 for side in shape)
+        if not good or (is_image and (len(shape) != 3 or max(shape) > SIDE_MOST)):
+            wanted = f"an image has 3 sides of at most {SIDE_MOST}" if is_image else "use a list of lengths"
+            raise origin.refuse(where, f"shape {str(shape)[:80]}; {wanted}")
 
 
 def check_stats(stats: dict[str, Any], features: dict[str, Any], origin: Origin) -> None:
     """Refuses a ``stats.json`` (feature → statistic → numbers) that no policy can be normalised by."""
-    for name, statistics in stats.items():
-        if not isinstance(statistics, dict):
+    for name in (name for name in stats if name.startswith(LEARNED)):
+        if not isinstance(stats[name], dict):
             raise origin.refuse(f"{STATS}: {name}", "a mapping from statistics to numbers is wanted")
         feature = features.get(name, {"dtype": "image"})
-        for statistic, values in statistics.items():
+        for statistic, values in stats[name].items():
             where, again = f"{STATS}: {name}.{statistic}", "compute the statistics again"
             try:
                 array = np.asarray(values)
@@ -283,8 +268,6 @@ def check_stats(stats: dict[str, Any], features: dict[str, Any], origin: Origin)
                 array = np.asarray(None)
             if array.dtype.kind not in "biuf":
                 raise origin.refuse(where, f"numbers in lists of equal lengths are wanted; {again}")
-            if not name.startswith(LEARNED):
-                continue
             plain = feature["dtype"] not in ("image", "video") and statistic != "count"
             if plain and array.shape and list(array.shape) != list(feature["shape"]):
                 remedy = f"shape {list(array.shape)}, and the feature has {list(feature['shape'])}; {again}"
@@ -293,31 +276,34 @@ def check_stats(stats: dict[str, Any], features: dict[str, Any], origin: Origin)
                 raise origin.refuse(where, f"a number that is not finite; {again}")
 
 
-def check_data(root: Path, info: dict[str, Any], origin: Origin, whole: bool = False) -> None:
-    """Refuses rows that are not what ``info.json`` says, or that cannot be learned from.
-
-    With `whole`, fewer rows than frames are refused too; otherwise LeRobot fetches the others.
-    """
-    features = {name: feature for name, feature in info["features"].items() if feature["dtype"] != "video"}
-    rows, frames = 0, info.get("total_frames", 0)
+def check_data(root: Path, info: dict[str, Any], origin: Origin) -> None:
+    """Refuses files of rows, images and videos that name other files, before LeRobot reads them."""
+    images = {name: feature for name, feature in info["features"].items() if feature["dtype"] == "image"}
     for path in _files(root, DATA, origin):
         name = f"{DATA}/{path.parent.name}/{path.name}"
         with _parquet(path, origin) as file:
-            rows += file.metadata.num_rows
-            if rows > frames:
-                raise origin.refuse(name, f"more rows than the {frames} frames that {INFO} says; {AGAIN}")
-            _check_columns(file, features, info, name, origin)
-            for feature in (f for f in features if features[f]["dtype"] == "image"):
-                _check_images(file, feature, list(features[feature]["shape"]), name, origin)
-    if whole and rows < frames:
-        raise origin.refuse(DATA, _fewer(rows, frames))
+            for image in images.keys() & set(file.schema_arrow.names):
+                _check_images(file, image, list(images[image]["shape"]), name, origin)
     videos = safe_join(root, "videos", origin)
     for path in videos.rglob("*") if videos.is_dir() else ():
         safe_join(root, path.relative_to(root).as_posix(), origin)
 
 
-def _fewer(rows: int, frames: int) -> str:
-    return f"{rows} rows, fewer than the {frames} frames that {INFO} says; {AGAIN}"
+def check_rows(rows: Any, info: dict[str, Any], origin: Origin, whole: bool = False) -> None:
+    """Refuses rows that LeRobot has loaded and nobody can learn from; with `whole`, missing ones too."""
+    frames = info.get("total_frames", 0)
+    if len(rows) > frames or (whole and len(rows) < frames):
+        raise origin.refuse(DATA, f"{len(rows)} rows, and {INFO} says {frames} frames; {AGAIN}")
+    below = {"task_index": info.get("total_tasks", 0), "episode_index": info.get("total_episodes", 0)}
+    for name, feature in info["features"].items():
+        whole_numbers = feature["dtype"].startswith(("int", "uint"))
+        if not whole_numbers and not (feature["dtype"].startswith("float") and name.startswith(LEARNED)):
+            continue
+        values = np.asarray(rows.with_format("numpy", columns=[name])[:][name])
+        if values.dtype.kind not in "biuf" or not np.isfinite(values).all():
+            raise origin.refuse(DATA, f"{name[:60]} has a number that is not finite; record it again")
+        if name in below and len(wrong := values[(values < 0) | (values >= below[name])]):
+            raise origin.refuse(DATA, f"{name}={wrong[0]}, and there are {below[name]}; {AGAIN}")
 
 
 def _files(root: Path, folder: str, origin: Origin) -> list[Path]:
@@ -379,72 +365,18 @@ def _check_episodes(file: pq.ParquetFile, frames: int, name: str, origin: Origin
     """Refuses a table of episodes that does not say where they are."""
     import pyarrow as pa
 
-    columns = ["dataset_from_index", "dataset_to_index", "data/chunk_index", "data/file_index"]
-    columns += [c for c in file.schema_arrow.names if c.endswith(("/chunk_index", "/file_index"))]
-    if missing := [column for column in columns if column not in file.schema_arrow.names]:
-        raise origin.refuse(name, f"no column {missing[0]}; {AGAIN}")
-    table = file.read(columns=list(dict.fromkeys(columns)))
-    for column in table.column_names:
-        values = table.column(column)
+    span, places = ("dataset_from_index", "dataset_to_index"), ("/chunk_index", "/file_index")
+    columns = [c for c in file.schema_arrow.names if c in span or c.endswith(places)]
+    if missing := {*span, *(f"data{place}" for place in places)} - set(columns):
+        raise origin.refuse(name, f"no column {min(missing)}; {AGAIN}")
+    table = file.read(columns=columns)
+    for column, values in zip(table.column_names, table.columns, strict=True):
         if not pa.types.is_integer(values.type) or values.null_count or (values.to_numpy() < 0).any():
             raise origin.refuse(f"{name}: {column}", f"whole numbers from 0 are wanted; {AGAIN}")
-    first, last = (table.column(column).to_numpy() for column in columns[:2])
-    wrong = np.flatnonzero((last <= first) | (last > frames))
-    if len(wrong):
-        span = f"from frame {first[wrong[0]]} to {last[wrong[0]]} of {frames}"
-        raise origin.refuse(name, f"an episode {span}; {AGAIN}")
-
-
-def _check_columns(
-    file: pq.ParquetFile, features: dict[str, Any], info: dict[str, Any], name: str, origin: Origin
-) -> None:
-    """Refuses columns other than the features, of other numbers, or of other lengths in a row."""
-    columns = set(file.schema_arrow.names)
-    if missing := sorted(features.keys() - columns) or sorted(columns - features.keys()):
-        which = "is no column" if missing[0] in features else f"is no feature of {INFO}"
-        raise origin.refuse(name, f"{missing[0][:60]} {which}; {AGAIN}")
-    below = {"task_index": info.get("total_tasks", 0), "episode_index": info.get("total_episodes", 0)}
-    numbers = [f for f in features if features[f]["dtype"] not in ("image", "string", "language")]
-    for feature in numbers:
-        dtype = features[feature]["dtype"]
-        if _family(file.schema_arrow.field(feature).type) != dtype.rstrip("0123468").removeprefix("u"):
-            raise origin.refuse(name, f"{feature[:60]} holds no numbers of type {dtype}; record it again")
-    for batch in file.iter_batches(batch_size=1024, columns=numbers):
-        for feature, column in zip(batch.schema.names, batch.columns, strict=True):
-            shape = list(features[feature]["shape"])
-            values = _values(column, [] if shape == [1] else shape)
-            if values is None:
-                remedy = f"{feature[:60]} has other numbers than {shape} in a row; record it again"
-                raise origin.refuse(name, remedy)
-            if feature.startswith(LEARNED) and not np.isfinite(values).all():
-                raise origin.refuse(name, f"{feature[:60]} has a number that is not finite; record it again")
-            if feature in below and len(wrong := values[(values < 0) | (values >= below[feature])]):
-                raise origin.refuse(name, f"{feature}={wrong[0]}, and there are {below[feature]}; {AGAIN}")
-
-
-def _family(kind: Any) -> str:
-    """bool, int or float for a column of such values or lists of them; otherwise empty."""
-    import pyarrow as pa
-
-    tests = {"bool": pa.types.is_boolean, "int": pa.types.is_integer, "float": pa.types.is_floating}
-    return next((family for family, test in tests.items() if test(_element_type(kind))), "")
-
-
-def _values(column: Any, shape: list[int]) -> np.ndarray | None:
-    """All numbers of a column whose rows have a shape; None if one has another."""
-    import pyarrow as pa
-    import pyarrow.compute as pc
-
-    column = getattr(column, "storage", column)
-    for length in shape:
-        if not hasattr(column, "flatten") or not hasattr(column.type, "value_type") or column.null_count:
-            return None
-        if not pc.all(pc.equal(pc.list_value_length(column), length)).as_py():
-            return None
-        column = column.flatten()
-    if column.null_count or pa.types.is_nested(column.type):
-        return None
-    return np.asarray(column.to_numpy(zero_copy_only=False))
+    first, last = (table.column(column).to_numpy() for column in span)
+    if len(wrong := np.flatnonzero((last <= first) | (last > frames))):
+        span_text = f"from frame {first[wrong[0]]} to {last[wrong[0]]} of {frames}"
+        raise origin.refuse(name, f"an episode {span_text}; {AGAIN}")
 
 
 def _undecodable(error: Exception, name: str, origin: Origin) -> InputError:

@@ -6,12 +6,6 @@ a real robot does not have. π0-FAST's action tokeniser, whose newest code LeRob
 read by `policies.vla` instead. ``--code_revision=COMMIT`` has code from the Hub run, of this commit only.
 ``--policy.discover_packages_path`` goes with ``--policy.path`` too, where LeRobot 0.6.1 takes it for a field
 of the policy's config.
-
-The dataset's items are kept in memory where they take less than 4 GiB and are not transformed at random:
-LeRobot 0.6.1 decodes every image of an action chunk to read the chunk's actions, 3.8 ms an item for a chunk
-of ten 64-pixel frames.
-
-Run: ``python -m accerl_lerobot.demos.guarded_train <lerobot-train arguments>``
 """
 
 from __future__ import annotations
@@ -39,7 +33,9 @@ MAX_BYTES = 4 * 1024**3
 class CachedDataset(Dataset[Any]):
     """A map-style LeRobotDataset whose items are remembered; everything else is the dataset's own.
 
-    Only for datasets without random image transforms, which must differ from epoch to epoch.
+    LeRobot 0.6.1 decodes every image of an action chunk to read the chunk's actions, 3.8 ms an item for a
+    chunk of ten 64-pixel frames. Not for datasets with random image transforms, which must differ from
+    epoch to epoch.
     """
 
     def __init__(self, dataset: Any) -> None:
@@ -61,11 +57,6 @@ class CachedDataset(Dataset[Any]):
         return getattr(self._dataset, name)
 
 
-def item_bytes(meta: Any) -> int:
-    """Memory of one item's images, as float32."""
-    return sum(4 * math.prod(meta.features[key]["shape"]) for key in meta.camera_keys)
-
-
 def _adapted(stock: Any) -> Any:
     """LeRobot's function that makes datasets, without a simulator's state beside the images to train on, and
     with a `CachedDataset` where that is possible."""
@@ -75,8 +66,8 @@ def _adapted(stock: Any) -> Any:
         if train.meta.camera_keys:
             train.meta.features.pop(ENVIRONMENT_STATE, None)
         fixed = not cfg.dataset.image_transforms.enable and not cfg.dataset.streaming
-        size = item_bytes(train.meta) * cfg.policy.n_obs_steps
-        if fixed and len(train) * size <= MAX_BYTES:
+        item = sum(4 * math.prod(train.meta.features[key]["shape"]) for key in train.meta.camera_keys)
+        if fixed and len(train) * item * cfg.policy.n_obs_steps <= MAX_BYTES:
             train = CachedDataset(train)
         return train, evaluation
 

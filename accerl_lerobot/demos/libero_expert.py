@@ -45,12 +45,7 @@ PRESS = 0.008
 
 
 class Hand:
-    """Movements of the robot's hand.
-
-    Args:
-        scene: where it moves.
-        rng: for the differences between episodes.
-    """
+    """Movements of the robot's hand in a scene; `rng` is for the differences between episodes."""
 
     def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
         self.scene, self.simulator, self.rng = scene, scene.simulator, rng

@@ -96,10 +96,8 @@ class Scene:
     def grasp(self, name: str, goal: np.ndarray, rng: np.random.Generator) -> Grasp:
         """Choose a grasp from above: across the narrow side, or at the rim of an object that is too wide.
 
-        Args:
-            name: of the object.
-            goal: (3,), position where the object is to be placed; the hand must fit there too.
-            rng: chooses among grasps of similar cost.
+        `goal` is the position (3,) where the object is to be placed, as the hand must fit there too; `rng`
+        chooses among grasps of similar cost.
         """
         corners, position = self.corners(name), self.simulator.pose(name)[0]
         low, high = corners[..., 2].min(), corners[..., 2].max()

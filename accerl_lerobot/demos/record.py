@@ -21,6 +21,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
+from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -51,9 +52,6 @@ _VERSIONS = {name: name for name in ("lerobot", "metaworld", "robosuite", "mujoc
 _VERSIONS |= {"libero": "hf-libero"}
 """Module → distribution."""
 
-
-# An episode.
-
 Expert = Callable[[], np.ndarray]
 """Gives the next action for the state its world is in."""
 
@@ -71,11 +69,8 @@ class Episode:
     actions: np.ndarray
     """float32 (T, A), as executed: noise included, clipped to the world's bounds."""
     rewards: np.ndarray
-    """float32 (T,)."""
     task: str
-    """The instruction text."""
     done: bool
-    """True if the last step ended the episode."""
     success_at: int
     """Index of the first step after which the task was achieved; -1 for never."""
     seed: int
@@ -102,21 +97,14 @@ def play(
 ) -> Episode:
     """Plays one episode to its end; equal arguments give equal episodes.
 
-    Args:
-        world: reset here with `seed`.
-        expert: reads `world`.
-        task: name of the task.
-        seed: of the world and of the noise.
-        noise, push: see `DemosConfig`.
-        fail: actions are a random drift from a random early step on.
+    With `fail`, actions are a random drift from a random early step on; for the others see `DemosConfig`.
     """
     rng = np.random.default_rng((seed, 1))
     low, high = world.spec.action_low, world.spec.action_high
     pushed = _push(world.spec.action_dim, push, seed)
     drift_from = int(rng.integers(0, _DRIFT_FROM)) if fail else world.spec.max_steps
     drift: np.ndarray = np.zeros(world.spec.action_dim)
-    observation: Observation | None = world.reset(seed, task)
-    done, success_at = False, -1
+    observation, done, success_at = world.reset(seed, task), False, -1
     seen: list[Observation] = []
     actions: list[np.ndarray] = []
     rewards: list[float] = []
@@ -126,10 +114,8 @@ def play(
         else:
             drift = _DRIFT_MEMORY * drift + _DRIFT_SCALE * rng.standard_normal(len(drift))
             wanted = np.clip(drift, low, high)
-        action = wanted + noise * rng.standard_normal(len(wanted))
-        action = np.clip(action, low, high).astype(np.float32)
+        action = np.clip(wanted + noise * rng.standard_normal(len(wanted)), low, high).astype(np.float32)
         result = world.step_chunk(action[None])
-        assert observation is not None
         seen.append(observation)
         actions.append(action)
         rewards.append(result.rewards[0])
@@ -169,9 +155,6 @@ def simulated_expert(world: World, task: str) -> Expert:
     """Holds the action that solves the episode."""
     assert isinstance(world, SimulatedWorld)
     return lambda: world.solution
-
-
-# A dataset, from simulated episodes: several processes simulate, the parent writes, in order.
 
 
 def check_free(root: str) -> Path:
@@ -227,22 +210,15 @@ def in_order[Item, Result](
     The first are already under way when this returns.
     """
     left = iter(items)
-    waiting = collections.deque(pool.submit(work, item) for _, item in zip(range(ahead), left, strict=False))
-    return _drained(pool, work, left, waiting)
+    waiting = collections.deque(pool.submit(work, item) for item in islice(left, ahead))
 
+    def results() -> Iterator[Result]:
+        while waiting:
+            result = waiting.popleft().result()
+            waiting.extend(pool.submit(work, item) for item in islice(left, 1))
+            yield result
 
-def _drained[Item, Result](
-    pool: concurrent.futures.Executor,
-    work: Callable[[Item], Result],
-    left: Iterator[Item],
-    waiting: collections.deque[concurrent.futures.Future[Result]],
-) -> Iterator[Result]:
-    while waiting:
-        result = waiting.popleft().result()
-        for item in left:
-            waiting.append(pool.submit(work, item))
-            break
-        yield result
+    return results()
 
 
 @contextmanager
@@ -267,9 +243,6 @@ def new_dataset(
     dataset.finalize()
     # The pictures are inside the parquet files; LeRobot leaves the folders they were collected in.
     shutil.rmtree(root / "images", ignore_errors=True)
-
-
-# Demonstrations.
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -32,7 +32,6 @@ from accerl_lerobot.policies.config import discovery, register_policies
 logger = logging.getLogger(__name__)
 
 CODE_REVISION = "--code_revision="
-"""Our argument of the trainer."""
 HELD_OUT = re.compile(r"\bstep (\d+): eval_loss=(\S+)")
 """LeRobot's report of a loss on held-out episodes."""
 CANDIDATES = 10
@@ -40,7 +39,6 @@ CANDIDATES = 10
 REFUSED = "accerl refuses: "
 """Begins the last line of a trainer that met something it must not use; JSON follows."""
 LOG_EVERY = 25
-"""Optimiser steps between two lines of progress."""
 NO_SFT = {"gaussian_actor": "only LeRobot's SAC trains it, lerobot-train does not; use act"}
 """LeRobot policy types that ``lerobot-train`` cannot fine-tune → why, and what to do."""
 
@@ -151,16 +149,10 @@ def run_sft(
     texts: Sequence[str] = (),
     on_step: Callable[[int, float], None] | None = None,
 ) -> Path:
-    """Trains and returns the ``pretrained_model`` folder.
+    """Trains and returns the ``pretrained_model`` folder; the parent of `output_dir` gets ``sft.log``.
 
-    Args:
-        config: what to train, and for how long.
-        dataset: what to train on.
-        output_dir: must not exist; its parent gets ``sft.log``.
-        seed: of LeRobot's trainer.
-        device: cpu or cuda.
-        texts: the dataset's instructions, for a new backbone's tokeniser.
-        on_step: receives step and loss as progress is reported, from 1000 on rounded to thousands.
+    A new backbone's tokeniser learns `texts`, the dataset's instructions. `on_step` receives step and loss as
+    progress is reported, from 1000 on rounded to thousands.
 
     Raises:
         InputError: `output_dir` exists; the checkpoint to start from, or the dataset, is not to be trusted.
@@ -173,7 +165,7 @@ def run_sft(
         config = replace(config, init_path=str(fetched_checkpoint(config.init_path, None, "sft.init_path")))
     output_dir.parent.mkdir(parents=True, exist_ok=True)
     if config.init_path is None and config.backbone is not None:
-        write_backbone(output_dir.parent / "backbone", config.backbone.sizes, texts)
+        write_backbone(output_dir.parent / "backbone", texts, **vars(config.backbone))
     config = _with_backbone_in_place(config, output_dir.parent / "init")
     command = sft_command(config, dataset, output_dir, seed, device, picked(dataset, config.pick))
     logger.info("%s", shlex.join(command))

@@ -7,6 +7,7 @@ itself, `terminated` means the task is over (bootstrap 0), `truncated` that only
 
 from __future__ import annotations
 
+import difflib
 import shlex
 from abc import ABC, abstractmethod
 from collections import deque
@@ -102,7 +103,6 @@ class Step(NamedTuple):
     """Outcome of one env step."""
 
     success: bool
-    """True if the task is achieved now."""
     ended: bool
     """True if the task is over, which `success` alone need not mean."""
     reward: float | None = None
@@ -219,6 +219,20 @@ class EnvConfig(Section, draccus.ChoiceRegistry, section="env"):
 def names(text: str) -> tuple[str, ...]:
     """Names separated by commas."""
     return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+def expand_tasks(text: str, groups: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
+    """Expands names of tasks and groups, separated by commas; keeps the order, drops repetitions."""
+    tasks = dict.fromkeys(task for group in groups.values() for task in group)
+    found: dict[str, None] = {}
+    for name in (part.strip() for part in text.split(",")):
+        if name not in groups and name not in tasks:
+            close = difflib.get_close_matches(name, [*tasks, *groups], cutoff=0.4)
+            hint = f"did you mean {' or '.join(close)}? " if close else ""
+            remedy = f"use names such as {next(iter(tasks))}, separated by commas, or of {', '.join(groups)}"
+            raise InputError("env.task", text, f"{name!r} is no task; {hint}{remedy}")
+        found |= dict.fromkeys(groups.get(name, (name,)))
+    return tuple(found)
 
 
 def check_cameras(cameras: Sequence[str], text: str) -> None:

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Any registered Gymnasium environment with continuous actions, its observation mapped to LeRobot's features.
-
-    accerl train RECIPE --env.type=gym --env.id=mine/Reach-v0 --env.discover_packages_path=my_package
+"""Any registered Gymnasium environment with continuous actions, with LeRobot's features.
 
 Importing this file loads no Gymnasium; making the world does.
 """
@@ -32,10 +30,6 @@ class GymConfig(EnvConfig):
     """A Gymnasium environment, and which of its observations become which features.
 
     Keys of nested observations are joined by dots. An episode ends with its first success.
-
-    Example:
-        >>> GymConfig(id="gym_pusht/PushT-v0", state=("agent_pos",), images={"image": "pixels"},
-        ...           kwargs={"obs_type": "pixels_agent_pos"}, discover_packages_path="gym_pusht")
     """
 
     world = "accerl_lerobot.envs.gym_env:GymWorld"
@@ -83,12 +77,7 @@ class GymConfig(EnvConfig):
 
 
 class GymWorld(EpisodeWorld):
-    """One Gymnasium environment.
-
-    Raises:
-        InputError: Gymnasium does not know it or refuses its arguments; an observation that `config` names is
-            missing or has another shape; actions are not a vector with bounds.
-    """
+    """One Gymnasium environment."""
 
     def __init__(self, config: GymConfig) -> None:
         import gymnasium
@@ -146,13 +135,12 @@ class GymWorld(EpisodeWorld):
         )
 
     def _observe(self) -> Observation:
-        raw = self._raw
-        config, size = self.config, self.config.image_size
-        state = self._vector("state", raw, config.state)
+        raw, config, size = flattened(self._raw), self.config, self.config.image_size
+        state = self._vector("state", raw, config.state or ("",))
         observation: Observation = {TASK: config.task, "observation.state": state}
         self._pictures = {}
         for camera, key in config.images.items():
-            picture = self._env.render() if key == RENDER else _at(raw, key, "images")
+            picture = self._env.render() if key == RENDER else _part(raw, key, "images")
             picture = np.asarray(picture)
             if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8:
                 remedy = f"{key} is {picture.dtype} {picture.shape}; an image is uint8 (H, W, 3)"
@@ -168,14 +156,11 @@ class GymWorld(EpisodeWorld):
             )
         return observation
 
-    def _vector(self, name: str, raw: Any, keys: tuple[str, ...]) -> np.ndarray:
-        """Numbers of the observation, float32 (N,); all of them if no key is given."""
-        parts = [np.asarray(_at(raw, key, name)) for key in keys] or [np.asarray(raw)]
+    def _vector(self, name: str, raw: dict[str, np.ndarray], keys: tuple[str, ...]) -> np.ndarray:
+        """Numbers of the observation, float32 (N,)."""
+        parts = [_part(raw, key, name) for key in keys]
         if any(part.dtype.kind not in "fiub" for part in parts):
-            shown = ", ".join(_keys(raw)) or "one array"
-            raise InputError(
-                f"env.{name}", list(keys), f"name keys with numbers; the observation has {shown}"
-            )
+            raise InputError(f"env.{name}", list(keys), "name keys with numbers")
         return np.concatenate([part.astype(np.float32).ravel() for part in parts])
 
 
@@ -186,31 +171,23 @@ def resized(frame: np.ndarray, height: int, width: int) -> np.ndarray:
     return np.asarray(Image.fromarray(frame).resize((width, height), Image.Resampling.BILINEAR))
 
 
-def _keys(raw: Any, prefix: str = "") -> list[str]:
-    """Dotted keys of a nested observation."""
+def flattened(raw: Any, prefix: str = "") -> dict[str, np.ndarray]:
+    """Arrays of a nested observation by their dotted keys; one array has the key ""."""
     if not isinstance(raw, dict):
-        return [prefix] if prefix else []
-    return [key for k, value in raw.items() for key in _keys(value, f"{prefix}.{k}" if prefix else str(k))]
+        return {prefix: np.asarray(raw)}
+    nested = (flattened(part, f"{prefix}.{key}" if prefix else str(key)) for key, part in raw.items())
+    return {key: array for part in nested for key, array in part.items()}
 
 
-def _at(raw: Any, key: str, name: str) -> Any:
-    """The part of a nested observation with a dotted key.
-
-    Raises:
-        InputError: there is none; `name` is the field that asks for it.
-    """
-    value = raw
-    for part in key.split("."):
-        if not isinstance(value, dict) or part not in value:
-            shown = ", ".join(_keys(raw)) or "no keys: it is one array"
-            raise InputError(f"env.{name}", key, f"the observation has {shown}")
-        value = value[part]
-    return value
+def _part(raw: dict[str, np.ndarray], key: str, name: str) -> np.ndarray:
+    """The array with a key, which `name`, a field, asks for."""
+    if key not in raw:
+        shown = ", ".join(filter(None, raw)) or "no keys: it is one array"
+        raise InputError(f"env.{name}", key, f"the observation has {shown}; name some of its keys")
+    return raw[key]
 
 
 def finite_numbers(raw: Any) -> bool:
     """True if no number of a nested observation is NaN or infinite."""
-    if isinstance(raw, dict):
-        return all(finite_numbers(value) for value in raw.values())
-    array = np.asarray(raw)
-    return array.dtype.kind != "f" or bool(np.isfinite(array).all())
+    arrays = flattened(raw).values()
+    return all(bool(np.isfinite(array).all()) for array in arrays if array.dtype.kind == "f")

@@ -19,11 +19,12 @@ from accerl_lerobot.envs.base import (
     Step,
     WorldSpec,
     check_cameras,
+    expand_tasks,
     names,
     task_code,
 )
 from accerl_lerobot.envs.libero_simulator import FPS, MAX_OBJECTS, OBJECT_NUMBERS, ROBOT_NUMBERS, Simulator
-from accerl_lerobot.envs.libero_tasks import instruction, resolve
+from accerl_lerobot.envs.libero_tasks import instruction, suites
 from accerl_lerobot.envs.metaworld import diverged
 from accerl_lerobot.errors import InputError, expanded
 from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Observation
@@ -41,10 +42,6 @@ class LiberoConfig(EnvConfig):
 
     Evaluation begins at the 50 recorded states of a task, demonstrations and exploration at placements drawn
     from the task's own regions, so that no evaluated start is trained on.
-
-    Example:
-        >>> LiberoConfig(task="libero_object/0,libero_object/3").tasks
-        ('libero_object/0', 'libero_object/3')
     """
 
     expert = "accerl_lerobot.demos.libero_expert:libero_expert"
@@ -74,7 +71,7 @@ class LiberoConfig(EnvConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        resolve(self.task)
+        expand_tasks(self.task, suites())
         check_cameras(self.cameras, self.camera)
         if self.assets and not (expanded(self.assets, "env.assets") / "scenes").is_dir():
             raise InputError("env.assets", self.assets, "no folder of LIBERO's assets: it holds no scenes/")
@@ -88,7 +85,7 @@ class LiberoConfig(EnvConfig):
     @property
     def tasks(self) -> tuple[str, ...]:
         """The tasks that `task` stands for, ``suite/number``."""
-        return resolve(self.task)
+        return expand_tasks(self.task, suites())
 
     @property
     def cameras(self) -> tuple[str, ...]:

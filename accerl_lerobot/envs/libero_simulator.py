@@ -26,7 +26,6 @@ SETTLING = 10
 MAX_OBJECTS = 4
 """Most objects that a task names as those it is about."""
 MAX_FACES = 2000
-"""Faces that ``rendering=fast`` keeps of a mesh."""
 ARENA = "64M"
 """Memory of a simulation's contacts and constraints; some 6 MB are used."""
 ROBOT_NUMBERS, OBJECT_NUMBERS = 25, 8
@@ -121,14 +120,7 @@ class Simulator:
             self.step(STILL)
 
     def step(self, action: np.ndarray) -> bool:
-        """One env step.
-
-        Args:
-            action: float32 (7,), within −1 and 1.
-
-        Returns:
-            True if the task's goal holds after it.
-        """
+        """One env step with an action, float32 (7,) in [−1, 1]; True if the goal holds after it."""
         model, data, mujoco = self.model, self.data, self._mujoco
         self._closing = np.array([-0.01, 0.01]) * np.sign(action[6])
         for i in range(round(1 / FPS / TIMESTEP)):
@@ -421,16 +413,9 @@ def _make_cheap(model: Any) -> None:
 def coarser(vertices: np.ndarray, faces: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
     """Fewer faces for a mesh, between vertices that it has (vertex clustering, Rossignac and Borrel, 1993).
 
-    Vertices in the same cell of a grid become the one that is nearest to their mean; faces that this leaves
-    without an area go. The grid is the finest of some that leaves at most so many faces.
-
-    Args:
-        vertices: (V, 3).
-        faces: int (F, 3).
-        most: faces wanted, at most; exceeded if the coarsest grid has more.
-
-    Returns:
-        Which faces stay, int (f,), and their vertices now, int (f, 3).
+    Vertices (V, 3) in the same cell of a grid become the one that is nearest to their mean; faces, int (F,
+    3), that this leaves without an area go. The grid is the finest of some that leaves at most so many
+    faces. Gives which faces stay, int (f,), and their vertices now, int (f, 3).
     """
     extent = float(np.ptp(vertices, axis=0).max())
     for cells in (96, 64, 48, 36, 27, 20, 15, 11, 8, 6):
@@ -449,15 +434,9 @@ def coarser(vertices: np.ndarray, faces: np.ndarray, most: int) -> tuple[np.ndar
 
 
 def moved_texture(before: np.ndarray, after: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Places in the texture of faces whose corners have moved, so that the picture on them does not.
+    """Places in the texture, (f, 3, 2), of faces whose corners have moved, so that their picture does not.
 
-    Args:
-        before: corners, (f, 3, 3).
-        after: the same corners now.
-        places: of the corners in the texture, (f, 3, 2).
-
-    Returns:
-        (f, 3, 2), each face's own affine map continued.
+    `before` and `after` are the corners, (f, 3, 3); each face's own affine map is continued.
     """
     edges = (before[:, 1:] - before[:, :1]).astype(np.float64)
     slope = np.linalg.pinv(edges, rcond=1e-4) @ (places[:, 1:] - places[:, :1])

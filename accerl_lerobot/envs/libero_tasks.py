@@ -43,26 +43,10 @@ def _names() -> dict[str, list[str]]:
     return ast.literal_eval(value)
 
 
-def resolve(text: str) -> tuple[str, ...]:
-    """Expands suites and single tasks; keeps the order, drops repetitions.
-
-    Example:
-        >>> resolve("libero_object/3")
-        ('libero_object/3',)
-
-    Raises:
-        InputError: a name is neither a suite nor a task, or there is none.
-    """
-    found: dict[str, None] = {}
-    for name in (part.strip() for part in text.split(",")):
-        suite, _, number = name.partition("/")
-        known = [f"{suite}/{i}" for i in range(len(_names()[suite]))] if suite in SUITES else []
-        if not known or (number and name not in known):
-            example = f"0 to {len(known) - 1}" if known else "a number"
-            remedy = f"{name!r} is no LIBERO task; use {', '.join(SUITES)}, or one of them, / and {example}"
-            raise InputError("env.task", text, remedy)
-        found |= dict.fromkeys([name] if number else known)
-    return tuple(found)
+@functools.cache
+def suites() -> dict[str, tuple[str, ...]]:
+    """Tasks of each suite, ``suite/number``."""
+    return {suite: tuple(f"{suite}/{i}" for i in range(len(_names()[suite]))) for suite in SUITES}
 
 
 def task_name(task: str) -> str:

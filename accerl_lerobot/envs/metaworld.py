@@ -11,8 +11,8 @@ Also the offscreen OpenGL of every MuJoCo world: MuJoCo reads ``MUJOCO_GL`` once
 from __future__ import annotations
 
 import atexit
+import contextlib
 import ctypes
-import difflib
 import functools
 import importlib
 import importlib.util
@@ -37,6 +37,7 @@ from accerl_lerobot.envs.base import (
     Step,
     WorldSpec,
     check_cameras,
+    expand_tasks,
     names,
     task_code,
 )
@@ -57,14 +58,11 @@ def _tables() -> dict[str, Any]:
     return json.loads(path.read_text())
 
 
-def all_tasks() -> tuple[str, ...]:
-    """All 50 names, sorted."""
-    return tuple(sorted(_tables()["TASK_DESCRIPTIONS"]))
-
-
+@functools.cache
 def groups() -> dict[str, tuple[str, ...]]:
-    """LeRobot's difficulty groups, plus ``all``."""
-    return {k: tuple(v) for k, v in _tables()["DIFFICULTY_TO_TASKS"].items()} | {"all": all_tasks()}
+    """LeRobot's difficulty groups, plus ``all`` 50 tasks."""
+    named = {name: tuple(tasks) for name, tasks in _tables()["DIFFICULTY_TO_TASKS"].items()}
+    return named | {"all": tuple(sorted(_tables()["TASK_DESCRIPTIONS"]))}
 
 
 def description(task: str) -> str:
@@ -75,35 +73,6 @@ def description(task: str) -> str:
 def expert_name(task: str) -> str:
     """Class name in ``metaworld.policies`` of the scripted expert for `task`."""
     return _tables()["TASK_POLICY_MAPPING"][task]
-
-
-def resolve(text: str, field: str = "env.task") -> tuple[str, ...]:
-    """Expands comma-separated names and groups; keeps the order, drops repetitions.
-
-    Example:
-        >>> resolve("drawer-open-v3, door-open-v3")
-        ('drawer-open-v3', 'door-open-v3')
-    """
-    known, named = set(all_tasks()), groups()
-    found: dict[str, None] = {}
-    for name in (part.strip() for part in text.split(",")):
-        if name in named:
-            found |= dict.fromkeys(named[name])
-        elif name in known:
-            found[name] = None
-        else:
-            raise InputError(field, text, _remedy(name, sorted(known), list(named)))
-    return tuple(found)
-
-
-def _remedy(name: str, tasks: list[str], group_names: list[str]) -> str:
-    wanted = name.replace("metaworld-", "").replace("-v2", "-v3")
-    close = difflib.get_close_matches(wanted, tasks, n=3, cutoff=0.5)
-    hint = f"did you mean {' or '.join(close)}? Otherwise " if close else ""
-    return (
-        f"{name!r} is not a MetaWorld task; {hint}use names such as drawer-open-v3, separated by commas, "
-        f"or a group: {', '.join(group_names)}"
-    )
 
 
 Metres = Annotated[float, Range("[-2, 2]")]
@@ -164,8 +133,10 @@ def choose_backend() -> str | None:
         return None
     order = ("egl", "osmesa") if any(Path(node).exists() for node in _GPU_NODES) else ("osmesa", "egl")
     for backend in order:
-        if any(_loads(library) for library in _LIBRARIES[backend]):
-            return backend
+        for library in _LIBRARIES[backend]:
+            with contextlib.suppress(OSError):
+                ctypes.CDLL(library)
+                return backend
     raise InputError("MUJOCO_GL", "", REMEDY)
 
 
@@ -225,14 +196,6 @@ def _headless() -> bool:
     return sys.platform == "linux" and not any(os.environ.get(k) for k in ("DISPLAY", "WAYLAND_DISPLAY"))
 
 
-def _loads(library: str) -> bool:
-    try:
-        ctypes.CDLL(library)
-    except OSError:
-        return False
-    return True
-
-
 CAMERAS = ("topview", "corner", "corner2", "corner3", "corner4", "behindGripper", "gripperPOV")
 STATE_DIM = 4
 RAW_DIM = 39
@@ -268,7 +231,7 @@ class MetaWorldConfig(EnvConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        resolve(self.task)
+        expand_tasks(self.task, groups())
         check_cameras(self.cameras, self.camera)
         if unknown := [name for name in self.cameras if name not in CAMERAS]:
             raise InputError("env.camera", self.camera, f"{unknown[0]!r} is none of: {', '.join(CAMERAS)}")
@@ -283,7 +246,7 @@ class MetaWorldConfig(EnvConfig):
     @property
     def tasks(self) -> tuple[str, ...]:
         """The task names `task` stands for."""
-        return resolve(self.task)
+        return expand_tasks(self.task, groups())
 
     @property
     def cameras(self) -> tuple[str, ...]:

@@ -7,7 +7,7 @@ A rate is never reported without n and an interval.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,12 +34,7 @@ class Interval(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Rate:
-    """Successes out of n.
-
-    Example:
-        >>> str(Rate(successes=93, n=100))
-        '93.0 % [86.3, 96.6] n=100'
-    """
+    """Successes out of n; as text ``93.0 % [86.3, 96.6] n=100``."""
 
     successes: int
     n: int
@@ -49,9 +44,9 @@ class Rate:
         """The observed fraction; NaN for n = 0."""
         return self.successes / self.n if self.n else math.nan
 
-    def interval(self, confidence: float = 0.95) -> Interval:
+    def interval(self) -> Interval:
         """`wilson_interval` of this rate."""
-        return wilson_interval(self.successes, self.n, confidence)
+        return wilson_interval(self.successes, self.n)
 
     def __str__(self) -> str:
         if self.n == 0:
@@ -60,11 +55,10 @@ class Rate:
         return f"{100 * self.value:.1f} % [{100 * low:.1f}, {100 * high:.1f}] n={self.n}"
 
 
-def wilson_interval(successes: int, n: int, confidence: float = 0.95) -> Interval:
-    """Wilson's score interval of a proportion (Wilson 1927; Brown, Cai and DasGupta 2001, section 3.1.1).
+def wilson_interval(successes: int, n: int) -> Interval:
+    """Wilson's score interval of 95 % (Wilson 1927; Brown, Cai and DasGupta 2001, section 3.1.1).
 
-        z = Φ⁻¹((1 + confidence) / 2),  p = successes / n
-        (p + z²/2n ± z √(p(1 − p)/n + z²/4n²)) / (1 + z²/n)
+        (p + z²/2n ± z √(p(1 − p)/n + z²/4n²)) / (1 + z²/n),  p = successes / n
 
     Unlike p ± z√(p(1 − p)/n) it has width at 0 and at n successes and stays inside [0, 1]. For n = 0 it is
     [0, 1], as nothing is known.
@@ -73,7 +67,7 @@ def wilson_interval(successes: int, n: int, confidence: float = 0.95) -> Interva
         raise ValueError(f"{successes} successes in {n} episodes")
     if n == 0:
         return Interval(0.0, 1.0)
-    z = NormalDist().inv_cdf((1 + confidence) / 2)
+    z = NormalDist().inv_cdf(0.975)
     p, share = successes / n, z * z / n
     centre = (p + share / 2) / (1 + share)
     half = z * math.sqrt(p * (1 - p) / n + share / (4 * n)) / (1 + share)
@@ -135,13 +129,7 @@ class EvaluationConfig(Section, section="evaluation"):
 
 
 def evaluation_plans(
-    tasks: Sequence[str],
-    episodes: int,
-    group: str,
-    *,
-    seed: int = 0,
-    filmed: int = 0,
-    film: tuple[int, int] = FILM,
+    tasks: Sequence[str], episodes: int, group: str, *, seed: int = 0, filmed: int = 0
 ) -> list[EpisodePlan]:
     """`episodes` plans of an evaluation called `group`, spread evenly over `tasks`; the first are `filmed`.
 
@@ -154,16 +142,14 @@ def evaluation_plans(
             explore=False,
             index=i,
             group=group,
-            film=film if i < filmed else None,
+            film=FILM if i < filmed else None,
         )
         for i in range(episodes)
     ]
 
 
 GAP = 4
-"""Pixels of white between two clips."""
 BORDER = 5
-"""Width, in pixels, of the frame that tells how an episode ended."""
 
 
 @contextmanager
@@ -206,19 +192,13 @@ def success_curve(
         axes.legend(loc="lower right")
 
 
-def write_video(
-    path: Path,
-    rows: Sequence[Sequence[Sequence[np.ndarray]]],
-    fps: int,
-    above: Callable[[int], np.ndarray] | None = None,
-) -> None:
-    """Writes a grid of clips; one that ends early holds its last frame.
+def write_video(path: Path, rows: Sequence[Sequence[Sequence[np.ndarray]]], fps: int) -> None:
+    """Writes a grid of clips as MP4; one that ends early holds its last frame.
 
     Args:
-        path: .mp4 to write.
-        rows: rows of clips, as many in each; frames of a clip are uint8 (H, W, 3), all of one size in a row.
+        path: file to write.
+        rows: rows of clips, of equal width; frames of a clip are uint8 (H, W, 3), all of one height in a row.
         fps: frames per second.
-        above: number of a frame → what is put above the grid in it, as wide as that.
     """
     import imageio.v2 as imageio
 
@@ -230,7 +210,7 @@ def write_video(
     with writer:
         for i in range(length + fps):
             lines = [_joined([clip[min(i, len(clip) - 1)] for clip in row], axis=1) for row in rows]
-            picture = _joined([*([] if above is None else [above(i)]), *lines], axis=0)
+            picture = _joined(lines, axis=0)
             writer.append_data(picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2])
 
 
@@ -242,9 +222,9 @@ def before_after(
 ) -> None:
     """Films the same episodes twice, before training on the left and after it on the right.
 
-    Above each half stand the evaluation's numbers, and how many of the filmed episodes have succeeded so far;
-    the frame of an episode that has ended is green for a success and red for a failure. Nothing is written
-    when no episode was filmed. `before` and `after` are results of the same plans, and their summaries.
+    Above each half stand the evaluation's numbers; the frame of an episode that has ended is green for a
+    success and red for a failure. Nothing is written when no episode was filmed. `before` and `after` are
+    results of the same plans, and their summaries.
     """
     filmed = [{r.plan.index: r for r in results if r.frames} for results, _ in (before, after)]
     both = sorted(filmed[0].keys() & filmed[1].keys())
@@ -252,25 +232,16 @@ def before_after(
         return
     columns = math.ceil(math.sqrt(len(both)))
     blank = np.full_like(filmed[0][both[0]].frames[0], 255)
-    gap = np.full((len(blank), 2 * GAP, 3), 255, np.uint8)
-    halves = [
-        [_with_outcome(half[i].frames, half[i].success) for i in both]
-        + [[blank]] * (-len(both) % columns)
-        for half in filmed
-    ]  # fmt: skip
-    left, right = ([half[i : i + columns] for i in range(0, len(half), columns)] for half in halves)
-    rows = [[*one, [gap], *two] for one, two in zip(left, right, strict=True)]
     width = columns * (blank.shape[1] + GAP) - GAP
-
-    def above(number: int) -> np.ndarray:
-        lines = []
-        for name, half, (_, summary) in zip(("before", "after"), filmed, (before, after), strict=True):
-            ended = sum(half[i].success and number >= len(half[i].frames) for i in both)
-            count = f"{ended} of these {len(both)} succeeded"
-            lines.append([f"{name} RL: {_rate_text(summary)}", count])
-        return _caption(lines, width, gap.shape[1] + 2 * GAP)
-
-    write_video(path, rows, fps, above)
+    halves = []
+    for name, half, (_, summary) in zip(("before", "after"), filmed, (before, after), strict=True):
+        clips = [_with_outcome(half[i].frames, half[i].success) for i in both]
+        clips += [[blank]] * (-len(both) % columns)
+        lines = [clips[i : i + columns] for i in range(0, len(clips), columns)]
+        halves.append([[[_caption(f"{name} RL: {_rate_text(summary)}", width)]], *lines])
+    between = [np.full((len(left[0][0]), 2 * GAP, 3), 255, np.uint8) for left in halves[0]]
+    rows = [[*left, [gap], *right] for left, gap, right in zip(halves[0], between, halves[1], strict=True)]
+    write_video(path, rows, fps)
 
 
 def _rate_text(summary: dict[str, Any] | None) -> str:
@@ -280,23 +251,13 @@ def _rate_text(summary: dict[str, Any] | None) -> str:
     return f"{summary['success']:.0%} success [{low:.0%}, {high:.0%}], n = {summary['n']}"
 
 
-def _caption(halves: Sequence[Sequence[str]], width: int, gap: int) -> np.ndarray:
-    """Lines of black text over each half of a picture, 8 to 20 pixels high, as large as they fit.
-
-    Width of a half, and the gap between them, are in pixels.
-    """
+def _caption(text: str, width: int) -> np.ndarray:
+    """Black text, 8 to 20 pixels high, in a picture as wide as asked."""
     from PIL import Image, ImageDraw, ImageFont
 
-    longest = max((line for lines in halves for line in lines), key=len)
-    size = 20
-    while size > 8 and ImageFont.load_default(size).getlength(longest) > width - 8:
-        size -= 1
-    step, font = size + 6, ImageFont.load_default(size)
-    image = Image.new("RGB", (len(halves) * (width + gap) - gap, step * len(halves[0]) + 6), "white")
-    draw = ImageDraw.Draw(image)
-    for half, lines in enumerate(halves):
-        for i, line in enumerate(lines):
-            draw.text((half * (width + gap) + 4, 4 + step * i), line, fill="black", font=font)
+    size = min(20, max(8, 2 * width // len(text)))
+    image = Image.new("RGB", (width, size + 12), "white")
+    ImageDraw.Draw(image).text((4, 4), text, fill="black", font=ImageFont.load_default(size))
     return np.asarray(image)
 
 

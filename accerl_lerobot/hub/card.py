@@ -23,6 +23,7 @@ from accerl_lerobot.checkpoint.layout import AWAY, BACKBONE, CHECKPOINTS, PREPRO
 from accerl_lerobot.checkpoint.layout import CONFIG as RECIPE
 from accerl_lerobot.config.parsing import DISCOVER, read_recipe
 from accerl_lerobot.config.ranges import NewFolder, Pattern, Section
+from accerl_lerobot.console import number
 from accerl_lerobot.envs.base import lerobot_eval_arguments
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import discovery
@@ -46,7 +47,6 @@ NEEDED = {
     DATASET: (INFO, "meta/tasks.parquet", "meta/episodes", "data"),
     RUN: (RECIPE, SUMMARY, LAST),
 }
-"""Artifact type → files and folders that it has at least."""
 CODEBASE_VERSION = "v3.0"
 """Version of LeRobotDatasets, and the tag under which LeRobot looks for them on the Hub."""
 REPO_ID = r"(?=.{3,192}\Z)(?!.*\.\.)[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*"
@@ -186,36 +186,27 @@ def find_provenance(folder: Path, artifact: str, evaluation: str | None) -> Prov
     """
     if evaluation is not None and artifact not in (POLICY, RUN):
         raise InputError("evaluation", evaluation, f"only a policy is evaluated, this is a {artifact}")
-    known, files = _known(folder, artifact)
+    carried = folder if artifact == RUN else folder / FOLDER
+    home = carried if carried.is_dir() else _run_of(folder.resolve(), artifact)
+    known: dict[str, Any] = {}
+    files: dict[str, Path] = {}
+    if home is not None:
+        summary, step = read_json(home / SUMMARY), folder.resolve().parent.name
+        is_last = step.isdigit() and int(step) == summary.get("updates")
+        measured = home == carried or artifact != POLICY or is_last
+        names = KEPT.get(artifact, ()) if measured else (RECIPE,)
+        files = {f"{FOLDER}/{name}": home / name for name in names if (home / name).is_file()}
+        known["validation"] = read_json(home / VALIDATION)
+        with contextlib.suppress(InputError):
+            known["recipe"] = read_recipe(home / RECIPE)
+        if measured and artifact in (POLICY, RUN):
+            known |= {"summary": summary, "evaluation": read_json(home / EVALUATION)}
     if evaluation is not None:
         path = Path(evaluation).expanduser()
         path = path / EVALUATION if path.is_dir() else path
         known["evaluation"] = _read_evaluation(path, folder / LAST if artifact == RUN else folder)
         files[EVALUATION if artifact == RUN else f"{FOLDER}/{EVALUATION}"] = path
     return Provenance(**known, files=files)
-
-
-def _known(folder: Path, artifact: str) -> tuple[dict[str, Any], dict[str, Path]]:
-    """Fields of a `Provenance`, and files of the run that go with the folder."""
-    carried = folder / FOLDER
-    own = folder if artifact == RUN else carried if carried.is_dir() else None
-    home = own or _run_of(folder.resolve(), artifact)
-    if home is None:
-        return {}, {}
-    summary, number = read_json(home / SUMMARY), folder.resolve().parent.name
-    is_last = number.isdigit() and int(number) == summary.get("updates")
-    measured = own is not None or artifact != POLICY or is_last
-    names = KEPT.get(artifact, ()) if measured else (RECIPE,)
-    known = {"validation": read_json(home / VALIDATION)}
-    with contextlib.suppress(InputError):
-        known["recipe"] = read_recipe(home / RECIPE)
-    if measured and artifact in (POLICY, RUN):
-        known["summary"] = summary
-    if own is not None:  # an evaluation is there only if one was given to an earlier push
-        known["evaluation"] = read_json(own / EVALUATION)
-    else:
-        names = tuple(name for name in names if name != EVALUATION)
-    return known, {f"{FOLDER}/{name}": home / name for name in names if (home / name).is_file()}
 
 
 def _run_of(folder: Path, artifact: str) -> Path | None:
@@ -272,10 +263,10 @@ def model_card(repo_id: str, artifact: str, folder: Path, files: Files, provenan
         title=TITLES[artifact],
         type=config.get("type"),
         measurements=measurements,
-        numbers={name: _plain(summary[key]) for name, key in NUMBERS.items() if summary.get(key) is not None},
+        numbers={name: _shown(summary[key]) for name, key in NUMBERS.items() if summary.get(key) is not None},
         validation=validation,
         checks={
-            name: (_plain(check.get("value")), check.get("holds"))
+            name: (_shown(check.get("value")), check.get("holds"))
             for name, check in (validation.get("checks") or {}).items()
         },
         pictures=[name for name in shown if name.endswith((".png", ".gif", ".svg", ".jpg"))],
@@ -382,7 +373,5 @@ def _stock(policy: str, config: Mapping[str, Any], env: Mapping[str, Any]) -> st
     return " \\\n  ".join([*command, "--eval.n_episodes=50 --eval.batch_size=5"])
 
 
-def _plain(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:.4g}" if abs(value) < 1e5 else f"{value:,.0f}"
-    return f"{value:,}" if isinstance(value, int) and not isinstance(value, bool) else str(value)
+def _shown(value: Any) -> str:
+    return value if isinstance(value, str) else number(value)

@@ -3,16 +3,14 @@
 
 Files are fetched into a folder beside the one that was asked for, which keeps what an interrupted pull has
 fetched, and is renamed when it has been checked. The server is not trusted: no name that it lists leads out
-of that folder, no file may be longer than it says, and nothing that came may let code run.
+of that folder, every file must have its size and hash, and nothing that came may let code run.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import re
 import shutil
-import unicodedata
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
@@ -26,59 +24,36 @@ from huggingface_hub.hf_api import RepoFile
 
 from accerl_lerobot.checkpoint import layout
 from accerl_lerobot.checkpoint.layout import CHECKPOINTS, PRETRAINED, relocate
-from accerl_lerobot.checkpoint.safety import REVISION, brief, unsafe_name
+from accerl_lerobot.checkpoint.safety import brief, unsafe_name
 from accerl_lerobot.config.parsing import drop_consents, read_recipe
 from accerl_lerobot.engine.resuming import LOCK
 from accerl_lerobot.errors import InputError, check_absent, expanded
-from accerl_lerobot.hub.card import (
-    CARD,
-    MANIFEST,
-    MANIFEST_FORMAT,
-    POLICY,
-    RECIPE,
-    RECORD,
-    REPO_TYPES,
-    RUN,
-    PullConfig,
-    recognise,
-)
-from accerl_lerobot.hub.errors import (
-    ANSWERS_MOST,
-    ANSWERS_S,
-    REQUESTS_MOST,
-    SLOWEST,
-    check_commit,
-    hub_errors,
-)
+from accerl_lerobot.hub import card
+from accerl_lerobot.hub.errors import check_commit, hub_errors
 
 CACHE, ATTRIBUTES = ".cache", ".gitattributes"
-"""Folder in which the client keeps its books while it fetches, and git's own file."""
 CODE = (".py", ".pyc", ".pyd", ".so")
 """Suffixes of files that Python imports: a recipe beside one could name it as ``discover_packages_path``."""
-FILES_MOST, SIZE_MOST = 100_000, 2**53
+FILES_MOST = 100_000
 THREADS = 8
-SHA256 = re.compile(r"[0-9a-f]{64}")
 BROKEN = (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError)
-"""Errors of reading JSON that is not what it should be."""
 
 
-def pull(config: PullConfig) -> dict[str, Any]:
+def pull(config: card.PullConfig) -> dict[str, Any]:
     """Pulls all files but Python's code; returns the commit and the content, as plain JSON.
 
     There is no new folder if it is refused.
     """
     repo_id, home = config.repo_id, expanded(config.output_dir, "output_dir").absolute()
     check_absent(home)
-    with hub_errors(repo_id, config.revision, writing=False) as limits:
+    with hub_errors(repo_id, config.revision, writing=False):
         repo_type, commit = _resolve(HfApi(), config)
         listed = HfApi().list_repo_tree(repo_id, recursive=True, revision=commit, repo_type=repo_type)
-        files = {file.path: file for file in _checked(listed, repo_id)}
+        files = _checked(listed, repo_id)
         # Named after the commit, so that an interrupted pull resumes and no other one's files are in it.
         temporary = home.parent / f".pulling-{commit[:16]}-{home.name}"
-        size = sum(file.size for file in files.values())
-        _make_room(home, temporary, size)
-        limits.set(ANSWERS_MOST + 2 * size, REQUESTS_MOST + 20 * len(files), ANSWERS_S + size / SLOWEST)
-        # Names have been checked; `snapshot_download` would ask for them again.
+        _make_room(home, temporary, sum(file.size for file in files.values()))
+        # `snapshot_download` would ask for the names again, and these have been checked.
         temporary.mkdir(exist_ok=True)
         pool = ThreadPoolExecutor(THREADS)
         options = {"repo_type": repo_type, "revision": commit, "local_dir": temporary}
@@ -89,25 +64,24 @@ def pull(config: PullConfig) -> dict[str, Any]:
     record = {"repo_id": repo_id, "repo_type": repo_type, "revision": config.revision, "commit": commit}
     try:
         record = _receive(temporary, home, files, repo_id) | record
-        (temporary / RECORD).write_text(json.dumps(record, indent=2) + "\n")
+        (temporary / card.RECORD).write_text(json.dumps(record, indent=2) + "\n")
         temporary.rename(home)
-    except InputError:
-        shutil.rmtree(temporary)  # resuming would not make it better
-        raise
     except OSError as error:
         raise _not_writable(home, error) from error
     except BROKEN as error:
-        shutil.rmtree(temporary)
+        shutil.rmtree(temporary)  # resuming would not make it better
+        if isinstance(error, InputError):
+            raise
         why = f"one of its files is not what its name says ({type(error).__name__}: {brief(error)})"
         raise InputError("repo_id", repo_id, f"{why}; push it anew") from error
     return record | {"path": str(home)}
 
 
-def _resolve(api: HfApi, config: PullConfig) -> tuple[str, str]:
+def _resolve(api: HfApi, config: card.PullConfig) -> tuple[str, str]:
     """Repository type, and the commit that the revision resolves to now."""
     repo_id, commits = config.repo_id, {}
     missing: Exception | None = None
-    for repo_type in REPO_TYPES if config.repo_type is None else (config.repo_type,):
+    for repo_type in card.REPO_TYPES if config.repo_type is None else (config.repo_type,):
         try:
             commits[repo_type] = api.repo_info(repo_id, repo_type=repo_type).sha
         except RepositoryNotFoundError as error:
@@ -119,47 +93,23 @@ def _resolve(api: HfApi, config: PullConfig) -> tuple[str, str]:
     ((repo_type, commit),) = commits.items()
     if config.revision is not None:
         commit = api.repo_info(repo_id, repo_type=repo_type, revision=config.revision).sha
-    return repo_type, check_commit(commit, repo_id)
+    return repo_type, check_commit(commit)
 
 
-def _checked(listed: Iterable[Any], repo_id: str) -> list[RepoFile]:
-    """Files that a server lists, once all names, sizes and hashes are good."""
+def _checked(listed: Iterable[Any], repo_id: str) -> dict[str, RepoFile]:
+    """Files that a server lists, by name; one with which it could write elsewhere is refused."""
     files = list(islice((item for item in listed if isinstance(item, RepoFile)), FILES_MOST + 1))
     if len(files) > FILES_MOST:
         raise InputError("repo_id", repo_id, f"it has more than {FILES_MOST} files; split it")
     for file in files:
-        digest, pattern = (file.lfs.sha256, SHA256) if file.lfs else (file.blob_id, REVISION)
-        good = isinstance(file.path, str) and type(file.size) is int and 0 <= file.size <= SIZE_MOST
-        if not good or not isinstance(digest, str) or not pattern.fullmatch(digest):
-            size, digest = str(file.size)[:40], ascii(digest)[:80]
-            why = f"{ascii(file.path)[:99]} is listed with size {size} and hash {digest}"
-            raise InputError("repo_id", repo_id, f"{why}, which no file has; use another server")
-    names = [file.path for file in files]
-    _check_names([*names, *({RECORD} - set(names))], repo_id)
-    return files
-
-
-def _check_names(names: Iterable[str], repo_id: str) -> None:
-    """Refuses names by which a server could write elsewhere, or write one file over another."""
-    files: set[str] = set()
-    folders: dict[str, str] = {}
-    for name in names:
-        parts = PurePosixPath(name).parts if not unsafe_name(name) else ()
+        name, parts = file.path, PurePosixPath(file.path).parts if not unsafe_name(file.path) else ()
         if not parts or name != "/".join(parts) or parts[0] in (CACHE, ".git") or "." in parts:
             why = f"it has a file named {ascii(name)[:200]}, which is not safe to write"
             raise InputError("repo_id", repo_id, why)
-        above = ["/".join(parts[:depth]) for depth in range(1, len(parts))]
-        clash = (same := _folded(name)) in files or same in folders
-        clash |= any(_folded(f) in files or folders.setdefault(_folded(f), f) != f for f in above)
-        if clash:
-            why = f"{ascii(name)[:200]} and another file of it cannot both be written"
+        if type(file.size) is not int or file.size < 0:
+            why = f"{ascii(name)[:99]} is listed with size {str(file.size)[:40]}; use another server"
             raise InputError("repo_id", repo_id, why)
-        files.add(same)
-
-
-def _folded(name: str) -> str:
-    """The name as a file system that ignores case, or composes letters, takes it."""
-    return unicodedata.normalize("NFC", name.casefold())
+    return {file.path: file for file in files}
 
 
 def _make_room(home: Path, temporary: Path, size: int) -> None:
@@ -194,27 +144,27 @@ def _receive(folder: Path, home: Path, files: dict[str, RepoFile], repo_id: str)
         if not _is_listed(folder / name, file):
             raise refuse(f"{name} is not what the server lists: its hash is another")
     pushed: dict[str, Any] = {}
-    if (folder / MANIFEST).is_file():
-        if (why := layout.defect(folder, MANIFEST, MANIFEST_FORMAT)) is not None:
+    if (folder / card.MANIFEST).is_file():
+        if (why := layout.defect(folder, card.MANIFEST, card.MANIFEST_FORMAT)) is not None:
             raise refuse(f"it is not what was pushed: {why}")
-        pushed = layout.read_manifest(folder, MANIFEST)
-        (folder / MANIFEST).unlink()  # paths are set below, and then it does not hold any more
+        pushed = layout.read_manifest(folder, card.MANIFEST)
+        (folder / card.MANIFEST).unlink()  # paths are set below, and then it does not hold any more
     (folder / ATTRIBUTES).unlink(missing_ok=True)
     numbers = sorted(p.name for p in folder.glob(f"{CHECKPOINTS}/*") if p.is_dir())
     if numbers and layout.LAST not in numbers:  # a repository has no links
         (folder / CHECKPOINTS / layout.LAST).symlink_to(numbers[-1])
-    artifact = recognise(folder, "repo_id")
+    artifact = card.recognise(folder, "repo_id")
     if artifact != (kind := pushed.get("kind", artifact)):
-        raise refuse(f"its {MANIFEST} says {ascii(kind)[:80]}, but this is a {artifact}")
-    checkpoints = [folder / CHECKPOINTS / number for number in numbers if artifact == RUN]
+        raise refuse(f"its {card.MANIFEST} says {ascii(kind)[:80]}, but this is a {artifact}")
+    checkpoints = [folder / CHECKPOINTS / number for number in numbers if artifact == card.RUN]
     own = [checkpoint for checkpoint in checkpoints if (checkpoint / layout.MANIFEST).is_file()]
     for checkpoint in own:
         if (why := layout.defect(checkpoint)) is not None:
             raise refuse(f"its checkpoint {checkpoint.name} is broken: {why}")
-    policies = [folder] if artifact == POLICY else [checkpoint / PRETRAINED for checkpoint in checkpoints]
+    policies = [folder] if artifact == card.POLICY else [each / PRETRAINED for each in checkpoints]
     for policy in policies:
         relocate(policy, home / policy.relative_to(folder))
-    if artifact == RUN:
+    if artifact == card.RUN:
         (folder / LOCK).touch()  # marks a run that can be resumed
     dropped = _drop_consents(folder)
     code = sorted(path for path in folder.rglob("*") if path.name.endswith(CODE) and path.is_file())
@@ -225,7 +175,7 @@ def _receive(folder: Path, home: Path, files: dict[str, RepoFile], repo_id: str)
         layout.write_manifest(checkpoint)
     checked = pushed.get("files", {}).keys()
     counts = {"files": len(files), "checked": len(checked)}
-    counts["unchecked"] = len(files.keys() - checked - {CARD, MANIFEST, ATTRIBUTES})
+    counts["unchecked"] = len(files.keys() - checked - {card.CARD, card.MANIFEST, ATTRIBUTES})
     left = {"left_out": left_out, "dropped": dropped}
     return {"kind": artifact} | counts | {name: value for name, value in left.items() if value}
 
@@ -242,7 +192,7 @@ def _is_listed(path: Path, file: RepoFile) -> bool:
 def _drop_consents(folder: Path) -> dict[str, dict[str, Any]]:
     """Removes from all configs of runs what would let code run; returns it, by file."""
     dropped: dict[str, dict[str, Any]] = {}
-    for path in sorted(p for p in folder.rglob(RECIPE) if p.is_file() and not p.is_symlink()):
+    for path in sorted(p for p in folder.rglob(card.RECIPE) if p.is_file() and not p.is_symlink()):
         try:
             tree = read_recipe(path)
         except InputError:

@@ -21,45 +21,15 @@ from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, ge
 from huggingface_hub.errors import EntryNotFoundError, RepositoryNotFoundError
 
 from accerl_lerobot.checkpoint import layout
-from accerl_lerobot.checkpoint.layout import (
-    AWAY,
-    BACKBONE,
-    CHECKPOINTS,
-    CONFIG_FOLDERS,
-    PREPROCESSOR,
-    PRETRAINED,
-    places_of_names,
-)
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.hub.card import (
-    CARD,
-    CODEBASE_VERSION,
-    CONFIG,
-    DATASET,
-    MANIFEST,
-    MANIFEST_FORMAT,
-    MARK,
-    POLICY,
-    RECORD,
-    REPO_TYPES,
-    RUN,
-    Files,
-    PushConfig,
-    dataset_card,
-    find_provenance,
-    model_card,
-    read_json,
-    recognise,
-    repo_type,
-)
+from accerl_lerobot.hub import card
 from accerl_lerobot.hub.errors import LOGIN, check_commit, hub_errors
 
 logger = logging.getLogger(__name__)
 
 BRANCH = "main"
-NOT_CONTENTS = (CARD, MANIFEST, RECORD, ".gitattributes")
+NOT_CONTENTS = (card.CARD, card.MANIFEST, card.RECORD, ".gitattributes")
 RESULTS = (".yaml", ".json", ".jsonl", ".png", ".jpg", ".gif", ".svg", ".mp4", ".html")
-"""Suffixes of files at the top of a run that are pushed."""
 WEIGHTS = (".safetensors", ".bin", ".pt", ".pth")
 RECORDS = (".json", ".jsonl", ".yaml", ".yml", ".md", ".txt", ".log", ".csv", ".html")
 VOCABULARIES = ("tokenizer.json", "vocab.json", "merges.txt", "added_tokens.json", "special_tokens_map.json")
@@ -71,13 +41,13 @@ ROOTS = (
 """Top folders of other machines, from where a file may have come here."""
 
 
-def push(config: PushConfig) -> dict[str, Any]:
+def push(config: card.PushConfig) -> dict[str, Any]:
     """Pushes a folder; returns what was pushed and the new commit, as plain JSON.
 
     If it is refused, or fails, the repository is as before.
     """
     folder, repo_id = Path(config.path).expanduser(), config.repo_id
-    artifact = recognise(folder)
+    artifact = card.recognise(folder)
     files, own_card = stage(config, folder, artifact)
     if get_token() is None:
         raise InputError("repo_id", repo_id, f"pushing needs a token; {LOGIN} that may write")
@@ -85,28 +55,28 @@ def push(config: PushConfig) -> dict[str, Any]:
         return _upload(config, artifact, files, own_card)
 
 
-def stage(config: PushConfig, folder: Path, artifact: str) -> tuple[Files, bool]:
+def stage(config: card.PushConfig, folder: Path, artifact: str) -> tuple[card.Files, bool]:
     """All files to upload but the manifest, and True if the card among them is the user's own."""
-    provenance = find_provenance(folder, artifact, config.evaluation)
+    provenance = card.find_provenance(folder, artifact, config.evaluation)
     files = contents(folder, artifact, config.include)
     for name, path in provenance.files.items():
         files[name] = scrubbed(name, path.read_bytes(), folder) if is_record(name) else path
-    card, repo_id = folder / CARD, config.repo_id
-    own = card.is_file() and MARK not in card.read_text()
+    readme, repo_id = folder / card.CARD, config.repo_id
+    own = readme.is_file() and card.MARK not in readme.read_text()
     if own:
-        text = card.read_text()
-    elif artifact == DATASET:
-        text = dataset_card(repo_id, folder)
+        text = readme.read_text()
+    elif artifact == card.DATASET:
+        text = card.dataset_card(repo_id, folder)
     else:
-        text = model_card(repo_id, artifact, folder, files, provenance)
-    files[CARD] = scrubbed(CARD, text.encode(), folder)
+        text = card.model_card(repo_id, artifact, folder, files, provenance)
+    files[card.CARD] = scrubbed(card.CARD, text.encode(), folder)
     return files, own
 
 
-def _upload(config: PushConfig, artifact: str, files: Files, own_card: bool) -> dict[str, Any]:
+def _upload(config: card.PushConfig, artifact: str, files: card.Files, own_card: bool) -> dict[str, Any]:
     """Creates the repository if need be, and the commit."""
     api, repo_id = HfApi(), config.repo_id
-    where: dict[str, Any] = {"repo_id": repo_id, "repo_type": repo_type(artifact)}
+    where: dict[str, Any] = {"repo_id": repo_id, "repo_type": card.repo_type(artifact)}
     parent = _parent(api, config, artifact)
 
     def read(name: str) -> bytes | None:
@@ -115,14 +85,14 @@ def _upload(config: PushConfig, artifact: str, files: Files, own_card: bool) -> 
         except EntryNotFoundError:
             return None
 
-    previous = _previous_files(read(MANIFEST), artifact, repo_id)
-    card = read(CARD)
-    if not own_card and card is not None and MARK.encode() not in card and card.strip():
+    previous = _previous_files(read(card.MANIFEST), artifact, repo_id)
+    readme = read(card.CARD)
+    if not own_card and readme is not None and card.MARK.encode() not in readme and readme.strip():
         logger.warning("the README.md on the Hub is left as it is, somebody wrote it")
-        files[CARD] = card
-    entries = {name: layout.entry(content) for name, content in files.items() if name != CARD}
-    manifest = {"format": MANIFEST_FORMAT, "kind": artifact, "files": dict(sorted(entries.items()))}
-    files = files | {MANIFEST: (json.dumps(manifest, indent=1) + "\n").encode()}
+        files[card.CARD] = readme
+    entries = {name: layout.entry(content) for name, content in files.items() if name != card.CARD}
+    manifest = layout.manifest_text(entries, format=card.MANIFEST_FORMAT, kind=artifact)
+    files = files | {card.MANIFEST: manifest.encode()}
     operations = [CommitOperationAdd(name, content) for name, content in files.items()]
     gone = previous - files.keys()
     gone &= set(api.list_repo_files(revision=parent, **where)) if gone else set()
@@ -131,7 +101,7 @@ def _upload(config: PushConfig, artifact: str, files: Files, own_card: bool) -> 
     commit = api.create_commit(
         operations=operations, commit_message=message, revision=BRANCH, parent_commit=parent, **where
     ).oid
-    if artifact == DATASET:
+    if artifact == card.DATASET:
         _tag(api, where, commit)
     return {
         "kind": artifact,
@@ -141,17 +111,17 @@ def _upload(config: PushConfig, artifact: str, files: Files, own_card: bool) -> 
         "private": bool(api.repo_info(**where).private),
         "files": len(files),
         "bytes": sum(int(entry["size"]) for entry in entries.values()),
-        "url": f"{api.endpoint}/{'datasets/' if artifact == DATASET else ''}{repo_id}",
+        "url": f"{api.endpoint}/{'datasets/' if artifact == card.DATASET else ''}{repo_id}",
     }
 
 
-def _parent(api: HfApi, config: PushConfig, artifact: str) -> str:
+def _parent(api: HfApi, config: card.PushConfig, artifact: str) -> str:
     """The commit to go on top of; the repository is created if need be."""
-    repo_id, kind = config.repo_id, repo_type(artifact)
+    repo_id, kind = config.repo_id, card.repo_type(artifact)
     try:
         info = api.repo_info(repo_id, repo_type=kind)
     except RepositoryNotFoundError:
-        (other,) = set(REPO_TYPES) - {kind}
+        (other,) = set(card.REPO_TYPES) - {kind}
         if api.repo_exists(repo_id, repo_type=other):
             remedy = f"it is a {other} repository, and this is a {artifact}; choose another name"
             raise InputError("repo_id", repo_id, remedy) from None
@@ -160,7 +130,7 @@ def _parent(api: HfApi, config: PushConfig, artifact: str) -> str:
     if config.private and info.private is False:
         remedy = "this repository is public: add --private=false, or choose another name"
         raise InputError("private", True, remedy)
-    return check_commit(info.sha, repo_id)
+    return check_commit(info.sha)
 
 
 def _previous_files(manifest: bytes | None, artifact: str, repo_id: str) -> set[str]:
@@ -171,7 +141,7 @@ def _previous_files(manifest: bytes | None, artifact: str, repo_id: str) -> set[
         content = json.loads(manifest)
         kind, files = content["kind"], set(content["files"])
     except (ValueError, KeyError, TypeError, RecursionError):
-        logger.warning("the %s on the Hub is broken, and is replaced", MANIFEST)
+        logger.warning("the %s on the Hub is broken, and is replaced", card.MANIFEST)
         return set()
     if kind != artifact:
         remedy = f"it holds a {kind}, and this is a {artifact}; choose another name"
@@ -182,27 +152,27 @@ def _previous_files(manifest: bytes | None, artifact: str, repo_id: str) -> set[
 def _tag(api: HfApi, where: dict[str, Any], commit: str) -> None:
     """Tags a commit with the version of the dataset's format, under which LeRobot looks for it."""
     tags = {tag.name: tag.target_commit for tag in api.list_repo_refs(**where).tags}
-    if tags.get(CODEBASE_VERSION) != commit:
-        if CODEBASE_VERSION in tags:
-            api.delete_tag(tag=CODEBASE_VERSION, **where)
-        api.create_tag(tag=CODEBASE_VERSION, revision=commit, **where)
+    if tags.get(card.CODEBASE_VERSION) != commit:
+        if card.CODEBASE_VERSION in tags:
+            api.delete_tag(tag=card.CODEBASE_VERSION, **where)
+        api.create_tag(tag=card.CODEBASE_VERSION, revision=commit, **where)
 
 
-def contents(folder: Path, artifact: str, include: Sequence[str] = ()) -> Files:
+def contents(folder: Path, artifact: str, include: Sequence[str] = ()) -> card.Files:
     """Files of a folder that are pushed, without paths of this machine.
 
     It refuses an `include` that is no folder of the run, a broken checkpoint, and a policy without backbone.
     """
-    if include and artifact != RUN:
+    if include and artifact != card.RUN:
         raise InputError("include", list(include), f"for a run; a {artifact} is pushed completely")
-    policies: list[str] = [""] if artifact == POLICY else []
-    last = (folder / CHECKPOINTS / layout.LAST).resolve()
-    if artifact == RUN:
+    policies: list[str] = [""] if artifact == card.POLICY else []
+    last = (folder / layout.CHECKPOINTS / layout.LAST).resolve()
+    if artifact == card.RUN:
         files = _of_a_run(folder, last, include)
-        policies = [f"{CHECKPOINTS}/{last.name}/{PRETRAINED}/"]
+        policies = [f"{layout.CHECKPOINTS}/{last.name}/{layout.PRETRAINED}/"]
     else:
         files = {name: path for name, path in _walk(folder) if name not in NOT_CONTENTS}
-    if artifact == DATASET:  # LeRobot leaves images behind that are in the tables or videos now
+    if artifact == card.DATASET:  # LeRobot leaves images behind that are in the tables or videos now
         files = {name: path for name, path in files.items() if not name.startswith("images/")}
     for prefix in policies:
         _bring_backbone(files, folder / prefix, prefix)
@@ -210,8 +180,8 @@ def contents(folder: Path, artifact: str, include: Sequence[str] = ()) -> Files:
         if is_record(name):
             data = content if isinstance(content, bytes) else content.read_bytes()
             files[name] = scrubbed(name, data, folder)
-    prefix = f"{CHECKPOINTS}/{last.name}/"
-    if artifact == RUN and (manifest := f"{prefix}{layout.MANIFEST}") in files:
+    prefix = f"{layout.CHECKPOINTS}/{last.name}/"
+    if artifact == card.RUN and (manifest := f"{prefix}{layout.MANIFEST}") in files:
         inside = {name: content for name, content in files.items() if name.startswith(prefix)}
         entries = {n.removeprefix(prefix): layout.entry(c) for n, c in inside.items() if n != manifest}
         files[manifest] = layout.manifest_text(entries).encode()
@@ -228,12 +198,12 @@ def _walk(folder: Path) -> Iterator[tuple[str, Path]]:
                 yield path.relative_to(folder).as_posix(), path
 
 
-def _of_a_run(run: Path, last: Path, include: Sequence[str]) -> Files:
+def _of_a_run(run: Path, last: Path, include: Sequence[str]) -> card.Files:
     if (last / layout.MANIFEST).is_file() and (why := layout.defect(last)) is not None:
         raise InputError("path", str(last), f"the checkpoint is broken: {why}")
     top = [path for path in sorted(run.iterdir()) if path.is_file() and path.suffix in RESULTS]
-    files: Files = {path.name: path for path in top if path.name not in NOT_CONTENTS}
-    folders = {f"{CHECKPOINTS}/{last.name}": last}
+    files: card.Files = {path.name: path for path in top if path.name not in NOT_CONTENTS}
+    folders = {f"{layout.CHECKPOINTS}/{last.name}": last}
     for name in (name.strip("/") for name in include):
         folders[name] = run / name
         if not (run / name).is_dir() or (run / name).name != name or name.startswith("."):
@@ -243,27 +213,28 @@ def _of_a_run(run: Path, last: Path, include: Sequence[str]) -> Files:
     return files
 
 
-def _bring_backbone(files: Files, home: Path, prefix: str) -> None:
+def _bring_backbone(files: card.Files, home: Path, prefix: str) -> None:
     """Points a policy at the backbone beside it, which is copied there if it is elsewhere on this machine."""
-    config, processor = read_json(home / CONFIG), read_json(home / PREPROCESSOR)
+    config, processor = card.read_json(home / card.CONFIG), card.read_json(home / layout.PREPROCESSOR)
     before = json.dumps([config, processor])
     elsewhere = Path(config.get("vlm_model_name") or "")
-    if elsewhere.is_absolute() and not (home / BACKBONE).is_dir():
+    if elsewhere.is_absolute() and not (home / layout.BACKBONE).is_dir():
         for name, path in _walk(elsewhere):
             # The policy's own file holds its weights, unless LeRobot builds it from the backbone's.
             if config.get("load_vlm_weights") or path.suffix not in WEIGHTS:
-                files[f"{prefix}{BACKBONE}/{name}"] = path
-    has = {own for own in CONFIG_FOLDERS.values() if any(n.startswith(f"{prefix}{own}/") for n in files)}
-    for fields, key, own in places_of_names(config, processor):
+                files[f"{prefix}{layout.BACKBONE}/{name}"] = path
+    ours = layout.CONFIG_FOLDERS.values()
+    has = {own for own in ours if any(name.startswith(f"{prefix}{own}/") for name in files)}
+    for fields, key, own in layout.places_of_names(config, processor):
         if not Path(named := fields.get(key) or "").is_absolute():
             continue
         if own not in has:
-            remedy = f"it needs {named}, which is not in it; put a copy into {BACKBONE}/ beside {CONFIG}"
-            raise InputError("path", str(home), remedy)
+            remedy = f"put a copy into {layout.BACKBONE}/ beside {card.CONFIG}"
+            raise InputError("path", str(home), f"it needs {named}, which is not in it; {remedy}")
         fields[key] = own
     if json.dumps([config, processor]) != before:
-        files[f"{prefix}{CONFIG}"] = (json.dumps(config, indent=4) + "\n").encode()
-        files[f"{prefix}{PREPROCESSOR}"] = (json.dumps(processor, indent=4) + "\n").encode()
+        files[f"{prefix}{card.CONFIG}"] = (json.dumps(config, indent=4) + "\n").encode()
+        files[f"{prefix}{layout.PREPROCESSOR}"] = (json.dumps(processor, indent=4) + "\n").encode()
 
 
 def is_record(name: str) -> bool:
@@ -327,4 +298,4 @@ def _portable(path: str, folder: Path) -> str:
     for root in (folder.absolute(), folder.resolve()):
         if Path(path).is_relative_to(root):
             return Path(path).relative_to(root).as_posix()
-    return f"{AWAY}/{Path(path).name}"
+    return f"{layout.AWAY}/{Path(path).name}"

@@ -23,7 +23,6 @@ from accerl_lerobot.errors import InputError, check_output, expanded
 
 NAME = "report.html"
 VIDEO_MB = 20
-"""Videos up to so many megabytes each are put into the page, larger ones are linked."""
 MARK = '<meta name="generator" content="accerl report'
 """Tells a page of ours from any other file; within its first 1000 characters."""
 
@@ -50,7 +49,7 @@ def write_report(config: ReportConfig) -> Path:
     """Reads the runs and writes the page."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    from accerl_lerobot.report.charts import POINTS
+    from accerl_lerobot.report.charts import COLOURS, POINTS
     from accerl_lerobot.report.content import comparison_page, run_page
     from accerl_lerobot.report.read import read_run
 
@@ -79,6 +78,7 @@ def write_report(config: ReportConfig) -> Path:
         **page,
         version=__version__,
         points=POINTS,
+        colours=COLOURS,
         video_mb=VIDEO_MB,
         base64=lambda path: base64.b64encode(path.read_bytes()).decode(),
         address=lambda path: quote(os.path.relpath(path.resolve(), folder)),

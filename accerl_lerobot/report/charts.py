@@ -8,18 +8,15 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from accerl_lerobot.console import number, percent
 
 POINTS = 100
-"""Points of a line at most, see `line`."""
 COLOURS = ("#1f5fd6", "#d9570b", "#0b8a7d", "#9a3fc2", "#5c8a0a", "#c2255c", "#8a5a12", "#7b8494")
-"""Colours of series. In the SVG they become the variables ``--c0`` to ``--c7`` of the style sheet."""
 TEXT, GRID = "#586172", "#e9ecf1"
-VARIABLES = {TEXT: "var(--soft)", GRID: "var(--grid)"} | {c: f"var(--c{i})" for i, c in enumerate(COLOURS)}
 STYLE = {
     "svg.fonttype": "none", "font.size": 9, "text.color": TEXT,
     "axes.edgecolor": GRID, "axes.labelcolor": TEXT, "axes.grid": True, "axes.axisbelow": True,
@@ -29,8 +26,7 @@ STYLE = {
 NO_METADATA = dict.fromkeys(("Creator", "Date", "Format", "Type"))
 
 
-@dataclass(frozen=True)
-class Series:
+class Series(NamedTuple):
     """A line, or points with intervals."""
 
     name: str
@@ -50,16 +46,13 @@ class Chart:
 
     title: str
     note: str
-    """Meaning of the chart, one sentence."""
     x_label: str
     series: Sequence[Series]
     unit: str = ""
     limit: float | None = None
-    """A value that is drawn as a dashed line across."""
     bottom: float | None = None
     top: float | None = None
     share: bool = False
-    """True if y is a share, shown in per cent."""
     bands: bool = True
     """False draws no bands and intervals, which hide each other where there are many series."""
     wide: bool = False
@@ -77,7 +70,7 @@ class Chart:
             ends = [show(float(value)) for value in (s.y if len(s.y) < 2 else s.y[[0, -1]])]
             if ends:
                 dashes = "dashed" if s.colour >= len(COLOURS) else "solid"
-                legend.append((f"{dashes} var(--c{s.colour % len(COLOURS)})", s.name, " → ".join(ends)))
+                legend.append((f"{dashes} {COLOURS[s.colour % len(COLOURS)]}", s.name, " → ".join(ends)))
         return legend
 
     def svg(self) -> str:
@@ -92,8 +85,7 @@ class Chart:
             figure.savefig(buffer, format="svg", transparent=True, metadata=NO_METADATA)
         svg = buffer.getvalue()
         svg = re.sub(r' id="(?![mp][0-9a-f]{10}")[^"]*"| font-family: [^;"]*;', "", svg[svg.index("<svg") :])
-        svg = re.sub(r'width="[\d.]+pt" height="[\d.]+pt"', 'aria-hidden="true"', svg, count=1)
-        return re.sub("|".join(VARIABLES), lambda colour: VARIABLES[colour[0]], svg)
+        return re.sub(r'width="[\d.]+pt" height="[\d.]+pt"', 'aria-hidden="true"', svg, count=1)
 
     def _draw(self, ax: Any) -> None:
         for s in self.series:
@@ -113,11 +105,11 @@ class Chart:
         ax.set_ylim(self.bottom, self.top)
 
 
-def line(name: str, x: np.ndarray, y: np.ndarray, colour: int = 0, *, largest: bool = False) -> Series:
+def line(name: str, x: np.ndarray, y: np.ndarray, colour: int = 0) -> Series:
     """A line of at most `POINTS` points, so that no page grows with its run.
 
-    Each of as many equal spans of x becomes its mean, with a band from its smallest to its largest value; or
-    its largest value, if so asked. Where y is not finite, there is no point.
+    Each of as many equal spans of x becomes its mean, with a band from its smallest to its largest value.
+    Where y is not finite, there is no point.
     """
     finite = np.isfinite(x) & np.isfinite(y)
     x, y = x[finite], y[finite]
@@ -129,7 +121,7 @@ def line(name: str, x: np.ndarray, y: np.ndarray, colour: int = 0, *, largest: b
     sizes = np.diff(np.append(starts, len(y)))
     x, mean = (np.add.reduceat(values[order], starts) / sizes for values in (x, y))
     low, high = (extreme.reduceat(y[order], starts) for extreme in (np.minimum, np.maximum))
-    return Series(name, x, high, colour) if largest else Series(name, x, mean, colour, low, high)
+    return Series(name, x, mean, colour, low, high)
 
 
 def rates(name: str, seconds: np.ndarray, counter: np.ndarray, *, spans: int = 60) -> Series:

@@ -22,7 +22,6 @@ from accerl_lerobot.timeline import STATES
 from accerl_lerobot.timeline.read import read_timeline
 
 RECENT_S = 120.0
-"""A run that has written something since is taken to be still going."""
 FEW = 25
 """Exploring episodes below which their success says nothing; the first to end are the short ones."""
 STATE_COLOURS = dict(zip(STATES, (0, 7, 1, 3, 2, 6, 5, 4, 4), strict=True))
@@ -31,11 +30,10 @@ MISMATCH = 1e-4
 STEPS = "env steps of online experience"
 SHARE: dict[str, Any] = {"share": True, "bottom": -0.03, "top": 1.04}
 """Options of a chart of shares, such that points at both ends are whole."""
-VIDEOS = {
-    "before_after.mp4": "The same episodes before training, left, and after it, right, under the success of "
-    "the whole evaluation. The frame at the end of a clip is green for a success and red for a failure.",
-}
-"""Captions of the videos that runs make."""
+FILM = (
+    "The same episodes before training, left, and after it, right, under the success of the evaluation. The "
+    "frame at the end of a clip is green for a success and red for a failure."
+)
 WARNINGS = {
     "restarts": ("restart", "of a rollout worker, which crashed or hung"),
     "dropped_nonfinite": ("decision", "thrown away, because the environment returned NaN or infinity"),
@@ -98,14 +96,12 @@ class Section:
     charts: Sequence[Chart] = ()
     tables: Sequence[Table] = ()
     videos: Sequence[tuple[Path, str]] = ()
-    changes: Sequence[tuple[str, str, str]] = ()
-    """Field, value and default."""
     details: str = ""
 
     @property
     def empty(self) -> bool:
         """True if there is nothing under the heading."""
-        rest = (self.text, self.bars, self.tables, self.videos, self.changes, self.details)
+        rest = (self.text, self.bars, self.tables, self.videos, self.details)
         return not any(rest) and not any(chart.drawable for chart in self.charts)
 
 
@@ -114,14 +110,16 @@ def run_page(run: Run, now: float) -> dict[str, Any]:
     config, why = resolved(run.config)
     bound = None if config is None else lag_limits(config)[0]
     found = () if config is None else differences(config)
-    changes = [(name, shown(value), shown(default)) for name, value, default in found]
-    text = f"This accerl cannot read the recipe: {why}." if why else "Fields that differ from the defaults:"
+    rows = [(name, shown(value), shown(default)) for name, value, default in found]
+    tables = [("Fields that differ from the defaults", ("field", "value", "default"), rows)] if rows else []
+    text = f"This accerl cannot read the recipe: {why}." if why else ""
+    videos = [(path, FILM if path.stem == "before_after" else path.name) for path in run.videos]
     success, *others = _training_sections(run, bound)
     sections = [
         success,
-        Section("Videos", videos=[(path, VIDEOS.get(path.name, path.name)) for path in run.videos]),
+        Section("Videos", videos=videos),
         *others,
-        Section("Recipe", text, changes=changes, details=run.config_text),
+        Section("Recipe", text, tables=tables, details=run.config_text),
     ]
     return {
         "title": run.name,
@@ -228,7 +226,7 @@ def _training_sections(run: Run, bound: int | None) -> list[Section]:
             rows.append((str(e.get("group")), number(e["env_steps"]), task, success, number(one["n"])))
     table = ("Evaluations, with 95 % Wilson intervals", ("", "env steps", "task", "success", "n"), rows)
     update, mean, largest = (column(run.train, name) for name in ("update", "lag_mean", "lag_max"))
-    lags = [line("mean of a batch", update, mean), line("largest", update, largest, 1, largest=True)]
+    lags = [line("mean of a batch", update, mean), line("largest", update, largest, 1)]
     dashed = "" if bound is None else f" Dashed: the bound of the recipe, {bound}."
     options: dict[str, Any] = {"unit": "updates", "limit": bound, "bottom": 0, "wide": True}
     lag = Chart("Lag", f"Age of the weights that decided.{dashed}", "updates", lags, **options)
@@ -297,11 +295,9 @@ def _time_shares(run: Run) -> dict[str, list[tuple[str, float, str, int]]]:
     }
 
 
-def _time_mean(records: Sequence[Record], name: str) -> float | None:
-    """Mean of shares of the time since the record before."""
-    length = np.diff(column(records, "wall_s"), prepend=np.nan)
-    there = np.isfinite(column(records, name)) & (length > 0)
-    return float(np.average(column(records, name)[there], weights=length[there])) if there.any() else None
+def _mean(records: Sequence[Record], name: str) -> float | None:
+    values = column(records, name)
+    return float(np.nanmean(values)) if np.isfinite(values).any() else None
 
 
 def _speed(run: Run) -> Section:
@@ -314,22 +310,8 @@ def _speed(run: Run) -> Section:
         name = key.replace("_", " ")
         series = [rates(name, seconds, counter)]
         charts.append(Chart(name.capitalize(), "", x_label, series, unit="per second", bottom=0))
-    busy_s = float(np.nansum(column(run.train, "update_s")) + np.nansum(column(run.train, "publish_s")))
-    wait_s = float(np.nansum(column(run.train, "wait_s")))
-    if not busy_s + wait_s:  # the engine in one process, in which nobody waits
-        return Section("Speed", charts=charts)
-    waited, inference = wait_s / (busy_s + wait_s), _time_mean(run.rollout, "inference_busy_share")
-    text = f"The trainer was busy for {percent(1 - waited)} of its time and waited for batches in the rest. "
-    if (blocked := newest(run.rollout, "replay_insert_wait_s")) is not None:
-        text += f"Segments waited to enter the replay buffer for {duration(blocked)}, all of them together. "
-    if waited <= 0.1:
-        text += "Learning was the slower side: more environments would only wait."
-    elif inference is not None and inference > 0.8:
-        text += f"Inference, busy for {percent(inference)} of the time, limited collecting."
-    else:
-        text += "Collecting was the slower side, and inference had time left for more environments."
-    charts += _charts(run.rollout, INFERENCE)
-    return Section("Speed", text, bars=_time_shares(run), charts=charts)
+    charts += _charts(run.rollout, INFERENCE) if np.nansum(column(run.train, "wait_s")) else []
+    return Section("Speed", bars=_time_shares(run), charts=charts)
 
 
 def _headline(run: Run) -> str:
@@ -357,8 +339,7 @@ def _headline(run: Run) -> str:
 
 def _tiles(run: Run, bound: int | None) -> list[tuple[str, str, str]]:
     result = run.result or {}
-    mean = float(np.nanmean(column(run.train, "lag_mean"))) if run.train else None
-    largest = float(np.nanmax(column(run.train, "lag_max"))) if run.train else None
+    mean, largest = _mean(run.train, "lag_mean"), np.nanmax([0.0, *column(run.train, "lag_max")])
     parts = {"warm start": result.get("warm_start_s") or 0.0, "RL": result.get("rl_s") or 0.0}
     tiles = []
     for e in run.outcomes:

@@ -44,11 +44,9 @@ class Run:
     result: Record | None
     """summary.json; None: not finished."""
     truncated: bool
-    """True if the last line of metrics.jsonl is incomplete."""
     sessions: int
     """1 + the number of times that it was resumed."""
     written: float
-    """When something was last written, in seconds since 1970."""
     videos: tuple[Path, ...]
 
     @property
@@ -218,12 +216,8 @@ def differences(config: Any, default: Any = None, prefix: str = "") -> Iterator[
     """Dotted field, value and default, where the two differ.
 
     Defaults are those of the types that were chosen: GIPO's for a run of GIPO. That it was chosen is a
-    difference too, and so is a section that is off unless it is given.
-
-    Args:
-        config: a section, or all of it.
-        default: its default; None, or one of another type: the defaults of its fields.
-        prefix: name of the section with a dot.
+    difference too, and so is a section that is off unless it is given. Without a `default` of its type,
+    those of a section's fields count.
     """
     for field in dataclasses.fields(config):
         name, value = f"{prefix}{field.name}", getattr(config, field.name)
@@ -250,9 +244,8 @@ def _default(field: dataclasses.Field[Any]) -> Any:
 def apart(trees: list[dict[str, Any]]) -> list[tuple[str, list[Any]]]:
     """Fields in which runs differ, with each run's value; a dash where one does not have it."""
     flats = [flat(tree) for tree in trees]
-    keys = dict.fromkeys(key for one in flats for key in one if key not in PLACES)
-    rows = [(key, [one.get(key, ABSENT) for one in flats]) for key in keys]
-    return [(key, values) for key, values in rows if any(v != values[0] for v in values)]
+    rows = {key: [one.get(key, ABSENT) for one in flats] for one in flats for key in one}
+    return [(key, row) for key, row in rows.items() if key not in PLACES and any(v != row[0] for v in row)]
 
 
 def resolved(tree: dict[str, Any]) -> tuple[RunConfig | None, str]:

@@ -8,8 +8,6 @@ calendar time at which a process began is noted too.
 ``RUN/timeline/rollout-0.1.3.bin`` is part 3 of the second process (1) of ``rollout 0``: a line of JSON, then
 8 bytes per entry, nanoseconds since the process began << 4 | state, little-endian. The newest two parts are
 kept. Nothing is overwritten: a killed process leaves at worst half an entry, which is not read.
-
-The states of a worker, which is in exactly one at any time; see ``docs/metrics.md``.
 """
 
 from __future__ import annotations
@@ -35,9 +33,7 @@ STATES = (
     len(STATES)
 )
 ROLES = ("driver", "local", "rollout", "imagination", "inference", "replay", "trainer", "world learning")
-"""In the order in which they are shown."""
 TIMELINE = "timeline"
-"""Name of the folder in a run's."""
 
 
 def role_of(worker: str) -> str:
@@ -52,9 +48,7 @@ def bubble(shares: Mapping[str, float]) -> float:
 
 FORMAT = 1
 BITS = 4
-"""Bits of an entry that hold the state."""
 BATCH = 512
-"""Entries that are written at once."""
 FLUSH_NS = 1_000_000_000
 """An entry is on its way to the disk after so long, if another follows or `Clock.beat` is called."""
 PART_BYTES = 4_000_000
@@ -64,28 +58,18 @@ BOOT = Path("/proc/sys/kernel/random/boot_id")
 
 
 class Moment(NamedTuple):
-    """A moment by two clocks."""
+    """A moment by the monotonic clock of a node and by the calendar, in nanoseconds."""
 
     node: str
-    """Whose monotonic clock it is."""
     clock_ns: int
-    """By that."""
     wall_ns: int
-    """By the calendar, in nanoseconds since 1970."""
 
 
 class Clock:
     """One worker's recorder; begins in the state `RECOVERY`, which is to get ready for work.
 
-    Example:
-        >>> clock = open_clock(folder, "trainer")
-        >>> clock.enter(WAIT_IN)         # from one thread
-        >>> clock.beat()                 # from any: entries so far are written, up to now
-
-    Args:
-        folder: of the timeline; made if it is not there.
-        worker: its name; the part before a number is its role.
-        begins: when its process does; None: now.
+    States are entered from one thread; `beat`, from any, writes entries so far, up to now. The part of
+    `worker` before a number is its role; its process `begins` now, unless it is said.
     """
 
     def __init__(

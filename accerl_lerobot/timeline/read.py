@@ -20,7 +20,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from accerl_lerobot.checkpoint.layout import write_atomically
-from accerl_lerobot.checkpoint.safety import Origin, check_folder
+from accerl_lerobot.checkpoint.safety import Origin, brief, check_folder
 from accerl_lerobot.config.ranges import NonNegative, Positive, Section
 from accerl_lerobot.errors import InputError, check_output, expanded
 from accerl_lerobot.timeline import (
@@ -78,7 +78,6 @@ class Timeline:
 
     run: Path
     rows: tuple[Row, ...]
-    """By role, then by number."""
 
     @property
     def seconds(self) -> float:
@@ -106,150 +105,99 @@ class Timeline:
         for row in self.rows:
             own = np.diff(row.until(ends), axis=0)[::2].sum(axis=0)
             spent[row.role] = spent.get(row.role, 0) + own
-        return {role: divided(own) for role, own in spent.items() if own.sum() > 0}
+        return {
+            role: {STATES[i]: float(own[i] / own.sum()) for i in np.flatnonzero(own)}
+            for role, own in spent.items()
+            if own.sum() > 0
+        }
 
 
-def divided(spent: np.ndarray) -> dict[str, float]:
-    """Shares by state, of time in each."""
-    return {STATES[i]: float(spent[i] / spent.sum()) for i in np.flatnonzero(spent)}
-
-
-def read_timeline(run_directory: Path) -> Timeline:
-    """Reads what the workers of a run have left."""
-    check_folder(run_directory, Origin("runs", str(run_directory)))
-    processes = read_processes(run_directory / TIMELINE)
-    if not processes:
-        remedy = "no timeline in it: it is no run, or no worker has begun"
-        raise InputError("runs", str(run_directory), remedy)
-    return Timeline(run=run_directory, rows=_rows(processes))
-
-
-class Head(NamedTuple):
-    """First line of a part."""
+class Part(NamedTuple):
+    """One file of a process; the intervals between `times` are spent in `states`."""
 
     worker: str
+    number: tuple[int, int]
+    """Numbers of the process and of the part."""
     begins: Moment
-    """When its process did."""
-    at_ns: int
-    """When the part begins, since the process did."""
-    state: int
-    """In which it begins."""
-    size: int
-    """Bytes of the line."""
-
-
-class Process(NamedTuple):
-    """Kept part of one process; the intervals between `times` are spent in `states`."""
-
-    head: Head
-    """Head of the oldest part that is kept."""
+    """When the process did."""
     times: np.ndarray
     """int64 (n + 1,), nanoseconds since the process began."""
     states: np.ndarray
     """uint8 (n,)."""
 
 
-def part_paths(folder: Path) -> dict[tuple[str, int], list[Path]]:
-    """Parts that there are, in order, by worker and number of the process."""
-    found: dict[tuple[str, int], list[Path]] = {}
-    for path in sorted(folder.glob(f"*{SUFFIX}"), key=_numbers):
-        found.setdefault(_numbers(path)[:2], []).append(path)
-    return found
-
-
-def read_processes(folder: Path) -> list[Process]:
-    """All that is kept, in no order."""
-    processes = []
-    for paths in part_paths(folder).values():
-        parts = []
-        for path in paths:
-            with contextlib.suppress(FileNotFoundError):  # its worker has begun another part meanwhile
-                if (head := read_head(path)) is not None:
-                    parts.append((head, *read_entries(path, head.size, head.at_ns)))
-        if parts:
-            head = parts[0][0]
-            times = np.concatenate([[head.at_ns], *(times for _, times, _ in parts)])
-            states = np.concatenate([[head.state], *(states for *_, states in parts)])
-            processes.append(Process(head, times, states[:-1].astype(np.uint8)))
-    return processes
-
-
-def read_head(path: Path) -> Head | None:
-    """A part's first line; None if it is incomplete."""
-    with path.open("rb") as file:
-        line = file.readline()
-    if not line.endswith(b"\n"):
-        return None
-    try:
-        content = json.loads(line)
-        if content["timeline"] != FORMAT:
-            raise ValueError(f"format {content['timeline']}, not {FORMAT}")
-        return Head(
-            worker=str(content["worker"]),
-            begins=Moment(str(content["node"]), int(content["clock_ns"]), int(content["wall_ns"])),
-            at_ns=int(content["at_ns"]),
-            state=STATES.index(content["state"]),
-            size=len(line),
-        )
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise _damaged(path, " ".join(str(error).split())[:80]) from error
-
-
-def read_entries(path: Path, start: int, after_ns: int) -> tuple[np.ndarray, np.ndarray]:
-    """Times and states of the whole entries of a part, from byte `start` on, later than `after_ns`."""
-    with path.open("rb") as file:
-        file.seek(start)
-        data = file.read()
-    entries = np.frombuffer(data[: len(data) // 8 * 8], "<u8")
-    times, states = (entries >> np.uint64(BITS)).astype(np.int64), (entries % 2**BITS).astype(np.uint8)
-    if (np.diff(times, prepend=after_ns) < 0).any():
-        raise _damaged(path, "time goes back")
-    if (states >= len(STATES)).any():
-        raise _damaged(path, "no such state")
-    return times, states
-
-
-def _numbers(path: Path) -> tuple[str, int, int]:
-    """Worker, process and part."""
-    try:
-        slug, process, part = path.name.removesuffix(SUFFIX).rsplit(".", 2)
-        return slug, int(process), int(part)
-    except ValueError as error:
-        raise _damaged(path, "no part of a timeline has such a name") from error
-
-
-def _damaged(path: Path, why: str) -> InputError:
-    return InputError("runs", str(path), f"damaged ({why}); restore it, or remove it")
-
-
-def _rows(processes: list[Process]) -> tuple[Row, ...]:
-    """One for each worker, on a common axis.
+def read_timeline(run_directory: Path) -> Timeline:
+    """Reads what the workers of a run have left, on a common axis.
 
     Clocks of one machine agree to the nanosecond, so all its processes are placed on the calendar together,
     by the moment that the first of them noted.
     """
+    check_folder(run_directory, Origin("runs", str(run_directory)))
+    parts = read_parts(run_directory / TIMELINE)
+    if not parts:
+        remedy = "no timeline in it: it is no run, or no worker has begun"
+        raise InputError("runs", str(run_directory), remedy)
     offsets: dict[str, int] = {}
-    for moment in sorted((process.head.begins for process in processes), key=lambda moment: moment.wall_ns):
-        offsets.setdefault(moment.node, moment.wall_ns - moment.clock_ns)
-    begins = [p.head.begins.clock_ns + offsets[p.head.begins.node] for p in processes]
-    workers: dict[str, list[tuple[int, Process]]] = {}
-    for begun, process in sorted(zip(begins, processes, strict=True), key=lambda pair: pair[0]):
-        workers.setdefault(process.head.worker, []).append((begun - min(begins), process))
-    return tuple(sorted((_row(worker, own) for worker, own in workers.items()), key=_place))
+    for begins in sorted((part.begins for part in parts), key=lambda moment: moment.wall_ns):
+        offsets.setdefault(begins.node, begins.wall_ns - begins.clock_ns)
+    first = min(part.begins.clock_ns + offsets[part.begins.node] for part in parts)
+    workers: dict[str, list[Part]] = {}
+    for part in parts:
+        moved = part.times + part.begins.clock_ns + offsets[part.begins.node] - first
+        workers.setdefault(part.worker, []).append(part._replace(times=moved))
+    rows = [_row(worker, own) for worker, own in workers.items()]
+    return Timeline(run=run_directory, rows=tuple(sorted(rows, key=_place)))
 
 
-def _row(worker: str, processes: list[tuple[int, Process]]) -> Row:
+def read_parts(folder: Path) -> list[Part]:
+    """All that is kept, by process and number."""
+    parts = []
+    for path in folder.glob(f"*{SUFFIX}"):
+        with contextlib.suppress(FileNotFoundError):  # its worker has begun another part meanwhile
+            head, newline, data = path.read_bytes().partition(b"\n")
+            if newline:
+                parts.append(_part(path, head, data))
+    return sorted(parts, key=lambda part: part.number)
+
+
+def _part(path: Path, head: bytes, data: bytes) -> Part:
+    def damaged(why: str) -> InputError:
+        return InputError("runs", str(path), f"damaged ({why}); restore it, or remove it")
+
+    try:
+        _, process, number = path.name.removesuffix(SUFFIX).rsplit(".", 2)
+        content = json.loads(head)
+        if content["timeline"] != FORMAT:
+            raise ValueError(f"format {content['timeline']}, not {FORMAT}")
+        begins = Moment(str(content["node"]), int(content["clock_ns"]), int(content["wall_ns"]))
+        start, state = int(content["at_ns"]), STATES.index(content["state"])
+        worker, place = str(content["worker"]), (int(process), int(number))
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise damaged(brief(error)) from error
+    entries = np.frombuffer(data[: len(data) // 8 * 8], "<u8")  # a killed process leaves half an entry
+    times = np.append(start, (entries >> np.uint64(BITS)).astype(np.int64))
+    states = np.append(state, (entries % 2**BITS).astype(np.int64))
+    if (np.diff(times) < 0).any():
+        raise damaged("time goes back")
+    if (states >= len(STATES)).any():
+        raise damaged("no such state")
+    return Part(worker, place, begins, times, states[:-1].astype(np.uint8))
+
+
+def _row(worker: str, parts: list[Part]) -> Row:
     times: np.ndarray = np.empty(0, np.int64)
     states: np.ndarray = np.empty(0, np.uint8)
-    kept_from = 0
-    for begun, process in processes:
-        own = process.times + begun
+    kept_from, process = 0, -1
+    for part in parts:
+        if part.number[0] != process and part.number[1]:
+            kept_from = int(part.times[0])
         if len(times):  # the last entries of a process that was being ended are cut where the next one begins
-            left = max(1, int(np.searchsorted(times, own[0])))
-            times, states = times[:left], np.append(states[: left - 1], np.uint8(ABSENT))
-        times, states = np.concatenate([times, own]), np.concatenate([states, process.states])
-        if process.head.at_ns:
-            kept_from = int(own[0])
+            times = times[: max(1, int(np.searchsorted(times, part.times[0], "right")))]
+            states = np.append(states[: len(times) - 1], np.uint8(ABSENT))
+        times, states = np.concatenate([times, part.times]), np.concatenate([states, part.states])
+        process = part.number[0]
+    passed = (np.diff(times) > 0) | (states != ABSENT)  # the next part of a process follows at once
+    times, states = np.append(times[:-1][passed], times[-1]), states[passed]
     change = np.flatnonzero(np.diff(states, prepend=-1) != 0)  # beats are no changes of state
     times = np.append(times[:-1][change], times[-1])
     return Row(worker=worker, times=times, states=states[change], kept_from=kept_from)
@@ -261,7 +209,6 @@ def _place(row: Row) -> tuple[int, int, str]:
 
 
 PICTURE, TRACE = "timeline.png", "timeline.json"
-"""Names in a run's folder."""
 MARK = "accerl timeline"
 """In a picture's metadata: made by us, and may be replaced."""
 TRACE_S = 60.0
@@ -271,7 +218,6 @@ COLOURS = {
     "weights": "#9b5de5", "checkpoint": "#8d6e63", "recovery": "#d64545", "training": "#a8c8a0",
     "evaluation": "#7fb8c9",
 }  # fmt: skip
-"""State → its colour in the picture."""
 COLUMNS = 1600
 """Columns of the picture; an interval that is shorter than one colours it in proportion."""
 
@@ -304,8 +250,7 @@ def show_timelines(config: TimelineConfig) -> dict[str, Any]:
     """Reads the runs, writes picture and traces.
 
     Returns:
-        ``picture``, and for each run, in ``runs``, ``run``, ``trace``, ``window_s`` (what is drawn),
-        ``training_s`` (when it trained, for each start), ``shares`` and ``bubble`` of the training by role.
+        ``picture`` and ``runs``: of each, what is drawn, when it trained, and how its roles spent that time.
     """
     picture = None if config.output is None else expanded(config.output, "output")
     timelines = [read_timeline(Path(name).expanduser()) for name in config.runs]

@@ -16,9 +16,7 @@ from accerl_lerobot.demos import backbone
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     build = bench.lerobot_config
-    sizes = backbone.BackboneSizes(
-        hidden=32, heads=2, kv_heads=1, vision_hidden=16, vision_layers=1, patch=32
-    )
+    sizes = {"hidden": 32, "heads": 2, "kv_heads": 1, "vision_hidden": 16, "vision_layers": 1, "patch": 32}
     monkeypatch.setattr(bench, "SMOLVLM2_500M", sizes)
 
     def shrunk(config: BenchPolicyConfig, directory: Path) -> Any:
@@ -45,6 +43,6 @@ def test_it_measures(small: None, precision: str, low: float, high: float) -> No
 def test_the_published_backbone_has_the_published_size(tmp_path: Path) -> None:
     import json
 
-    backbone.write_backbone(tmp_path / "b", bench.SMOLVLM2_500M)
+    backbone.write_backbone(tmp_path / "b", **bench.SMOLVLM2_500M)
     text = json.loads((tmp_path / "b" / "config.json").read_text())["text_config"]
     assert (text["hidden_size"], text["intermediate_size"], text["vocab_size"]) == (960, 2560, 49280)

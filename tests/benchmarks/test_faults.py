@@ -8,16 +8,13 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import CHECKPOINTS, TRAINING_STATE, save_checkpoint
-from accerl_lerobot.engine.config import encode
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.replay.buffer import MixedReplay
 from accerl_lerobot.replay.journal import EPISODES, Journal
@@ -26,9 +23,8 @@ from benchmarks.audit import audit_segments, audit_updates
 from benchmarks.fault_injection import POINTS
 from benchmarks.faults import BenchFaultsConfig, bench_faults
 from benchmarks.hits import ANYWHERE, FAULTS, places
-from benchmarks.light_run import light_config
-from benchmarks.soak import BenchSoakConfig, compare, costs
-from benchmarks.victims import CLASSES, LIGHT, Victim, await_hit, descendants, hit, title
+from benchmarks.soak import compare, costs
+from benchmarks.victims import CLASSES, Victim, await_hit, descendants, hit, title
 from tests.replay.segments import make_segment
 
 SLEEPS = """
@@ -120,22 +116,6 @@ def test_segments_that_counted_are_in_the_journal_once(kept: Path):
     assert not list(kept.glob(".*")), "nothing is left there"
 
 
-@pytest.mark.parametrize(
-    ("spoil", "lost", "doubled"),
-    [
-        (lambda lines: [lines[0], *lines[2:4], *lines[4:]], 0, 0),  # the last one moves into the place of b
-        (lambda lines: lines[:3], 1, 0),
-        (lambda lines: [lines[0], lines[0], *lines[2:]], 1, 1),
-    ],
-)
-def test_segments_that_are_missing_or_there_twice_are_found(kept: Path, spoil: Any, lost: int, doubled: int):
-    lines = (kept / EPISODES).read_bytes().splitlines(keepends=True)
-    (kept / EPISODES).write_bytes(b"".join(spoil(lines)))
-    found = audit_segments(kept)
-    lost = lost or 1  # b is stored and not in the journal
-    assert (found["segments_lost"], found["segments_doubled"]) == (lost, doubled)
-
-
 def test_every_point_is_somewhere_that_a_target_can_be_hit():
     targets = [*CLASSES, "driver", "everything"]
     found = {place for target in targets for fault in FAULTS for place in places(target, fault)}
@@ -145,20 +125,6 @@ def test_every_point_is_somewhere_that_a_target_can_be_hit():
     assert places("trainer", "nans") == places("trainer", "nan") == ["trainer.loss"]
     assert places("inference", "nans") == [], "a decision or two that replay refuses end nobody"
     assert ANYWHERE not in places("driver", "kill")[1:] and places("driver", "stop") == []
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"targets": ("everyone",)}, r"targets=\('everyone',\): use some of rollout, inference"),
-        ({"targets": ()}, "use some of"),
-        ({"faults": ("kill", "kill")}, "none twice"),
-        ({"targets": ("everything",), "faults": ("nan", "torn")}, "none of them can befall everything"),
-    ],
-)
-def test_what_cannot_be_done_is_refused(options: dict[str, Any], message: str):
-    with pytest.raises(InputError, match=message):
-        BenchFaultsConfig(**options)
 
 
 def test_nothing_is_begun_where_something_is(tmp_path: Path):
@@ -193,26 +159,6 @@ def test_a_run_of_time_survives_what_is_done_to_it(tmp_path: Path):
     assert written["hits"] == result["hits"] and (root / "faults.png").stat().st_size > 1000
 
 
-@pytest.mark.slow
-def test_a_service_comes_back_long_after_the_run_was_taken_back(tmp_path: Path):
-    """Where it begins again is still there, whatever has been saved since."""
-    light = tmp_path / "light.yaml"
-    config = replace(light_config(updates=1_000_000), save_every_s=0.0, save_every_updates=1)
-    light.write_text(yaml.safe_dump(encode(config), sort_keys=False))
-    victim = Victim(tmp_path / "run", [f"--config_path={light}"], tmp_path / "run.log", LIGHT)
-    try:
-        for target, updates in (("trainer", 4), ("inference", 20)):
-            victim.await_update(max(victim.updates(), default=0) + updates, 120.0)
-            (pid,) = victim.pids(target)
-            assert hit(pid, signal.SIGKILL)
-            victim.await_successors(target, pid, 1, 120.0)
-        before = set(victim.pids("trainer"))
-        victim.await_update(max(victim.updates()) + 20, 120.0)
-        assert set(victim.pids("trainer")) == before
-    finally:
-        victim.kill()
-
-
 def test_a_soak_compares_each_block_with_its_neighbour():
     rates = {"quiet": [10.0, 12.0], "struck": [9.0, 6.0]}
     blocks = [
@@ -222,16 +168,3 @@ def test_a_soak_compares_each_block_with_its_neighbour():
     found = compare(blocks)
     assert found["left"]["updates"]["blocks"] == [0.9, 0.5]
     assert found["rates"]["decisions"]["quiet"]["median"] == 16 * 11.0
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"minutes": 3.0}, "minutes=3.0: use at least 4"),
-        ({"targets": ("driver",)}, "leave out driver"),
-        ({"targets": ("rollout", "replay"), "faults": ("nan",)}, "add kill"),
-    ],
-)
-def test_a_soak_that_says_nothing_is_refused(options: dict[str, Any], message: str):
-    with pytest.raises(InputError, match=message):
-        BenchSoakConfig(**options)

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from benchmarks import study as studies
-from benchmarks.few_shot import BenchFewShotConfig, bench_few_shot, means
+from benchmarks.few_shot import BenchFewShotConfig, bench_few_shot
 from benchmarks.records import mean_interval
 from benchmarks.study import Results, Study
 
@@ -54,11 +54,6 @@ def test_runs_of_a_task_share_its_policy_and_its_episodes(tmp_path: Path, monkey
     assert len(table) == 2 + 8
     assert table[2] == "| push-v3 | 0 | chunk_critic | 40% [31%, 50%] | 90% [83%, 94%] | 30 | 4,500 |"
     assert (tmp_path / "few_shot.png").stat().st_size > 5000 and (tmp_path / "few_shot.json").is_file()
-
-
-def test_one_policy_has_no_interval():
-    rows = [{"algorithm": "sft", "success": 0.5}]
-    assert means(rows) == {"sft": {"success": 0.5, "policies": 1}}
 
 
 def test_a_mean_over_runs_is_as_unsure_as_they_differ():

@@ -71,14 +71,6 @@ def test_seeds_are_counted_together(result: dict[str, Any]):
     json.dumps(result)
 
 
-def test_the_table_says_rate_interval_and_each_seed(result: dict[str, Any]):
-    lines = bench.markdown(result).splitlines()
-    assert lines[0] == "| algorithm | held back 0 (lag 0) | held back 2 (lag 2) |"
-    assert lines[2].startswith("| gipo | 95.0 % [31.5, 100.0] n=20 (90 100) | 55.0 % [")
-    shown = bench.table(result)
-    assert shown.row_count == 2 and "40%, 50%" in str(shown.title)
-
-
 @pytest.mark.slow
 def test_a_study_is_run_and_goes_on_where_it_was_stopped(
     tmp_path: Path, tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
@@ -131,28 +123,6 @@ def test_cells_differ_from_the_recipe_in_what_is_studied(tmp_path: Path, tiny_ch
     assert made.output_dir == str(tmp_path / "study" / "ppo-lag2-seed4")
     assert made.replay == tiny_run(tiny_checkpoint).replay
     assert study.starts[4].trainer.updates == 0
-
-
-def test_settings_are_checked_before_anything_runs(tmp_path: Path, tiny_checkpoint: Path):
-    config = small(tmp_path, tiny_checkpoint, algorithms=("gipo", "pppo"))
-    with pytest.raises(InputError, match="algorithm.type"):
-        bench.bench_lag(config)
-    with pytest.raises(InputError, match="policy.path"):
-        bench.bench_lag(small(tmp_path, tiny_checkpoint, recipe=recipe(tmp_path, tmp_path / "nowhere")))
-    assert not (tmp_path / "study").exists()
-
-
-def test_a_run_that_fails_ends_the_study_with_its_last_lines(
-    tmp_path: Path, tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
-):
-    real = subprocess.Popen
-
-    def start(command: list[str], **options: Any) -> subprocess.Popen[bytes]:
-        return real([sys.executable, "-c", "print('one'); print('it broke'); raise SystemExit(3)"], **options)
-
-    monkeypatch.setattr(studies.subprocess, "Popen", start)
-    with pytest.raises(RuntimeError, match="the run start-seed. failed, see .*\\none\\nit broke"):
-        bench.bench_lag(small(tmp_path, tiny_checkpoint))
 
 
 def test_a_study_that_is_stopped_ends_its_runs(

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from accerl_lerobot.envs import make_world
-from accerl_lerobot.errors import InputError
 from benchmarks import simulated_world
 from benchmarks.simulated_world import LatencyConfig, read_trace
 
@@ -55,33 +54,6 @@ def test_a_trace_is_gone_through_from_some_moment_on_and_scaled(tmp_path: Path, 
             assert draws[(draws.index(1.0) + 1) % 3] == 2.0
         starts.add(draws[0])
     assert starts == {1.0, 2.0, 6.0}
-
-
-def test_without_resets_in_a_trace_they_take_as_long_as_decisions(tmp_path: Path, slept: list[float]):
-    path = tmp_path / "trace.txt"
-    path.write_text("1\n1\n")
-    world = make_world(LatencyConfig(latency_trace=str(path), frame_ms=3.0))
-    world.reset(0, "match")
-    world.step_chunk(NO_ACTIONS)
-    assert slept == [3.0, 3.0]
-
-
-@pytest.mark.parametrize(
-    ("text", "why"),
-    [
-        (None, "cannot be read"),
-        ("1.0\nfast\n", "line 2, 'fast', is no duration"),
-        ("1.0\nafter 1.0\n", "line 2, 'after 1.0'"),
-        ("nan\n", "line 1"),
-        ("0\n0\n", "no time passes"),
-    ],
-)
-def test_a_trace_that_is_none_is_refused(tmp_path: Path, text: str | None, why: str):
-    trace = tmp_path / "trace.txt"
-    if text is not None:
-        trace.write_text(text)
-    with pytest.raises(InputError, match=f"^env.latency_trace=.*{why}"):
-        make_world(LatencyConfig(latency_trace=str(trace)))
 
 
 def test_it_crashes_on_request_and_counts_over_episodes():

@@ -5,9 +5,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -38,24 +35,3 @@ def test_all_arms_at_all_sizes(light_ray: None, tmp_path: Path):
     assert (root / "weights.png").read_bytes()[:4] == b"\x89PNG"
     with pytest.raises(InputError, match="^output_dir=.*the folder exists"):
         bench_weights(config)
-
-
-@pytest.mark.slow
-def test_readers_apart_are_on_a_node_of_their_own(light_ray: None, tmp_path: Path):
-    """In a process of its own, as this one has a Ray of one node."""
-    with pytest.raises(InputError, match="^apart=True: Ray has been started already"):
-        bench_weights(BenchWeightsConfig(sizes_mb=(1,), readers=(1,), repeats=1, apart=True))
-    clean = {k: v for k, v in os.environ.items() if not k.startswith("RAY_")}
-    options = ["--apart=true", "--sizes_mb=[1]", "--readers=[1,2]", "--repeats=1", "--tensors=2"]
-    command = [sys.executable, "-m", "benchmarks", "weights", *options]
-    done = subprocess.run(
-        [*command, f"--output_dir={tmp_path / 'apart'}"],
-        env=clean,
-        capture_output=True,
-        text=True,
-        timeout=240,
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
-    cells = json.loads((tmp_path / "apart" / "weights.json").read_text())["cells"]
-    found = [(c["arm"], c["readers"], c["mb"]["median"]) for c in cells]
-    assert found == [(arm, n, 1.0) for n in (1, 2) for arm in ("Ray",)]

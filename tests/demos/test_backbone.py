@@ -6,7 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from accerl_lerobot.demos.backbone import SPECIAL_TOKENS, BackboneSizes, write_backbone
+from accerl_lerobot.demos.backbone import SPECIAL_TOKENS, write_backbone
 
 TEXTS = ["Open the door", "Close the drawer"]
 
@@ -18,8 +18,8 @@ def tokenizer_of(directory: Path) -> Any:
 
 
 def test_instructions_are_few_tokens_and_others_still_encode(tmp_path: Path):
-    learned = tokenizer_of(write_backbone(tmp_path / "learned", BackboneSizes(), TEXTS))
-    plain = tokenizer_of(write_backbone(tmp_path / "plain", BackboneSizes()))
+    learned = tokenizer_of(write_backbone(tmp_path / "learned", TEXTS))
+    plain = tokenizer_of(write_backbone(tmp_path / "plain"))
     assert [len(plain(text).input_ids) for text in TEXTS] == [13, 16], "a byte each"
     assert all(len(learned(text).input_ids) <= 5 for text in TEXTS)
     for text in (*TEXTS, "Öffne die Tür 🚪", "pick\tup\n"):
@@ -31,7 +31,7 @@ def test_the_vocabulary_is_bounded_and_ids_are_those_of_the_config(tmp_path: Pat
     from transformers import AutoConfig
 
     many = [f"Task number {i} of a benchmark: {i * 7919}" for i in range(200)]
-    directory = write_backbone(tmp_path / "backbone", BackboneSizes(vocabulary=300), many)
+    directory = write_backbone(tmp_path / "backbone", many, vocabulary=300)
     tokenizer, config = tokenizer_of(directory), AutoConfig.from_pretrained(directory)
     assert len(tokenizer) == config.text_config.vocab_size <= 300
     assert config.image_token_id == tokenizer.convert_tokens_to_ids("<image>")
@@ -39,18 +39,11 @@ def test_the_vocabulary_is_bounded_and_ids_are_those_of_the_config(tmp_path: Pat
     assert all(len(tokenizer(token).input_ids) == 1 for token in SPECIAL_TOKENS)
 
 
-def test_equal_texts_give_equal_files(tmp_path: Path):
-    one = write_backbone(tmp_path / "one", BackboneSizes(), TEXTS)
-    other = write_backbone(tmp_path / "deep" / "other", BackboneSizes(), [*reversed(TEXTS), TEXTS[0]])
-    for file in one.iterdir():
-        assert file.read_bytes() == (other / file.name).read_bytes(), file.name
-
-
 def test_the_vision_tower_has_the_sizes_asked_for(tmp_path: Path):
     from transformers import AutoConfig
 
-    sizes = BackboneSizes(hidden=48, layers=3, heads=4, kv_heads=2, vision_hidden=32, patch=8, image=32)
-    config = AutoConfig.from_pretrained(write_backbone(tmp_path / "backbone", sizes))
+    sizes = {"hidden": 48, "layers": 3, "vision_hidden": 32, "patch": 8, "image": 32}
+    config = AutoConfig.from_pretrained(write_backbone(tmp_path / "backbone", **sizes))
     text, vision = config.text_config, config.vision_config
     assert (text.hidden_size, text.num_hidden_layers, text.head_dim) == (48, 3, 12)
     assert (vision.hidden_size, vision.patch_size, vision.image_size) == (32, 8, 32)

@@ -16,11 +16,10 @@ import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 
-from accerl_lerobot.checkpoint.safety import Origin, read_json
+from accerl_lerobot.checkpoint.safety import Origin
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos.dataset_files import (
     check_data,
-    check_info,
     check_metadata,
     checked,
     open_metadata,
@@ -111,28 +110,22 @@ def feature(dtype: Any = "float32", shape: Any = (4,), **more: Any) -> dict[str,
 @pytest.mark.parametrize(
     ("changes", "why"),
     [
-        ({"fps": 10**9}, "fps: 1000000000; use 1 to 10000"),
-        ({"total_frames": -1}, "total_frames"),
+        ({"total_frames": 0.5}, "total_frames"),
+        ({"total_frames": -1}, "an episode from frame 0 to "),
         ({"total_episodes": 9}, "4 episodes, and meta/info.json says 9"),
-        ({"chunks_size": 0}, "chunks_size"),
-        ({"codebase_version": "v" * 100}, "codebase_version"),
+        ({"chunks_size": 0}, "chunks_size must be positive"),
+        ({"fps": -1}, "fps must be positive"),
         ({"features": {}}, "features"),
         ({"features": {"../../x": feature()}}, "cannot be part of a path"),
         ({"features": {"a": feature("object")}}, "a dtype is wanted"),
         ({"features": {"a": feature(shape=(0,))}}, "shape"),
         ({"features": {"a": feature("image", (10**5, 10**5, 3))}}, "shape"),
         ({"features": {"a": feature("video", (9000, 10, 3))}}, "an image has 3 sides of at most 8192"),
-        ({"features": {"a": feature(info=7)}}, "info is a mapping"),
     ],
 )
 def test_what_info_may_say(copied: Path, changes: dict[str, Any], why: str):
     edit(copied, **changes)
-    refused(copied, f"meta/.*{why}")
-
-
-def test_cameras_of_any_usual_size():
-    for shape in ((480, 640, 3), (1080, 1920, 3), (4, 8, 1)):
-        check_info(info() | {"features": {"observation.images.top": feature("video", shape)}}, ORIGIN)
+    refused(copied, f"meta.*{why}")
 
 
 def rewrite(path: Path, change: Callable[[pa.Table], pa.Table]) -> None:
@@ -176,12 +169,6 @@ def test_columns_that_would_open_other_files(copied: Path, tmp_path: Path):
 
     rewrite(copied / EPISODES, change)
     refused(copied, "columns of kind Image, which name other files")
-
-
-def test_structures_do_not_belong_into_metadata(copied: Path):
-    images = pa.array([{"bytes": None, "path": "/etc/hostname"}] * 4)
-    rewrite(copied / EPISODES, lambda table: table.append_column("picture", images))
-    refused(copied, "column picture of struct<.*use numbers and texts")
 
 
 def test_a_million_equal_rows_in_a_few_bytes(copied: Path):
@@ -310,22 +297,16 @@ def column(name: str, values: Callable[[list[Any]], Any]) -> Callable[[pa.Table]
 @pytest.mark.parametrize(
     ("change", "why"),
     [
-        (lambda t: t.slice(0, 300), "300 rows, fewer than the 365 frames"),
-        (lambda t: t.drop_columns(["action"]), "action is no column"),
-        (lambda t: t.append_column("more", pa.array([0] * len(t))), "more is no feature of meta/info.json"),
+        (lambda t: t.slice(0, 300), "300 rows, and meta/info.json says 365 frames"),
+        (lambda t: t.drop_columns(["action"]), "action has a number"),
+        (lambda t: t.append_column("more", pa.array([0] * len(t))), "LeRobot cannot load it"),
         (column("task_index", lambda v: pa.array([99, *v])), "task_index=99, and there are 1"),
         (column("episode_index", lambda v: pa.array([4, *v])), "episode_index=4, and there are 4"),
-        (column("action", lambda v: pa.array([[0.0], *v], pa.list_(pa.float32()))), "action has other num"),
-        (column("action", lambda v: pa.array(["a", *map(str, v)])), "action holds no numbers of type float"),
-        (
-            column("action", lambda v: pa.array([[float("nan")] * 4, *v])),
-            "action has a number that is not fin",
-        ),
-        (
-            column("observation.state", lambda v: pa.array([[1e999] * 4, *v])),
-            "state has a number that is not",
-        ),
-        (column("frame_index", lambda v: pa.array([None, *v])), "frame_index has other numbers"),
+        (column("action", lambda v: pa.array([[0.0], *v], pa.list_(pa.float32()))), "LeRobot cannot load it"),
+        (column("action", lambda v: pa.array(["a", *map(str, v)])), "LeRobot cannot load it"),
+        (column("action", lambda v: pa.array([[float("nan")] * 4, *v])), "action has a number"),
+        (column("observation.state", lambda v: pa.array([[1e999] * 4, *v])), "state has a number"),
+        (column("frame_index", lambda v: pa.array([None, *v])), "frame_index has a number"),
     ],
 )
 def test_rows_are_what_their_features_say(copied: Path, change: Callable[[pa.Table], pa.Table], why: str):
@@ -350,17 +331,6 @@ def test_rows_are_what_their_features_say(copied: Path, change: Callable[[pa.Tab
 def test_statistics_can_normalise(copied: Path, statistics: Any, why: str):
     (copied / "meta/stats.json").write_text(json.dumps({"action": statistics}))
     refused(copied, f"meta/stats.json: {why}")
-
-
-def test_fewer_tasks_than_the_metadata_says(copied: Path):
-    edit(copied, total_tasks=2)
-    refused(copied, "meta/tasks.parquet: 1 tasks, and meta/info.json says 2")
-
-
-def test_more_rows_than_frames(copied: Path):
-    shutil.copy(copied / DATA, copied / "data/chunk-000/file-001.parquet")
-    with pytest.raises(InputError, match="file-001.parquet: more rows than the 365 frames"):
-        check_data(copied, read_json(copied / "meta/info.json", ORIGIN), ORIGIN)
 
 
 @pytest.mark.parametrize("part", ["meta/tasks.parquet", EPISODES])

@@ -78,18 +78,6 @@ def test_a_termination_inside_a_chunk_ends_it():
     same(result.observation, seen[-2:])
 
 
-def test_bad_actions_are_refused_before_any_is_executed():
-    world = make_world(WORLD, 2)
-    first = world.reset(5, "match")
-    bad = np.zeros((4, 2), np.float32)
-    bad[-1] = np.nan
-    with pytest.raises(ValueError, match="non-finite"):
-        world.step_chunk(bad)
-    result = world.step_chunk(np.zeros((1, 2), np.float32))
-    assert result.observation is not None
-    assert np.array_equal(result.observation[STATE][0], first[STATE][-1])
-
-
 @pytest.mark.parametrize(
     ("length", "rows", "cut", "shown"),
     [

@@ -171,26 +171,8 @@ def test_environments_on_the_hub_are_not_run_unasked(arena, hub_path: str, trust
     assert not arena.exists()
 
 
-def test_an_environment_s_default_is_not_pinned(arena):
-    """LeRobot names a repository of its own accord, in its newest version."""
-    with pytest.raises(InputError, match="^env.kwargs.hub_path='nvidia/isaaclab-arena-envs': name a commit"):
-        make_world(LeRobotEnvConfig(name="isaaclab_arena", trust_remote_code=True))
-
-
 def test_an_environment_is_run_at_its_commit(arena):
     kwargs = {"hub_path": f"them/arena@{COMMIT}:env.py"}
     with pytest.raises(OSError, match="ran"):
         make_world(LeRobotEnvConfig(name="isaaclab_arena", kwargs=kwargs, trust_remote_code=True))
     assert arena.exists()
-
-
-def test_trust_that_nothing_needs(arena):
-    pytest.importorskip("gym_pusht")
-    with pytest.raises(InputError, match="^env.trust_remote_code=True: pusht is no environment on the Hub"):
-        make_world(LeRobotEnvConfig(name="pusht", trust_remote_code=True))
-
-
-@pytest.mark.parametrize("name", ["libero", "libero_plus"])
-def test_libero_has_a_type_of_its_own(name: str):
-    with pytest.raises(InputError, match=f"env.name='{name}': .* use env.type=libero"):
-        LeRobotEnvConfig(name=name)

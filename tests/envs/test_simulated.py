@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from accerl_lerobot.envs import SimulatedConfig, SimulatedWorld
-from accerl_lerobot.errors import InputError
 
 
 def held(world: SimulatedWorld, count: int = 10) -> np.ndarray:
@@ -50,8 +49,3 @@ def test_no_picture_is_drawn_inside_a_chunk(monkeypatch: pytest.MonkeyPatch):
     world.step_chunk(np.zeros((10, 2), np.float32))
     world.step_chunk(held(world))
     assert len(drawn) == 3
-
-
-def test_a_success_that_cannot_be_is_refused():
-    with pytest.raises(InputError, match="^env.hold=41"):
-        SimulatedConfig(hold=41)

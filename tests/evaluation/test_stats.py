@@ -4,33 +4,29 @@
 from __future__ import annotations
 
 import io
-import json
 import math
 
 import pytest
 from rich.console import Console
 
-from accerl_lerobot.evaluation import Rate, evaluation_plans, summarise, table, wilson_interval
+from accerl_lerobot.evaluation import FILM, Rate, evaluation_plans, summarise, table, wilson_interval
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.seeds import DEMO_SEEDS, EVAL_SEEDS, TRAIN_SEEDS
 
 
 @pytest.mark.parametrize(
-    ("successes", "n", "confidence", "low", "high"),
+    ("successes", "n", "low", "high"),
     [
         # z = 1.959964, z² = 3.841459. n = 10, p = ½: centre ½, half √(0.025 + 0.0096036)·1.959964/1.3841459
-        (5, 10, 0.95, 0.236593, 0.763407),
-        (93, 100, 0.95, 0.862505, 0.965681),
-        (0, 20, 0.95, 0.0, 0.161125),  # z²/(n + z²) = 3.841459/23.841459
-        (20, 20, 0.95, 0.838875, 1.0),
-        (0, 1, 0.95, 0.0, 0.793450),  # 3.841459/4.841459
-        # z = 1.644854, z² = 2.705543. centre ½, half √(0.025 + 0.00676386)·1.644854/1.2705543
-        (5, 10, 0.90, 0.269273, 0.730727),
-        (0, 20, 0.99, 0.0, 0.249107),  # z² = 6.634897
+        (5, 10, 0.236593, 0.763407),
+        (93, 100, 0.862505, 0.965681),
+        (0, 20, 0.0, 0.161125),  # z²/(n + z²) = 3.841459/23.841459
+        (20, 20, 0.838875, 1.0),
+        (0, 1, 0.0, 0.793450),  # 3.841459/4.841459
     ],
 )
-def test_wilson_by_hand(successes: int, n: int, confidence: float, low: float, high: float) -> None:
-    interval = wilson_interval(successes, n, confidence)
+def test_wilson_by_hand(successes: int, n: int, low: float, high: float) -> None:
+    interval = wilson_interval(successes, n)
     assert interval.low == pytest.approx(low, abs=2e-6)
     assert interval.high == pytest.approx(high, abs=2e-6)
 
@@ -38,19 +34,10 @@ def test_wilson_by_hand(successes: int, n: int, confidence: float, low: float, h
 def test_wilson_ends_solve_the_score_equation() -> None:
     """Both ends are the rates p₀ from which the observed one is exactly z standard errors away."""
     for successes, n in [(1, 7), (40, 50), (123, 1000)]:
-        interval = wilson_interval(successes, n, 0.95)
+        interval = wilson_interval(successes, n)
         for end in (interval.low, interval.high):
             distance = abs(successes / n - end) / math.sqrt(end * (1 - end) / n)
             assert distance == pytest.approx(1.959964, abs=1e-6)
-
-
-def test_wilson_is_symmetric_nested_and_contains_the_rate() -> None:
-    for n in (1, 3, 17, 100):
-        for k in range(n + 1):
-            narrow, wide = wilson_interval(k, n, 0.8), wilson_interval(k, n, 0.99)
-            mirror = wilson_interval(n - k, n, 0.8)
-            assert 0.0 <= wide.low <= narrow.low <= k / n <= narrow.high <= wide.high <= 1.0
-            assert narrow.low == pytest.approx(1 - mirror.high, abs=1e-12)
 
 
 def test_knowing_nothing() -> None:
@@ -65,12 +52,6 @@ def test_knowing_nothing() -> None:
 )
 def test_a_rate_as_text(successes: int, n: int, text: str) -> None:
     assert str(Rate(successes=successes, n=n)) == f"{text} n={n}"
-
-
-def test_nonsense_is_refused() -> None:
-    for successes, n in [(-1, 5), (6, 5)]:
-        with pytest.raises(ValueError, match="episodes"):
-            wilson_interval(successes, n)
 
 
 def result(task: str, seed: int, success: bool, versions: tuple[int, int] = (3, 3)) -> EpisodeResult:
@@ -113,10 +94,6 @@ class TestSummarise:
         task = summarise(RESULTS)["tasks"]["door"]
         assert task["seeds"] == [0, 9] and task["failed_seeds"] == [8, 9]
 
-    def test_is_json(self) -> None:
-        summary = summarise(RESULTS)
-        assert json.loads(json.dumps(summary)) == summary
-
 
 def test_a_table_has_a_row_per_task_and_one_for_all() -> None:
     def printed(results: list[EpisodeResult]) -> str:
@@ -138,10 +115,6 @@ class TestPlans:
         assert [(p.task, p.seed) for p in before] == [(p.task, p.seed) for p in after]
         assert len({(p.task, p.seed) for p in before}) == 10
 
-    def test_another_seed_has_other_starts(self) -> None:
-        seeds = [{p.seed for p in evaluation_plans(("a", "b"), 10, "x", seed=seed)} for seed in (0, 1)]
-        assert len(seeds[0]) == len(seeds[1]) == 5 and not seeds[0] & seeds[1]
-
     def test_smaller_evaluations_are_the_beginning_of_larger_ones(self) -> None:
         few, many = (evaluation_plans(("a", "b"), n, "x") for n in (6, 12))
         assert few == many[:6]
@@ -156,7 +129,7 @@ class TestPlans:
         assert [sum(p.task == t for p in plans) for t in "abc"] == [3, 3, 2]
 
     def test_do_not_explore_and_are_filmed_first(self) -> None:
-        plans = evaluation_plans(("a",), 4, "x", filmed=2, film=(8, 2))
+        plans = evaluation_plans(("a",), 4, "x", filmed=2)
         assert not any(p.explore for p in plans)
-        assert [p.film for p in plans] == [(8, 2), (8, 2), None, None]
+        assert [p.film for p in plans] == [FILM, FILM, None, None]
         assert [p.index for p in plans] == [0, 1, 2, 3] and {p.group for p in plans} == {"x"}

@@ -78,12 +78,6 @@ def test_a_backbone_elsewhere_is_brought(tmp_path: Path):
         contents(folder, "policy")
 
 
-def test_names_on_the_hub_stay(tmp_path: Path):
-    folder = write_policy_folder(tmp_path / "policy", type="smolvla", vlm_model_name="HuggingFaceTB/SmolVLM2")
-    write_json(folder / "backbone" / "config.json", {})
-    assert contents(folder, "policy")["config.json"] == (folder / "config.json").read_bytes()
-
-
 def test_numbers_go_only_with_the_policy_they_are_of(tmp_path: Path):
     run = write_run_folder(tmp_path / "run")
     last = find_provenance(run / "checkpoints" / "last" / "pretrained_model", "policy", None)

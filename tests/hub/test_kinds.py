@@ -3,14 +3,13 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from pathlib import Path
 
 import pytest
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.hub.card import PullConfig, PushConfig, read_json, recognise, repo_type
+from accerl_lerobot.hub.card import PullConfig, PushConfig, recognise, repo_type
 from tests.hub.folders import write_json, write_policy_folder, write_run_folder
 
 TINY = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
@@ -80,9 +79,3 @@ def test_what_is_no_name_of_a_repository(name: str | None):
     ):
         with pytest.raises(InputError, match="user/name"):
             make()
-
-
-def test_a_device_or_a_pipe_in_place_of_a_file_is_not_read(tmp_path: Path):
-    os.symlink("/dev/zero", tmp_path / "evaluation.json")
-    os.mkfifo(tmp_path / "summary.json")
-    assert read_json(tmp_path / "evaluation.json") == read_json(tmp_path / "summary.json") == {}

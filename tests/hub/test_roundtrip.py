@@ -19,16 +19,14 @@ import yaml
 from accerl_lerobot import cli
 from accerl_lerobot.checkpoint.layout import defect, save_checkpoint
 from accerl_lerobot.engine.config import LaunchConfig, encode
-from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.policies.config import PolicyConfig
-from accerl_lerobot.policies.loading import load_adapter, load_lerobot_config
+from accerl_lerobot.policies.loading import load_adapter
 from accerl_lerobot.policies.saving import save_pretrained
 from accerl_lerobot.testing import perturb
 from accerl_lerobot.trainer.config import TrainerConfig
 from tests.hub.folders import SUMMARY, write_json
 from tests.hub_server import HubServer, environment
-from tests.policies.checkpoints import write_act
 from tests.runs import tiny_run
 from tests.world_model.test_pixels import model
 
@@ -162,27 +160,6 @@ def test_a_run_that_was_pulled_can_be_gone_on_with(
     weights.write_bytes(weights.read_bytes()[:-1] + b"x")
     assert cli.main(["push", f"--path={tmp_path / 'pulled'}", "--repo_id=alice/run"]) == 2
     assert hub.files("alice/run") == uploaded, "what is broken is not pushed"
-
-
-def test_a_policy_that_is_not_there_is_an_error_of_one_line(hub: HubServer):
-    with pytest.raises(
-        InputError, match="policy.path='alice/nothing': not a directory here and not loadable"
-    ):
-        load_lerobot_config(PolicyConfig(path="alice/nothing", device="cpu"))
-
-
-def test_stock_lerobot_loads_a_policy_from_the_hub(hub: HubServer, tmp_path: Path):
-    from lerobot.configs.policies import PreTrainedConfig
-    from lerobot.policies.factory import get_policy_class, make_pre_post_processors
-
-    folder = write_act(tmp_path / "actor")
-    accerl("push", f"--path={folder}", "--repo_id=alice/actor")
-    config = PreTrainedConfig.from_pretrained("alice/actor")
-    there = get_policy_class(config.type).from_pretrained("alice/actor")
-    make_pre_post_processors(config, pretrained_path="alice/actor")
-    here = get_policy_class(config.type).from_pretrained(folder).state_dict()
-    assert here.keys() == there.state_dict().keys()
-    assert all(torch.equal(value, here[key]) for key, value in there.state_dict().items())
 
 
 def test_a_dataset_is_one_that_lerobot_finds(hub: HubServer, tmp_path: Path):

@@ -66,19 +66,19 @@ def write_policy(
 
 def with_backbone(directory: Path, image: int) -> dict[str, Any]:
     """Fields of a policy on a tiny SmolVLM, which is written beside the policy's folder."""
-    from accerl_lerobot.demos.backbone import BackboneSizes, write_backbone
+    from accerl_lerobot.demos.backbone import write_backbone
 
-    sizes = BackboneSizes(
-        hidden=32,
-        heads=2,
-        kv_heads=1,
-        vision_hidden=16,
-        vision_layers=1,
-        vision_heads=2,
-        patch=8,
-        image=image,
-    )
-    backbone = write_backbone(directory.parent / f"{directory.name}-backbone", sizes, ["Match the target"])
+    sizes = {
+        "hidden": 32,
+        "heads": 2,
+        "kv_heads": 1,
+        "vision_hidden": 16,
+        "vision_layers": 1,
+        "vision_heads": 2,
+        "patch": 8,
+        "image": image,
+    }
+    backbone = write_backbone(directory.parent / f"{directory.name}-backbone", ["Match the target"], **sizes)
     return {
         "image": image,
         "vlm_model_name": str(backbone),

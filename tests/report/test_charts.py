@@ -18,7 +18,7 @@ def chart(*series: Series, **fields: object) -> Chart:
 
 def heights(svg: str, colour: int = 0) -> list[float]:
     """Vertical positions along the first path of a colour, from the top."""
-    path = re.search(rf'<path d="([^"]+)"[^>]*stroke: var\(--c{colour}\)', svg)
+    path = re.search(rf'<path d="([^"]+)"[^>]*stroke: {COLOURS[colour]}', svg)
     assert path
     return [float(y) for y in re.findall(r"[ML] \S+ (\S+)", path[1])]
 
@@ -32,7 +32,6 @@ def test_thinning_keeps_every_extreme_and_the_mean() -> None:
     assert thinned.high.max() == 50.0 and thinned.low.min() == -50.0
     assert (thinned.low <= thinned.y).all() and (thinned.y <= thinned.high).all()
     assert thinned.y.mean() == pytest.approx(y.mean(), abs=0.01)
-    assert line("a", np.arange(10_000.0), y, largest=True).y.max() == 50.0
 
 
 def test_thinning_by_hand() -> None:
@@ -63,16 +62,12 @@ def test_the_picture_shows_the_numbers_and_no_text_of_a_run() -> None:
     low, high, middle = heights(svg)
     assert high < middle < low and middle == pytest.approx((low + high) / 2, abs=0.01)
     assert "hostile" not in svg and "updates" in svg and "100\xa0%" in svg
-    assert not any(colour in svg for colour in COLOURS), "colours follow the style sheet"
-
-
-def test_pictures_of_one_page_share_no_ids() -> None:
-    series = Series("a", np.arange(2.0), np.arange(2.0), 0, np.zeros(2), np.ones(2), points=True)
-    ids = [re.findall(r'id="([^"]*)"', Chart(title, "", "x", [series]).svg()) for title in ("One", "Other")]
-    assert ids[0] and not set(ids[0]) & set(ids[1])
 
 
 def test_the_legend_has_first_and_last_values_and_dashes_beyond_the_palette() -> None:
     x, y = np.arange(3.0), np.array([0.1, 0.9, 0.5])
     legend = chart(line("mean", x, y), line("ninth", x, y, len(COLOURS)), line("none", x[:0], y[:0])).legend
-    assert legend == [("solid var(--c0)", "mean", "0.1 → 0.5"), ("dashed var(--c0)", "ninth", "0.1 → 0.5")]
+    assert legend == [
+        (f"solid {COLOURS[0]}", "mean", "0.1 → 0.5"),
+        (f"dashed {COLOURS[0]}", "ninth", "0.1 → 0.5"),
+    ]

@@ -106,12 +106,6 @@ def test_a_resumed_run_reads_as_one(tmp_path: Path) -> None:
     assert (np.diff(column(run.records["rollout"], "wall_s")) > 0).all()
 
 
-def test_counters_that_were_restored_are_not_added_up_twice(tmp_path: Path) -> None:
-    folder = write_run(tmp_path / "run", finished=False)
-    append(folder, {**rollout_record(41, 100, {}), "wall_s": 3.0})
-    assert newest(read_run(folder).records["rollout"], "env_steps") == 1000 + 4100
-
-
 def test_columns_hold_numbers_only() -> None:
     records: list[dict[str, Any]] = [{"a": 1}, {}, {"a": None}, {"a": "x"}, {"a": 2.5}]
     assert np.array_equal(column(records, "a"), [1, np.nan, np.nan, np.nan, 2.5], equal_nan=True)

@@ -13,7 +13,7 @@ from accerl_lerobot.config.parsing import read_recipe
 from accerl_lerobot.demos.backbone import BackboneConfig
 from accerl_lerobot.demos.sft import SFTConfig
 from accerl_lerobot.engine.config import RunConfig, encode, parse
-from accerl_lerobot.report.read import apart, differences, flat, resolved
+from accerl_lerobot.report.read import apart, differences, flat
 from tests.report.folders import run_config
 
 ROOT = Path(__file__).parents[2]
@@ -54,13 +54,6 @@ def test_runs_apart() -> None:
     rows = dict(apart([a, b]))
     assert rows["seed"] == [1, 2] and rows["algorithm.type"] == ["gipo", "ppo"]
     assert rows["algorithm.sigma"] == [1.0, "–"] and "output_dir" not in rows
-
-
-def test_a_recipe_of_another_version() -> None:
-    tree = encode(RunConfig())
-    tree["replay"]["colour"] = "blue"
-    config, why = resolved(tree)
-    assert config is None and "replay.colour" in why
 
 
 def test_a_section_that_is_off_unless_given() -> None:

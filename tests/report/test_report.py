@@ -38,15 +38,6 @@ def test_mistakes_are_one_line(arguments: list[str], said: str, capsys: pytest.C
     assert out == "" and said in err and err.count("\n") == 1
 
 
-def test_one_run_under_two_names(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write_run(tmp_path / "run")
-    monkeypatch.chdir(tmp_path)
-    assert cli.main(["report", "run", "./run"]) == 2
-    assert capsys.readouterr().err == "accerl: runs='run,./run': name each run once\n"
-
-
 def test_a_page_is_made_without_torch(tmp_path: Path) -> None:
     folder = write_run(tmp_path / "run")
     code = (

@@ -25,7 +25,7 @@ from accerl_lerobot.timeline import (
     NoClock,
     open_clock,
 )
-from accerl_lerobot.timeline.read import read_processes, read_timeline
+from accerl_lerobot.timeline.read import read_parts, read_timeline
 from tests.timeline.folders import UP, a_clock, write_worker
 
 
@@ -90,7 +90,7 @@ def test_entries_and_beats_of_two_threads_leave_no_time_out(tmp_path: Path) -> N
     over.set()
     thread.join()
     clock.close()
-    (process,) = read_processes(tmp_path / TIMELINE)
+    (process,) = read_parts(tmp_path / TIMELINE)
     assert process.times[-1] > 0
     assert np.sum(np.diff(process.states.astype(int)) != 0) == 5000
 
@@ -103,8 +103,7 @@ def test_what_is_old_makes_room_and_is_counted(tmp_path: Path) -> None:
     # Two parts, each beyond its size by one batch of entries and a first line at most.
     assert len(files) == 2 and sum(f.stat().st_size for f in files) < 2 * (8 * (1000 + 512) + 1000)
     (row,) = read_timeline(tmp_path).rows
-    (process,) = read_processes(tmp_path / TIMELINE)
-    assert len(process.states) >= 1000 and row.kept_from > 0
+    assert sum(len(part.states) for part in read_parts(tmp_path / TIMELINE)) >= 1000 and row.kept_from > 0
     kept = [(s, n) for s, n in zip(row.states.tolist(), np.diff(row.times).tolist(), strict=True) if n]
     assert merged(kept)[1:] == merged([(s, n) for s, n in spans if n])[-len(merged(kept)) + 1 :]
     assert PART_BYTES / 8 >= 400_000
@@ -117,7 +116,7 @@ def test_a_process_that_was_killed_leaves_all_but_what_was_on_its_way(tmp_path: 
     head = data.index(b"\n") + 1
     for size in range(len(data), -1, -1):
         path.write_bytes(data[:size])
-        processes = read_processes(tmp_path / TIMELINE)
+        processes = read_parts(tmp_path / TIMELINE)
         if size < head:
             assert processes == []
         else:
@@ -129,13 +128,13 @@ def test_a_process_that_was_killed_leaves_all_but_what_was_on_its_way(tmp_path: 
 @pytest.mark.parametrize(
     ("broken", "why"),
     [
-        (b'{"timeline": 1}\n', "worker"),
+        (b'{"timeline": 1}\n', "node"),
         (b"no json\n", "Expecting value"),
         (b"[1, 2]\n", "indices"),
         ("format", "format 9"),
         ("back", "time goes back"),
         ("state", "no such state"),
-        ("name", "no part of a timeline has such a name"),
+        ("name", "not enough values"),
     ],
 )
 def test_a_damaged_file_is_named(tmp_path: Path, broken: bytes | str, why: str) -> None:

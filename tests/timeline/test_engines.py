@@ -18,7 +18,7 @@ from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.inference import worker as inference_worker
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.timeline import TIMELINE
-from accerl_lerobot.timeline.read import ABSENT, Timeline, read_head, read_timeline
+from accerl_lerobot.timeline.read import ABSENT, Timeline, read_parts, read_timeline
 from accerl_lerobot.trainer import worker as trainer_worker
 from benchmarks.simulated_world import LatencyConfig
 from tests.light_workers import LightInference, LightTrainer, light_ray
@@ -76,10 +76,8 @@ def test_the_asynchronous_engine(light: None, tmp_path: Path) -> None:
     assert {"recovery", "compute", "transport", "wait_in"} <= found["rollout"].keys()
     assert found["replay"].keys() == {"recovery", "compute", "wait_in"}
     # The whole life of replay is in it, from before it was ready to when it was asked last.
-    (path,) = (tmp_path / TIMELINE).glob("replay.*")
-    head = read_head(path)
-    assert head is not None
-    first = head.begins.clock_ns
+    (part,) = (part for part in read_parts(tmp_path / TIMELINE) if part.worker == "replay")
+    first = part.begins.clock_ns
     assert begun < first < ready
     assert asked < first + int(rows["replay"].times[-1] - rows["replay"].times[0]) < ended
 

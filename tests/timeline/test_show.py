@@ -9,7 +9,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from PIL import Image
 from rich.console import Console
@@ -18,10 +17,8 @@ from accerl_lerobot.cli import main
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.timeline import COMPUTE, RECOVERY, STATES, TRAINING, WAIT_IN
 from accerl_lerobot.timeline.read import (
-    COLUMNS,
     TimelineConfig,
     choose_window,
-    columns,
     read_timeline,
     show_timelines,
     timeline_table,
@@ -69,17 +66,6 @@ def test_the_trace_is_one_that_viewers_understand(run: Path) -> None:
     assert len(trainer) == 401
     part = [e for e in trace(timeline, (5.1, 5.4))["traceEvents"] if e["ph"] == "X"]
     assert min(e["ts"] for e in part) == 5.1e6 and max(e["ts"] + e["dur"] for e in part) == 5.4e6
-
-
-def test_a_column_of_the_picture_shares_itself_among_the_states(run: Path) -> None:
-    (row,) = [row for row in read_timeline(run).rows if row.worker == "trainer"]
-    shares = columns(row, 5.0, 5.0 + COLUMNS * 0.5)  # a turn in each, far beyond the end
-    np.testing.assert_allclose(shares[:200, [COMPUTE, WAIT_IN]], 0.5, atol=1e-6)
-    assert (shares[200:] == 0).all(), "there is no worker any more"
-    narrow = columns(row, 5.0, 5.5)
-    assert (narrow[: COLUMNS // 2 - 1, COMPUTE] > 0.999).all() and (
-        narrow[COLUMNS // 2 + 1 :, COMPUTE] < 1e-3
-    ).all()
 
 
 def test_a_window_is_in_the_middle_of_the_training_unless_it_is_chosen(run: Path) -> None:

@@ -1,15 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Our MetaWorld and LIBERO in stock LeRobot: ``lerobot-eval`` and ``lerobot-train`` on the world we train in.
 
-A package and not a module, because LeRobot's plugin loader looks for submodules.
-
-Example:
-    ::
-
-        lerobot-eval --policy.path=outputs/run/pretrained_model \\
-          --env.discover_packages_path=accerl_lerobot.envs.lerobot_plugin \\
-          --env.type=accerl_metaworld --env.task=drawer-open-v3 --env.image_size=64 --env.max_steps=150 \\
-          --eval.n_episodes=20 --eval.batch_size=4
+``--env.discover_packages_path=accerl_lerobot.envs.lerobot_plugin --env.type=accerl_metaworld``. A package and
+not a module, because LeRobot's plugin loader looks for submodules.
 """
 
 from __future__ import annotations
