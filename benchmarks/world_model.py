@@ -55,10 +55,8 @@ def bench_world_model(config: BenchWorldModelConfig) -> dict[str, Any]:
     import torch
 
     from accerl_lerobot.policies.loading import resolve_device
-    from accerl_lerobot.world_model.contract import WorldModelSpec, learnable_class
+    from accerl_lerobot.world_model.contract import WorldModelSpec, context_of, new_model
     from accerl_lerobot.world_model.learners import Learner, new_success_model
-    from accerl_lerobot.world_model.rollout_eval import context_of
-    from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import probabilities
 
     torch.set_num_threads(config.num_threads)
     torch.manual_seed(0)
@@ -72,9 +70,8 @@ def bench_world_model(config: BenchWorldModelConfig) -> dict[str, Any]:
         chunk=of.chunk,
         fps=10,
         context=of.model.context,
-        provides=of.model.provides(config.state_dim),
     )
-    model = learnable_class(of.model)(spec, of.model).to(device)
+    model = new_model(spec, of.model).to(device)
     success = new_success_model(of.chunk).to(device).eval()
     seconds: dict[str, Any] = {"predict": {}, "classify": {}}
     for batch in config.batches:
@@ -83,11 +80,10 @@ def bench_world_model(config: BenchWorldModelConfig) -> dict[str, Any]:
         step = partial(model.step, state, torch.from_numpy(windows.actions[:, 0]), list(range(batch)))
         newest = windows.frames[:, spec.context - 1]
         seconds["predict"][str(batch)] = timed(step, config.repeats, device)
-        seconds["classify"][str(batch)] = timed(
-            partial(probabilities, success, newest, newest), config.repeats, device
-        )
+        classify = partial(success.probabilities, newest, newest)
+        seconds["classify"][str(batch)] = timed(classify, config.repeats, device)
     memory.note("predicted")
-    learner = Learner(model, of.learn, seed=0)
+    learner = Learner(model, of, seed=0)
     windows = _windows(spec, of.learn.batch, of.learn.chunks)
     seconds["learn"] = timed(lambda: learner.step(windows), config.repeats, device)
     memory.note("learnt")
@@ -153,7 +149,6 @@ def _windows(spec: Any, count: int, chunks: int) -> Any:
         actions=rng.standard_normal((count, chunks, spec.chunk, spec.action_dim), dtype=np.float32),
         steps=np.full((count, chunks), spec.chunk),
         success=np.zeros((count, chunks), bool),
-        valid=np.ones((count, chunks), bool),
         episode=np.arange(count),
         task=("",) * count,
     )

@@ -12,7 +12,7 @@ from benchmarks.world_model import table
 
 def test_it_measures(capsys: pytest.CaptureFixture[str]) -> None:
     options = ["--batches=1,3", "--repeats=1", "--device=cpu", "--cameras=2", "--world_model.image_size=16"]
-    small = ["--world_model.model.network.channels=8,8", "--world_model.learn.batch=2"]
+    small = ["--world_model.model.channels=8,8", "--world_model.learn.batch=2"]
     assert main(["world_model", *options, *small]) == 0
     result = json.loads(capsys.readouterr().out)
     assert set(result["seconds"]) == {"predict", "classify", "learn"}
