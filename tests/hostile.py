@@ -112,23 +112,21 @@ def write_examples(scratch: Path) -> dict[str, Path]:
     from accerl_lerobot.policies.config import PolicyConfig
     from accerl_lerobot.policies.loading import load_adapter
     from accerl_lerobot.policies.saving import save_pretrained
-    from accerl_lerobot.world_model.config import NetworkConfig, PixelModelConfig
+    from accerl_lerobot.world_model.config import PixelModelConfig
     from accerl_lerobot.world_model.contract import WorldModelSpec
     from accerl_lerobot.world_model.pixels import PixelWorldModel
-    from accerl_lerobot.world_model.store import Source, save_world_model
+    from accerl_lerobot.world_model.store import save_world_model
     from accerl_lerobot.world_model.success_plugin.configuration_success_pairs import SuccessPairsConfig
     from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
     from tests.policies.checkpoints import write_act
 
     spec = WorldModelSpec(
         cameras=("observation.images.front",), image_size=(8, 8), state_dim=2, action_dim=2, chunk=2, fps=10,
-        context=1, provides=frozenset({"pixels", "state"}), tasks=("reach",),
+        context=1, tasks=("reach",),
     )  # fmt: skip
-    network = NetworkConfig(channels=(8,), condition=8, planes=2)
-    world = PixelWorldModel(spec, PixelModelConfig(context=1, heads=2, network=network))
-    success = SuccessPairsRewardModel(SuccessPairsConfig(chunk=2, channels=(8,), hidden=8, device="cpu"))
-    source = Source(repo_id="a/b", fingerprint="0", learnt=(0, 1), held_out=(2,))
-    save_world_model(scratch / "world_model", world, success, [source])
+    world = PixelWorldModel(spec, PixelModelConfig(context=1, channels=(8,)))
+    success = SuccessPairsRewardModel(SuccessPairsConfig(chunk=2, channels=(8,), device="cpu"))
+    save_world_model(scratch / "world_model", world, success, {"a": "learnt", "b": "held out"})
     config = PolicyConfig(path=str(write_act(scratch / "made")), device="cpu")
     save_pretrained(load_adapter(config), scratch / "policy", config)
     shutil.copytree(DATASET, scratch / "dataset")
@@ -287,13 +285,13 @@ def loaders(trial: Trial, at: dict[str, Path], times: int) -> None:
     from accerl_lerobot.engine.config import DatasetConfig
     from accerl_lerobot.policies.config import PolicyConfig
     from accerl_lerobot.policies.loading import load_adapter, rehearsed_config
-    from accerl_lerobot.world_model.store import load_sources, load_world_model, rehearse_world_model
+    from accerl_lerobot.world_model.store import load_roles, load_world_model, rehearse_world_model
 
     isolation.CPU_S = CPU_S
     world, policy, dataset = at["world_model"], at["policy"], at["dataset"]
 
     def whole_world() -> None:
-        load_sources(world)
+        load_roles(world)
         rehearse_world_model(world)
         load_world_model(world)
 

@@ -30,7 +30,6 @@ from accerl_lerobot.timeline.read import read_timeline
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.world_model.config import (
     ImaginationConfig,
-    NetworkConfig,
     OnlineLearnConfig,
     PixelModelConfig,
     ValidationConfig,
@@ -67,7 +66,7 @@ def learning(validate_every: int = 2, held_out: float = 0.4, validation: Validat
 def world_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A new one, which has learnt nothing."""
     torch.manual_seed(0)
-    config = PixelModelConfig(network=NetworkConfig(channels=(8, 8), condition=8, planes=2))
+    config = PixelModelConfig(channels=(8, 8))
     spec = world_spec(WorldModelConfig(chunk=4, image_size=32, model=config), ENV)
     folder = tmp_path_factory.mktemp("world") / "world_model"
     save_world_model(folder, PixelWorldModel(spec, config), new_success_model(4))
@@ -77,9 +76,9 @@ def world_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def imagining(
     checkpoint: Path, *, episodes: int = 6, sections: dict[str, Any] | None = None, **config: Any
 ) -> RunConfig:
-    constants = {"window": 10_000, "samples_per_insert": 1.0}
+    constants: dict[str, Any] = {"window": 10_000, "samples_per_insert": 1.0, "rollouts": 4}
     constants |= {name: config.pop(name) for name in CONSTANTS if name in config}
-    fields: dict[str, Any] = {"share": 0.5, "rollouts": 4}
+    fields: dict[str, Any] = {"share": 0.5}
     return tiny_run(
         checkpoint,
         env=ENV,
@@ -244,24 +243,17 @@ def test_it_runs_asynchronously(tiny_checkpoint: Path, world_model: Path, tmp_pa
     spent = read_timeline(tmp_path).shares()
     assert {"recovery", "compute", "transport", "wait_in"} <= spent["imagination"].keys()
     assert len(list((tmp_path / "timeline").glob("imagination*"))) == 1
-    saved = snapshot.load(tmp_path / "saved" / TRAINING_STATE / "imagination")["imagination"]
-    assert len(saved["rows"]) == 4 and saved["counters"].decisions >= last.imagination["decisions"]
+    saved = snapshot.load(tmp_path / "saved" / TRAINING_STATE / "imagination")["core"]
+    assert len(saved["rows"]) == 4 and saved["counters"]["decisions"] >= last.imagination["decisions"]
     assert {"recovery", "compute", "transport", "wait_in"} <= spent["world learning"].keys()
 
 
-@pytest.mark.parametrize(
-    ("kind", "name", "what"),
-    [
-        (ImaginationWorker, "_imagining", "imagination step"),
-        (WorldLearningWorker, "_learning", "step of learning"),
-    ],
-)
-def test_one_that_hangs_is_found_when_it_is_saved(kind: type, name: str, what: str, tmp_path: Path):
+@pytest.mark.parametrize("kind", [ImaginationWorker, WorldLearningWorker])
+def test_one_that_hangs_is_found_when_it_is_saved(kind: type, tmp_path: Path):
     """And not after the minutes that large files may take; `benchmarks.faults` does it to a whole run."""
     worker, held = object.__new__(kind), threading.Lock()
-    worker._limit, worker._promoted = 1.0, "something that nobody takes over"
-    setattr(worker, name, held)
-    message = f"an? {what} has not ended for \\d s or more; raise launch.stall_s"
+    worker._limit, worker._promoted, worker._changing = 1.0, "something that nobody takes over", held
+    message = f"{kind.step_name} has not ended for \\d s or more; raise launch.stall_s"  # type: ignore[attr-defined]
     with held, pytest.raises(TimeoutError, match=message):
         worker.save(tmp_path)
     assert not held.locked()

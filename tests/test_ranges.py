@@ -28,7 +28,7 @@ from accerl_lerobot.policies.config import (
 )
 from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.timeline.read import TimelineConfig
-from accerl_lerobot.world_model.config import NetworkConfig, WorldModelConfig
+from accerl_lerobot.world_model.config import PixelModelConfig, WorldModelConfig
 from benchmarks.__main__ import CONFIGS as BENCHMARKS
 from benchmarks.async_vs_sync import BenchAsyncVsSyncConfig
 from benchmarks.batching import BenchBatchingConfig
@@ -109,7 +109,7 @@ RULES = [
     (BenchScalingConfig, {"counts": (2, 2)}, "counts="),
     (BenchTransportConfig, {"sizes": ("1 GB",)}, "sizes="),
     (MachineryConfig, {"segment_length": 5}, "segment_length="),
-    (NetworkConfig, {"channels": ()}, "world_model.model.network.channels="),
+    (PixelModelConfig, {"channels": ()}, "world_model.model.channels="),
     (ReplayConfig, {"min_decisions": 5000}, "replay.min_decisions="),
     (ReplayConfig, {"ahead": 5000}, "replay.ahead="),
     (LaunchConfig, {"placement": {"rollout": " "}}, "launch.placement.rollout=' ': use one of"),

@@ -277,8 +277,6 @@ def evaluate(arguments: list[str]) -> int:
 def world_model(arguments: list[str]) -> int:
     """``accerl world-model``; 1 if it fails validation."""
     config: WorldModelRun = parse(WorldModelRun, arguments, recipe_class=RunConfig)
-    if config.dataset.repo_id is None:
-        raise InputError("dataset.repo_id", None, NO_DATASET)
     from accerl_lerobot.world_model.pretrain import pretrain
 
     return _validated(config, lambda directory, console: pretrain(config, directory, console))
@@ -296,8 +294,10 @@ def _validated(
     config: WorldModelRun | WorldModelEvalRun, work: Callable[[Path, Console], dict[str, Any]]
 ) -> int:
     """Does the work in a new folder and shows the validation that it ends with."""
+    if config.dataset.repo_id is None:
+        raise InputError("dataset.repo_id", None, NO_DATASET)
     from accerl_lerobot.engine.run import discard_unused, make_output_dir
-    from accerl_lerobot.world_model.metrics import check_lines, datasets_table, depth_table, has_several
+    from accerl_lerobot.world_model.validation import checks_table
 
     directory = make_output_dir(config)
     (directory / CONFIG).write_text(yaml.safe_dump(encode(config), sort_keys=False))
@@ -309,11 +309,8 @@ def _validated(
     except InputError:
         discard_unused(directory)
         raise
-    console.rich.print(depth_table(found))
-    if has_several(found):
-        console.rich.print(datasets_table(found))
-    for line in check_lines(found):
-        console.say(line)
+    (directory / "validation.json").write_text(json.dumps(found, indent=2) + "\n")
+    console.rich.print(checks_table(found))
     console.say(f"{'passed' if found['passed'] else 'FAILED'}; see {directory / 'preview.mp4'}")
     return _told(found, 0 if found["passed"] else 1)
 

@@ -19,126 +19,146 @@ import math
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE, WORLD_MODEL
-from accerl_lerobot.engine.config import DatasetConfig, RunConfig
+from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.preflight import policy_to_be
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.envs.base import WorldSpec
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.fault_points import fault_point
-from accerl_lerobot.policies.loading import load_lerobot_config
+from accerl_lerobot.policies.loading import load_lerobot_config, resolve_device
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TRANSPORT, WAIT_IN, WAIT_OUT, WEIGHT_SYNC, open_clock
 from accerl_lerobot.transport.endpoint import Endpoint, ReconnectingClient
-from accerl_lerobot.world_model.config import IMAGINATION, WORLD_LEARNING, OnlineLearnConfig
-from accerl_lerobot.world_model.contract import WorldModelSpec
-from accerl_lerobot.world_model.data import fingerprint, load_episodes
-from accerl_lerobot.world_model.online import OnlineLearner, PretrainingEpisodes, Promotion
-from accerl_lerobot.world_model.registry import (
-    ImaginationModels,
-    check_fit,
-    learned_part,
-    make_models,
-)
-from accerl_lerobot.world_model.rollouts import Imagination, RolloutSettings
-from accerl_lerobot.world_model.store import OWN_RUN, Source, find_source, load_sources
-from accerl_lerobot.world_model.validation import (
-    DATASET,
-    ONLINE,
-    check_disjoint,
-    name_section,
-    open_datasets,
-)
+from accerl_lerobot.world_model.config import IMAGINATION, WORLD_LEARNING
+from accerl_lerobot.world_model.contract import WorldModel, WorldModelSpec
+from accerl_lerobot.world_model.data import Episode, load_datasets, named_datasets, open_datasets
+from accerl_lerobot.world_model.online import OnlineLearner, Promotion
+from accerl_lerobot.world_model.reference import CopyModel, OracleModel, ShuffledModel, learned_part
+from accerl_lerobot.world_model.rollouts import Imagination
+from accerl_lerobot.world_model.store import LEARNT, load_roles, load_world_model, rehearse_world_model
+from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
 
+LEARN = "imagination.learn."
+"""Prefix of the config sections of datasets."""
 MAX_PENDING = 2
 """Messages to replay that may be pending before imagination pauses."""
-LEARNER = "world_learner"
-"""Name of the learner's state."""
 PAUSE_S = 0.02
 """Sleep of a worker with nothing to do."""
 SWAP_S = 30.0
 """Largest wait of a checkpoint for a promoted model to be taken over."""
 POLL_S = 0.2
 """Interval at which replay is asked for new real segments."""
-EARLIER = "earlier"
-"""`Episode.source` of the pre-training episodes."""
 
 
 def make_imagination(config: RunConfig, on_segment: Callable[[Segment], object]) -> Imagination:
-    """Builds the imagination of a run."""
-    world = _world_spec(config)
-    models = load_models(config, world)
-    run = RolloutSettings(
+    """Builds the imagination of a run; its ``policy.path`` must be set."""
+    world, model, success = _load(config, load_lerobot_config(config.policy))
+    return Imagination(
+        model,
+        success,
+        world,
+        config.imagination,
+        on_segment,
         decision_cost=config.rollout.decision_cost,
         time_limit_fails=config.rollout.time_limit == "fail",
         seed=config.seed,
     )
-    sources = _sources(config, models.model.spec)
-    return Imagination(models, world, config.imagination, run, on_segment, sources)
 
 
-def _sources(config: RunConfig, spec: WorldModelSpec) -> list[Source]:
-    """Datasets that a world model is trained on in the run, beside the run's own episodes."""
-    if not config.imagination.learns:
-        return []
-    sources = list(load_sources(Path(str(config.imagination.path)), "imagination"))
-    sections = _dataset_sections(config.imagination.learn)
-    for section, meta in open_datasets(sections, spec).items():
-        if find_source(sources, known := fingerprint(meta)) is None:  # then it trains on all of it
-            every = tuple(range(meta.total_episodes))
-            name = sections[section].repo_id or ""
-            sources.append(Source(repo_id=name, fingerprint=known, learnt=every, held_out=()))
-    return [*sources, OWN_RUN]
-
-
-def load_models(config: RunConfig, world: WorldSpec) -> ImaginationModels:
-    """Loads a run's world model; its ``policy.path`` must be set."""
-    policy = load_lerobot_config(config.policy)
-    executed = getattr(policy, "n_action_steps", 1)
-    return _models(config, world, executed, policy.n_obs_steps)
-
-
-def make_learner(config: RunConfig, models: ImaginationModels | None = None) -> OnlineLearner:
-    """Builds the learner of a run's world model, which starts at `models`; None: at the saved ones."""
-    learn = config.imagination.learn
-    world = _world_spec(config)
-    models = models or load_models(config, world)
-    model, success = learned_part(models.model), models.success
+def make_learner(config: RunConfig) -> OnlineLearner:
+    """Builds the learner of a run's world model, which starts at the saved one."""
+    world, model, success = _load(config, load_lerobot_config(config.policy))
+    assert success is not None  # only an oracle has none
+    roles = load_roles(Path(str(config.imagination.path)), IMAGINATION)
+    loaded = load_datasets(named_datasets(config.imagination.learn, LEARN), model.spec)
+    offline: list[Episode] = []
+    held_out: list[Episode] = []
+    for episode in chain(*loaded.values()):
+        (offline if roles.get(episode.key, LEARNT) == LEARNT else held_out).append(episode)
     longest = _longest(world, model.spec.chunk)
-    assert success is not None  # as `check_imagination` has found
-    sources = load_sources(Path(str(config.imagination.path)), "imagination")
-    known = PretrainingEpisodes([], [])
-    sections = _dataset_sections(learn)
-    for section, meta in open_datasets(sections, model.spec).items():
-        with name_section(section):
-            # Not ``online``, even if a policy recorded them: in validation this run's own failures count.
-            episodes = load_episodes(sections[section], model.spec, EARLIER, both=False)
-            check_disjoint(sections[section], episodes, known.learnt + known.held_out)
-        source = find_source(sources, fingerprint(meta))
-        known.learnt.extend(episodes if source is None else [episodes[i] for i in source.learnt])
-        known.held_out.extend([] if source is None else [episodes[i] for i in source.held_out])
-    return OnlineLearner(model, success, config.imagination, known, longest, seed=config.seed)
+    settings = (config.imagination.learn, offline, held_out, roles, longest, config.seed)
+    return OnlineLearner(learned_part(model), success, *settings)
 
 
 def check_imagination(config: RunConfig) -> None:
     """Refuses, before a run begins, what `make_imagination` would refuse in the middle of it."""
-    policy = policy_to_be(config)
-    executed = getattr(policy, "n_action_steps", 1)
-    models = _models(config, _world_spec(config), executed, policy.n_obs_steps, first=True)
+    _, model, _ = _load(config, policy_to_be(config), first=True)
     if config.imagination.learns:
-        open_datasets(_dataset_sections(config.imagination.learn), models.model.spec)
+        open_datasets(named_datasets(config.imagination.learn, LEARN), model.spec)
 
 
-def _dataset_sections(learn: OnlineLearnConfig) -> dict[str, DatasetConfig]:
-    """The datasets that are named, by their config section."""
-    sections = {DATASET: learn.dataset, ONLINE: learn.online}
-    return {f"imagination.learn.{name}": of for name, of in sections.items() if of.repo_id is not None}
+def _load(
+    config: RunConfig, policy: Any, *, first: bool = False
+) -> tuple[WorldSpec, WorldModel, SuccessPairsRewardModel | None]:
+    """The environment, and the models for it, which are checked to fit it and the policy.
+
+    `policy` is LeRobot's config. If nobody has loaded the files before (`first`), a child process does so
+    first, see `isolation`. An oracle has no success model.
+    """
+    imagination, executed = config.imagination, getattr(policy, "n_action_steps", 1)
+    for name, wanted in (("reward", "success"), ("terminate_on_success", True)):
+        if (value := getattr(config.env, name, wanted)) != wanted:
+            why = f"use {wanted} with imagination.share: imagined rollouts end with a success, and pay for it"
+            raise InputError(f"env.{name}", value, why)
+    with closing(make_world(config.env)) as environment:
+        world = environment.spec
+    imagination.imagined_replay(config.replay).check(
+        batch_decisions=config.trainer.batch_decisions, segment_decisions=_longest(world, executed)
+    )
+    if not imagination.needs_path:
+        return world, OracleModel(world, executed, lambda: make_world(config.env)), None
+    device = resolve_device(config.policy.device)
+    path, package = Path(str(imagination.path)), imagination.discover_packages_path
+    if first:
+        rehearse_world_model(path, package, section=IMAGINATION)
+    learned, success = load_world_model(path, package, section=IMAGINATION)
+    check_fit(learned.spec, world, executed, policy.n_obs_steps)
+    success.config.device = str(device)
+    success.to(device)
+    if imagination.model == "copy":
+        return world, CopyModel(learned.spec), success
+    model = learned.to(device)
+    return world, ShuffledModel(model) if imagination.model == "shuffled" else model, success
+
+
+def check_fit(spec: WorldModelSpec, world: WorldSpec, executed: int, history: int) -> None:
+    """Refuses a world model that does not fit environment and policy, before a run begins.
+
+    The policy executes so many actions per decision, and its observations hold `history` env steps.
+    """
+    field, again = f"{IMAGINATION}.path", "train one of this world"
+    if missing := [camera for camera in world.images if camera not in spec.cameras]:
+        why = f"the world shows this camera, the world model {spec.cameras!r}; {again}"
+        raise InputError(field, missing[0], why)
+    for name in ("state_dim", "action_dim", "fps"):
+        theirs, ours = getattr(spec, name), getattr(world, name)
+        if theirs != ours:
+            why = f"is the world model's {name}, and the world's is {ours}; {again}"
+            raise InputError(field, theirs, why)
+    if spec.tasks and (others := [task for task in world.tasks if not _is_of(task, spec.tasks)]):
+        remedy = f"the world model is of {spec.tasks!r}; name these, or train one of it"
+        raise InputError("env.task", others[0], remedy)
+    if spec.chunk != executed:
+        why = f"env steps per prediction, and the policy executes {executed} actions per decision"
+        raise InputError(field, spec.chunk, f"{why}; train one with world_model.chunk={executed}")
+    if history > 1:
+        why = "the policy looks back so many env steps, and only one frame per decision is imagined"
+        raise InputError("policy.n_obs_steps", history, f"{why}; use a policy with 1, or imagination.share=0")
+
+
+def _is_of(task: str, known: Sequence[str]) -> bool:
+    """True if the task is known. A task of a suite that is played alone may have the suite's name only."""
+    suite, _, number = task.partition("/")
+    return task in known or suite in known or (not number and any(k.startswith(f"{suite}/") for k in known))
 
 
 def _longest(world: WorldSpec, chunk: int) -> int:
@@ -146,94 +166,98 @@ def _longest(world: WorldSpec, chunk: int) -> int:
     return math.ceil(world.max_steps / chunk)
 
 
-def _world_spec(config: RunConfig) -> WorldSpec:
-    world = make_world(config.env)
-    try:
-        return world.spec
-    finally:
-        world.close()
-
-
-def _models(
-    config: RunConfig, world: WorldSpec, executed: int, history: int, *, first: bool = False
-) -> ImaginationModels:
-    """Loads and checks the models; `first`: see `make_models`."""
-    if (reward := getattr(config.env, "reward", "success")) != "success":
-        remedy = "use success with imagination.share: that is what imagined rollouts are rewarded for"
-        raise InputError("env.reward", reward, remedy)
-    if not getattr(config.env, "terminate_on_success", True):
-        remedy = "use true with imagination.share: imagined rollouts end with a success, real ones must too"
-        raise InputError("env.terminate_on_success", False, remedy)
-    models = make_models(config.imagination, config.env, world, executed, config.policy.device, first=first)
-    if config.imagination.learns and models.success is None:
-        remedy = "it has no success model to train on; use imagination.learn.steps_per_episode=0"
-        raise InputError("imagination.path", config.imagination.path, remedy)
-    check_fit(models.model.spec, world, executed, history, models.success is not None)
-    imagined, longest = config.imagination.imagined_replay(config.replay), _longest(world, executed)
-    imagined.check(batch_decisions=config.trainer.batch_decisions, segment_decisions=longest)
-    return models
-
-
-class ImaginationWorker:
+class _Worker:
     """Becomes a threaded Ray actor in `launch`: `run` on one thread, everything else beside it."""
 
+    name: str
+    state_name: str
+    step_name: str
+
     def __init__(self, config: RunConfig, state: Path | None = None, timeline: Path | None = None) -> None:
-        self._clock = open_clock(timeline, IMAGINATION)
+        self._clock = open_clock(timeline, self.name)
         import torch
 
         torch.set_num_threads(config.trainer.num_threads)
-        self._limit = config.launch.stall_s
+        torch.manual_seed(config.seed)
+        self._limit, self._cursor = config.launch.stall_s, 0
+        self._core = self._make(config)
+        self._changing = threading.Lock()
+        """Held while the core changes, but not during a validation, which is of a copy."""
+        if state is not None:
+            saved = snapshot.load(state / self.state_name)
+            self._core.restore(saved["core"])
+            self._cursor = saved["cursor"]
+        self._clock.enter(WAIT_IN)
+
+    def _make(self, config: RunConfig) -> Any:
+        raise NotImplementedError
+
+    def ready(self) -> int:
+        """Returns this process's id once the models are loaded."""
+        return os.getpid()
+
+    def metrics(self) -> dict[str, float]:
+        """See the class of the core."""
+        self._clock.beat()
+        metrics: dict[str, float] = self._core.metrics()
+        return metrics
+
+    def save(self, directory: Path) -> None:
+        """Writes its part of a checkpoint."""
+        with self._unchanging(self._limit):
+            self._write(directory)
+
+    def _write(self, directory: Path) -> None:
+        saved = {"core": self._core.state(), "cursor": self._cursor}
+        snapshot.save(directory / TRAINING_STATE / self.state_name, saved)
+
+    @contextmanager
+    def _unchanging(self, patience_s: float) -> Iterator[None]:
+        if not self._changing.acquire(timeout=patience_s):
+            remedy = "raise launch.stall_s if one takes that long"
+            raise TimeoutError(f"{self.step_name} has not ended for {patience_s:.0f} s or more; {remedy}")
+        try:
+            yield
+        finally:
+            self._changing.release()
+
+
+class ImaginationWorker(_Worker):
+    """The worker that imagines."""
+
+    name = state_name = IMAGINATION
+    step_name = "an imagination step"
+
+    def _make(self, config: RunConfig) -> Imagination:
         # The engine notices inference that hangs after `stall_s`; this is in case it does not.
         self._patience_s = 2 * self._limit
         self._share, self._batch = config.imagination.share, config.inference.max_batch
         self._outbox: list[Segment] = []
-        self._imagination = make_imagination(config, self._outbox.append)
-        self._lock = threading.Lock()
-        self._imagining = threading.Lock()
-        """Held while the imagination changes; outside, the outbox is empty."""
         self._deciding = ReconnectingClient("inference")
-        self._promoted: Promotion | None = None
+        self._promoted: deque[Promotion] = deque(maxlen=1)
         self._may_promote = config.imagination.learns
-        self._cursor = 0
-        if state is not None:
-            saved = snapshot.load(state / IMAGINATION)
-            self._imagination.restore(saved["imagination"])
-            self._cursor = saved["cursor"]
-        self._clock.enter(WAIT_IN)
-
-    def ready(self) -> int:
-        """Returns this process's id once the world model is loaded."""
-        return os.getpid()
+        return make_imagination(config, self._outbox.append)
 
     def promote(self, promotion: Promotion) -> None:
         """Uses this model from the next chunk on."""
-        with self._lock:
-            self._promoted = promotion
+        self._promoted.append(promotion)
 
     def expect(self, may_promote: bool) -> None:
         """Notes whether another model may be promoted."""
-        with self._lock:
-            self._may_promote = may_promote
+        self._may_promote = may_promote
 
     def move(self, inference: Endpoint) -> None:
         """Sends requests to this endpoint from now on."""
         self._deciding.move(inference)
 
-    def metrics(self) -> dict[str, float]:
-        """See `Imagination.metrics`."""
-        self._clock.beat()
-        return self._imagination.metrics()
-
     def save(self, directory: Path) -> None:
         """Writes its part of a checkpoint, once it has taken over what was promoted."""
         began = time.monotonic()
-        while self._promoted is not None and time.monotonic() < began + min(SWAP_S, self._limit / 2):
+        while self._promoted and time.monotonic() < began + min(SWAP_S, self._limit / 2):
             time.sleep(PAUSE_S)
-        left = began + self._limit - time.monotonic()
-        with _within(left, self._imagining, "an imagination step"):
-            saved = {"imagination": self._imagination.state(), "cursor": self._cursor}
-            snapshot.save(directory / TRAINING_STATE / IMAGINATION, saved)
-            self._imagination.save_promoted(directory / WORLD_MODEL)
+        with self._unchanging(began + self._limit - time.monotonic()):
+            self._write(directory)
+            self._core.save_promoted(directory / WORLD_MODEL)
 
     def run(self, inference: Endpoint, inserting: Endpoint, replay: Any) -> None:
         """Imagines until replay is closed."""
@@ -242,17 +266,23 @@ class ImaginationWorker:
         deciding.move(inference)
         pending: set[int] = set()
         while not news.closed:
+            self._clock.enter(TRANSPORT)
+            segments = news.fresh()
             self._clock.enter(CHECKPOINT)
-            with self._imagining:
+            with self._changing:
                 self._clock.enter(COMPUTE)
-                may_promote = self._swap()
-                for segment in news.fresh():
-                    self._imagination.remember(segment)
+                may_promote = self._may_promote  # first: the last model comes before the word that it is
+                if self._promoted:
+                    self._clock.enter(WEIGHT_SYNC)
+                    self._core.swap(self._promoted.pop())
+                    self._clock.enter(COMPUTE)
+                for segment in segments:
+                    self._core.remember(segment)
                 self._cursor = news.cursor
             # Both at once: a run that imagines nothing and expects no model has nothing to wait for.
-            if reported != (self._imagination.on, may_promote):
-                reported = (self._imagination.on, may_promote)
-                share = self._share if self._imagination.on else 0.0
+            if reported != (self._core.on, may_promote):
+                reported = (self._core.on, may_promote)
+                share = self._share if self._core.on else 0.0
                 _await(replay.mix.remote(share, any(reported)))
             self._clock.enter(TRANSPORT)
             for ticket, stored in connection.done(0.0):
@@ -260,8 +290,8 @@ class ImaginationWorker:
                 if not stored:
                     return
             self._clock.enter(COMPUTE)
-            with self._imagining:
-                requests = [] if len(pending) >= MAX_PENDING else self._imagination.requests()
+            with self._changing:
+                requests = [] if len(pending) >= MAX_PENDING else self._core.requests()
             if not requests:
                 self._clock.enter(WAIT_OUT if len(pending) >= MAX_PENDING else WAIT_IN)
                 time.sleep(PAUSE_S)
@@ -270,72 +300,35 @@ class ImaginationWorker:
             self._clock.enter(WAIT_IN)
             answers = deciding.ask(parts, self._patience_s)
             self._clock.enter(CHECKPOINT)
-            with self._imagining:
+            with self._changing:
                 self._clock.enter(COMPUTE)
                 fault_point("imagination.step")
-                self._imagination.advance([decision for answer in answers for decision in answer])
+                self._core.advance([decision for answer in answers for decision in answer])
                 self._clock.enter(TRANSPORT)
                 if self._outbox:
                     pending.add(connection.send(self._outbox))
                     self._outbox.clear()
 
-    def _swap(self) -> bool:
-        """Takes over what was promoted; True if more may come."""
-        with self._lock:
-            promoted, self._promoted = self._promoted, None
-            may_promote = self._may_promote
-        if promoted is not None:
-            self._clock.enter(WEIGHT_SYNC)
-            self._imagination.swap(promoted)
-            self._clock.enter(COMPUTE)
-        return may_promote
 
+class WorldLearningWorker(_Worker):
+    """The worker that trains the world model."""
 
-class WorldLearningWorker:
-    """Becomes a threaded Ray actor in `launch`: `run` on one thread, everything else beside it."""
+    name, state_name = WORLD_LEARNING, "world_learner"
+    step_name = "a step of learning"
 
-    def __init__(self, config: RunConfig, state: Path | None = None, timeline: Path | None = None) -> None:
-        self._clock = open_clock(timeline, WORLD_LEARNING)
-        import torch
-
-        torch.set_num_threads(config.trainer.num_threads)
-        torch.manual_seed(config.seed)
-        self._limit = config.launch.stall_s
-        self._learner = make_learner(config)
-        self._learning = threading.Lock()
-        """Held while the learner changes, but not during a validation, which is of a copy."""
-        self._cursor = 0
-        if state is not None:
-            saved = snapshot.load(state / LEARNER)
-            self._learner.restore(saved["learner"])
-            self._cursor = saved["cursor"]
-        self._clock.enter(WAIT_IN)
-
-    def ready(self) -> int:
-        """Returns this process's id once the world model and its datasets are loaded."""
-        return os.getpid()
-
-    def metrics(self) -> dict[str, float]:
-        """See `OnlineLearner.metrics`."""
-        self._clock.beat()
-        return self._learner.metrics()
-
-    def save(self, directory: Path) -> None:
-        """Writes its part of ``training_state``."""
-        with _within(self._limit, self._learning, "a step of learning"):
-            saved = {"learner": self._learner.state(), "cursor": self._cursor}
-        snapshot.save(directory / TRAINING_STATE / LEARNER, saved)
+    def _make(self, config: RunConfig) -> OnlineLearner:
+        return make_learner(config)
 
     def run(self, imaginer: Any, replay: Any) -> None:
         """Trains until replay is closed."""
-        news, learner = _News(replay, self._cursor), self._learner
+        news, learner = _News(replay, self._cursor), self._core
         may_promote: bool | None = None
-        hold: bool | None = None
-        """As last reported to replay."""
+        hold: bool | None = None  # as last reported
         while not news.closed:
             self._clock.enter(TRANSPORT)
-            with self._learning:
-                for segment in news.fresh():
+            segments = news.fresh()
+            with self._changing:
+                for segment in segments:
                     learner.add(segment)
                 self._cursor = news.cursor
             last = news.ended
@@ -348,7 +341,7 @@ class WorldLearningWorker:
                 _await(imaginer.expect.remote(may_promote))
             if learner.pending_steps >= 1:
                 self._clock.enter(CHECKPOINT)
-                with self._learning:
+                with self._changing:
                     self._clock.enter(COMPUTE)
                     fault_point("learning.step")
                     learner.step()
@@ -363,44 +356,25 @@ class WorldLearningWorker:
                 time.sleep(PAUSE_S)
 
 
-@contextmanager
-def _within(seconds: float, lock: threading.Lock, what: str) -> Iterator[None]:
-    """Holds a lock that others hold for a moment."""
-    if not lock.acquire(timeout=seconds):
-        remedy = "raise launch.stall_s if one takes that long"
-        raise TimeoutError(f"{what} has not ended for {seconds:.0f} s or more; {remedy}")
-    try:
-        yield
-    finally:
-        lock.release()
-
-
 class _News:
-    """New real segments in replay, polled without waiting."""
+    """New real segments in replay."""
 
     def __init__(self, replay: Any, cursor: int) -> None:
-        self._replay, self._asked, self._next = replay, None, 0.0
+        self._replay, self._next = replay, 0.0
         self.cursor = cursor
         self.ended = self.closed = False
 
     def fresh(self) -> list[Segment]:
-        """Real segments that have come since."""
-        if self._asked is None:
-            if time.monotonic() < self._next:
-                return []
-            self._asked = self._replay.news.remote(self.cursor)
-        import ray
-
-        done, _ = ray.wait([self._asked], timeout=0)
-        if not done:
+        """Real segments that have come since; asks every `POLL_S`."""
+        if time.monotonic() < self._next:
             return []
-        news = ray.get(self._asked)
-        self._asked, self._next = None, time.monotonic() + POLL_S
+        news = _await(self._replay.news.remote(self.cursor))
+        self._next = time.monotonic() + POLL_S
         self.cursor, self.ended, self.closed = news.cursor, news.ended, news.closed
         return list(news.segments)
 
 
-def _await(reference: Any) -> None:
+def _await(reference: Any) -> Any:
     import ray  # the engine in one process uses this file too
 
-    ray.get(reference)
+    return ray.get(reference)

@@ -78,7 +78,7 @@ class LocalEngine(Engine):
 
             self._imagination = make_imagination(config, self._replay.insert)
             if imagination.learns:
-                self._world_learner = make_learner(config, self._imagination.models)
+                self._world_learner = make_learner(config)
         self._rng = np.random.default_rng(config.seed)
         self._outstanding: set[tuple[str, int]] = set()
         self._episodes: list[EpisodeResult] = []

@@ -9,52 +9,18 @@ from typing import Annotated, ClassVar, Literal
 
 import draccus
 
-from accerl_lerobot.config.ranges import (
-    DatasetConfig,
-    LearningRate,
-    NonNegative,
-    Positive,
-    Range,
-    Section,
-    Share,
-    Steps,
-)
+from accerl_lerobot.config.ranges import DatasetConfig, LearningRate, NonNegative, Range, Section
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.replay.pacing import ReplayConfig
 
 PIXELS = "pixels"
 """The type of our own class of learned world models."""
+SPACE_TO_DEPTH = 4
+"""Side of the pixel blocks that become channels in its network."""
 IMAGINATION = "imagination"
 """Name of the worker that imagines, and of its state."""
 WORLD_LEARNING = "world learning"
 """Name of the worker that trains the world model."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class NetworkConfig(Section, section="world_model.model.network"):
-    """Size of the network."""
-
-    space_to_depth: Annotated[int, Range("[1, 64]")] = 4
-    """Side of the pixel blocks that become channels; image height and width are multiples of it times 2 for
-    every further level."""
-    channels: tuple[Annotated[int, Range("[1, 65536]")], ...] = (64, 96)
-    """Channels of each level, finest first."""
-    blocks: Annotated[int, Range("[1, 1000]")] = 1
-    """Residual blocks per level."""
-    condition: Annotated[int, Range("[1, 65536]")] = 128
-    """Width of the conditioning vector that the adaptive norms read."""
-    planes: Annotated[int, Range("[0, 65536]")] = 8
-    """Channels of the action planes; 0: none."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.channels:
-            raise InputError("world_model.model.network.channels", self.channels, "name at least one width")
-
-    @property
-    def multiple(self) -> int:
-        """Number that image sides must be a multiple of."""
-        return self.space_to_depth * 2 ** (len(self.channels) - 1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,10 +51,6 @@ class LearnableModelConfig(Section, draccus.ChoiceRegistry, section="world_model
         """Number that image sides must be a multiple of."""
         return 1
 
-    def provides(self, state_dim: int) -> frozenset[str]:
-        """Outputs of the model, see `contract.WorldModelSpec`; `state_dim` may be 0."""
-        return frozenset({"pixels", "state"} if state_dim else {"pixels"})
-
 
 @LearnableModelConfig.register_subclass(PIXELS)
 @dataclass(frozen=True, kw_only=True)
@@ -100,19 +62,18 @@ class PixelModelConfig(LearnableModelConfig):
     context_noise: NonNegative = 0.02
     """Largest standard deviation of the noise on context and anchor in training, in units of [−1, 1].
     Imagined frames are never as clean as the training data."""
-    heads: Annotated[int, Range("[2, 1000]")] = 3
-    """Size of the ensemble that predicts the robot's state; its disagreement is the uncertainty."""
-    state_weight: NonNegative = 1.0
-    """Weight of the state's loss beside the image's."""
-    network: NetworkConfig = field(default_factory=NetworkConfig)
+    channels: tuple[Annotated[int, Range("[1, 65536]")], ...] = (64, 96)
+    """Channels of each level of the network, finest first. Image height and width are multiples of 4, times
+    2 for every further level."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.channels:
+            raise InputError("world_model.model.channels", self.channels, "name at least one width")
 
     @property
     def multiple(self) -> int:
-        return self.network.multiple
-
-    def provides(self, state_dim: int) -> frozenset[str]:
-        """Without a state there is no ensemble, so no uncertainty."""
-        return super().provides(state_dim) | ({"uncertainty"} if state_dim else set())
+        return SPACE_TO_DEPTH * 2 ** (len(self.channels) - 1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,25 +85,9 @@ class LearnConfig(Section, section="world_model.learn"):
     batch: Annotated[int, Range("[2, 65536]")] = 16
     """Windows per gradient step."""
     lr: LearningRate = 1e-3
-    """Peak learning rate; falls to a tenth by a cosine."""
-    warmup: Steps = 50
-    """Steps in which the learning rate rises."""
-    weight_decay: NonNegative = 1e-2
-    grad_clip: Positive = 1.0
-    """Largest gradient norm."""
-    average: Annotated[float, Range("[0, 1)")] = 0.99
-    """Decay of the exponential moving average of the weights, which is what is used and saved."""
+    """Peak learning rate; rises over 50 steps and falls to a tenth by a cosine."""
     chunks: Annotated[int, Range("[1, 10000]")] = 2
     """Chunks per window. From its second chunk on, the model is trained on its own prediction as input."""
-    anchors: Annotated[int, Range("[0, 10000]")] = 15
-    """The anchor lies up to so many chunks back, as far as imagined rollouts will go."""
-
-    def lr_at(self, step: int) -> float:
-        """Learning rate of a step, counted from 0; constant beyond `steps`."""
-        if step < self.warmup:
-            return self.lr * (step + 1) / self.warmup
-        done = min(1.0, (step - self.warmup) / max(1, self.steps - self.warmup))
-        return self.lr * (0.1 + 0.9 * 0.5 * (1 + math.cos(math.pi * done)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,15 +99,6 @@ class SuccessLearnConfig(Section, section="world_model.success"):
     batch: Annotated[int, Range("[2, 65536]")] = 32
     """Pairs of frames per gradient step."""
     lr: LearningRate = 1e-3
-    weight_decay: NonNegative = 1e-2
-    imagined: Share = 0.5
-    """Share of pairs from imagined replays of real episodes, with the actions that were executed in them."""
-    depth: Annotated[int, Range("[1, 100000]")] = 15
-    """Chunks of such a replay at most."""
-    episodes: Annotated[int, Range("[2, 1000000]")] = 48
-    """Episodes that are replayed at a time."""
-    refresh_every: Annotated[int, Range("[1, 1000000]")] = 50
-    """Gradient steps until other episodes are replayed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -203,6 +139,9 @@ class WorldModelConfig(Section, section="world_model"):
     learn: LearnConfig = field(default_factory=LearnConfig)
     success: SuccessLearnConfig = field(default_factory=SuccessLearnConfig)
     validation: ValidationConfig = field(default_factory=ValidationConfig)
+    longest: Annotated[int, Range("[1, 10000]")] = 15
+    """Chunks of an imagined rollout at most: so far back lies the anchor, and so long are the imagined
+    replays of real episodes that half of the pairs of frames come from."""
     held_out: Annotated[float, Range("(0, 1)")] = 0.2
     """Share of the episodes held out for validation."""
     image_size: Annotated[int, Range("[2, 1024]")] = 64
@@ -220,20 +159,13 @@ class WorldModelConfig(Section, section="world_model"):
             raise InputError("world_model.image_size", self.image_size, remedy)
 
 
-# Imagination in a run.
-
-
 @dataclass(frozen=True, kw_only=True)
 class OnlineLearnConfig(Section, section="imagination.learn"):
     """Training of the world model on the policy's episodes during a run."""
 
     steps_per_episode: Annotated[float, Range("[0, 1000000]")] = 5.0
     """Gradient steps of world model and success model each, per real episode; 0: both stay as they are.
-
-    A model that only saw demonstrations classifies a policy's failures as successes: on door-open 39 % of
-    them after four decisions, and 2 % after 100 steps on 64 episodes of that policy. So nothing is imagined
-    before it has passed validation on the policy's own episodes.
-    """
+    Otherwise nothing is imagined before they have passed validation on the policy's own episodes."""
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     """Dataset of the pre-training: the model trains on the episodes it already knows, and is validated on
     those that were held out. Of another dataset it trains on all episodes."""
@@ -243,9 +175,7 @@ class OnlineLearnConfig(Section, section="imagination.learn"):
     held_out: ClassVar[float] = 0.2
     """Share of real episodes held out for validation."""
     validate_every: ClassVar[int] = 16
-    """Real episodes between two validations. Where real episodes are counted, no more are collected until
-    the validation is over. Once all are in, it is repeated after as many steps as so many would have
-    brought, five times at most; a model that has not passed by then is never used."""
+    """Real episodes between two validations; where episodes are counted, their collection waits for it."""
     validation: ClassVar[ValidationConfig] = ValidationConfig(
         max_windows=120, depth=4, auroc=0.6, false_success=0.5, recall=0.3, false_positives=0.3
     )
@@ -260,19 +190,19 @@ class ImaginationConfig(Section, section="imagination"):
     share: Annotated[float, Range("[0, 1)")] = 0.0
     """Share of the decisions of a batch that are imagined; 0: none."""
     model: Literal["learned", "shuffled", "copy", "oracle"] = "learned"
-    """World model. learned: the one in `path`. oracle: a simulator, put where a rollout starts: the best
-    there can be. copy (nothing ever moves) and shuffled (the learned one, given the actions of another
-    imagined rollout) are placebos: a gain that they give too is not the world model's."""
+    """World model. learned: the one in `path`. oracle: a simulator, the best there can be. copy (nothing ever
+    moves) and shuffled (the learned one, given another rollout's actions): placebos; a gain that they give
+    too is not the world model's."""
     path: str | None = None
     """The folder ``world_model`` that ``accerl world-model`` has written; oracle needs none, copy uses its
     success model."""
     discover_packages_path: str | None = None
     """Package to import that registers the type of the world model in `path`, where that is not one of ours;
     every machine of the cluster needs it."""
-    rollouts: Annotated[int, Range("[1, 100000]")] = 32
-    """Imagined rollouts at a time, as one batch."""
     learn: OnlineLearnConfig = field(default_factory=OnlineLearnConfig)
 
+    rollouts: ClassVar[int] = 32
+    """Imagined rollouts at a time, as one batch."""
     samples_per_insert: ClassVar[float] = 2.0
     """How often an imagined decision is trained on, on average; see `imagined_replay`."""
     max_uncertainty: ClassVar[float] = 2.0
@@ -281,11 +211,7 @@ class ImaginationConfig(Section, section="imagination"):
     memory: ClassVar[int] = 256
     """Newest real episodes at whose resets rollouts start."""
     max_gap: ClassVar[float] = 0.5
-    """The kill switch: largest difference of the success rates, imagined less real.
-
-    Rollouts are compared with real episodes of the same time, so nothing is compared any more once all real
-    episodes have been played. A world model that is promoted later gets another chance.
-    """
+    """The kill switch: largest difference of the success rates, imagined less real."""
     window: ClassVar[int] = 100
     """Imagined rollouts over which the gap is measured. When as many in a row end at once because the model
     is too uncertain, nothing is imagined any more either."""
@@ -294,8 +220,6 @@ class ImaginationConfig(Section, section="imagination"):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.model == "shuffled" and self.rollouts < 2:
-            raise InputError("imagination.rollouts", self.rollouts, "use at least 2: shuffled needs them")
         if self.share and self.path is None and self.needs_path:
             remedy = "give the folder world_model that accerl world-model has written"
             raise InputError("imagination.path", None, remedy)

@@ -5,10 +5,10 @@
     prediction = model.step(state, actions, seeds)    # .frames, .robot; the next step starts at .state
 
 A learned one has a `loss` too; `pixels.py` has ours, and ``docs/world_model.md`` says how to add another.
-`registry.py` has what a run can imagine with. Success is classified by another model, see
-`learners.py`.
+`reference.py` has others. Success is classified by another model, see `learners.py`.
 
-States are dicts of tensors with the batch in front, so that rows can be selected and replaced.
+States are dicts of tensors with the batch in front, so that rows can be selected and replaced; their other
+sizes stay the same from step to step.
 
 Shapes: B batch, L frames of context, V cameras, H×W pixels, S robot state dims, K env steps of a chunk, A
 action dims.
@@ -19,15 +19,14 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from accerl_lerobot.checkpoint.safety import brief
 from accerl_lerobot.config.parsing import imported
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.config.ranges import Range, Section
 
 if TYPE_CHECKING:
     from accerl_lerobot.world_model.config import LearnableModelConfig
@@ -43,42 +42,33 @@ def select_rows(state: State, chosen: Sequence[int] | np.ndarray) -> State:
 
 
 def replace_rows(state: State, at: list[int], fresh: State) -> State:
-    """Replaces rows of the batch; where a dimension grows with a rollout, the shorter tensor is padded."""
-    merged = {}
-    for key, old in state.items():
-        new = fresh[key].to(old.device)
-        sides = [max(a, b) for a, b in zip(old.shape[1:], new.shape[1:], strict=True)]
-        old, new = (_padded(x, sides) for x in (old, new))
-        merged[key] = old.clone()
-        merged[key][at] = new
-    return merged
+    """Replaces rows of the batch."""
+    return {
+        key: old.index_copy(0, torch.tensor(at, device=old.device), fresh[key].to(old.device))
+        for key, old in state.items()
+    }
 
 
-def _padded(x: Tensor, sides: list[int]) -> Tensor:
-    """Pads at the far end of each dimension but the first."""
-    missing = [n for want, have in zip(sides, x.shape[1:], strict=True) for n in (want - have, 0)]
-    return torch.nn.functional.pad(x, missing[::-1]) if any(missing) else x
+Size = Annotated[int, Range("[1, 1000000]")]
 
 
 @dataclass(frozen=True, kw_only=True)
-class WorldModelSpec:
+class WorldModelSpec(Section, section="spec"):
     """Sizes of a world model, and the environment it models."""
 
     cameras: tuple[str, ...]
     """``observation.images.<camera>``, in the order of V."""
-    image_size: tuple[int, int]
+    image_size: tuple[Size, Size]
     """(H, W)."""
-    state_dim: int
+    state_dim: Annotated[int, Range("[0, 1000000]")]
     """S; 0: there is no ``observation.state``."""
-    action_dim: int
-    chunk: int
+    action_dim: Size
+    chunk: Size
     """K."""
-    fps: int
+    fps: Size
     """Env steps per second, which a dataset must have too."""
-    context: int
+    context: Size
     """L."""
-    provides: frozenset[str]
-    """Outputs among pixels, state, uncertainty, success."""
     tasks: tuple[str, ...] = ()
     """Names of the environment's tasks; empty: unknown."""
 
@@ -117,6 +107,18 @@ class Context(NamedTuple):
     """float32 (B, S), the robot's state where that sum begins."""
 
 
+def context_of(windows: Windows, rows: slice = slice(None)) -> Context:
+    """A world model's context at the first frame of some windows."""
+    length = windows.context
+    return Context(
+        frames=torch.from_numpy(windows.frames[rows, :length]),
+        robot=torch.from_numpy(windows.state[rows, :length]),
+        actions=torch.from_numpy(windows.before[rows]),
+        commanded_sum=torch.from_numpy(windows.commanded_sum[rows]),
+        initial_state=torch.from_numpy(windows.initial_state[rows]),
+    )
+
+
 class Reset(NamedTuple):
     """Arguments of the `World.reset` at which a rollout starts, for models that repeat it."""
 
@@ -151,7 +153,7 @@ class LearnableWorldModel(nn.Module, WorldModel):
     """
 
     uncertainty_scale: Tensor
-    """Scalar that the uncertainty is divided by, see `validate.fit_uncertainty_scale`."""
+    """Scalar that the uncertainty is divided by, see `validation.fit_uncertainty_scale`."""
 
     def __init__(self, spec: WorldModelSpec, config: LearnableModelConfig) -> None:
         super().__init__()
@@ -171,24 +173,7 @@ class LearnableWorldModel(nn.Module, WorldModel):
         """
 
 
-def learnable_class(config: LearnableModelConfig) -> type[LearnableWorldModel]:
-    """Imports the class of `config`, which is made from a `WorldModelSpec` and the config.
-
-    Raises:
-        InputError: it cannot be imported, or is not a complete `LearnableWorldModel`.
-    """
-
-    def refuse(why: str) -> InputError:
-        return InputError("world_model.model.type", config.type, why)
-
-    name = getattr(config, "make", "")
-    try:
-        made = imported(name)
-    except (Exception, SystemExit) as error:  # third-party code
-        remedy = f"its config's make is {name!r}, which cannot be imported ({brief(error)}); use module:name"
-        raise refuse(remedy) from error
-    if not (isinstance(made, type) and issubclass(made, LearnableWorldModel)):
-        raise refuse(f"{name} is no subclass of LearnableWorldModel")
-    if lacking := sorted(made.__abstractmethods__):
-        raise refuse(f"{name} lacks {', '.join(lacking)}")
+def new_model(spec: WorldModelSpec, config: LearnableModelConfig) -> LearnableWorldModel:
+    """Builds an untrained model of the class that `config` names."""
+    made: LearnableWorldModel = imported(config.make)(spec, config)
     return made

@@ -12,8 +12,8 @@ of a chunk, L frames of context, R chunks of a window, B batch.
 from __future__ import annotations
 
 import hashlib
-import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -22,22 +22,17 @@ import numpy as np
 from accerl_lerobot.checkpoint.snapshot import kind
 from accerl_lerobot.demos.dataset_files import frames_of, open_metadata, opened, pixels_of
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import SUCCESS, TASK, Observation
+from accerl_lerobot.experience import SUCCESS
 
 if TYPE_CHECKING:
     from accerl_lerobot.config.ranges import DatasetConfig
-    from accerl_lerobot.envs.base import WorldSpec
     from accerl_lerobot.world_model.contract import WorldModelSpec
 
 
 @kind
 @dataclass(frozen=True, kw_only=True)
 class Episode:
-    """One recorded episode.
-
-    Raises:
-        ValueError: the arrays do not fit each other.
-    """
+    """One recorded episode."""
 
     frames: np.ndarray
     """uint8 (F, V, H, W, 3)."""
@@ -51,21 +46,16 @@ class Episode:
     """Index of the step that achieved the task; −1 for never."""
     task: str
     """The instruction."""
-    source: str
-    """``demo``, ``online``, or another name that an evaluation gives it."""
+    own: bool
+    """True if it was played by the policy that the world model is for: in validation its failures count."""
 
-    def __post_init__(self) -> None:
-        f, t = len(self.frames), len(self.actions)
-        if not f == len(self.times) == len(self.state) or f == 0 or t == 0:
-            raise ValueError(f"{f} frames, {len(self.times)} times, {len(self.state)} states, {t} actions")
-        if self.times[0] != 0 or (np.diff(self.times) <= 0).any() or self.times[-1] > t:
-            raise ValueError(f"times rise from 0 to at most {t}, not {self.times.tolist()}")
-        if not -1 <= self.success_at < t:
-            raise ValueError(f"success at step {self.success_at} of {t}")
+    @property
+    def key(self) -> str:
+        """Identifies an episode, whatever dataset it is in."""
+        return hashlib.sha256(self.actions.tobytes()).hexdigest()[:16]
 
     @property
     def success(self) -> bool:
-        """True if the task was achieved."""
         return self.success_at >= 0
 
     @property
@@ -83,9 +73,7 @@ class Episode:
     def starts(self) -> int:
         """Number of frames, from the first on, that are followed by another and precede the success."""
         followed = len(self.frames) - 1
-        if not self.success:
-            return followed
-        return min(followed, int(np.searchsorted(self.times, self.success_at, side="right")))
+        return min(followed, frame_at(self, self.success_at) + 1) if self.success else followed
 
     def __len__(self) -> int:
         """Env steps."""
@@ -121,8 +109,6 @@ class Windows:
     """int64 (B, R), how many of a chunk's actions lie between its frames; 0 beyond the end."""
     success: np.ndarray
     """bool (B, R), True if the task was achieved in this chunk."""
-    valid: np.ndarray
-    """bool (B, R), True if the chunk's frame is at least one step later than the one before."""
     episode: np.ndarray
     """int64 (B,), index of the episode."""
     task: tuple[str, ...]
@@ -131,14 +117,14 @@ class Windows:
         return len(self.frames)
 
     @property
+    def valid(self) -> np.ndarray:
+        """bool (B, R), True if the chunk's frame is at least one step later than the one before."""
+        return self.steps > 0
+
+    @property
     def context(self) -> int:
         """L."""
         return self.before.shape[1] + 1
-
-    def rows(self, chosen: Sequence[int]) -> Windows:
-        """Selects some of the windows."""
-        arrays = {k: v[list(chosen)] for k, v in vars(self).items() if k != "task"}
-        return Windows(**arrays, task=tuple(self.task[i] for i in chosen))
 
 
 def hold_last_action(actions: np.ndarray, steps: np.ndarray) -> np.ndarray:
@@ -154,71 +140,61 @@ def window_starts(episodes: Sequence[Episode]) -> list[WindowStart]:
     return [WindowStart(e, f) for e, episode in enumerate(episodes) for f in range(len(episode.frames) - 1)]
 
 
+def frame_at(episode: Episode, time: int) -> int:
+    """Index of the last frame recorded by an env step; the first one before all of them."""
+    return max(0, int(np.searchsorted(episode.times, time, side="right")) - 1)
+
+
 def cut_windows(
     episodes: Sequence[Episode],
     at: Sequence[WindowStart],
-    *,
-    chunk: int,
-    context: int,
+    spec: WorldModelSpec,
     chunks: int,
     anchors: Sequence[int] | None = None,
 ) -> Windows:
-    """Cuts windows of R = `chunks` chunks of K = `chunk` env steps, with L = `context` frames.
-
-    The anchor of each lies so many chunks before its first frame; None: it is the first frame.
-    """
+    """Cuts windows of R = `chunks` chunks, whose anchors lie so many chunks before their first frame."""
     rows = [
-        _window(episodes[start.episode], start.frame, chunk, context, chunks, anchor)
+        _window(episodes[start.episode], start.frame, spec, chunks, anchor)
         for start, anchor in zip(at, anchors or [0] * len(at), strict=True)
     ]
-    stacked = {key: np.stack([row[key] for row in rows]) for key in rows[0]}
     return Windows(
-        **stacked,
+        **{key: np.stack([row[key] for row in rows]) for key in rows[0]},
         episode=np.array([start.episode for start in at], np.int64),
         task=tuple(episodes[start.episode].task for start in at),
     )
 
 
 def _window(
-    episode: Episode, first: int, chunk: int, context: int, chunks: int, anchor: int
+    episode: Episode, first: int, spec: WorldModelSpec, chunks: int, anchor: int
 ) -> dict[str, np.ndarray]:
-    times, start = episode.times, int(episode.times[first])
-
-    def frame(time: int) -> int:
-        """Index of the last frame recorded by then."""
-        return int(np.searchsorted(times, max(0, time), side="right")) - 1
-
-    before = [frame(start - chunk * i) for i in range(context - 1, 0, -1)]
-    actions_before = np.zeros((context - 1, chunk, episode.actions.shape[1]), np.float32)
+    chunk, context, action_dim = spec.chunk, spec.context, episode.actions.shape[1]
+    start = int(episode.times[first])
+    before = [frame_at(episode, start - chunk * i) for i in range(context - 1, 0, -1)]
+    actions_before = np.zeros((context - 1, chunk, action_dim), np.float32)
     for i in range(1, context):
         then = start - chunk * i
         known = episode.actions[max(0, then) : max(0, then + chunk)]
         if len(known):
             actions_before[-i, -len(known) :] = known
-    path, actions, steps, success = [first], [], [], []
+    path, actions = [first], np.zeros((chunks, chunk, action_dim), np.float32)
+    steps, success = np.zeros(chunks, np.int64), np.zeros(chunks, bool)
     for r in range(chunks):
         then = start + chunk * r
-        following = max(path[-1], frame(then + chunk))
+        path.append(max(path[-1], frame_at(episode, then + chunk)))
         # Actions between the two frames: the chunk's, unless the last frame comes before its end.
-        executed = int(np.clip(times[following] - then, 0, chunk))
-        padded = np.zeros((chunk, episode.actions.shape[1]), np.float32)
-        padded[:executed] = episode.actions[then : then + executed]
-        path.append(following)
-        actions.append(padded)
-        steps.append(executed)
-        success.append(then <= episode.success_at < then + chunk)
-    counts = np.array(steps, np.int64)
+        steps[r] = np.clip(episode.times[path[-1]] - then, 0, chunk)
+        actions[r, : steps[r]] = episode.actions[then : then + steps[r]]
+        success[r] = then <= episode.success_at < then + chunk
     return {
         "frames": episode.frames[before + path],
-        "anchor": episode.frames[frame(start - chunk * anchor)],
+        "anchor": episode.frames[frame_at(episode, start - chunk * anchor)],
         "state": episode.state[before + path],
         "before": actions_before,
         "commanded_sum": episode.actions[:start].sum(0, dtype=np.float32),
         "initial_state": episode.state[0],
-        "actions": np.stack(actions),
-        "steps": counts,
-        "success": np.array(success),
-        "valid": counts > 0,
+        "actions": actions,
+        "steps": steps,
+        "success": success,
     }
 
 
@@ -227,30 +203,19 @@ def count_episodes(episodes: Sequence[Episode]) -> dict[str, int]:
     return {"episodes": len(episodes), "env_steps": sum(map(len, episodes))}
 
 
-def longest_rollout(episodes: Sequence[Episode], chunk: int) -> int:
-    """Chunks of the longest episode."""
-    return max(-(-len(episode) // chunk) for episode in episodes)
-
-
 def split_episodes(
     episodes: Sequence[Episode], share: float, rng: np.random.Generator
-) -> tuple[list[int], list[int]]:
-    """Indices of episodes to train on and of a held-out share.
+) -> tuple[list[Episode], list[Episode]]:
+    """Episodes to train on, and a held-out share.
 
     Successes and failures are split alike; where there are two of a kind, each part gets at least one.
     """
-    learn: list[int] = []
-    held: list[int] = []
+    held: set[int] = set()
     for outcome in (False, True):
         of = [i for i, e in enumerate(episodes) if e.success is outcome]
         rng.shuffle(of)
-        count = min(max(1, round(share * len(of))), len(of) - 1) if len(of) > 1 else 0
-        held += of[:count]
-        learn += of[count:]
-    return sorted(learn), sorted(held)
-
-
-# Observations, as world models and as policies see them.
+        held.update(of[: min(max(1, round(share * len(of))), len(of) - 1) if len(of) > 1 else 0])
+    return [e for i, e in enumerate(episodes) if i not in held], [episodes[i] for i in sorted(held)]
 
 
 def resize(frames: np.ndarray, size: tuple[int, int]) -> np.ndarray:
@@ -273,115 +238,96 @@ def model_arrays(observations: dict[str, np.ndarray], spec: WorldModelSpec) -> t
     return frames, observations["observation.state"] if spec.state_dim else no_state
 
 
-def policy_observation(
-    frames: np.ndarray, robot: np.ndarray, task: str, spec: WorldModelSpec, world: WorldSpec
-) -> Observation:
-    """Observation of frames (V, H, W, 3) and a state (S,), in the sizes of the policy's environment."""
-    observation: Observation = {TASK: task}
-    for v, camera in enumerate(spec.cameras):
-        if camera in world.images:
-            observation[camera] = resize(frames[v : v + 1], world.images[camera][:2])[0]
-    if world.state_dim:
-        observation["observation.state"] = robot
-    return observation
+def named_datasets(config: Any, section: str = "") -> dict[str, DatasetConfig]:
+    """Its ``dataset`` and ``online``, if they are named, by their config section."""
+    datasets = {f"{section}{name}": getattr(config, name) for name in ("dataset", "online")}
+    return {name: dataset for name, dataset in datasets.items() if dataset.repo_id is not None}
 
 
-def executed_actions(chunks: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Actions (t, A) of chunks (T, K, A) of which the first `steps` (T,) each were executed."""
-    actions: np.ndarray = chunks[np.arange(chunks.shape[1]) < steps[:, None]]
-    return actions
+def open_datasets(sections: dict[str, DatasetConfig], spec: WorldModelSpec) -> dict[str, Any]:
+    """Opens and checks the metadata of each dataset, by its config section, before any image is read."""
+    metas: dict[str, Any] = {}
+    for section, dataset in sections.items():
+        with name_section(section):
+            if same := [other for other in metas if sections[other] == dataset]:
+                raise InputError(
+                    "dataset.repo_id", dataset.repo_id, f"it is the one in {same[0]}; name another"
+                )
+            metas[section] = open_metadata(dataset)
+            check_metadata(metas[section], str(dataset.repo_id), spec)
+    return metas
 
 
-# LeRobotDatasets.
+def load_datasets(
+    sections: dict[str, DatasetConfig], spec: WorldModelSpec, own: str | None = None
+) -> dict[str, list[Episode]]:
+    """Reads LeRobotDatasets into memory, one uint8 image of the spec's size per env step and camera.
 
-
-def load_episodes(
-    dataset: DatasetConfig,
-    spec: WorldModelSpec,
-    source: str = "demo",
-    *,
-    both: bool = True,
-    only: Sequence[int] | None = None,
-) -> list[Episode]:
-    """Reads a LeRobotDataset into memory, one uint8 image of the spec's size per env step and camera.
-
-    Args:
-        dataset: on the Hub, or in a folder.
-        spec: of the world model.
-        source: see `Episode`.
-        both: refuse a dataset without a success, or without a failure.
-        only: indices of the episodes to read; None: all.
-
-    Raises:
-        InputError: a camera, the success labels or the rate do not match; state or actions are another
-            robot's; a single episode; only successes, or only failures.
+    Two with an episode in common are refused: it may be on both sides of a split. The episodes of the section
+    `own` are the policy's, see `Episode`.
     """
-    meta = open_metadata(dataset)
-    check_metadata(meta, dataset.repo_id or "", spec)
-    indices = range(meta.total_episodes) if only is None else only
-    with opened(dataset, meta) as data:
-        episodes = [_episode(data, index, spec, source) for index in indices]
-    remedies = {True: "add episodes that succeed", False: "add failures, see demos.failure_share"}
-    for outcome, remedy in remedies.items() if both else ():
-        if not any(e.success is outcome for e in episodes):
-            why = f"no {'success' if outcome else 'failure'} among {len(episodes)} episodes; {remedy}"
-            raise InputError("dataset.repo_id", dataset.repo_id, why)
-    return episodes
+    loaded: dict[str, list[Episode]] = {}
+    known: set[str] = set()
+    for section, meta in open_datasets(sections, spec).items():
+        dataset = sections[section]
+        with name_section(section), opened(dataset, meta) as data:
+            episodes = [_episode(data, i, spec, section == own) for i in range(meta.total_episodes)]
+            keys = {episode.key for episode in episodes}
+            if twice := len(keys & known):
+                remedy = (
+                    f"{twice} of its episodes are in the other dataset, too; name one that has only others"
+                )
+                raise InputError("dataset.repo_id", dataset.repo_id, remedy)
+        known |= keys
+        loaded[section] = episodes
+    return loaded
 
 
-def fingerprint(meta: Any) -> str:
-    """Hash of the lengths of a dataset's episodes, in their order, and of statistics of its actions.
-
-    It identifies a dataset whatever its name.
-    """
-    moments = [np.asarray(meta.stats["action"][k], np.float64).round(6).tolist() for k in ("mean", "std")]
-    ends = [list(map(int, meta.episodes[f"dataset_{end}_index"])) for end in ("from", "to")]
-    content = json.dumps([ends, meta.fps, moments])
-    return hashlib.sha256(content.encode()).hexdigest()
+@contextmanager
+def name_section(section: str) -> Iterator[None]:
+    """Puts the config section of a dataset into errors about it."""
+    try:
+        yield
+    except InputError as error:
+        field = error.field.replace("dataset.", f"{section}.", 1)
+        raise InputError(field, error.value, error.remedy) from error
 
 
 def check_metadata(meta: Any, name: str, spec: WorldModelSpec) -> None:
-    """Refuses a dataset that a world model of `spec` cannot be trained on, before any image is read.
-
-    Raises:
-        InputError: see `load_episodes`.
-    """
-
-    def refuse(why: str) -> InputError:
-        return InputError("dataset.repo_id", name, why)
-
-    for camera in spec.cameras:
-        if camera not in meta.features:
-            cameras = ", ".join(meta.camera_keys) or "no camera"
-            raise refuse(f"no {camera}: the dataset has {cameras}; choose env.camera accordingly")
+    """Refuses a dataset that a world model of `spec` cannot be trained on."""
+    shapes = {key: tuple(feature["shape"]) for key, feature in meta.features.items()}
     sizes = {"action": spec.action_dim} | ({"observation.state": spec.state_dim} if spec.state_dim else {})
-    for key, size in sizes.items():
-        shape = tuple(meta.features[key]["shape"]) if key in meta.features else None
-        if shape != (size,):
-            raise refuse(f"{key} has shape {shape}, the world's has ({size},): it is another robot's")
-    if SUCCESS not in meta.features:
-        raise refuse(f"no {SUCCESS}: record it, as accerl demos does, or add it to the dataset")
-    if meta.fps != spec.fps:
-        why = f"{meta.fps} frames a second, and the world makes {spec.fps} steps"
-        raise refuse(f"{why}: its chunks would be other chunks; record at the world's rate")
-    if meta.total_episodes < 2:
-        raise refuse("a single episode; at least one to train on and one to hold out are needed")
+    others = {key: shapes.get(key) for key, size in sizes.items() if shapes.get(key) != (size,)}
+    if missing := [camera for camera in spec.cameras if camera not in shapes]:
+        cameras = ", ".join(meta.camera_keys) or "no camera"
+        why = f"no {missing[0]!r}: the dataset has {cameras}; choose env.camera accordingly"
+    elif others:
+        key, shape = next(iter(others.items()))
+        why = f"{key} has shape {shape}, the world's has ({sizes[key]},): it is another robot's"
+    elif SUCCESS not in shapes:
+        why = f"no {SUCCESS}: record it, as accerl demos does, or add it to the dataset"
+    elif meta.fps != spec.fps:
+        why = f"{meta.fps} frames a second, and the world makes {spec.fps} steps; record at the world's rate"
+    elif meta.total_episodes < 2:
+        why = "a single episode; at least one to train on and one to hold out are needed"
+    else:
+        return
+    raise InputError("dataset.repo_id", name, why)
 
 
-def _episode(data: Any, index: int, spec: WorldModelSpec, source: str) -> Episode:
+def _episode(data: Any, index: int, spec: WorldModelSpec, own: bool) -> Episode:
     items = list(frames_of(data, index))
     success = np.array([bool(item[SUCCESS]) for item in items])
-    state = [item["observation.state"].numpy() if spec.state_dim else np.zeros(0) for item in items]
-    images = [np.stack([pixels_of(item[camera]) for item in items]) for camera in spec.cameras]
-    actions = np.stack([item["action"].numpy() for item in items])
-    if not (np.isfinite(actions).all() and np.isfinite(np.stack(state)).all()):
-        raise InputError("dataset.repo_id", data.repo_id, f"episode {index} has a NaN state or action")
+    arrays = {camera: np.stack([pixels_of(item[camera]) for item in items]) for camera in spec.cameras}
+    if spec.state_dim:
+        arrays["observation.state"] = np.stack([item["observation.state"].numpy() for item in items])
+    frames, state = model_arrays(arrays, spec)
     return Episode(
-        frames=np.stack([resize(frames, spec.image_size) for frames in images], 1),
+        frames=frames,
         times=np.arange(len(items)),
-        state=np.stack(state).astype(np.float32),
-        actions=actions.astype(np.float32),
+        state=state.astype(np.float32),
+        actions=np.stack([item["action"].numpy() for item in items]).astype(np.float32),
         success_at=int(success.argmax()) if success.any() else -1,
         task=str(items[0]["task"]),
-        source=source,
+        own=own,
     )

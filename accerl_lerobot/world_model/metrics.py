@@ -9,55 +9,35 @@ Better pixels than a copy prove nothing: a model may learn to blur what moves an
 Intervals are percentile bootstraps over episodes, as windows of one episode are alike.
 
 Shapes: M windows, V cameras, H×W pixels.
-
-Results of a validation as text, for the terminal and for reports. Free of torch.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable
 
 import numpy as np
-from rich.table import Table
 
 CHANGED = 16
 """A pixel counts as changed if one of its colours differs by more, of 255."""
 
-
-class Estimate(NamedTuple):
-    """A number with its 95 % bootstrap interval."""
-
-    value: float
-    low: float
-    high: float
+DRAWS = 1000
+"""Resamples of an interval."""
 
 
-def bootstrap(
-    groups: np.ndarray, statistic: Callable[[np.ndarray], float], *, draws: int = 1000, seed: int = 0
-) -> Estimate:
-    """Bootstraps a statistic of row indices by resampling groups, such as episodes.
+def bootstrap(groups: np.ndarray, statistic: Callable[[np.ndarray], float]) -> dict[str, float]:
+    """``value`` of a statistic of row indices, and its 95 % interval ``low`` to ``high`` by a bootstrap.
 
-    Args:
-        groups: (M,) group of each row.
-        statistic: draws for which it is NaN are left out.
-        draws: resamples.
-        seed: of the resampling.
+    Groups (M,) of rows, such as episodes, are resampled. Draws for which the statistic is NaN are left out.
     """
-    rng, count = np.random.default_rng(seed), len(groups)
+    rng = np.random.default_rng(0)
     order = np.argsort(groups, kind="stable")
-    rows = np.split(order, np.flatnonzero(np.diff(np.asarray(groups)[order])) + 1)
-    values = np.array(
-        [
-            statistic(np.concatenate([rows[i] for i in rng.integers(len(rows), size=len(rows))]))
-            for _ in range(draws)
-        ]
-    )
+    rows = np.split(order, np.flatnonzero(np.diff(groups[order])) + 1)
+    draws = (rng.integers(len(rows), size=len(rows)) for _ in range(DRAWS))
+    values = np.array([statistic(np.concatenate([rows[i] for i in drawn])) for drawn in draws])
     values = values[~np.isnan(values)]
     # The nearest draw, since between two infinite ones there is nothing to interpolate.
     low, high = np.quantile(values, [0.025, 0.975], method="nearest") if len(values) else (np.nan, np.nan)
-    return Estimate(statistic(np.arange(count)), float(low), float(high))
+    return {"value": statistic(np.arange(len(groups))), "low": float(low), "high": float(high)}
 
 
 def changed(before: np.ndarray, after: np.ndarray) -> np.ndarray:
@@ -79,7 +59,7 @@ def mean_error(sums: np.ndarray) -> float:
     return float(total / count) if count else float("nan")
 
 
-def skill(model: np.ndarray, copy: np.ndarray, groups: np.ndarray) -> Estimate:
+def skill(model: np.ndarray, copy: np.ndarray, groups: np.ndarray) -> dict[str, float]:
     """1 − MSE(model)/MSE(copy), from `squared_errors` of both (M, 2)."""
 
     def of(rows: np.ndarray) -> float:
@@ -89,7 +69,7 @@ def skill(model: np.ndarray, copy: np.ndarray, groups: np.ndarray) -> Estimate:
     return bootstrap(groups, of)
 
 
-def sensitivity(true: np.ndarray, other: np.ndarray, groups: np.ndarray) -> Estimate:
+def sensitivity(true: np.ndarray, other: np.ndarray, groups: np.ndarray) -> dict[str, float]:
     """MSE(other actions)/MSE(true actions), from `squared_errors` of both (M, 2); of two exact ones 1."""
 
     def of(rows: np.ndarray) -> float:
@@ -101,134 +81,25 @@ def sensitivity(true: np.ndarray, other: np.ndarray, groups: np.ndarray) -> Esti
     return bootstrap(groups, of)
 
 
-def ranks(x: np.ndarray) -> np.ndarray:
-    """Ranks from 1 to M; ties have their mean rank."""
-    _, places, counts = np.unique(x, return_inverse=True, return_counts=True)
-    mean_ranks: np.ndarray = (np.cumsum(counts) - (counts - 1) / 2)[places]
-    return mean_ranks
-
-
 def auroc(scores: np.ndarray, labels: np.ndarray) -> float:
     """Chance that a success scores above a failure, ties counting half; NaN without both."""
-    scores, labels = np.asarray(scores, np.float64), np.asarray(labels, bool)
-    good, bad = int(labels.sum()), int((~labels).sum())
-    if not good or not bad:
+    difference = scores[labels][:, None] - scores[~labels]
+    if not difference.size:
         return float("nan")
-    return float((ranks(scores)[labels].sum() - good * (good + 1) / 2) / (good * bad))
-
-
-def auroc_estimate(scores: np.ndarray, labels: np.ndarray, groups: np.ndarray) -> Estimate:
-    """`auroc` with its interval; NaN without both kinds."""
-    if len(np.unique(labels)) < 2:
-        return Estimate(float("nan"), float("nan"), float("nan"))
-    return bootstrap(groups, lambda rows: auroc(scores[rows], labels[rows]))
+    return float(((difference > 0) + 0.5 * (difference == 0)).mean())
 
 
 def threshold_at(failures: np.ndarray, false_positives: float) -> float:
-    """The lowest threshold that at most this share, in [0, 1), of the failures' scores (M,) reaches.
-
-    Raises:
-        ValueError: there is no failure.
-    """
-    if not len(failures):
-        raise ValueError("no failures to choose a threshold on")
-    falling = np.sort(np.asarray(failures, np.float64))[::-1]
+    """The lowest threshold that at most this share, in [0, 1), of the failures' scores (M ≥ 1,) reaches."""
+    falling = np.sort(failures.astype(np.float64))[::-1]
     return float(np.nextafter(falling[int(np.floor(false_positives * len(falling)))], np.inf))
 
 
-def shuffle_across_groups(count: int, groups: Sequence[object], rng: np.random.Generator) -> np.ndarray:
-    """For each window the index of another one, from another group (its episode) where there is one."""
-    windows = np.arange(count)
-    chosen = np.empty(count, np.int64)
-    of = np.array([hash(g) for g in groups])
-    for i in range(count):
-        others = windows[of != of[i]]
-        chosen[i] = rng.choice(others if len(others) else np.flatnonzero(windows != i))
+def shuffle_across_groups(groups: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """For each row the index of another one, from another group (its episode) where there is one."""
+    rows = np.arange(len(groups))
+    chosen = np.empty_like(rows)
+    for i in rows:
+        others = rows[groups != groups[i]]
+        chosen[i] = rng.choice(others if len(others) else rows[rows != i])
     return chosen
-
-
-def per_dataset(result: dict[str, Any]) -> list[dict[str, Any]]:
-    """Results on each dataset, the first of them first."""
-    return [result, *(result.get("datasets") or {}).values()]
-
-
-def has_several(result: dict[str, Any]) -> bool:
-    """True if there are results on more than one dataset."""
-    return bool(result.get("datasets"))
-
-
-def dataset_rows(results: Sequence[dict[str, Any]]) -> list[tuple[str, list[str]]]:
-    """Rows of a table with a column per dataset: a name, and a text for each of them."""
-    rows = [("episodes", [str((one.get("tried") or {}).get("episodes", "")) for one in results])]
-    rows += [("checks that hold", [_holding(one["checks"]) for one in results])]
-    ends = [one.get("outcomes") or {} for one in results]
-    for name, depth, key in (
-        ("skill, changed pixels, first chunk", 0, "skill_changed"),
-        ("last chunk", -1, "skill_changed"),
-        ("sensitivity, other actions", 0, "sensitivity_shuffled"),
-    ):
-        rows.append((name, [estimate((one["depths"] or [{}])[depth].get(key)) for one in results]))
-    rows.append(("successes, failures", [_counts(o) for o in ends]))
-    rows.append(("AUROC of imagined outcomes", [estimate(o.get("auroc")) for o in ends]))
-    for name, key in (("false success", "false_success"), ("recall", "recall")):
-        rows.append((name, [number(o.get(key), 2) for o in ends]))
-    return [(name, cells) for name, cells in rows if any(cells)]
-
-
-def _holding(checks: dict[str, Any]) -> str:
-    """Counts the checks of one dataset, which have no dataset in their name."""
-    checks = {name: check for name, check in checks.items() if "." not in name}
-    return f"{sum(check['holds'] for check in checks.values())} of {len(checks)}"
-
-
-def _counts(outcomes: dict[str, Any]) -> str:
-    return f"{outcomes['successes']}, {outcomes['failures']}" if outcomes else ""
-
-
-def number(value: float | None, digits: int) -> str:
-    """Formats a number; empty for None and NaN."""
-    return "" if value is None or math.isnan(value) else f"{value:.{digits}f}"
-
-
-def estimate(value: dict[str, float] | None) -> str:
-    """Formats a number with its interval; empty for None and NaN."""
-    if value is None or math.isnan(value["value"]):
-        return ""
-    return f"{value['value']:.2f} [{value['low']:.2f}, {value['high']:.2f}]"
-
-
-def depth_table(result: dict[str, Any]) -> Table:
-    """A row per depth."""
-    shown = Table(title=f"{result['windows']} windows: {'passed' if result['passed'] else 'FAILED'}")
-    for column in ("depth", "windows", "skill, changed pixels", "sensitivity", "PSNR"):
-        shown.add_column(column, justify="right")
-    for row in result["depths"]:
-        shown.add_row(
-            str(row["depth"]),
-            str(row["windows"]),
-            estimate(row.get("skill_changed")),
-            estimate(row.get("sensitivity_shuffled")),
-            number(row.get("psnr"), 1),
-        )
-    return shown
-
-
-def datasets_table(result: dict[str, Any]) -> Table:
-    """A column per dataset."""
-    shown = Table(title="By dataset")
-    shown.add_column("")
-    results = per_dataset(result)
-    for one in results:
-        shown.add_column(str(one["name"]), justify="right")
-    for name, cells in dataset_rows(results):
-        shown.add_row(name, *cells)
-    return shown
-
-
-def check_lines(result: dict[str, Any]) -> list[str]:
-    """Each check in a line."""
-    return [
-        f"{'holds' if check['holds'] else 'FAILS'}  {name} = {number(check['value'], 2) or 'unknown'}, "
-        f"{check['wanted']} wanted"
-        for name, check in result["checks"].items()
-    ]

@@ -13,23 +13,25 @@ import contextlib
 import copy
 import time
 from collections import OrderedDict, deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from accerl_lerobot.experience import REAL, Segment
-from accerl_lerobot.world_model.config import ImaginationConfig, LearnConfig, SuccessLearnConfig
-from accerl_lerobot.world_model.contract import LearnableWorldModel, WorldModelSpec
-from accerl_lerobot.world_model.data import Episode, WindowStart, executed_actions, model_arrays
-from accerl_lerobot.world_model.learners import Examples, Learner, SuccessLearner
-from accerl_lerobot.world_model.rollout_eval import (
-    Scores,
-    choose_threshold,
-    concatenate,
-    score_episodes,
+from accerl_lerobot.world_model.config import (
+    LearnConfig,
+    OnlineLearnConfig,
+    SuccessLearnConfig,
+    WorldModelConfig,
 )
+from accerl_lerobot.world_model.contract import LearnableWorldModel, WorldModelSpec
+from accerl_lerobot.world_model.data import Episode, WindowStart, model_arrays
+from accerl_lerobot.world_model.learners import Examples, Learner, SuccessLearner
+from accerl_lerobot.world_model.rollout_eval import Scores, choose_threshold, score_episodes
+from accerl_lerobot.world_model.store import HELD_OUT, LEARNT
 from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
 from accerl_lerobot.world_model.validation import fit_uncertainty_scale, validate
 
@@ -40,6 +42,8 @@ OFFLINE, RECENT, FAILURES = 0.5, 0.7, 0.6
 those, from failures."""
 MEMORY = 400
 """Real episodes kept for training."""
+MOST_UNFINISHED = 1024
+"""Incomplete episodes; of more the oldest are dropped, such as those of a worker that died."""
 FINAL_VALIDATIONS = 5
 """Validations after the last real episode, at most."""
 MAX_VALIDATION_S = 3600.0
@@ -57,7 +61,8 @@ def episode_from_segments(segments: Sequence[Segment], spec: WorldModelSpec) -> 
         np.concatenate([part[i][:-1] for part in arrays[:-1]] + [arrays[-1][i]]) for i in range(2)
     )
     steps = np.concatenate([segment.steps for segment in segments])
-    actions = executed_actions(np.concatenate([segment.actions for segment in segments]), steps)
+    chunks = np.concatenate([segment.actions for segment in segments])
+    actions = chunks[np.arange(chunks.shape[1]) < steps[:, None]]
     return Episode(
         frames=frames,
         times=np.concatenate([[0], np.cumsum(steps)]).astype(np.int64),
@@ -65,35 +70,8 @@ def episode_from_segments(segments: Sequence[Segment], spec: WorldModelSpec) -> 
         actions=actions,
         success_at=len(actions) - 1 if segments[-1].success else -1,
         task=segments[-1].task,
-        source="online",
+        own=True,
     )
-
-
-class UnfinishedEpisodes:
-    """Segments of episodes that are incomplete so far; the oldest of more than `most` are dropped, such as
-    those of a worker that died."""
-
-    def __init__(self, most: int = 1024) -> None:
-        self._most = most
-        self.parts: OrderedDict[tuple[str, int], dict[int, Segment]] = OrderedDict()
-
-    def add(self, segment: Segment) -> list[Segment] | None:
-        """The whole episode, in order, if it is complete with this segment."""
-        name = segment.origin[:2]
-        parts = self.parts.setdefault(name, {})
-        parts[segment.origin.decision] = segment
-        if len(self.parts) > self._most:
-            self.parts.popitem(last=False)
-        ordered = [parts[at] for at in sorted(parts)]
-        expected = 0
-        for part in ordered:
-            if part.origin.decision != expected:
-                return None
-            expected += len(part)
-        if not (ordered[-1].terminated or ordered[-1].truncated):
-            return None
-        self.parts.pop(name, None)
-        return ordered
 
 
 class Promotion(NamedTuple):
@@ -103,15 +81,8 @@ class Promotion(NamedTuple):
     success: SuccessPairsRewardModel
     version: int
     """Gradient steps in the run."""
-    result: dict[str, Any]
-    """See `validate`."""
-
-
-class PretrainingEpisodes(NamedTuple):
-    """Episodes that the world model was trained on before the run, and those that were held out."""
-
-    learnt: list[Episode]
-    held_out: list[Episode]
+    roles: dict[str, str]
+    """Roles of episodes, by their keys, see `store`."""
 
 
 class OnlineLearner:
@@ -124,36 +95,42 @@ class OnlineLearner:
         >>> if learner.validation_due(last=False) and (promotion := learner.promote(last=False)):
         ...     imagination.swap(promotion)
 
-    It starts at a copy of both models. A rollout has `longest` chunks at most.
+    It starts at a copy of both models, and knows episodes to train on and held-out ones, and the `roles` of
+    those it was trained and validated on before. A rollout has `longest` chunks at most.
     """
 
     def __init__(
         self,
         model: LearnableWorldModel,
         success: SuccessPairsRewardModel,
-        config: ImaginationConfig,
-        pretraining: PretrainingEpisodes | None = None,
+        config: OnlineLearnConfig,
+        offline: Sequence[Episode] = (),
+        held_offline: Sequence[Episode] = (),
+        roles: Mapping[str, str] | None = None,
         longest: int = 15,
         seed: int = 0,
     ) -> None:
-        self.config = config.learn
-        validation = self.config.validation
-        self.validation = replace(validation, depth=min(validation.depth, longest))
+        self.config, self._seed = config, seed
+        self.validation = replace(config.validation, depth=min(config.validation.depth, longest))
         self.pending_steps = 0.0
         """Gradient steps that are due."""
         self.promoted = self.rejected = 0
-        self._seed = seed
         self.result: dict[str, Any] = {}
         """Result of the last validation."""
-        learn = LearnConfig(steps=ENDLESS, batch=BATCH, lr=LEARNING_RATE, anchors=longest)
-        self._learner = Learner(_trainable(model), learn, seed)
-        success_learn = SuccessLearnConfig(steps=ENDLESS, lr=LEARNING_RATE, depth=longest)
-        self._success = SuccessLearner(_trainable(success), success_learn, seed)
-        self._offline, self._held_offline = pretraining or PretrainingEpisodes([], [])
+        training = WorldModelConfig(
+            learn=LearnConfig(steps=ENDLESS, batch=BATCH, lr=LEARNING_RATE),
+            success=SuccessLearnConfig(lr=LEARNING_RATE),
+            longest=longest,
+        )
+        self._learner = Learner(_trainable(model), training, seed)
+        self._success = SuccessLearner(_trainable(success), training, seed)
+        self._offline, self._held_offline = list(offline), list(held_offline)
+        self._roles = {key: LEARNT if role == LEARNT else HELD_OUT for key, role in (roles or {}).items()}
+        self._roles |= {episode.key: LEARNT for episode in self._offline}
         self._learnt: deque[Episode] = deque(maxlen=MEMORY)
-        self._held: deque[Episode] = deque(maxlen=max(1, round(MEMORY * self.config.held_out)))
+        self._held: deque[Episode] = deque(maxlen=max(1, round(MEMORY * config.held_out)))
         self._rng = np.random.default_rng((seed, 4))
-        self._unfinished = UnfinishedEpisodes()
+        self._unfinished: OrderedDict[tuple[str, int], dict[int, Segment]] = OrderedDict()
         self._examples: Examples | None = None
         self._examples_stale = True
         self._ended = self._since = self._final_validations = 0
@@ -181,28 +158,37 @@ class OnlineLearner:
         return not last or self.pending_steps >= 1 or self.validation_due(last)
 
     def add(self, segment: Segment) -> None:
-        """Takes a real segment; some of the episodes that it completes are held out.
-
-        Raises:
-            ValueError: it was imagined: a world model must not train on its own predictions.
-        """
+        """Takes a real segment; some of the episodes that it completes are held out."""
         if segment.source != REAL:
             raise ValueError(f"a world model trains on real segments, and {segment.key} is {segment.source}")
-        parts = self._unfinished.add(segment)
-        if parts is None:
-            return
+        parts = self._completed(segment)
+        if parts is None or (parts[-1].success and not parts[-1].terminated):
+            return  # incomplete, or the step of its success is unknown
         episode = episode_from_segments(parts, self._learner.model.spec)
-        if parts[-1].success and not parts[-1].terminated:
-            return  # the step of its success is unknown
-        share = self.config.held_out
-        before, self._ended = self._ended, self._ended + 1
-        held = int(self._ended * share) > int(before * share)
+        share, self._ended = self.config.held_out, self._ended + 1
+        held = int(self._ended * share) > int((self._ended - 1) * share)
         (self._held if held else self._learnt).append(episode)
+        self._roles[episode.key] = HELD_OUT if held else LEARNT
         self._examples, self._examples_stale = None, True
         self._since += 1
         # Bounded, where episodes come faster than it can train.
         most = max(1.0, self.config.validate_every * self.config.steps_per_episode)
         self.pending_steps = min(self.pending_steps + self.config.steps_per_episode, most)
+
+    def _completed(self, segment: Segment) -> list[Segment] | None:
+        """The whole episode, in order, if it is complete with this segment."""
+        name = segment.origin[:2]
+        parts = self._unfinished.setdefault(name, {})
+        parts[segment.origin.decision] = segment
+        if len(self._unfinished) > MOST_UNFINISHED:
+            self._unfinished.popitem(last=False)
+        begun = sorted(parts)
+        ordered = [parts[decision] for decision in begun]
+        ends = list(accumulate(map(len, ordered)))
+        if begun != [0, *ends[:-1]] or not (ordered[-1].terminated or ordered[-1].truncated):
+            return None
+        self._unfinished.pop(name, None)
+        return ordered
 
     def step(self) -> dict[str, float]:
         """Makes one gradient step of either model, if there are episodes."""
@@ -223,75 +209,67 @@ class OnlineLearner:
     def promote(self, last: bool) -> Promotion | None:
         """Validates a copy of the present model; None if it fails, and the one before stays in use.
 
-        If it fails when `last`, more gradient steps become due all the same.
+        If it fails when `last`, more gradient steps become due, for `FINAL_VALIDATIONS` times at most.
         """
         self._validating = time.monotonic()
+        self._unserved = {name: getattr(self, name) for name in _COUNTS}
+        self._since = 0
+        self._final_validations += last
         try:
-            return self._promote(last)
+            promotion = self._validated()
         finally:
             self._validating = None
+        if promotion is None:
+            if last and self.result and self._final_validations < FINAL_VALIDATIONS:
+                self.pending_steps += self.config.validate_every * self.config.steps_per_episode
+            self._unserved = {}
+        return promotion
 
     def mark_served(self) -> None:
         """Notes that the last promoted model is in use."""
         self._unserved = {}
 
-    def _promote(self, last: bool) -> Promotion | None:
-        self._unserved = {name: getattr(self, name) for name in _COUNTS}
-        self._since = 0
-        self._final_validations += last
-        held = [*self._held_offline, *self._held]
-        if not held:
-            self._unserved = {}
+    def _validated(self) -> Promotion | None:
+        if not (held := [*self._held_offline, *self._held]):
             return None
         model = copy.deepcopy(self._learner.serving)
         success = copy.deepcopy(self._success.model).eval().requires_grad_(False)
         known = [*self._offline, *self._learnt][-100:]
         fit_uncertainty_scale(model, known, self.validation, self._seed)
+        parts: list[Scores] = []
+
+        def choose_also_on(episodes: list[Episode]) -> None:
+            if not episodes:
+                return
+            parts.append(score_episodes(model, success, episodes, self.validation, self._seed))
+            scores = Scores(*map(np.concatenate, zip(*parts, strict=True)))
+            # Without a failure among them it stays.
+            success.config.threshold = choose_threshold(scores, self.validation) or success.config.threshold
+
         # A dozen held-out episodes are too few to choose a threshold. It is chosen on training episodes,
         # validated on the others, and chosen again on both for use.
-        learnt = self._scores(model, success, list(self._learnt)[-self.validation.max_windows :])
-        self._set_threshold(success, learnt)
-        result = self.result = validate(model, held, self.validation, success, self._seed)
-        if not result["passed"]:
+        choose_also_on(list(self._learnt)[-self.validation.max_windows :])
+        threshold = success.config.threshold
+        self.result = validate(model, held, self.validation, success, self._seed, threshold)
+        if not self.result["passed"]:
             self.rejected += 1
-            if last and self._final_validations < FINAL_VALIDATIONS:
-                self.pending_steps += self.config.validate_every * self.config.steps_per_episode
-            self._unserved = {}
             return None
         self.promoted += 1
-        self._set_threshold(success, learnt + self._scores(model, success, list(self._held)))
-        return Promotion(model.cpu(), success.cpu(), self.version, result)
-
-    def _scores(
-        self, model: LearnableWorldModel, success: SuccessPairsRewardModel, episodes: list[Episode]
-    ) -> list[Scores]:
-        return [score_episodes(model, success, episodes, self.validation, self._seed)] if episodes else []
-
-    def _set_threshold(self, success: SuccessPairsRewardModel, parts: list[Scores]) -> None:
-        """Chooses it on the policy's own episodes; without a failure among them it stays."""
-        if parts:
-            scores = concatenate(*parts)
-            chosen = choose_threshold(scores, np.ones(len(scores.achieved), bool), self.validation)
-            success.config.threshold = chosen or success.config.threshold
+        choose_also_on(list(self._held))
+        return Promotion(model.cpu(), success.cpu(), self.version, dict(self._roles))
 
     def state(self) -> dict[str, Any]:
-        """Copies all that `restore` needs; see `snapshot`.
-
-        A validation that is in progress, or whose outcome has not been served, will be repeated.
-        """
-        unfinished = {name: dict(parts) for name, parts in self._unfinished.parts.items()}
-        return (
-            {name: getattr(self, name) for name in _COUNTS}
-            | self._unserved
-            | {
-                "learner": self._learner.state(),
-                "success": self._success.state(),
-                "learnt": list(self._learnt),
-                "held": list(self._held),
-                "rng": copy.deepcopy(self._rng),
-                "unfinished": unfinished,
-            }
-        )
+        """Copies all that `restore` needs. A validation whose outcome has not been served is repeated."""
+        counts = {name: getattr(self, name) for name in _COUNTS} | self._unserved
+        return counts | {
+            "learner": self._learner.state(),
+            "success": self._success.state(),
+            "learnt": list(self._learnt),
+            "held": list(self._held),
+            "roles": dict(self._roles),
+            "rng": copy.deepcopy(self._rng),
+            "unfinished": {name: dict(parts) for name, parts in self._unfinished.items()},
+        }
 
     def restore(self, state: dict[str, Any]) -> None:
         """Continues from a `state`."""
@@ -301,8 +279,9 @@ class OnlineLearner:
         self._success.restore(state["success"])
         self._learnt.extend(state["learnt"])
         self._held.extend(state["held"])
+        self._roles = state["roles"]
         self._rng = state["rng"]
-        self._unfinished.parts.update(state["unfinished"])
+        self._unfinished.update(state["unfinished"])
 
     def metrics(self) -> dict[str, float]:
         """Counts of training and validations, and the checks of the last one."""
@@ -318,13 +297,12 @@ class OnlineLearner:
 
     def _draw(self) -> list[WindowStart]:
         """Draws a batch from the pre-training episodes, which have the first indices, and the policy's."""
-        count, known = BATCH, len(self._offline)
-        share = OFFLINE if self._learnt else 1.0
-        offline = round(share * count) if known else 0
+        known = len(self._offline)
+        offline = (round(OFFLINE * BATCH) if self._learnt else BATCH) if known else 0
         chosen = self._rng.integers(known, size=offline).tolist() if offline else []
-        if count > offline:
+        if offline < BATCH:
             weights = episode_weights([e.success for e in self._learnt])
-            chosen += (known + self._rng.choice(len(weights), size=count - offline, p=weights)).tolist()
+            chosen += (known + self._rng.choice(len(weights), size=BATCH - offline, p=weights)).tolist()
         episodes = self._offline + list(self._learnt)
         return [WindowStart(e, int(self._rng.integers(len(episodes[e].frames) - 1))) for e in chosen]
 

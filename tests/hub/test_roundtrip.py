@@ -173,22 +173,16 @@ def test_a_dataset_is_one_that_lerobot_finds(hub: HubServer, tmp_path: Path):
 
 def test_world_models_and_success_models(hub: HubServer, tmp_path: Path):
     from accerl_lerobot.world_model.learners import new_success_model
-    from accerl_lerobot.world_model.store import (
-        Source,
-        load_sources,
-        load_world_model,
-        save_world_model,
-    )
+    from accerl_lerobot.world_model.store import load_roles, load_world_model, save_world_model
     from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
 
-    source = Source(repo_id="a/b", fingerprint="f", learnt=(0, 2), held_out=(1,))
-    world, success = model(), new_success_model(5)
-    save_world_model(tmp_path / "world_model", world, success, [source])
+    world, success, roles = model(), new_success_model(5), {"a": "learnt", "b": "held out"}
+    save_world_model(tmp_path / "world_model", world, success, roles)
     accerl("push", f"--path={tmp_path / 'world_model'}", "--repo_id=alice/world")
     accerl("push", f"--path={tmp_path / 'world_model' / 'success_model'}", "--repo_id=alice/success")
     accerl("pull", "--repo_id=alice/world", f"--output_dir={tmp_path / 'pulled'}")
     came, judge = load_world_model(tmp_path / "pulled")
-    assert load_sources(tmp_path / "pulled") == (source,) and came.spec == world.spec and judge is not None
+    assert load_roles(tmp_path / "pulled") == roles and came.spec == world.spec
     for first, second in ((world, came), (success, judge)):
         assert all(torch.equal(value, second.state_dict()[key]) for key, value in first.state_dict().items())
     alone = SuccessPairsRewardModel.from_pretrained("alice/success", strict=True)

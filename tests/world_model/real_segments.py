@@ -22,7 +22,6 @@ SPEC = WorldModelSpec(
     chunk=K,
     context=2,
     fps=80,
-    provides=frozenset({"pixels", "state"}),
 )
 
 

@@ -15,15 +15,16 @@ from accerl_lerobot.demos.record import DemosConfig, record_demos
 from accerl_lerobot.engine.config import DatasetConfig
 from accerl_lerobot.envs import SimulatedConfig, make_world
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.world_model import data as module
 from accerl_lerobot.world_model.contract import WorldModelSpec
 from accerl_lerobot.world_model.data import (
     Episode,
+    Windows,
     WindowStart,
     check_metadata,
     cut_windows,
     hold_last_action,
-    load_episodes,
+    load_datasets,
+    open_datasets,
     split_episodes,
     window_starts,
 )
@@ -43,8 +44,13 @@ def an_episode(steps: int = 8, *, every: int = 1, success_at: int = -1, last: bo
         actions=np.stack([np.arange(steps), -np.arange(steps)], 1).astype(np.float32),
         success_at=success_at,
         task="go",
-        source="demo",
+        own=False,
     )
+
+
+def cut(episodes: list[Episode], at: list[WindowStart], context: int, chunks: int, **options: Any) -> Windows:
+    spec = replace(SPEC, chunk=K, context=context)
+    return cut_windows(episodes, at, spec, chunks, **options)
 
 
 def shown(frames: np.ndarray) -> list[int]:
@@ -52,7 +58,7 @@ def shown(frames: np.ndarray) -> list[int]:
 
 
 def test_a_window_inside_an_episode():
-    windows = cut_windows([an_episode(20)], [WindowStart(0, 7)], chunk=K, context=3, chunks=2)
+    windows = cut([an_episode(20)], [WindowStart(0, 7)], 3, 2)
     assert shown(windows.frames[0]) == [1, 4, 7, 10, 13] and shown(windows.anchor) == [7]
     assert windows.state[0, :, 0].tolist() == [1, 4, 7, 10, 13] and windows.context == 3
     assert windows.before[0, :, :, 0].tolist() == [[1, 2, 3], [4, 5, 6]]
@@ -62,9 +68,7 @@ def test_a_window_inside_an_episode():
 
 
 def test_context_and_anchor_stop_at_the_first_frame():
-    windows = cut_windows(
-        [an_episode(20)], [WindowStart(0, 4)] * 3, chunk=K, context=3, chunks=1, anchors=[0, 1, 5]
-    )
+    windows = cut([an_episode(20)], [WindowStart(0, 4)] * 3, 3, 1, anchors=[0, 1, 5])
     assert shown(windows.frames[0]) == [0, 1, 4, 7]
     assert windows.before[0, :, :, 1].tolist() == [[0, 0, 0], [-1, -2, -3]]
     assert shown(windows.anchor) == [4, 1, 0]
@@ -72,7 +76,7 @@ def test_context_and_anchor_stop_at_the_first_frame():
 
 def test_an_episode_that_ends_within_a_chunk():
     """Demonstrations have no frame after the last step: frames 0 to 7, actions 0 to 7."""
-    windows = cut_windows([an_episode(8, success_at=7)], [WindowStart(0, 3)], chunk=K, context=1, chunks=3)
+    windows = cut([an_episode(8, success_at=7)], [WindowStart(0, 3)], 1, 3)
     assert shown(windows.frames[0]) == [3, 6, 7, 7]
     assert windows.steps.tolist() == [[3, 1, 0]] and windows.valid.tolist() == [[True, True, False]]
     assert windows.actions[0, :, :, 0].tolist() == [[3, 4, 5], [6, 0, 0], [0, 0, 0]]
@@ -80,7 +84,7 @@ def test_an_episode_that_ends_within_a_chunk():
 
 
 def test_chunks_are_made_whole_by_holding_the_last_action():
-    windows = cut_windows([an_episode(8, success_at=7)], [WindowStart(0, 3)], chunk=K, context=1, chunks=3)
+    windows = cut([an_episode(8, success_at=7)], [WindowStart(0, 3)], 1, 3)
     whole = hold_last_action(windows.actions, windows.steps)
     assert whole[0, :, :, 0].tolist() == [[3, 4, 5], [6, 6, 6], [6, 6, 6]]
     assert whole[0, :, :, 1].tolist() == [[-3, -4, -5], [-6, -6, -6], [-6, -6, -6]]
@@ -98,7 +102,7 @@ def test_frames_that_show_the_task_achieved():
 def test_an_episode_that_was_looked_at_when_decisions_were_due():
     episode = an_episode(8, every=K, success_at=7, last=True)
     assert episode.times.tolist() == [0, 3, 6, 8]
-    windows = cut_windows([episode], [WindowStart(0, 0), WindowStart(0, 2)], chunk=K, context=2, chunks=3)
+    windows = cut([episode], [WindowStart(0, 0), WindowStart(0, 2)], 2, 3)
     assert shown(windows.frames[0]) == [0, 0, 3, 6, 8] and windows.steps[0].tolist() == [3, 3, 2]
     assert windows.success[0].tolist() == [False, False, True] and windows.valid[0].all()
     assert shown(windows.frames[1]) == [3, 6, 8, 8, 8] and windows.valid[1].tolist() == [True, False, False]
@@ -108,11 +112,9 @@ def test_windows_of_one_batch_are_those_cut_alone():
     episodes = [an_episode(9, success_at=4), an_episode(15), an_episode(7, every=K, last=True)]
     at = window_starts(episodes)
     assert len(at) == 8 + 14 + 3 and at[8] == WindowStart(1, 0)
-    together = cut_windows(
-        episodes, at, chunk=K, context=2, chunks=2, anchors=[i % 3 for i in range(len(at))]
-    )
+    together = cut(episodes, at, 2, 2, anchors=[i % 3 for i in range(len(at))])
     for i, place in enumerate(at):
-        alone = cut_windows(episodes, [place], chunk=K, context=2, chunks=2, anchors=[i % 3])
+        alone = cut(episodes, [place], 2, 2, anchors=[i % 3])
         for name in ("frames", "anchor", "state", "actions", "steps", "success", "valid"):
             assert np.array_equal(getattr(together, name)[i], getattr(alone, name)[0]), name
     assert together.valid[:, 0].all(), "something follows every place"
@@ -120,20 +122,18 @@ def test_windows_of_one_batch_are_those_cut_alone():
 
 def test_every_success_is_in_exactly_one_chunk_of_a_chain():
     for at in range(8):
-        windows = cut_windows(
-            [an_episode(8, success_at=at)], [WindowStart(0, 0)], chunk=K, context=1, chunks=3
-        )
+        windows = cut([an_episode(8, success_at=at)], [WindowStart(0, 0)], 1, 3)
         assert windows.success.sum() == 1 and windows.success[0, at // K]
 
 
 def test_a_split_has_every_outcome_on_both_sides():
     episodes = [an_episode(success_at=3 if i % 4 == 0 else -1) for i in range(20)]
     learn, held = split_episodes(episodes, 0.25, np.random.default_rng(0))
-    assert sorted(learn + held) == list(range(20)) and len(held) == 1 + 4
+    assert {*map(id, learn + held)} == {*map(id, episodes)} and len(held) == 1 + 4
     for part in (learn, held):
-        assert {episodes[i].success for i in part} == {True, False}
-    assert split_episodes(episodes, 0.25, np.random.default_rng(0)) == (learn, held)
-    assert split_episodes(episodes, 0.25, np.random.default_rng(1)) != (learn, held)
+        assert {episode.success for episode in part} == {True, False}
+    again, other = (split_episodes(episodes, 0.25, np.random.default_rng(seed))[0] for seed in (0, 1))
+    assert [*map(id, again)] == [*map(id, learn)] != [*map(id, other)]
 
 
 @pytest.mark.parametrize("share", [0.01, 0.99])
@@ -143,27 +143,6 @@ def test_no_part_of_a_split_is_empty(share: float):
     assert len(learn) == len(held) == 2
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"times": np.array([0, 2, 2])},
-        {"times": np.array([1, 2, 3])},
-        {"times": np.array([0, 4, 9])},
-        {"times": np.array([0, 1])},
-        {"success_at": 8},
-        {"state": np.zeros((2, 1), np.float32)},
-        {"actions": np.zeros((0, 2), np.float32)},
-    ],
-)
-def test_arrays_that_do_not_fit(changes: dict[str, object]):
-    fields = vars(an_episode(8, every=3)) | changes
-    with pytest.raises(ValueError, match="frames|times|success"):
-        Episode(**fields)
-
-
-TINY = DatasetConfig(
-    repo_id="accerl/metaworld_tiny", root=str(Path(__file__).parents[2] / "datasets" / "metaworld_tiny")
-)
 SPEC = WorldModelSpec(
     cameras=("observation.images.corner2",),
     image_size=(64, 64),
@@ -172,7 +151,6 @@ SPEC = WorldModelSpec(
     chunk=10,
     context=2,
     fps=80,
-    provides=frozenset({"pixels", "state"}),
 )
 
 
@@ -191,16 +169,20 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[DatasetConfig, W
     return DatasetConfig(repo_id="a/b", root=str(root)), spec
 
 
+def load(dataset: DatasetConfig, spec: WorldModelSpec, own: str | None = None) -> list[Episode]:
+    return load_datasets({"dataset": dataset}, spec, own)["dataset"]
+
+
 def test_every_frame_and_action_is_the_dataset_s(recorded: tuple[DatasetConfig, WorldModelSpec]):
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     dataset, spec = recorded
-    episodes = load_episodes(dataset, spec)
+    episodes = load(dataset, spec, own="dataset")
     data = LeRobotDataset(dataset.repo_id, root=dataset.root)
     assert len(episodes) == data.meta.total_episodes == 6 and sum(map(len, episodes)) == len(data)
     index = 0
     for episode in episodes:
-        assert episode.source == "demo" and episode.task in data.meta.tasks.index
+        assert episode.own and episode.task in data.meta.tasks.index
         found = -1
         for t in range(len(episode)):
             item = data[index + t]
@@ -213,12 +195,13 @@ def test_every_frame_and_action_is_the_dataset_s(recorded: tuple[DatasetConfig, 
         assert episode.success_at == found
         index += len(episode)
     assert {e.success for e in episodes} == {True, False}
+    assert len({e.key for e in episodes}) == 6, "by which they are known in any dataset"
 
 
 def test_images_are_brought_to_size(recorded: tuple[DatasetConfig, WorldModelSpec]):
     dataset, spec = recorded
-    episodes = load_episodes(dataset, replace(spec, image_size=(8, 24)))
-    for small, full in zip(episodes, load_episodes(dataset, spec), strict=True):
+    episodes = load(dataset, replace(spec, image_size=(8, 24)))
+    for small, full in zip(episodes, load(dataset, spec), strict=True):
         assert small.frames.shape == (len(full), 1, 8, 24, 3) and small.frames.dtype == np.uint8
         assert abs(small.frames.mean() - full.frames.mean()) < 2
 
@@ -241,7 +224,7 @@ def metadata(**changes: Any) -> SimpleNamespace:
     [
         (
             {"shapes": {"observation.images.corner2": None, "observation.images.top": (64, 64, 3)}},
-            "no observation.images.corner2: the dataset has observation.images.top; choose env.camera",
+            "no 'observation.images.corner2': the dataset has observation.images.top; choose env.camera",
         ),
         ({"shapes": {"action": (7,)}}, r"action has shape \(7,\), the world's has \(4,\): it is another"),
         ({"shapes": {"observation.state": None}}, "observation.state has shape None, the world's has"),
@@ -260,31 +243,12 @@ def test_a_world_without_a_state_does_not_ask_for_one():
     check_metadata(metadata(shapes={"observation.state": None}), "a/b", replace(SPEC, state_dim=0))
 
 
-def test_only_successes():
-    with pytest.raises(InputError, match="no failure among 4 episodes; add failures, see demos"):
-        load_episodes(TINY, SPEC)
-    assert len(load_episodes(TINY, SPEC, both=False)) == 4
-
-
-def test_only_failures(recorded: tuple[DatasetConfig, WorldModelSpec], monkeypatch: pytest.MonkeyPatch):
-    real = module._episode
-    monkeypatch.setattr(module, "_episode", lambda *args: replace(real(*args), success_at=-1))
-    with pytest.raises(InputError, match="no success among 6 episodes; add episodes that succeed"):
-        load_episodes(*recorded)
-
-
-def test_what_is_not_a_number(
-    recorded: tuple[DatasetConfig, WorldModelSpec], monkeypatch: pytest.MonkeyPatch
-):
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-    real = LeRobotDataset.__getitem__
-
-    def broken(self: Any, index: int) -> Any:
-        item = real(self, index)
-        item["action"] = item["action"] * (np.nan if index == 3 else 1)
-        return item
-
-    monkeypatch.setattr(LeRobotDataset, "__getitem__", broken)
-    with pytest.raises(InputError, match="episode 0 has a NaN state or action"):
-        load_episodes(*recorded)
+def test_datasets_that_share_episodes(recorded: tuple[DatasetConfig, WorldModelSpec], tmp_path: Path):
+    dataset, spec = recorded
+    with pytest.raises(InputError, match="^online.repo_id='a/b': it is the one in dataset; name another"):
+        open_datasets({"dataset": dataset, "online": dataset}, spec)
+    same = replace(dataset, repo_id="c/d")
+    with pytest.raises(InputError, match="^online.repo_id='c/d': 6 of its episodes are in the other"):
+        load_datasets({"dataset": dataset, "online": same}, spec)
+    with pytest.raises(InputError, match="^online.root='nowhere': no meta/info.json there"):
+        load_datasets({"dataset": dataset, "online": replace(dataset, root="nowhere")}, spec)

@@ -9,7 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot.world_model.config import LearnConfig, PixelModelConfig, SuccessLearnConfig
+from accerl_lerobot.world_model.config import (
+    LearnConfig,
+    PixelModelConfig,
+    SuccessLearnConfig,
+    WorldModelConfig,
+)
 from accerl_lerobot.world_model.data import Episode, Windows
 from accerl_lerobot.world_model.learners import (
     Examples,
@@ -19,10 +24,10 @@ from accerl_lerobot.world_model.learners import (
 )
 from accerl_lerobot.world_model.metrics import skill, squared_errors
 from accerl_lerobot.world_model.pixels import PixelWorldModel
-from tests.world_model.test_pixels import NETWORK, SIZE, SPEC, K, dots, rollout, windows
+from tests.world_model.test_pixels import CHANNELS, SIZE, SPEC, K, dots, rollout, windows
 from tests.world_model.test_validate import Deterministic, with_successes
 
-SUCCESS_CONFIG = SuccessLearnConfig(batch=8, episodes=4, depth=2, refresh_every=3)
+CONFIG = WorldModelConfig(success=SuccessLearnConfig(batch=8), longest=2)
 
 
 def examples(seed: int) -> Examples:
@@ -31,7 +36,7 @@ def examples(seed: int) -> Examples:
 
 def new() -> SuccessLearner:
     torch.manual_seed(0)
-    return SuccessLearner(new_success_model(K), SUCCESS_CONFIG, seed=0)
+    return SuccessLearner(new_success_model(K), CONFIG, seed=0)
 
 
 def test_a_model_that_diverges_is_an_error_and_stays_as_it_was():
@@ -82,7 +87,7 @@ def seen_twice(episodes: list[Episode], seed: int) -> tuple[list[Episode], list[
 
 def two_cameras(seed: int = 0) -> PixelWorldModel:
     torch.manual_seed(seed)
-    return PixelWorldModel(TWO, PixelModelConfig(network=NETWORK))
+    return PixelWorldModel(TWO, PixelModelConfig(channels=CHANNELS))
 
 
 def swapped(of: Windows) -> Windows:
@@ -101,7 +106,7 @@ def test_frames_go_in_and_come_out_in_the_order_of_the_cameras():
 
 @pytest.fixture(scope="module")
 def learnt() -> PixelWorldModel:
-    config = LearnConfig(steps=200, batch=16, lr=2e-3, warmup=10, anchors=3)
+    config = WorldModelConfig(learn=LearnConfig(steps=200, batch=16, lr=2e-3), longest=3)
     return train_from_scratch(two_cameras(), seen_twice(dots(60), 1)[0], config, seed=0).serving
 
 
@@ -112,7 +117,7 @@ def skills(frames: np.ndarray, wanted: np.ndarray, newest: np.ndarray, of: Windo
             squared_errors(frames[:, v : v + 1], wanted[:, v : v + 1]),
             squared_errors(newest[:, v : v + 1], wanted[:, v : v + 1]),
             of.episode,
-        ).value
+        )["value"]
         for v in range(2)
     ]
 

@@ -8,7 +8,6 @@ import pytest
 
 from accerl_lerobot.world_model.metrics import (
     auroc,
-    auroc_estimate,
     bootstrap,
     changed,
     mean_error,
@@ -51,28 +50,27 @@ def test_errors_are_sums_over_counted_pixels():
 def test_skill_and_sensitivity_by_hand():
     wanted, of = frames(100, 100), np.arange(2)
     model, copy = squared_errors(frames(98, 96), wanted), squared_errors(frames(90, 110), wanted)
-    assert skill(model, copy, of).value == pytest.approx(1 - 10 / 100)
-    assert sensitivity(model, copy, of).value == pytest.approx(100 / 10)
-    assert skill(copy, copy, of)[:] == pytest.approx((0, 0, 0))
-    assert sensitivity(copy, copy, of)[:] == pytest.approx((1, 1, 1))
+    assert skill(model, copy, of)["value"] == pytest.approx(1 - 10 / 100)
+    assert sensitivity(model, copy, of)["value"] == pytest.approx(100 / 10)
+    assert [*skill(copy, copy, of).values()] == pytest.approx([0, 0, 0])
+    assert [*sensitivity(copy, copy, of).values()] == pytest.approx([1, 1, 1])
     exact = squared_errors(wanted, wanted)
-    assert sensitivity(exact, copy, of) == (np.inf,) * 3 and sensitivity(exact, exact, of) == (1, 1, 1)
+    assert {*sensitivity(exact, copy, of).values()} == {np.inf}
+    assert {*sensitivity(exact, exact, of).values()} == {1.0}
 
 
 def test_the_interval_narrows_with_windows_and_holds_the_value():
     rng = np.random.default_rng(0)
-
-    def of(count: int) -> tuple[float, float, float]:
+    widths = []
+    for count in (10, 1000):
         wanted = rng.integers(60, 200, (count, 1, 4, 4, 3)).astype(np.uint8)
         off = rng.integers(-4, 5, wanted.shape) * rng.integers(1, 5, (count, 1, 1, 1, 1))
         near = (wanted + off).astype(np.uint8)
         far = (wanted + rng.integers(-20, 21, wanted.shape)).astype(np.uint8)
-        return skill(squared_errors(near, wanted), squared_errors(far, wanted), np.arange(count))
-
-    few, many = of(10), of(1000)
-    for value, low, high in (few, many):
-        assert low <= value <= high
-    assert many[2] - many[1] < 0.3 * (few[2] - few[1])
+        made = skill(squared_errors(near, wanted), squared_errors(far, wanted), np.arange(count))
+        assert made["low"] <= made["value"] <= made["high"]
+        widths.append(made["high"] - made["low"])
+    assert widths[1] < 0.3 * widths[0]
 
 
 def test_windows_of_one_episode_are_drawn_together():
@@ -84,14 +82,16 @@ def test_windows_of_one_episode_are_drawn_together():
     grouped = bootstrap(groups, lambda rows: float(copies[rows].mean()))
     assert grouped == pytest.approx(ten)
     alone = bootstrap(np.arange(1000), lambda rows: float(copies[rows].mean()))
-    assert alone.high - alone.low < 0.2 * (ten.high - ten.low)
+    assert alone["high"] - alone["low"] < 0.2 * (ten["high"] - ten["low"])
 
 
 def test_a_statistic_that_is_not_always_there():
     labels = np.array([True] + [False] * 9)
-    estimate = auroc_estimate(np.arange(10.0), labels, np.arange(10))
-    assert estimate.value == 0.0 and estimate.low == 0.0 <= estimate.high
-    assert all(np.isnan(auroc_estimate(np.arange(3.0), np.zeros(3, bool), np.arange(3))))
+    scores = np.arange(10.0)
+    estimate = bootstrap(np.arange(10), lambda rows: auroc(scores[rows], labels[rows]))
+    assert estimate["value"] == 0.0 and estimate["low"] == 0.0 <= estimate["high"]
+    never = bootstrap(np.arange(10), lambda rows: auroc(scores[rows], np.zeros(len(rows), bool)))
+    assert all(np.isnan(value) for value in never.values())
 
 
 def test_auroc_is_the_share_of_pairs_in_order():
@@ -112,14 +112,9 @@ def test_a_threshold_lets_at_most_so_many_failures_pass(share: float, accepted: 
     assert (scores[~labels] >= np.nextafter(at, -np.inf)).sum() > share * 10, "no lower one would do"
 
 
-def test_a_threshold_without_failures():
-    with pytest.raises(ValueError, match="no failures"):
-        threshold_at(np.ones(0), 0.02)
-
-
 def test_shuffled_actions_are_another_episode_s():
-    groups = [i // 4 for i in range(20)]
-    chosen = shuffle_across_groups(20, groups, np.random.default_rng(0))
-    assert all(groups[i] != groups[j] for i, j in enumerate(chosen))
-    alone = shuffle_across_groups(5, [0] * 5, np.random.default_rng(0))
+    groups = np.arange(20) // 4
+    chosen = shuffle_across_groups(groups, np.random.default_rng(0))
+    assert (groups != groups[chosen]).all()
+    alone = shuffle_across_groups(np.zeros(5, int), np.random.default_rng(0))
     assert all(i != j for i, j in enumerate(alone))

@@ -7,24 +7,21 @@ import pytest
 import torch
 from torch import Tensor
 
-from accerl_lerobot.world_model.config import NetworkConfig
 from accerl_lerobot.world_model.pixels import Attention, FrameNetwork
 from tests.rounding import assert_close
 
-SMALL = NetworkConfig(channels=(8, 12), condition=16, planes=4)
 
-
-def network(config: NetworkConfig = SMALL, state: int = 3) -> FrameNetwork:
+def network(*channels: int) -> FrameNetwork:
     torch.manual_seed(0)
-    return FrameNetwork(image=3, frames=6, action=8, state=state, config=config)
+    return FrameNetwork(image=3, frames=6, action=8, state=3, channels=channels or (8, 12))
 
 
-def inputs(seed: int = 0, size: int = 16, state: int = 3) -> dict[str, Tensor]:
+def inputs(seed: int = 0, size: int = 16) -> dict[str, Tensor]:
     g = torch.Generator().manual_seed(seed)
     return {
         "frames": torch.randn(2, 6, size, size, generator=g),
         "chunk": torch.randn(2, 8, generator=g),
-        "state": torch.randn(2, state, generator=g),
+        "state": torch.randn(2, 3, generator=g),
     }
 
 
@@ -67,18 +64,10 @@ def test_rows_of_a_batch_do_not_meet():
     assert_close(alone, together[1:])
 
 
-@pytest.mark.parametrize(
-    "config",
-    [
-        NetworkConfig(space_to_depth=2, channels=(8, 8, 12), blocks=2, condition=16, planes=0),
-        NetworkConfig(space_to_depth=1, channels=(7,), condition=16),
-        NetworkConfig(channels=(10, 14), condition=16),
-    ],
-    ids=["deep", "flat", "odd widths"],
-)
-def test_other_sizes(config: NetworkConfig):
-    side = 2 * config.multiple
-    image = awake(network(config))(**inputs(size=side))
+@pytest.mark.parametrize("channels", [(8, 8, 12), (7,), (10, 14)], ids=["deep", "flat", "odd widths"])
+def test_other_sizes(channels: tuple[int, ...]):
+    side = 8 * 2 ** (len(channels) - 1)
+    image = awake(network(*channels))(**inputs(size=side))
     assert image.shape == (2, 3, side, side) and torch.isfinite(image).all()
 
 

@@ -14,8 +14,6 @@ from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.experience import IMAGINED, Segment
 from accerl_lerobot.world_model import online
 from accerl_lerobot.world_model.config import (
-    ImaginationConfig,
-    NetworkConfig,
     OnlineLearnConfig,
     PixelModelConfig,
     ValidationConfig,
@@ -24,8 +22,6 @@ from accerl_lerobot.world_model.data import model_arrays
 from accerl_lerobot.world_model.learners import new_success_model
 from accerl_lerobot.world_model.online import (
     OnlineLearner,
-    PretrainingEpisodes,
-    UnfinishedEpisodes,
     episode_from_segments,
     episode_weights,
 )
@@ -33,18 +29,15 @@ from accerl_lerobot.world_model.pixels import PixelWorldModel
 from tests.runs import adjusted
 from tests.world_model.real_segments import SPEC, K, real_episode
 
-NETWORK = NetworkConfig(space_to_depth=2, channels=(8, 8), condition=8, planes=2)
-
 
 def learner(**config: Any) -> OnlineLearner:
     torch.manual_seed(0)
-    known = PretrainingEpisodes(config.pop("offline", []), config.pop("held_out_offline", []))
+    known = (config.pop("offline", []), config.pop("held_out_offline", []))
     fields: dict[str, Any] = {"steps_per_episode": 2.0, "validate_every": 4, "held_out": 0.25}
     fields |= {"validation": ValidationConfig(depth=2)} | config
     learn = adjusted(OnlineLearnConfig, **fields)(steps_per_episode=fields.pop("steps_per_episode"))
-    model = PixelWorldModel(SPEC, PixelModelConfig(network=NETWORK))
-    imagination = ImaginationConfig(learn=learn)
-    made = OnlineLearner(model, new_success_model(K), imagination, known, seed=0)
+    model = PixelWorldModel(SPEC, PixelModelConfig(channels=(8, 8)))
+    made = OnlineLearner(model, new_success_model(K), learn, *known, seed=0)
     made.given = model  # type: ignore[attr-defined]
     return made
 
@@ -64,7 +57,7 @@ def test_a_segment_is_a_stretch_of_experience():
         len(episode) == 13 and episode.success_at == 12 and episode.achieved.tolist() == [False] * 4 + [True]
     )
     failure = episode_from_segments(real_episode(1), SPEC)
-    assert not failure.success and failure.source == "online"
+    assert not failure.success and failure.own
 
 
 def test_some_episodes_are_held_out_and_steps_are_pending_for_all():
@@ -110,11 +103,13 @@ def test_less_than_a_step_in_a_validation_s_time_is_made_later():
     assert made.pending_steps == pytest.approx(1.0)
 
 
-def test_what_never_ends_is_forgotten():
-    unfinished = UnfinishedEpisodes(most=2)
+def test_what_never_ends_is_forgotten(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(online, "MOST_UNFINISHED", 2)
+    made = learner()
     first, second, third = (real_episode(seed, length=2) for seed in (1, 2, 3))
-    assert unfinished.add(first[0]) is unfinished.add(second[0]) is unfinished.add(third[0]) is None
-    assert unfinished.add(first[1]) is None and unfinished.add(third[1]) == third
+    for segment in (first[0], second[0], third[0], first[1], third[1]):
+        made.add(segment)
+    assert len(made._learnt) == 1, "the third"
 
 
 def test_it_learns_from_real_windows_and_leaves_what_serves_alone():
@@ -160,12 +155,12 @@ def test_new_and_failed_episodes_are_drawn_more_often():
     assert episode_weights([True]).tolist() == [1]
 
 
-def passes(monkeypatch: pytest.MonkeyPatch, *outcomes: bool) -> list[list[str]]:
-    """Trials end so; gives the sources of the episodes they are on."""
+def passes(monkeypatch: pytest.MonkeyPatch, *outcomes: bool) -> list[list[bool]]:
+    """Trials end so; returns which episodes of each are the policy's own."""
     results, tried = list(outcomes), []
 
     def trial(model: Any, held: Any, *rest: Any) -> dict[str, Any]:
-        tried.append([e.source for e in held])
+        tried.append([e.own for e in held])
         return {"passed": results.pop(0), "checks": {"auroc": {"value": 0.5}}}
 
     monkeypatch.setattr(online, "validate", trial)
@@ -173,7 +168,7 @@ def passes(monkeypatch: pytest.MonkeyPatch, *outcomes: bool) -> list[list[str]]:
 
 
 def test_what_passes_is_promoted_and_what_does_not_is_not(monkeypatch: pytest.MonkeyPatch):
-    demo = [replace(episode_from_segments([s], SPEC), source="demo") for s in episodes(True)]
+    demo = [replace(episode_from_segments([s], SPEC), own=False) for s in episodes(True)]
     made = learner(held_out_offline=demo)
     tried = passes(monkeypatch, False, True)
     assert not made.validation_due(last=False)
@@ -190,7 +185,7 @@ def test_what_passes_is_promoted_and_what_does_not_is_not(monkeypatch: pytest.Mo
             assert promotion is not None and promotion.version == made.version == 16
             assert not any(p.requires_grad for p in promotion.model.parameters())
             assert not promotion.success.training
-    assert tried == [["demo", "online"], ["demo", "online", "online"]]
+    assert tried == [[False, True], [False, True, True]]
     assert made.metrics()["check_auroc"] == 0.5 and made.metrics()["promoted"] == 1
     assert made.pending_steps == 0
 

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot.errors import InputError
-from accerl_lerobot.world_model.config import LearnConfig, NetworkConfig, PixelModelConfig
-from accerl_lerobot.world_model.contract import Prediction, WorldModelSpec
+from accerl_lerobot.world_model.config import LearnConfig, PixelModelConfig, WorldModelConfig
+from accerl_lerobot.world_model.contract import Prediction, WorldModelSpec, context_of
 from accerl_lerobot.world_model.data import Episode, Windows, cut_windows, window_starts
 from accerl_lerobot.world_model.learners import Learner, train_from_scratch
 from accerl_lerobot.world_model.metrics import (
@@ -22,7 +21,6 @@ from accerl_lerobot.world_model.metrics import (
     squared_errors,
 )
 from accerl_lerobot.world_model.pixels import PixelWorldModel
-from accerl_lerobot.world_model.rollout_eval import context_of
 from tests.rounding import assert_close
 
 SIZE, K = 16, 2
@@ -34,9 +32,8 @@ SPEC = WorldModelSpec(
     chunk=K,
     context=2,
     fps=80,
-    provides=frozenset({"pixels", "state", "uncertainty"}),
 )
-NETWORK = NetworkConfig(space_to_depth=2, channels=(24, 32), condition=48, planes=6)
+CHANNELS = (24, 32)
 
 
 def dots(count: int, steps: int = 12, seed: int = 0) -> list[Episode]:
@@ -63,7 +60,7 @@ def dots(count: int, steps: int = 12, seed: int = 0) -> list[Episode]:
                 actions=np.stack(actions),
                 success_at=-1,
                 task="go",
-                source="demo",
+                own=False,
             )
         )
     return made
@@ -71,12 +68,12 @@ def dots(count: int, steps: int = 12, seed: int = 0) -> list[Episode]:
 
 def model(**options: object) -> PixelWorldModel:
     torch.manual_seed(0)
-    return PixelWorldModel(SPEC, PixelModelConfig(network=NETWORK, **options))  # type: ignore[arg-type]
+    return PixelWorldModel(SPEC, PixelModelConfig(channels=CHANNELS, **options))  # type: ignore[arg-type]
 
 
 def windows(episodes: list[Episode], chunks: int = 3) -> Windows:
     at = [p for p in window_starts(episodes) if p.frame + K * chunks < len(episodes[p.episode].frames)]
-    return cut_windows(episodes, at, chunk=K, context=2, chunks=chunks)
+    return cut_windows(episodes, at, SPEC, chunks)
 
 
 def rollout(
@@ -134,14 +131,14 @@ def test_a_state_is_not_changed_by_going_on_from_it():
 def test_a_picture_that_is_no_number_is_uncertain(monkeypatch: pytest.MonkeyPatch):
     of = windows(dots(1))
     made = awake(model())
-    state, sample = made.begin(context_of(of), of.task), made._image
+    state, change = made.begin(context_of(of), of.task), made._change
 
     def broken(*given: object) -> torch.Tensor:
-        image = sample(*given)  # type: ignore[arg-type]
+        image = change(*given)  # type: ignore[arg-type]
         image[1, 0, 2, 2] = torch.nan
         return image
 
-    monkeypatch.setattr(made, "_image", broken)
+    monkeypatch.setattr(made, "_change", broken)
     doubt = made.step(state, torch.from_numpy(of.actions[:, 0]), range(len(of))).uncertainty
     assert doubt[1] == torch.inf and torch.isfinite(doubt).sum() == len(of) - 1
 
@@ -162,8 +159,8 @@ def test_actions_that_are_not_executed_do_not_matter():
 
 def test_what_is_not_valid_is_not_learnt():
     of = windows(dots(2))
-    valid = of.valid.copy()
-    valid[1:] = False
+    steps = of.steps.copy()
+    steps[1:] = 0
     frames = of.frames.copy()
     frames[1:, 2:] = 0
     made = awake(model())
@@ -171,8 +168,8 @@ def test_what_is_not_valid_is_not_learnt():
     def loss(of: Windows) -> float:
         return float(made.loss(of, torch.Generator().manual_seed(0))[0])
 
-    one = loss(replace(of, valid=valid))
-    assert one == loss(replace(of, valid=valid, frames=frames)) != loss(replace(of, frames=frames))
+    one = loss(replace(of, steps=steps))
+    assert one == loss(replace(of, steps=steps, frames=frames)) != loss(replace(of, frames=frames))
 
 
 def test_statistics_by_hand():
@@ -217,8 +214,9 @@ def test_the_loss_reaches_every_weight():
 
 
 def trained(shuffle: bool = False, **options: object) -> Learner:
-    config = LearnConfig(steps=250, batch=16, lr=2e-3, warmup=10, anchors=3)
-    return train_from_scratch(model(**options), dots(60), config, seed=0, shuffle=shuffle)
+    learn = LearnConfig(steps=250, batch=16, lr=2e-3)
+    config = WorldModelConfig(learn=learn, longest=3, shuffle_actions=shuffle)
+    return train_from_scratch(model(**options), dots(60), config, seed=0)
 
 
 @pytest.fixture(scope="module")
@@ -233,10 +231,10 @@ def scores(learner: Learner, depth: int = 0) -> tuple[float, float]:
     wanted = of.frames[:, 2 + depth]
     with torch.no_grad():
         true = squared_errors(rollout(learner.serving, of)[depth].frames.numpy(), wanted)
-        rows = shuffle_across_groups(len(of), range(len(of)), np.random.default_rng(0))
+        rows = shuffle_across_groups(np.arange(len(of)), np.random.default_rng(0))
         other = squared_errors(rollout(learner.serving, of, of.actions[rows])[depth].frames.numpy(), wanted)
     copy = squared_errors(of.frames[:, 1], wanted)
-    return skill(true, copy, of.episode).value, sensitivity(true, other, of.episode).low
+    return skill(true, copy, of.episode)["value"], sensitivity(true, other, of.episode)["low"]
 
 
 def test_it_learns_where_the_dot_goes(learnt: Learner):
@@ -261,14 +259,14 @@ def test_a_model_of_shuffled_actions_ignores_them():
 
 def test_a_model_that_diverges_is_an_error():
     episodes = dots(3)
-    learner = Learner(model(), LearnConfig(), seed=0)
+    learner = Learner(model(), WorldModelConfig(), seed=0)
     of = learner.draw(episodes, window_starts(episodes))
     with pytest.raises(FloatingPointError, match="not finite at step 1"):
         learner.step(replace(of, state=of.state * np.nan))
 
 
 def test_the_same_seed_learns_the_same():
-    config = LearnConfig(steps=3, batch=4, anchors=2)
+    config = WorldModelConfig(learn=LearnConfig(steps=3, batch=4), longest=2)
     weights = [
         train_from_scratch(model(), dots(4), config, seed).serving.state_dict()["network.leave.2.weight"]
         for seed in (0, 0, 1)
@@ -281,8 +279,3 @@ def test_the_weights_that_serve_follow_those_that_learn(learnt: Learner):
     assert all(torch.equal(now[k], mean[k]) for k in now if "." not in k), "statistics"
     far = mean_error(np.array([[float((now[k] - mean[k]).square().sum()), now[k].numel()] for k in now]))
     assert 0 < far < 1e-3
-
-
-def test_sizes_that_do_not_fit():
-    with pytest.raises(InputError, match=r"world_model.image_size=\(18, 16\): use .* multiples of 4, or"):
-        PixelWorldModel(replace(SPEC, image_size=(18, 16)), PixelModelConfig(network=NETWORK))

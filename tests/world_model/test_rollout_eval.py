@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot.world_model import learners, rollout_eval
 from accerl_lerobot.world_model.config import ValidationConfig
 from accerl_lerobot.world_model.data import Episode, WindowStart
-from accerl_lerobot.world_model.learners import Examples, ImaginedPairs
+from accerl_lerobot.world_model.learners import Examples, draw_pairs, imagine_pairs
 from accerl_lerobot.world_model.rollout_eval import (
     Scores,
     choose_threshold,
     outcome_metrics,
     score_episodes,
-    spaced_frames,
     subsample,
 )
 from tests.world_model.test_pixels import SIZE, K, dots
@@ -40,24 +38,21 @@ def ending_on_the_right(count: int) -> list[Episode]:
     return made
 
 
-def on_the_right(model: object, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Judgement of a perfect success model on the dot."""
-    x = (after[:, 0, :, :, 0] > 200).any(1).argmax(1)
-    said: np.ndarray = 0.1 + 0.8 * (x > SIZE / 2 + 0.5)
-    return said
+class OnTheRight:
+    """A perfect success model of the dot."""
+
+    def probabilities(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+        x = (after[:, 0, :, :, 0] > 200).any(1).argmax(1)
+        classified: np.ndarray = 0.1 + 0.8 * (x > SIZE / 2 + 0.5)
+        return classified
 
 
-@pytest.fixture(autouse=True)
-def perfect(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (rollout_eval, learners):
-        monkeypatch.setattr(module, "probabilities", on_the_right)
+PERFECT: Any = OnTheRight()
 
 
 def found(model: str, **options: Any) -> Scores:
     episodes = ending_on_the_right(60)
-    return score_episodes(
-        Deterministic(model), SimpleNamespace(), episodes, replace(CONFIG, **options), seed=0
-    )  # type: ignore[arg-type]
+    return score_episodes(Deterministic(model), PERFECT, episodes, replace(CONFIG, **options), seed=0)
 
 
 def test_an_exact_world_ends_as_reality_did():
@@ -65,8 +60,6 @@ def test_an_exact_world_ends_as_reality_did():
     assert 10 < ended.achieved.sum() < len(ended.achieved) - 10
     counts = np.unique(ended.episode, return_counts=True)[1]
     assert set(counts) == {1, 2} and (counts == 2).mean() > 0.8, "from the beginning, and from later on"
-    assert ended.real[~ended.achieved] == pytest.approx(0.1)
-    assert ended.real[ended.achieved] == pytest.approx(0.9)
     # A chunk that is held at its last action may go further than the episode did.
     assert ((ended.imagined > 0.5) == ended.achieved).mean() > 0.9
     assert ended.idle == pytest.approx(0.1), "nobody gets there by doing nothing"
@@ -75,13 +68,8 @@ def test_an_exact_world_ends_as_reality_did():
 def test_where_nothing_moves_nothing_succeeds():
     still = found("copy")
     assert still.achieved.any() and still.imagined == pytest.approx(0.1)
-    result = outcome_metrics(still, np.zeros(len(still.achieved), bool), CONFIG)
+    result = outcome_metrics(still, CONFIG)
     assert result["auroc"]["value"] == 0.5 and result["recall"] == 0 == result["false_success"]
-
-
-def test_frames_are_spaced():
-    assert spaced_frames(np.array([0, 1, 4, 6, 7, 9]), 3) == [0, 2, 4]
-    assert len(found("exact", max_windows=20).achieved) == 20
 
 
 def test_what_follows_a_success_is_no_failure():
@@ -90,7 +78,7 @@ def test_what_follows_a_success_is_no_failure():
     assert (after.starts, episode.starts, replace(episode, success_at=39).starts) == (20, 39, 39)
     model: Any = Deterministic("exact")
     for seed in range(20):
-        assert score_episodes(model, SimpleNamespace(), [after], CONFIG, seed).achieved.all()  # type: ignore[arg-type]
+        assert score_episodes(model, PERFECT, [after], CONFIG, seed).achieved.all()
     chunks = Examples([after, episode], K).chunks(400, np.random.default_rng(0))
     assert max(p.frame for p in chunks if p.episode == 0) == 19
 
@@ -104,62 +92,52 @@ def test_who_does_nothing_has_as_much_time_as_anybody():
 
     episodes = ending_on_the_right(60)
     model: Any = Drifting("exact")
-    still = score_episodes(model, SimpleNamespace(), episodes, CONFIG, seed=0)  # type: ignore[arg-type]
+    still = score_episodes(model, PERFECT, episodes, CONFIG, seed=0)
     short = np.array([len(episodes[e]) < 10 for e in still.episode])
     assert short.sum() > 5 and (still.idle[short] > 0.5).mean() > 0.8
 
 
-def made(imagined: list[float], achieved: list[int]) -> Scores:
+def made(imagined: list[float], achieved: list[int], own: Sequence[int] = ()) -> Scores:
     count = len(imagined)
     return Scores(
-        imagined=np.array(imagined), idle=np.zeros(count), real=np.array(achieved, float),
-        achieved=np.array(achieved, bool), episode=np.arange(count),
+        imagined=np.array(imagined), idle=np.zeros(count),
+        achieved=np.array(achieved, bool), episode=np.arange(count), own=np.isin(np.arange(count), own),
     )  # fmt: skip
 
 
 def test_the_threshold_lets_few_failures_through_those_of_the_policy_first():
-    of = made([0.95, 0.9, 0.6, 0.2, 0.92], [0, 0, 0, 0, 1])
-    nobody, theirs = np.zeros(5, bool), np.array([False, False, True, True, True])
-    assert (
-        choose_threshold(of, nobody, CONFIG) == pytest.approx(0.95)
-        and choose_threshold(of, nobody, CONFIG) > 0.95
-    )
-    quarter = ValidationConfig(false_positives=0.25)
-    assert choose_threshold(of, nobody, quarter) == pytest.approx(0.9)
-    assert choose_threshold(of, theirs, CONFIG) == pytest.approx(0.6)
-    assert choose_threshold(made([0.3, 0.2, 0.92], [0, 0, 1]), np.zeros(3, bool), CONFIG) == 0.5, (
-        "never below one half"
-    )
-    assert choose_threshold(made([0.9], [1]), np.ones(1, bool), CONFIG) is None
+    scores = ([0.95, 0.9, 0.6, 0.2, 0.92], [0, 0, 0, 0, 1])
+    chosen = choose_threshold(made(*scores), CONFIG)
+    assert chosen == pytest.approx(0.95) and chosen > 0.95
+    assert choose_threshold(made(*scores), ValidationConfig(false_positives=0.25)) == pytest.approx(0.9)
+    assert choose_threshold(made(*scores, own=[2, 3, 4]), CONFIG) == pytest.approx(0.6)
+    assert choose_threshold(made([0.3, 0.2, 0.92], [0, 0, 1]), CONFIG) == 0.5, "never below one half"
+    assert choose_threshold(made([0.9], [1], own=[0]), CONFIG) is None
 
 
 def test_of_thresholds_that_are_strict_enough_the_one_that_tells_most_is_taken():
     # From 0.6 on three of four successes are told at the price of one failure of five; from 0.9 on only one.
-    of = made([0.55, 0.52, 0.3, 0.2, 0.8, 0.6, 0.7, 0.75, 0.95], [0, 0, 0, 0, 0, 1, 1, 1, 1])
-    nobody = np.zeros(9, bool)
-    loose = ValidationConfig(false_positives=0.4)
-    assert (
-        choose_threshold(of, nobody, loose) == pytest.approx(0.55)
-        and choose_threshold(of, nobody, loose) > 0.55
-    )
-    assert choose_threshold(of, nobody, ValidationConfig(false_positives=0.0)) == pytest.approx(0.8)
+    scores = ([0.55, 0.52, 0.3, 0.2, 0.8, 0.6, 0.7, 0.75, 0.95], [0, 0, 0, 0, 0, 1, 1, 1, 1])
+    chosen = choose_threshold(made(*scores), ValidationConfig(false_positives=0.4))
+    assert chosen == pytest.approx(0.55) and chosen > 0.55
+    assert choose_threshold(made(*scores), CONFIG) == pytest.approx(0.8)
     # The policy's own: its failure is at 0.8, and its successes are above and below.
-    theirs = np.array([0, 0, 0, 0, 1, 0, 0, 1, 1], bool)
-    assert choose_threshold(of, theirs, ValidationConfig(false_positives=0.9)) == pytest.approx(0.8)
+    theirs = made(*scores, own=[4, 7, 8])
+    assert choose_threshold(theirs, ValidationConfig(false_positives=0.9)) == pytest.approx(0.8)
 
 
 def test_what_is_classified_was_not_used_to_set_the_threshold():
     # Folds are i mod 4. Whichever failure is left out, the highest of the others is what it is judged by.
     of = made([0.9, 0.8, 0.7, 0.6, 0.95, 0.85], [0, 0, 0, 0, 1, 1])
-    result = outcome_metrics(of, np.zeros(6, bool), CONFIG)
+    result = outcome_metrics(of, CONFIG)
     assert result["failures"] == 4 and result["successes"] == 2
     assert result["false_success"] == 0.25, "only the highest exceeds all others"
     # Of the successes one is judged without the 0.9 (same fold), by 0.8; the other by 0.9.
     assert result["recall"] == 0.5
-    assert result["auroc"]["value"] == 7 / 8 and result["auroc_real"] == 1
-    given = outcome_metrics(of, np.zeros(6, bool), CONFIG, 0.65)
+    assert result["auroc"]["value"] == 7 / 8
+    given = outcome_metrics(of, CONFIG, 0.65)
     assert given["false_success"] == 0.75 and given["recall"] == 1
-    theirs = outcome_metrics(of, np.array([False, False, True, True, False, False]), CONFIG, 0.65)
+    theirs = outcome_metrics(of._replace(own=np.isin(np.arange(6), [2, 3])), CONFIG, 0.65)
     assert theirs["false_success"] == 0.5 and theirs["failures"] == 2
 
 
@@ -167,20 +145,19 @@ def test_a_success_model_learns_how_rollouts_end():
     """Pairs are of rollouts, the label is what really came of it, and near misses are drawn most."""
     episodes = ending_on_the_right(60)
     examples, rng = Examples(episodes, K), np.random.default_rng(0)
-    imagined = ImaginedPairs.imagine(examples, Deterministic("copy"), SimpleNamespace(), 20, 9, rng)  # type: ignore[arg-type]
-    before, after, achieved, progress = imagined.sample(8, rng)
+    imagined = imagine_pairs(examples, Deterministic("copy"), PERFECT, 20, 9, rng)
+    before, after, achieved, progress = draw_pairs(*imagined, 8, rng)
     assert np.array_equal(before, after), "nothing moves in its rollouts"
     assert achieved.tolist() == [True] * 4 + [False] * 4 and before.shape == (8, 1, SIZE, SIZE, 3)
     assert (progress[:4] == 1).all()
-    exact = ImaginedPairs.imagine(examples, Deterministic("exact"), SimpleNamespace(), 40, 9, rng)  # type: ignore[arg-type]
-    pairs = exact.sample(400, rng)
-    assert on_the_right(None, pairs[0], pairs[1])[pairs[2]].mean() > 0.7
-    hard = exact.weights[~exact.success]
-    assert set(np.round(np.unique(hard), 6)) <= {0.2, 1.0}
+    exact, weights = imagine_pairs(examples, Deterministic("exact"), PERFECT, 40, 9, rng)
+    pairs = draw_pairs(exact, weights, 400, rng)
+    assert PERFECT.probabilities(pairs.before, pairs.after)[pairs.success].mean() > 0.7
+    assert set(np.round(np.unique(weights[~exact.success]), 6)) <= {0.2, 1.0}
 
 
 def test_what_the_policy_itself_has_lived_through_is_tried_first():
-    episodes = [replace(e, source="online" if i in (4, 7) else "earlier") for i, e in enumerate(dots(12))]
+    episodes = [replace(e, own=i in (4, 7)) for i, e in enumerate(dots(12))]
     at = [WindowStart(e, f) for e in range(12) for f in (0, 1)]
     for seed in range(5):
         chosen = subsample(episodes, at, 6, np.random.default_rng(seed))

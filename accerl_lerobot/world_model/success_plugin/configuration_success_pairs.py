@@ -20,31 +20,18 @@ class SuccessPairsConfig(RewardModelConfig):
     """Env steps between the two frames."""
     channels: tuple[int, ...] = (32, 64, 96)
     """Channels of the convolutions, each of which halves the image; the first one does so twice."""
-    hidden: int = 128
-    """Width of the layer behind them."""
-    success_reward: float = 0.5
-    """A ``next.reward`` above it is a success; datasets of ``accerl demos`` give 1."""
     threshold: float = 0.5
     """P above which a frame counts as a success, in [0, 1]."""
-    alone: float = 0.25
-    """Share of pairs, in [0, 1], whose first frame is replaced by the second in training, so that the second
-    frame is judged and not their distance."""
-    noise: float = 0.03
-    """Largest standard deviation of the noise on frames in training, where 1 is white; ≥ 0."""
-    shift: int = 3
-    """Largest shift of the frames in training, in pixels; ≥ 0. Both frames of a pair are shifted alike."""
     learning_rate: float = 1e-3
     weight_decay: float = 1e-2
     grad_clip_norm: float = 1.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, least in (("chunk", 1), ("hidden", 1), ("shift", 0), ("noise", 0)):
-            if getattr(self, name) < least:
-                raise InputError(f"reward_model.{name}", getattr(self, name), f"use at least {least}")
-        for name in ("threshold", "alone"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise InputError(f"reward_model.{name}", getattr(self, name), "use a value in [0, 1]")
+        if self.chunk < 1:
+            raise InputError("reward_model.chunk", self.chunk, "use at least 1")
+        if not 0 <= self.threshold <= 1:
+            raise InputError("reward_model.threshold", self.threshold, "use a value in [0, 1]")
         if not self.channels or min(self.channels) < 1:
             raise InputError("reward_model.channels", self.channels, "name at least one width")
 

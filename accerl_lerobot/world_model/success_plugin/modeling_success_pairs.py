@@ -20,8 +20,18 @@ from torch.nn import functional
 from accerl_lerobot.world_model.success_plugin.configuration_success_pairs import SuccessPairsConfig
 
 IMAGES, REWARD, PAD = "observation.image", "next.reward", "_is_pad"
-GRID = 4
-"""Side of the feature map that is flattened."""
+GRID, HIDDEN = 4, 128
+"""Side of the feature map that is flattened, and width of the layer behind it."""
+BATCH = 64
+"""Pairs that are classified at once."""
+SUCCESS_REWARD = 0.5
+"""A ``next.reward`` above it is a success; datasets of ``accerl demos`` give 1."""
+ALONE = 0.25
+"""Share of pairs whose first frame is replaced by the second in training, so that the second frame is judged
+and not their distance."""
+NOISE, SHIFT = 0.03, 3
+"""Largest standard deviation of the noise on frames in training, where 1 is white, and their largest shift in
+pixels."""
 
 
 class SuccessPairsRewardModel(PreTrainedRewardModel):
@@ -39,8 +49,8 @@ class SuccessPairsRewardModel(PreTrainedRewardModel):
             layers += [nn.Conv2d(into, width, 3, stride=2, padding=1), norm, nn.SiLU()]
             into = width
         self.convolutions = nn.Sequential(*layers)
-        self.hidden = nn.Linear(into * GRID * GRID, config.hidden)
-        self.out = nn.Linear(config.hidden, 2)
+        self.hidden = nn.Linear(into * GRID * GRID, HIDDEN)
+        self.out = nn.Linear(HIDDEN, 2)
 
     def logits(self, before: Tensor, after: Tensor) -> tuple[Tensor, Tensor]:
         """Success and progress, each (B,), from frames (B, V, 3, H, W) in [0, 1]."""
@@ -52,9 +62,17 @@ class SuccessPairsRewardModel(PreTrainedRewardModel):
         return success, progress
 
     @torch.no_grad()
-    def probability(self, before: Tensor, after: Tensor) -> Tensor:
-        """P(success), (B,), of frames (B, V, 3, H, W) in [0, 1]."""
-        return torch.sigmoid(self.logits(before, after)[0])
+    def probabilities(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+        """float32 (M,): P that the second frames show a success; frames uint8 (M, V, H, W, 3)."""
+        parts = [
+            torch.sigmoid(self.logits(*(self.as_floats(x[i : i + BATCH]) for x in (before, after)))[0])
+            for i in range(0, len(before), BATCH)
+        ]
+        return torch.cat(parts).cpu().numpy() if parts else np.zeros(0, np.float32)
+
+    def as_floats(self, frames: np.ndarray) -> Tensor:
+        """uint8 (B, V, H, W, 3) to float (B, V, 3, H, W) in [0, 1]."""
+        return torch.from_numpy(frames).movedim(-1, 2).to(self.out.weight.device).float() / 255
 
     def loss(
         self,
@@ -92,7 +110,7 @@ class SuccessPairsRewardModel(PreTrainedRewardModel):
         before, after = self._frames(batch)
         reward = batch[REWARD]
         pad = batch.get(REWARD + PAD)
-        achieved = reward > self.config.success_reward
+        achieved = reward > SUCCESS_REWARD
         if pad is not None:
             achieved = achieved & ~pad
         return self.loss(before, after, achieved.reshape(len(reward), -1).any(1).float())
@@ -114,38 +132,17 @@ class SuccessPairsRewardModel(PreTrainedRewardModel):
     def _augmented(
         self, before: Tensor, after: Tensor, generator: torch.Generator | None = None
     ) -> tuple[Tensor, Tensor]:
-        b, size = len(before), before.shape[3:]
+        """Shifts, lights and noises both frames of a pair alike."""
+        b, (height, width) = len(before), before.shape[3:]
         both = torch.cat([before, after], 1).flatten(1, 2)
-        shift = self.config.shift
-        if shift:
-            # One shift for a batch is enough: there are many batches.
-            y, x = torch.randint(2 * shift + 1, (2,), generator=generator).tolist()
-            padded = functional.pad(both, (shift,) * 4, mode="replicate")
-            both = padded[:, :, y : y + size[0], x : x + size[1]]
+        # One shift for a batch is enough: there are many batches.
+        y, x = torch.randint(2 * SHIFT + 1, (2,), generator=generator).tolist()
+        padded = functional.pad(both, (SHIFT,) * 4, mode="replicate")
+        both = padded[:, :, y : y + height, x : x + width]
         light = 1 + 0.1 * torch.randn(b, 1, 1, 1, generator=generator)
-        level = self.config.noise * torch.rand(b, 1, 1, 1, generator=generator)
+        level = NOISE * torch.rand(b, 1, 1, 1, generator=generator)
         noise = level * torch.randn(both.shape, generator=generator)
         both = both * light.to(both) + noise.to(both)
         first, second = both.clamp(0, 1).unflatten(1, (-1, 3)).chunk(2, 1)
-        alone = torch.rand(b, 1, 1, 1, 1, generator=generator) < self.config.alone
+        alone = torch.rand(b, 1, 1, 1, 1, generator=generator) < ALONE
         return torch.where(alone.to(both.device), second, first), second
-
-
-# For frames as world models have them.
-
-
-def as_floats(frames: np.ndarray, device: torch.device) -> Tensor:
-    """uint8 (B, V, H, W, 3) to float (B, V, 3, H, W) in [0, 1], the input of a success model."""
-    return torch.from_numpy(frames).movedim(-1, 2).to(device).float() / 255
-
-
-def probabilities(
-    success: SuccessPairsRewardModel, before: np.ndarray, after: np.ndarray, batch: int = 64
-) -> np.ndarray:
-    """float32 (M,): P that the second frames show a success; frames uint8 (M, V, H, W, 3)."""
-    device = success.out.weight.device
-    parts = [
-        success.probability(as_floats(before[i : i + batch], device), as_floats(after[i : i + batch], device))
-        for i in range(0, len(before), batch)
-    ]
-    return torch.cat(parts).cpu().numpy() if parts else np.zeros(0, np.float32)
