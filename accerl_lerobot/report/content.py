@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import datetime
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from accerl_lerobot.console import count, duration, number, percent, rate
 from accerl_lerobot.engine.sizes import lag_limits
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.report.charts import COLOURS, Chart, Series, line, rates
-from accerl_lerobot.report.read import Record, Run, apart, column, differences, newest, resolved
+from accerl_lerobot.report.read import Record, Run, apart, column, differences, newest, resolved, unread
 from accerl_lerobot.timeline import STATES
 from accerl_lerobot.timeline.read import read_timeline
 
@@ -43,6 +43,20 @@ WARNINGS = {
     "replay_dropped_nonfinite": ("segment", "refused by the replay buffer because of a NaN or infinity"),
 }
 """Counter → what is counted, and what happened; a run in which it is 0 needs no warning."""
+
+LATE = 20
+"""Updates at the end over which `WORRIES` are looked at."""
+WORRIES: dict[str, tuple[Callable[[float], bool], str]] = {
+    "low_weight": (
+        lambda x: x > 0.3,
+        "Many samples hardly counted: too stale, or trainer.lr too high",
+    ),
+    "explained_variance": (
+        lambda x: x < -0.05,
+        "The critic explained less of the returns than their mean does",
+    ),
+}
+"""Metric → when it points to a problem, and to which."""
 
 Spec = tuple[str, str, dict[str, str], dict[str, Any]]
 """Title, note, metric → label, and options of a chart."""
@@ -109,10 +123,10 @@ def run_page(run: Run, now: float) -> dict[str, Any]:
     """Values for the template: the page of one run, at `now`, in seconds since 1970."""
     config, why = resolved(run.config)
     bound = None if config is None else lag_limits(config)[0]
-    found = () if config is None else differences(config)
+    found = unread(run.config) if config is None else differences(config)
     rows = [(name, shown(value), shown(default)) for name, value, default in found]
     tables = [("Fields that differ from the defaults", ("field", "value", "default"), rows)] if rows else []
-    text = f"This accerl cannot read the recipe: {why}." if why else ""
+    text = f"This accerl does not know all of the recipe's types or fields: {why}." if why else ""
     videos = [(path, FILM if path.stem == "before_after" else path.name) for path in run.videos]
     success, *others = _training_sections(run, bound)
     sections = [
@@ -181,6 +195,15 @@ def warnings(run: Run, bound: int | None, now: float) -> Iterator[str]:
             yield f"{count(n, thing)} {what}."
     if skipped := int(newest(run.train, "skipped") or 0):
         yield f"{count(skipped, 'update')} skipped, because loss or gradient was not finite."
+    if run.train and newest(run.train, "lr") == np.nanmax([0.0, *column(run.train, "lr")]) == 0:
+        yield "The policy was not changed: its learning rate was 0, as in trainer.value_warmup_updates."
+    if len(run.rollout) and np.nanmax([0.0, *column(run.rollout, "success_exploring")]) == 0:
+        yield "No exploring episode succeeded: there was nothing to learn from, unless rewards say more."
+    late = run.train[-LATE:] if len(run.train) > LATE else []
+    for name, (worse, what) in WORRIES.items():
+        values = column(late, name)
+        if np.isfinite(values).any() and worse(value := float(np.nanmean(values))):
+            yield f"{what} (mean of the last {count(len(late), 'update')}: {number(value, 2)})."
     lag, mismatch = (np.nanmax([0.0, *column(run.train, k)]) for k in ("lag_max", "logprob/mismatch_max"))
     if bound is not None and lag > bound:
         yield f"The lag reached {number(lag)} updates, above the bound of {bound}."

@@ -20,7 +20,7 @@ import numpy as np
 
 from accerl_lerobot.checkpoint.layout import CONFIG, SUMMARY
 from accerl_lerobot.checkpoint.safety import Origin, brief, check_folder
-from accerl_lerobot.config.parsing import TYPE, decode, read_recipe
+from accerl_lerobot.config.parsing import TYPE, decode, encode, read_recipe
 from accerl_lerobot.console import ABSENT
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.errors import InputError
@@ -246,6 +246,14 @@ def apart(trees: list[dict[str, Any]]) -> list[tuple[str, list[Any]]]:
     flats = [flat(tree) for tree in trees]
     rows = {key: [one.get(key, ABSENT) for one in flats] for one in flats for key in one}
     return [(key, row) for key, row in rows.items() if key not in PLACES and any(v != row[0] for v in row)]
+
+
+def unread(tree: dict[str, Any]) -> Iterator[tuple[str, Any, Any]]:
+    """As `differences`, of a recipe that this version cannot read: from the defaults of the usual types."""
+    usual = flat(encode(RunConfig()))
+    for name, value in flat(tree).items():
+        if name not in PLACES and value != usual.get(name, ABSENT):
+            yield name, value, usual.get(name, ABSENT)
 
 
 def resolved(tree: dict[str, Any]) -> tuple[RunConfig | None, str]:

@@ -52,6 +52,7 @@ def write_run(
     n: int = 100,
     finished: bool = True,
     rollout: dict[str, Any] | None = None,
+    train: dict[str, Any] | None = None,
 ) -> Path:
     """A run of ``accerl train`` with an evaluation before, one after, and `n` episodes in each.
 
@@ -63,6 +64,7 @@ def write_run(
         n: episodes of each evaluation.
         finished: whether there is a summary and an evaluation after.
         rollout: further numbers of each record of the workers.
+        train: further numbers of each record of the trainer.
     """
     folder.mkdir(parents=True)
     config = config or run_config()
@@ -71,7 +73,7 @@ def write_run(
     evaluations = [evaluation("before", 0.0, successes[0], n, tasks)]
     lines = [{"kind": "evaluation", "wall_s": 5.0, "update": 0, **evaluations[0]}]
     for update in range(1, updates + 1):
-        lines += [train_record(update), rollout_record(update, n, rollout or {})]
+        lines += [train_record(update) | (train or {}), rollout_record(update, n, rollout or {})]
     if finished:
         evaluations.append(evaluation("after", 100.0 * updates, successes[1], n, tasks))
         lines.append({"kind": "evaluation", "wall_s": 12.0 + updates, "update": updates, **evaluations[1]})

@@ -130,10 +130,23 @@ def test_numbers_of_a_known_run(tmp_path: Path) -> None:
             {"replay_retired_unused": 7.0},
             "7 segments left the replay buffer unused, being older than replay.max_lag",
         ),
+        ({"lr": 0.0}, "The policy was not changed"),
+        ({"success_exploring": 0.0}, "No exploring episode succeeded"),
+        ({"low_weight": 0.4}, "Many samples hardly counted"),
+        ({"explained_variance": -0.2}, "The critic explained less of the returns than their mean does"),
     ],
 )
 def test_what_went_wrong_is_said(tmp_path: Path, numbers: dict[str, float], said: str) -> None:
-    assert said in page_of(write_run(tmp_path / "run", rollout=numbers)).text
+    assert said in page_of(write_run(tmp_path / "run", rollout=numbers, train=numbers)).text
+
+
+def test_a_recipe_with_types_of_another_package_is_compared_with_the_usual_defaults(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run")
+    recipe = (folder / "config.yaml").read_text()
+    (folder / "config.yaml").write_text(recipe.replace("type: gipo", "type: cispo\n  cap: 7.5"))
+    text = page_of(folder).text
+    assert "does not know all of the recipe's types or fields: algorithm.type='cispo'" in text
+    assert "algorithm.type cispo gipo" in text and "algorithm.cap 7.5 –" in text
 
 
 def test_how_workers_spent_their_time_in_the_training(tmp_path: Path) -> None:
