@@ -137,12 +137,10 @@ class WorldModel(ABC):
 
     @abstractmethod
     def step(self, state: State, actions: Tensor, seeds: Sequence[int]) -> Prediction:
-        """Predicts one chunk further.
+        """Predicts one chunk further from a state, which is not modified.
 
-        Args:
-            state: of `begin`, or of the last prediction; not modified.
-            actions: float32 (B, K, A), in the environment's units.
-            seeds: B seeds of the randomness, so that a row does not depend on its batch.
+        Actions are float32 (B, K, A), in the environment's units. All randomness is that of B seeds, so a row
+        does not depend on its batch.
         """
 
 
@@ -166,11 +164,7 @@ class LearnableWorldModel(nn.Module, WorldModel):
 
     @abstractmethod
     def loss(self, windows: Windows, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
-        """Loss of a batch of real windows; all randomness is the generator's.
-
-        Returns:
-            The loss, a scalar, and its parts by their names in metrics.
-        """
+        """Loss of a batch of real windows, a scalar, and metrics; all randomness is the generator's."""
 
 
 def new_model(spec: WorldModelSpec, config: LearnableModelConfig) -> LearnableWorldModel:

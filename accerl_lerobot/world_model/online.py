@@ -86,14 +86,7 @@ class Promotion(NamedTuple):
 
 
 class OnlineLearner:
-    """Trains as real segments come in.
-
-    Example:
-        >>> learner.add(segment)
-        >>> while learner.pending_steps >= 1:
-        ...     learner.step()
-        >>> if learner.validation_due(last=False) and (promotion := learner.promote(last=False)):
-        ...     imagination.swap(promotion)
+    """Trains as real segments come in: `add`, `step` while any is pending, `promote` when validation is due.
 
     It starts at a copy of both models, and knows episodes to train on and held-out ones, and the `roles` of
     those it was trained and validated on before. A rollout has `longest` chunks at most.

@@ -85,11 +85,7 @@ class PixelWorldModel(LearnableWorldModel):
         return self._predict(state, actions, torch.ones_like(actions[..., 0], dtype=torch.bool))
 
     def loss(self, windows: Windows, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
-        """Loss over every valid chunk; after the first, the model's own prediction is its input.
-
-        Returns:
-            The loss, and ``image``, ``state`` and, of chunks after the first, ``image_imagined``.
-        """
+        """Loss over every valid chunk; after the first, the model's own prediction is its input."""
         device = self.change.device
         arrays = (windows.frames, windows.state, windows.actions, windows.steps, windows.valid)
         frames, robot, actions, steps, valid = (torch.from_numpy(array).to(device) for array in arrays)

@@ -221,9 +221,9 @@ def outcome_metrics(
     Where `threshold` is None, that of each fold of the episodes is chosen on the others.
 
     Returns:
-        Numbers of ``rollouts``, ``successes`` and ``failures``; ``auroc``,
-        ``false_success`` (share of failures above the threshold), ``false_success_idle`` (of all, without any
-        action), and ``recall`` (share of successes above it).
+        Numbers of ``rollouts``, ``successes`` and ``failures``; ``auroc``; shares above the threshold:
+        ``false_success`` of failures, ``false_success_idle`` of all without any action, ``recall`` of
+        successes.
     """
     failed = _own(scores, ~scores.achieved)
     thresholds = np.full(len(scores.achieved), 0.5 if threshold is None else threshold)

@@ -5,9 +5,8 @@ From each window some chunks are predicted with the executed actions, and with a
 must be better than a copy of the last frame where something moves, and worse with wrong actions; and whole
 imagined rollouts must end as the real episodes did, see `rollout_eval.py`.
 
-Predictions are of whole chunks. Where an episode ended within one, its last action is held.
-
-Depths are counted in chunks, from 1. Shapes: M windows, D depths; see `data.py` for the others.
+Predictions are of whole chunks: where an episode ended within one, its last action is held. Depths are
+counted in chunks, from 1. Shapes: M windows, D depths; see `data.py` for the others.
 
 <output_dir>/
   validation.json    results

@@ -84,12 +84,8 @@ class SuccessPairsRewardModel(PreTrainedRewardModel):
     ) -> tuple[Tensor, dict[str, float]]:
         """Cross-entropy in which successes and failures of the batch weigh the same, on augmented frames.
 
-        Args:
-            before: (B, V, 3, H, W) in [0, 1].
-            after: the same, a chunk later.
-            success: (B,) 0 or 1.
-            progress: (B,) in [0, 1], NaN where it is not known; None: nowhere.
-            generator: of the augmentation, on the CPU; None: torch's own.
+        Frames are (B, V, 3, H, W) in [0, 1], success (B,) 0 or 1, progress (B,) in [0, 1] or NaN. The
+        generator is that of the augmentation, on the CPU.
         """
         if self.training:
             before, after = self._augmented(before, after, generator)
