@@ -219,7 +219,7 @@ def test_a_saved_model_predicts_the_same(tmp_path: Path):
         ("success", "config.json: is missing"),
         ("weights", "model.safetensors: not safetensors"),
         ("size", "not a world model of accerl world-model"),
-        ("chunk", "config.json: spec.chunk=0: use a whole number in \[1, "),
+        ("chunk", r"config.json: spec.chunk=0: use a whole number in \[1, "),
         ("nan", "model.safetensors: uncertainty_scale holds NaN or infinity; train it again"),
     ],
 )
