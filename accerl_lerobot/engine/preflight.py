@@ -11,6 +11,7 @@ import difflib
 import logging
 import math
 import os
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -73,7 +74,7 @@ def check_policy(config: RunConfig, spec: WorldSpec, *, own: bool = False) -> in
     return int(policy.n_obs_steps)
 
 
-def check_start(config: RunConfig) -> int:
+def check_start(config: RunConfig, say: Callable[[str], object] = str) -> int:
     """Refuse a run that could not begin or whose outcome could not be used; what can be is checked here."""
     from accerl_lerobot.demos.dataset_files import open_metadata
     from accerl_lerobot.policies.loading import resolve_device
@@ -92,6 +93,7 @@ def check_start(config: RunConfig) -> int:
             config.trainer.value_warmup_updates,
         )
     check_wandb(config.wandb)
+    say("looking at policy, environment and data …")
     policy = policy_to_be(config)
     check_memory(config)
     spec = check_world(config.env, config.rollout.reward_model)

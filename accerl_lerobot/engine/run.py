@@ -90,8 +90,7 @@ def start(
         directory, wanted = resuming.resumed_run(recipe, config)
     else:
         if load is None:
-            console.say("looking at policy, environment and data …")
-            check_start(config)  # before there is a folder
+            check_start(config, console.say)  # before there is a folder
         directory = make_output_dir(config)
     console.say(f"run {directory}")
     how = resuming.resume_command(directory)
