@@ -20,7 +20,14 @@ import torch
 import yaml
 
 from accerl_lerobot.algorithms import OffPolicyConfig
-from accerl_lerobot.checkpoint.layout import CONFIG, PRETRAINED, SUMMARY, save_checkpoint, write_atomically
+from accerl_lerobot.checkpoint.layout import (
+    CHECKPOINTS,
+    CONFIG,
+    PRETRAINED,
+    SUMMARY,
+    save_checkpoint,
+    write_atomically,
+)
 from accerl_lerobot.config.parsing import encode
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError
@@ -82,7 +89,7 @@ def learn_offline(config: OfflineRun, directory: Path, console: Console) -> dict
         version: int = update.version
         return version
 
-    path = save_checkpoint(directory / "checkpoints", write)
+    path = save_checkpoint(directory / CHECKPOINTS, write)
     losses = {"before": before, "after": _imitation(update)}
     summary: dict[str, Any] = plain(
         counts
