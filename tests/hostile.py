@@ -116,8 +116,7 @@ def write_examples(scratch: Path) -> dict[str, Path]:
     from accerl_lerobot.world_model.contract import WorldModelSpec
     from accerl_lerobot.world_model.pixels import PixelWorldModel
     from accerl_lerobot.world_model.store import save_world_model
-    from accerl_lerobot.world_model.success_plugin.configuration_success_pairs import SuccessPairsConfig
-    from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
+    from accerl_lerobot.world_model.success_model import SuccessPairsConfig, SuccessPairsRewardModel
     from tests.policies.checkpoints import write_act
 
     spec = WorldModelSpec(

@@ -45,7 +45,7 @@ from accerl_lerobot.world_model.online import OnlineLearner, Promotion
 from accerl_lerobot.world_model.reference import CopyModel, OracleModel, ShuffledModel, learned_part
 from accerl_lerobot.world_model.rollouts import Imagination
 from accerl_lerobot.world_model.store import LEARNT, load_roles, load_world_model, rehearse_world_model
-from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
+from accerl_lerobot.world_model.success_model import SuccessPairsRewardModel
 
 LEARN = "imagination.learn."
 """Prefix of the config sections of datasets."""

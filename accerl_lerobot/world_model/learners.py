@@ -36,8 +36,7 @@ from accerl_lerobot.world_model.data import (
 )
 from accerl_lerobot.world_model.metrics import shuffle_across_groups
 from accerl_lerobot.world_model.rollout_eval import replay
-from accerl_lerobot.world_model.success_plugin import SuccessPairsConfig
-from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
+from accerl_lerobot.world_model.success_model import SuccessPairsConfig, SuccessPairsRewardModel
 
 WEIGHT_DECAY, GRAD_CLIP = 1e-2, 1.0
 WARMUP = 50

@@ -32,7 +32,7 @@ from accerl_lerobot.world_model.data import Episode, WindowStart, model_arrays
 from accerl_lerobot.world_model.learners import Examples, Learner, SuccessLearner
 from accerl_lerobot.world_model.rollout_eval import Scores, choose_threshold, score_episodes
 from accerl_lerobot.world_model.store import HELD_OUT, LEARNT
-from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
+from accerl_lerobot.world_model.success_model import SuccessPairsRewardModel
 from accerl_lerobot.world_model.validation import fit_uncertainty_scale, validate
 
 BATCH, LEARNING_RATE = 16, 3e-4

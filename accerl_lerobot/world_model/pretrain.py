@@ -29,7 +29,7 @@ from accerl_lerobot.world_model import data, learners, store, validation
 from accerl_lerobot.world_model.config import WorldModelConfig
 from accerl_lerobot.world_model.contract import LearnableWorldModel, WorldModelSpec, new_model
 from accerl_lerobot.world_model.data import Episode
-from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
+from accerl_lerobot.world_model.success_model import SuccessPairsRewardModel
 
 if TYPE_CHECKING:
     from accerl_lerobot.cli.verbs import WorldModelRun

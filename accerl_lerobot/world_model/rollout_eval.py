@@ -20,7 +20,7 @@ from accerl_lerobot.world_model import metrics
 from accerl_lerobot.world_model.config import ValidationConfig
 from accerl_lerobot.world_model.contract import WorldModel, context_of, select_rows
 from accerl_lerobot.world_model.data import Episode, Windows, WindowStart, cut_windows, hold_last_action
-from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
+from accerl_lerobot.world_model.success_model import SuccessPairsRewardModel
 
 BATCH = 64
 """Rollouts at once."""

@@ -40,7 +40,7 @@ from accerl_lerobot.world_model.contract import (
 from accerl_lerobot.world_model.data import model_arrays, resize
 from accerl_lerobot.world_model.reference import OracleModel, ShuffledModel, learned_part
 from accerl_lerobot.world_model.store import save_world_model
-from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
+from accerl_lerobot.world_model.success_model import SuccessPairsRewardModel
 
 if TYPE_CHECKING:
     from accerl_lerobot.world_model.online import Promotion

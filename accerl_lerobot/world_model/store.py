@@ -34,7 +34,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.guard import Unfilled, guarded, input_error
 from accerl_lerobot.world_model.config import LearnableModelConfig
 from accerl_lerobot.world_model.contract import Context, LearnableWorldModel, WorldModelSpec, new_model
-from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
+from accerl_lerobot.world_model.success_model import SuccessPairsRewardModel
 
 UNREADABLE = (
     OSError, LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError,

@@ -41,7 +41,7 @@ from accerl_lerobot.world_model.rollout_eval import (
     score_episodes,
     subsample,
 )
-from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
+from accerl_lerobot.world_model.success_model import SuccessPairsRewardModel
 
 if TYPE_CHECKING:
     from accerl_lerobot.cli.verbs import WorldModelEvalRun

@@ -174,7 +174,7 @@ def test_a_dataset_is_one_that_lerobot_finds(hub: HubServer, tmp_path: Path):
 def test_world_models_and_success_models(hub: HubServer, tmp_path: Path):
     from accerl_lerobot.world_model.learners import new_success_model
     from accerl_lerobot.world_model.store import load_roles, load_world_model, save_world_model
-    from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
+    from accerl_lerobot.world_model.success_model import SuccessPairsRewardModel
 
     world, success, roles = model(), new_success_model(5), {"a": "learnt", "b": "held out"}
     save_world_model(tmp_path / "world_model", world, success, roles)

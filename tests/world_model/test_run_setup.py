@@ -30,7 +30,7 @@ from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.pretrain import world_spec
 from accerl_lerobot.world_model.reference import CopyModel, OracleModel, ShuffledModel
 from accerl_lerobot.world_model.store import HELD_OUT, LEARNT, THRESHOLD, load_roles, save_world_model
-from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
+from accerl_lerobot.world_model.success_model import SuccessPairsRewardModel
 from tests.runs import tiny_run
 
 ENV = SimulatedConfig(max_steps=16, hold=8)

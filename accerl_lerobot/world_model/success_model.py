@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The network, its loss, and the interface of a LeRobot reward model.
+"""The success model, a LeRobot reward model: did a chunk achieve the task, and how far along is it?
 
-Cameras share their convolutions, and their features are averaged, so a model serves any number of them.
+A convolutional network of 0.3 million weights looks at the frames before and after a chunk, so it can be
+trained beside a policy. Cameras share their convolutions, and their features are averaged, so it serves any
+number of them.
 
 Shapes: B batch, V cameras, C×H×W image.
 """
@@ -9,29 +11,51 @@ Shapes: B batch, V cameras, C×H×W image.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
+from lerobot.configs.rewards import RewardModelConfig
 from lerobot.rewards.pretrained import PreTrainedRewardModel
 from torch import Tensor, nn
 from torch.nn import functional
 
-from accerl_lerobot.world_model.success_plugin.configuration_success_pairs import SuccessPairsConfig
+from accerl_lerobot.errors import InputError
 
-IMAGES, REWARD, PAD = "observation.image", "next.reward", "_is_pad"
+IMAGES = "observation.image"
 GRID, HIDDEN = 4, 128
 """Side of the feature map that is flattened, and width of the layer behind it."""
 BATCH = 64
 """Pairs that are classified at once."""
-SUCCESS_REWARD = 0.5
-"""A ``next.reward`` above it is a success; datasets of ``accerl demos`` give 1."""
 ALONE = 0.25
 """Share of pairs whose first frame is replaced by the second in training, so that the second frame is judged
 and not their distance."""
 NOISE, SHIFT = 0.03, 3
 """Largest standard deviation of the noise on frames in training, where 1 is white, and their largest shift in
 pixels."""
+
+
+@RewardModelConfig.register_subclass("success_pairs")
+@dataclass
+class SuccessPairsConfig(RewardModelConfig):
+    """Inputs and sizes of the success model."""
+
+    chunk: int = 10
+    """Env steps between the two frames."""
+    channels: tuple[int, ...] = (32, 64, 96)
+    """Channels of the convolutions, each of which halves the image; the first one does so twice."""
+    threshold: float = 0.5
+    """P above which a frame counts as a success, in [0, 1]."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.chunk < 1:
+            raise InputError("reward_model.chunk", self.chunk, "use at least 1")
+        if not 0 <= self.threshold <= 1:
+            raise InputError("reward_model.threshold", self.threshold, "use a value in [0, 1]")
+        if not self.channels or min(self.channels) < 1:
+            raise InputError("reward_model.channels", self.channels, "name at least one width")
 
 
 class SuccessPairsRewardModel(PreTrainedRewardModel):
@@ -101,29 +125,13 @@ class SuccessPairsRewardModel(PreTrainedRewardModel):
             total, metrics = total + error, metrics | {"progress": error.item()}
         return total, {"loss": total.item()} | metrics
 
-    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, Any]]:
-        """LeRobot's training step; its batch holds pairs of frames and a chunk's rewards."""
-        before, after = self._frames(batch)
-        reward = batch[REWARD]
-        pad = batch.get(REWARD + PAD)
-        achieved = reward > SUCCESS_REWARD
-        if pad is not None:
-            achieved = achieved & ~pad
-        return self.loss(before, after, achieved.reshape(len(reward), -1).any(1).float())
-
     @torch.no_grad()
     def compute_reward(self, batch: dict[str, Tensor]) -> Tensor:
-        """P(success), (B,), of the same batches, or of single frames, which stand for both."""
-        success, _ = self.logits(*self._frames(batch))
-        return torch.sigmoid(success)
-
-    def _frames(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-        keys = sorted(k for k in batch if k.startswith(IMAGES) and not k.endswith(PAD))
-        images = torch.stack([batch[k] for k in keys], 1)
+        """P(success), (B,), of LeRobot's batches: pairs of frames, or single frames, which stand for both."""
+        images = torch.stack([batch[key] for key in sorted(batch) if key.startswith(IMAGES)], 1)
         images = images.float() / 255 if images.dtype == torch.uint8 else images.float()
-        if images.ndim == 5:  # one frame each
-            return images, images
-        return images[:, :, 0], images[:, :, -1]
+        before, after = (images, images) if images.ndim == 5 else (images[:, :, 0], images[:, :, -1])
+        return torch.sigmoid(self.logits(before, after)[0])
 
     def _augmented(
         self, before: Tensor, after: Tensor, generator: torch.Generator | None = None
