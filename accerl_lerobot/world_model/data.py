@@ -14,7 +14,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -133,6 +133,16 @@ def hold_last_action(actions: np.ndarray, steps: np.ndarray) -> np.ndarray:
     executed = (np.arange(k) < steps[..., None]).reshape(b, r * k)
     last = np.maximum.accumulate(np.where(executed, np.arange(r * k), 0), axis=1)
     return np.take_along_axis(actions.reshape(b, r * k, a), last[..., None], 1).reshape(actions.shape)
+
+
+def shuffle_actions(windows: Windows, rng: np.random.Generator) -> Windows:
+    """Gives each window the actions of another one, from another episode where there is one."""
+    rows, groups = np.arange(len(windows)), windows.episode
+    donors = np.empty_like(rows)
+    for i in rows:
+        others = rows[groups != groups[i]]
+        donors[i] = rng.choice(others if len(others) else rows[rows != i])
+    return replace(windows, actions=windows.actions[donors])
 
 
 def window_starts(episodes: Sequence[Episode]) -> list[WindowStart]:

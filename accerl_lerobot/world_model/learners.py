@@ -15,7 +15,6 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,9 +31,9 @@ from accerl_lerobot.world_model.data import (
     WindowStart,
     cut_windows,
     frame_at,
+    shuffle_actions,
     window_starts,
 )
-from accerl_lerobot.world_model.metrics import shuffle_across_groups
 from accerl_lerobot.world_model.rollout_eval import replay
 from accerl_lerobot.world_model.success_model import SuccessPairsConfig, SuccessPairsRewardModel
 
@@ -118,10 +117,7 @@ class Learner(_Trainer):
         """Cuts windows, with anchors as far back as rollouts will go."""
         back = self.rng.integers(self.config.longest + 1, size=len(at)).tolist()
         windows = cut_windows(episodes, at, self.model.spec, self.config.learn.chunks, back)
-        if self.config.shuffle_actions:
-            donors = shuffle_across_groups(windows.episode, self.rng)
-            windows = replace(windows, actions=windows.actions[donors])
-        return windows
+        return shuffle_actions(windows, self.rng) if self.config.shuffle_actions else windows
 
     def step(self, windows: Windows) -> dict[str, float]:
         """Makes a gradient step; returns the losses and ``grad_norm``."""

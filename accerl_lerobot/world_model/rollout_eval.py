@@ -10,13 +10,12 @@ Shapes: M rollouts, D depths in chunks; see `data.py` for the others.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
-from accerl_lerobot.world_model import metrics
 from accerl_lerobot.world_model.config import ValidationConfig
 from accerl_lerobot.world_model.contract import WorldModel, context_of, select_rows
 from accerl_lerobot.world_model.data import Episode, Windows, WindowStart, cut_windows, hold_last_action
@@ -26,19 +25,17 @@ BATCH = 64
 """Rollouts at once."""
 FOLDS = 4
 """Folds of the episodes, see `outcome_metrics`."""
+DRAWS = 1000
+"""Resamples of an interval."""
 
 
 class Predictions(NamedTuple):
     """Predictions of M windows."""
 
-    frames: np.ndarray
-    """uint8 (M, D + 1, V, H, W, 3): the window's first frame, then one after each chunk."""
-    robot: np.ndarray
-    """float32 (M, D, S)."""
-    uncertainty: np.ndarray
-    """float32 (M, D)."""
-    ends: np.ndarray
-    """uint8 (M, D, V, H, W, 3): those after each chunk, if it were the one in `ends` of `predict`."""
+    frames: np.ndarray  # uint8 (M, D + 1, V, H, W, 3): the window's first frame, then one after each chunk
+    robot: np.ndarray  # float32 (M, D, S)
+    uncertainty: np.ndarray  # float32 (M, D)
+    ends: np.ndarray  # uint8 (M, D, V, H, W, 3): those after each chunk, if it were the one in `ends`
 
 
 def predict(
@@ -55,22 +52,20 @@ def predict(
     """
     count, depth = actions.shape[:2]
     lengths = np.full(count, depth) if lengths is None else lengths
-    shape, spec = (count, depth), model.spec
+    spec = model.spec
     frames = np.zeros((count, depth + 1, len(spec.cameras), *spec.image_size, 3), np.uint8)
     frames[:, 0] = windows.frames[:, windows.context - 1]
     made = Predictions(
         frames=frames,
-        robot=np.zeros((*shape, spec.state_dim), np.float32),
-        uncertainty=np.zeros(shape, np.float32),
+        robot=np.zeros((count, depth, spec.state_dim), np.float32),
+        uncertainty=np.zeros((count, depth), np.float32),
         ends=frames[:, 1:] if ends is None else np.zeros_like(frames[:, 1:]),
     )
     for start in range(0, count, BATCH):
         of = slice(start, start + BATCH)
         state, rows = model.begin(context_of(windows, of), windows.task[of]), np.arange(count)[of]
-        for d in range(depth):
+        for d in range(int(lengths[of].max())):
             going = lengths[rows] > d
-            if not going.any():
-                break
             if not going.all():
                 state, rows = select_rows(state, np.flatnonzero(going)), rows[going]
             seeds, chunk = rows + 1_000_003 * d, actions[rows, d]
@@ -78,12 +73,12 @@ def predict(
             made.frames[rows, d + 1] = made.ends[rows, d] = prediction.frames.cpu().numpy()
             made.robot[rows, d] = prediction.robot.cpu().numpy()
             made.uncertainty[rows, d] = prediction.uncertainty.cpu().numpy()
-            other = chunk if ends is None else ends[rows, d]
-            differ = np.flatnonzero((chunk != other).any((1, 2)))
-            if len(differ):
-                chosen = select_rows(state, differ)
-                again = model.step(chosen, torch.from_numpy(other[differ]), seeds[differ].tolist())
-                made.ends[rows[differ], d] = again.frames.cpu().numpy()
+            if ends is not None:
+                other = ends[rows, d]
+                if len(differ := np.flatnonzero((chunk != other).any((1, 2)))):
+                    chosen = select_rows(state, differ)
+                    again = model.step(chosen, torch.from_numpy(other[differ]), seeds[differ].tolist())
+                    made.ends[rows[differ], d] = again.frames.cpu().numpy()
             state = prediction.state
     return made
 
@@ -120,27 +115,25 @@ def match_cut_lengths(steps: np.ndarray, success: np.ndarray, rng: np.random.Gen
     Each failure of a column gets the steps of one of its successes, if these are fewer.
     """
     shortened = steps.copy()
-    for d in range(steps.shape[1]):
-        of = steps[success[:, d], d]
-        if len(of):
-            failed = ~success[:, d]
-            shortened[failed, d] = np.minimum(steps[failed, d], rng.choice(of, int(failed.sum())))
+    for d, succeeded in enumerate(success.T):
+        if succeeded.any():
+            drawn = rng.choice(steps[succeeded, d], int((~succeeded).sum()))
+            shortened[~succeeded, d] = np.minimum(steps[~succeeded, d], drawn)
     return shortened
 
 
 class Scores(NamedTuple):
     """Scores of M rollouts."""
 
-    imagined: np.ndarray
-    """Highest P(success) with the executed actions, until the real success."""
-    idle: np.ndarray
-    """Highest P(success) without any action, until the longest episode's end."""
-    achieved: np.ndarray
-    """bool, True if the real episode achieved the task."""
-    episode: np.ndarray
-    """int64, index of the episode."""
-    own: np.ndarray
-    """bool, see `Episode`."""
+    imagined: np.ndarray  # highest P(success) with the executed actions, until the real success
+    idle: np.ndarray  # highest P(success) without any action, until the longest episode's end
+    achieved: np.ndarray  # bool, True if the real episode achieved the task
+    episode: np.ndarray  # int64, index of the episode
+    own: np.ndarray  # bool, see `Episode`
+
+    def of_own(self, chosen: np.ndarray) -> np.ndarray:
+        """Selection of the policy's own episodes, or else of all."""
+        return chosen & self.own if (chosen & self.own).any() else chosen
 
 
 def score_episodes(
@@ -162,18 +155,18 @@ def score_episodes(
     begun = np.array([int(episodes[e].times[f]) // chunk for e, f in at])
     left = np.arange(depth) < (depth - begun)[:, None]
     idle = predict(model, windows, np.zeros_like(windows.actions), lengths=left.sum(1))
-    best = {}
-    for name, path, counted in (
-        ("imagined", predictions.frames, executed),
-        ("idle", idle.frames, left),
-    ):
-        best[name] = np.zeros(len(at))
+
+    def best(path: np.ndarray, counted: np.ndarray) -> np.ndarray:
+        highest = np.zeros(len(at))
         for d in range(depth):
             rows = np.flatnonzero(counted[:, d])
             probability = success.probabilities(path[rows, d], path[rows, d + 1])
-            best[name][rows] = np.maximum(best[name][rows], probability)
+            highest[rows] = np.maximum(highest[rows], probability)
+        return highest
+
     return Scores(
-        **best,
+        imagined=best(predictions.frames, executed),
+        idle=best(idle.frames, left),
         achieved=(windows.success & executed).any(1),
         episode=windows.episode,
         own=np.array([episodes[e].own for e in windows.episode], bool),
@@ -200,11 +193,12 @@ def choose_threshold(scores: Scores, config: ValidationConfig) -> float | None:
     and a policy that never sees a success learns nothing. Failures and successes are those of the policy's
     own episodes, if there are any.
     """
-    failures = scores.imagined[_own(scores, ~scores.achieved)]
-    successes = scores.imagined[_own(scores, scores.achieved)]
+    failures = scores.imagined[scores.of_own(~scores.achieved)]
+    successes = scores.imagined[scores.of_own(scores.achieved)]
     if not len(failures):
         return None
-    least = float(np.clip(metrics.threshold_at(failures, config.false_positives), 0.5, 1 - 1e-6))
+    passing = np.sort(failures)[::-1][int(config.false_positives * len(failures))]
+    least = float(np.clip(np.nextafter(passing, np.inf), 0.5, 1 - 1e-6))
     if not len(successes):
         return least
     # Only thresholds just above a failure are worth trying.
@@ -225,7 +219,7 @@ def outcome_metrics(
         ``false_success`` of failures, ``false_success_idle`` of all without any action, ``recall`` of
         successes.
     """
-    failed = _own(scores, ~scores.achieved)
+    failed = scores.of_own(~scores.achieved)
     thresholds = np.full(len(scores.achieved), 0.5 if threshold is None else threshold)
     fold = np.unique(scores.episode, return_inverse=True)[1] % FOLDS
     for i in range(FOLDS if threshold is None else 0):
@@ -239,15 +233,33 @@ def outcome_metrics(
         "rollouts": len(scores.achieved),
         "successes": int(scores.achieved.sum()),
         "failures": int(failed.sum()),
-        "auroc": metrics.bootstrap(
-            scores.episode, lambda rows: metrics.auroc(scores.imagined[rows], scores.achieved[rows])
-        ),
+        "auroc": bootstrap(scores.episode, lambda of: auroc(scores.imagined[of], scores.achieved[of])),
         "false_success": share(scores.imagined, failed),
         "false_success_idle": share(scores.idle, np.ones(len(failed), bool)),
         "recall": share(scores.imagined, scores.achieved),
     }
 
 
-def _own(scores: Scores, chosen: np.ndarray) -> np.ndarray:
-    """Selection of the policy's own episodes, or else of all."""
-    return chosen & scores.own if (chosen & scores.own).any() else chosen
+def bootstrap(groups: np.ndarray, statistic: Callable[[np.ndarray], float]) -> dict[str, float]:
+    """``value`` of a statistic of row indices, and its 95 % interval ``low`` to ``high``.
+
+    It is a percentile bootstrap over groups (M,), the episodes, as windows of one are alike. Draws for which
+    the statistic is NaN are left out.
+    """
+    rng = np.random.default_rng(0)
+    order = np.argsort(groups, kind="stable")
+    rows = np.split(order, np.flatnonzero(np.diff(groups[order])) + 1)
+    draws = (rng.integers(len(rows), size=len(rows)) for _ in range(DRAWS))
+    values = np.array([statistic(np.concatenate([rows[i] for i in drawn])) for drawn in draws])
+    values = values[~np.isnan(values)]
+    # The nearest draw, since between two infinite ones there is nothing to interpolate.
+    low, high = np.quantile(values, [0.025, 0.975], method="nearest") if len(values) else (np.nan, np.nan)
+    return {"value": statistic(np.arange(len(groups))), "low": float(low), "high": float(high)}
+
+
+def auroc(scores: np.ndarray, labels: np.ndarray) -> float:
+    """Chance that a success scores above a failure, ties counting half; NaN without both."""
+    difference = scores[labels][:, None] - scores[~labels]
+    if not difference.size:
+        return float("nan")
+    return float(((difference > 0) + 0.5 * (difference == 0)).mean())

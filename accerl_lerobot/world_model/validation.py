@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Validation of a world model on held-out episodes; ``accerl world-model-eval``.
 
-From each window some chunks are predicted with the executed actions, and with another episode's. A model
-must be better than a copy of the last frame where something moves, and worse with wrong actions; and whole
-imagined rollouts must end as the real episodes did, see `rollout_eval.py`.
+    skill          1 − MSE(model) / MSE(copy of the last frame), on all pixels or on those that changed
+    sensitivity    MSE(with another episode's actions) / MSE(with the executed ones); 1 if they are ignored
+
+Better pixels than a copy prove nothing: a model may learn to blur what moves and ignore the actions. And
+whole imagined rollouts must end as the real episodes did, see `rollout_eval.py`.
 
 Predictions are of whole chunks: where an episode ended within one, its last action is held. Depths are
 counted in chunks, from 1. Shapes: M windows, D depths; see `data.py` for the others.
@@ -30,11 +32,12 @@ from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import write_video
 from accerl_lerobot.policies.loading import resolve_device
-from accerl_lerobot.world_model import data, metrics, store
+from accerl_lerobot.world_model import data, store
 from accerl_lerobot.world_model.config import ValidationConfig
 from accerl_lerobot.world_model.contract import LearnableWorldModel, WorldModel
 from accerl_lerobot.world_model.data import Episode, Windows, WindowStart
 from accerl_lerobot.world_model.rollout_eval import (
+    bootstrap,
     choose_threshold,
     outcome_metrics,
     predict,
@@ -48,6 +51,8 @@ if TYPE_CHECKING:
 
 DATASET, ONLINE = "dataset", "online"
 """Config sections of datasets, and their names in the results."""
+CHANGED = 16
+"""A pixel counts as changed if one of its colours differs by more, of 255."""
 PREVIEW_ROWS, SCALE, FPS = 4, 3, 4
 """Windows in a video, its enlargement, and its chunks per second."""
 
@@ -69,9 +74,40 @@ def validation_windows(
     return replace(windows, actions=data.hold_last_action(windows.actions, windows.steps))
 
 
-def shuffled_actions(windows: Windows, rng: np.random.Generator) -> np.ndarray:
-    """(M, D, K, A), the actions of windows of other episodes."""
-    return windows.actions[metrics.shuffle_across_groups(windows.episode, rng)]
+def squared_errors(frames: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
+    """(M, 2) sums of squared errors and of pixels, of uint8 frames (M, V, H, W, 3), where `mask` holds."""
+    errors = np.square(frames.astype(np.float64) - target).mean(-1)
+    counted = np.ones(errors.shape) if mask is None else mask.astype(np.float64)
+    sums: np.ndarray = np.stack([(errors * counted).sum((1, 2, 3)), counted.sum((1, 2, 3))], 1)
+    return sums
+
+
+def mean_error(sums: np.ndarray) -> float:
+    """Mean squared error of `squared_errors` rows; NaN without a pixel."""
+    total, count = sums.sum(0)
+    return float(total / count) if count else float("nan")
+
+
+def skill(model: np.ndarray, copy: np.ndarray, groups: np.ndarray) -> dict[str, float]:
+    """1 − MSE(model)/MSE(copy), from `squared_errors` of both (M, 2)."""
+
+    def of(rows: np.ndarray) -> float:
+        copied = mean_error(copy[rows])
+        return 1 - mean_error(model[rows]) / copied if copied > 0 else float("nan")
+
+    return bootstrap(groups, of)
+
+
+def sensitivity(true: np.ndarray, other: np.ndarray, groups: np.ndarray) -> dict[str, float]:
+    """MSE(other actions)/MSE(true actions), from `squared_errors` of both (M, 2); of two exact ones 1."""
+
+    def of(rows: np.ndarray) -> float:
+        right, wrong = mean_error(true[rows]), mean_error(other[rows])
+        if right > 0:
+            return wrong / right
+        return float("inf") if wrong > 0 else 1.0
+
+    return bootstrap(groups, of)
 
 
 def fit_uncertainty_scale(
@@ -108,7 +144,7 @@ def validate(
     outcomes = outcome_metrics(scores, config, threshold)
     windows = validation_windows(episodes, model, config, seed)
     predicted = predict(model, windows, windows.actions)
-    shuffled = predict(model, windows, shuffled_actions(windows, rng)).frames
+    shuffled = predict(model, windows, data.shuffle_actions(windows, rng).actions).frames
     now = model.spec.context - 1
     rows = []
     # A chunk cut short by the episode's end is not the one that was predicted, nor are those after it.
@@ -117,16 +153,12 @@ def validate(
         row: dict[str, Any] = {"depth": depth, "windows": int(fits.sum())}
         if fits.sum() >= 2:
             newest, real = windows.frames[fits, now], windows.frames[fits, now + depth]
-            made, moved, groups = (
-                predicted.frames[fits, depth],
-                metrics.changed(newest, real),
-                windows.episode[fits],
-            )
-            error = partial(metrics.squared_errors, target=real)
-            wrong = error(shuffled[fits, depth])
-            row["skill"] = metrics.skill(error(made), error(newest), groups)
-            row["skill_changed"] = metrics.skill(error(made, mask=moved), error(newest, mask=moved), groups)
-            row["sensitivity_shuffled"] = metrics.sensitivity(error(made), wrong, groups)
+            made, groups = predicted.frames[fits, depth], windows.episode[fits]
+            moved = np.abs(newest.astype(np.int16) - real).max(-1) > CHANGED
+            error = partial(squared_errors, target=real)
+            row["skill"] = skill(error(made), error(newest), groups)
+            row["skill_changed"] = skill(error(made, mask=moved), error(newest, mask=moved), groups)
+            row["sensitivity_shuffled"] = sensitivity(error(made), error(shuffled[fits, depth]), groups)
             if model.spec.state_dim:
                 state = windows.state[fits, now + depth]
                 row["state_error"] = float(np.abs(predicted.robot[fits, depth - 1] - state).mean())
@@ -175,8 +207,8 @@ def preview_video(
     rng = np.random.default_rng((seed, 3))
     windows = validation_windows(episodes, model, replace(config, max_windows=PREVIEW_ROWS), seed)
     lines = [windows.frames[:, windows.context - 1 :]]
-    for actions in (windows.actions, shuffled_actions(windows, rng)):
-        lines.append(predict(model, windows, actions).frames)
+    for of in (windows, data.shuffle_actions(windows, rng)):
+        lines.append(predict(model, windows, of.actions).frames)
     write_video(path, [[list(_enlarge(clip)) for clip in line] for line in lines], fps=FPS)
 
 

@@ -22,8 +22,8 @@ from accerl_lerobot.world_model.learners import (
     new_success_model,
     train_from_scratch,
 )
-from accerl_lerobot.world_model.metrics import skill, squared_errors
 from accerl_lerobot.world_model.pixels import PixelWorldModel
+from accerl_lerobot.world_model.validation import skill, squared_errors
 from tests.world_model.test_pixels import CHANNELS, SIZE, SPEC, K, dots, rollout, windows
 from tests.world_model.test_validate import Deterministic, with_successes
 

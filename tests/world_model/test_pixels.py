@@ -11,16 +11,10 @@ import torch
 
 from accerl_lerobot.world_model.config import LearnConfig, PixelModelConfig, WorldModelConfig
 from accerl_lerobot.world_model.contract import Prediction, WorldModelSpec, context_of
-from accerl_lerobot.world_model.data import Episode, Windows, cut_windows, window_starts
+from accerl_lerobot.world_model.data import Episode, Windows, cut_windows, shuffle_actions, window_starts
 from accerl_lerobot.world_model.learners import Learner, train_from_scratch
-from accerl_lerobot.world_model.metrics import (
-    mean_error,
-    sensitivity,
-    shuffle_across_groups,
-    skill,
-    squared_errors,
-)
 from accerl_lerobot.world_model.pixels import PixelWorldModel
+from accerl_lerobot.world_model.validation import sensitivity, skill, squared_errors
 from tests.rounding import assert_close
 
 SIZE, K = 16, 2
@@ -231,8 +225,8 @@ def scores(learner: Learner, depth: int = 0) -> tuple[float, float]:
     wanted = of.frames[:, 2 + depth]
     with torch.no_grad():
         true = squared_errors(rollout(learner.serving, of)[depth].frames.numpy(), wanted)
-        rows = shuffle_across_groups(np.arange(len(of)), np.random.default_rng(0))
-        other = squared_errors(rollout(learner.serving, of, of.actions[rows])[depth].frames.numpy(), wanted)
+        wrong = shuffle_actions(of, np.random.default_rng(0)).actions
+        other = squared_errors(rollout(learner.serving, of, wrong)[depth].frames.numpy(), wanted)
     copy = squared_errors(of.frames[:, 1], wanted)
     return skill(true, copy, of.episode)["value"], sensitivity(true, other, of.episode)["low"]
 
@@ -277,5 +271,5 @@ def test_the_same_seed_learns_the_same():
 def test_the_weights_that_serve_follow_those_that_learn(learnt: Learner):
     now, mean = learnt.model.state_dict(), learnt.serving.state_dict()
     assert all(torch.equal(now[k], mean[k]) for k in now if "." not in k), "statistics"
-    far = mean_error(np.array([[float((now[k] - mean[k]).square().sum()), now[k].numel()] for k in now]))
+    far = torch.cat([(now[k] - mean[k]).flatten() for k in now]).square().mean()
     assert 0 < far < 1e-3

@@ -9,7 +9,7 @@ from lerobot.rewards.factory import get_reward_model_class
 from torch import Tensor
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.world_model.metrics import auroc
+from accerl_lerobot.world_model.rollout_eval import auroc
 from accerl_lerobot.world_model.success_model import SuccessPairsConfig, SuccessPairsRewardModel
 from tests.rounding import assert_close
 

@@ -14,14 +14,10 @@ from torch import Tensor
 
 from accerl_lerobot.world_model.config import SuccessLearnConfig, ValidationConfig, WorldModelConfig
 from accerl_lerobot.world_model.contract import Context, Prediction, Reset, State, WorldModel
-from accerl_lerobot.world_model.data import Episode
+from accerl_lerobot.world_model.data import Episode, shuffle_actions
 from accerl_lerobot.world_model.learners import Examples, SuccessLearner, new_success_model
 from accerl_lerobot.world_model.rollout_eval import match_cut_lengths, predict
-from accerl_lerobot.world_model.validation import (
-    shuffled_actions,
-    validate,
-    validation_windows,
-)
+from accerl_lerobot.world_model.validation import validate, validation_windows
 from tests.world_model.test_pixels import SIZE, SPEC, K, dots
 
 CONFIG = ValidationConfig(depth=3, stride=2)
@@ -140,10 +136,9 @@ def test_windows_are_spaced():
     assert windows.state[:, 1, 0].tolist() == [0, 4, 8], "frames 0, 2 and 4"
 
 
-def test_wrong_actions_are_wrong():
+def test_shuffled_actions_are_another_episode_s():
     windows = validation_windows(dots(6, seed=3), Deterministic("exact"), CONFIG, seed=0)
-    rng = np.random.default_rng(0)
-    shuffled = shuffled_actions(windows, rng)
+    shuffled = shuffle_actions(windows, np.random.default_rng(0)).actions
     for i in range(len(windows)):
         from_ = [j for j in range(len(windows)) if np.array_equal(shuffled[i], windows.actions[j])]
         assert from_ and all(windows.episode[j] != windows.episode[i] for j in from_)
