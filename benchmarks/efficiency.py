@@ -179,10 +179,10 @@ def beside(study: Study, recipe: RunConfig) -> dict[str, dict[str, float]]:
         recorded = [DatasetConfig(repo_id=REPO_ID, root=str(folder)) for folder in folders]
         used = recorded if recipe.dataset.repo_id is None else [recipe.dataset]
         found["demonstrations"] = {name: total / len(used) for name, total in _totals(used).items()}
-    learn = recipe.imagination.learn
-    learnt = [dataset for dataset in (learn.dataset, learn.online) if dataset.repo_id is not None]
-    if learnt and any(run.imagination.share and run.imagination.needs_path for run in study.runs):
-        found["world model"] = _totals(learnt)
+    learnt = recipe.imagination.learn.dataset
+    imagined = any(run.imagination.share and run.imagination.needs_path for run in study.runs)
+    if learnt.repo_id is not None and imagined:
+        found["world model"] = _totals([learnt])
     return found
 
 

@@ -22,7 +22,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -40,15 +39,14 @@ from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TRANSPORT, WAIT_IN, WAI
 from accerl_lerobot.transport.endpoint import Endpoint, ReconnectingClient
 from accerl_lerobot.world_model.config import IMAGINATION, WORLD_LEARNING
 from accerl_lerobot.world_model.contract import WorldModel, WorldModelSpec
-from accerl_lerobot.world_model.data import Episode, load_datasets, named_datasets, open_datasets
+from accerl_lerobot.world_model.data import load_datasets, open_datasets
 from accerl_lerobot.world_model.online import OnlineLearner, Promotion
 from accerl_lerobot.world_model.reference import CopyModel, OracleModel, ShuffledModel, learned_part
 from accerl_lerobot.world_model.rollouts import Imagination
 from accerl_lerobot.world_model.store import LEARNT, load_roles, load_world_model, rehearse_world_model
 from accerl_lerobot.world_model.success_model import SuccessPairsRewardModel
 
-LEARN = "imagination.learn."
-"""Prefix of the config sections of datasets."""
+LEARN = "imagination.learn.dataset"
 MAX_PENDING = 2
 """Messages to replay that may be pending before imagination pauses."""
 PAUSE_S = 0.02
@@ -79,11 +77,9 @@ def make_learner(config: RunConfig) -> OnlineLearner:
     world, model, success = _load(config, load_lerobot_config(config.policy))
     assert success is not None  # only an oracle has none
     roles = load_roles(Path(str(config.imagination.path)), IMAGINATION)
-    loaded = load_datasets(named_datasets(config.imagination.learn, LEARN), model.spec)
-    offline: list[Episode] = []
-    held_out: list[Episode] = []
-    for episode in chain(*loaded.values()):
-        (offline if roles.get(episode.key, LEARNT) == LEARNT else held_out).append(episode)
+    known = load_datasets({LEARN: config.imagination.learn.dataset}, model.spec).get(LEARN, [])
+    offline = [episode for episode in known if roles.get(episode.key, LEARNT) == LEARNT]
+    held_out = [episode for episode in known if roles.get(episode.key, LEARNT) != LEARNT]
     longest = _longest(world, model.spec.chunk)
     settings = (config.imagination.learn, offline, held_out, roles, longest, config.seed)
     return OnlineLearner(learned_part(model), success, *settings)
@@ -93,7 +89,7 @@ def check_imagination(config: RunConfig) -> None:
     """Refuses, before a run begins, what `make_imagination` would refuse in the middle of it."""
     _, model, _ = _load(config, policy_to_be(config), first=True)
     if config.imagination.learns:
-        open_datasets(named_datasets(config.imagination.learn, LEARN), model.spec)
+        open_datasets({LEARN: config.imagination.learn.dataset}, model.spec)
 
 
 def _load(

@@ -167,10 +167,8 @@ class OnlineLearnConfig(Section, section="imagination.learn"):
     """Gradient steps of world model and success model each, per real episode; 0: both stay as they are.
     Otherwise nothing is imagined before they have passed validation on the policy's own episodes."""
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
-    """Dataset of the pre-training: the model trains on the episodes it already knows, and is validated on
-    those that were held out. Of another dataset it trains on all episodes."""
-    online: DatasetConfig = field(default_factory=DatasetConfig)
-    """Episodes of an earlier policy from the pre-training, used in the same way."""
+    """Dataset of the pre-training, or both merged: the model trains on the episodes it already knows, and is
+    validated on those that were held out. Of another dataset it trains on all episodes."""
 
     held_out: ClassVar[float] = 0.2
     """Share of real episodes held out for validation."""

@@ -28,26 +28,22 @@ if TYPE_CHECKING:
     from accerl_lerobot.config.ranges import DatasetConfig
     from accerl_lerobot.world_model.contract import WorldModelSpec
 
+DATASET, ONLINE = "dataset", "online"
+"""Config sections of a verb's datasets, of which the second has a policy's own episodes."""
+
 
 @kind
 @dataclass(frozen=True, kw_only=True)
 class Episode:
     """One recorded episode."""
 
-    frames: np.ndarray
-    """uint8 (F, V, H, W, 3)."""
-    times: np.ndarray
-    """int64 (F,), env steps before each frame; rising, from 0."""
-    state: np.ndarray
-    """float32 (F, S); S may be 0."""
-    actions: np.ndarray
-    """float32 (T, A), as executed, in the environment's units."""
-    success_at: int
-    """Index of the step that achieved the task; −1 for never."""
-    task: str
-    """The instruction."""
-    own: bool
-    """True if it was played by the policy that the world model is for: in validation its failures count."""
+    frames: np.ndarray  # uint8 (F, V, H, W, 3)
+    times: np.ndarray  # int64 (F,), env steps before each frame; rising, from 0
+    state: np.ndarray  # float32 (F, S); S may be 0
+    actions: np.ndarray  # float32 (T, A), as executed, in the environment's units
+    success_at: int  # index of the step that achieved the task; −1 for never
+    task: str  # the instruction
+    own: bool  # played by the policy that the world model is for: in validation its failures count
 
     @property
     def key(self) -> str:
@@ -73,7 +69,11 @@ class Episode:
     def starts(self) -> int:
         """Number of frames, from the first on, that are followed by another and precede the success."""
         followed = len(self.frames) - 1
-        return min(followed, frame_at(self, self.success_at) + 1) if self.success else followed
+        return min(followed, self.frame_at(self.success_at) + 1) if self.success else followed
+
+    def frame_at(self, time: int) -> int:
+        """Index of the last frame recorded by an env step; the first one before all of them."""
+        return max(0, int(np.searchsorted(self.times, time, side="right")) - 1)
 
     def __len__(self) -> int:
         """Env steps."""
@@ -150,11 +150,6 @@ def window_starts(episodes: Sequence[Episode]) -> list[WindowStart]:
     return [WindowStart(e, f) for e, episode in enumerate(episodes) for f in range(len(episode.frames) - 1)]
 
 
-def frame_at(episode: Episode, time: int) -> int:
-    """Index of the last frame recorded by an env step; the first one before all of them."""
-    return max(0, int(np.searchsorted(episode.times, time, side="right")) - 1)
-
-
 def cut_windows(
     episodes: Sequence[Episode],
     at: Sequence[WindowStart],
@@ -179,27 +174,23 @@ def _window(
 ) -> dict[str, np.ndarray]:
     chunk, context, action_dim = spec.chunk, spec.context, episode.actions.shape[1]
     start = int(episode.times[first])
-    before = [frame_at(episode, start - chunk * i) for i in range(context - 1, 0, -1)]
-    actions_before = np.zeros((context - 1, chunk, action_dim), np.float32)
-    for i in range(1, context):
-        then = start - chunk * i
-        known = episode.actions[max(0, then) : max(0, then + chunk)]
-        if len(known):
-            actions_before[-i, -len(known) :] = known
+    before = [episode.frame_at(start - chunk * i) for i in range(context - 1, 0, -1)]
+    nothing = np.zeros(((context - 1) * chunk, action_dim), np.float32)
+    actions_before = np.concatenate([nothing, episode.actions[:start]])[start:]
     path, actions = [first], np.zeros((chunks, chunk, action_dim), np.float32)
     steps, success = np.zeros(chunks, np.int64), np.zeros(chunks, bool)
     for r in range(chunks):
         then = start + chunk * r
-        path.append(max(path[-1], frame_at(episode, then + chunk)))
+        path.append(max(path[-1], episode.frame_at(then + chunk)))
         # Actions between the two frames: the chunk's, unless the last frame comes before its end.
         steps[r] = np.clip(episode.times[path[-1]] - then, 0, chunk)
         actions[r, : steps[r]] = episode.actions[then : then + steps[r]]
         success[r] = then <= episode.success_at < then + chunk
     return {
         "frames": episode.frames[before + path],
-        "anchor": episode.frames[frame_at(episode, start - chunk * anchor)],
+        "anchor": episode.frames[episode.frame_at(start - chunk * anchor)],
         "state": episode.state[before + path],
-        "before": actions_before,
+        "before": actions_before.reshape(context - 1, chunk, action_dim),
         "commanded_sum": episode.actions[:start].sum(0, dtype=np.float32),
         "initial_state": episode.state[0],
         "actions": actions,
@@ -248,45 +239,31 @@ def model_arrays(observations: dict[str, np.ndarray], spec: WorldModelSpec) -> t
     return frames, observations["observation.state"] if spec.state_dim else no_state
 
 
-def named_datasets(config: Any, section: str = "") -> dict[str, DatasetConfig]:
-    """Its ``dataset`` and ``online``, if they are named, by their config section."""
-    datasets = {f"{section}{name}": getattr(config, name) for name in ("dataset", "online")}
-    return {name: dataset for name, dataset in datasets.items() if dataset.repo_id is not None}
-
-
 def open_datasets(sections: dict[str, DatasetConfig], spec: WorldModelSpec) -> dict[str, Any]:
-    """Opens and checks the metadata of each dataset, by its config section, before any image is read."""
+    """Opens and checks the metadata of each named dataset, by its config section, before images are read."""
     metas: dict[str, Any] = {}
     for section, dataset in sections.items():
-        with name_section(section):
-            if same := [other for other in metas if sections[other] == dataset]:
-                raise InputError(
-                    "dataset.repo_id", dataset.repo_id, f"it is the one in {same[0]}; name another"
-                )
-            metas[section] = open_metadata(dataset)
-            check_metadata(metas[section], str(dataset.repo_id), spec)
+        if dataset.repo_id is not None:
+            with name_section(section):
+                metas[section] = open_metadata(dataset)
+                check_metadata(metas[section], dataset.repo_id, spec)
     return metas
 
 
-def load_datasets(
-    sections: dict[str, DatasetConfig], spec: WorldModelSpec, own: str | None = None
-) -> dict[str, list[Episode]]:
+def load_datasets(sections: dict[str, DatasetConfig], spec: WorldModelSpec) -> dict[str, list[Episode]]:
     """Reads LeRobotDatasets into memory, one uint8 image of the spec's size per env step and camera.
 
-    Two with an episode in common are refused: it may be on both sides of a split. The episodes of the section
-    `own` are the policy's, see `Episode`.
+    Two with an episode in common are refused: it may be on both sides of a split.
     """
     loaded: dict[str, list[Episode]] = {}
     known: set[str] = set()
     for section, meta in open_datasets(sections, spec).items():
         dataset = sections[section]
         with name_section(section), opened(dataset, meta) as data:
-            episodes = [_episode(data, i, spec, section == own) for i in range(meta.total_episodes)]
+            episodes = [_episode(data, i, spec, section == ONLINE) for i in range(meta.total_episodes)]
             keys = {episode.key for episode in episodes}
             if twice := len(keys & known):
-                remedy = (
-                    f"{twice} of its episodes are in the other dataset, too; name one that has only others"
-                )
+                remedy = f"{twice} of its episodes are in the other dataset, too; name one with others"
                 raise InputError("dataset.repo_id", dataset.repo_id, remedy)
         known |= keys
         loaded[section] = episodes

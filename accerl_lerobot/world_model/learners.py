@@ -30,7 +30,6 @@ from accerl_lerobot.world_model.data import (
     Windows,
     WindowStart,
     cut_windows,
-    frame_at,
     shuffle_actions,
     window_starts,
 )
@@ -211,7 +210,7 @@ class Examples:
         earlier = []
         for e, f in later:
             then = int(self.episodes[e].times[f] - rng.integers(self.chunk + 1))
-            earlier.append(WindowStart(e, frame_at(self.episodes[e], then)))
+            earlier.append(WindowStart(e, self.episodes[e].frame_at(then)))
         return Pairs(
             before=np.stack([self.episodes[e].frames[f] for e, f in earlier]),
             after=np.stack([self.episodes[e].frames[f] for e, f in later]),

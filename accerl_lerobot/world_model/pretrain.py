@@ -67,7 +67,7 @@ def pretrain(run: WorldModelRun, directory: Path, console: Console) -> dict[str,
     learnt: list[Episode] = []
     held_out: dict[str, list[Episode]] = {}
     with console.stage("episodes"):
-        loaded = data.load_datasets(data.named_datasets(run), spec, own=validation.ONLINE)
+        loaded = data.load_datasets({data.DATASET: run.dataset, data.ONLINE: run.online}, spec)
         for section, episodes in loaded.items():
             learn, held_out[section] = data.split_episodes(episodes, config.held_out, rng)
             with data.name_section(section):

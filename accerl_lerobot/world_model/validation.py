@@ -35,7 +35,7 @@ from accerl_lerobot.policies.loading import resolve_device
 from accerl_lerobot.world_model import data, store
 from accerl_lerobot.world_model.config import ValidationConfig
 from accerl_lerobot.world_model.contract import LearnableWorldModel, WorldModel
-from accerl_lerobot.world_model.data import Episode, Windows, WindowStart
+from accerl_lerobot.world_model.data import DATASET, ONLINE, Episode, Windows, WindowStart
 from accerl_lerobot.world_model.rollout_eval import (
     bootstrap,
     choose_threshold,
@@ -49,8 +49,6 @@ from accerl_lerobot.world_model.success_model import SuccessPairsRewardModel
 if TYPE_CHECKING:
     from accerl_lerobot.cli.verbs import WorldModelEvalRun
 
-DATASET, ONLINE = "dataset", "online"
-"""Config sections of datasets, and their names in the results."""
 CHANGED = 16
 """A pixel counts as changed if one of its colours differs by more, of 255."""
 PREVIEW_ROWS, SCALE, FPS = 4, 3, 4
@@ -274,12 +272,13 @@ def evaluate(config: WorldModelEvalRun, directory: Path, console: Console) -> di
     model, success = store.load_world_model(path, config.discover_packages_path)
     roles, fresh = store.load_roles(path), None
     with console.stage("episodes"):
-        datasets = data.load_datasets(data.named_datasets(config), model.spec, own=ONLINE)
+        named = {DATASET: config.dataset, ONLINE: config.online}
+        datasets = data.load_datasets(named, model.spec)
     for name, episodes in datasets.items():
         kept = [episode for episode in episodes if roles.get(episode.key) != store.LEARNT]
         if not kept:
             remedy = "the world model was trained on every episode of it; give another dataset"
-            raise InputError(f"{name}.repo_id", getattr(config, name).repo_id, remedy)
+            raise InputError(f"{name}.repo_id", named[name].repo_id, remedy)
         if trained_on := len(episodes) - len(kept):
             console.say(f"{name}: trained on {trained_on} episodes of it, evaluated on the other {len(kept)}")
         if any(roles.get(episode.key) == store.THRESHOLD for episode in kept):

@@ -17,6 +17,7 @@ from accerl_lerobot.envs import SimulatedConfig, make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.contract import WorldModelSpec
 from accerl_lerobot.world_model.data import (
+    ONLINE,
     Episode,
     Windows,
     WindowStart,
@@ -24,7 +25,6 @@ from accerl_lerobot.world_model.data import (
     cut_windows,
     hold_last_action,
     load_datasets,
-    open_datasets,
     split_episodes,
     window_starts,
 )
@@ -169,15 +169,15 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[DatasetConfig, W
     return DatasetConfig(repo_id="a/b", root=str(root)), spec
 
 
-def load(dataset: DatasetConfig, spec: WorldModelSpec, own: str | None = None) -> list[Episode]:
-    return load_datasets({"dataset": dataset}, spec, own)["dataset"]
+def load(dataset: DatasetConfig, spec: WorldModelSpec, section: str = "dataset") -> list[Episode]:
+    return load_datasets({section: dataset, "other": DatasetConfig()}, spec)[section]
 
 
 def test_every_frame_and_action_is_the_dataset_s(recorded: tuple[DatasetConfig, WorldModelSpec]):
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     dataset, spec = recorded
-    episodes = load(dataset, spec, own="dataset")
+    episodes = load(dataset, spec, ONLINE)
     data = LeRobotDataset(dataset.repo_id, root=dataset.root)
     assert len(episodes) == data.meta.total_episodes == 6 and sum(map(len, episodes)) == len(data)
     index = 0
@@ -245,8 +245,6 @@ def test_a_world_without_a_state_does_not_ask_for_one():
 
 def test_datasets_that_share_episodes(recorded: tuple[DatasetConfig, WorldModelSpec], tmp_path: Path):
     dataset, spec = recorded
-    with pytest.raises(InputError, match="^online.repo_id='a/b': it is the one in dataset; name another"):
-        open_datasets({"dataset": dataset, "online": dataset}, spec)
     same = replace(dataset, repo_id="c/d")
     with pytest.raises(InputError, match="^online.repo_id='c/d': 6 of its episodes are in the other"):
         load_datasets({"dataset": dataset, "online": same}, spec)

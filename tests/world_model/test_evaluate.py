@@ -16,11 +16,11 @@ from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.world_model import validation
 from accerl_lerobot.world_model.config import PixelModelConfig, ValidationConfig, WorldModelConfig
 from accerl_lerobot.world_model.contract import new_model
-from accerl_lerobot.world_model.data import load_datasets
+from accerl_lerobot.world_model.data import DATASET, ONLINE, load_datasets
 from accerl_lerobot.world_model.learners import new_success_model
 from accerl_lerobot.world_model.pretrain import world_spec
 from accerl_lerobot.world_model.store import LEARNT, THRESHOLD, save_world_model
-from accerl_lerobot.world_model.validation import DATASET, ONLINE, validate_datasets
+from accerl_lerobot.world_model.validation import validate_datasets
 from tests.world_model.test_pretrain import recorded
 
 ENV = SimulatedConfig(max_steps=60, hold=25, image_size=16)

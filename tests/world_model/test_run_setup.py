@@ -42,10 +42,9 @@ def recorded(root: Path, episodes: int, seed: int) -> DatasetConfig:
 
 
 @pytest.fixture(scope="module")
-def datasets(tmp_path_factory: pytest.TempPathFactory) -> tuple[DatasetConfig, DatasetConfig]:
-    """Demonstrations, and what stands for a policy's episodes."""
-    root = tmp_path_factory.mktemp("datasets")
-    return recorded(root / "demos", 5, 0), recorded(root / "rollouts", 4, 1)
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> DatasetConfig:
+    """The data of a pre-training."""
+    return recorded(tmp_path_factory.mktemp("dataset") / "demos", 9, 0)
 
 
 def run(checkpoint: Path, folder: Path, learn: OnlineLearnConfig, roles: dict[str, str]) -> RunConfig:
@@ -74,10 +73,9 @@ def test_what_a_run_can_imagine_with(name: Any, made: type, tiny_checkpoint: Pat
 
 
 def test_it_goes_on_with_what_it_has_learned_from_and_never_with_what_was_held_out(
-    tiny_checkpoint: Path, datasets: tuple[DatasetConfig, DatasetConfig], tmp_path: Path
+    tiny_checkpoint: Path, dataset: DatasetConfig, tmp_path: Path
 ):
-    demos, rollouts = datasets
-    learn = OnlineLearnConfig(dataset=demos, online=rollouts)
+    learn = OnlineLearnConfig(dataset=dataset)
     config = run(tiny_checkpoint, tmp_path / "none", learn, {})
     learner = make_learner(config)
     assert (len(learner._offline), len(learner._held_offline)) == (9, 0), "of unknown ones it takes all"
@@ -123,14 +121,11 @@ def test_what_would_be_fine_tuned_is_looked_at_before(tiny_checkpoint: Path, tmp
     assert check_start(tuned) == 1
 
 
-@pytest.mark.parametrize("section", ["dataset", "online"])
-def test_a_dataset_that_is_not_there_is_named_by_its_section(
-    section: str, tiny_checkpoint: Path, tmp_path: Path
-):
-    learn = OnlineLearnConfig(**{section: DatasetConfig(repo_id="a/b", root="nowhere")})
+def test_a_dataset_that_is_not_there_is_named_by_its_section(tiny_checkpoint: Path, tmp_path: Path):
+    learn = OnlineLearnConfig(dataset=DatasetConfig(repo_id="a/b", root="nowhere"))
     config = run(tiny_checkpoint, tmp_path / "model", learn, {})
     for refused in (check_imagination, make_learner):
         with pytest.raises(
-            InputError, match=rf"^imagination.learn.{section}.root='nowhere': no meta/info.json"
+            InputError, match=r"^imagination.learn.dataset.root='nowhere': no meta/info.json there"
         ):
             refused(config)
