@@ -71,6 +71,10 @@ class Episode:
         followed = len(self.frames) - 1
         return min(followed, self.frame_at(self.success_at) + 1) if self.success else followed
 
+    def progress(self, time: int) -> float:
+        """Share of the way to the success by an env step; NaN without a success."""
+        return min(1.0, time / max(1, self.success_at)) if self.success else float("nan")
+
     def frame_at(self, time: int) -> int:
         """Index of the last frame recorded by an env step; the first one before all of them."""
         return max(0, int(np.searchsorted(self.times, time, side="right")) - 1)

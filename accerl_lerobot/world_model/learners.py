@@ -52,8 +52,7 @@ EASY = 0.1
 class _Trainer:
     """A network with an optimiser, and random numbers of its own."""
 
-    name: str
-    """In errors."""
+    name: str  # in errors
     section: str
 
     def __init__(self, model: nn.Module, lr: float, seed: int, stream: int) -> None:
@@ -110,9 +109,9 @@ class Learner(_Trainer):
     ) -> Windows:
         """Draws windows uniformly, a batch by default."""
         chosen = self.rng.integers(len(at), size=count or self.config.learn.batch)
-        return self.windows(episodes, [at[i] for i in chosen])
+        return self.cut(episodes, [at[i] for i in chosen])
 
-    def windows(self, episodes: Sequence[Episode], at: Sequence[WindowStart]) -> Windows:
+    def cut(self, episodes: Sequence[Episode], at: Sequence[WindowStart]) -> Windows:
         """Cuts windows, with anchors as far back as rollouts will go."""
         back = self.rng.integers(self.config.longest + 1, size=len(at)).tolist()
         windows = cut_windows(episodes, at, self.model.spec, self.config.learn.chunks, back)
@@ -172,13 +171,10 @@ def train_from_scratch(
 class Pairs(NamedTuple):
     """B pairs of frames, up to a chunk apart."""
 
-    before: np.ndarray
-    """uint8 (B, V, H, W, 3)."""
+    before: np.ndarray  # uint8 (B, V, H, W, 3)
     after: np.ndarray
-    success: np.ndarray
-    """bool (B,), True if the task had been achieved by the second frame."""
-    progress: np.ndarray
-    """float (B,), share of the way to the success by then; NaN for episodes without one."""
+    success: np.ndarray  # bool (B,), True if the task had been achieved by the second frame
+    progress: np.ndarray  # float (B,), share of the way to the success by then; NaN for episodes without one
 
 
 class Examples:
@@ -203,37 +199,24 @@ class Examples:
     def sample(self, count: int, rng: np.random.Generator) -> Pairs:
         """Draws recorded pairs: half successes, then as many failures, at the same distances; of these, half
         are from the last two chunks before a success, if there are any."""
-        later = self._halves(self._frames, count, rng)
-        near = count // 4 if self._near else 0
-        if near:
-            later[-near:] = [self._near[i] for i in rng.integers(len(self._near), size=near)]
-        earlier = []
-        for e, f in later:
-            then = int(self.episodes[e].times[f] - rng.integers(self.chunk + 1))
-            earlier.append(WindowStart(e, self.episodes[e].frame_at(then)))
-        return Pairs(
-            before=np.stack([self.episodes[e].frames[f] for e, f in earlier]),
-            after=np.stack([self.episodes[e].frames[f] for e, f in later]),
-            success=np.array([self.episodes[e].achieved[f] for e, f in later]),
-            progress=np.array([self.progress(at) for at in later]),
-        )
-
-    def progress(self, at: WindowStart, ahead: int = 0) -> float:
-        """Share of the way to the episode's success, `ahead` env steps later; NaN without a success."""
-        episode = self.episodes[at.episode]
-        if not episode.success:
-            return float("nan")
-        return min(1.0, (int(episode.times[at.frame]) + ahead) / max(1, episode.success_at))
-
-    def _halves(
-        self, of: dict[bool, list[WindowStart]], count: int, rng: np.random.Generator
-    ) -> list[WindowStart]:
-        sizes = {True: count // 2, False: count - count // 2}
-        return [of[k][i] for k, n in sizes.items() for i in rng.integers(len(of[k]), size=n)]
+        at = _halves(self._frames, count, rng)
+        if near := count // 4 if self._near else 0:
+            at[-near:] = [self._near[i] for i in rng.integers(len(self._near), size=near)]
+        pairs = []
+        for episode, f in ((self.episodes[e], f) for e, f in at):
+            earlier = episode.frame_at(int(episode.times[f] - rng.integers(self.chunk + 1)))
+            progress = episode.progress(int(episode.times[f]))
+            pairs.append((episode.frames[earlier], episode.frames[f], episode.achieved[f], progress))
+        return Pairs(*map(np.stack, zip(*pairs, strict=True)))
 
     def chunks(self, count: int, rng: np.random.Generator) -> list[WindowStart]:
         """Draws starts of chunks: half achieved the task, then as many that did not."""
-        return self._halves(self._chunks, count, rng)
+        return _halves(self._chunks, count, rng)
+
+
+def _halves(of: dict[bool, list[WindowStart]], count: int, rng: np.random.Generator) -> list[WindowStart]:
+    sizes = {True: count // 2, False: count - count // 2}
+    return [of[k][i] for k, n in sizes.items() for i in rng.integers(len(of[k]), size=n)]
 
 
 def imagine_pairs(
@@ -251,12 +234,14 @@ def imagine_pairs(
     at = [WindowStart(e, 0 if rng.random() < 0.5 else f) for e, f in examples.chunks(count, rng)]
     windows, predictions, executed = replay(world, examples.episodes, at, depth, rng)
     rows, depths = np.nonzero(executed)
-    ahead = (depths + 1) * world.spec.chunk
+    begun = [(examples.episodes[at[m].episode], at[m].frame) for m in rows]
+    steps = (depths + 1) * world.spec.chunk
+    progress = [e.progress(int(e.times[f]) + n) for (e, f), n in zip(begun, steps.tolist(), strict=True)]
     pairs = Pairs(
         before=predictions.frames[rows, depths],
         after=predictions.ends[rows, depths],
         success=windows.success[rows, depths],
-        progress=np.array([examples.progress(at[m], n) for m, n in zip(rows, ahead, strict=True)]),
+        progress=np.array(progress),
     )
     wrong = EASY + success.probabilities(pairs.before, pairs.after)
     return pairs, np.where(pairs.success, 1.0, wrong)

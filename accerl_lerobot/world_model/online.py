@@ -55,11 +55,10 @@ _COUNTS = ("pending_steps", "promoted", "rejected", "result", "_ended", "_since"
 
 def episode_from_segments(segments: Sequence[Segment], spec: WorldModelSpec) -> Episode:
     """Joins the segments of a whole episode, in order; it has a frame per decision."""
-    arrays = [model_arrays(segment.observations, spec) for segment in segments]
     # A segment's first observation is the last one of the segment before.
-    frames, robot = (
-        np.concatenate([part[i][:-1] for part in arrays[:-1]] + [arrays[-1][i]]) for i in range(2)
-    )
+    parts = [{k: v[:-1] for k, v in segment.observations.items()} for segment in segments[:-1]]
+    parts.append(segments[-1].observations)
+    frames, robot = model_arrays({k: np.concatenate([part[k] for part in parts]) for k in parts[0]}, spec)
     steps = np.concatenate([segment.steps for segment in segments])
     chunks = np.concatenate([segment.actions for segment in segments])
     actions = chunks[np.arange(chunks.shape[1]) < steps[:, None]]
@@ -79,10 +78,8 @@ class Promotion(NamedTuple):
 
     model: LearnableWorldModel
     success: SuccessPairsRewardModel
-    version: int
-    """Gradient steps in the run."""
-    roles: dict[str, str]
-    """Roles of episodes, by their keys, see `store`."""
+    version: int  # gradient steps in the run
+    roles: dict[str, str]  # of episodes, by their keys, see `store`
 
 
 class OnlineLearner:
@@ -105,18 +102,16 @@ class OnlineLearner:
     ) -> None:
         self.config, self._seed = config, seed
         self.validation = replace(config.validation, depth=min(config.validation.depth, longest))
-        self.pending_steps = 0.0
-        """Gradient steps that are due."""
+        self.pending_steps = 0.0  # gradient steps that are due
         self.promoted = self.rejected = 0
-        self.result: dict[str, Any] = {}
-        """Result of the last validation."""
+        self.result: dict[str, Any] = {}  # of the last validation
         training = WorldModelConfig(
             learn=LearnConfig(steps=ENDLESS, batch=BATCH, lr=LEARNING_RATE),
             success=SuccessLearnConfig(lr=LEARNING_RATE),
             longest=longest,
         )
-        self._learner = Learner(_trainable(model), training, seed)
-        self._success = SuccessLearner(_trainable(success), training, seed)
+        self._learner = Learner(copy.deepcopy(model).requires_grad_(True), training, seed)
+        self._success = SuccessLearner(copy.deepcopy(success).requires_grad_(True), training, seed)
         self._offline, self._held_offline = list(offline), list(held_offline)
         self._roles = {key: LEARNT if role == LEARNT else HELD_OUT for key, role in (roles or {}).items()}
         self._roles |= {episode.key: LEARNT for episode in self._offline}
@@ -127,10 +122,8 @@ class OnlineLearner:
         self._examples: Examples | None = None
         self._examples_stale = True
         self._ended = self._since = self._final_validations = 0
-        self._unserved: dict[str, Any] = {}
-        """Counts before the validation whose outcome has not been served yet."""
-        self._validating: float | None = None
-        """Start of the validation in progress; read on another thread."""
+        self._unserved: dict[str, Any] = {}  # counts before the validation whose outcome is not served yet
+        self._validating: float | None = None  # when it began; read on another thread
 
     @property
     def version(self) -> int:
@@ -175,10 +168,9 @@ class OnlineLearner:
         parts[segment.origin.decision] = segment
         if len(self._unfinished) > MOST_UNFINISHED:
             self._unfinished.popitem(last=False)
-        begun = sorted(parts)
-        ordered = [parts[decision] for decision in begun]
-        ends = list(accumulate(map(len, ordered)))
-        if begun != [0, *ends[:-1]] or not (ordered[-1].terminated or ordered[-1].truncated):
+        ordered = [parts[decision] for decision in sorted(parts)]
+        starts = accumulate(map(len, ordered[:-1]), initial=0)
+        if sorted(parts) != [*starts] or not (ordered[-1].terminated or ordered[-1].truncated):
             return None
         self._unfinished.pop(name, None)
         return ordered
@@ -189,7 +181,7 @@ class OnlineLearner:
         if not self._learnt and not self._offline:
             return {}
         episodes = self._offline + list(self._learnt)
-        metrics = self._learner.step(self._learner.windows(episodes, self._draw()))
+        metrics = self._learner.step(self._learner.cut(episodes, self._draw()))
         if self._examples is None and self._examples_stale:
             self._examples_stale = False
             with contextlib.suppress(ValueError):  # so far there may be only one kind of outcome
@@ -304,16 +296,9 @@ def episode_weights(successes: Sequence[bool]) -> np.ndarray:
     """Probability of drawing each of the policy's episodes, oldest first."""
     count = len(successes)
     newest = np.arange(count) >= count - max(1, count // 4)
-    weights = np.where(newest, RECENT / newest.sum(), 0.0)
-    old = ~newest
-    weights[old] += (1 - RECENT) / max(1, old.sum())
+    weights = np.where(newest, RECENT / newest.sum(), (1 - RECENT) / max(1, (~newest).sum()))
     failed = ~np.asarray(successes, bool)
     if failed.any() and not failed.all():
         for which, share in ((failed, FAILURES), (~failed, 1 - FAILURES)):
-            weights[which] *= share / weights[which].sum() if weights[which].sum() else 0.0
-    total = weights.sum()
-    return np.asarray(weights / total if total else np.full(count, 1 / count))
-
-
-def _trainable(model: Any) -> Any:
-    return copy.deepcopy(model).requires_grad_(True)
+            weights[which] *= share / weights[which].sum()
+    return np.asarray(weights / weights.sum())

@@ -14,6 +14,7 @@ import time
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +22,7 @@ import numpy as np
 import torch
 
 from accerl_lerobot.config.ranges import DatasetConfig
-from accerl_lerobot.console import Console
+from accerl_lerobot.console import Console, Stage
 from accerl_lerobot.envs import EnvConfig, make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.loading import resolve_device
@@ -104,30 +105,25 @@ def _train(
     """Trains a world model and a success model."""
     config, seed = run.world_model, run.seed
     examples = learners.Examples(learnt, config.chunk)
+
+    def on_step(stage: Stage, kind: str, step: int, metrics: dict[str, float]) -> None:
+        stage.update(step, " ".join(f"{k} {v:.3f}" for k, v in [*metrics.items()][:2]))
+        if step % LOG_EVERY == 0:
+            with (directory / METRICS).open("a") as log:
+                log.write(json.dumps({"kind": kind, "step": step} | metrics) + "\n")
+
     torch.manual_seed(seed)
     # Both networks are initialised on the CPU, so alike on every device.
     model = new_model(spec, config.model).to(device)
-    with (directory / METRICS).open("w") as log:
-
-        def record(kind: str, step: int, metrics: dict[str, float]) -> None:
-            if step % LOG_EVERY == 0:
-                log.write(json.dumps({"kind": kind, "step": step} | metrics) + "\n")
-
-        with console.stage("world model", total=config.learn.steps) as stage:
-
-            def on_step(step: int, metrics: dict[str, float]) -> None:
-                stage.update(step, " ".join(f"{k} {v:.3f}" for k, v in [*metrics.items()][:2]))
-                record("world_model", step, metrics)
-
-            serving = learners.train_from_scratch(model, learnt, config, seed, on_step).serving
-        validation.fit_uncertainty_scale(serving, learnt, config.validation, seed)
-        success = learners.new_success_model(config.chunk).to(device)
-        learner = learners.SuccessLearner(success, config, seed)
-        with console.stage("success model", total=config.success.steps) as stage:
-            for step in range(1, config.success.steps + 1):
-                metrics = learner.step(examples, serving)
-                record("success_model", step, metrics)
-                stage.update(step, f"loss {metrics['loss']:.3f}")
+    with console.stage("world model", total=config.learn.steps) as stage:
+        say = partial(on_step, stage, "world_model")
+        serving = learners.train_from_scratch(model, learnt, config, seed, say).serving
+    validation.fit_uncertainty_scale(serving, learnt, config.validation, seed)
+    success = learners.new_success_model(config.chunk).to(device)
+    learner = learners.SuccessLearner(success, config, seed)
+    with console.stage("success model", total=config.success.steps) as stage:
+        for step in range(1, config.success.steps + 1):
+            on_step(stage, "success_model", step, learner.step(examples, serving))
     return serving, success.eval()
 
 

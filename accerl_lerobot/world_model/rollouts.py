@@ -18,7 +18,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -47,16 +47,12 @@ if TYPE_CHECKING:
 
 
 @kind
-@dataclass(frozen=True, kw_only=True)
-class Start:
+class Start(NamedTuple):
     """The first observation of a real episode."""
 
-    frames: np.ndarray
-    """uint8 (V, H, W, 3), of the model's size."""
-    robot: np.ndarray
-    """float32 (S,)."""
-    task: str
-    """The instruction."""
+    frames: np.ndarray  # uint8 (V, H, W, 3), of the model's size
+    robot: np.ndarray  # float32 (S,)
+    task: str  # the instruction
     origin: Origin
 
 
@@ -64,14 +60,13 @@ def start_of(segment: Segment, spec: WorldModelSpec) -> Start:
     """The start of a rollout, from the first segment of a real episode."""
     first = {name: rows[:1] for name, rows in segment.observations.items()}
     frames, robot = model_arrays(first, spec)
-    return Start(frames=frames[0], robot=robot[0], task=segment.task, origin=segment.origin)
+    return Start(frames[0], robot[0], segment.task, segment.origin)
 
 
 def context_at(starts: Sequence[Start], spec: WorldModelSpec) -> Context:
     """A world model's context: nothing has moved before a reset, and no action was executed."""
-    frames, robot = (
-        torch.from_numpy(np.stack([getattr(start, name) for start in starts])) for name in ("frames", "robot")
-    )
+    frames = torch.from_numpy(np.stack([start.frames for start in starts]))
+    robot = torch.from_numpy(np.stack([start.robot for start in starts]))
     return Context(
         frames=frames[:, None].repeat(1, spec.context, 1, 1, 1, 1),
         robot=robot[:, None].repeat(1, spec.context, 1),
@@ -87,54 +82,55 @@ class KillSwitch:
     """Trips when imagined rollouts succeed too much more often than real episodes.
 
     Each real outcome is compared with the success rate of imagined rollouts at that time. As both are of
-    nearly the same policy, a policy that improves does not trip the switch.
+    nearly the same policy, a policy that improves does not trip the switch. Lists are replaced and never
+    changed, as another thread reads the rates.
     """
 
-    max_gap: float
-    """Largest difference of the two success rates."""
-    window: int
-    """Newest imagined rollouts over which their rate is taken; until there are so many, nothing is
-    compared."""
-    min_real: int
-    """Newest real outcomes over which the difference is taken; the same holds for them."""
+    max_gap: float  # largest difference of the two success rates
+    window: int  # newest imagined rollouts whose rate is taken; until there are so many, nothing is compared
+    min_real: int  # newest real outcomes over which the difference is taken; the same holds for them
     rollouts: list[bool] = field(default_factory=list)
-    pairs: list[tuple[float, bool]] = field(default_factory=list)
-    """The success rate of imagined rollouts, and a real outcome."""
+    pairs: list[tuple[float, float]] = field(default_factory=list)  # rate of imagined ones, real outcome
     tripped: bool = False
-    # Kept as numbers, as they are read on another thread too.
-    share: float = math.nan
-    """Success rate of the newest imagined rollouts; NaN before there are any."""
-    shares: tuple[float, float] = (math.nan, math.nan)
-    """Success rates, imagined and real, at the same times; NaN before there are any."""
+
+    @property
+    def share(self) -> float:
+        """Success rate of the newest imagined rollouts; NaN before there are any."""
+        rollouts = self.rollouts
+        return sum(rollouts) / len(rollouts) if rollouts else math.nan
+
+    @property
+    def shares(self) -> tuple[float, float]:
+        """Success rates, imagined and real, at the same times; NaN before there are any."""
+        pairs = self.pairs or [(math.nan, math.nan)]
+        imagined, real = (sum(column) / len(pairs) for column in zip(*pairs, strict=True))
+        return imagined, real
 
     def add_imagined(self, success: bool) -> None:
         """Takes the outcome of an imagined rollout."""
         self.rollouts = [*self.rollouts, success][-self.window :]
-        self.share = sum(self.rollouts) / len(self.rollouts)
 
     def add_real(self, success: bool) -> None:
         """Takes a real outcome; it does not count before the window is full."""
         if len(self.rollouts) < self.window:
             return
         self.pairs = [*self.pairs, (self.share, success)][-self.min_real :]
-        count = len(self.pairs)
-        imagined, real = (sum(column) / count for column in zip(*self.pairs, strict=True))
-        self.shares = imagined, real
-        self.tripped |= count == self.min_real and imagined - real > self.max_gap
+        imagined, real = self.shares
+        self.tripped |= len(self.pairs) == self.min_real and imagined - real > self.max_gap
 
     def reset(self) -> None:
         """Starts again for another world model; unless it has tripped, pairs of the last one still count."""
-        self.rollouts, self.share = [], math.nan
+        self.rollouts = []
         if self.tripped:
-            self.pairs, self.shares = [], (math.nan, math.nan)
+            self.pairs = []
         self.tripped = False
 
 
 class Imagination:
     """A batch of imagined rollouts, each of which starts anew when it has ended.
 
-    Without `success`, the model classifies successes itself. `on_segment` receives imagined segments,
-    `decision_cost` is subtracted from every reward, and the time limit is a failure or truncates.
+    Without `success`, the model classifies successes itself. `decision_cost` is subtracted from every reward,
+    and the time limit is a failure or truncates.
     """
 
     def __init__(
@@ -151,14 +147,10 @@ class Imagination:
     ) -> None:
         self.config = config
         self.counters = {"rollouts": 0, "decisions": 0, "successes": 0, "uncertain": 0}
-        """Imagined rollouts that ended; ``uncertain``: before such a prediction."""
         self.switch = KillSwitch(config.max_gap, config.window, config.min_real_episodes)
-        self.version = 0
-        self.awaits_model = config.learns
-        """True if no model has passed validation yet."""
+        self.version, self.awaits_model = 0, config.learns  # true until a model has passed validation
         self._model, self._success, self._world = model, success, world
-        self._roles: dict[str, str] = {}
-        """Roles of episodes, see `Promotion`."""
+        self._roles: dict[str, str] = {}  # of episodes, see `Promotion`
         self._on_segment = on_segment
         self._decision_cost, self._time_limit_fails = decision_cost, time_limit_fails
         self._starts: deque[Start] = deque(maxlen=config.memory)
@@ -166,8 +158,7 @@ class Imagination:
         self._rows: list[SegmentBuilder | None] = [None] * config.rollouts
         self._state: State | None = None
         frames = (config.rollouts, len(model.spec.cameras), *model.spec.image_size, 3)
-        self._frames = np.zeros(frames, np.uint8)
-        """The newest frame of each row."""
+        self._frames = np.zeros(frames, np.uint8)  # the newest of each row
         self._sequence = self._uncertain_in_a_row = 0
         self._limit = math.ceil(world.max_steps / model.spec.chunk)
 
@@ -180,9 +171,8 @@ class Imagination:
 
     def swap(self, promotion: Promotion) -> None:
         """Replaces the models; unfinished rollouts are dropped. A placebo stays one."""
-        self._rows, self._state = [None] * len(self._rows), None
-        self._uncertain_in_a_row = 0
         assert self._success is not None  # or there would be nothing to promote
+        self._rows, self._state, self._uncertain_in_a_row = [None] * len(self._rows), None, 0
         device = self._success.out.weight.device
         model = promotion.model.to(device)
         self._model = ShuffledModel(model) if isinstance(self._model, ShuffledModel) else model
@@ -239,9 +229,8 @@ class Imagination:
     @property
     def on(self) -> bool:
         """True if anything is to be imagined now."""
-        if self.awaits_model or self.switch.tripped:
-            return False
-        return self._uncertain_in_a_row < self.config.window
+        uncertain = self._uncertain_in_a_row >= self.config.window
+        return not (self.awaits_model or self.switch.tripped or uncertain)
 
     def requests(self) -> list[Request]:
         """Requests for decisions, one per rollout; none before there is a real segment, or switched off."""
@@ -321,7 +310,6 @@ class Imagination:
         self._on_segment(segment)
 
     def _begin(self, rows: list[int]) -> None:
-        """Starts rollouts in free rows."""
         if not rows:
             return
         starts = [self._starts[i] for i in self._rng.integers(len(self._starts), size=len(rows))]

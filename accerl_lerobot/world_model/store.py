@@ -10,13 +10,13 @@ world_model/
 from __future__ import annotations
 
 import json
-from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 
 import draccus
 import torch
+from lerobot.configs.rewards import RewardModelConfig
 from safetensors import SafetensorError
 from safetensors.torch import save_file
 
@@ -31,7 +31,7 @@ from accerl_lerobot.checkpoint.safety import (
 )
 from accerl_lerobot.config.parsing import DISCOVER, discover
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.policies.guard import Unfilled, guarded, input_error
+from accerl_lerobot.policies.guard import Unfilled, input_error
 from accerl_lerobot.world_model.config import LearnableModelConfig
 from accerl_lerobot.world_model.contract import Context, LearnableWorldModel, WorldModelSpec, new_model
 from accerl_lerobot.world_model.success_model import SuccessPairsRewardModel
@@ -91,17 +91,40 @@ def load_world_model(
         package_field = origin.field.removesuffix("path") + DISCOVER
         remedy = f"use one of {', '.join(known)}, or name its package: {package_field}"
         raise origin.refuse(f"{CONFIG}: model.type", f"{str(kind)[:60]!r}; {remedy}")
+
+    def make_model() -> LearnableWorldModel:
+        spec = draccus.decode(WorldModelSpec, content.get("spec"))
+        return new_model(spec, draccus.decode(LearnableModelConfig, named))
+
+    model = _filled("world model", make_model, directory, origin)
+    directory = safe_join(directory, SUCCESS, origin)
+    config = read_json(safe_join(directory, CONFIG, origin), origin)
+    if (kind := config.get("type")) != SuccessPairsRewardModel.name:
+        raise origin.refuse(f"{CONFIG}: type", f"{str(kind)[:60]!r}; use {SuccessPairsRewardModel.name}")
+    success = _filled(
+        "success model",
+        lambda: SuccessPairsRewardModel(draccus.decode(RewardModelConfig, config)),
+        directory,
+        origin,
+    )
+    return model, success
+
+
+def _filled[M: torch.nn.Module](what: str, make: Callable[[], M], directory: Path, origin: Origin) -> M:
+    """A new model with the weights in `directory`."""
     check_not_pickled(directory, WEIGHTS, origin)
     weights = safe_join(directory, WEIGHTS, origin)
     try:
-        spec = draccus.decode(WorldModelSpec, content.get("spec"))
-        config = draccus.decode(LearnableModelConfig, named)
         with Unfilled():
-            model = new_model(spec, config)
+            model = make()
         model.load_state_dict(dict(read_tensors(weights, origin)))
     except UNREADABLE as error:
-        raise _unreadable(error, "world model", origin) from error
-    return model.requires_grad_(False).eval(), _success(safe_join(directory, SUCCESS, origin), origin)
+        ours = input_error(error)  # draccus wraps what a config refuses
+        if ours is None:
+            remedy = f"not a {what} of accerl world-model ({brief(error)})"
+            raise InputError(origin.field, origin.value, remedy) from error
+        raise (ours if ours.field == origin.field else origin.refuse(CONFIG, brief(ours))) from error
+    return model.requires_grad_(False).eval()
 
 
 def rehearse_world_model(directory: Path, package: str | None = None, *, section: str = "") -> None:
@@ -121,27 +144,6 @@ def _predict_once(model: LearnableWorldModel, success: SuccessPairsRewardModel) 
     state = model.begin(Context(frames, robot, actions, commanded, robot[:, -1]), spec.tasks[:1] or ("",))
     prediction = model.step(state, torch.zeros(1, spec.chunk, spec.action_dim), [0])
     success.probabilities(frames[:, -1].numpy(), prediction.frames.numpy())
-
-
-def _success(directory: Path, origin: Origin) -> SuccessPairsRewardModel:
-    kind = read_json(safe_join(directory, CONFIG, origin), origin).get("type")
-    if kind != "success_pairs":
-        raise origin.refuse(f"{CONFIG}: type", f"{str(kind)[:60]!r}; use success_pairs")
-    check_not_pickled(directory, WEIGHTS, origin)
-    try:
-        with guarded("path"), Unfilled():
-            success = SuccessPairsRewardModel.from_pretrained(directory, strict=True).eval()
-        deque(read_tensors(safe_join(directory, WEIGHTS, origin), origin), maxlen=0)
-    except UNREADABLE as error:
-        raise _unreadable(error, "success model", origin) from error
-    return success
-
-
-def _unreadable(error: Exception, what: str, origin: Origin) -> InputError:
-    ours = input_error(error)  # draccus wraps what a config refuses
-    if ours is None:
-        return InputError(origin.field, origin.value, f"not a {what} of accerl world-model ({brief(error)})")
-    return ours if ours.field == origin.field else origin.refuse(CONFIG, brief(ours))
 
 
 def _origin(directory: Path, section: str) -> Origin:
