@@ -18,7 +18,6 @@ from benchmarks.faults import BenchFaultsConfig
 from benchmarks.few_shot import BenchFewShotConfig
 from benchmarks.gpu import BenchGpuConfig
 from benchmarks.lag import BenchLagConfig
-from benchmarks.replay import BenchReplayConfig
 from benchmarks.scaling import BenchScalingConfig
 from benchmarks.soak import BenchSoakConfig
 from benchmarks.transport import BenchTransportConfig
@@ -33,7 +32,6 @@ CONFIGS: dict[str, type[Any]] = {
     "async_vs_sync": BenchAsyncVsSyncConfig,
     "scaling": BenchScalingConfig,
     "batching": BenchBatchingConfig,
-    "replay": BenchReplayConfig,
     "transport": BenchTransportConfig,
     "weights": BenchWeightsConfig,
     "gpu": BenchGpuConfig,

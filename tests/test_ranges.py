@@ -35,7 +35,6 @@ from benchmarks.batching import BenchBatchingConfig
 from benchmarks.efficiency import BenchEfficiencyConfig
 from benchmarks.lag import BenchLagConfig
 from benchmarks.machinery import MachineryConfig
-from benchmarks.replay import BenchReplayConfig
 from benchmarks.scaling import BenchScalingConfig
 from benchmarks.transport import BenchTransportConfig
 
@@ -104,8 +103,6 @@ RULES = [
     (BenchEfficiencyConfig, {"budgets": (4, 4)}, "budgets="),
     (BenchLagConfig, {"algorithms": ()}, "algorithms="),
     (BenchLagConfig, {"lags": (0, 0)}, "lags="),
-    (BenchReplayConfig, {"batch": 8}, "batch="),
-    (BenchReplayConfig, {"capacity": 256}, "capacity="),
     (BenchScalingConfig, {"counts": (2, 2)}, "counts="),
     (BenchTransportConfig, {"sizes": ("1 GB",)}, "sizes="),
     (MachineryConfig, {"segment_length": 5}, "segment_length="),

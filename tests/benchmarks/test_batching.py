@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Batching and replay: what is made of the numbers, and a small run of each."""
+"""Rules of batching: what is made of the numbers, and a small run."""
 
 from __future__ import annotations
 
@@ -10,11 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from accerl_lerobot.console import Console
 from accerl_lerobot.inference.batcher import GRAIN, Batcher, quantile
-from benchmarks import batching, replay
+from benchmarks import batching
 from benchmarks.batching import BenchBatchingConfig
-from benchmarks.replay import BenchReplayConfig
 from tests.light_workers import light_ray
 
 __all__ = ["light_ray"]
@@ -59,13 +57,3 @@ def test_a_small_run_of_batching(light_ray: None, tmp_path: Path):
     assert "wait p99" in (tmp_path / "batching.md").read_text()
 
 
-def test_a_small_run_of_replay():
-    result = replay.bench_replay(BenchReplayConfig(capacity=64, batch=32, image_size=8, repeats=2))
-    assert set(result["us"]) == {"insert", "insert with journal", "draw a batch", "checkpoint"}
-    assert all(0 < us["min"] <= us["max"] for us in result["us"].values())
-    # A picture, a state, a chunk twice and its log-prob; of pictures and states one more than decisions.
-    assert result["bytes"] == pytest.approx((8 * 8 * 3 + 16) * 17 / 16 + 2 * 10 * 4 * 4 + 10 * 4)
-    # Everything that the replay holds is in the checkpoint.
-    assert result["checkpoint_mb"] >= 64 * 8 * 8 * 3 / 1e6
-    with Console().rich.capture():
-        Console().rich.print(replay.table(result))
