@@ -93,12 +93,6 @@ def test_chunks_are_made_whole_by_holding_the_last_action():
     assert windows.actions[0, 1, 1, 0] == 0, "they themselves stay"
 
 
-def test_frames_that_show_the_task_achieved():
-    assert an_episode(8, success_at=7).achieved.tolist() == [False] * 7 + [True]
-    assert an_episode(8, every=K, success_at=7, last=True).achieved.tolist() == [False] * 3 + [True]
-    assert not an_episode(8).achieved.any()
-
-
 def test_an_episode_that_was_looked_at_when_decisions_were_due():
     episode = an_episode(8, every=K, success_at=7, last=True)
     assert episode.times.tolist() == [0, 3, 6, 8]
@@ -196,14 +190,6 @@ def test_every_frame_and_action_is_the_dataset_s(recorded: tuple[DatasetConfig, 
         index += len(episode)
     assert {e.success for e in episodes} == {True, False}
     assert len({e.key for e in episodes}) == 6, "by which they are known in any dataset"
-
-
-def test_images_are_brought_to_size(recorded: tuple[DatasetConfig, WorldModelSpec]):
-    dataset, spec = recorded
-    episodes = load(dataset, replace(spec, image_size=(8, 24)))
-    for small, full in zip(episodes, load(dataset, spec), strict=True):
-        assert small.frames.shape == (len(full), 1, 8, 24, 3) and small.frames.dtype == np.uint8
-        assert abs(small.frames.mean() - full.frames.mean()) < 2
 
 
 def metadata(**changes: Any) -> SimpleNamespace:

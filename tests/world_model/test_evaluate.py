@@ -76,45 +76,24 @@ def test_one_that_does_not_know_the_dataset_is_tried_on_all_of_it(
     assert {name: one["episodes"] for name, one in found["datasets"].items()} == {DATASET: 8}
 
 
-SAVED, SET = 0.8, 0.6
-OF: dict[str, Any] = {DATASET: "demos", ONLINE: "a policy's"}
-
-
-@pytest.fixture
-def judged(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, float | None]]:
-    """In place of a validation: which threshold classifies each dataset, in order."""
+def test_a_threshold_is_chosen_anew_only_where_it_comes_from(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     calls: list[tuple[str, float | None]] = []
 
     def validate(model: Any, episodes: Any, config: Any, success: Any, seed: int, threshold: Any) -> Any:
         calls.append((episodes, threshold))
         check = {"value": 1.0, "wanted": "above 0", "holds": episodes == "demos"}
-        return {"checks": {"skill": check}, "threshold": SET if threshold is None else threshold}
+        return {"checks": {"skill": check}, "threshold": 0.6 if threshold is None else threshold}
 
     monkeypatch.setattr(validation, "validate", validate)
-    monkeypatch.setattr(validation, "preview_video", lambda path, *_: path.write_bytes(b"video"))
-    return calls
-
-
-def validated(tmp_path: Path, **options: Any) -> dict[str, Any]:
-    return validate_datasets(None, OF, ValidationConfig(), None, tmp_path, **options)  # type: ignore[arg-type]
-
-
-def test_a_threshold_that_is_chosen_on_a_policys_episodes_classifies_the_others(
-    judged: list[tuple[str, float | None]], tmp_path: Path
-):
-    found = validated(tmp_path, fresh=ONLINE)
-    assert judged == [("a policy's", None), ("demos", SET)] and list(found["datasets"]) == [DATASET, ONLINE]
-    assert {path.name for path in tmp_path.iterdir()} == {"preview.mp4", "preview_online.mp4"}
-    assert not found["passed"]
-    assert {k: check["holds"] for k, check in found["checks"].items()} == {
-        "skill": True,
-        "online.skill": False,
-    }
-
-
-def test_a_saved_threshold_is_chosen_anew_only_where_it_comes_from(
-    judged: list[tuple[str, float | None]], tmp_path: Path
-):
-    validated(tmp_path, fresh=DATASET, threshold=SAVED)
-    validated(tmp_path, fresh=None, threshold=SAVED)
-    assert judged == [("demos", None), ("a policy's", SAVED), ("demos", SAVED), ("a policy's", SAVED)]
+    monkeypatch.setattr(validation, "preview_video", lambda path, *_: None)
+    datasets: Any = {DATASET: "demos", ONLINE: "a policy's"}
+    for fresh, saved, wanted in (
+        (ONLINE, None, [("a policy's", None), ("demos", 0.6)]),
+        (DATASET, 0.8, [("demos", None), ("a policy's", 0.8)]),
+        (None, 0.8, [("demos", 0.8), ("a policy's", 0.8)]),
+    ):
+        calls.clear()
+        of: dict[str, Any] = {"model": None, "success": None, "fresh": fresh, "threshold": saved}
+        found = validate_datasets(datasets=datasets, config=ValidationConfig(), directory=tmp_path, **of)
+        assert calls == wanted and list(found["datasets"]) == [DATASET, ONLINE] and not found["passed"]
+        assert {k: c["holds"] for k, c in found["checks"].items()} == {"skill": True, "online.skill": False}

@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from accerl_lerobot.world_model.config import (
-    LearnConfig,
     PixelModelConfig,
     SuccessLearnConfig,
     WorldModelConfig,
@@ -20,10 +19,8 @@ from accerl_lerobot.world_model.learners import (
     Examples,
     SuccessLearner,
     new_success_model,
-    train_from_scratch,
 )
 from accerl_lerobot.world_model.pixels import PixelWorldModel
-from accerl_lerobot.world_model.validation import skill, squared_errors
 from tests.world_model.test_pixels import CHANNELS, SIZE, SPEC, K, dots, rollout, windows
 from tests.world_model.test_validate import Deterministic, with_successes
 
@@ -102,31 +99,3 @@ def test_frames_go_in_and_come_out_in_the_order_of_the_cameras():
         frames = rollout(two_cameras(), shown)[0].frames.numpy()
         assert frames.shape[1:] == (2, SIZE, SIZE, 3) and np.array_equal(frames, shown.frames[:, 1])
     assert not np.array_equal(of.frames[:, 1, 0], of.frames[:, 1, 1])
-
-
-@pytest.fixture(scope="module")
-def learnt() -> PixelWorldModel:
-    config = WorldModelConfig(learn=LearnConfig(steps=200, batch=16, lr=2e-3), longest=3)
-    return train_from_scratch(two_cameras(), seen_twice(dots(60), 1)[0], config, seed=0).serving
-
-
-def skills(frames: np.ndarray, wanted: np.ndarray, newest: np.ndarray, of: Windows) -> list[float]:
-    """Skill for each camera, frames uint8 (B, V, H, W, 3)."""
-    return [
-        skill(
-            squared_errors(frames[:, v : v + 1], wanted[:, v : v + 1]),
-            squared_errors(newest[:, v : v + 1], wanted[:, v : v + 1]),
-            of.episode,
-        )["value"]
-        for v in range(2)
-    ]
-
-
-@pytest.mark.slow
-def test_either_camera_is_predicted_in_its_place(learnt: PixelWorldModel):
-    of = windows(seen_twice(dots(12, seed=5), 6)[0])
-    frames, wanted = rollout(learnt, of)[0].frames.numpy(), of.frames[:, 2]
-    assert min(skills(frames, wanted, of.frames[:, 1], of)) > 0.4
-    # Each looks like its own camera, and nothing like the other one.
-    crossed = squared_errors(frames[:, ::-1], wanted).mean()
-    assert crossed > 10 * squared_errors(frames, wanted).mean()

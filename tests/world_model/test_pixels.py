@@ -13,7 +13,7 @@ from accerl_lerobot.world_model.config import LearnConfig, PixelModelConfig, Wor
 from accerl_lerobot.world_model.contract import Prediction, WorldModelSpec, context_of
 from accerl_lerobot.world_model.data import Episode, Windows, cut_windows, shuffle_actions, window_starts
 from accerl_lerobot.world_model.learners import Learner, train_from_scratch
-from accerl_lerobot.world_model.pixels import PixelWorldModel
+from accerl_lerobot.world_model.pixels import Attention, FrameNetwork, PixelWorldModel
 from accerl_lerobot.world_model.validation import sensitivity, skill, squared_errors
 from tests.rounding import assert_close
 
@@ -84,7 +84,7 @@ def rollout(
     return predictions
 
 
-def awake(made: PixelWorldModel) -> PixelWorldModel:
+def awake[M: torch.nn.Module](made: M) -> M:
     """Random where it starts at zero."""
     with torch.no_grad():
         for p in made.parameters():
@@ -259,17 +259,35 @@ def test_a_model_that_diverges_is_an_error():
         learner.step(replace(of, state=of.state * np.nan))
 
 
-def test_the_same_seed_learns_the_same():
-    config = WorldModelConfig(learn=LearnConfig(steps=3, batch=4), longest=2)
-    weights = [
-        train_from_scratch(model(), dots(4), config, seed).serving.state_dict()["network.leave.2.weight"]
-        for seed in (0, 0, 1)
-    ]
-    assert torch.equal(weights[0], weights[1]) and not torch.equal(weights[0], weights[2])
-
-
 def test_the_weights_that_serve_follow_those_that_learn(learnt: Learner):
     now, mean = learnt.model.state_dict(), learnt.serving.state_dict()
     assert all(torch.equal(now[k], mean[k]) for k in now if "." not in k), "statistics"
     far = torch.cat([(now[k] - mean[k]).flatten() for k in now]).square().mean()
     assert 0 < far < 1e-3
+
+
+@pytest.mark.parametrize("channels", [(8, 8, 12), (7,), (10, 14)], ids=["deep", "flat", "odd widths"])
+def test_networks_of_other_sizes(channels: tuple[int, ...]):
+    torch.manual_seed(0)
+    network, side = FrameNetwork(3, 6, 8, 3, channels), 8 * 2 ** (len(channels) - 1)
+    given = {"frames": torch.randn(2, 6, side, side), "chunk": torch.randn(2, 8), "state": torch.randn(2, 3)}
+    assert not network(**given).any(), "it starts at no change"
+    image = awake(network)(**given)
+    assert image.shape == (2, 3, side, side) and torch.isfinite(image).all()
+    for name, value in given.items():
+        assert (awake(network)(**given | {name: value.flip(0)}) - image).abs().max() > 1e-3, name
+
+
+def test_attention_is_softmax_attention():
+    torch.manual_seed(0)
+    layer = Attention(6)
+    torch.nn.init.normal_(layer.out.weight, std=0.3)
+    x = torch.randn(2, 6, 3, 2)
+    with torch.no_grad():
+        got = layer(x)
+        h = layer.into(layer.norm(x)).flatten(2)
+        for b in range(2):
+            q, k, v = h[b].view(3, 6, 6)
+            mixed = v @ torch.softmax(q.T @ k / 6**0.5, -1).T
+            want = x[b] + layer.out(mixed.view(1, 6, 3, 2))[0]
+            assert_close(got[b], want)

@@ -21,8 +21,7 @@ from accerl_lerobot.demos.record import DemosConfig, record_demos
 from accerl_lerobot.engine.config import DatasetConfig, RunConfig, parse
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.world_model import learners, pretrain
-from accerl_lerobot.world_model import validation as evaluate
+from accerl_lerobot.world_model import learners, pretrain, validation
 from accerl_lerobot.world_model.config import WorldModelConfig
 from accerl_lerobot.world_model.learners import new_success_model
 from accerl_lerobot.world_model.store import (
@@ -113,29 +112,6 @@ def test_one_success_is_not_enough_to_learn_from_and_be_classified_on():
     pretrain._check_split(DatasetConfig(), success + failures[:2], success + failures[2:], config)
 
 
-@pytest.mark.slow
-def test_the_validation_is_on_episodes_that_were_not_learned_from(
-    demos: Path, rollouts: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    seen: dict[str, list[bytes]] = {}
-
-    def spy(name: str, place: int, real: Any) -> Any:
-        def called(*args: Any, **options: Any) -> Any:
-            of = getattr(args[place], "episodes", args[place])
-            seen.setdefault(name, []).extend(e.frames.tobytes() for e in of)
-            return real(*args, **options)
-
-        return called
-
-    monkeypatch.setattr(learners, "train_from_scratch", spy("learnt", 1, learners.train_from_scratch))
-    monkeypatch.setattr(evaluate, "validate", spy("tried", 1, evaluate.validate))
-    monkeypatch.setattr(learners.SuccessLearner, "step", spy("success", 1, learners.SuccessLearner.step))
-    more = ["--online.repo_id=a/b", f"--online.root={rollouts}"]
-    cli.main([*arguments(demos, tmp_path / "out"), *more])
-    assert set(seen["learnt"]) == set(seen["success"]) and len(set(seen["learnt"] + seen["tried"])) == 14
-    assert not set(seen["learnt"]) & set(seen["tried"])
-
-
 @pytest.mark.parametrize("shuffled", [False, True])
 def test_a_placebo_is_learned_where_one_is_asked_for(
     shuffled: bool, demos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -152,39 +128,35 @@ def test_a_placebo_is_learned_where_one_is_asked_for(
 
 
 @pytest.mark.slow
-def test_both_networks_learn_on_the_device_and_are_saved_for_any(
-    demos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    asked, went = moved(monkeypatch)
-    learnt: list[str] = []
-
-    def on(name: str, real: Any) -> Any:
-        def called(*args: Any, **options: Any) -> Any:
-            learnt.extend([name, *(kind for kind, device in went if device == torch.device("cpu", 0))])
-            return real(*args, **options)
-
-        return called
-
-    monkeypatch.setattr(learners, "train_from_scratch", on("pretrain", learners.train_from_scratch))
-    monkeypatch.setattr(learners, "SuccessLearner", on("success", learners.SuccessLearner))
-    cli.main(replacing(arguments(demos, tmp_path / "out"), "--device=cuda:3"))
-    assert asked == ["cuda:3"]
-    models = ["PixelWorldModel", "SuccessPairsRewardModel"]
-    assert learnt == ["pretrain", models[0], "success", *models], "before the optimisers are made"
-    saved = json.loads((tmp_path / "out" / "world_model" / "success_model" / "config.json").read_text())
-    assert saved["device"] == "cpu"
-
-
-@pytest.mark.slow
 def test_a_policys_episodes_are_learned_from_beside_demonstrations(
-    demos: Path, rollouts: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    demos: Path,
+    rollouts: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ):
+    seen: dict[str, set[str]] = {}
+
+    def spy(module: Any, name: str) -> None:
+        real = getattr(module, name)
+
+        def called(*args: Any) -> Any:
+            seen.setdefault(name, set()).update(episode.key for episode in args[1])
+            return real(*args)
+
+        monkeypatch.setattr(module, name, called)
+
+    spy(learners, "train_from_scratch")
+    spy(validation, "validate")
     theirs = ["--online.repo_id=a/rollouts", f"--online.root={rollouts}"]
     out = tmp_path / "out"
     code = cli.main([*arguments(demos, out), *theirs])
     stdout, stderr = capsys.readouterr()
     found = json.loads(stdout)
-    counts = Counter(load_roles(out / "world_model").values())
+    roles = load_roles(out / "world_model")
+    assert seen["train_from_scratch"] == {key for key, role in roles.items() if role == "learnt"}
+    assert seen["validate"] == roles.keys() - seen["train_from_scratch"]
+    counts = Counter(roles.values())
     assert counts["learnt"] == found["learnt"]["episodes"] and counts.total() == 8 + 6
     assert counts["held out"] + counts["threshold"] == found["held_out"]["episodes"]
     online = found["datasets"]["online"]
@@ -265,26 +237,6 @@ def test_what_nobody_could_load_is_found_in_a_child_process(
     with pytest.raises(InputError) as caught:
         rehearse_world_model(tmp_path / "w")
     assert str(caught.value).startswith("path=") and "\n" not in str(caught.value)
-
-
-def moved(monkeypatch: pytest.MonkeyPatch) -> tuple[list[str], list[tuple[str, Any]]]:
-    """Devices that are asked for, and which networks go where; the CPU stands in for all of them."""
-    asked: list[str] = []
-    went: list[tuple[str, Any]] = []
-    real = torch.nn.Module.to
-
-    def resolve(name: str, field: str) -> torch.device:
-        asked.append(name)
-        return torch.device("cpu", 0)
-
-    def to(self: torch.nn.Module, *args: Any, **options: Any) -> torch.nn.Module:
-        went.append((type(self).__name__, args[0]))
-        return real(self, *args, **options)
-
-    for module in (pretrain, evaluate):
-        monkeypatch.setattr(module, "resolve_device", resolve)
-    monkeypatch.setattr(torch.nn.Module, "to", to)
-    return asked, went
 
 
 def test_a_device_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
