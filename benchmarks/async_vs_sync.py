@@ -29,7 +29,7 @@ from accerl_lerobot.errors import InputError, output_folder
 from accerl_lerobot.evaluation import Rate, drawing, evaluation_plans
 from accerl_lerobot.replay.pacing import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, Schedule
 from benchmarks.machinery import MachineryConfig
-from benchmarks.records import as_markdown, floors, write
+from benchmarks.records import as_markdown, write
 from benchmarks.simulated_world import read_trace
 
 LEARNING = MachineryConfig(worlds=4, latency_ms=4.0, image_size=16, decide_ms=1.0, update_ms=8.0)
@@ -72,7 +72,7 @@ def bench_async_vs_sync(config: BenchAsyncVsSyncConfig) -> dict[str, Any]:
 
     Returns:
         ``laws``: for each, the blocks, decisions per second by arm, S, S*, S/S* and whether the processors
-        were busy; ``learning``: success by arm and seed; ``config``, ``host`` and ``floors``.
+        were busy; ``learning``: success by arm and seed; ``config`` and ``host``.
 
     Raises:
         InputError: one of `traces` is none.
@@ -80,7 +80,7 @@ def bench_async_vs_sync(config: BenchAsyncVsSyncConfig) -> dict[str, Any]:
     for trace in config.traces:
         read_trace(trace, "traces")
     console, root = Console(), output_folder(config.output_dir)
-    result: dict[str, Any] = {"config": asdict(config), "host": host(), "floors": floors(), "laws": []}
+    result: dict[str, Any] = {"config": asdict(config), "host": host(), "laws": []}
     every = laws(config)
     with console.stage("laws", total=len(every)) as stage:
         for of in every:

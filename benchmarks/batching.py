@@ -22,7 +22,7 @@ from accerl_lerobot.errors import InputError, output_folder
 from accerl_lerobot.inference.batcher import quantile
 from accerl_lerobot.replay.pacing import ASYNCHRONOUS
 from benchmarks.machinery import MachineryConfig
-from benchmarks.records import as_markdown, floors, write
+from benchmarks.records import as_markdown, write
 from benchmarks.simulated_world import read_trace
 
 
@@ -54,12 +54,12 @@ def bench_batching(config: BenchBatchingConfig) -> dict[str, Any]:
 
     Returns:
         ``rules``: for each, decisions per second, waits in milliseconds, the batches' sizes and how busy the
-        service was; ``config``, ``host`` and ``floors``.
+        service was; ``config`` and ``host``.
     """
     if config.latency_trace is not None:
         read_trace(config.latency_trace)
     console, root = Console(), output_folder(config.output_dir)
-    result: dict[str, Any] = {"config": asdict(config), "host": host(), "floors": floors()}
+    result: dict[str, Any] = {"config": asdict(config), "host": host()}
     rules = {"one at a time": replace(config, max_batch=1, max_wait_ms=0.0)}
     rules |= {_name(wait): replace(config, max_wait_ms=wait) for wait in config.waits_ms}
     found: dict[str, list[dict[str, Any]]] = {name: [] for name in rules}

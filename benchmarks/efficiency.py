@@ -4,8 +4,7 @@
     python -m benchmarks efficiency --recipe=recipes/imagination.yaml --budgets=16,64,256
 
 Every cell may collect so many real episodes, and makes as many updates as any other unless its imagination
-is switched off; where nothing is imagined, each real decision is used so much more often. What was real
-before, the demonstrations of the warm start and the episodes of the pre-training, comes on top in all cells.
+is switched off; where nothing is imagined, each real decision is used so much more often.
 """
 
 from __future__ import annotations
@@ -18,11 +17,8 @@ from typing import Annotated, Any
 
 from rich.table import Table
 
-from accerl_lerobot.checkpoint.layout import DEMOS
-from accerl_lerobot.config.ranges import DatasetConfig, Pattern, Range, Seed
+from accerl_lerobot.config.ranges import Pattern, Range, Seed
 from accerl_lerobot.console import Console
-from accerl_lerobot.demos.dataset_files import open_metadata
-from accerl_lerobot.demos.record import REPO_ID
 from accerl_lerobot.engine.config import RunConfig, parse
 from benchmarks.records import as_markdown, mean_interval, write
 from benchmarks.study import (
@@ -112,8 +108,8 @@ def bench_efficiency(config: BenchEfficiencyConfig) -> dict[str, Any]:
 
     Returns:
         ``starts`` (success of each seed's warm start), ``cells`` (of each run success, n, real episodes and
-        env steps, updates, and what was imagined), ``groups`` (arm, budget, what `together` and `over_none`
-        give, and means of real episodes and env steps and of updates) and ``beside``, see there.
+        env steps, updates, and what was imagined) and ``groups`` (arm, budget, what `together` and
+        `over_none` give, and means of real episodes and env steps and of updates).
 
     Raises:
         InputError: see `Study.run`.
@@ -126,7 +122,7 @@ def bench_efficiency(config: BenchEfficiencyConfig) -> dict[str, Any]:
     for run in study.runs[: len(config.arms)]:
         if run.imagination.share:
             check_imagination(replace(study.starts[run.seed], imagination=run.imagination))
-    result = compare(config, study.run(console)) | {"beside": beside(study, recipe)}
+    result = compare(config, study.run(console))
     write(study.root, "efficiency", result, markdown(result), draw)
     console.say(f"wrote efficiency.json, .md and .png into {study.root}")
     return result
@@ -166,46 +162,14 @@ def over_none(rows: Sequence[dict[str, Any]], none: Sequence[dict[str, Any]]) ->
     return {"gain": gain, "gain_ci95": (min(low, interval.low), max(high, interval.high))}
 
 
-def beside(study: Study, recipe: RunConfig) -> dict[str, dict[str, float]]:
-    """Real ``episodes`` and ``env_steps`` on top of those of the cells.
-
-    Returns:
-        ``demonstrations`` of a warm start, means over the seeds where each records its own, and ``world
-        model``, all that it has learnt from and was tried on; each only where there is such a thing.
-    """
-    found = {}
-    if recipe.policy.path is None:
-        folders = [study.start(seed) / DEMOS for seed in study.starts]
-        recorded = [DatasetConfig(repo_id=REPO_ID, root=str(folder)) for folder in folders]
-        used = recorded if recipe.dataset.repo_id is None else [recipe.dataset]
-        found["demonstrations"] = {name: total / len(used) for name, total in _totals(used).items()}
-    learnt = recipe.imagination.learn.dataset
-    imagined = any(run.imagination.share and run.imagination.needs_path for run in study.runs)
-    if learnt.repo_id is not None and imagined:
-        found["world model"] = _totals([learnt])
-    return found
-
-
-def _totals(datasets: Sequence[DatasetConfig]) -> dict[str, float]:
-    metas = [open_metadata(dataset) for dataset in datasets]
-    return {
-        "episodes": sum(meta.total_episodes for meta in metas),
-        "env_steps": sum(meta.total_frames for meta in metas),
-    }
-
-
 def table(result: dict[str, Any]) -> Table:
     """`result` for people: one row per arm, one column per budget."""
     return tabled("success after so many real episodes; before them", result, _columns(result), _rows(result))
 
 
 def markdown(result: dict[str, Any]) -> str:
-    """`table` for the docs, and what is real beside it."""
-    lines = [f"\n{INTERVALS.capitalize()}.\n"] + [
-        f"\nOn top, {name}: {of['episodes']:,.0f} real episodes, {of['env_steps']:,.0f} env steps.\n"
-        for name, of in result["beside"].items()
-    ]
-    return as_markdown(_columns(result), _rows(result)) + "".join(lines)
+    """`table` for the docs."""
+    return as_markdown(_columns(result), _rows(result)) + f"\n{INTERVALS.capitalize()}.\n"
 
 
 def draw(path: Path, result: dict[str, Any]) -> None:

@@ -31,7 +31,7 @@ from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import RunConfig, encode, parse
 from accerl_lerobot.engine.ray_session import RAY_PROCESSES
 from accerl_lerobot.errors import InputError, check_absent, make_folder
-from accerl_lerobot.evaluation import Rate, drawing
+from accerl_lerobot.evaluation import Rate
 from accerl_lerobot.trainer.batch import MAX_NONFINITE
 from benchmarks.audit import audit_segments, audit_updates
 from benchmarks.hits import FAULTS, START_S, TIDY_S, places, strike
@@ -60,7 +60,7 @@ class BenchFaultsConfig(Section):
     """The run. Its demonstrations and SFT are cut short, unless it has a policy: they do not matter here.
     None: one with worlds and a policy made of time, in which all else is real."""
     output_dir: str = "outputs/faults"
-    """Folder of the runs and of faults.json, .md and .png; must not exist."""
+    """Folder of the runs and of faults.json and .md; must not exist."""
     targets: tuple[str, ...] = (
         "rollout",
         "inference",
@@ -126,7 +126,7 @@ def bench_faults(config: BenchFaultsConfig) -> dict[str, Any]:
         with console.stage(target, total=len(drawn)) as stage:
             _target(config, start, target, drawn, result, stage.update)
         result["host_after"] = host()
-        write(root, "faults", result, markdown(result), _draw)
+        write(root, "faults", result, markdown(result))
     return result
 
 
@@ -354,18 +354,3 @@ def _run_row(run: dict[str, Any]) -> list[str]:
     books = {True: "add up", False: "DO NOT", None: "–"}[run["books"]]
     names = ("updates", "lost", "doubled", "segments", "segments_lost", "segments_doubled")
     return [run["target"], *(str(run.get(name, "–")) for name in names), books, ended]
-
-
-def _draw(path: Path, result: dict[str, Any]) -> None:
-    """Seconds to recover, a dot for each hit."""
-    with drawing(path) as axes:
-        names: list[str] = []
-        for (target, fault), hits in cells(result).items():
-            seconds = [h["seconds"] for h in hits if h["seconds"] is not None]
-            if seconds:
-                x = [len(names)] * len(seconds)
-                axes.scatter(x, seconds, s=14, alpha=0.5, color=f"C{TARGETS.index(target)}", linewidths=0)
-                names.append(f"{fault} {target}")
-        axes.set_xticks(range(len(names)), names, rotation=90, fontsize=6)
-        axes.set(ylabel="seconds to recover", title="faults, one dot each")
-        axes.set_ylim(bottom=0)

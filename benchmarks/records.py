@@ -1,13 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Shared by studies: floors of a machine, intervals over runs, and the files that results are kept in."""
+"""Shared by studies: intervals over runs, and the files that results are kept in."""
 
 from __future__ import annotations
 
 import json
 import math
-import os
-import statistics
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,33 +12,6 @@ from typing import Any
 import numpy as np
 
 from accerl_lerobot.evaluation import Interval
-
-MEMCPY_BYTES = 64 << 20
-
-
-def floors() -> dict[str, float]:
-    """Lower bounds of all measurements: copying memory, waking up, a byte through a pipe and back."""
-    source = np.ones(MEMCPY_BYTES, np.uint8)
-    target = np.empty_like(source)
-    copies = [_seconds(lambda: np.copyto(target, source)) for _ in range(9)][1:]
-    sleeps = [_seconds(lambda: time.sleep(0.005)) - 0.005 for _ in range(40)]
-    read, write = os.pipe()
-    try:
-        tokens = [_seconds(lambda: (os.write(write, b"x"), os.read(read, 1))) for _ in range(200)]
-    finally:
-        os.close(read)
-        os.close(write)
-    return {
-        "memcpy_gb_per_s": MEMCPY_BYTES / statistics.median(copies) / 1e9,
-        "sleep_overshoot_us": 1e6 * statistics.median(sleeps),
-        "pipe_us": 1e6 * statistics.median(tokens),
-    }
-
-
-def _seconds(work: Any) -> float:
-    started = time.perf_counter()
-    work()
-    return time.perf_counter() - started
 
 
 def mean_interval(values: Sequence[float], confidence: float = 0.95) -> Interval:

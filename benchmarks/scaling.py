@@ -11,7 +11,6 @@ were busy for more than `MOST_BUSY` of the time, they may be what was measured, 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Annotated, Any
 
 from rich.table import Table
@@ -21,10 +20,9 @@ from accerl_lerobot.bench.throughput import MOST_BUSY, Block
 from accerl_lerobot.config.ranges import NonNegative, Positive, Range, Repeats
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError, output_folder
-from accerl_lerobot.evaluation import drawing
 from accerl_lerobot.replay.pacing import ASYNCHRONOUS
 from benchmarks.machinery import MachineryConfig
-from benchmarks.records import as_markdown, floors, write
+from benchmarks.records import as_markdown, write
 from benchmarks.simulated_world import read_trace
 
 
@@ -44,7 +42,7 @@ class BenchScalingConfig(MachineryConfig):
     blocks: Repeats = 5
     """At each count."""
     output_dir: str = "outputs/scaling"
-    """Folder for scaling.json, .md and .png."""
+    """Folder for scaling.json and .md."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -57,12 +55,12 @@ def bench_scaling(config: BenchScalingConfig) -> dict[str, Any]:
 
     Returns:
         ``counts``: for each, decisions per second, E(N), the bound, their share of it, and whether the
-        processors were busy; ``config``, ``host`` and ``floors``.
+        processors were busy; ``config`` and ``host``.
     """
     if config.latency_trace is not None:
         read_trace(config.latency_trace)
     console, root = Console(), output_folder(config.output_dir)
-    result: dict[str, Any] = {"config": asdict(config), "host": host(), "floors": floors()}
+    result: dict[str, Any] = {"config": asdict(config), "host": host()}
     blocks: dict[int, list[Block]] = {n: [] for n in config.counts}
     forth, back = config.blocks - config.blocks // 2, config.blocks // 2
     legs = [(n, forth) for n in config.counts] + [(n, back) for n in reversed(config.counts) if back]
@@ -72,8 +70,8 @@ def bench_scaling(config: BenchScalingConfig) -> dict[str, Any]:
                 blocks[n] += [engine.block(ASYNCHRONOUS, config.seconds) for _ in range(repeats)]
             stage.update(done, f"{n} worlds: {blocks[n][-1].decisions_per_s:.0f} decisions/s")
     result |= {"counts": compare(config, blocks), "host_after": host()}
-    write(root, "scaling", result, as_markdown(_COLUMNS, _rows(result)), _draw)
-    console.say(f"wrote scaling.json, .md and .png into {root}")
+    write(root, "scaling", result, as_markdown(_COLUMNS, _rows(result)))
+    console.say(f"wrote scaling.json and .md into {root}")
     return result
 
 
@@ -119,25 +117,3 @@ def _rows(result: dict[str, Any]) -> list[list[str]]:
         ]
         for row in result["counts"]
     ]
-
-
-def _draw(path: Path, result: dict[str, Any]) -> None:
-    """Decisions per second over worlds, beside the bound."""
-    rows = sorted(result["counts"], key=lambda row: row["worlds"])
-    x = [row["worlds"] for row in rows]
-    with drawing(path) as axes:
-        axes.plot(x, [row["bound"] for row in rows], "k--", lw=1, label="bound")
-        axes.plot(x, [row["decisions_per_s"]["median"] for row in rows], "o-", label="measured")
-        for row in rows:
-            place = (row["worlds"], row["decisions_per_s"]["median"])
-            text = f"{row['efficiency']['median']:.2f}"
-            axes.annotate(text, place, textcoords="offset points", xytext=(6, -10), fontsize=8)
-        axes.set_xscale("log", base=2)
-        axes.set_yscale("log", base=2)
-        axes.set_xticks(x, [str(n) for n in x])
-        axes.set(
-            xlabel="worlds, a process each",
-            ylabel="decisions per second",
-            title="with E(N) beside each point",
-        )
-        axes.legend()

@@ -5,29 +5,23 @@
 
 Blocks without a fault and blocks with one take turns, forth and back, in one run, so that whatever else
 changes befalls both alike. What counts is what counts in the end: an update that is lost with a worker and
-made again is one. At the end: whether the run's process has grown, and what its log and checkpoints cost.
+made again is one.
 """
 
 from __future__ import annotations
 
-import json
 import random
-import tempfile
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import psutil
-from rich.console import Group
+from rich.table import Table
 
 from accerl_lerobot.bench import as_table, host, ranged, spread
 from accerl_lerobot.config.ranges import Positive, Range, Section, Seed
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError, check_absent, make_folder
-from accerl_lerobot.metrics import METRICS, MetricsLog, WandBConfig
-from accerl_lerobot.replay.journal import EPISODES
-from accerl_lerobot.timeline.read import read_timeline
 from accerl_lerobot.trainer.batch import MAX_NONFINITE
 from benchmarks.audit import audit_segments, audit_updates
 from benchmarks.faults import BenchFaultsConfig, Start, end_run, recipe_of
@@ -89,9 +83,9 @@ def bench_soak(config: BenchSoakConfig) -> dict[str, Any]:
     """Measures one run.
 
     Returns:
-        ``blocks``, of each ``kind``, ``seconds``, ``updates`` and ``decisions`` learned from a second, what
-        the run's process holds (``rss_mb``, ``files``), and the ``hit``; ``rates`` of either kind; ``left``,
-        the share of them that was left, pair by pair; ``costs``; what `audit` finds; ``config``, ``host``.
+        ``blocks``, of each ``kind``, ``seconds``, ``updates`` and ``decisions`` learned from a second, and
+        the ``hit``; ``rates`` of either kind; ``left``, the share of them that was left, pair by pair; what
+        `audit` finds; ``config``, ``host``.
 
     Raises:
         InputError: the folder exists, or the recipe is wrong.
@@ -118,8 +112,8 @@ def bench_soak(config: BenchSoakConfig) -> dict[str, Any]:
     finally:
         victim.kill()
     result |= audit_updates(victim.records()) | audit_segments(victim.folder)
-    result |= {"costs": costs(victim.folder), "host_after": host()}
-    write(root, "soak", result, markdown(result))
+    result["host_after"] = host()
+    write(root, "soak", result, as_markdown(_COLUMNS, _rows(result)))
     return result
 
 
@@ -143,14 +137,11 @@ def _block(
             raise RuntimeError(f"{fault} of {target}: {struck['said']}")
     time.sleep(max(0.0, began + config.block_s - time.monotonic()))
     seconds, after = time.monotonic() - began, _made(victim)
-    process = psutil.Process(victim.process.pid)
     return {
         "kind": kind,
         "seconds": seconds,
         "updates": (after[0] - before[0]) / seconds,
         "decisions": (after[1] - before[1]) / seconds,
-        "rss_mb": process.memory_info().rss / 1e6,
-        "files": process.num_fds(),
         "hit": struck,
     }
 
@@ -172,48 +163,12 @@ def compare(blocks: list[dict[str, Any]]) -> dict[str, Any]:
     return {"rates": rates, "left": left}
 
 
-def costs(run: Path) -> dict[str, float]:
-    """Shares of a run's time: the trainer's and replay's in which they were saved, the driver's in which it
-    saved, and of one process what writing its log once more takes.
-    """
-    timeline = read_timeline(run)
-    spent = timeline.shares(timeline.training())
-    roles = ("trainer", "replay", "driver")
-    found = {f"checkpoint_{role}": spent.get(role, {}).get("checkpoint", 0.0) for role in roles}
-    lines = (run / METRICS).read_text().splitlines()
-    records = [json.loads(line) for line in lines]
-    journal = (run / EPISODES).read_bytes().splitlines(keepends=True)
-    with tempfile.TemporaryDirectory(dir=run) as scratch:
-        began = time.perf_counter()
-        log = MetricsLog(Path(scratch), WandBConfig(), {})
-        for record in records:
-            values = {k: v for k, v in record.items() if k not in ("kind", "wall_s", "update")}
-            log.write(record["kind"], int(record["update"]), values)
-        log.close()
-        metrics_s = time.perf_counter() - began
-        began = time.perf_counter()
-        with (Path(scratch) / EPISODES).open("wb") as file:
-            for line in journal:
-                file.write(line)
-                file.flush()
-        journal_s = time.perf_counter() - began
-    wall = records[-1]["wall_s"]
-    return found | {"metrics": metrics_s / wall, "journal": journal_s / wall}
-
-
-def table(result: dict[str, Any]) -> Group:
+def table(result: dict[str, Any]) -> Table:
     """`result` for people."""
-    rates = as_table("a fault in every other block", _COLUMNS, _rows(result))
-    return Group(rates, as_table("shares of the time", _COST_COLUMNS, _cost_rows(result)))
-
-
-def markdown(result: dict[str, Any]) -> str:
-    """`table` for the docs."""
-    return f"{as_markdown(_COLUMNS, _rows(result))}\n{as_markdown(_COST_COLUMNS, _cost_rows(result))}"
+    return as_table("a fault in every other block", _COLUMNS, _rows(result))
 
 
 _COLUMNS = ("a second", "without a fault", "with one", "left")
-_COST_COLUMNS = ("what", "of the time")
 
 
 def _rows(result: dict[str, Any]) -> list[list[str]]:
@@ -222,12 +177,4 @@ def _rows(result: dict[str, Any]) -> list[list[str]]:
         rates = result["rates"][name]
         cells = [ranged(rates[kind], ".1f") for kind in (QUIET, STRUCK)]
         rows.append([name, *cells, ranged(result["left"][name], ".0%")])
-    return rows
-
-
-def _cost_rows(result: dict[str, Any]) -> list[list[str]]:
-    rows = [[name.replace("_", ", "), f"{share:.2%}"] for name, share in result["costs"].items()]
-    first, last = result["blocks"][0], result["blocks"][-1]
-    rows.append(["memory of the run's process, MB", f"{first['rss_mb']:.0f} → {last['rss_mb']:.0f}"])
-    rows.append(["its open files", f"{first['files']} → {last['files']}"])
     return rows

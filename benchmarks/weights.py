@@ -14,7 +14,6 @@ reader processes; of each block the last publication counts, when all memory has
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from time import perf_counter
@@ -34,8 +33,6 @@ from benchmarks.records import as_markdown, write
 from benchmarks.study import named
 
 ARMS = ("shared memory", "Ray")
-FAR = ("Ray",)
-"""Arms with readers on other nodes."""
 MB = 1 << 20
 WARM = 4
 """Publications of a block that do not count: until all slabs have been written to and mapped."""
@@ -56,11 +53,8 @@ class BenchWeightsConfig(Section):
     """Publications of each arm that count, each in a block of its own."""
     seed: Seed = 0
     """Seed of the values."""
-    apart: bool = False
-    """Readers are on a Ray node of their own, with an object store of its own, and share no memory: what lies
-    between two machines, but for the cable."""
     output_dir: str | None = None
-    """Folder for weights.json, weights.md and weights.png; must not exist. None: nothing is written."""
+    """Folder for weights.json and weights.md; must not exist. None: nothing is written."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -77,62 +71,27 @@ def bench_weights(config: BenchWeightsConfig) -> dict[str, Any]:
         what memcpy allows, 1 the best: each median, min, max and all; ``config``; ``host`` before and after.
 
     Raises:
-        InputError: the folder exists, or readers are to be apart and Ray is there.
+        InputError: the folder exists.
     """
     root = None if config.output_dir is None else Path(config.output_dir).expanduser()
     if root is not None:
         check_absent(root)
     ray_session.prepare()
-    from benchmarks.weights_readers import two_nodes
-
     before, console, cells = host(), Console(), []
-    largest = max(config.readers), MB * max(config.sizes_mb)
-    with two_nodes(*largest) if config.apart else nullcontext():
-        for size in config.sizes_mb:
-            for readers in config.readers:
-                with console.stage(f"{size} MB, {readers} readers"):
-                    cells += _measure(config, size, readers)
+    for size in config.sizes_mb:
+        for readers in config.readers:
+            with console.stage(f"{size} MB, {readers} readers"):
+                cells += _measure(config, size, readers)
     result = {"config": asdict(config), "cells": cells, "host": [before, host()]}
     if root is not None:
         make_folder(root, "output_dir")
-        write(root, "weights", result, as_markdown(_COLUMNS, _rows(result)), draw)
+        write(root, "weights", result, as_markdown(_COLUMNS, _rows(result)))
     return result
 
 
 def table(result: dict[str, Any]) -> Table:
     """`result` for people."""
     return as_table("milliseconds, and share of what memcpy allows", _COLUMNS, _rows(result))
-
-
-def draw(path: Path, result: dict[str, Any]) -> None:
-    """Draws the speed of memcpy and the share of it that is reached, over the size; a line per arm."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
-
-    config = result["config"]
-    kinds = {"stall": "trainer's stall", "applied": "publish to applied", "pause": "reader's pause"}
-    figure, panels = plt.subplots(
-        len(config["readers"]), 3, figsize=(12, 3.2 * len(config["readers"])), squeeze=False, sharey=True
-    )
-    for row, readers in zip(panels, config["readers"], strict=True):
-        for axes, (kind, label) in zip(row, kinds.items(), strict=True):
-            for arm in _arms(config["apart"]):
-                cells = [c for c in result["cells"] if (c["arm"], c["readers"]) == (arm, readers)]
-                middle = [c[kind]["median"] for c in cells]
-                ends = [
-                    [m - c[kind]["min"] for m, c in zip(middle, cells, strict=True)],
-                    [c[kind]["max"] - m for m, c in zip(middle, cells, strict=True)],
-                ]
-                axes.errorbar([c["size_mb"] for c in cells], middle, ends, marker="o", capsize=3, label=arm)
-            axes.axhline(1, color="0.6", linestyle=":")
-            axes.set(xscale="log", yscale="log", xlabel="MiB", title=f"{label}, {readers} readers")
-    panels[0][0].legend(fontsize="small")
-    panels[0][0].set_ylabel("share of what memcpy allows")
-    figure.tight_layout()
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
 
 
 def _measure(config: BenchWeightsConfig, size_mb: int, readers: int) -> list[dict[str, Any]]:
@@ -143,17 +102,12 @@ def _measure(config: BenchWeightsConfig, size_mb: int, readers: int) -> list[dic
     elements = max(1, size_mb * MB // 4 // config.tensors)
     tensors = {f"t{i}": rng.random(elements, np.float32) for i in range(config.tensors)}
     copy = {name: np.zeros_like(tensor) for name, tensor in tensors.items()}
-    arms = _arms(config.apart)
-    blocks: dict[str, list[dict[str, float]]] = {arm: [] for arm in arms}
-    with reading(readers, config.tensors, elements, apart=config.apart) as endpoints:
+    blocks: dict[str, list[dict[str, float]]] = {arm: [] for arm in ARMS}
+    with reading(readers, config.tensors, elements) as endpoints:
         for repeat in range(config.repeats):
-            for arm in arms[:: -1 if repeat % 2 else 1]:
+            for arm in ARMS[:: -1 if repeat % 2 else 1]:
                 blocks[arm].append(_block(arm, endpoints, tensors, copy))
     return [_cell(size_mb, readers, arm, notes) for arm, notes in blocks.items()]
-
-
-def _arms(apart: bool) -> list[str]:
-    return list(FAR if apart else ARMS)
 
 
 def _block(arm: str, endpoints: list[Endpoint], tensors: Tensors, copy: Tensors) -> dict[str, float]:

@@ -12,15 +12,12 @@ from typing import Any
 import numpy as np
 import ray
 
-from accerl_lerobot.engine.ray_session import check_private, start_ray
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.engine.ray_session import start_ray
 from accerl_lerobot.transport.contract import PendingRequest
 from accerl_lerobot.transport.endpoint import Endpoint
 from accerl_lerobot.transport.shared_memory import Address, SharedMemoryServer
 from accerl_lerobot.transport.weights import WeightUpdate
 
-_APART = "apart"
-"""Resource of the node that is not this one."""
 READY_S = 120.0
 """How long they may take to start, and to answer."""
 
@@ -68,20 +65,11 @@ class ReadingWorker:
 
 
 @contextmanager
-def reading(count: int, tensors: int, elements: int, *, apart: bool = False) -> Iterator[list[Endpoint]]:
-    """Endpoints of so many of them, ready; they end with the block. Ray is started if it is not there.
-
-    Args:
-        count: how many.
-        tensors: of a set.
-        elements: of each tensor, float32.
-        apart: on the other node of `two_nodes`.
-
-    """
+def reading(count: int, tensors: int, elements: int) -> Iterator[list[Endpoint]]:
+    """Endpoints of so many of them, ready, for `tensors` of `elements` each; they end with the block."""
     if not ray.is_initialized():
         start_ray()
-    there = {_APART: 1.0} if apart else {}
-    worker = ray.remote(ReadingWorker).options(num_cpus=0, max_concurrency=4, resources=there)
+    worker = ray.remote(ReadingWorker).options(num_cpus=0, max_concurrency=4)
     handles = [worker.remote(tensors, elements) for _ in range(count)]
     try:
         yield [
@@ -91,39 +79,6 @@ def reading(count: int, tensors: int, elements: int, *, apart: bool = False) -> 
     finally:
         for handle in handles:
             ray.kill(handle)
-
-
-@contextmanager
-def two_nodes(readers: int, nbytes: int) -> Iterator[None]:
-    """A Ray of two nodes on this machine, once in a process; the other one is for those that read apart.
-
-    Args:
-        readers: how many there will be at most.
-        nbytes: of a set, at most; each node has room for a few.
-
-    Raises:
-        InputError: Ray is there already, with one node.
-    """
-    from ray.cluster_utils import Cluster
-
-    if ray.is_initialized():
-        raise InputError("apart", True, "Ray has been started already, with one node; leave it out")
-    check_private()
-    cluster = Cluster()
-    try:
-        for resources in ({}, {_APART: float(readers)}):
-            cluster.add_node(
-                num_cpus=1,
-                include_dashboard=False,
-                node_ip_address="127.0.0.1",
-                resources=resources,
-                object_store_memory=6 * nbytes + (1 << 28),
-            )
-        ray.init(address=cluster.address, log_to_driver=False, configure_logging=False)
-        yield
-    finally:
-        ray.shutdown()
-        cluster.shutdown()
 
 
 def ask(handle: Any, method: str, *arguments: Any) -> Any:

@@ -55,5 +55,3 @@ def test_a_small_run_of_batching(light_ray: None, tmp_path: Path):
     assert set(rules["at most 20 ms"]["batch_sizes"]) <= {1, 2} and 2 in rules["at most 20 ms"]["batch_sizes"]
     assert json.loads((tmp_path / "batching.json").read_text())["rules"]
     assert "wait p99" in (tmp_path / "batching.md").read_text()
-
-

@@ -54,8 +54,7 @@ def result(tmp_path: Path, tiny_checkpoint: Path) -> dict[str, Any]:
         (cell, a_summary(success[cell.of["arm"], cell.of["budget"]], cell.of["budget"] - (cell.seed == 4)))
         for cell in made
     ]
-    offline = {"world model": {"episodes": 494, "env_steps": 67551}}
-    return bench.compare(config, Results({3: a_summary(0.2), 4: a_summary(0.4)}, runs)) | {"beside": offline}
+    return bench.compare(config, Results({3: a_summary(0.2), 4: a_summary(0.4)}, runs))
 
 
 def test_intervals_are_over_seeds_and_gains_are_of_pairs():
@@ -89,8 +88,7 @@ def test_the_table_and_the_picture(result: dict[str, Any], tmp_path: Path):
         "| none | 10.0 % [2.8, 30.1] n=20 (10 10), 4 episodes of 100 env steps, 4 updates | 50.0 % ["
     )
     assert "(80 80), +70.0 points [+40.5, +83.9] over none, 4 episodes" in lines[3]
-    assert lines[5] == "Intervals are 95 %, over seeds where there are several."
-    assert lines[-1] == "On top, world model: 494 real episodes, 67,551 env steps."
+    assert lines[-1] == "Intervals are 95 %, over seeds where there are several."
     assert bench.table(result).row_count == 2
     bench.draw(tmp_path / "efficiency.png", result)
     assert (tmp_path / "efficiency.png").read_bytes().startswith(b"\x89PNG")

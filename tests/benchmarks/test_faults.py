@@ -23,7 +23,7 @@ from benchmarks.audit import audit_segments, audit_updates
 from benchmarks.fault_injection import POINTS
 from benchmarks.faults import BenchFaultsConfig, bench_faults
 from benchmarks.hits import ANYWHERE, FAULTS, places
-from benchmarks.soak import compare, costs
+from benchmarks.soak import compare
 from benchmarks.victims import CLASSES, Victim, await_hit, descendants, hit, title
 from tests.replay.segments import make_segment
 
@@ -153,10 +153,8 @@ def test_a_run_of_time_survives_what_is_done_to_it(tmp_path: Path):
     assert (run["exit"], run["left_behind"], run["skipped_updates"]) == (143, 0, 0)
     assert run["lost"] == run["doubled"] == run["segments_lost"] == run["segments_doubled"] == 0
     assert run["books"] and run["segments"] > 0
-    spent = costs(root / run["run"])
-    assert len(spent) == 5 and all(0 < share < 1 for share in spent.values()), spent
     written = json.loads((root / "faults.json").read_text())
-    assert written["hits"] == result["hits"] and (root / "faults.png").stat().st_size > 1000
+    assert written["hits"] == result["hits"]
 
 
 def test_a_soak_compares_each_block_with_its_neighbour():

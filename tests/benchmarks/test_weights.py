@@ -32,6 +32,5 @@ def test_all_arms_at_all_sizes(light_ray: None, tmp_path: Path):
     console.print(table(result))
     shown = console.export_text()
     assert all(arm in shown and arm in (root / "weights.md").read_text() for arm in ARMS)
-    assert (root / "weights.png").read_bytes()[:4] == b"\x89PNG"
     with pytest.raises(InputError, match="^output_dir=.*the folder exists"):
         bench_weights(config)
