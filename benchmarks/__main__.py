@@ -46,11 +46,7 @@ def usage() -> str:
 
 
 def run(name: str, rest: list[str]) -> int:
-    """Runs a benchmark, or shows its help.
-
-    Raises:
-        InputError: there is no such benchmark, or a field of it is wrong.
-    """
+    """Runs a benchmark, or shows its help."""
     set_up_logging()
     if name not in CONFIGS:
         raise InputError("NAME", name, f"use one of {', '.join(CONFIGS)}")

@@ -73,9 +73,6 @@ def bench_async_vs_sync(config: BenchAsyncVsSyncConfig) -> dict[str, Any]:
     Returns:
         ``laws``: for each, the blocks, decisions per second by arm, S, S*, S/S* and whether the processors
         were busy; ``learning``: success by arm and seed; ``config`` and ``host``.
-
-    Raises:
-        InputError: one of `traces` is none.
     """
     for trace in config.traces:
         read_trace(trace, "traces")
@@ -97,12 +94,7 @@ def bench_async_vs_sync(config: BenchAsyncVsSyncConfig) -> dict[str, Any]:
 
 
 def compare(config: MachineryConfig, blocks: list[Block]) -> dict[str, Any]:
-    """Compares one law's blocks: `bench_async_vs_sync`'s ``laws``.
-
-    Args:
-        config: with that law.
-        blocks: forth and back through `ARMS`.
-    """
+    """Compares one law's blocks: `bench_async_vs_sync`'s ``laws``."""
     rates = {arm: [b.decisions_per_s for b in blocks if b.schedule == arm] for arm in ARMS}
     waits = {arm: [b.trainer_waits for b in blocks if b.schedule == arm] for arm in ARMS}
     pairs = {

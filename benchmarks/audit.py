@@ -23,11 +23,7 @@ STORED = ("stored", "evicted", "retired")
 
 
 def audit_updates(records: list[dict[str, Any]]) -> dict[str, Any]:
-    """``updates`` made, ``lost`` and ``doubled`` among them, and whether replay's ``books`` add up.
-
-    Args:
-        records: of ``metrics.jsonl``.
-    """
+    """``updates`` made, ``lost`` and ``doubled`` among them, and whether replay's ``books`` add up."""
     counts = Counter(int(record["update"]) for record in records if record["kind"] == "train")
     newest = max(counts, default=0)
     rollout = [record for record in records if record["kind"] == "rollout"]

@@ -110,10 +110,6 @@ def bench_efficiency(config: BenchEfficiencyConfig) -> dict[str, Any]:
         ``starts`` (success of each seed's warm start), ``cells`` (of each run success, n, real episodes and
         env steps, updates, and what was imagined) and ``groups`` (arm, budget, what `together` and
         `over_none` give, and means of real episodes and env steps and of updates).
-
-    Raises:
-        InputError: see `Study.run`.
-        RuntimeError: see there.
     """
     from accerl_lerobot.engine.imagination import check_imagination
 

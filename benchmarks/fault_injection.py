@@ -127,12 +127,7 @@ def proof(taken: Path) -> dict[str, Any] | None:
 
 
 def handle(point: str, path: Path | None = None) -> bool:
-    """Take the order for this point, if there is one and its visit has come; see `fault_point`.
-
-    Raises:
-        FaultError: it was ordered to.
-        OSError: the same, for a full disk.
-    """
+    """Take the order for this point, if there is one and its visit has come; see `fault_point`."""
     return _orders is not None and _orders.take(point, path)
 
 

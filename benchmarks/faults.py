@@ -32,7 +32,6 @@ from accerl_lerobot.engine.config import RunConfig, encode, parse
 from accerl_lerobot.engine.ray_session import RAY_PROCESSES
 from accerl_lerobot.errors import InputError, check_absent, make_folder
 from accerl_lerobot.evaluation import Rate
-from accerl_lerobot.trainer.batch import MAX_NONFINITE
 from benchmarks.audit import audit_segments, audit_updates
 from benchmarks.hits import FAULTS, START_S, TIDY_S, places, strike
 from benchmarks.light_run import light_config
@@ -109,10 +108,6 @@ def bench_faults(config: BenchFaultsConfig) -> dict[str, Any]:
     Returns:
         ``hits``, see `hits.Hit`; ``runs``, of each ``target``, what `audit` finds, ``exit`` (its code at the
         end), ``left_behind`` (processes) and ``skipped_updates``; ``config`` and ``host``.
-
-    Raises:
-        InputError: the folder exists, or the recipe is wrong or has no such target.
-        RuntimeError: no policy could be made to begin with.
     """
     root, console = Path(config.output_dir).expanduser().resolve(), Console()
     recipe = recipe_of(config)
@@ -131,11 +126,7 @@ def bench_faults(config: BenchFaultsConfig) -> dict[str, Any]:
 
 
 def recipe_of(config: BenchFaultsConfig) -> RunConfig:
-    """The run.
-
-    Raises:
-        InputError: the recipe is wrong or has no such target.
-    """
+    """The run."""
     if config.recipe is None:
         recipe = light_config(updates=ENDLESS, stall_s=config.stall_s)
     else:
@@ -149,18 +140,7 @@ def recipe_of(config: BenchFaultsConfig) -> RunConfig:
 
 
 class Start:
-    """How runs to be done harm to are begun: all of one recipe, and of one policy.
-
-    Args:
-        path: of the recipe; None: the one made of time.
-        recipe: what is in it.
-        stall_s: of the runs.
-        root: folder for them.
-        console: progress for people.
-
-    Raises:
-        RuntimeError: no policy could be made to begin with.
-    """
+    """How runs to be done harm to are begun: all of one recipe, and of one policy."""
 
     def __init__(
         self, path: str | None, recipe: RunConfig, stall_s: float, root: Path, console: Console
@@ -178,13 +158,7 @@ class Start:
             self._arguments += self._policy(console)
 
     def run(self, name: str, *changes: str, orders: Path | None = None) -> Victim:
-        """Begins one.
-
-        Args:
-            name: of its folder.
-            changes: of its command line.
-            orders: folder of them, see `fault_injection`.
-        """
+        """Begins one."""
         chosen = [
             f"--trainer.updates={ENDLESS}",
             "--trainer.final_lr_share=1",
@@ -250,8 +224,7 @@ def _target(
             while done < len(drawn):
                 if moments:
                     victim.await_update(moments[done], WAIT_S, every=1.0)
-                in_a_row = MAX_NONFINITE
-                struck = strike(victim, orders, str(done), target, drawn[done], rng, in_a_row)
+                struck = strike(victim, orders, str(done), target, drawn[done], rng)
                 result["hits"].append(asdict(struck))
                 done += 1
                 on_progress(done, f"{struck.fault} at {struck.place}: {struck.outcome}")
@@ -275,11 +248,7 @@ def _first(config: BenchFaultsConfig) -> int:
 
 
 def end_run(victim: Victim) -> dict[str, Any]:
-    """Asks the run to stop: its ``exit`` code, processes ``left_behind``, and ``skipped_updates``.
-
-    Raises:
-        subprocess.TimeoutExpired: it does not.
-    """
+    """Asks the run to stop: its ``exit`` code, processes ``left_behind``, and ``skipped_updates``."""
     code, below = victim.end(GRACE_S)
     deadline = time.monotonic() + TIDY_S
     while time.monotonic() < deadline and any(alive(pid) for pid in below):

@@ -53,10 +53,6 @@ def bench_few_shot(config: BenchFewShotConfig) -> dict[str, Any]:
 
     Returns:
         ``config``, ``rows`` (one per task, seed and algorithm) and ``means`` of each algorithm.
-
-    Raises:
-        InputError: see `Study.run`.
-        RuntimeError: see there.
     """
     console, root, rows = Console(), output_folder(config.output_dir).resolve(), []
     for task in config.tasks:

@@ -56,10 +56,6 @@ def bench_gpu(config: BenchGpuConfig) -> dict[str, Any]:
     Returns:
         ``policies``: results of `bench_policy` by precision; ``runs``: summaries by sharding, or the reason
         why there is none; ``config`` and ``host``.
-
-    Raises:
-        InputError: there is no such device.
-        RuntimeError: a run failed; its last lines are in the message.
     """
     import torch
 

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from accerl_lerobot.engine.ray_session import RAY_PROCESSES, REQUIRED
+from accerl_lerobot.trainer.batch import MAX_NONFINITE
 from benchmarks.audit import audit_updates
 from benchmarks.fault_injection import FULL, NAN, POINTS, TORN, inject, proof, withdraw
 from benchmarks.study import last_words
@@ -82,25 +83,13 @@ def places(target: str, fault: str) -> list[str]:
     return found
 
 
-def strike(
-    victim: Victim, orders: Path, name: str, target: str, fault: str, rng: random.Random, in_a_row: int
-) -> Hit:
-    """Does it once, and waits until the run has recovered, or has not.
-
-    Args:
-        victim: the run, which learns.
-        orders: its folder of them.
-        name: of this one.
-        target: whom it befalls.
-        fault: one of `FAULTS`.
-        rng: of the place and the moment.
-        in_a_row: updates that end the trainer if nothing can be learnt from any of them.
-    """
+def strike(victim: Victim, orders: Path, name: str, target: str, fault: str, rng: random.Random) -> Hit:
+    """Does it once, and waits until the run has recovered, or has not."""
     place, count = rng.choice(places(target, fault)), len(victim.pids(target))
     said_before = victim.log.stat().st_size
     fired, outcome, said, seconds = False, "survived", "", None
     try:
-        began, pid = _befall(victim, orders, name, target, fault, place, rng, in_a_row)
+        began, pid = _befall(victim, orders, name, target, fault, place, rng)
         fired = True
         try:
             _recover(victim, target, fault, pid, count)
@@ -130,11 +119,10 @@ def _befall(
     fault: str,
     place: str,
     rng: random.Random,
-    in_a_row: int,
 ) -> tuple[float, int]:
     """Makes it happen; when it did, by the monotonic clock, and to which process."""
     if place != ANYWHERE:
-        times = in_a_row if fault == NANS else 1
+        times = MAX_NONFINITE if fault == NANS else 1
         what = NAN if fault == NANS else fault
         taken = inject(orders, name, place, what, at=rng.randint(1, VISITS), times=times)
         deadline = time.monotonic() + AWAIT_S
@@ -161,11 +149,7 @@ def _befall(
 
 
 def _recover(victim: Victim, target: str, fault: str, pid: int, count: int) -> None:
-    """Waits until the run has, with as many processes of the target as before.
-
-    Raises:
-        RuntimeError: its process has ended, or it has not in time.
-    """
+    """Waits until the run has, with as many processes of the target as before."""
     last = max(victim.updates(), default=0)
     if fault == NAN or target in RAY_PROCESSES.keys() - set(REQUIRED):
         victim.await_update(last + SPARE, START_S)
@@ -189,13 +173,7 @@ def _recover(victim: Victim, target: str, fault: str, pid: int, count: int) -> N
 
 
 def _reason(victim: Victim, error: RuntimeError, since: int) -> str:
-    """How its process ended, and what it said last.
-
-    Args:
-        victim: the run.
-        error: that says how it ended.
-        since: byte of its log after which it said that.
-    """
+    """How its process ended, and what it said last."""
     with victim.log.open("rb") as log:
         log.seek(since)
         lines = [line.strip() for line in log.read().decode(errors="replace").splitlines() if line.strip()]

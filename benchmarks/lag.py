@@ -71,10 +71,6 @@ def bench_lag(config: BenchLagConfig) -> dict[str, Any]:
     Returns:
         ``starts`` (success of each seed's warm start), ``cells`` (success, n, env steps and measured lag of
         each run) and ``groups``: algorithm, lag, successes and episodes over the seeds.
-
-    Raises:
-        InputError: see `Study.run`.
-        RuntimeError: see there.
     """
     study, console = Study(config, cells(config)), Console()
     result = compare(config, study.run(console))

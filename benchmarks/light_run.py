@@ -30,14 +30,7 @@ BATCH = 16
 def light_config(
     *, updates: int, ranks: int = 1, stall_s: float = 10.0, save_every_s: float = 2.0
 ) -> RunConfig:
-    """Some ten updates a second, most of which is slept.
-
-    Args:
-        updates: of the run.
-        ranks: of the trainer.
-        stall_s: see `LaunchConfig`.
-        save_every_s: see `RunConfig`.
-    """
+    """Some ten updates a second, most of which is slept."""
     return RunConfig(
         job_name="light",
         env=LatencyConfig(max_steps=32, frame_ms=40.0, latency_cv=0.5),

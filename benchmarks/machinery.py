@@ -134,11 +134,7 @@ class MachineryConfig(Section):
         )
 
     def open(self) -> Measured:
-        """An engine of it, which has begun to train.
-
-        Raises:
-            InputError: `latency_trace` is none.
-        """
+        """An engine of it, which has begun to train."""
         if self.latency_trace is not None:
             read_trace(self.latency_trace)
         return Measured(self.run_config(), ("match",), load=self.load())

@@ -22,7 +22,6 @@ from accerl_lerobot.bench import as_table, host, ranged, spread
 from accerl_lerobot.config.ranges import Positive, Range, Section, Seed
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError, check_absent, make_folder
-from accerl_lerobot.trainer.batch import MAX_NONFINITE
 from benchmarks.audit import audit_segments, audit_updates
 from benchmarks.faults import BenchFaultsConfig, Start, end_run, recipe_of
 from benchmarks.hits import START_S, strike
@@ -86,10 +85,6 @@ def bench_soak(config: BenchSoakConfig) -> dict[str, Any]:
         ``blocks``, of each ``kind``, ``seconds``, ``updates`` and ``decisions`` learned from a second, and
         the ``hit``; ``rates`` of either kind; ``left``, the share of them that was left, pair by pair; what
         `audit` finds; ``config``, ``host``.
-
-    Raises:
-        InputError: the folder exists, or the recipe is wrong.
-        RuntimeError: the run did not begin, or was lost.
     """
     root, console = Path(config.output_dir).expanduser().resolve(), Console()
     recipe = recipe_of(config.of)
@@ -104,7 +99,7 @@ def bench_soak(config: BenchSoakConfig) -> dict[str, Any]:
         with console.stage("blocks", total=config.blocks) as stage:
             for number in range(config.blocks):
                 kind = ORDER[number % len(ORDER)]
-                block = _block(config, victim, orders, str(number), kind, rng, MAX_NONFINITE)
+                block = _block(config, victim, orders, str(number), kind, rng)
                 result["blocks"].append(block)
                 stage.update(number + 1, f"{kind}: {block['updates']:.1f} updates/s")
         result |= compare(result["blocks"])
@@ -124,7 +119,6 @@ def _block(
     name: str,
     kind: str,
     rng: random.Random,
-    in_a_row: int,
 ) -> dict[str, Any]:
     """Some seconds of the run; the fault, if any, is early enough that the block bears all of it."""
     before, began, struck = _made(victim), time.monotonic(), None
@@ -132,7 +126,7 @@ def _block(
         target = rng.choice(config.targets)
         fault = rng.choice(config.of.of(target))
         time.sleep(rng.uniform(0.0, config.block_s / 10))
-        struck = asdict(strike(victim, orders, name, target, fault, rng, in_a_row))
+        struck = asdict(strike(victim, orders, name, target, fault, rng))
         if struck["outcome"] == "lost":
             raise RuntimeError(f"{fault} of {target}: {struck['said']}")
     time.sleep(max(0.0, began + config.block_s - time.monotonic()))

@@ -150,14 +150,7 @@ def draw_lines(
 ) -> None:
     """Success, one line per name with its 95 % interval, one dot per seed.
 
-    Args:
-        path: of the picture.
-        result: with ``groups``, of which each has its name under `key`, and ``starts``.
-        key: see there.
-        names: of the lines.
-        places: x of a line's groups, which lie a little apart from the other lines': so many lines from the
-            middle one.
-        dress: gives the axes their ticks, x label and legend.
+    `places` gives x of a line that lies so many lines from the middle one; `dress` labels the axes.
     """
     with drawing(path) as axes:
         for i, name in enumerate(names):
@@ -177,16 +170,7 @@ def draw_lines(
 
 
 class Study:
-    """The runs of a study, all of them settled before the first one starts.
-
-    Args:
-        config: what they have in common.
-        cells: what they have not.
-        common: what all of them, warm starts too, add to the recipe.
-
-    Raises:
-        InputError: the recipe, or a cell's settings, are wrong.
-    """
+    """The runs of a study, all of them settled before the first one starts."""
 
     def __init__(self, config: StudyConfig, cells: Sequence[Cell], common: Sequence[str] = ()) -> None:
         self.config, self.root = config, expanded(config.output_dir, "output_dir").resolve()
@@ -207,13 +191,7 @@ class Study:
         return self.root / cell.name
 
     def run(self, console: Console) -> Results:
-        """Does the runs that are missing.
-
-        Raises:
-            InputError: the settings of a cell are wrong, which is found before the first run as far as a run
-                itself finds it before it begins; the folder holds runs of other settings, or is in use.
-            RuntimeError: a run failed; those that were under way have ended, and what is finished is kept.
-        """
+        """Does the runs that are missing."""
         from accerl_lerobot.engine.preflight import check_start
 
         for seed, start in self.starts.items():
@@ -267,13 +245,7 @@ class Study:
 
 
 class _Runner:
-    """Runs ``accerl train`` in processes of their own.
-
-    Args:
-        jobs: how many at a time.
-        lock: a file descriptor that they inherit.
-        console: progress for people.
-    """
+    """Runs ``accerl train`` in processes of their own."""
 
     def __init__(self, jobs: int, lock: int, console: Console) -> None:
         self._jobs, self._lock, self._console = jobs, lock, console

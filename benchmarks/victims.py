@@ -42,15 +42,7 @@ LOOK_S = 0.05
 
 
 class Victim:
-    """One run.
-
-    Args:
-        folder: of the run.
-        arguments: of ``accerl train``, without its folder.
-        log: file for what it says.
-        module: what runs, `TRAIN` or `LIGHT`.
-        orders: folder of orders, see `fault_injection`; None: no point of it looks for any.
-    """
+    """One run."""
 
     def __init__(
         self,
@@ -102,19 +94,11 @@ class Victim:
         return [0.0, *(record["decisions"] for record in self.records() if record["kind"] == "rollout")]
 
     def await_update(self, number: int, timeout: float, every: float = LOOK_S) -> None:
-        """Waits until it has logged this update; looks `every` so many seconds.
-
-        Raises:
-            RuntimeError: it ended before, or did not get there in time.
-        """
+        """Waits until it has logged this update; looks `every` so many seconds."""
         self.wait(lambda: self.updates()[-1:] >= [number], timeout, f"update {number} was not reached", every)
 
     def await_successors(self, target: str, gone: int, count: int, timeout: float) -> None:
-        """Waits until a target has as many processes as before, none of them `gone`.
-
-        Raises:
-            RuntimeError: see `await_update`.
-        """
+        """Waits until a target has as many processes as before, none of them `gone`."""
 
         def there() -> bool:
             pids = self.pids(target)
@@ -123,11 +107,7 @@ class Victim:
         self.wait(there, timeout, f"no successor of {target} {gone}")
 
     def end(self, grace: float) -> tuple[int, list[int]]:
-        """Asks it to stop; its exit code, and the processes that were below it.
-
-        Raises:
-            subprocess.TimeoutExpired: it did not within so many seconds.
-        """
+        """Asks it to stop; its exit code, and the processes that were below it."""
         below = descendants(self.process.pid)
         self.process.send_signal(signal.SIGTERM)
         return self.process.wait(grace), below
@@ -144,17 +124,7 @@ class Victim:
         return everyone
 
     def wait(self, there: Callable[[], bool], timeout: float, otherwise: str, every: float = LOOK_S) -> None:
-        """Looks again and again, until what is waited for is there.
-
-        Args:
-            there: whether it is.
-            timeout: seconds.
-            otherwise: how the error begins.
-            every: seconds between two looks.
-
-        Raises:
-            RuntimeError: the run ended before, or it did not come in time.
-        """
+        """Looks again and again, until what is waited for is there."""
         deadline = time.monotonic() + timeout
         while not there():
             code = self.process.poll()

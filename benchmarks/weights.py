@@ -69,9 +69,6 @@ def bench_weights(config: BenchWeightsConfig) -> dict[str, Any]:
         ``cells``: ``size_mb``, ``readers``, ``arm``; ``stall_ms``, ``applied_ms``, ``pause_ms`` and
         ``memcpy_ms``; ``mb`` that each reader read; and ``stall``, ``applied`` and ``pause`` as shares of
         what memcpy allows, 1 the best: each median, min, max and all; ``config``; ``host`` before and after.
-
-    Raises:
-        InputError: the folder exists.
     """
     root = None if config.output_dir is None else Path(config.output_dir).expanduser()
     if root is not None:

@@ -82,11 +82,7 @@ def reading(count: int, tensors: int, elements: int) -> Iterator[list[Endpoint]]
 
 
 def ask(handle: Any, method: str, *arguments: Any) -> Any:
-    """The answer of one of them.
-
-    Raises:
-        TimeoutError: names the question that was not answered.
-    """
+    """The answer of one of them."""
     try:
         return ray.get(getattr(handle, method).remote(*arguments), timeout=READY_S)
     except ray.exceptions.GetTimeoutError as error:
