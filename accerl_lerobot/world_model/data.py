@@ -95,26 +95,18 @@ class WindowStart(NamedTuple):
 class Windows:
     """A batch of windows. Chunks beyond an episode's end repeat its last frame and are not `valid`."""
 
-    frames: np.ndarray
-    """uint8 (B, L + R, V, H, W, 3): the context, the window's first frame last, then one after each chunk."""
-    anchor: np.ndarray
-    """uint8 (B, V, H, W, 3): a frame some chunks before the first, where a rollout would have started."""
-    state: np.ndarray
-    """float32 (B, L + R, S), at each of these."""
-    before: np.ndarray
-    """float32 (B, L − 1, K, A), actions between the frames of the context; zero where none was executed."""
-    commanded_sum: np.ndarray
-    """float32 (B, A), the sum of the actions before the window's first frame."""
-    initial_state: np.ndarray
-    """float32 (B, S), the robot's state when the episode began."""
-    actions: np.ndarray
-    """float32 (B, R, K, A), zero where none was executed."""
-    steps: np.ndarray
-    """int64 (B, R), how many of a chunk's actions lie between its frames; 0 beyond the end."""
-    success: np.ndarray
-    """bool (B, R), True if the task was achieved in this chunk."""
-    episode: np.ndarray
-    """int64 (B,), index of the episode."""
+    frames: np.ndarray  # uint8 (B, L + R, V, H, W, 3): context, the first frame last, one after each chunk
+    anchor: (
+        np.ndarray
+    )  # uint8 (B, V, H, W, 3), some chunks before the first, where a rollout would have begun
+    state: np.ndarray  # float32 (B, L + R, S), at each of the frames
+    before: np.ndarray  # float32 (B, L − 1, K, A), actions within the context; zero where none was executed
+    commanded_sum: np.ndarray  # float32 (B, A), the sum of the actions before the window's first frame
+    initial_state: np.ndarray  # float32 (B, S), the robot's state when the episode began
+    actions: np.ndarray  # float32 (B, R, K, A), zero where none was executed
+    steps: np.ndarray  # int64 (B, R), how many of a chunk's actions lie between its frames; 0 beyond the end
+    success: np.ndarray  # bool (B, R), True if the task was achieved in this chunk
+    episode: np.ndarray  # int64 (B,), index of the episode
     task: tuple[str, ...]
 
     def __len__(self) -> int:

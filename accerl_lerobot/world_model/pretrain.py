@@ -28,9 +28,8 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.loading import resolve_device
 from accerl_lerobot.world_model import data, learners, store, validation
 from accerl_lerobot.world_model.config import WorldModelConfig
-from accerl_lerobot.world_model.contract import LearnableWorldModel, WorldModelSpec, new_model
+from accerl_lerobot.world_model.contract import WorldModelSpec, new_model
 from accerl_lerobot.world_model.data import Episode
-from accerl_lerobot.world_model.success_model import SuccessPairsRewardModel
 
 if TYPE_CHECKING:
     from accerl_lerobot.cli.verbs import WorldModelRun
@@ -76,9 +75,30 @@ def pretrain(run: WorldModelRun, directory: Path, console: Console) -> dict[str,
             learnt += learn
     held = [episode for part in held_out.values() for episode in part]
     spec = replace(spec, tasks=_tasks(run.env, learnt + held))
+
+    def on_step(stage: Stage, kind: str, step: int, metrics: dict[str, float]) -> None:
+        stage.update(step, " ".join(f"{k} {v:.3f}" for k, v in [*metrics.items()][:2]))
+        if step % LOG_EVERY == 0:
+            with (directory / METRICS).open("a") as log:
+                log.write(json.dumps({"kind": kind, "step": step} | metrics) + "\n")
+
     started = time.monotonic()
-    serving, success = _train(run, spec, learnt, device, directory, console)
+    examples = learners.Examples(learnt, config.chunk)
+    torch.manual_seed(run.seed)
+    # Both networks are initialised on the CPU, so alike on every device.
+    model = new_model(spec, config.model).to(device)
+    with console.stage("world model", total=config.learn.steps) as stage:
+        say = partial(on_step, stage, "world_model")
+        serving = learners.train_from_scratch(model, learnt, config, run.seed, say).serving
+    validation.fit_uncertainty_scale(serving, learnt, config.validation, run.seed)
+    success = learners.new_success_model(config.chunk).to(device)
+    learner = learners.SuccessLearner(success, config, run.seed)
+    with console.stage("success model", total=config.success.steps) as stage:
+        for step in range(1, config.success.steps + 1):
+            on_step(stage, "success_model", step, learner.step(examples, serving))
+    success.eval()
     seconds = time.monotonic() - started
+
     # The threshold is chosen on the policy's failures, where there are any, as demonstrations fail otherwise.
     *others, fresh = held_out
     roles = {e.key: store.HELD_OUT for name in others for e in held_out[name]}
@@ -92,39 +112,6 @@ def pretrain(run: WorldModelRun, directory: Path, console: Console) -> dict[str,
     success.save_pretrained(directory / "world_model" / store.SUCCESS)
     counts = {"learnt": data.count_episodes(learnt), "held_out": data.count_episodes(held)}
     return found | counts | {"seconds": seconds}
-
-
-def _train(
-    run: WorldModelRun,
-    spec: WorldModelSpec,
-    learnt: Sequence[Episode],
-    device: torch.device,
-    directory: Path,
-    console: Console,
-) -> tuple[LearnableWorldModel, SuccessPairsRewardModel]:
-    """Trains a world model and a success model."""
-    config, seed = run.world_model, run.seed
-    examples = learners.Examples(learnt, config.chunk)
-
-    def on_step(stage: Stage, kind: str, step: int, metrics: dict[str, float]) -> None:
-        stage.update(step, " ".join(f"{k} {v:.3f}" for k, v in [*metrics.items()][:2]))
-        if step % LOG_EVERY == 0:
-            with (directory / METRICS).open("a") as log:
-                log.write(json.dumps({"kind": kind, "step": step} | metrics) + "\n")
-
-    torch.manual_seed(seed)
-    # Both networks are initialised on the CPU, so alike on every device.
-    model = new_model(spec, config.model).to(device)
-    with console.stage("world model", total=config.learn.steps) as stage:
-        say = partial(on_step, stage, "world_model")
-        serving = learners.train_from_scratch(model, learnt, config, seed, say).serving
-    validation.fit_uncertainty_scale(serving, learnt, config.validation, seed)
-    success = learners.new_success_model(config.chunk).to(device)
-    learner = learners.SuccessLearner(success, config, seed)
-    with console.stage("success model", total=config.success.steps) as stage:
-        for step in range(1, config.success.steps + 1):
-            on_step(stage, "success_model", step, learner.step(examples, serving))
-    return serving, success.eval()
 
 
 def _tasks(env: EnvConfig, episodes: Sequence[Episode]) -> tuple[str, ...]:
