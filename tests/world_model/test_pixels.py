@@ -99,6 +99,14 @@ def test_a_new_model_is_a_copy_of_the_last_frame():
         assert np.array_equal(one.frames.numpy(), of.frames[:, 1])
 
 
+def test_frames_go_in_and_come_out_in_the_order_of_the_cameras():
+    of = windows(dots(2))
+    frames, anchor = (np.concatenate([x, 255 - x], -4) for x in (of.frames, of.anchor))
+    of, spec = replace(of, frames=frames, anchor=anchor), replace(SPEC, cameras=("a", "b"))
+    made = PixelWorldModel(spec, PixelModelConfig(channels=CHANNELS))
+    assert np.array_equal(rollout(made, of)[0].frames.numpy(), frames[:, 1])
+
+
 def test_a_rollout_depends_on_its_row_alone():
     of = windows(dots(2), chunks=2)
     made = awake(model())

@@ -14,11 +14,11 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from accerl_lerobot import cli, console
+from accerl_lerobot import cli
 from accerl_lerobot.checkpoint import isolation
 from accerl_lerobot.cli.verbs import WorldModelEvalRun, WorldModelRun
 from accerl_lerobot.demos.record import DemosConfig, record_demos
-from accerl_lerobot.engine.config import DatasetConfig, RunConfig, parse
+from accerl_lerobot.engine.config import DatasetConfig
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model import learners, pretrain, validation
@@ -110,21 +110,6 @@ def test_one_success_is_not_enough_to_learn_from_and_be_classified_on():
     with pytest.raises(InputError, match="at least two successes and two failures"):
         pretrain._check_split(DatasetConfig(), success + failures[:2], failures[2:], config)
     pretrain._check_split(DatasetConfig(), success + failures[:2], success + failures[2:], config)
-
-
-@pytest.mark.parametrize("shuffled", [False, True])
-def test_a_placebo_is_learned_where_one_is_asked_for(
-    shuffled: bool, demos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    class Spy(learners.Learner):
-        def draw(self, *args: Any) -> Any:
-            raise InterruptedError(self.config.shuffle_actions)
-
-    monkeypatch.setattr(learners, "Learner", Spy)
-    told = [*arguments(demos, tmp_path / "out")[1:], f"--world_model.shuffle_actions={shuffled}"]
-    config = parse(WorldModelRun, told, recipe_class=RunConfig)
-    with pytest.raises(InterruptedError, match=str(shuffled)):
-        pretrain.pretrain(config, tmp_path, console.Console())
 
 
 @pytest.mark.slow

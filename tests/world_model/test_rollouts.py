@@ -342,6 +342,15 @@ def test_rollouts_that_succeed_too_often_trip_it():
     assert not switch.tripped and math.isnan(switch.share) and all(math.isnan(x) for x in switch.shares)
 
 
+def test_it_waits_for_the_window_and_for_more_than_the_gap():
+    switch = told(KillSwitch(max_gap=0.5, window=4, min_real=2), [1, 1, 1], real=[0] * 5)
+    assert math.isnan(switch.shares[0]) and not switch.tripped
+    assert told(switch, [1], real=[0, 1]).shares == (1.0, 0.5) and not switch.tripped
+    assert told(switch, real=[0, 0]).tripped
+    better = told(KillSwitch(max_gap=0.1, window=1, min_real=1), [0], real=[1])
+    assert not better.tripped, "reality may be as good as it likes"
+
+
 def test_promotions_do_not_make_it_forget():
     """Else a model that flatters would not be found out where its successors come before enough outcomes."""
     switch = KillSwitch(max_gap=0.3, window=2, min_real=6)
@@ -351,22 +360,9 @@ def test_promotions_do_not_make_it_forget():
     assert told(switch, [1, 1], real=[0, 0]).tripped
 
 
-def test_real_outcomes_before_the_window_is_full_do_not_count():
-    switch = told(KillSwitch(max_gap=0.3, window=4, min_real=2), [1, 1, 1], real=[0] * 5)
-    assert math.isnan(switch.shares[0]) and not switch.tripped
-    assert told(switch, [1], real=[0, 1]).shares == (1.0, 0.5) and switch.tripped
-
-
 def test_a_policy_that_learns_is_not_taken_for_a_world_model_that_flatters():
     """Reality is held against what was imagined when it happened, not against what is imagined now."""
     switch = KillSwitch(max_gap=0.3, window=2, min_real=4)
     for outcome in (0, 0, 1, 1):
         told(switch, [outcome] * 2, real=[outcome])
     assert switch.share == 1.0 and switch.shares == (0.5, 0.5) and not switch.tripped
-
-
-def test_more_than_the_gap_not_as_much():
-    exact = told(KillSwitch(max_gap=0.5, window=2, min_real=1), [1, 0], real=[0])
-    assert exact.shares == (0.5, 0.0) and not exact.tripped
-    better = told(KillSwitch(max_gap=0.1, window=1, min_real=1), [0], real=[1])
-    assert not better.tripped, "reality may be as good as it likes"

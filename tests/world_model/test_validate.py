@@ -163,6 +163,21 @@ def test_the_success_model_is_classified_on_what_was_imagined():
     assert still["outcomes"]["auroc"]["value"] < exact["outcomes"]["auroc"]["value"] - 0.1, "nothing moved"
 
 
+def test_a_success_model_that_diverges_is_an_error_and_stays_as_it_was():
+    examples, world = Examples(with_successes(dots(30, seed=1)), K), Deterministic("exact")
+    config = WorldModelConfig(success=SuccessLearnConfig(batch=8), longest=2)
+    learner = SuccessLearner(new_success_model(K), config, seed=0)
+    learner.step(examples, world)
+    with torch.no_grad():
+        learner.model.out.bias.fill_(torch.nan)
+    before = {k: v.clone() for k, v in learner.model.state_dict().items()}
+    why = r"^the success model's .* not finite at step 2; lower world_model.success.lr"
+    with pytest.raises(FloatingPointError, match=why):
+        learner.step(examples, world)
+    now = learner.model.state_dict()
+    assert all(torch.equal(v, now[k]) for k, v in before.items() if k != "out.bias")
+
+
 def test_what_is_taken_for_a_success_depends_on_the_threshold():
     episodes = with_successes(dots(40, seed=1))
     success = new_success_model(K).eval()
