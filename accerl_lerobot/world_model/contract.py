@@ -56,55 +56,39 @@ Size = Annotated[int, Range("[1, 1000000]")]
 class WorldModelSpec(Section, section="spec"):
     """Sizes of a world model, and the environment it models."""
 
-    cameras: tuple[str, ...]
-    """``observation.images.<camera>``, in the order of V."""
-    image_size: tuple[Size, Size]
-    """(H, W)."""
-    state_dim: Annotated[int, Range("[0, 1000000]")]
-    """S; 0: there is no ``observation.state``."""
+    cameras: tuple[str, ...]  # ``observation.images.<camera>``, in the order of V
+    image_size: tuple[Size, Size]  # (H, W)
+    state_dim: Annotated[int, Range("[0, 1000000]")]  # S; 0: there is no ``observation.state``
     action_dim: Size
-    chunk: Size
-    """K."""
-    fps: Size
-    """Env steps per second, which a dataset must have too."""
-    context: Size
-    """L."""
-    tasks: tuple[str, ...] = ()
-    """Names of the environment's tasks; empty: unknown."""
+    chunk: Size  # K
+    fps: Size  # env steps per second, which a dataset must have too
+    context: Size  # L
+    tasks: tuple[str, ...] = ()  # names of the environment's tasks; empty: unknown
 
 
 @dataclass(frozen=True, kw_only=True)
 class Prediction:
     """Predicted observation after a chunk."""
 
-    state: State
-    """Input of the next `WorldModel.step`."""
-    frames: Tensor
-    """uint8 (B, V, H, W, 3)."""
-    robot: Tensor
-    """float32 (B, S), in the environment's units."""
-    uncertainty: Tensor
-    """float32 (B,), ≥ 0; 1 is the 95th percentile on training data. NaN where the model has none."""
-    success: Tensor | None = None
-    """float32 (B,), P(the task has been achieved); None: a success model has to say."""
-    done: Tensor | None = None
-    """bool (B,), True where the episode is over, with a success or without; None: only a success ends it."""
+    state: State  # input of the next `WorldModel.step`
+    frames: Tensor  # uint8 (B, V, H, W, 3)
+    robot: Tensor  # float32 (B, S), in the environment's units
+    uncertainty: Tensor  # float32 (B,), ≥ 0; 1: the 95th percentile on training data; NaN: the model has none
+    success: Tensor | None = None  # float32 (B,), P(the task is achieved); None: a success model says
+    done: Tensor | None = None  # bool (B,), True where the episode is over; None: only a success ends it
 
 
 class Context(NamedTuple):
-    """Observations until a rollout starts, a chunk apart, the newest last. They are the anchor too."""
+    """Observations until a rollout starts, a chunk apart, the newest last, which is the anchor too.
 
-    frames: Tensor
-    """uint8 (B, L, V, H, W, 3)."""
-    robot: Tensor
-    """float32 (B, L, S)."""
-    actions: Tensor
-    """float32 (B, L − 1, K, A), executed between these; zero where none was."""
-    commanded_sum: Tensor
-    """float32 (B, A), sum of the actions since the episode began, or since they are known. With relative
-    actions this is where the robot is commanded to be, and may not be yet."""
-    initial_state: Tensor
-    """float32 (B, S), the robot's state where that sum begins."""
+    With relative actions `commanded_sum` is where the robot is commanded to be, and may not be yet.
+    """
+
+    frames: Tensor  # uint8 (B, L, V, H, W, 3)
+    robot: Tensor  # float32 (B, L, S)
+    actions: Tensor  # float32 (B, L − 1, K, A), executed between these; zero where none was
+    commanded_sum: Tensor  # float32 (B, A), of the actions since the episode began, or since they are known
+    initial_state: Tensor  # float32 (B, S), the robot's state where that sum begins
 
 
 def context_of(windows: Windows, rows: slice = slice(None)) -> Context:
