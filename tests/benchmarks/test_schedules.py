@@ -115,9 +115,7 @@ def test_a_small_run_of_scaling(light_ray: None, tmp_path: Path):
     )
     rows = bench_scaling(config)["counts"]
     assert [row["worlds"] for row in rows] == [1, 2] and rows[0]["efficiency"]["median"] == 1.0
-    assert (tmp_path / "scaling.png").stat().st_size > 1000 and "E(N)" in (
-        tmp_path / "scaling.md"
-    ).read_text()
+    assert "E(N)" in (tmp_path / "scaling.md").read_text()
 
 
 @pytest.mark.slow
