@@ -24,7 +24,7 @@ from accerl_lerobot.policies.loading import load_adapter
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Six successes and two failures."""
     root = tmp_path_factory.mktemp("recorded") / "dataset"
-    config = DemosConfig(episodes=8, failure_share=0.25, processes=1)
+    config = DemosConfig(episodes=8, failure_share=0.25)
     record_demos(SimulatedConfig(max_steps=16), config, str(root))
     return root
 

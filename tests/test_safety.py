@@ -22,7 +22,6 @@ from accerl_lerobot.checkpoint.safety import (
     Origin,
     check_name,
     check_not_pickled,
-    check_remote_code,
     read_json,
     read_tensors,
     safe_join,
@@ -209,27 +208,6 @@ def test_pickled_weights_are_named_with_the_way_out(tmp_path: Path):
     (tmp_path / "pytorch_model.bin").unlink()
     with pytest.raises(InputError, match="model.safetensors: is missing; give a folder"):
         check_not_pickled(tmp_path, "model.safetensors", ORIGIN)
-
-
-COMMIT = "0123456789abcdef0123456789abcdef01234567"
-
-
-@pytest.mark.parametrize(
-    ("trust", "revision", "said"),
-    [
-        (True, None, "policy.code_revision=None: name the commit whose code you have read"),
-        (True, "main", "policy.code_revision='main': name a commit, 40 hexadecimal digits"),
-        (True, COMMIT[:39], "policy.code_revision="),
-        (True, COMMIT.upper(), "policy.code_revision="),
-        (True, f"{COMMIT}\n", "policy.code_revision="),
-        (False, COMMIT, "policy.code_revision=.*add policy.trust_remote_code=true"),
-    ],
-)
-def test_code_is_run_at_a_commit_or_not_at_all(trust: bool, revision: str | None, said: str):
-    check_remote_code(True, COMMIT, "policy")
-    check_remote_code(False, None, "policy")
-    with pytest.raises(InputError, match=f"^{said}"):
-        check_remote_code(trust, revision, "policy")
 
 
 TIMES = 30

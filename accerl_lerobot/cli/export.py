@@ -13,20 +13,20 @@ from __future__ import annotations
 import json
 from contextlib import closing
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from accerl_lerobot.checkpoint.layout import CONFIG
 from accerl_lerobot.checkpoint.safety import Origin, check_folder
 from accerl_lerobot.config.parsing import DISCOVER, decode, drop_consents, read_recipe
-from accerl_lerobot.config.ranges import DatasetName, NewFolder, Range, Section
+from accerl_lerobot.config.ranges import DatasetName, NewFolder, Section
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos import record
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.envs import make_world
-from accerl_lerobot.envs.base import EnvConfig, World
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.replay.journal import EPISODES, Done, read_journal, whole_episodes
 
@@ -50,8 +50,6 @@ class ExportConfig(Section):
     """Name of the dataset, ``owner/name``."""
     pick: Literal["all", "successes", "failures"] = "all"
     """Episodes by their outcome."""
-    processes: Annotated[int, Range("[1, 64]")] = 2
-    """Simulator processes; does not change the content."""
     hub_path: str | None = None
     """``owner/name@COMMIT`` whose code is run with your rights, if the run's environment is on the Hub."""
     discover_packages_path: str | None = field(default=None, metadata={"registers": True})
@@ -119,71 +117,34 @@ def _write(
         spec = world.spec
     tally = {"episodes": 0, "frames": 0, "successes": 0, "unlike": 0}
     version = {VERSION: {"dtype": "int64", "shape": (1,), "names": None}}
-    table = record.features(spec, settings.env.state_size) | version
-    cost = settings.rollout.decision_cost
+    replay = partial(_replay, settings.rollout.decision_cost)
     with (
         console.stage("replaying episodes", total=len(chosen)) as stage,
-        record.simulators(config.processes, _start, settings.env, cost) as pool,
+        record.simulated(settings.env, replay, chosen) as repeated,
+        record.new_dataset(root, config.repo_id, spec, settings.env, version) as dataset,
     ):
-        repeated = record.in_order(pool, _replay, chosen, ahead=2 * config.processes)
-        with record.new_dataset(root, config.repo_id, spec.fps, settings.env.type, table) as dataset:
-            for number, (episode, parts) in enumerate(zip(repeated, chosen, strict=True), start=1):
-                stage.update(number, f"{tally['successes']} successes")
-                if episode is None:
-                    tally["unlike"] += 1
-                    continue
-                versions = np.concatenate([np.repeat(part.versions, part.steps) for part in parts])
-                for frame, policy in zip(record.frames(episode), versions, strict=True):
-                    dataset.add_frame(frame | {VERSION: np.array([policy], np.int64)})
-                dataset.save_episode()
-                tally["episodes"] += 1
-                tally["frames"] += len(episode)
-                tally["successes"] += episode.success
+        for number, (episode, parts) in enumerate(zip(repeated, chosen, strict=True), start=1):
+            stage.update(number, f"{tally['successes']} successes")
+            if episode is None:
+                tally["unlike"] += 1
+                continue
+            versions = np.concatenate([np.repeat(part.versions, part.steps) for part in parts])
+            record.save_episode(dataset, episode, tally, {VERSION: versions[:, None].astype(np.int64)})
     if tally["unlike"]:
         console.say(f"{tally['unlike']} of {len(chosen)} episodes differed from the run and are left out")
     return tally
 
 
-_world: World
-_cost: float
-
-
-def _start(env: EnvConfig, cost: float) -> None:
-    """Initialises a process with one environment for all its episodes."""
-    global _world, _cost
-    _world, _cost = make_world(env), cost
-
-
-def _replay(parts: list[Done]) -> record.Episode | None:
+def _replay(cost: float, parts: list[Done]) -> record.Episode | None:
     """An episode with an observation at every step; None if it differs from the journal."""
-    origin = parts[0].origin
-    observation = _world.reset(origin.seed, origin.task)
-    seen, rewards, success_at, done = [], [], -1, False
-    actions = np.concatenate([part.actions for part in parts])
-    for i, action in enumerate(actions):
-        if done:
-            return None
-        seen.append(observation)
-        result = _world.step_chunk(action[None])
-        rewards.append(result.rewards[0])
-        observation, done = result.observation, result.done
-        if result.success and success_at < 0:
-            success_at = i
-    if not _matches(parts, np.array(rewards), success_at >= 0):
-        return None
-    return record.Episode(
-        observations={key: np.stack([row[key] for row in seen]) for key in seen[0] if key != "task"},
-        actions=actions,
-        rewards=np.asarray(rewards, np.float32),
-        task=str(seen[0]["task"]),
-        done=done,
-        success_at=success_at,
-        seed=origin.seed,
-    )
+    actions, origin = np.concatenate([part.actions for part in parts]), parts[0].origin
+    episode = record.played(record.this_world(), origin.task, origin.seed, actions)
+    same = len(episode) == len(actions) and episode.success == parts[-1].success
+    return episode if same and _rewards_match(parts, episode.rewards, cost) else None
 
 
-def _matches(parts: list[Done], rewards: np.ndarray, success: bool) -> bool:
+def _rewards_match(parts: list[Done], rewards: np.ndarray, cost: float) -> bool:
     steps = np.concatenate([part.steps for part in parts])
-    brought = np.add.reduceat(rewards, np.concatenate([[0], np.cumsum(steps)[:-1]])) - _cost
+    brought = np.add.reduceat(rewards, np.concatenate([[0], np.cumsum(steps)[:-1]])) - cost
     expected = np.concatenate([part.rewards for part in parts])
-    return success == parts[-1].success and bool(np.allclose(brought, expected, rtol=0, atol=TOLERANCE))
+    return bool(np.allclose(brought, expected, rtol=0, atol=TOLERANCE))

@@ -60,7 +60,7 @@ LONGEST_KEY = 80
 LEROBOT = {
     "steps": "use trainer.updates or sft.steps",
     "batch_size": "use trainer.batch_decisions or sft.batch_size",
-    "num_workers": "use rollout.workers or sft.num_workers",
+    "num_workers": "use rollout.workers",
     "save_freq": "use save_every_updates or save_every_s",
     "eval_freq": "use evaluation.every_updates",
     "eval.n_episodes": "use evaluation.episodes",
@@ -79,14 +79,11 @@ LEROBOT = {
 """LeRobot's names of what has another name here → what to do."""
 REGISTERS = "registers"
 """In a field's metadata: the package that it names registers types of the section that the field is in."""
-CONSENT = frozenset(
-    {
-        "trust_remote_code", "code_revision", "hub_path", "discover_packages_path", "extra_args", "address",
-    }
-)  # fmt: skip
+CONSENT = {"trust_remote_code", "hub_path", DISCOVER, "extra_args", "address"}
 """Names of the fields that let somebody's code run with the user's rights: from the Hub, from a package, by
 further arguments of ``lerobot-train``, or from a Ray cluster, which exchanges pickles with the run. Only the
 command line can set them. A recipe may have come with the very code that it would allow."""
+UNSET = (None, False, "", [], {})
 
 
 def parse(config_class: type[Any], arguments: list[str], *, recipe_class: type[Any] | None = None) -> Any:
@@ -116,39 +113,35 @@ def parse(config_class: type[Any], arguments: list[str], *, recipe_class: type[A
 
 def drop_consents(tree: dict[str, Any]) -> dict[str, Any]:
     """Removes from a tree what `consents` finds in it; returns that."""
-    found = consents(tree, drop=True)
-    launch = tree.get("launch")
-    if "launch.address" in found and isinstance(launch, dict) and "placement" in launch:
-        found["launch.placement"] = launch.pop("placement")  # of the nodes of that cluster
+    found = consents(tree)
+    for _, key, holder, _ in [leaf for leaf in _leaves(tree) if leaf[0] in found]:
+        del holder[key]
+    if "launch.address" in found and "placement" in tree["launch"]:
+        found["launch.placement"] = tree["launch"].pop("placement")  # of the nodes of that cluster
     return found
 
 
-def consents(tree: Any, given: Any = None, *, drop: bool = False) -> dict[str, Any]:
+def consents(tree: Any, given: Any = None) -> dict[str, Any]:
     """Dotted field → value, of the fields in `CONSENT` that a tree, read from a file, sets at any depth.
 
-    Fields that the command line sets as well, in `given`, are left out. `drop` removes them from `tree`.
+    Fields that the command line sets as well, in `given`, are left out.
     """
-    found: dict[str, Any] = {}
+    asked = {name for name, *_ in _leaves(given)}
+    return {
+        name: value
+        for name, key, _, value in _leaves(tree)
+        if str(key).rpartition(".")[2] in CONSENT and value not in UNSET and name not in asked
+    }
 
-    def look(below: Any, given: Any, path: tuple[str, ...]) -> None:
-        if below is given:
-            return
-        given = given if isinstance(given, dict) else {}
-        if isinstance(below, list):
-            for number, entry in enumerate(below):
-                look(entry, None, (*path, str(number)))
-        elif isinstance(below, dict):
-            for key, value in list(below.items()):
-                here = (*path, str(key))
-                if str(key).rpartition(".")[2] not in CONSENT:
-                    look(value, given.get(key), here)
-                elif value not in (None, False, "", [], {}) and key not in given:
-                    found[".".join(here)] = value
-                    if drop:
-                        del below[key]
 
-    look(tree, given, ())
-    return found
+def _leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any, Any, Any]]:
+    """Dotted name, key, what holds it, and value, of everything in a tree that is not looked into."""
+    entries = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
+    for key, value in entries:
+        if isinstance(value, (dict, list)) and str(key).rpartition(".")[2] not in CONSENT:
+            yield from _leaves(value, f"{path}{key}.")
+        else:
+            yield f"{path}{key}", key, tree, value
 
 
 def decode(config_class: type[Any], tree: dict[str, Any]) -> Any:

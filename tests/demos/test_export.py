@@ -35,7 +35,7 @@ def run(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
 
 
 def exported(run: Path, root: Path, *options: str) -> int:
-    return main(["export", f"--path={run}", f"--root={root}", "--processes=1", *options])
+    return main(["export", f"--path={run}", f"--root={root}", *options])
 
 
 def test_every_whole_episode_is_in_the_dataset_step_by_step(

@@ -8,7 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from accerl_lerobot.demos.record import DemosConfig, Episode, make_expert, play, record_demos
+from accerl_lerobot.demos.record import (
+    DemosConfig,
+    Episode,
+    disturbed,
+    make_expert,
+    played,
+    record_demos,
+)
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.envs.libero import LiberoConfig
 from accerl_lerobot.errors import InputError
@@ -32,7 +39,8 @@ def config(task: str) -> LiberoConfig:
 def episode(settings: LiberoConfig, world, seed: int) -> Episode:
     (task,) = settings.tasks
     expert = make_expert(settings, world, task)
-    return play(world, expert, task=task, seed=seed, noise=0.1, push=0, fail=False)
+    actions = disturbed(expert, world.spec, seed, noise=0.1, push=0, fail=False)
+    return played(world, task, seed, actions)
 
 
 @needs_assets

@@ -34,7 +34,6 @@ CAMERA = "observation.images.corner2"
 TINY = SFTConfig(
     steps=2,
     batch_size=4,
-    warmup_steps=1,
     num_threads=1,
     policy={
         "type": "smolvla",
@@ -152,7 +151,7 @@ class TestPick:
     def dataset(self, tmp_path_factory: pytest.TempPathFactory) -> DatasetConfig:
         """Every second episode fails."""
         root = str(tmp_path_factory.mktemp("demos") / "dataset")
-        config = DemosConfig(episodes=4, failure_share=0.5, processes=1)
+        config = DemosConfig(episodes=4, failure_share=0.5)
         record_demos(SimulatedConfig(max_steps=16), config, root)
         return DatasetConfig(repo_id="a/b", root=root)
 
