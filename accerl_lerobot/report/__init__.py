@@ -23,8 +23,6 @@ from accerl_lerobot.errors import InputError, check_output, expanded
 
 NAME = "report.html"
 VIDEO_MB = 20
-MARK = '<meta name="generator" content="accerl report'
-"""Tells a page of ours from any other file; within its first 1000 characters."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,8 +34,7 @@ class ReportConfig(Section):
     runs: tuple[str, ...] = ()
     """Folders of runs of ``accerl train``; several make a page that compares them. Bare ones are runs."""
     output: str | None = None
-    """The page. None: ``report.html`` in the run's folder, or here if there are several. An older page of
-    accerl is replaced; any other file is left alone."""
+    """The page. None: ``report.html`` in the run's folder, or here if there are several."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -59,7 +56,7 @@ def write_report(config: ReportConfig) -> Path:
         raise InputError("runs", ",".join(config.runs), "name each run once")
     if output is None:
         output = runs[0].path / NAME if len(runs) == 1 else Path(NAME)
-    check_output(output, _is_ours)
+    check_output(output)
     now = time.time()
     try:
         page = comparison_page(runs, now) if len(runs) > 1 else run_page(runs[0], now)
@@ -92,8 +89,3 @@ def write_report(config: ReportConfig) -> Path:
             part.unlink()
         raise InputError("output", str(output), f"cannot be written: {error.strerror}") from error
     return output
-
-
-def _is_ours(path: Path) -> bool:
-    with path.open(encoding="utf-8", errors="replace") as file:
-        return MARK in file.read(1000)

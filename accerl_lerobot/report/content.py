@@ -13,11 +13,13 @@ import numpy as np
 import yaml
 
 from accerl_lerobot.checkpoint.layout import SUMMARY
+from accerl_lerobot.config.parsing import decode
 from accerl_lerobot.console import count, duration, number, percent, rate
+from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.sizes import lag_limits
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.report.charts import COLOURS, Chart, Series, line, rates
-from accerl_lerobot.report.read import Record, Run, apart, column, differences, newest, resolved, unread
+from accerl_lerobot.report.read import Record, Run, apart, column, differences, newest
 from accerl_lerobot.timeline import STATES
 from accerl_lerobot.timeline.read import read_timeline
 
@@ -121,12 +123,13 @@ class Section:
 
 def run_page(run: Run, now: float) -> dict[str, Any]:
     """Values for the template: the page of one run, at `now`, in seconds since 1970."""
-    config, why = resolved(run.config)
-    bound = None if config is None else lag_limits(config)[0]
-    found = unread(run.config) if config is None else differences(config)
-    rows = [(name, shown(value), shown(default)) for name, value, default in found]
+    text, bound = "", None
+    try:
+        bound = lag_limits(decode(RunConfig, run.config))[0]
+    except InputError as error:  # another version, or a package of the user's, wrote it
+        text = f"This accerl does not know all of the recipe's types or fields: {error}."
+    rows = [(name, shown(value), shown(default)) for name, value, default in differences(run.config)]
     tables = [("Fields that differ from the defaults", ("field", "value", "default"), rows)] if rows else []
-    text = f"This accerl does not know all of the recipe's types or fields: {why}." if why else ""
     videos = [(path, FILM if path.stem == "before_after" else path.name) for path in run.videos]
     success, *others = _training_sections(run, bound)
     sections = [

@@ -9,9 +9,8 @@ Also the differences of a run's recipe from the defaults and from other runs.
 
 from __future__ import annotations
 
-import dataclasses
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ import numpy as np
 
 from accerl_lerobot.checkpoint.layout import CONFIG, SUMMARY
 from accerl_lerobot.checkpoint.safety import Origin, brief, check_folder
-from accerl_lerobot.config.parsing import TYPE, decode, encode, read_recipe
+from accerl_lerobot.config.parsing import encode, read_recipe
 from accerl_lerobot.console import ABSENT
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.errors import InputError
@@ -212,33 +211,11 @@ def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return fields
 
 
-def differences(config: Any, default: Any = None, prefix: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Dotted field, value and default, where the two differ.
-
-    Defaults are those of the types that were chosen: GIPO's for a run of GIPO. That it was chosen is a
-    difference too, and so is a section that is off unless it is given. Without a `default` of its type,
-    those of a section's fields count.
-    """
-    for field in dataclasses.fields(config):
-        name, value = f"{prefix}{field.name}", getattr(config, field.name)
-        usual = getattr(default, field.name) if type(default) is type(config) else _default(field)
-        if name in PLACES:
-            continue
-        if not dataclasses.is_dataclass(value):
-            if value != usual:
-                yield name, value, usual
-            continue
-        if usual is None:
-            yield name, getattr(value, TYPE, "given"), None
-        elif type(value) is not type(usual):
-            yield f"{name}.{TYPE}", getattr(value, TYPE), usual.type
-        yield from differences(value, usual, f"{name}.")
-
-
-def _default(field: dataclasses.Field[Any]) -> Any:
-    if field.default_factory is not dataclasses.MISSING:
-        return field.default_factory()
-    return ABSENT if field.default is dataclasses.MISSING else field.default
+def differences(tree: dict[str, Any]) -> list[tuple[str, Any, Any]]:
+    """Dotted field, value and default, where the two differ; a dash for a field of another type."""
+    usual = flat(encode(RunConfig()))
+    rows = ((name, value, usual.get(name, ABSENT)) for name, value in flat(tree).items())
+    return [row for row in rows if row[0] not in PLACES and row[1] != row[2]]
 
 
 def apart(trees: list[dict[str, Any]]) -> list[tuple[str, list[Any]]]:
@@ -246,19 +223,3 @@ def apart(trees: list[dict[str, Any]]) -> list[tuple[str, list[Any]]]:
     flats = [flat(tree) for tree in trees]
     rows = {key: [one.get(key, ABSENT) for one in flats] for one in flats for key in one}
     return [(key, row) for key, row in rows.items() if key not in PLACES and any(v != row[0] for v in row)]
-
-
-def unread(tree: dict[str, Any]) -> Iterator[tuple[str, Any, Any]]:
-    """As `differences`, of a recipe that this version cannot read: from the defaults of the usual types."""
-    usual = flat(encode(RunConfig()))
-    for name, value in flat(tree).items():
-        if name not in PLACES and value != usual.get(name, ABSENT):
-            yield name, value, usual.get(name, ABSENT)
-
-
-def resolved(tree: dict[str, Any]) -> tuple[RunConfig | None, str]:
-    """A run's recipe as a config, or why this version does not understand what another version wrote."""
-    try:
-        return decode(RunConfig, tree), ""
-    except InputError as error:
-        return None, str(error)
