@@ -8,7 +8,6 @@ import importlib.util
 import math
 import os
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -112,14 +111,6 @@ class TestRendering:
         check = doctor.rendering(needed=True)
         assert check.status == FAIL and "there is no display: use egl or osmesa" in check.text
 
-    def test_takes_too_long(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(doctor, "RENDER_TIMEOUT_S", 0.2)
-        assert "no frame within" in self.draw("import time; time.sleep(30)").text
-
-    def test_without_mujoco(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-        assert "install the extra" in doctor.rendering(needed=True).text
-
 
 class TestPackages:
     """Requirements against what is installed."""
@@ -147,8 +138,8 @@ class TestPackages:
                 "all within their ranges, lerobot 0.6.1 among them",
             ),
             ({"lerobot": "0.6.2", "torch": "2.11.0", "ruff": "0.1"}, OK, "lerobot 0.6.2"),
-            ({"lerobot": "0.7.0", "torch": "2.11.0"}, WARN, "lerobot 0.7.0, not <0.7,>=0.6.1: not tested"),
-            ({"lerobot": "0.6.1"}, FAIL, "not installed: torch"),
+            ({"lerobot": "0.7.0", "torch": "2.11.0"}, WARN, "lerobot 0.7.0, not <0.7,>=0.6.1: run make"),
+            ({"lerobot": "0.6.1"}, FAIL, "torch missing"),
         ],
     )
     def test_against_the_ranges(
@@ -211,10 +202,6 @@ class TestResources:
         assert pictures[1] - pictures[0] == pytest.approx(pictures[2] - pictures[1])
         assert each <= pictures[1] - pictures[0] < 1.1 * each
 
-    def test_too_little_disk(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(doctor.shutil, "disk_usage", lambda path: SimpleNamespace(free=2**28))
-        assert checks(self.recipe())["disk"].status == WARN
-
     def test_lag_is_that_of_the_formula(self) -> None:
         """⌊⌈r⌉ (max(ahead, min) + 2·in_flight + capacity) / batch⌋ − 1; with Ray one pickup, one prefetch."""
         replay = {"capacity": 1024, "ahead": 256, "min_decisions": 128, "samples_per_insert": 2.0}
@@ -230,15 +217,6 @@ class TestResources:
     def test_a_pace_that_would_waste_is_warned_about(self) -> None:
         lag = checks(self.recipe(replay={"max_lag": 3}))["lag"]
         assert lag.status == WARN and lag.text.startswith("at most 4 updates") and "thrown away" in lag.text
-
-    def test_work(self) -> None:
-        config = self.recipe(
-            replay={"samples_per_insert": 4.0},
-            trainer={"updates": 100, "batch_decisions": 64},
-            policy={"n_action_steps": 5},
-        )
-        text = "100 updates of 64 on about 1,600 decisions, at most 8,000 env steps"
-        assert checks(config)["work"].text == text
 
 
 def test_imagination_is_checked_where_there_is_any(capsys: pytest.CaptureFixture[str]) -> None:

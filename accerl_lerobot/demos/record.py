@@ -240,11 +240,7 @@ def this_world() -> World:
 
 @contextmanager
 def new_dataset(
-    root: Path,
-    repo_id: str,
-    spec: WorldSpec,
-    env_config: EnvConfig,
-    more: Mapping[str, Any] | None = None,
+    root: Path, repo_id: str, spec: WorldSpec, env_config: EnvConfig, more: Mapping[str, Any] | None = None
 ) -> Iterator[Any]:
     """A LeRobotDataset to be filled, with `more` features; complete when the context has been left."""
     from datasets.utils.logging import disable_progress_bar
@@ -334,10 +330,7 @@ def _write(
 
 
 def save_episode(
-    dataset: Any,
-    episode: Episode,
-    tally: dict[str, int],
-    more: Mapping[str, np.ndarray] | None = None,
+    dataset: Any, episode: Episode, tally: dict[str, int], more: Mapping[str, np.ndarray] | None = None
 ) -> None:
     """Adds an episode, with `more` features (T, 1), to a dataset and to a count."""
     for t in range(len(episode)):

@@ -79,21 +79,15 @@ def pull(config: card.PullConfig) -> dict[str, Any]:
 
 def _resolve(api: HfApi, config: card.PullConfig) -> tuple[str, str]:
     """Repository type, and the commit that the revision resolves to now."""
-    repo_id, commits = config.repo_id, {}
     missing: Exception | None = None
-    for repo_type in card.REPO_TYPES if config.repo_type is None else (config.repo_type,):
+    for repo_type in card.REPO_TYPES:
         try:
-            commits[repo_type] = api.repo_info(repo_id, repo_type=repo_type).sha
+            info = api.repo_info(config.repo_id, repo_type=repo_type, revision=config.revision)
+            return repo_type, check_commit(info.sha)
         except RepositoryNotFoundError as error:
             missing = missing or error
-    if len(commits) > 1:
-        raise InputError("repo_type", None, f"{repo_id} is a model and a dataset; say which")
-    if missing is not None and not commits:
-        raise missing
-    ((repo_type, commit),) = commits.items()
-    if config.revision is not None:
-        commit = api.repo_info(repo_id, repo_type=repo_type, revision=config.revision).sha
-    return repo_type, check_commit(commit)
+    assert missing is not None
+    raise missing
 
 
 def _checked(listed: Iterable[Any], repo_id: str) -> dict[str, RepoFile]:
@@ -130,7 +124,7 @@ def _not_writable(home: Path, error: OSError) -> InputError:
 
 
 def _receive(folder: Path, home: Path, files: dict[str, RepoFile], repo_id: str) -> dict[str, Any]:
-    """Checks what came and adapts it to `home`; returns its type and how much of it was checked."""
+    """Checks what came and adapts it to `home`; returns its type and what of it is not kept."""
 
     def refuse(why: str) -> InputError:
         return InputError("repo_id", repo_id, f"{why}; pull again, or push it anew")
@@ -143,19 +137,11 @@ def _receive(folder: Path, home: Path, files: dict[str, RepoFile], repo_id: str)
             raise refuse(f"{name} came with {size} bytes instead of the {file.size} that the server lists")
         if not _is_listed(folder / name, file):
             raise refuse(f"{name} is not what the server lists: its hash is another")
-    pushed: dict[str, Any] = {}
-    if (folder / card.MANIFEST).is_file():
-        if (why := layout.defect(folder, card.MANIFEST, card.MANIFEST_FORMAT)) is not None:
-            raise refuse(f"it is not what was pushed: {why}")
-        pushed = layout.read_manifest(folder, card.MANIFEST)
-        (folder / card.MANIFEST).unlink()  # paths are set below, and then it does not hold any more
     (folder / ATTRIBUTES).unlink(missing_ok=True)
     numbers = sorted(p.name for p in folder.glob(f"{CHECKPOINTS}/*") if p.is_dir())
     if numbers and layout.LAST not in numbers:  # a repository has no links
         (folder / CHECKPOINTS / layout.LAST).symlink_to(numbers[-1])
     artifact = card.recognise(folder, "repo_id")
-    if artifact != (kind := pushed.get("kind", artifact)):
-        raise refuse(f"its {card.MANIFEST} says {ascii(kind)[:80]}, but this is a {artifact}")
     checkpoints = [folder / CHECKPOINTS / number for number in numbers if artifact == card.RUN]
     own = [checkpoint for checkpoint in checkpoints if (checkpoint / layout.MANIFEST).is_file()]
     for checkpoint in own:
@@ -173,11 +159,8 @@ def _receive(folder: Path, home: Path, files: dict[str, RepoFile], repo_id: str)
         path.unlink()
     for checkpoint in own:
         layout.write_manifest(checkpoint)
-    checked = pushed.get("files", {}).keys()
-    counts = {"files": len(files), "checked": len(checked)}
-    counts["unchecked"] = len(files.keys() - checked - {card.CARD, card.MANIFEST, ATTRIBUTES})
     left = {"left_out": left_out, "dropped": dropped}
-    return {"kind": artifact} | counts | {name: value for name, value in left.items() if value}
+    return {"kind": artifact, "files": len(files)} | {name: value for name, value in left.items() if value}
 
 
 def _is_listed(path: Path, file: RepoFile) -> bool:

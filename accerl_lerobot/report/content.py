@@ -49,10 +49,7 @@ WARNINGS = {
 LATE = 20
 """Updates at the end over which `WORRIES` are looked at."""
 WORRIES: dict[str, tuple[Callable[[float], bool], str]] = {
-    "low_weight": (
-        lambda x: x > 0.3,
-        "Many samples hardly counted: too stale, or trainer.lr too high",
-    ),
+    "low_weight": (lambda x: x > 0.3, "Many samples hardly counted: too stale, or trainer.lr too high"),
     "explained_variance": (
         lambda x: x < -0.05,
         "The critic explained less of the returns than their mean does",

@@ -8,14 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from accerl_lerobot.demos.record import (
-    DemosConfig,
-    Episode,
-    disturbed,
-    make_expert,
-    played,
-    record_demos,
-)
+from accerl_lerobot.demos.record import DemosConfig, Episode, disturbed, make_expert, played, record_demos
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.envs.libero import LiberoConfig
 from accerl_lerobot.errors import InputError

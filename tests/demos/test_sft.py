@@ -10,7 +10,6 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -71,22 +70,6 @@ def equal(one: dict[str, Any], other: dict[str, Any]) -> bool:
     )
 
 
-class Counting:
-    """A dataset that counts how often it is read."""
-
-    num_frames = 3
-
-    def __init__(self) -> None:
-        self.reads: list[int] = []
-
-    def __len__(self) -> int:
-        return 3
-
-    def __getitem__(self, index: int) -> dict[str, int]:
-        self.reads.append(index)
-        return {"index": index}
-
-
 def test_cached_items_are_the_stock_ones_at_every_reading():
     dataset = stock_dataset()
     cached = guarded_train.CachedDataset(dataset)
@@ -96,46 +79,6 @@ def test_cached_items_are_the_stock_ones_at_every_reading():
             assert equal(cached[index], dataset[index])
     assert cached[364]["action_is_pad"].tolist() == [False, True, True, True]
     assert cached.meta is dataset.meta and cached.num_frames == 365
-
-
-@pytest.mark.parametrize(
-    ("transforms", "streaming", "limit", "history", "expected"),
-    [
-        (False, False, 1000, 1, True),
-        (True, False, 1000, 1, False),
-        (False, True, 1000, 1, False),
-        (False, False, 100, 1, False),
-        (False, False, 1000, 2, False),  # twice the images
-    ],
-)
-def test_what_cannot_be_cached_is_read_the_stock_way(
-    monkeypatch: pytest.MonkeyPatch,
-    transforms: bool,
-    streaming: bool,
-    limit: int,
-    expected: bool,
-    history: int,
-):
-    from lerobot.scripts import lerobot_train
-
-    dataset = Counting()
-    dataset.meta = SimpleNamespace(camera_keys=["a"], features={"a": {"shape": (4, 4, 3)}})
-    got = []
-    monkeypatch.setattr(lerobot_train, "make_train_eval_datasets", lambda cfg: (dataset, "evaluation"))
-    options = SimpleNamespace(image_transforms=SimpleNamespace(enable=transforms), streaming=streaming)
-    monkeypatch.setattr(
-        lerobot_train,
-        "main",
-        lambda: got.extend(
-            lerobot_train.make_train_eval_datasets(
-                SimpleNamespace(dataset=options, policy=SimpleNamespace(n_obs_steps=history))
-            )
-        ),
-    )
-    monkeypatch.setattr(guarded_train, "MAX_BYTES", limit)
-    monkeypatch.setattr(sys, "argv", ["lerobot-train"])
-    guarded_train.main()
-    assert isinstance(got[0], guarded_train.CachedDataset) == expected and got[1] == "evaluation"
 
 
 def test_the_checkpoint_that_is_best_on_held_out_episodes_is_used(tmp_path: Path):
@@ -179,21 +122,6 @@ def test_two_steps_of_lerobot_s_trainer_give_a_checkpoint(tmp_path: Path):
     stats = stock_dataset().meta.stats["observation.state"]
     expected = (observation["observation.state"] - stats["mean"]) / (stats["std"] + 1e-8)
     assert_close(batch["observation.state"], expected)  # the dataset's normalisation
-
-
-@pytest.mark.slow
-def test_act_is_trained_as_well(tmp_path: Path):
-    small = {"dim_model": 32, "n_heads": 2, "dim_feedforward": 64, "n_encoder_layers": 1, "latent_dim": 4}
-    policy = {
-        "type": "act",
-        "chunk_size": 4,
-        "n_action_steps": 4,
-        "pretrained_backbone_weights": None,
-    } | small
-    config = SFTConfig(steps=2, batch_size=4, num_threads=1, policy=policy)
-    adapter = adapter_at(run_sft(config, LOCAL, tmp_path / "sft", seed=0))
-    assert adapter.policy.name == "act" and adapter.family.model.executed == 4
-    assert adapter.policy.config.optimizer_lr == config.lr
 
 
 def command_that(monkeypatch: pytest.MonkeyPatch, program: str) -> None:

@@ -93,15 +93,6 @@ def test_stock_lerobot_and_a_plugin_policy(tmp_path: Path):
     assert "loads it from the Hub as well: `--policy.path=alice/door`" in text
 
 
-def test_of_a_policy_that_was_pulled_and_improved(tmp_path: Path):
-    start = write_policy_folder(tmp_path / "start")
-    write_json(start / "accerl_pulled.json", {"repo_id": "bob/start"})
-    run = write_run_folder(tmp_path / "run")
-    recipe = run / "config.yaml"
-    recipe.write_text(recipe.read_text().replace("lerobot/smolvla_base", str(start)))
-    assert ModelCard(card_of(run, "run")).data.base_model == "bob/start"
-
-
 def test_a_validation_is_reported(tmp_path: Path):
     write_json(tmp_path / "world_model" / "config.json", {"spec": {}, "model": {}})
     checks = {
