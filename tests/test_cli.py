@@ -37,12 +37,6 @@ def test_help_answers_without_torch_or_lerobot() -> None:
         assert f"\n  {verb} " in done.stdout
 
 
-@pytest.mark.parametrize("arguments", [[], ["-h"], ["help"]])
-def test_usage(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(arguments) == 0
-    assert capsys.readouterr().out == cli.usage() + "\n"
-
-
 def test_every_verb_has_a_function_and_a_config() -> None:
     assert {name.split()[0] for name in verbs.CONFIGS} == cli.VERBS.keys()
 
@@ -343,12 +337,3 @@ def test_a_place_that_cannot_be_is_refused_before_any_work(
         err = capsys.readouterr().err
         assert err.startswith(f"accerl: {flag}={place!r}"[:150]) and err.count("\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
-
-
-def test_a_folder_that_may_not_be_written_to_is_refused_before_an_evaluation(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != tmp_path)
-    arguments = ["--env.type=simulated", "--policy.path=a/b", f"--output_dir={tmp_path / 'a' / 'b'}"]
-    assert cli.main(["eval", *arguments]) == 2
-    assert f"{tmp_path} cannot be written to" in capsys.readouterr().err

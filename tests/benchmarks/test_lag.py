@@ -5,10 +5,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -123,25 +119,3 @@ def test_cells_differ_from_the_recipe_in_what_is_studied(tmp_path: Path, tiny_ch
     assert made.output_dir == str(tmp_path / "study" / "ppo-lag2-seed4")
     assert made.replay == tiny_run(tiny_checkpoint).replay
     assert study.starts[4].trainer.updates == 0
-
-
-def test_a_study_that_is_stopped_ends_its_runs(
-    tmp_path: Path, tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
-):
-    real, started = subprocess.Popen, []
-
-    def start(command: list[str], **options: Any) -> subprocess.Popen[bytes]:
-        started.append(real([sys.executable, "-c", "import time; time.sleep(600)"], **options))
-        return started[-1]
-
-    def interrupted(under_way: list[Any]) -> Any:
-        while len(started) < 2:
-            time.sleep(0.01)
-        time.sleep(0.2)
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(studies.subprocess, "Popen", start)
-    monkeypatch.setattr(studies, "as_completed", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        bench.bench_lag(small(tmp_path, tiny_checkpoint))
-    assert len(started) == 2 and all(p.returncode == -signal.SIGTERM for p in started)

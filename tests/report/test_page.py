@@ -23,16 +23,7 @@ from accerl_lerobot.report.charts import Chart
 from accerl_lerobot.report.content import evaluated, exploring
 from accerl_lerobot.report.read import read_run
 from accerl_lerobot.timeline import COMPUTE, RECOVERY, TRAINING, WAIT_IN
-from accerl_lerobot.trainer.config import TrainerConfig
-from tests.report.folders import (
-    HOSTILE,
-    imagined,
-    imagining,
-    metaworld,
-    ppo,
-    run_config,
-    write_run,
-)
+from tests.report.folders import HOSTILE, imagined, imagining, metaworld, ppo, write_run
 from tests.report.html import Seen
 from tests.runs import tiny_run
 from tests.timeline.folders import write_worker
@@ -222,15 +213,6 @@ def test_a_large_video_is_linked(tmp_path: Path) -> None:
     assert seen.named("video") == []
     assert {"href": "a%20run/before_after.mp4"} in seen.named("a")
     assert "before_after.mp4 is 20 MB, too large" in seen.text
-
-
-def test_a_long_run_makes_a_small_page_soon(pictures: None, tmp_path: Path) -> None:
-    folder = write_run(tmp_path / "run", config=run_config(trainer=TrainerConfig(updates=10_000)))
-    started = time.process_time()
-    path = write_report(ReportConfig(runs=(str(folder),)))
-    assert time.process_time() - started < 20
-    assert path.stat().st_size < 500_000
-    assert "largest 8 → 8" in Seen(path.read_text()).text
 
 
 @pytest.mark.parametrize(
