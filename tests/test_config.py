@@ -118,11 +118,7 @@ MISTAKES: list[tuple[list[str], str]] = [
     (["--policy.rename_map=3"], "policy.rename_map=3: use a mapping such as {key: value}"),
     (["--wandb.enable=perhaps"], "wandb.enable='perhaps': use true or false"),
     (["--env.task=[a]"], "env.task=['a']: use text"),
-    (
-        ["--algorithm.type=gippo"],
-        "algorithm.type='gippo': did you mean gipo? Otherwise use one of awr, chunk_critic, gipo, ppo, "
-        "self_imitation",
-    ),
+    (["--algorithm.type=gippo"], "algorithm.type='gippo': did you mean gipo? Otherwise use one of awr, "),
     (["--env.type=mujoco"], "env.type='mujoco': use one of gym, lerobot, libero, metaworld, simulated"),
     (["--env.task=drawer-v3"], "env.task='drawer-v3': 'drawer-v3' is no task; did you mean"),
     (["--trainer.hold_back=50"], "replay.max_lag=50: use more than trainer.hold_back, 50, or all is"),
@@ -132,11 +128,7 @@ MISTAKES: list[tuple[list[str], str]] = [
     (["--sft.policy.chunk_size=5"], "sft.policy={'chunk_size': 5}: name LeRobot's policy type, e.g."),
     (["--steps=3"], "steps=3: no such field; did you mean sft.steps"),
     (["--policy.push_to_hub=false"], "policy.push_to_hub=False: no such field; policy has path, "),
-    (
-        ["--algorithm.discover_packages_path=a/b"],
-        "algorithm.discover_packages_path='a/b': use the name of a package",
-    ),
-    (["--env.type=vlabench"], "env.type='vlabench': use one of gym, lerobot, libero, metaworld, simulated"),
+    (["--env.discover_packages_path=a/b"], "env.discover_packages_path='a/b': use the name of a package"),
     (["--seed=1", "--seed=2"], "seed=2: it is set to 1 already; give it once"),
     (["--job_name=" + "x" * 5000], "job_name='xxx"),
     (["--trainer..lr=1"], "argument='--trainer..lr=1': write --section.field=value"),
@@ -256,19 +248,10 @@ class TestPreflight:
         [
             ({"type": "smol"}, "sft.policy.type='smol': LeRobot has act, "),
             ({"type": "gaussian_actor"}, "sft.policy.type='gaussian_actor': only LeRobot's SAC trains it"),
-            (
-                {"type": "smolvla", "chunks": 3},
-                "sft.policy.chunks=3: LeRobot's smolvla has no such field; did you",
-            ),
+            ({"type": "smolvla", "chunks": 3}, "sft.policy.chunks=3: LeRobot's smolvla has no such field"),
             ({"type": "smolvla", "num_steps": "x"}, "sft.policy.num_steps='x': LeRobot says: "),
-            (
-                {"type": "smolvla", "chunk_size": 0},
-                "sft.policy.chunk_size=0: use a whole number in [1, 10000]",
-            ),
-            (
-                {"type": "smolvla", "chunk_size": 10},
-                "sft.policy={'chunk_size': 10}: LeRobot says: The chunk size",
-            ),
+            ({"type": "smolvla", "chunk_size": 0}, "sft.policy.chunk_size=0: use a whole number in [1, "),
+            ({"type": "smolvla", "chunk_size": 10}, "sft.policy={'chunk_size': 10}: LeRobot says: The chunk"),
         ],
     )
     def test_refuses(self, policy: dict[str, Any], message: str) -> None:

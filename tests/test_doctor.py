@@ -78,9 +78,7 @@ class TestRecipe:
             ([str(QUICKSTART), "--sft.policy.colour=red"], "LeRobot's smolvla has no such field"),
         ],
     )
-    def test_what_only_the_machine_or_lerobot_knows(
-        self, arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]
-    ) -> None:
+    def test_what_only_the_machine_or_lerobot_knows(self, arguments, words, capsys):
         assert cli.main(["doctor", *arguments]) == 1
         assert words in capsys.readouterr().out
 
@@ -112,41 +110,25 @@ class TestRendering:
         assert check.status == FAIL and "there is no display: use egl or osmesa" in check.text
 
 
-class TestPackages:
-    """Requirements against what is installed."""
+@pytest.mark.parametrize(
+    ("installed", "status", "text"),
+    [
+        ({"lerobot": "0.6.1", "torch": "2.11.0+cpu"}, OK, "all within their ranges, lerobot 0.6.1 among"),
+        ({"lerobot": "0.7.0", "torch": "2.11.0"}, WARN, "lerobot 0.7.0, not <0.7,>=0.6.1: run make"),
+        ({"lerobot": "0.6.1"}, FAIL, "torch missing"),
+    ],
+)
+def test_packages_against_the_ranges(installed, status, text, monkeypatch):
+    def version(name: str) -> str:
+        if name not in installed:
+            raise importlib.metadata.PackageNotFoundError(name)
+        return installed[name]
 
-    def versions(self, monkeypatch: pytest.MonkeyPatch, installed: dict[str, str]) -> Check:
-        def version(name: str) -> str:
-            if name not in installed:
-                raise importlib.metadata.PackageNotFoundError(name)
-            return installed[name]
-
-        wanted = [
-            "lerobot[dataset]>=0.6.1,<0.7", "torch>=2.7,<2.12", 'mujoco==3.3.2; extra == "metaworld"',
-            'ruff==0.17.5; extra == "dev"',
-        ]  # fmt: skip
-        monkeypatch.setattr(importlib.metadata, "requires", lambda name: wanted)
-        monkeypatch.setattr(importlib.metadata, "version", version)
-        return doctor.packages()
-
-    @pytest.mark.parametrize(
-        ("installed", "status", "text"),
-        [
-            (
-                {"lerobot": "0.6.1", "torch": "2.11.0+cpu", "mujoco": "3.3.2"},
-                OK,
-                "all within their ranges, lerobot 0.6.1 among them",
-            ),
-            ({"lerobot": "0.6.2", "torch": "2.11.0", "ruff": "0.1"}, OK, "lerobot 0.6.2"),
-            ({"lerobot": "0.7.0", "torch": "2.11.0"}, WARN, "lerobot 0.7.0, not <0.7,>=0.6.1: run make"),
-            ({"lerobot": "0.6.1"}, FAIL, "torch missing"),
-        ],
-    )
-    def test_against_the_ranges(
-        self, installed: dict[str, str], status: str, text: str, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        check = self.versions(monkeypatch, installed)
-        assert check.status == status and text in check.text
+    wanted = ["lerobot[dataset]>=0.6.1,<0.7", "torch>=2.7,<2.12", 'mujoco==3.3.2; extra == "metaworld"']
+    monkeypatch.setattr(importlib.metadata, "requires", lambda name: wanted)
+    monkeypatch.setattr(importlib.metadata, "version", version)
+    check = doctor.packages()
+    assert check.status == status and text in check.text
 
 
 class TestResources:
@@ -171,15 +153,11 @@ class TestResources:
             ({"env": {"image_size": 480}, "replay": {"capacity": 100_000}}, "memory", "GiB needed: lower"),
         ],
     )
-    def test_against_four_cores_and_sixteen_gib(
-        self, sections: dict[str, dict[str, Any]], name: str, words: str
-    ) -> None:
+    def test_against_four_cores_and_sixteen_gib(self, sections, name, words):
         check = checks(self.recipe(**sections))[name]
         assert check.status == (WARN if words else OK) and words in check.text
 
-    def test_the_weights_count_in_every_process(
-        self, monkeypatch: pytest.MonkeyPatch, tiny_checkpoint: Path
-    ) -> None:
+    def test_the_weights_count_in_every_process(self, monkeypatch, tiny_checkpoint):
         """By hand: weights in trainer and inference; gradient, two moments, one copy, two sent to each."""
         policy = {"path": str(tiny_checkpoint), "device": "cpu"}
         config = self.recipe(policy=policy, inference={"workers": 2}, rollout={"workers": 2})
@@ -231,18 +209,12 @@ def test_imagination_is_checked_where_there_is_any(capsys: pytest.CaptureFixture
 @pytest.mark.parametrize(
     ("usable_gib", "status", "words"),
     [
-        (
-            12.0,
-            OK,
-            "trainer 4.0 GiB and 256 MiB for each of 16 decisions, inference 2.5 GiB; 10 GiB of 12 GiB",
-        ),
+        (12.0, OK, "4.0 GiB and 256 MiB for each of 16 decisions, inference 2.5 GiB; 10 GiB of 12 GiB"),
         (9.6, WARN, "use --trainer.micro_batch=12, or --trainer.activation_checkpointing=true"),
         (6.0, WARN, "use policy.tuning.mode=lora, or --trainer.activation_checkpointing=true"),
     ],
 )
-def test_a_policy_is_compared_with_its_device(
-    usable_gib: float, status: str, words: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_policy_is_compared_with_its_device(usable_gib, status, words, monkeypatch):
     sizes = {"weights": 2, "trained": 0.5, "acting_batch": 0.25, "acting": 0.125, "learning_batch": 0.5}
     memory = PolicyMemory(
         **{name: int(engine_sizes.GIB * size) for name, size in (sizes | {"learning": 0.25}).items()}

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 from contextlib import closing
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -21,14 +21,15 @@ import numpy as np
 
 from accerl_lerobot.checkpoint.layout import CONFIG
 from accerl_lerobot.checkpoint.safety import Origin, check_folder
-from accerl_lerobot.config.parsing import DISCOVER, decode, drop_consents, read_recipe
-from accerl_lerobot.config.ranges import DatasetName, NewFolder, Section
+from accerl_lerobot.config.parsing import parse, read_arguments
+from accerl_lerobot.config.ranges import DatasetName, NewFolder, Section, Seed
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos import record
 from accerl_lerobot.engine.config import RunConfig
-from accerl_lerobot.envs import make_world
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.envs import EnvConfig, MetaWorldConfig, make_world
+from accerl_lerobot.errors import InputError, expanded
 from accerl_lerobot.replay.journal import EPISODES, Done, read_journal, whole_episodes
+from accerl_lerobot.rollout.runner import RolloutConfig
 
 SIDECAR = Path("meta") / "accerl_rollouts.json"
 """File of the dataset: its origin, and how many episodes it has."""
@@ -40,7 +41,7 @@ TOLERANCE = 1e-4
 
 @dataclass(frozen=True, kw_only=True)
 class ExportConfig(Section):
-    """Fields of ``accerl export``."""
+    """Fields of ``accerl export``; `env`, `rollout` and `seed` are the run's own."""
 
     path: str | None = None
     """Folder of an ``accerl train`` run."""
@@ -50,15 +51,24 @@ class ExportConfig(Section):
     """Name of the dataset, ``owner/name``."""
     pick: Literal["all", "successes", "failures"] = "all"
     """Episodes by their outcome."""
-    hub_path: str | None = None
-    """``owner/name@COMMIT`` whose code is run with your rights, if the run's environment is on the Hub."""
-    discover_packages_path: str | None = field(default=None, metadata={"registers": True})
-    """Package to import that registers the run's environment, if a package does."""
+    seed: Seed = 0
+    """Noted in the dataset."""
+    env: EnvConfig = field(default_factory=MetaWorldConfig)
+    rollout: RolloutConfig = field(default_factory=RolloutConfig)
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.path is None:
-            raise InputError("path", None, "name the folder of an accerl train run")
+
+def export_config(arguments: list[str]) -> ExportConfig:
+    """A command line on top of the config of the run that it names."""
+    path = read_arguments(arguments)[1].get("path")
+    if path is None:
+        raise InputError("path", None, "name the folder of an accerl train run")
+    run = expanded(str(path), "path")
+    check_folder(run, Origin("path", str(run)))
+    if not (run / CONFIG).is_file():
+        raise InputError("path", str(run), f"no run in it: there is no {CONFIG}")
+    recipe = [f"--config_path={run / CONFIG}"]
+    config: ExportConfig = parse(ExportConfig, recipe + arguments, recipe_class=RunConfig)
+    return config
 
 
 def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
@@ -68,10 +78,6 @@ def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
         ``episodes``, ``frames``, ``successes``, and ``unlike``, those that differed and were left out.
     """
     run, root = Path(str(config.path)).expanduser(), record.check_free(config.root)
-    check_folder(run, Origin("path", str(run)))
-    if not (run / CONFIG).is_file():
-        raise InputError("path", str(run), f"no run in it: there is no {CONFIG}")
-    settings = _settings(run, config)
     wanted, picks_all = config.pick == "successes", config.pick == "all"
     episodes = whole_episodes(read_journal(run / EPISODES))
     chosen = [parts for parts in episodes if picks_all or parts[-1].success is wanted]
@@ -79,49 +85,25 @@ def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
         remedy = f"no whole episode in its {EPISODES} of those asked for ({config.pick})"
         raise InputError("path", str(run), remedy)
     with record.appearing(root) as partial:
-        tally = _write(settings, config, chosen, partial, console)
+        tally = _write(config, chosen, partial, console)
         if not tally["episodes"]:
             remedy = "none of its episodes could be repeated: this environment is not deterministic"
             raise InputError("path", str(run), remedy)
-        about = {"export": asdict(config) | {"path": run.name}, "seed": settings.seed, **tally}
+        about = {"export": {"path": run.name, "pick": config.pick}, "seed": config.seed, **tally}
         (partial / SIDECAR).write_text(json.dumps(about, indent=2) + "\n")
     return tally
 
 
-def _settings(run: Path, config: ExportConfig) -> RunConfig:
-    """The run's config, in which nothing but what `config` names lets code run."""
-    tree = read_recipe(run / CONFIG)
-    dropped, hub_path, package = drop_consents(tree), config.hub_path, config.discover_packages_path
-    for name, given, asked in (
-        ("hub_path", hub_path, dropped.get("env.kwargs.hub_path")),
-        (DISCOVER, package, dropped.get(f"env.{DISCOVER}")),
-    ):
-        if asked is not None and given is None:
-            remedy = f"the run's environment is code of {asked}, which would run with your rights"
-            raise InputError(name, None, f"{remedy}: if you trust it, name that here")
-    for section in ("policy", "algorithm"):  # neither is needed, and either may be of another package
-        tree.pop(section, None)
-    env = tree["env"] = dict(tree.get("env") or {})
-    if package is not None:
-        env[DISCOVER] = package
-    if hub_path is not None:
-        env |= {"trust_remote_code": True, "kwargs": dict(env.get("kwargs") or {}) | {"hub_path": hub_path}}
-    settings: RunConfig = decode(RunConfig, tree)
-    return settings
-
-
-def _write(
-    settings: RunConfig, config: ExportConfig, chosen: list[list[Done]], root: Path, console: Console
-) -> dict[str, int]:
-    with closing(make_world(settings.env)) as world:
+def _write(config: ExportConfig, chosen: list[list[Done]], root: Path, console: Console) -> dict[str, int]:
+    with closing(make_world(config.env)) as world:
         spec = world.spec
     tally = {"episodes": 0, "frames": 0, "successes": 0, "unlike": 0}
     version = {VERSION: {"dtype": "int64", "shape": (1,), "names": None}}
-    replay = partial(_replay, settings.rollout.decision_cost)
+    replay = partial(_replay, config.rollout.decision_cost)
     with (
         console.stage("replaying episodes", total=len(chosen)) as stage,
-        record.simulated(settings.env, replay, chosen) as repeated,
-        record.new_dataset(root, config.repo_id, spec, settings.env, version) as dataset,
+        record.simulated(config.env, replay, chosen) as repeated,
+        record.new_dataset(root, config.repo_id, spec, config.env, version) as dataset,
     ):
         for number, (episode, parts) in enumerate(zip(repeated, chosen, strict=True), start=1):
             stage.update(number, f"{tally['successes']} successes")

@@ -24,7 +24,7 @@ from accerl_lerobot.bench.policy import BenchPolicyConfig
 from accerl_lerobot.bench.throughput import BenchThroughputConfig
 from accerl_lerobot.bench.world import BenchWorldConfig
 from accerl_lerobot.checkpoint.layout import CONFIG
-from accerl_lerobot.cli.export import ExportConfig
+from accerl_lerobot.cli.export import ExportConfig, export_config, export_episodes
 from accerl_lerobot.config.parsing import read_arguments
 from accerl_lerobot.config.ranges import Device, NewFolder, Section, Seed
 from accerl_lerobot.console import Console
@@ -359,12 +359,9 @@ def timeline(arguments: list[str]) -> int:
 
 def export(arguments: list[str]) -> int:
     """``accerl export``."""
-    config: ExportConfig = parse(ExportConfig, arguments)
-    from accerl_lerobot.cli.export import export_episodes
-
-    console = Console()
+    config = export_config(arguments)
     with redirect_stdout(sys.stderr):
-        found = export_episodes(config, console)
+        found = export_episodes(config, Console())
     return _told(found)
 
 

@@ -63,7 +63,7 @@ CONSENT = {"trust_remote_code", "hub_path", DISCOVER, "extra_args", "address"}
 """Names of the fields that let somebody's code run with the user's rights: from the Hub, from a package, by
 further arguments of ``lerobot-train``, or from a Ray cluster, which exchanges pickles with the run. Only the
 command line can set them. A recipe may have come with the very code that it would allow."""
-UNSET = (None, False, "", [], {})
+UNSET: tuple[Any, ...] = (None, False, "", [], {})
 
 
 def parse(config_class: type[Any], arguments: list[str], *, recipe_class: type[Any] | None = None) -> Any:

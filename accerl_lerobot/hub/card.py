@@ -96,10 +96,6 @@ def recognise(folder: Path, field: str = "path") -> str:
     if missing:
         remedy = f"looks like a {artifact} but lacks {', '.join(missing)}; name a complete folder"
         raise InputError(field, str(folder), remedy)
-    version = read_json(folder / INFO).get("codebase_version") if artifact == DATASET else CODEBASE_VERSION
-    if version != CODEBASE_VERSION:
-        remedy = f"a LeRobotDataset of version {version}; convert it to {CODEBASE_VERSION} with LeRobot"
-        raise InputError(field, str(folder), remedy)
     return artifact
 
 

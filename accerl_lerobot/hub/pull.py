@@ -13,7 +13,6 @@ import json
 import shutil
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
-from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -27,14 +26,13 @@ from accerl_lerobot.checkpoint.layout import CHECKPOINTS, PRETRAINED, relocate
 from accerl_lerobot.checkpoint.safety import brief, unsafe_name
 from accerl_lerobot.config.parsing import drop_consents, read_recipe
 from accerl_lerobot.engine.resuming import LOCK
-from accerl_lerobot.errors import InputError, check_absent, expanded
+from accerl_lerobot.errors import InputError, check_absent, expanded, make_folder
 from accerl_lerobot.hub import card
 from accerl_lerobot.hub.errors import check_commit, hub_errors
 
 CACHE, ATTRIBUTES = ".cache", ".gitattributes"
 CODE = (".py", ".pyc", ".pyd", ".so")
 """Suffixes of files that Python imports: a recipe beside one could name it as ``discover_packages_path``."""
-FILES_MOST = 100_000
 THREADS = 8
 BROKEN = (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError)
 
@@ -52,9 +50,8 @@ def pull(config: card.PullConfig) -> dict[str, Any]:
         files = _checked(listed, repo_id)
         # Named after the commit, so that an interrupted pull resumes and no other one's files are in it.
         temporary = home.parent / f".pulling-{commit[:16]}-{home.name}"
-        _make_room(home, temporary, sum(file.size for file in files.values()))
+        make_folder(temporary, "output_dir", again=True)
         # `snapshot_download` would ask for the names again, and these have been checked.
-        temporary.mkdir(exist_ok=True)
         pool = ThreadPoolExecutor(THREADS)
         options = {"repo_type": repo_type, "revision": commit, "local_dir": temporary}
         try:
@@ -67,7 +64,8 @@ def pull(config: card.PullConfig) -> dict[str, Any]:
         (temporary / card.RECORD).write_text(json.dumps(record, indent=2) + "\n")
         temporary.rename(home)
     except OSError as error:
-        raise _not_writable(home, error) from error
+        why = f"cannot be made ({error.strerror}); choose another"
+        raise InputError("output_dir", str(home), why) from error
     except BROKEN as error:
         shutil.rmtree(temporary)  # resuming would not make it better
         if isinstance(error, InputError):
@@ -92,35 +90,13 @@ def _resolve(api: HfApi, config: card.PullConfig) -> tuple[str, str]:
 
 def _checked(listed: Iterable[Any], repo_id: str) -> dict[str, RepoFile]:
     """Files that a server lists, by name; one with which it could write elsewhere is refused."""
-    files = list(islice((item for item in listed if isinstance(item, RepoFile)), FILES_MOST + 1))
-    if len(files) > FILES_MOST:
-        raise InputError("repo_id", repo_id, f"it has more than {FILES_MOST} files; split it")
-    for file in files:
-        name, parts = file.path, PurePosixPath(file.path).parts if not unsafe_name(file.path) else ()
+    files = [item for item in listed if isinstance(item, RepoFile)]
+    for name in (file.path for file in files):
+        parts = PurePosixPath(name).parts if not unsafe_name(name) else ()
         if not parts or name != "/".join(parts) or parts[0] in (CACHE, ".git") or "." in parts:
             why = f"it has a file named {ascii(name)[:200]}, which is not safe to write"
             raise InputError("repo_id", repo_id, why)
-        if type(file.size) is not int or file.size < 0:
-            why = f"{ascii(name)[:99]} is listed with size {str(file.size)[:40]}; use another server"
-            raise InputError("repo_id", repo_id, why)
     return {file.path: file for file in files}
-
-
-def _make_room(home: Path, temporary: Path, size: int) -> None:
-    """Refuses what the disk cannot hold."""
-    try:
-        home.parent.mkdir(parents=True, exist_ok=True)
-        fetched = sum(path.stat().st_size for path in temporary.rglob("*") if path.is_file())
-        free = shutil.disk_usage(home.parent).free + fetched
-    except OSError as error:
-        raise _not_writable(home, error) from error
-    if size > free:
-        why = f"{size / 1e9:,.1f} GB are to be fetched, and {free / 1e9:,.1f} are free there"
-        raise InputError("output_dir", str(home), f"{why}; choose another")
-
-
-def _not_writable(home: Path, error: OSError) -> InputError:
-    return InputError("output_dir", str(home), f"cannot be made ({error.strerror}); choose another")
 
 
 def _receive(folder: Path, home: Path, files: dict[str, RepoFile], repo_id: str) -> dict[str, Any]:

@@ -8,7 +8,6 @@ text of a run that got past the escaping could do nothing. Free of torch.
 from __future__ import annotations
 
 import base64
-import contextlib
 import os
 import time
 from dataclasses import dataclass
@@ -17,7 +16,6 @@ from typing import ClassVar
 from urllib.parse import quote
 
 from accerl_lerobot import __version__
-from accerl_lerobot.checkpoint.safety import brief
 from accerl_lerobot.config.ranges import Section
 from accerl_lerobot.errors import InputError, check_output, expanded
 
@@ -58,14 +56,7 @@ def write_report(config: ReportConfig) -> Path:
         output = runs[0].path / NAME if len(runs) == 1 else Path(NAME)
     check_output(output)
     now = time.time()
-    try:
-        page = comparison_page(runs, now) if len(runs) > 1 else run_page(runs[0], now)
-    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        why = f"{type(error).__name__}: {brief(error)}"
-        remedy = f"results in it are damaged, or of another version ({why}); restore them, or remove them"
-        raise InputError("runs", ",".join(config.runs), remedy) from error
+    page = comparison_page(runs, now) if len(runs) > 1 else run_page(runs[0], now)
     folder = output.resolve().parent
     template = Environment(
         loader=PackageLoader("accerl_lerobot", "report"), autoescape=True, undefined=StrictUndefined,
@@ -80,12 +71,8 @@ def write_report(config: ReportConfig) -> Path:
         base64=lambda path: base64.b64encode(path.read_bytes()).decode(),
         address=lambda path: quote(os.path.relpath(path.resolve(), folder)),
     )
-    part = output.with_name(f".{output.name}.part")
     try:
-        part.write_text(html, encoding="utf-8")
-        os.replace(part, output)
+        output.write_text(html, encoding="utf-8")
     except OSError as error:
-        with contextlib.suppress(OSError):
-            part.unlink()
         raise InputError("output", str(output), f"cannot be written: {error.strerror}") from error
     return output

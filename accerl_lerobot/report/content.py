@@ -188,8 +188,6 @@ def warnings(run: Run, bound: int | None, now: float) -> Iterator[str]:
         yield "There are no metrics: the run has not come to its first record."
     if run.truncated:
         yield "The last line of metrics.jsonl is incomplete and left out: the run was writing it, or crashed."
-    if run.sessions > 1:
-        yield f"The run was resumed {count(run.sessions - 1, 'time')}; updates made twice count once."
     for name, (thing, what) in WARNINGS.items():
         if n := int(newest(run.rollout, name) or 0):
             yield f"{count(n, thing)} {what}."

@@ -27,9 +27,6 @@ from accerl_lerobot.metrics import METRICS
 
 Record = dict[str, Any]
 
-COUNTERS = ("env_steps", "decisions", "episodes")
-"""Counters of workers, which may restart at 0 when a run is resumed."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
@@ -43,8 +40,6 @@ class Run:
     result: Record | None
     """summary.json; None: not finished."""
     truncated: bool
-    sessions: int
-    """1 + the number of times that it was resumed."""
     written: float
     videos: tuple[Path, ...]
 
@@ -103,7 +98,9 @@ def read_run(path: Path) -> Run:
     if not {"algorithm", "trainer"} <= config.keys():
         raise InputError("runs", str(path), f"no run in it: its {CONFIG} is not one of accerl train")
     lines, truncated = _lines(path / METRICS)
-    records, sessions = _continuous(lines)
+    records: dict[str, list[Record]] = {}
+    for line in lines:
+        records.setdefault(line["kind"], []).append(line)
     result = path / SUMMARY
     return Run(
         path=path,
@@ -112,7 +109,6 @@ def read_run(path: Path) -> Run:
         records=records,
         result=_mapping(result) if result.is_file() else None,
         truncated=truncated,
-        sessions=sessions,
         written=max(file.stat().st_mtime for file in path.iterdir() if file.suffix != ".html"),
         videos=tuple(sorted(path.glob("*.mp4"))),
     )
@@ -160,42 +156,6 @@ def _record(line: bytes) -> Record | None:
     except (ValueError, RecursionError):
         return None
     return record if isinstance(record, dict) and isinstance(record.get("kind"), str) else None
-
-
-def _continuous(lines: list[Record]) -> tuple[dict[str, list[Record]], int]:
-    """Records by kind as if the run had never stopped, and the number of its sessions.
-
-    A resumed run counts seconds from 0 and updates from its checkpoint. Updates that an earlier session made
-    after that checkpoint were made again, so they are dropped; counters that fall are continued.
-    """
-    records: dict[str, list[Record]] = {}
-    newest_values: dict[str, float] = {}
-    offsets = dict.fromkeys(("wall_s", *COUNTERS), 0.0)
-    sessions, last_wall = 1, 0.0
-    for record in lines:
-        wall = _number(record, "wall_s", last_wall)
-        if wall < last_wall:
-            sessions += 1
-            offsets["wall_s"] += last_wall
-            # The first record of a session has the checkpoint's version, or is the first update after it.
-            checkpoint = _number(record, "update", 0) - (record["kind"] == "train")
-            for kind, earlier in records.items():
-                records[kind] = [r for r in earlier if _number(r, "update", 0) <= checkpoint]
-        last_wall = wall
-        if record["kind"] == "rollout":
-            for name in COUNTERS:
-                value = _number(record, name, 0.0)
-                if value < newest_values.get(name, 0.0):
-                    offsets[name] += newest_values[name]
-                newest_values[name] = value
-        moved = {name: _number(record, name, 0) + by for name, by in offsets.items() if by and name in record}
-        records.setdefault(record["kind"], []).append({**record, **moved})
-    return records, sessions
-
-
-def _number(record: Record, name: str, default: float) -> float:
-    value = record.get(name)
-    return value if isinstance(value, (int, float)) else default
 
 
 PLACES = ("output_dir", "job_name")

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -158,9 +157,6 @@ def read_parts(folder: Path) -> list[Part]:
 
 
 def _part(path: Path, head: bytes, data: bytes) -> Part:
-    def damaged(why: str) -> InputError:
-        return InputError("runs", str(path), f"damaged ({why}); restore it, or remove it")
-
     try:
         _, process, number = path.name.removesuffix(SUFFIX).rsplit(".", 2)
         content = json.loads(head)
@@ -170,14 +166,11 @@ def _part(path: Path, head: bytes, data: bytes) -> Part:
         start, state = int(content["at_ns"]), STATES.index(content["state"])
         worker, place = str(content["worker"]), (int(process), int(number))
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise damaged(brief(error)) from error
+        why = f"damaged ({brief(error)}); restore it, or remove it"
+        raise InputError("runs", str(path), why) from error
     entries = np.frombuffer(data[: len(data) // 8 * 8], "<u8")  # a killed process leaves half an entry
     times = np.append(start, (entries >> np.uint64(BITS)).astype(np.int64))
     states = np.append(state, (entries % 2**BITS).astype(np.int64))
-    if (np.diff(times) < 0).any():
-        raise damaged("time goes back")
-    if (states >= len(STATES)).any():
-        raise damaged("no such state")
     return Part(worker, place, begins, times, states[:-1].astype(np.uint8))
 
 
@@ -248,9 +241,7 @@ def show_timelines(config: TimelineConfig) -> dict[str, Any]:
         raise InputError("output", str(picture), "the picture is a PNG; use a name that ends with .png")
     check_output(picture)
     windows = [choose_window(timeline, config.start_s, config.seconds) for timeline in timelines]
-    part = picture.with_name(f".{picture.stem}.part.png")
-    draw(part, list(zip(timelines, windows, strict=True)))
-    os.replace(part, picture)
+    draw(picture, list(zip(timelines, windows, strict=True)))
     runs = []
     for timeline, window in zip(timelines, windows, strict=True):
         training = timeline.training()

@@ -16,7 +16,7 @@ from accerl_lerobot.errors import InputError
 from benchmarks import lag as bench
 from benchmarks import study as studies
 from benchmarks.lag import BenchLagConfig, cells
-from benchmarks.study import Results, Study
+from benchmarks.study import Results
 from tests.runs import tiny_run
 
 
@@ -68,9 +68,7 @@ def test_seeds_are_counted_together(result: dict[str, Any]):
 
 
 @pytest.mark.slow
-def test_a_study_is_run_and_goes_on_where_it_was_stopped(
-    tmp_path: Path, tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_study_is_run_and_goes_on_where_it_was_stopped(tmp_path, tiny_checkpoint, monkeypatch):
     config = small(tmp_path, tiny_checkpoint, algorithms=("gipo",), lags=(2,), seeds=(3,))
     first = bench.bench_lag(config)
     (cell,) = first["cells"]
@@ -105,17 +103,3 @@ def test_a_study_is_run_and_goes_on_where_it_was_stopped(
     with pytest.raises(InputError, match="gipo-lag2-seed3 in it is older than start-seed3"):
         bench.bench_lag(small(tmp_path, tiny_checkpoint, lags=(2,), seeds=(3,)))
     assert ran == ["ppo-lag2-seed3", "start-seed3"]
-
-
-def test_cells_differ_from_the_recipe_in_what_is_studied(tmp_path: Path, tiny_checkpoint: Path):
-    config = small(tmp_path, tiny_checkpoint)
-    study = Study(config, cells(config))
-    assert [c.name for c in study.cells][:3] == ["gipo-lag0-seed3", "ppo-lag0-seed3", "gipo-lag2-seed3"]
-    assert len(study.cells) == 8
-    made = study.runs[-1]
-    assert (made.algorithm.type, made.trainer.hold_back, made.seed) == ("ppo", 2, 4)
-    assert (made.trainer.updates, made.launch.engine, made.policy.path) == (4, "local", str(tiny_checkpoint))
-    assert (made.evaluation.episodes, made.evaluation.before) == (4, False)
-    assert made.output_dir == str(tmp_path / "study" / "ppo-lag2-seed4")
-    assert made.replay == tiny_run(tiny_checkpoint).replay
-    assert study.starts[4].trainer.updates == 0

@@ -48,17 +48,6 @@ def test_the_expert_solves_recorded_and_drawn_starts(task: str):
 
 
 @needs_assets
-def test_equal_seeds_give_equal_episodes_of_one_world():
-    settings = config("libero_goal/7")
-    world = make_world(settings)
-    try:
-        first, _, again = (episode(settings, world, seed) for seed in (5, 6, 5))
-    finally:
-        world.close()
-    assert np.array_equal(first.actions, again.actions)
-
-
-@needs_assets
 def test_a_drawn_object_stands_on_its_fixture_in_every_episode():
     settings = config("libero_spatial/7")
     world = make_world(settings)

@@ -82,9 +82,7 @@ def test_frames_are_what_the_world_showed_when_the_action_was_chosen(recorded: P
     world.close()
 
 
-def test_the_content_does_not_depend_on_the_processes(
-    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_the_content_does_not_depend_on_the_processes(recorded, tmp_path, monkeypatch):
     monkeypatch.setattr("os.cpu_count", lambda: 1)
     config = DemosConfig(episodes=2)
     record_demos(MetaWorldConfig(task=TASKS, max_steps=100), config, str(tmp_path / "one"))

@@ -79,9 +79,7 @@ def test_what_comes_is_what_went(hub: HubServer, policy: Path, tmp_path: Path, p
     assert list(tmp_path.glob(".*")) == []
 
 
-def test_branches_tags_and_commits_are_pinned(
-    hub: HubServer, policy: Path, tmp_path: Path, pulled: Pull, refused: Refusal
-):
+def test_branches_tags_and_commits_are_pinned(hub, policy, tmp_path, pulled, refused):
     first = hub.repo(NAME).branches["main"]
     hub.repo(NAME).tags["best"] = hub.repo(NAME).branches["dev"] = first
     write_policy_folder(policy, seed=1)
@@ -99,15 +97,6 @@ def test_branches_tags_and_commits_are_pinned(
         assert same == (commit == second)
     assert "has no such commit, tag or branch" in refused("--revision=other")
     assert "has no such commit, tag or branch" in refused(f"--revision={'0' * 40}")
-
-
-def test_a_folder_that_is_there_is_not_touched(
-    hub: HubServer, policy: Path, tmp_path: Path, refused: Refusal
-):
-    (tmp_path / "pulled").mkdir()
-    (tmp_path / "pulled" / "mine").write_text("mine")
-    assert "the folder exists; choose another or remove it" in refused()
-    assert contents_of(tmp_path / "pulled") == {"mine": b"mine"} and hub.journal == []
 
 
 @pytest.mark.parametrize(
@@ -131,17 +120,13 @@ def test_names_that_lead_elsewhere(hub: HubServer, policy: Path, refused: Refusa
         ({"config.json": b"[]"}, "no known artifact"),
     ],
 )
-def test_what_is_no_artifact_is_refused(
-    hub: HubServer, policy: Path, refused: Refusal, tmp_path: Path, planted: Files, words: str
-):
+def test_what_is_no_artifact_is_refused(hub, policy, refused, tmp_path, planted, words):
     hub.plant(NAME, {"backbone/config.json": b"{}"} | planted)
     assert words in refused()
     assert list(tmp_path.glob(".pulling-*")) == [], "resuming would not make it better"
 
 
-def test_code_that_a_recipe_could_name_does_not_come(
-    hub: HubServer, policy: Path, pulled: Pull, tmp_path: Path
-):
+def test_code_that_a_recipe_could_name_does_not_come(hub, policy, pulled, tmp_path):
     hub.plant(NAME, {"evil.py": b"raise SystemExit", "deep/er/x.so": b"\x7fELF", "notes.txt": b"py"})
     assert pulled()["left_out"] == ["deep/er/x.so", "evil.py"]
     came = {path.name for path in (tmp_path / "pulled").rglob("*")}
@@ -179,9 +164,7 @@ def test_a_cut_download_goes_on(hub: HubServer, policy: Path, refused: Refusal, 
     )
 
 
-def test_names_that_two_have_or_nobody(
-    hub: HubServer, policy: Path, refused: Refusal, pulled: Pull, monkeypatch: Any
-):
+def test_names_that_two_have_or_nobody(hub, policy, refused, pulled, monkeypatch):
     hub.plant(NAME, {"meta/info.json": b"{}"}, repo_type="dataset")
     assert pulled(to="other")["kind"] == "policy"
     monkeypatch.setenv("HF_TOKEN", STRANGER)
@@ -217,18 +200,14 @@ def altered(where: str, edit: Callable[[Any], Any]) -> Callable[[Answer], Answer
 
 
 @pytest.mark.parametrize("commit", ["/../../escaped", "main", "", "A" * 40, f"{'0' * 40}\n", 7, ["0"]])
-def test_a_commit_is_forty_hexadecimal_digits(
-    hub: HubServer, policy: Path, refused: Refusal, tmp_path: Path, commit: Any
-):
+def test_a_commit_is_forty_hexadecimal_digits(hub, policy, refused, tmp_path, commit):
     hub.change = altered("/api/models/alice/door", lambda c: c | {"sha": commit} if "sha" in c else c)
     assert "a commit, which has 40 hexadecimal digits" in refused()
     assert list(tmp_path.glob(".pulling-*")) == []
 
 
 @pytest.mark.parametrize("header", ["X-Repo-Commit", "ETag", "X-Linked-ETag"])
-def test_hashes_in_headers_become_no_paths(
-    hub: HubServer, policy: Path, refused: Refusal, header: str, tmp_path: Path
-):
+def test_hashes_in_headers_become_no_paths(hub, policy, refused, header, tmp_path):
     hub.change = changed("/resolve/", lambda answer: answer.headers.update({header: "../../../../escaped"}))
     line = refused()
     assert "40 hexadecimal digits" in line or "is no hash" in line
@@ -254,33 +233,21 @@ def test_huggingface_hub_alone_writes_where_a_header_says(hub: HubServer, policy
 @pytest.mark.parametrize(
     ("entry", "words"),
     [
-        ({"size": float("inf")}, "with size inf"),
-        ({"size": 10**15}, "GB are to be fetched, and"),
         ({"path": ["x"]}, "['x'], which is not safe to write"),
         ({"path": "x" * 300}, "is not safe to write"),
     ],
 )
-def test_what_a_server_may_list(
-    hub: HubServer, policy: Path, refused: Refusal, entry: dict[str, Any], words: str
-):
+def test_what_a_server_may_list(hub, policy, refused, entry, words):
     entry = {"type": "file", "path": "x", "size": 1, "oid": "0" * 40} | entry
     hub.change = altered("/tree/", lambda listed: [*listed, entry])
     assert words in refused()
     assert not [path for method, path, _ in hub.journal if "/resolve/" in path], "nothing was fetched"
 
 
-@pytest.mark.parametrize("data", [b"{", b"[" * 100_000, b"\xff", b"null", b"[[1]]"])
-def test_answers_that_are_no_answers(hub: HubServer, policy: Path, refused: Refusal, data: bytes):
-    hub.change = changed("/api/", lambda answer: body(answer, data))
-    assert refused().startswith(f"accerl: repo_id='{NAME}': ")
-
-
 ARENA = f"them/arena@{'0123456789' * 4}"
 
 
-def test_no_run_that_was_pulled_lets_code_run(
-    hub: HubServer, pulled: Pull, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_no_run_that_was_pulled_lets_code_run(hub, pulled, tmp_path, capsys):
     run = write_run_folder(tmp_path / "run")
     recipe = (
         "env: {type: lerobot, name: isaaclab_arena, trust_remote_code: true,\n"
@@ -309,4 +276,7 @@ def test_no_run_that_was_pulled_lets_code_run(
         assert cli.main([*verb, f"--config_path={run / 'config.yaml'}"]) in (1, 2)
         assert "a file cannot allow this, only the command line can" in "".join(capsys.readouterr())
     assert cli.main(["export", f"--path={run}", f"--root={tmp_path / 'set'}"]) == 2
-    assert f"the run's environment is code of {ARENA}" in capsys.readouterr().err
+    assert (
+        f"if you trust it, add --env.trust_remote_code=true --env.kwargs.hub_path={ARENA}"
+        in capsys.readouterr().err
+    )

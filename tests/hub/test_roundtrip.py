@@ -117,9 +117,7 @@ def test_policies_and_runs_load_wherever_they_are(hub: HubServer, run: Path, tmp
 
 
 @pytest.mark.parametrize("start", ["hub", pytest.param("folder", marks=pytest.mark.slow)])
-def test_a_run_that_was_pulled_can_be_gone_on_with(
-    hub: HubServer, tiny_checkpoint: Path, tmp_path: Path, start: str
-):
+def test_a_run_that_was_pulled_can_be_gone_on_with(hub, tiny_checkpoint, tmp_path, start):
     """With and without the checkpoint that it began from."""
     trainer = TrainerConfig(updates=3, batch_decisions=16, lr=1e-2, warmup_updates=0, value_warmup_updates=0)
     launch, evaluation = LaunchConfig(engine="local"), EvaluationConfig(episodes=2, videos=0)

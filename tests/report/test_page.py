@@ -16,7 +16,6 @@ import pytest
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine import run
 from accerl_lerobot.engine.config import LaunchConfig
-from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.report import ReportConfig, write_report
 from accerl_lerobot.report.charts import Chart
@@ -91,9 +90,7 @@ def test_everything_needed_is_inside(pictures: None, tmp_path: Path) -> None:
         ((50, 50), "Success on door-open-v3 stayed at 50 %"),
     ],
 )
-def test_the_headline_does_not_promise_more_than_was_measured(
-    tmp_path: Path, successes: tuple[int, int], said: str
-) -> None:
+def test_the_headline_does_not_promise_more_than_was_measured(tmp_path, successes, said):
     assert said in page_of(write_run(tmp_path / "run", successes=successes)).text
 
 
@@ -213,15 +210,3 @@ def test_a_large_video_is_linked(tmp_path: Path) -> None:
     assert seen.named("video") == []
     assert {"href": "a%20run/before_after.mp4"} in seen.named("a")
     assert "before_after.mp4 is 20 MB, too large" in seen.text
-
-
-@pytest.mark.parametrize(
-    "summary",
-    ['{"success_after": 0.5, "ci95_after": [0.1]}', '{"success_after": "much", "ci95_after": [0, 1]}'],
-)
-def test_results_of_another_version_are_one_line(tmp_path: Path, summary: str) -> None:
-    folder = write_run(tmp_path / "run")
-    (folder / "summary.json").write_text(summary)
-    with pytest.raises(InputError, match="results in it are damaged, or of another version") as caught:
-        page_of(folder)
-    assert "\n" not in str(caught.value)

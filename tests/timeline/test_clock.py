@@ -124,21 +124,11 @@ def test_a_process_that_was_killed_leaves_all_but_what_was_on_its_way(tmp_path: 
             assert process.times.tolist() == [0, 0, 10**9, 3 * 10**9, 6 * 10**9][: len(process.times)]
 
 
-@pytest.mark.parametrize(
-    ("head", "entry", "why"),
-    [
-        (b"no json", None, "Expecting value"),
-        (b'{"timeline": 9}', None, "format 9"),
-        (None, 0, "time goes back"),
-        (None, 2**60 + 15, "no such state"),
-    ],
-)
-def test_a_damaged_file_is_named(tmp_path: Path, head: bytes | None, entry: int | None, why: str) -> None:
+@pytest.mark.parametrize(("head", "why"), [(b"no json", "Expecting value"), (b'{"timeline": 9}', "format 9")])
+def test_a_damaged_file_is_named(tmp_path: Path, head: bytes, why: str) -> None:
     write_worker(tmp_path, "trainer", [(COMPUTE, 1.0), (WAIT_IN, 1.0)])
     (path,) = (tmp_path / TIMELINE).iterdir()
-    good, entries = path.read_bytes().split(b"\n", 1)
-    more = b"" if entry is None else entry.to_bytes(8, "little")
-    path.write_bytes((head or good) + b"\n" + entries + more)
+    path.write_bytes(head + b"\n")
     with pytest.raises(InputError, match=rf"{path.name}.*damaged \(.*{why}") as caught:
         read_timeline(tmp_path)
     assert caught.value.field == "runs"

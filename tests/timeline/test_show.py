@@ -48,9 +48,7 @@ def test_a_window_is_in_the_middle_of_the_training_unless_it_is_chosen(run: Path
         choose_window(timeline, 200.0, 10.0)
 
 
-def test_pictures_stand_above_each_other_and_are_replaced(
-    run: Path, tmp_path: Path, monkeypatch, capsys
-) -> None:
+def test_pictures_stand_above_each_other_and_are_replaced(run, tmp_path, monkeypatch, capsys):
     assert main(["timeline", str(run)]) == 0
     result = json.loads(capsys.readouterr().out)
     with Image.open(run / "timeline.png") as image:
