@@ -335,10 +335,7 @@ def pull(arguments: list[str]) -> int:
 
     with redirect_stdout(sys.stderr):
         found = from_hub(config)
-    console = Console()
-    console.say(f"{found['kind']} {found['path']} is {found['commit']}, {found['files']} files")
-    for name, fields in found.get("dropped", {}).items():
-        console.say(f"dropped from {name}, as it would let code run: {', '.join(fields)}")
+    Console().say(f"{found['kind']} {found['path']} is {found['commit']}, {found['files']} files")
     return _told(found)
 
 

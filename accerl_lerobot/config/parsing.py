@@ -91,16 +91,6 @@ def parse(config_class: type[Any], arguments: list[str], *, recipe_class: type[A
     return decode(config_class, merged)
 
 
-def drop_consents(tree: dict[str, Any]) -> dict[str, Any]:
-    """Removes from a tree what `consents` finds in it; returns that."""
-    found = consents(tree)
-    for _, key, holder, _ in [leaf for leaf in _leaves(tree) if leaf[0] in found]:
-        del holder[key]
-    if "launch.address" in found and "placement" in tree["launch"]:
-        found["launch.placement"] = tree["launch"].pop("placement")  # of the nodes of that cluster
-    return found
-
-
 def consents(tree: Any, given: Any = None) -> dict[str, Any]:
     """Dotted field → value, of the fields in `CONSENT` that a tree, read from a file, sets at any depth.
 
@@ -109,19 +99,19 @@ def consents(tree: Any, given: Any = None) -> dict[str, Any]:
     asked = {name for name, *_ in _leaves(given)}
     return {
         name: value
-        for name, key, _, value in _leaves(tree)
+        for name, key, value in _leaves(tree)
         if str(key).rpartition(".")[2] in CONSENT and value not in UNSET and name not in asked
     }
 
 
-def _leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any, Any, Any]]:
-    """Dotted name, key, what holds it, and value, of everything in a tree that is not looked into."""
+def _leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Dotted name, key and value of everything in a tree that is not looked into."""
     entries = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
     for key, value in entries:
         if isinstance(value, (dict, list)) and str(key).rpartition(".")[2] not in CONSENT:
             yield from _leaves(value, f"{path}{key}.")
         else:
-            yield f"{path}{key}", key, tree, value
+            yield f"{path}{key}", key, value
 
 
 def decode(config_class: type[Any], tree: dict[str, Any]) -> Any:

@@ -16,7 +16,6 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-import yaml
 from huggingface_hub import HfApi, hf_hub_download
 from huggingface_hub.errors import RepositoryNotFoundError
 from huggingface_hub.hf_api import RepoFile
@@ -24,7 +23,6 @@ from huggingface_hub.hf_api import RepoFile
 from accerl_lerobot.checkpoint import layout
 from accerl_lerobot.checkpoint.layout import CHECKPOINTS, PRETRAINED, relocate
 from accerl_lerobot.checkpoint.safety import brief, unsafe_name
-from accerl_lerobot.config.parsing import drop_consents, read_recipe
 from accerl_lerobot.engine.resuming import LOCK
 from accerl_lerobot.errors import InputError, check_absent, expanded, make_folder
 from accerl_lerobot.hub import card
@@ -128,15 +126,13 @@ def _receive(folder: Path, home: Path, files: dict[str, RepoFile], repo_id: str)
         relocate(policy, home / policy.relative_to(folder))
     if artifact == card.RUN:
         (folder / LOCK).touch()  # marks a run that can be resumed
-    dropped = _drop_consents(folder)
     code = sorted(path for path in folder.rglob("*") if path.name.endswith(CODE) and path.is_file())
     left_out = [path.relative_to(folder).as_posix() for path in code]
     for path in code:
         path.unlink()
     for checkpoint in own:
         layout.write_manifest(checkpoint)
-    left = {"left_out": left_out, "dropped": dropped}
-    return {"kind": artifact, "files": len(files)} | {name: value for name, value in left.items() if value}
+    return {"kind": artifact, "files": len(files)} | ({"left_out": left_out} if left_out else {})
 
 
 def _is_listed(path: Path, file: RepoFile) -> bool:
@@ -146,17 +142,3 @@ def _is_listed(path: Path, file: RepoFile) -> bool:
     git = hashlib.sha1(b"blob %d\0" % file.size, usedforsecurity=False)
     with path.open("rb") as opened:
         return hashlib.file_digest(opened, lambda: git).hexdigest() == file.blob_id
-
-
-def _drop_consents(folder: Path) -> dict[str, dict[str, Any]]:
-    """Removes from all configs of runs what would let code run; returns it, by file."""
-    dropped: dict[str, dict[str, Any]] = {}
-    for path in sorted(p for p in folder.rglob(card.RECIPE) if p.is_file() and not p.is_symlink()):
-        try:
-            tree = read_recipe(path)
-        except InputError:
-            continue  # `parse` refuses it as well
-        if found := drop_consents(tree):
-            path.write_text(yaml.safe_dump(tree, sort_keys=False))
-            dropped[path.relative_to(folder).as_posix()] = found
-    return dropped
