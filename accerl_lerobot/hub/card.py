@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from huggingface_hub import DatasetCard, EvalResult, ModelCard, ModelCardData
+from huggingface_hub import DatasetCard, ModelCard, ModelCardData
 
 from accerl_lerobot.checkpoint import safety
 from accerl_lerobot.checkpoint.layout import AWAY, BACKBONE, CHECKPOINTS, PREPROCESSOR, PRETRAINED, SUMMARY
@@ -225,15 +225,13 @@ def model_card(repo_id: str, artifact: str, folder: Path, files: Files, provenan
     sections = [recipe.get(name) or {} for name in ("dataset", "online")]
     # Beside a folder the name is a label, and no dataset on the Hub.
     datasets = [s["repo_id"] for s in sections if s.get("repo_id") and not s.get("root")]
-    measurements, stock = _measurements(provenance), lerobot_eval_arguments(env)
+    stock = lerobot_eval_arguments(env)
     data = ModelCardData(
         library_name="lerobot",
         pipeline_tag="robotics",
         tags=list(dict.fromkeys(str(tag) for tag in tags if tag)),
         datasets=datasets or None,
         base_model=_base_model(recipe),
-        model_name=local,
-        eval_results=_results(measurements, env.get("type", "simulation")) or None,
     )
     own_recipe = files.get(place, b"")
     card = ModelCard.from_template(
@@ -245,7 +243,7 @@ def model_card(repo_id: str, artifact: str, folder: Path, files: Files, provenan
         artifact=artifact,
         title=TITLES[artifact],
         config=config,
-        measurements=measurements,
+        measurements=_measurements(provenance),
         summary=summary,
         validation=provenance.validation,
         number=number,
@@ -300,23 +298,3 @@ def _measurements(provenance: Provenance) -> list[tuple[str, str, dict[str, Any]
         rows += [(when, next(iter(tasks)) if len(tasks) == 1 else "all tasks", result)]
         rows += [(when, task, each) for task, each in tasks.items() if len(tasks) > 1]
     return rows
-
-
-def _results(rows: list[tuple[str, str, dict[str, Any]]], env: str) -> list[EvalResult]:
-    """Latest measurements for the Hub's model index."""
-    latest = rows[-1][0] if rows else "before RL"
-    return [
-        EvalResult(
-            task_type="robotics",
-            task_name="robotics",
-            dataset_type=env,
-            dataset_name=f"{env} {task}",
-            dataset_config=task,
-            metric_type="success_rate",
-            metric_name="success rate",
-            metric_value=round(result["success"], 4),
-            metric_args={"n": result["n"], "ci95": [round(v, 4) for v in result["ci95"]]},
-        )
-        for when, task, result in rows
-        if when == latest != "before RL"
-    ]
