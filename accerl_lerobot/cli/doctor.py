@@ -15,10 +15,9 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from accerl_lerobot.checkpoint.safety import MIB, brief
 from accerl_lerobot.engine import sizes
@@ -54,8 +53,7 @@ print("drawn", frame.std() > 1, round(1000 * (time.perf_counter() - started), 1)
 """
 
 
-@dataclass(frozen=True)
-class Check:
+class Check(NamedTuple):
     """One result."""
 
     name: str

@@ -301,20 +301,8 @@ def _parquet(path: Path, origin: Origin) -> Iterator[pq.ParquetFile]:
         raise origin.refuse(path.name, f"not good parquet ({brief(error)}); {AGAIN}") from error
 
 
-def _element_type(kind: Any) -> Any:
-    """The type at the bottom of nested lists."""
-    import pyarrow as pa
-
-    kind = getattr(kind, "storage_type", kind)
-    while pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind):
-        kind = kind.value_type
-    return kind
-
-
 def _check_plain(file: pq.ParquetFile, name: str, origin: Origin) -> None:
     """Refuses metadata that are not numbers and texts: `datasets` would open the files that others name."""
-    import pyarrow as pa
-
     stored = (file.schema_arrow.metadata or {}).get(b"huggingface")
     kinds: set[str] = set()
     try:
@@ -324,12 +312,6 @@ def _check_plain(file: pq.ParquetFile, name: str, origin: Origin) -> None:
     if kinds - PLAIN:
         remedy = f"columns of kind {', '.join(sorted(kinds - PLAIN))[:80]}, which name other files"
         raise origin.refuse(name, f"{remedy}; numbers and texts are wanted")
-    types = pa.types
-    for field in file.schema_arrow:
-        kind = _element_type(field.type)
-        plain = types.is_primitive(kind) or types.is_null(kind)
-        if not (plain or types.is_string(kind) or types.is_large_string(kind)):
-            raise origin.refuse(name, f"column {field.name[:60]} of {str(kind)[:60]}; use numbers and texts")
 
 
 def _check_episodes(file: pq.ParquetFile, frames: int, name: str, origin: Origin) -> None:

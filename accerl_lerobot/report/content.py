@@ -341,7 +341,7 @@ def _headline(run: Run) -> str:
     names = (run.result or {}).get("tasks") or sorted((last[0].get("tasks") if last else None) or ())
     names = names or [env.get("task") or env.get("name") or env.get("type")]
     tasks = str(names[0]) if len(names) == 1 else count(len(names), "task")
-    if run.result is None:
+    if run.result is None or not run.outcomes:
         share = newest(run.rollout, "success_exploring")
         so_far = "" if share is None else f", with {percent(share)} success while exploring"
         of = run.section("trainer").get("updates")

@@ -65,15 +65,9 @@ class Run:
 
     @property
     def outcomes(self) -> list[Record]:
-        """``group``, ``success``, ``ci95`` and ``n`` before and after training; or the newest."""
-        result = self.result
-        if result is None:
-            return self.evaluations[-1:]
-        return [
-            {"group": when, **{key: result.get(f"{key}_{when}") for key in ("success", "ci95", "n")}}
-            for when in ("before", "after")
-            if result.get(f"success_{when}") is not None and result.get(f"ci95_{when}") is not None
-        ]
+        """Evaluations before and after training; of a run that is not finished, the newest."""
+        ends = [e for e in self.evaluations if e.get("group") in ("before", "after")]
+        return self.evaluations[-1:] if self.result is None else ends
 
     @property
     def wall_s(self) -> float | None:
