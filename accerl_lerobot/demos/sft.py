@@ -34,6 +34,7 @@ logger = logging.getLogger(__name__)
 TRUST = "--trust_remote_code="
 HELD_OUT = re.compile(r"\bstep (\d+): eval_loss=(\S+)")
 """LeRobot's report of a loss on held-out episodes."""
+PROGRESS = re.compile(r"\bstep:(\d+\.?\d*)([KM]?) .*\bloss:(nan|inf|\d+\.?\d*)\b")
 CANDIDATES = 10
 """Checkpoints of which the best on held-out episodes is used."""
 REFUSED = "accerl refuses: "
@@ -264,13 +265,7 @@ def _as_argument(value: Any) -> str:
 
 def _parse_progress(line: str) -> tuple[int, float] | None:
     """LeRobot logs lines such as ``step:50 smpl:3K ep:40 epch:1.2 loss:0.512 grdn:… lr:…``."""
-    fields = dict(part.split(":", 1) for part in line.split() if part.count(":") == 1)
-    if "step" not in fields or "loss" not in fields:
+    if (found := PROGRESS.search(line)) is None:
         return None
-    try:
-        step = fields["step"]
-        scale = {"K": 1_000, "M": 1_000_000}.get(step[-1:], 1)
-        number = float(step if scale == 1 else step[:-1]) * scale
-        return int(number), float(fields["loss"])
-    except ValueError:
-        return None
+    scale = {"": 1, "K": 1_000, "M": 1_000_000}[found[2]]
+    return int(float(found[1]) * scale), float(found[3])
