@@ -8,7 +8,7 @@ import errno
 import os
 import re
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -55,12 +55,10 @@ def check_absent(path: Path, field: str = "output_dir") -> None:
         raise InputError(field, str(path), f"{above} cannot be written to; name another folder")
 
 
-def check_output(path: Path, ours: Callable[[Path], bool]) -> None:
-    """Refuses an ``output`` in no folder, or over anything but an older file of ours."""
-    if not path.parent.is_dir():
-        raise InputError("output", str(path), f"there is no folder {path.parent}; make it first")
-    if path.is_dir() or (path.exists() and not ours(path)):
-        raise InputError("output", str(path), "there is another file or folder of this name; choose another")
+def check_output(path: Path) -> None:
+    """Refuses an ``output`` that is a folder, or in none."""
+    if path.is_dir() or not path.parent.is_dir():
+        raise InputError("output", str(path), "name a file in a folder that exists")
 
 
 def is_full(error: BaseException | None) -> bool:

@@ -121,17 +121,3 @@ class Segment:
 
     def __len__(self) -> int:
         return len(self.reward)
-
-    def __post_init__(self) -> None:
-        t = len(self.reward)
-        if t == 0:
-            raise ValueError(f"segment {self.key}: holds no decision")
-        if self.terminated and self.truncated:
-            raise ValueError(f"segment {self.key}: terminated and truncated at once")
-        names = ("log_prob", "value", "version", "actions", "steps")
-        sizes = {name: len(getattr(self, name)) for name in names}
-        sizes |= {f"latent.{k}": len(v) for k, v in self.latent.items()}
-        sizes |= {k: len(v) - 1 for k, v in self.observations.items()}
-        wrong = {k: n for k, n in sizes.items() if n != t}
-        if wrong:
-            raise ValueError(f"segment {self.key}: {t} rewards but {wrong}")

@@ -34,23 +34,20 @@ ACCOUNTS = {WRITER: ("alice", "write"), READER: ("alice", "read"), STRANGER: ("m
 
 @dataclass
 class Fault:
-    """Something that goes wrong, so many times."""
+    """Something that goes wrong with requests of a method whose path has `match` in it, so many `times`.
+
+    Either a `status` is answered, which `says` something; or nothing happens for `hang_s`, `cut_after` bytes
+    of the body are read, and the connection is cut; or one byte of the answer is another (`spoil`).
+    """
 
     method: str
     match: str
-    """Part of the path."""
     status: int = 0
-    """Answered instead of an answer,"""
     says: str = "as it was told to"
-    """with these words."""
     cut_after: int = -1
-    """Bytes of the request's body after which the connection is cut."""
     hang_s: float = 0.0
-    """How long nothing happens before the connection is cut."""
     spoil: bool = False
-    """One byte of the answer is another."""
     times: int = 1
-    """How often."""
 
 
 @dataclass

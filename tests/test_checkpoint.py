@@ -191,29 +191,6 @@ def test_pruning_that_was_interrupted_is_completed(tmp_path: Path, monkeypatch: 
     assert not (tmp_path / "000001" / TRAINING_STATE).exists()
 
 
-def test_paths_in_the_files_are_those_of_the_final_place(tmp_path: Path):
-    def write(directory: Path) -> int:
-        directory = directory / PRETRAINED
-        (directory / BACKBONE).mkdir(parents=True)
-        (directory / "config.json").write_text(json.dumps({"vlm_model_name": "/elsewhere", "chunk_size": 4}))
-        steps = [
-            {"registry_name": "device_processor", "config": {"device": "cpu"}},
-            {
-                "registry_name": "tokenizer_processor",
-                "config": {"tokenizer_name": "/elsewhere", "max_length": 48},
-            },
-        ]
-        (directory / "policy_preprocessor.json").write_text(json.dumps({"name": "pre", "steps": steps}))
-        return 4
-
-    pretrained = save_checkpoint(tmp_path, write) / PRETRAINED
-    home = str(pretrained / BACKBONE)
-    assert json.loads((pretrained / "config.json").read_text()) == {"vlm_model_name": home, "chunk_size": 4}
-    first, second = json.loads((pretrained / "policy_preprocessor.json").read_text())["steps"]
-    assert first["config"] == {"device": "cpu"}
-    assert second["config"] == {"tokenizer_name": home, "max_length": 48}
-
-
 def test_a_backbone_by_its_bare_name_is_the_one_beside_and_one_from_the_hub_stays(tmp_path: Path):
     (tmp_path / "config.json").write_text('{"vlm_model_name": "some/backbone"}')
     relocate(tmp_path, tmp_path / "home")

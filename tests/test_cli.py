@@ -37,12 +37,6 @@ def test_help_answers_without_torch_or_lerobot() -> None:
         assert f"\n  {verb} " in done.stdout
 
 
-@pytest.mark.parametrize("arguments", [[], ["-h"], ["help"]])
-def test_usage(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(arguments) == 0
-    assert capsys.readouterr().out == cli.usage() + "\n"
-
-
 def test_every_verb_has_a_function_and_a_config() -> None:
     assert {name.split()[0] for name in verbs.CONFIGS} == cli.VERBS.keys()
 
@@ -100,31 +94,16 @@ class RayTaskError(InputError):
 @pytest.mark.parametrize(
     ("error", "code", "line"),
     [
-        (
-            InputError("env.task", "push-v2", "use one of:\npush-v3"),
-            2,
-            "env.task='push-v2': use one of: push-v3",
-        ),
+        (InputError("a", 1, "use one of:\nb"), 2, "a=1: use one of: b"),
         (RayTaskError("", "", ""), 2, "policy.path='here': give another"),
         (KeyboardInterrupt(), 130, "interrupted"),
-        (
-            RuntimeError("a worker\n\n  failed"),
-            1,
-            "RuntimeError: a worker … failed; ACCERL_LOG=DEBUG shows the",
-        ),
+        (RuntimeError("a worker\n\n  failed"), 1, "RuntimeError: a worker … failed; ACCERL_LOG=DEBUG shows"),
         (MemoryError(), 1, "MemoryError; ACCERL_LOG=DEBUG"),
         (BrokenPipeError(32, "Broken pipe"), 1, "BrokenPipeError: [Errno 32] Broken pipe; ACCERL_LOG"),
     ],
     ids=lambda value: type(value).__name__,
 )
-def test_every_error_is_one_line(
-    error: BaseException,
-    code: int,
-    line: str,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_every_error_is_one_line(error, code, line, monkeypatch, capsys, caplog):
     def broken(arguments: list[str]) -> int:
         raise error
 
@@ -151,9 +130,7 @@ def test_a_reader_that_has_gone_ends_the_command_quietly() -> None:
     assert done.stdout.startswith("usage: accerl train") and done.stderr == ""
 
 
-def test_a_log_level_that_is_none_is_refused(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_log_level_that_is_none_is_refused(monkeypatch, capsys):
     monkeypatch.setenv("ACCERL_LOG", "loud")
     assert cli.main(["train", "--help"]) == 2
     assert capsys.readouterr().err == "accerl: ACCERL_LOG='LOUD': use DEBUG, INFO, WARNING, ERROR\n"
@@ -164,20 +141,10 @@ class TestTrain:
 
     @pytest.fixture
     def arguments(self, tmp_path: Path, tiny_checkpoint: Path) -> list[str]:
-        return [
-            "train",
-            "--env.type=simulated",
-            f"--policy.path={tiny_checkpoint}",
-            f"--output_dir={tmp_path / 'run'}",
-        ]
+        places = [f"--policy.path={tiny_checkpoint}", f"--output_dir={tmp_path / 'run'}"]
+        return ["train", "--env.type=simulated", *places]
 
-    def test_prints_the_summary(
-        self,
-        arguments: list[str],
-        tmp_path: Path,
-        capsys: pytest.CaptureFixture[str],
-        monkeypatch: pytest.MonkeyPatch,
-    ) -> None:
+    def test_prints_the_summary(self, arguments, tmp_path, capsys, monkeypatch):
         seen: dict[str, Any] = {}
 
         def train(config: RunConfig, directory: Path, console: Any, *_: Any) -> dict[str, Any]:
@@ -194,8 +161,8 @@ class TestTrain:
 
     @pytest.mark.parametrize("work", [False, True])
     def test_a_refused_run_leaves_no_folder_unless_work_was_done(
-        self, work: bool, arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+        self, work, arguments, tmp_path, monkeypatch
+    ):
         def train(config: RunConfig, directory: Path, console: Any, *_: Any) -> dict[str, Any]:
             (directory / "config.yaml").write_text("seed: 0\n")
             if work:
@@ -217,37 +184,22 @@ class TestSFT:
             (["--dataset.repo_id=a/b"], "sft.steps=0: use at least 1\n"),
         ],
     )
-    def test_needs_a_dataset_and_steps(
-        self, arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]
-    ) -> None:
+    def test_needs_a_dataset_and_steps(self, arguments, words, capsys):
         assert cli.main(["sft", *arguments]) == 2
         assert capsys.readouterr().err.startswith(f"accerl: {words}")
 
     def test_checks_the_dataset_against_the_world(self, capsys: pytest.CaptureFixture[str]) -> None:
-        arguments = [
-            "sft",
-            str(QUICKSTART),  # camera corner2, as the dataset
-            "--env.camera=topview",
-            "--dataset.repo_id=accerl/metaworld_tiny",
-            f"--dataset.root={ROOT / 'datasets' / 'metaworld_tiny'}",
-        ]
+        data = ROOT / "datasets" / "metaworld_tiny"  # camera corner2, as the recipe
+        arguments = ["sft", str(QUICKSTART), "--env.camera=topview", "--dataset.repo_id=a/b"]
+        arguments += [f"--dataset.root={data}"]
         assert cli.main(arguments) == 2
         assert "no observation.images.corner2 in the environment" in capsys.readouterr().err
 
 
-def test_eval_in_one_process(
-    tmp_path: Path, tiny_checkpoint: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_eval_in_one_process(tmp_path, tiny_checkpoint, capsys):
     out = tmp_path / "evaluation"
-    arguments = [
-        "eval",
-        "--env.type=simulated",
-        "--env.max_steps=8",
-        f"--policy.path={tiny_checkpoint}",
-        "--evaluation.episodes=4",
-        "--launch.engine=local",
-        f"--output_dir={out}",
-    ]
+    arguments = ["eval", "--env.type=simulated", "--env.max_steps=8", f"--policy.path={tiny_checkpoint}"]
+    arguments += ["--evaluation.episodes=4", "--launch.engine=local", f"--output_dir={out}"]
     assert cli.main(arguments) == 0
     stdout, stderr = capsys.readouterr()
     summary = json.loads(stdout)
@@ -275,35 +227,15 @@ def test_a_verb_that_is_asked_to_stop_ends_what_it_has_started(monkeypatch: pyte
     assert signal.getsignal(signal.SIGTERM) is before
 
 
-def _nested() -> Exception:
-    """A full disk, and what went wrong because of it."""
-    try:
-        try:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        except OSError:
-            raise ValueError("the log could not be closed")  # noqa: B904
-    except ValueError as error:
-        return error
-
-
 @pytest.mark.parametrize(
     ("error", "said"),
     [
-        (_nested(), "the disk of {run} is full; free some space, then {how}"),
+        (OSError(errno.ENOSPC, "full"), "the disk of {run} is full; free some space, then {how}"),
         (WorkerError("replay:\n  OSError: No space left on device"), "the disk of {run} is full; free some"),
-        (
-            WorkerError("Ray's raylet (process 7) has died"),
-            "Ray's raylet (process 7) has died; to resume: {how}",
-        ),
+        (WorkerError("Ray's raylet has died"), "Ray's raylet has died; to resume: {how}"),
     ],
 )
-def test_a_run_that_cannot_go_on_ends_with_one_line(
-    error: Exception,
-    said: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_run_that_cannot_go_on_ends_with_one_line(error, said, tmp_path, monkeypatch, capsys):
     from accerl_lerobot.engine import run
     from benchmarks.light_run import light_config, light_policy
 
@@ -324,16 +256,13 @@ def test_a_run_that_cannot_go_on_ends_with_one_line(
     [
         ["eval", "--env.type=simulated", "--policy.path=a/b", "--output_dir="],
         ["demos", "--root="],
-        ["export", "--path=x", "--root="],
         ["pull", "--repo_id=a/b", "--output_dir="],
         ["report", "@run", "--output="],
         ["timeline", "@run", "--output="],
     ],
     ids=lambda arguments: " ".join(arguments[:2]),
 )
-def test_a_place_that_cannot_be_is_refused_before_any_work(
-    arguments: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_place_that_cannot_be_is_refused_before_any_work(arguments, tmp_path, capsys):
     (tmp_path / "file").touch()
     flag = arguments[-1].strip("-=")
     for name in ("file/below", "x" * 300):
@@ -343,12 +272,3 @@ def test_a_place_that_cannot_be_is_refused_before_any_work(
         err = capsys.readouterr().err
         assert err.startswith(f"accerl: {flag}={place!r}"[:150]) and err.count("\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
-
-
-def test_a_folder_that_may_not_be_written_to_is_refused_before_an_evaluation(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != tmp_path)
-    arguments = ["--env.type=simulated", "--policy.path=a/b", f"--output_dir={tmp_path / 'a' / 'b'}"]
-    assert cli.main(["eval", *arguments]) == 2
-    assert f"{tmp_path} cannot be written to" in capsys.readouterr().err

@@ -118,11 +118,7 @@ MISTAKES: list[tuple[list[str], str]] = [
     (["--policy.rename_map=3"], "policy.rename_map=3: use a mapping such as {key: value}"),
     (["--wandb.enable=perhaps"], "wandb.enable='perhaps': use true or false"),
     (["--env.task=[a]"], "env.task=['a']: use text"),
-    (
-        ["--algorithm.type=gippo"],
-        "algorithm.type='gippo': did you mean gipo? Otherwise use one of awr, chunk_critic, gipo, ppo, "
-        "self_imitation",
-    ),
+    (["--algorithm.type=gippo"], "algorithm.type='gippo': did you mean gipo? Otherwise use one of awr, "),
     (["--env.type=mujoco"], "env.type='mujoco': use one of gym, lerobot, libero, metaworld, simulated"),
     (["--env.task=drawer-v3"], "env.task='drawer-v3': 'drawer-v3' is no task; did you mean"),
     (["--trainer.hold_back=50"], "replay.max_lag=50: use more than trainer.hold_back, 50, or all is"),
@@ -130,13 +126,9 @@ MISTAKES: list[tuple[list[str], str]] = [
     (["--dataset.root=x"], "dataset.repo_id=None: name the dataset in dataset.root"),
     (["--policy.path=x", "--sft.steps=5"], "policy.path='x': add --sft.steps=0 to improve this checkpoint"),
     (["--sft.policy.chunk_size=5"], "sft.policy={'chunk_size': 5}: name LeRobot's policy type, e.g."),
-    (["--steps=3"], "steps=3: the name is LeRobot's; use trainer.updates or sft.steps"),
-    (["--policy.push_to_hub=false"], "policy.push_to_hub=False: the name is LeRobot's; leave it out"),
-    (
-        ["--algorithm.discover_packages_path=a/b"],
-        "algorithm.discover_packages_path='a/b': use the name of a package",
-    ),
-    (["--env.type=vlabench"], "env.type='vlabench': use one of gym, lerobot, libero, metaworld, simulated"),
+    (["--steps=3"], "steps=3: no such field; did you mean sft.steps"),
+    (["--policy.push_to_hub=false"], "policy.push_to_hub=False: no such field; policy has path, "),
+    (["--env.discover_packages_path=a/b"], "env.discover_packages_path='a/b': use the name of a package"),
     (["--seed=1", "--seed=2"], "seed=2: it is set to 1 already; give it once"),
     (["--job_name=" + "x" * 5000], "job_name='xxx"),
     (["--trainer..lr=1"], "argument='--trainer..lr=1': write --section.field=value"),
@@ -197,13 +189,6 @@ def test_sizes_far_beyond_the_machine_are_refused(monkeypatch: pytest.MonkeyPatc
     sizes.check_memory(parse(RunConfig, ["--rollout.workers=100", "--launch.address=auto"]))
 
 
-def test_long_values_are_shortened() -> None:
-    text = str(InputError("a", "x" * 1000, "shorten\nit"))
-    assert len(text) < 250 and text.endswith("…: shorten it")
-    text = str(InputError("a", 1, f"{'y' * 5000} is none; use 2"))
-    assert len(text) < 1300 and text.endswith("y is none; use 2")
-
-
 ARENA = f"them/arena@{'0123456789' * 4}"
 
 
@@ -213,16 +198,14 @@ class TestConsent:
     @pytest.mark.parametrize(
         ("text", "flag"),
         [
-            ("policy: {trust_remote_code: true}", "--policy.trust_remote_code=true"),
-            ("policy: {code_revision: abc}", "--policy.code_revision=abc"),
-            ("sft: {trust_remote_code: yes}", "--sft.trust_remote_code=true"),
-            ("sft: {extra_args: [--code_revision=x]}", "'--sft.extra_args=[\"--code_revision=x\"]'"),
+            ("policy: {trust_remote_code: abc}", "--policy.trust_remote_code=abc"),
+            ("sft: {extra_args: [--a=x]}", "'--sft.extra_args=[\"--a=x\"]'"),
             ("sft: {policy: {discover_packages_path: os}}", "--sft.policy.discover_packages_path=os"),
             ("sft: {policy: {vision.trust_remote_code: 1}}", "--sft.policy.vision.trust_remote_code=1"),
             ("env: {type: lerobot, trust_remote_code: true}", "--env.trust_remote_code=true"),
             (f"env: {{type: lerobot, kwargs: {{hub_path: {ARENA}}}}}", f"--env.kwargs.hub_path={ARENA}"),
             ("imagination: {discover_packages_path: os}", "--imagination.discover_packages_path=os"),
-            ("imagination: {success: {code_revision: a}}", "--imagination.success.code_revision=a"),
+            ("imagination: {success: {hub_path: a}}", "--imagination.success.hub_path=a"),
             ("launch: {address: 'them:6379'}", "--launch.address=them:6379"),
             ('sft: {extra_args: ["\\e[2J"]}', "\\u001b"),
         ],
@@ -265,19 +248,10 @@ class TestPreflight:
         [
             ({"type": "smol"}, "sft.policy.type='smol': LeRobot has act, "),
             ({"type": "gaussian_actor"}, "sft.policy.type='gaussian_actor': only LeRobot's SAC trains it"),
-            (
-                {"type": "smolvla", "chunks": 3},
-                "sft.policy.chunks=3: LeRobot's smolvla has no such field; did you",
-            ),
+            ({"type": "smolvla", "chunks": 3}, "sft.policy.chunks=3: LeRobot's smolvla has no such field"),
             ({"type": "smolvla", "num_steps": "x"}, "sft.policy.num_steps='x': LeRobot says: "),
-            (
-                {"type": "smolvla", "chunk_size": 0},
-                "sft.policy.chunk_size=0: use a whole number in [1, 10000]",
-            ),
-            (
-                {"type": "smolvla", "chunk_size": 10},
-                "sft.policy={'chunk_size': 10}: LeRobot says: The chunk size",
-            ),
+            ({"type": "smolvla", "chunk_size": 0}, "sft.policy.chunk_size=0: use a whole number in [1, "),
+            ({"type": "smolvla", "chunk_size": 10}, "sft.policy={'chunk_size': 10}: LeRobot says: The chunk"),
         ],
     )
     def test_refuses(self, policy: dict[str, Any], message: str) -> None:

@@ -8,7 +8,6 @@ import importlib.util
 import math
 import os
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -79,9 +78,7 @@ class TestRecipe:
             ([str(QUICKSTART), "--sft.policy.colour=red"], "LeRobot's smolvla has no such field"),
         ],
     )
-    def test_what_only_the_machine_or_lerobot_knows(
-        self, arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]
-    ) -> None:
+    def test_what_only_the_machine_or_lerobot_knows(self, arguments, words, capsys):
         assert cli.main(["doctor", *arguments]) == 1
         assert words in capsys.readouterr().out
 
@@ -112,50 +109,26 @@ class TestRendering:
         check = doctor.rendering(needed=True)
         assert check.status == FAIL and "there is no display: use egl or osmesa" in check.text
 
-    def test_takes_too_long(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(doctor, "RENDER_TIMEOUT_S", 0.2)
-        assert "no frame within" in self.draw("import time; time.sleep(30)").text
 
-    def test_without_mujoco(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-        assert "install the extra" in doctor.rendering(needed=True).text
+@pytest.mark.parametrize(
+    ("installed", "status", "text"),
+    [
+        ({"lerobot": "0.6.1", "torch": "2.11.0+cpu"}, OK, "all within their ranges, lerobot 0.6.1 among"),
+        ({"lerobot": "0.7.0", "torch": "2.11.0"}, WARN, "lerobot 0.7.0, not <0.7,>=0.6.1: run make"),
+        ({"lerobot": "0.6.1"}, FAIL, "torch missing"),
+    ],
+)
+def test_packages_against_the_ranges(installed, status, text, monkeypatch):
+    def version(name: str) -> str:
+        if name not in installed:
+            raise importlib.metadata.PackageNotFoundError(name)
+        return installed[name]
 
-
-class TestPackages:
-    """Requirements against what is installed."""
-
-    def versions(self, monkeypatch: pytest.MonkeyPatch, installed: dict[str, str]) -> Check:
-        def version(name: str) -> str:
-            if name not in installed:
-                raise importlib.metadata.PackageNotFoundError(name)
-            return installed[name]
-
-        wanted = [
-            "lerobot[dataset]>=0.6.1,<0.7", "torch>=2.7,<2.12", 'mujoco==3.3.2; extra == "metaworld"',
-            'ruff==0.17.5; extra == "dev"',
-        ]  # fmt: skip
-        monkeypatch.setattr(importlib.metadata, "requires", lambda name: wanted)
-        monkeypatch.setattr(importlib.metadata, "version", version)
-        return doctor.packages()
-
-    @pytest.mark.parametrize(
-        ("installed", "status", "text"),
-        [
-            (
-                {"lerobot": "0.6.1", "torch": "2.11.0+cpu", "mujoco": "3.3.2"},
-                OK,
-                "all within their ranges, lerobot 0.6.1 among them",
-            ),
-            ({"lerobot": "0.6.2", "torch": "2.11.0", "ruff": "0.1"}, OK, "lerobot 0.6.2"),
-            ({"lerobot": "0.7.0", "torch": "2.11.0"}, WARN, "lerobot 0.7.0, not <0.7,>=0.6.1: not tested"),
-            ({"lerobot": "0.6.1"}, FAIL, "not installed: torch"),
-        ],
-    )
-    def test_against_the_ranges(
-        self, installed: dict[str, str], status: str, text: str, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        check = self.versions(monkeypatch, installed)
-        assert check.status == status and text in check.text
+    wanted = ["lerobot[dataset]>=0.6.1,<0.7", "torch>=2.7,<2.12", 'mujoco==3.3.2; extra == "metaworld"']
+    monkeypatch.setattr(importlib.metadata, "requires", lambda name: wanted)
+    monkeypatch.setattr(importlib.metadata, "version", version)
+    check = doctor.packages()
+    assert check.status == status and text in check.text
 
 
 class TestResources:
@@ -180,15 +153,11 @@ class TestResources:
             ({"env": {"image_size": 480}, "replay": {"capacity": 100_000}}, "memory", "GiB needed: lower"),
         ],
     )
-    def test_against_four_cores_and_sixteen_gib(
-        self, sections: dict[str, dict[str, Any]], name: str, words: str
-    ) -> None:
+    def test_against_four_cores_and_sixteen_gib(self, sections, name, words):
         check = checks(self.recipe(**sections))[name]
         assert check.status == (WARN if words else OK) and words in check.text
 
-    def test_the_weights_count_in_every_process(
-        self, monkeypatch: pytest.MonkeyPatch, tiny_checkpoint: Path
-    ) -> None:
+    def test_the_weights_count_in_every_process(self, monkeypatch, tiny_checkpoint):
         """By hand: weights in trainer and inference; gradient, two moments, one copy, two sent to each."""
         policy = {"path": str(tiny_checkpoint), "device": "cpu"}
         config = self.recipe(policy=policy, inference={"workers": 2}, rollout={"workers": 2})
@@ -211,10 +180,6 @@ class TestResources:
         assert pictures[1] - pictures[0] == pytest.approx(pictures[2] - pictures[1])
         assert each <= pictures[1] - pictures[0] < 1.1 * each
 
-    def test_too_little_disk(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(doctor.shutil, "disk_usage", lambda path: SimpleNamespace(free=2**28))
-        assert checks(self.recipe())["disk"].status == WARN
-
     def test_lag_is_that_of_the_formula(self) -> None:
         """⌊⌈r⌉ (max(ahead, min) + 2·in_flight + capacity) / batch⌋ − 1; with Ray one pickup, one prefetch."""
         replay = {"capacity": 1024, "ahead": 256, "min_decisions": 128, "samples_per_insert": 2.0}
@@ -231,15 +196,6 @@ class TestResources:
         lag = checks(self.recipe(replay={"max_lag": 3}))["lag"]
         assert lag.status == WARN and lag.text.startswith("at most 4 updates") and "thrown away" in lag.text
 
-    def test_work(self) -> None:
-        config = self.recipe(
-            replay={"samples_per_insert": 4.0},
-            trainer={"updates": 100, "batch_decisions": 64},
-            policy={"n_action_steps": 5},
-        )
-        text = "100 updates of 64 on about 1,600 decisions, at most 8,000 env steps"
-        assert checks(config)["work"].text == text
-
 
 def test_imagination_is_checked_where_there_is_any(capsys: pytest.CaptureFixture[str]) -> None:
     recipe = str(QUICKSTART.with_name("imagination.yaml"))
@@ -253,18 +209,12 @@ def test_imagination_is_checked_where_there_is_any(capsys: pytest.CaptureFixture
 @pytest.mark.parametrize(
     ("usable_gib", "status", "words"),
     [
-        (
-            12.0,
-            OK,
-            "trainer 4.0 GiB and 256 MiB for each of 16 decisions, inference 2.5 GiB; 10 GiB of 12 GiB",
-        ),
+        (12.0, OK, "4.0 GiB and 256 MiB for each of 16 decisions, inference 2.5 GiB; 10 GiB of 12 GiB"),
         (9.6, WARN, "use --trainer.micro_batch=12, or --trainer.activation_checkpointing=true"),
         (6.0, WARN, "use policy.tuning.mode=lora, or --trainer.activation_checkpointing=true"),
     ],
 )
-def test_a_policy_is_compared_with_its_device(
-    usable_gib: float, status: str, words: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_policy_is_compared_with_its_device(usable_gib, status, words, monkeypatch):
     sizes = {"weights": 2, "trained": 0.5, "acting_batch": 0.25, "acting": 0.125, "learning_batch": 0.5}
     memory = PolicyMemory(
         **{name: int(engine_sizes.GIB * size) for name, size in (sizes | {"learning": 0.25}).items()}

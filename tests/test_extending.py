@@ -10,7 +10,7 @@ import importlib
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -112,13 +112,7 @@ def no_gradient(policy: Any) -> None:
         ),
     ],
 )
-def test_mistakes_are_found(
-    mistake: Callable[[Any], None],
-    message: str,
-    checkpoint: Path,
-    observations: list[Observation],
-    monkeypatch: pytest.MonkeyPatch,
-):
+def test_mistakes_are_found(mistake, message, checkpoint, observations, monkeypatch):
     module = importlib.import_module(f"{PACKAGE}.modeling_mlp_flow")
     built = module.MLPFlowPolicy.__init__
 
@@ -131,9 +125,7 @@ def test_mistakes_are_found(
         check_policy(named(checkpoint), observations)
 
 
-def test_a_density_that_leaves_out_executed_actions_is_found(
-    checkpoint: Path, observations: list[Observation], monkeypatch: pytest.MonkeyPatch
-):
+def test_a_density_that_leaves_out_executed_actions_is_found(checkpoint, observations, monkeypatch):
     whole = FlowFamily._rows
 
     def first_row(*arguments: Any) -> Any:

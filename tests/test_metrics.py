@@ -64,14 +64,9 @@ def test_each_record_is_a_line_and_an_event(tmp_path: Path) -> None:
 def test_what_json_does_not_know(tmp_path: Path) -> None:
     log = MetricsLog(tmp_path, WandBConfig(), {})
     values = {
-        "nan": float("nan"),
-        "inf": np.float32("inf"),
-        "single": np.float32(0.5),
-        "whole": np.int64(3),
-        "yes": np.bool_(True),
-        "tasks": {"a": {"ci95": [float("nan"), np.float64(1.0)]}},
-        "name": "during-1",
-    }
+        "nan": float("nan"), "inf": np.float32("inf"), "single": np.float32(0.5), "whole": np.int64(3),
+        "yes": np.bool_(True), "name": "during-1", "tasks": {"a": {"ci95": [float("nan"), np.float64(1.0)]}},
+    }  # fmt: skip
     log.write("evaluation", 7, values)
     log.close()
     (record,) = lines(tmp_path)
@@ -112,20 +107,13 @@ def explained(section: str) -> set[str]:
 def test_every_logged_number_is_explained(tiny_checkpoint: Path) -> None:
     """And nothing is explained that is not logged."""
     arguments = [
-        "--env.type=simulated",
-        f"--policy.path={tiny_checkpoint}",
-        "--launch.engine=local",
-        "--replay.min_decisions=32",
-        "--trainer.batch_decisions=16",
-        "--rollout.worlds=4",
-    ]
+        "--env.type=simulated", f"--policy.path={tiny_checkpoint}", "--launch.engine=local",
+        "--replay.min_decisions=32", "--trainer.batch_decisions=16", "--rollout.worlds=4",
+    ]  # fmt: skip
     off_policy = [
-        "--algorithm.type=chunk_critic",
-        "--algorithm.policy_steps=1",
-        "--env.environment_state=true",
-        "--rollout.segment_length=10",
-        "--trainer.value_warmup_updates=0",
-    ]
+        "--algorithm.type=chunk_critic", "--algorithm.policy_steps=1", "--env.environment_state=true",
+        "--rollout.segment_length=10", "--trainer.value_warmup_updates=0",
+    ]  # fmt: skip
     told: set[str] = set()
     for more in (off_policy, []):
         config = parse(RunConfig, arguments + more)
@@ -147,14 +135,8 @@ def test_every_logged_number_is_explained(tiny_checkpoint: Path) -> None:
     of_weights = ("version", "swap_s", "publish_to_served_s")
     rollout |= {f"inference_{k}" for k in (*BatcherStats().metrics(), "busy_share", *of_weights)}
     ends = ("s", "_return", "_steps", "_decisions", "_success")
-    rollout |= {
-        "restarts",
-        "moved",
-        "inference_restarts",
-        "success_exploring",
-        "replay_insert_wait_s",
-        "replay_sample_wait_s",
-    }
+    rollout |= {"restarts", "moved", "inference_restarts", "success_exploring"}
+    rollout |= {"replay_insert_wait_s", "replay_sample_wait_s"}
     assert explained("rollout") == rollout | {f"replay_episode{end}" for end in ends}
 
 
@@ -174,9 +156,7 @@ def test_the_summary_is_explained() -> None:
     assert whens <= logged and logged - whens == set(re.findall(r"`([a-z_0-9]+)`", text)) - whens
 
 
-def test_progress_without_a_terminal_is_lines_with_the_time_left(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_progress_without_a_terminal_is_lines_with_the_time_left(capsys, monkeypatch):
     monkeypatch.setattr("accerl_lerobot.console.PLAIN_EVERY_S", -1.0)
     console = Console()
     console.say("success [not markup]")

@@ -24,7 +24,7 @@ from accerl_lerobot.policies.loading import load_adapter
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Six successes and two failures."""
     root = tmp_path_factory.mktemp("recorded") / "dataset"
-    config = DemosConfig(episodes=8, failure_share=0.25, processes=1)
+    config = DemosConfig(episodes=8, failure_share=0.25)
     record_demos(SimulatedConfig(max_steps=16), config, str(root))
     return root
 
@@ -45,9 +45,7 @@ def arguments(checkpoint: Path, root: Path, out: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("algorithm", ["awr", "self_imitation"])
-def test_the_checkpoint_does_more_of_what_succeeded(
-    algorithm: str, tiny_checkpoint: Path, recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_the_checkpoint_does_more_of_what_succeeded(algorithm, tiny_checkpoint, recorded, tmp_path, capsys):
     out = tmp_path / "out"
     assert main([*arguments(tiny_checkpoint, recorded, out), f"--algorithm.type={algorithm}"]) == 0
     summary = json.loads(capsys.readouterr().out)
@@ -75,12 +73,7 @@ def test_the_checkpoint_does_more_of_what_succeeded(
     ids=lambda value: value[0] if isinstance(value, list) else "",
 )
 def test_a_mistake_is_one_line_and_leaves_no_folder(
-    wrong: list[str],
-    message: str,
-    tiny_checkpoint: Path,
-    recorded: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    wrong, message, tiny_checkpoint, recorded, tmp_path, capsys
 ):
     names = {argument.partition("=")[0] for argument in wrong}
     given = [
@@ -92,9 +85,7 @@ def test_a_mistake_is_one_line_and_leaves_no_folder(
     assert re.search(message, error), error
 
 
-def test_episodes_without_labels_are_refused(
-    tiny_checkpoint: Path, recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_episodes_without_labels_are_refused(tiny_checkpoint, recorded, tmp_path, capsys):
     data = LeRobotDataset("me/robot", root=recorded)
     remove_feature(data, ["next.success", "next.reward"], output_dir=tmp_path / "bare", repo_id="me/robot")
     assert main(arguments(tiny_checkpoint, tmp_path / "bare", tmp_path / "out")) == 2

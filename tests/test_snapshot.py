@@ -85,14 +85,6 @@ def test_what_is_not_known_is_refused_and_named(value: Any, message: str, tmp_pa
     assert not list(tmp_path.iterdir()), "nothing half written"
 
 
-def test_two_kinds_of_one_name_are_refused():
-    with pytest.raises(TypeError, match="two kinds are called Origin"):
-
-        @snapshot.kind
-        class Origin(NamedTuple):
-            x: int
-
-
 @pytest.mark.parametrize(
     "text",
     [

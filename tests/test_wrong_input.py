@@ -124,12 +124,7 @@ def nothing_is_begun(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     return work
 
 
-def test_wrong_input_is_one_line_and_begins_nothing(
-    nothing_is_begun: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-):
+def test_wrong_input_is_one_line_and_begins_nothing(nothing_is_begun, tmp_path, monkeypatch, capsys):
     from accerl_lerobot.cli import verbs
     from accerl_lerobot.engine import preflight
 

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from typing import Any
 
-import psutil
 from rich.table import Table
 
 PACKAGES = ("accerl-lerobot", "lerobot", "torch", "ray", "numpy")
@@ -25,21 +24,6 @@ def host() -> dict[str, Any]:
         "versions": {name: version(name) for name in PACKAGES},
         "load_1min": os.getloadavg()[0],
     }
-
-
-class Processors:
-    """Busy share of all cores since the last question, whoever uses them."""
-
-    def __init__(self) -> None:
-        self._last = psutil.cpu_times()
-
-    def share(self) -> float:
-        """In [0, 1]."""
-        now = psutil.cpu_times()
-        passed = sum(now) - sum(self._last)
-        idle = now.idle - self._last.idle + getattr(now, "iowait", 0.0) - getattr(self._last, "iowait", 0.0)
-        self._last = now
-        return float(1 - idle / passed) if passed > 0 else 0.0
 
 
 def spread(values: list[float]) -> dict[str, Any]:

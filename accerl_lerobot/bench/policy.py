@@ -12,7 +12,7 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -43,8 +43,6 @@ class BenchPolicyConfig(Section):
     """Pictures in an observation."""
     batch: Annotated[int, Range("[1, 65536]")] = 8
     """Decisions made together, and learned from together."""
-    num_steps: Annotated[int, Range("[1, 10000]")] | None = None
-    """Denoising steps; None: the published 10."""
     precision: Literal["fp32", "bf16"] = "fp32"
     """fp32 or bf16; see ``policy.precision``."""
     tuning: TuningConfig = field(default_factory=lambda: TuningConfig(mode="expert"))
@@ -197,15 +195,13 @@ def _adapter(config: BenchPolicyConfig, device: Any, directory: Path) -> Any:
 
     from accerl_lerobot.config.parsing import imported
     from accerl_lerobot.policies.adapter import LeRobotAdapter, ValueHead
-    from accerl_lerobot.policies.config import POLICIES, FlowSamplerConfig, steps_field
+    from accerl_lerobot.policies.config import POLICIES, FlowSamplerConfig
     from accerl_lerobot.policies.flow import FlowFamily
     from accerl_lerobot.policies.saving import tune
 
     torch.manual_seed(0)
     settings = lerobot_config(config, directory)
     settings.device = str(device)
-    if config.num_steps is not None:
-        settings = replace(settings, **{str(steps_field(settings)): config.num_steps})
     policy = get_policy_class(config.type)(settings).to(device)
     model = imported(POLICIES[config.type][0])(policy)
     family = FlowFamily(model, FlowSamplerConfig(noise_level=0.2))

@@ -12,9 +12,10 @@ import time
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+import psutil
 from rich.table import Table
 
-from accerl_lerobot.bench import Processors, as_table, host, ranged, spread
+from accerl_lerobot.bench import as_table, host, ranged, spread
 from accerl_lerobot.config.ranges import Positive, Repeats, Section
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import RunConfig, parse
@@ -47,6 +48,7 @@ class Block:
     """Observations of a forward pass."""
     inference_busy: float
     processors: float
+    """Busy share of all cores, whoever uses them."""
 
 
 class Measured:
@@ -76,7 +78,8 @@ class Measured:
         self.engine.follow(schedule)
         self._updates(1, 0.0)  # updates made before are reported first
         self._updates(SETTLE + self._round, 0.0)
-        processors, first, started = Processors(), self.engine.poll(), time.perf_counter()
+        psutil.cpu_percent()  # begins to count
+        first, started = self.engine.poll(), time.perf_counter()
         updates, polls = self._updates(1, seconds)
         wall = time.perf_counter() - started
         before, after = first.inference, polls[-1].inference
@@ -94,7 +97,7 @@ class Measured:
             trainer_waits=sum(u["wait_s"] for u in updates) / total,
             batch_size=requests / batches if batches else 0.0,
             inference_busy=sum(p.inference["busy_share"] for p in polls) / len(polls),
-            processors=processors.share(),
+            processors=psutil.cpu_percent() / 100,
         )
 
     def _updates(self, count: int, seconds: float) -> tuple[list[dict[str, float]], list[Progress]]:

@@ -32,8 +32,8 @@ float32, because SmolVLA builds layers that it then drops."""
 CPU_S, CPU_S_PER_BYTE = 15, 1e-7
 """Seconds of processor time, and those for each byte of the files: a decision computes with all weights.
 Processor time, because a busy machine must not refuse a good file."""
-STALLED_S = 60
-"""Seconds without any processor time after which a child is given up, whatever it waits for."""
+PATIENCE = 20
+"""Times its processor time after which a child is given up, whatever it waits for."""
 LONGEST = 1000
 """Characters of a child's message."""
 NO_MEMORY = (
@@ -69,7 +69,7 @@ def rehearse[T](task: Callable[[], T], folder: Path, origin: Origin, pattern: st
     os.close(writer)
     status = None
     try:
-        message, status = _wait(child, reader)
+        message, status = _wait(child, reader, PATIENCE * cpu_s)
     finally:
         os.close(reader)
         if status is None:  # it may still run
@@ -89,7 +89,7 @@ def rehearse[T](task: Callable[[], T], folder: Path, origin: Origin, pattern: st
 def _cause(status: int | None, cpu_s: int) -> str:
     """Why a child sent no message."""
     if status is None:
-        return f"waits for something since {STALLED_S} s"
+        return f"takes more than {PATIENCE * cpu_s:.0f} s"
     code = os.waitstatus_to_exitcode(status)
     if -code in (signal.SIGXCPU, signal.SIGKILL):
         return f"takes more than {cpu_s} s of processor time"
@@ -130,35 +130,18 @@ def _confine(memory: int, cpu_s: int) -> None:
     if (torch := sys.modules.get("torch")) is not None:
         torch.set_num_threads(1)  # the threads of a pool are not copied by a fork
     taken = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    limits = {
-        resource.RLIMIT_AS: taken + memory,
-        resource.RLIMIT_CPU: cpu_s,
-        resource.RLIMIT_CORE: 0,
-    }
+    limits = {resource.RLIMIT_AS: taken + memory, resource.RLIMIT_CPU: cpu_s, resource.RLIMIT_CORE: 0}
     for kind, limit in limits.items():
         hard = resource.getrlimit(kind)[1]
         limit = limit if hard == resource.RLIM_INFINITY else min(limit, hard)
         resource.setrlimit(kind, (limit, limit))
 
 
-def _wait(child: int, reader: int) -> tuple[bytes, int | None]:
-    """The child's message, and how it ended; None if it stalls."""
-    ticks, since, message = -1, time.monotonic(), b""
-    while True:
-        ready, _, _ = select.select([reader], [], [], 1.0)
-        if ready and (part := os.read(reader, select.PIPE_BUF)):
-            message += part
-            continue
-        if ready:  # it has closed its end
+def _wait(child: int, reader: int, seconds: float) -> tuple[bytes, int | None]:
+    """The child's message, and how it ended; None if it takes longer."""
+    deadline, message = time.monotonic() + seconds, b""
+    while select.select([reader], [], [], max(0.0, deadline - time.monotonic()))[0]:
+        if not (part := os.read(reader, select.PIPE_BUF)):  # it has closed its end
             return message, os.waitpid(child, 0)[1]
-        now = _ticks(child)
-        if now != ticks:
-            ticks, since = now, time.monotonic()
-        elif time.monotonic() - since > STALLED_S:
-            return message, None
-
-
-def _ticks(child: int) -> int:
-    """Processor time of a process, in the system's units; its name, which is in brackets, may have spaces."""
-    fields = Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()
-    return int(fields[11]) + int(fields[12])
+        message += part
+    return message, None

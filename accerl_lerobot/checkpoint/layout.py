@@ -144,9 +144,9 @@ def entry(content: Path | bytes) -> dict[str, int | str]:
     return {"size": content.stat().st_size, "sha256": digest(content)}
 
 
-def manifest_text(files: dict[str, dict[str, int | str]], **more: Any) -> str:
+def manifest_text(files: dict[str, dict[str, int | str]]) -> str:
     """A manifest of files, by name."""
-    return json.dumps({"format": FORMAT, **more, "files": dict(sorted(files.items()))}, indent=2) + "\n"
+    return json.dumps({"format": FORMAT, "files": dict(sorted(files.items()))}, indent=2) + "\n"
 
 
 def write_manifest(directory: Path) -> None:
@@ -157,28 +157,27 @@ def write_manifest(directory: Path) -> None:
     write_atomically(directory / MANIFEST, manifest_text(entries))
 
 
-def read_manifest(directory: Path, name: str = MANIFEST) -> dict[str, Any]:
+def read_manifest(directory: Path) -> dict[str, Any]:
     """The content of a manifest, not checked any further."""
-    return read_json(directory / name, Origin("config_path", str(directory)), MANIFEST_MOST)
+    return read_json(directory / MANIFEST, Origin("config_path", str(directory)), MANIFEST_MOST)
 
 
-def defect(directory: Path, name: str = MANIFEST, expected_format: int = FORMAT) -> str | None:
-    """The first difference between a folder and its manifest; None if every byte is as it was written."""
-    origin = Origin("config_path", str(directory))
-    if not (directory / name).is_file():
-        return f"it has no {name}"
+def defect(directory: Path) -> str | None:
+    """The first difference between a checkpoint and its manifest; None if every byte is as it was written."""
+    if not (directory / MANIFEST).is_file():
+        return f"it has no {MANIFEST}"
     try:
-        manifest = read_manifest(directory, name)
-        if manifest["format"] != expected_format:
-            return f"its format is {manifest['format']}, and this accerl reads {expected_format}"
+        manifest = read_manifest(directory)
+        if manifest["format"] != FORMAT:
+            return f"its format is {manifest['format']}, and this accerl reads {FORMAT}"
         files = {str(file): (int(v["size"]), str(v["sha256"])) for file, v in manifest["files"].items()}
     except (InputError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
-        return f"its {name} is broken ({' '.join(str(error).split())[-80:]})"
+        return f"its {MANIFEST} is broken ({' '.join(str(error).split())[-80:]})"
     for file, (size, sha256) in files.items():
         try:
-            path = safe_join(directory, file, origin)
+            path = safe_join(directory, file, Origin("config_path", str(directory)))
         except InputError:
-            return f"its {name} names {file!r}, outside of it"
+            return f"its {MANIFEST} names {file!r}, outside of it"
         if not path.is_file():
             return f"{file} is missing"
         if path.stat().st_size != size:

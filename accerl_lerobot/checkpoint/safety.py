@@ -193,20 +193,6 @@ def check_not_pickled(folder: Path, weights: str, origin: Origin) -> None:
     raise origin.refuse(weights, "is missing; give a folder with the weights as safetensors")
 
 
-def check_remote_code(trust: bool, revision: str | None, section: str, name: str = "code_revision") -> None:
-    """Refuses code from the Hub unless it is asked for and one commit of it is named."""
-    if trust and revision is None:
-        remedy = "name the commit whose code you have read, 40 hexadecimal digits: it is run with your rights"
-        raise InputError(f"{section}.{name}", revision, remedy)
-    if revision is not None and not REVISION.fullmatch(revision):
-        remedy = "name a commit, 40 hexadecimal digits: branches and tags can be moved to other code"
-        raise InputError(f"{section}.{name}", revision, remedy)
-    if revision is not None and not trust:
-        raise InputError(
-            f"{section}.{name}", revision, f"add {section}.trust_remote_code=true, or leave it out"
-        )
-
-
 def brief(error: BaseException) -> str:
     """An error's words on one line, not more than a line's worth."""
     text = " ".join(str(error).split()) or type(error).__name__

@@ -27,7 +27,7 @@ VERBS = {
     "push": "push a policy, world model, dataset or run to the Hub, as one commit",
     "pull": "pull from the Hub into a new folder, pinned and checked",
     "report": "write one HTML page about a run, or several side by side",
-    "timeline": "show when every worker of a run did what: a picture, a trace and shares",
+    "timeline": "show when every worker of a run did what: a picture and shares",
     "export": "write the episodes of a run as a LeRobotDataset, with an image at every env step",
     "doctor": "resolve a recipe and check this machine",
     "bench": "measure this machine: accerl bench world, policy, throughput or latency",

@@ -15,10 +15,9 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from accerl_lerobot.checkpoint.safety import MIB, brief
 from accerl_lerobot.engine import sizes
@@ -54,8 +53,7 @@ print("drawn", frame.std() > 1, round(1000 * (time.perf_counter() - started), 1)
 """
 
 
-@dataclass(frozen=True)
-class Check:
+class Check(NamedTuple):
     """One result."""
 
     name: str
@@ -101,20 +99,17 @@ def packages() -> Check:
         wanted = [Requirement(text) for text in importlib.metadata.requires("accerl-lerobot") or []]
     except importlib.metadata.PackageNotFoundError:
         return Check("packages", FAIL, "accerl-lerobot is not installed: run make setup")
-    missing, differing = [], []
-    for requirement in wanted:
-        needed = requirement.marker is None or requirement.marker.evaluate({"extra": ""})
+    status, wrong = OK, []
+    for requirement in (r for r in wanted if r.marker is None or r.marker.evaluate({"extra": ""})):
         try:
             installed = importlib.metadata.version(requirement.name)
+            if not requirement.specifier.contains(installed, prereleases=True):
+                wrong.append(f"{requirement.name} {installed}, not {requirement.specifier}")
         except importlib.metadata.PackageNotFoundError:
-            missing += [requirement.name] if needed else []
-            continue
-        if needed and not requirement.specifier.contains(installed, prereleases=True):
-            differing.append(f"{requirement.name} {installed}, not {requirement.specifier}")
-    if missing:
-        return Check("packages", FAIL, f"not installed: {', '.join(missing)}; run make setup")
-    if differing:
-        return Check("packages", WARN, f"{'; '.join(differing)}: not tested; run make setup")
+            status = FAIL
+            wrong.append(f"{requirement.name} missing")
+    if wrong:
+        return Check("packages", status if status == FAIL else WARN, f"{'; '.join(wrong)}: run make setup")
     text = f"all within their ranges, lerobot {importlib.metadata.version('lerobot')} among them"
     return Check("packages", OK, text)
 

@@ -12,23 +12,24 @@ from __future__ import annotations
 
 import json
 from contextlib import closing
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from accerl_lerobot.checkpoint.layout import CONFIG
 from accerl_lerobot.checkpoint.safety import Origin, check_folder
-from accerl_lerobot.config.parsing import DISCOVER, decode, drop_consents, read_recipe
-from accerl_lerobot.config.ranges import DatasetName, NewFolder, Range, Section
+from accerl_lerobot.config.parsing import parse, read_arguments
+from accerl_lerobot.config.ranges import DatasetName, NewFolder, Section, Seed
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos import record
 from accerl_lerobot.engine.config import RunConfig
-from accerl_lerobot.envs import make_world
-from accerl_lerobot.envs.base import EnvConfig, World
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.envs import EnvConfig, MetaWorldConfig, make_world
+from accerl_lerobot.errors import InputError, expanded
 from accerl_lerobot.replay.journal import EPISODES, Done, read_journal, whole_episodes
+from accerl_lerobot.rollout.runner import RolloutConfig
 
 SIDECAR = Path("meta") / "accerl_rollouts.json"
 """File of the dataset: its origin, and how many episodes it has."""
@@ -40,7 +41,7 @@ TOLERANCE = 1e-4
 
 @dataclass(frozen=True, kw_only=True)
 class ExportConfig(Section):
-    """Fields of ``accerl export``."""
+    """Fields of ``accerl export``; `env`, `rollout` and `seed` are the run's own."""
 
     path: str | None = None
     """Folder of an ``accerl train`` run."""
@@ -50,17 +51,24 @@ class ExportConfig(Section):
     """Name of the dataset, ``owner/name``."""
     pick: Literal["all", "successes", "failures"] = "all"
     """Episodes by their outcome."""
-    processes: Annotated[int, Range("[1, 64]")] = 2
-    """Simulator processes; does not change the content."""
-    hub_path: str | None = None
-    """``owner/name@COMMIT`` whose code is run with your rights, if the run's environment is on the Hub."""
-    discover_packages_path: str | None = field(default=None, metadata={"registers": True})
-    """Package to import that registers the run's environment, if a package does."""
+    seed: Seed = 0
+    """Noted in the dataset."""
+    env: EnvConfig = field(default_factory=MetaWorldConfig)
+    rollout: RolloutConfig = field(default_factory=RolloutConfig)
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.path is None:
-            raise InputError("path", None, "name the folder of an accerl train run")
+
+def export_config(arguments: list[str]) -> ExportConfig:
+    """A command line on top of the config of the run that it names."""
+    path = read_arguments(arguments)[1].get("path")
+    if path is None:
+        raise InputError("path", None, "name the folder of an accerl train run")
+    run = expanded(str(path), "path")
+    check_folder(run, Origin("path", str(run)))
+    if not (run / CONFIG).is_file():
+        raise InputError("path", str(run), f"no run in it: there is no {CONFIG}")
+    recipe = [f"--config_path={run / CONFIG}"]
+    config: ExportConfig = parse(ExportConfig, recipe + arguments, recipe_class=RunConfig)
+    return config
 
 
 def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
@@ -70,10 +78,6 @@ def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
         ``episodes``, ``frames``, ``successes``, and ``unlike``, those that differed and were left out.
     """
     run, root = Path(str(config.path)).expanduser(), record.check_free(config.root)
-    check_folder(run, Origin("path", str(run)))
-    if not (run / CONFIG).is_file():
-        raise InputError("path", str(run), f"no run in it: there is no {CONFIG}")
-    settings = _settings(run, config)
     wanted, picks_all = config.pick == "successes", config.pick == "all"
     episodes = whole_episodes(read_journal(run / EPISODES))
     chosen = [parts for parts in episodes if picks_all or parts[-1].success is wanted]
@@ -81,109 +85,48 @@ def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
         remedy = f"no whole episode in its {EPISODES} of those asked for ({config.pick})"
         raise InputError("path", str(run), remedy)
     with record.appearing(root) as partial:
-        tally = _write(settings, config, chosen, partial, console)
+        tally = _write(config, chosen, partial, console)
         if not tally["episodes"]:
             remedy = "none of its episodes could be repeated: this environment is not deterministic"
             raise InputError("path", str(run), remedy)
-        about = {"export": asdict(config) | {"path": run.name}, "seed": settings.seed, **tally}
+        about = {"export": {"path": run.name, "pick": config.pick}, "seed": config.seed, **tally}
         (partial / SIDECAR).write_text(json.dumps(about, indent=2) + "\n")
     return tally
 
 
-def _settings(run: Path, config: ExportConfig) -> RunConfig:
-    """The run's config, in which nothing but what `config` names lets code run."""
-    tree = read_recipe(run / CONFIG)
-    dropped, hub_path, package = drop_consents(tree), config.hub_path, config.discover_packages_path
-    for name, given, asked in (
-        ("hub_path", hub_path, dropped.get("env.kwargs.hub_path")),
-        (DISCOVER, package, dropped.get(f"env.{DISCOVER}")),
-    ):
-        if asked is not None and given is None:
-            remedy = f"the run's environment is code of {asked}, which would run with your rights"
-            raise InputError(name, None, f"{remedy}: if you trust it, name that here")
-    for section in ("policy", "algorithm"):  # neither is needed, and either may be of another package
-        tree.pop(section, None)
-    env = tree["env"] = dict(tree.get("env") or {})
-    if package is not None:
-        env[DISCOVER] = package
-    if hub_path is not None:
-        env |= {"trust_remote_code": True, "kwargs": dict(env.get("kwargs") or {}) | {"hub_path": hub_path}}
-    settings: RunConfig = decode(RunConfig, tree)
-    return settings
-
-
-def _write(
-    settings: RunConfig, config: ExportConfig, chosen: list[list[Done]], root: Path, console: Console
-) -> dict[str, int]:
-    with closing(make_world(settings.env)) as world:
+def _write(config: ExportConfig, chosen: list[list[Done]], root: Path, console: Console) -> dict[str, int]:
+    with closing(make_world(config.env)) as world:
         spec = world.spec
     tally = {"episodes": 0, "frames": 0, "successes": 0, "unlike": 0}
     version = {VERSION: {"dtype": "int64", "shape": (1,), "names": None}}
-    table = record.features(spec, settings.env.state_size) | version
-    cost = settings.rollout.decision_cost
+    replay = partial(_replay, config.rollout.decision_cost)
     with (
         console.stage("replaying episodes", total=len(chosen)) as stage,
-        record.simulators(config.processes, _start, settings.env, cost) as pool,
+        record.simulated(config.env, replay, chosen) as repeated,
+        record.new_dataset(root, config.repo_id, spec, config.env, version) as dataset,
     ):
-        repeated = record.in_order(pool, _replay, chosen, ahead=2 * config.processes)
-        with record.new_dataset(root, config.repo_id, spec.fps, settings.env.type, table) as dataset:
-            for number, (episode, parts) in enumerate(zip(repeated, chosen, strict=True), start=1):
-                stage.update(number, f"{tally['successes']} successes")
-                if episode is None:
-                    tally["unlike"] += 1
-                    continue
-                versions = np.concatenate([np.repeat(part.versions, part.steps) for part in parts])
-                for frame, policy in zip(record.frames(episode), versions, strict=True):
-                    dataset.add_frame(frame | {VERSION: np.array([policy], np.int64)})
-                dataset.save_episode()
-                tally["episodes"] += 1
-                tally["frames"] += len(episode)
-                tally["successes"] += episode.success
+        for number, (episode, parts) in enumerate(zip(repeated, chosen, strict=True), start=1):
+            stage.update(number, f"{tally['successes']} successes")
+            if episode is None:
+                tally["unlike"] += 1
+                continue
+            versions = np.concatenate([np.repeat(part.versions, part.steps) for part in parts])
+            record.save_episode(dataset, episode, tally, {VERSION: versions[:, None].astype(np.int64)})
     if tally["unlike"]:
         console.say(f"{tally['unlike']} of {len(chosen)} episodes differed from the run and are left out")
     return tally
 
 
-_world: World
-_cost: float
-
-
-def _start(env: EnvConfig, cost: float) -> None:
-    """Initialises a process with one environment for all its episodes."""
-    global _world, _cost
-    _world, _cost = make_world(env), cost
-
-
-def _replay(parts: list[Done]) -> record.Episode | None:
+def _replay(cost: float, parts: list[Done]) -> record.Episode | None:
     """An episode with an observation at every step; None if it differs from the journal."""
-    origin = parts[0].origin
-    observation = _world.reset(origin.seed, origin.task)
-    seen, rewards, success_at, done = [], [], -1, False
-    actions = np.concatenate([part.actions for part in parts])
-    for i, action in enumerate(actions):
-        if done:
-            return None
-        seen.append(observation)
-        result = _world.step_chunk(action[None])
-        rewards.append(result.rewards[0])
-        observation, done = result.observation, result.done
-        if result.success and success_at < 0:
-            success_at = i
-    if not _matches(parts, np.array(rewards), success_at >= 0):
-        return None
-    return record.Episode(
-        observations={key: np.stack([row[key] for row in seen]) for key in seen[0] if key != "task"},
-        actions=actions,
-        rewards=np.asarray(rewards, np.float32),
-        task=str(seen[0]["task"]),
-        done=done,
-        success_at=success_at,
-        seed=origin.seed,
-    )
+    actions, origin = np.concatenate([part.actions for part in parts]), parts[0].origin
+    episode = record.played(record.this_world(), origin.task, origin.seed, actions)
+    same = len(episode) == len(actions) and episode.success == parts[-1].success
+    return episode if same and _rewards_match(parts, episode.rewards, cost) else None
 
 
-def _matches(parts: list[Done], rewards: np.ndarray, success: bool) -> bool:
+def _rewards_match(parts: list[Done], rewards: np.ndarray, cost: float) -> bool:
     steps = np.concatenate([part.steps for part in parts])
-    brought = np.add.reduceat(rewards, np.concatenate([[0], np.cumsum(steps)[:-1]])) - _cost
+    brought = np.add.reduceat(rewards, np.concatenate([[0], np.cumsum(steps)[:-1]])) - cost
     expected = np.concatenate([part.rewards for part in parts])
-    return success == parts[-1].success and bool(np.allclose(brought, expected, rtol=0, atol=TOLERANCE))
+    return bool(np.allclose(brought, expected, rtol=0, atol=TOLERANCE))

@@ -24,7 +24,7 @@ from accerl_lerobot.bench.policy import BenchPolicyConfig
 from accerl_lerobot.bench.throughput import BenchThroughputConfig
 from accerl_lerobot.bench.world import BenchWorldConfig
 from accerl_lerobot.checkpoint.layout import CONFIG
-from accerl_lerobot.cli.export import ExportConfig
+from accerl_lerobot.cli.export import ExportConfig, export_config, export_episodes
 from accerl_lerobot.config.parsing import read_arguments
 from accerl_lerobot.config.ranges import Device, NewFolder, Section, Seed
 from accerl_lerobot.console import Console
@@ -66,8 +66,6 @@ class NewFolderRun(Section):
     """Folder to create. None: ``outputs/<date>/<time>_<job_name>``."""
     job_name: str
     """Last part of the folder's name."""
-    device: Device = "auto"
-    """cpu, cuda, or auto."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,6 +73,8 @@ class SFTRun(NewFolderRun):
     """``accerl sft``: LeRobot's own trainer on a LeRobotDataset."""
 
     job_name: str = "sft"
+    device: Device = "auto"
+    """cpu, cuda, or auto."""
     env: EnvConfig | None = None
     """When given, the dataset is checked against it first."""
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
@@ -82,17 +82,13 @@ class SFTRun(NewFolderRun):
 
 
 @dataclass(frozen=True, kw_only=True)
-class OfflineRun(Section):
+class OfflineRun(NewFolderRun):
     """``accerl offline``: a LeRobot checkpoint learns from a LeRobotDataset whose episodes are labelled.
 
     Each of ``trainer.updates`` is one gradient step on 64 decisions.
     """
 
-    seed: Seed = 0
-    output_dir: str | None = None
-    """Folder to create. None: ``outputs/<date>/<time>_<job_name>``."""
     job_name: str = "offline"
-    """Last part of the folder's name."""
     policy: PolicyConfig = field(default_factory=PolicyConfig)
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     """Successes and failures, told apart by ``next.success``, or by ``next.reward``."""
@@ -136,6 +132,8 @@ class WorldModelRun(NewFolderRun):
     """``accerl world-model``: a world model, and a success model, from one or two LeRobotDatasets."""
 
     job_name: str = "world_model"
+    device: Device = "auto"
+    """cpu, cuda, or auto."""
     env: EnvConfig = field(default_factory=MetaWorldConfig)
     """Environment to model: its cameras, sizes, rate and tasks."""
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
@@ -151,6 +149,8 @@ class WorldModelEvalRun(NewFolderRun):
     """``accerl world-model-eval``: a saved world model on one or two LeRobotDatasets."""
 
     job_name: str = "world_model_eval"
+    device: Device = "auto"
+    """cpu, cuda, or auto."""
     path: str | None = None
     """The folder named world_model that ``accerl world-model`` wrote."""
     discover_packages_path: str | None = None
@@ -236,19 +236,26 @@ def sft(arguments: list[str]) -> int:
 def offline(arguments: list[str]) -> int:
     """``accerl offline``."""
     config: OfflineRun = parse(OfflineRun, arguments, recipe_class=RunConfig)
-    from accerl_lerobot.engine import run
     from accerl_lerobot.engine.offline import learn_offline
 
-    directory, console = run.make_output_dir(config), Console()
+    summary = _in_new_folder(config, lambda *place: learn_offline(config, *place))[0]
+    return _told(summary)
+
+
+def _in_new_folder[Result](
+    config: Any, work: Callable[[Path, Console], Result]
+) -> tuple[Result, Path, Console]:
+    """Does work in the folder that a config names, which goes if the input turns out to be bad."""
+    from accerl_lerobot.engine.run import discard_unused, make_output_dir
+
+    directory, console = make_output_dir(config), Console()
     console.say(f"run {directory}")
     try:
         with redirect_stdout(sys.stderr), kept_traceback(directory):
-            summary = learn_offline(config, directory, console)
+            return work(directory, console), directory, console
     except InputError:
-        run.discard_unused(directory)
+        discard_unused(directory)
         raise
-    sys.stdout.write(json.dumps(summary, indent=2) + "\n")
-    return 0
 
 
 def evaluate(arguments: list[str]) -> int:
@@ -296,19 +303,13 @@ def _validated(
     """Does the work in a new folder and shows the validation that it ends with."""
     if config.dataset.repo_id is None:
         raise InputError("dataset.repo_id", None, NO_DATASET)
-    from accerl_lerobot.engine.run import discard_unused, make_output_dir
     from accerl_lerobot.world_model.validation import checks_table
 
-    directory = make_output_dir(config)
-    (directory / CONFIG).write_text(yaml.safe_dump(encode(config), sort_keys=False))
-    console = Console()
-    console.say(f"run {directory}")
-    try:
-        with redirect_stdout(sys.stderr), kept_traceback(directory):
-            found = work(directory, console)
-    except InputError:
-        discard_unused(directory)
-        raise
+    def noted(directory: Path, console: Console) -> dict[str, Any]:
+        (directory / CONFIG).write_text(yaml.safe_dump(encode(config), sort_keys=False))
+        return work(directory, console)
+
+    found, directory, console = _in_new_folder(config, noted)
     (directory / "validation.json").write_text(json.dumps(found, indent=2) + "\n")
     console.rich.print(checks_table(found))
     console.say(f"{'passed' if found['passed'] else 'FAILED'}; see {directory / 'preview.mp4'}")
@@ -334,10 +335,7 @@ def pull(arguments: list[str]) -> int:
 
     with redirect_stdout(sys.stderr):
         found = from_hub(config)
-    console = Console()
-    console.say(f"{found['kind']} {found['path']} is {found['commit']}, {found['checked']} files checked")
-    for name, fields in found.get("dropped", {}).items():
-        console.say(f"dropped from {name}, as it would let code run: {', '.join(fields)}")
+    Console().say(f"{found['kind']} {found['path']} is {found['commit']}, {found['files']} files")
     return _told(found)
 
 
@@ -358,12 +356,9 @@ def timeline(arguments: list[str]) -> int:
 
 def export(arguments: list[str]) -> int:
     """``accerl export``."""
-    config: ExportConfig = parse(ExportConfig, arguments)
-    from accerl_lerobot.cli.export import export_episodes
-
-    console = Console()
+    config = export_config(arguments)
     with redirect_stdout(sys.stderr):
-        found = export_episodes(config, console)
+        found = export_episodes(config, Console())
     return _told(found)
 
 

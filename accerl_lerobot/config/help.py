@@ -9,7 +9,6 @@ import inspect
 import sys
 import textwrap
 import typing
-from collections.abc import Collection, Mapping
 from typing import Any, NamedTuple
 
 import yaml
@@ -110,59 +109,31 @@ def docstrings(cls: type[Any]) -> dict[str, str]:
     return found
 
 
-def _listed(
-    cls: type[Any], prefix: str = "", usual: Any = None, shared: Collection[Line] = (), all_types: bool = True
-) -> list[Line]:
+def _listed(cls: type[Any], prefix: str = "", usual: Any = None, all_types: bool = True) -> list[Line]:
     """Fields of a config and of its sections, with the defaults of `usual`, which is one of it, or its own.
 
-    Args:
-        shared: fields that are listed already.
-        all_types: False: where there is a choice, the default alone, and the choice as a field.
+    Of a choice, all types, or, with `all_types` off, the default one and the choice itself as a field.
     """
-    hints, fields, sections = hints_of(cls), list[Line](), list[Line]()
+    hints, texts, fields, sections = hints_of(cls), docstrings(cls), list[Line](), list[Line]()
     for field in dataclasses.fields(cls):
-        name, section, default = (
-            f"{prefix}{field.name}",
-            section_of(hints[field.name]),
-            _default(field, usual),
-        )
+        hint, name = hints[field.name], f"{prefix}{field.name}"
+        section, default = section_of(hint), _default(field, usual)
         if section is None:
-            line = Line(name, _shown(default), docstrings(cls)[field.name], range_in_words(hints[field.name]))
-            fields += [] if line in shared else [line]
+            fields.append(Line(name, _shown(default), texts[field.name], range_in_words(hint)))
         elif not (choices := choices_of(section)):
             note = "" if default is not None else " (off unless given)"
             sections.append(Line(name, None, f"{name}{note}: {_summary(section)}"))
-            sections += _listed(section, f"{name}.", default, (), all_types)
+            sections += _listed(section, f"{name}.", default)
         elif all_types:
-            sections += _types(choices, name, default)
+            for kind, subclass in choices.items():
+                own = default if getattr(default, TYPE, None) == kind else None
+                note = "" if own is None else " (default)"
+                sections.append(Line(name, None, f"{name}.{TYPE}={kind}{note}: {_summary(subclass)}"))
+                sections += _listed(subclass, f"{name}.", own)
         elif default is not None:
             sections.append(Line(f"{name}.{TYPE}", getattr(default, TYPE), "", " | ".join(choices)))
-            sections += _listed(type(default), f"{name}.", default, (), all_types)
+            sections += _listed(type(default), f"{name}.", default, all_types=False)
     return fields + sections
-
-
-def _types(choices: Mapping[str, type[Any]], name: str, default: Any) -> list[Line]:
-    """Fields of the types of a choice: what they have in common, then each."""
-    usual = {kind: default if getattr(default, TYPE, None) == kind else None for kind in choices}
-    owners: dict[Line, list[str]] = {}
-    for kind, subclass in choices.items():
-        for line in _listed(subclass, f"{name}.", usual[kind]):
-            if "." not in line.name.removeprefix(f"{name}."):
-                owners.setdefault(line, []).append(kind)
-    common: dict[tuple[str, ...], list[Line]] = {}
-    for line, kinds in owners.items():
-        if len(kinds) > 1 and line.default is not None:
-            common.setdefault(tuple(kinds), []).append(line)
-    listed: list[Line] = []
-    for alike, lines in common.items():
-        title = f"{name}.{TYPE}={' | '.join(alike)}: Fields that these have in common."
-        listed += [Line(name, None, title), *lines]
-    for kind, subclass in choices.items():
-        note = "" if usual[kind] is None else " (default)"
-        listed.append(Line(name, None, f"{name}.{TYPE}={kind}{note}: {_summary(subclass)}"))
-        shared = [line for alike, lines in common.items() if kind in alike for line in lines]
-        listed += _listed(subclass, f"{name}.", usual[kind], shared)
-    return listed
 
 
 def _in_full(listed: list[Line]) -> list[str]:

@@ -57,36 +57,13 @@ RECIPES = "recipes"
 TYPE = "type"
 """The key that picks one config of several, as in ``env.type``."""
 LONGEST_KEY = 80
-LEROBOT = {
-    "steps": "use trainer.updates or sft.steps",
-    "batch_size": "use trainer.batch_decisions or sft.batch_size",
-    "num_workers": "use rollout.workers or sft.num_workers",
-    "save_freq": "use save_every_updates or save_every_s",
-    "eval_freq": "use evaluation.every_updates",
-    "eval.n_episodes": "use evaluation.episodes",
-    "eval.batch_size": "use rollout.worlds and rollout.workers",
-    "rename_map": "use policy.rename_map",
-    "optimizer.lr": "use trainer.lr or sft.lr",
-    "optimizer.betas": "use trainer.betas",
-    "optimizer.grad_clip_norm": "use trainer.grad_clip",
-    "policy.type": "use policy.path (a checkpoint) or sft.policy.type (a new policy)",
-    "policy.pretrained_path": "use policy.path",
-    "policy.use_amp": "use policy.precision=bf16",
-    "policy.use_peft": "use policy.tuning.mode=lora",
-    "policy.push_to_hub": "leave it out, and use accerl push --path=RUN --repo_id=USER/NAME afterwards",
-    "policy.repo_id": "leave it out, and use accerl push --path=RUN --repo_id=USER/NAME afterwards",
-}
-"""LeRobot's names of what has another name here → what to do."""
 REGISTERS = "registers"
 """In a field's metadata: the package that it names registers types of the section that the field is in."""
-CONSENT = frozenset(
-    {
-        "trust_remote_code", "code_revision", "hub_path", "discover_packages_path", "extra_args", "address",
-    }
-)  # fmt: skip
+CONSENT = {"trust_remote_code", "hub_path", DISCOVER, "extra_args", "address"}
 """Names of the fields that let somebody's code run with the user's rights: from the Hub, from a package, by
 further arguments of ``lerobot-train``, or from a Ray cluster, which exchanges pickles with the run. Only the
 command line can set them. A recipe may have come with the very code that it would allow."""
+UNSET: tuple[Any, ...] = (None, False, "", [], {})
 
 
 def parse(config_class: type[Any], arguments: list[str], *, recipe_class: type[Any] | None = None) -> Any:
@@ -114,41 +91,27 @@ def parse(config_class: type[Any], arguments: list[str], *, recipe_class: type[A
     return decode(config_class, merged)
 
 
-def drop_consents(tree: dict[str, Any]) -> dict[str, Any]:
-    """Removes from a tree what `consents` finds in it; returns that."""
-    found = consents(tree, drop=True)
-    launch = tree.get("launch")
-    if "launch.address" in found and isinstance(launch, dict) and "placement" in launch:
-        found["launch.placement"] = launch.pop("placement")  # of the nodes of that cluster
-    return found
-
-
-def consents(tree: Any, given: Any = None, *, drop: bool = False) -> dict[str, Any]:
+def consents(tree: Any, given: Any = None) -> dict[str, Any]:
     """Dotted field → value, of the fields in `CONSENT` that a tree, read from a file, sets at any depth.
 
-    Fields that the command line sets as well, in `given`, are left out. `drop` removes them from `tree`.
+    Fields that the command line sets as well, in `given`, are left out.
     """
-    found: dict[str, Any] = {}
+    asked = {name for name, *_ in _leaves(given)}
+    return {
+        name: value
+        for name, key, value in _leaves(tree)
+        if str(key).rpartition(".")[2] in CONSENT and value not in UNSET and name not in asked
+    }
 
-    def look(below: Any, given: Any, path: tuple[str, ...]) -> None:
-        if below is given:
-            return
-        given = given if isinstance(given, dict) else {}
-        if isinstance(below, list):
-            for number, entry in enumerate(below):
-                look(entry, None, (*path, str(number)))
-        elif isinstance(below, dict):
-            for key, value in list(below.items()):
-                here = (*path, str(key))
-                if str(key).rpartition(".")[2] not in CONSENT:
-                    look(value, given.get(key), here)
-                elif value not in (None, False, "", [], {}) and key not in given:
-                    found[".".join(here)] = value
-                    if drop:
-                        del below[key]
 
-    look(tree, given, ())
-    return found
+def _leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Dotted name, key and value of everything in a tree that is not looked into."""
+    entries = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
+    for key, value in entries:
+        if isinstance(value, (dict, list)) and str(key).rpartition(".")[2] not in CONSENT:
+            yield from _leaves(value, f"{path}{key}.")
+        else:
+            yield f"{path}{key}", key, value
 
 
 def decode(config_class: type[Any], tree: dict[str, Any]) -> Any:
@@ -461,12 +424,6 @@ def _unknown(key: str, value: Any, path: tuple[str, ...], names: list[str], whol
     """The error for a field that a config does not have: what it resembles, or where it belongs."""
     if len(key) > LONGEST_KEY:
         return InputError(key[:LONGEST_KEY], value, "no such field")
-    dotted, leaf = ".".join((*path, key)), value
-    while dotted not in LEROBOT and isinstance(leaf, dict) and len(leaf) == 1:
-        ((below, leaf),) = leaf.items()
-        dotted += f".{below}"
-    if dotted in LEROBOT:
-        return InputError(dotted, leaf, f"the name is LeRobot's; {LEROBOT[dotted]}")
     here = ".".join((*path, key))
     near = [".".join((*path, name)) for name in difflib.get_close_matches(key, names, n=3)]
     near += [name for name in dotted_fields(whole) if name.rpartition(".")[2] == key and name != here]

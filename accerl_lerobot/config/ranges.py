@@ -75,6 +75,7 @@ Threads = Annotated[int, Range("[1, 1024]")]
 NewFolder = Annotated[str, Pattern(r"(?s).+", "the name of a folder to create")]
 DatasetName = Annotated[str, Pattern(r"[^/]+/[^/]+", "the form owner/name")]
 Repeats = Annotated[int, Range("[1, 100000]")]
+Commit = Annotated[str, Pattern(r"[0-9a-f]{40}", "the 40 hexadecimal digits of a commit")]
 
 
 LONGEST_TEXT = 4096

@@ -3,7 +3,7 @@
 
 Same arguments, same result, but that a new policy of images reads no ``observation.environment_state``, which
 a real robot does not have. π0-FAST's action tokeniser, whose newest code LeRobot would fetch and run, is
-read by `policies.vla` instead. ``--code_revision=COMMIT`` has code from the Hub run, of this commit only.
+read by `policies.vla` instead. ``--trust_remote_code=COMMIT`` has code from the Hub run, of this commit only.
 ``--policy.discover_packages_path`` goes with ``--policy.path`` too, where LeRobot 0.6.1 takes it for a field
 of the policy's config.
 """
@@ -21,7 +21,7 @@ from torch.utils.data import Dataset
 from accerl_lerobot.checkpoint.safety import Origin
 from accerl_lerobot.config.parsing import DISCOVER, discover
 from accerl_lerobot.demos.dataset_files import checked
-from accerl_lerobot.demos.sft import CODE_REVISION, REFUSED
+from accerl_lerobot.demos.sft import REFUSED, TRUST
 from accerl_lerobot.experience import ENVIRONMENT_STATE
 from accerl_lerobot.policies.guard import guarded, input_error
 
@@ -83,11 +83,11 @@ def main() -> None:
     def given(prefix: str) -> str | None:
         return next((a.removeprefix(prefix) for a in sys.argv[1:] if a.startswith(prefix)), None)
 
-    code, root, name = given(CODE_REVISION), given("--dataset.root="), given("--dataset.repo_id=")
+    code, root, name = given(TRUST), given("--dataset.root="), given("--dataset.repo_id=")
     origin = Origin("dataset.repo_id", name) if root is None else Origin("dataset.root", root)
     lerobot_train.make_train_eval_datasets = _adapted(lerobot_train.make_train_eval_datasets)
     discover(given(PACKAGE), "policy")
-    sys.argv[1:] = [a for a in sys.argv[1:] if not a.startswith((CODE_REVISION, PACKAGE))]
+    sys.argv[1:] = [a for a in sys.argv[1:] if not a.startswith((TRUST, PACKAGE))]
     try:
         with contextlib.ExitStack() as guards:
             guards.enter_context(guarded("sft", code))

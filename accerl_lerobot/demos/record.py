@@ -10,18 +10,20 @@ from __future__ import annotations
 import collections
 import concurrent.futures
 import importlib.metadata
+import itertools
 import json
 import logging
 import math
 import multiprocessing
+import os
 import shutil
 import signal
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from functools import partial
 from importlib.util import find_spec
-from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -37,7 +39,7 @@ from accerl_lerobot.envs.base import EnvConfig, World, WorldSpec
 from accerl_lerobot.envs.metaworld import MetaWorld, expert_name, import_mujoco
 from accerl_lerobot.envs.simulated import SimulatedWorld
 from accerl_lerobot.errors import InputError, check_absent, expanded
-from accerl_lerobot.experience import ENVIRONMENT_STATE, REWARD, SUCCESS, Observation
+from accerl_lerobot.experience import ENVIRONMENT_STATE, REWARD, SUCCESS
 from accerl_lerobot.seeds import demo_seed
 
 REPO_ID = "accerl/demos"
@@ -92,39 +94,23 @@ def make_expert(config: EnvConfig, world: World, task: str) -> Expert:
     return expert
 
 
-def play(
-    world: World, expert: Expert, *, task: str, seed: int, noise: float, push: float, fail: bool
-) -> Episode:
-    """Plays one episode to its end; equal arguments give equal episodes.
-
-    With `fail`, actions are a random drift from a random early step on; for the others see `DemosConfig`.
-    """
-    rng = np.random.default_rng((seed, 1))
-    low, high = world.spec.action_low, world.spec.action_high
-    pushed = _push(world.spec.action_dim, push, seed)
-    drift_from = int(rng.integers(0, _DRIFT_FROM)) if fail else world.spec.max_steps
-    drift: np.ndarray = np.zeros(world.spec.action_dim)
+def played(world: World, task: str, seed: int, actions: Iterable[np.ndarray]) -> Episode:
+    """Plays actions, float32 (A,), until they or the episode end; each is asked for when it is its turn."""
     observation, done, success_at = world.reset(seed, task), False, -1
-    seen: list[Observation] = []
-    actions: list[np.ndarray] = []
-    rewards: list[float] = []
-    while not done:
-        if len(actions) < drift_from:
-            wanted = np.clip(np.asarray(expert(), np.float64), low, high) + pushed
-        else:
-            drift = _DRIFT_MEMORY * drift + _DRIFT_SCALE * rng.standard_normal(len(drift))
-            wanted = np.clip(drift, low, high)
-        action = np.clip(wanted + noise * rng.standard_normal(len(wanted)), low, high).astype(np.float32)
+    seen, executed, rewards = [], [], []
+    for action in actions:
         result = world.step_chunk(action[None])
         seen.append(observation)
-        actions.append(action)
+        executed.append(action)
         rewards.append(result.rewards[0])
         if result.success and success_at < 0:
-            success_at = len(actions) - 1
+            success_at = len(executed) - 1
         observation, done = result.observation, result.done
+        if done:
+            break
     return Episode(
         observations={key: np.stack([row[key] for row in seen]) for key in seen[0] if key != "task"},
-        actions=np.stack(actions),
+        actions=np.stack(executed),
         rewards=np.asarray(rewards, np.float32),
         task=str(seen[0]["task"]),
         done=done,
@@ -133,12 +119,26 @@ def play(
     )
 
 
-def _push(size: int, longest: float, seed: int) -> np.ndarray:
-    """In any direction, and of any length up to the longest."""
-    rng = np.random.default_rng((seed, 2))
-    direction = rng.standard_normal(size)
-    pushed: np.ndarray = longest * rng.random() * direction / np.linalg.norm(direction)
-    return pushed
+def disturbed(
+    expert: Expert, spec: WorldSpec, seed: int, *, noise: float, push: float, fail: bool
+) -> Iterator[np.ndarray]:
+    """Actions of an expert, without end; equal arguments give equal ones.
+
+    With `fail`, actions are a random drift from a random early step on; for the others see `DemosConfig`.
+    """
+    rng, push_rng = np.random.default_rng((seed, 1)), np.random.default_rng((seed, 2))
+    low, high = spec.action_low, spec.action_high
+    direction = push_rng.standard_normal(spec.action_dim)
+    pushed = push * push_rng.random() * direction / np.linalg.norm(direction)
+    drift_from = int(rng.integers(0, _DRIFT_FROM)) if fail else spec.max_steps
+    drift: np.ndarray = np.zeros(spec.action_dim)
+    for step in itertools.count():
+        if step < drift_from:
+            wanted = np.clip(np.asarray(expert(), np.float64), low, high) + pushed
+        else:
+            drift = _DRIFT_MEMORY * drift + _DRIFT_SCALE * rng.standard_normal(len(drift))
+            wanted = np.clip(drift, low, high)
+        yield np.clip(wanted + noise * rng.standard_normal(len(wanted)), low, high).astype(np.float32)
 
 
 def metaworld_expert(world: World, task: str) -> Expert:
@@ -202,40 +202,57 @@ def _ready(start: Callable[..., None], *arguments: Any) -> None:
     start(*arguments)
 
 
-def in_order[Item, Result](
-    pool: concurrent.futures.Executor, work: Callable[[Item], Result], items: Iterable[Item], ahead: int
-) -> Iterator[Result]:
-    """Results of `work`, in the order of `items`, with at most `ahead` finished ones waiting in memory.
+@contextmanager
+def simulated[Item, Result](
+    env_config: EnvConfig, work: Callable[[Item], Result], items: Sequence[Item]
+) -> Iterator[Iterator[Result]]:
+    """Results of `work`, in the order of `items`, from processes that have each a `this_world`.
 
-    The first are already under way when this returns.
+    The first are already under way when the context is entered; few finished ones wait in memory.
     """
-    left = iter(items)
-    waiting = collections.deque(pool.submit(work, item) for item in islice(left, ahead))
+    processes, left = min(os.cpu_count() or 1, len(items)), iter(items)
+    with simulators(processes, _open_world, env_config) as pool:
+        waiting = collections.deque(pool.submit(work, item) for item in itertools.islice(left, 2 * processes))
 
-    def results() -> Iterator[Result]:
-        while waiting:
-            result = waiting.popleft().result()
-            waiting.extend(pool.submit(work, item) for item in islice(left, 1))
-            yield result
+        def results() -> Iterator[Result]:
+            while waiting:
+                result = waiting.popleft().result()
+                waiting.extend(pool.submit(work, item) for item in itertools.islice(left, 1))
+                yield result
 
-    return results()
+        yield results()
+
+
+_world: World
+
+
+def _open_world(env_config: EnvConfig) -> None:
+    global _world
+    # The experts' gains are too high on purpose, and `disturbed` clips.
+    warnings.filterwarnings("ignore", message="Constant.s. may be too high", category=UserWarning)
+    _world = make_world(env_config)
+
+
+def this_world() -> World:
+    """The world that a process of `simulated` has for all its episodes."""
+    return _world
 
 
 @contextmanager
 def new_dataset(
-    root: Path, repo_id: str, fps: int, robot_type: str, features: dict[str, Any]
+    root: Path, repo_id: str, spec: WorldSpec, env_config: EnvConfig, more: Mapping[str, Any] | None = None
 ) -> Iterator[Any]:
-    """A LeRobotDataset to be filled; complete when the context has been left."""
+    """A LeRobotDataset to be filled, with `more` features; complete when the context has been left."""
     from datasets.utils.logging import disable_progress_bar
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     disable_progress_bar()  # one per episode would bury ours
     dataset = LeRobotDataset.create(
         repo_id,
-        fps=fps,
-        features=features,
+        fps=spec.fps,
+        features=features(spec, env_config.state_size) | dict(more or {}),
         root=root,
-        robot_type=robot_type,
+        robot_type=env_config.type,
         use_videos=False,
         video_backend="pyav",  # unused, but the default probes for FFmpeg and complains at length
     )
@@ -263,8 +280,6 @@ class DemosConfig(Section, section="demos"):
     push, other episodes that fail are tried again with another seed."""
     shifted: bool = False
     """Apply ``env.shift`` to the demonstrations too; otherwise they show the world without it."""
-    processes: Annotated[int, Range("[1, 64]")] = 2
-    """Simulator processes; does not change the content."""
 
 
 def record_demos(env_config: EnvConfig, config: DemosConfig, root: str, seed: int = 0) -> Path:
@@ -287,7 +302,7 @@ def record_demos(env_config: EnvConfig, config: DemosConfig, root: str, seed: in
         tally = _write(env_config, config, spec, partial, seed)
         sidecar = {
             "env": draccus.encode(env_config, EnvConfig),
-            "demos": {k: v for k, v in draccus.encode(config).items() if k != "processes"} | {"seed": seed},
+            "demos": asdict(config) | {"seed": seed},
             **tally,
             "versions": {k: importlib.metadata.version(v) for k, v in _VERSIONS.items() if find_spec(k)},
         }
@@ -298,27 +313,40 @@ def record_demos(env_config: EnvConfig, config: DemosConfig, root: str, seed: in
 
 def _write(
     env_config: EnvConfig, config: DemosConfig, spec: WorldSpec, root: Path, seed: int
-) -> dict[str, Any]:
+) -> dict[str, int]:
     tally = {"episodes": 0, "frames": 0, "successes": 0, "discarded": 0}
+    record = partial(_record_one, env_config, config, seed)
     with (
-        simulators(config.processes, _start, env_config, config, seed) as pool,
+        simulated(env_config, record, range(config.episodes)) as episodes,
         Progress(transient=True) as progress,
+        new_dataset(root, REPO_ID, spec, env_config) as dataset,
     ):
-        # The first episodes are already being simulated while LeRobot is imported.
-        episodes = in_order(pool, _record_one, range(config.episodes), ahead=2 * config.processes)
-        table = features(spec, env_config.state_size)
-        with new_dataset(root, REPO_ID, spec.fps, env_config.type, table) as dataset:
-            bar = progress.add_task("recording", total=config.episodes)
-            for episode, discarded in episodes:
-                for frame in frames(episode):
-                    dataset.add_frame(frame)
-                dataset.save_episode()
-                tally["episodes"] += 1
-                tally["frames"] += len(episode)
-                tally["successes"] += episode.success
-                tally["discarded"] += discarded
-                progress.advance(bar)
+        bar = progress.add_task("recording", total=config.episodes)
+        for episode, discarded in episodes:
+            save_episode(dataset, episode, tally)
+            tally["discarded"] += discarded
+            progress.advance(bar)
     return tally
+
+
+def save_episode(
+    dataset: Any, episode: Episode, tally: dict[str, int], more: Mapping[str, np.ndarray] | None = None
+) -> None:
+    """Adds an episode, with `more` features (T, 1), to a dataset and to a count."""
+    for t in range(len(episode)):
+        frame = {
+            **{key: rows[t] for key, rows in (episode.observations | dict(more or {})).items()},
+            "action": episode.actions[t],
+            REWARD: episode.rewards[t : t + 1],
+            "next.done": np.array([episode.done and t == len(episode) - 1]),
+            SUCCESS: np.array([episode.success and t >= episode.success_at]),
+            "task": episode.task,
+        }
+        dataset.add_frame(frame)
+    dataset.save_episode()
+    tally["episodes"] += 1
+    tally["frames"] += len(episode)
+    tally["successes"] += episode.success
 
 
 def features(spec: WorldSpec, environment_state: int) -> dict[str, dict[str, Any]]:
@@ -341,54 +369,21 @@ def features(spec: WorldSpec, environment_state: int) -> dict[str, dict[str, Any
     return table
 
 
-def frames(episode: Episode) -> Iterator[dict[str, Any]]:
-    """The rows of `episode` as ``LeRobotDataset.add_frame`` takes them."""
-    for t in range(len(episode)):
-        yield {
-            **{key: rows[t] for key, rows in episode.observations.items()},
-            "action": episode.actions[t],
-            REWARD: episode.rewards[t : t + 1],
-            "next.done": np.array([episode.done and t == len(episode) - 1]),
-            SUCCESS: np.array([episode.success and t >= episode.success_at]),
-            "task": episode.task,
-        }
-
-
-_world: World
-_env_config: EnvConfig
-_config: DemosConfig
-_seed: int
-
-
-def _start(env_config: EnvConfig, config: DemosConfig, seed: int) -> None:
-    """Makes a worker process ready: one world for all its episodes."""
-    global _world, _env_config, _config, _seed
-    # The experts' gains are too high on purpose, and `play` clips.
-    warnings.filterwarnings("ignore", message="Constant.s. may be too high", category=UserWarning)
-    _world, _env_config, _config, _seed = make_world(env_config), env_config, config, seed
-
-
-def _record_one(slot: int) -> tuple[Episode, int]:
+def _record_one(env_config: EnvConfig, config: DemosConfig, seed: int, slot: int) -> tuple[Episode, int]:
     """The episode at place `slot` of the dataset, and how many tries were thrown away for it."""
-    tasks = _world.spec.tasks
+    world = this_world()
+    tasks, share = world.spec.tasks, config.failure_share
     task, rank = tasks[slot % len(tasks)], slot // len(tasks)
-    share = _config.failure_share
     fail = math.floor((rank + 1) * share) > math.floor(rank * share)
     for attempt in range(_MAX_TRIES):
-        episode = play(
-            _world,
-            make_expert(_env_config, _world, task),
-            task=task,
-            seed=demo_seed(_seed, slot + attempt * _MAX_EPISODES),
-            noise=_config.action_noise,
-            push=_config.push,
-            fail=fail,
-        )
-        if episode.success != fail or (_config.push and not fail):
+        own, expert = demo_seed(seed, slot + attempt * _MAX_EPISODES), make_expert(env_config, world, task)
+        actions = disturbed(expert, world.spec, own, noise=config.action_noise, push=config.push, fail=fail)
+        episode = played(world, task, own, actions)
+        if episode.success != fail or (config.push and not fail):
             return episode, attempt
     raise InputError(
         "demos.failure_share" if fail else "demos.action_noise",
-        share if fail else _config.action_noise,
+        share if fail else config.action_noise,
         f"{_MAX_TRIES} tries of {task} in a row did not {'fail' if fail else 'succeed'}; "
         "lower it, or allow more env steps (env.max_steps)",
     )

@@ -22,8 +22,8 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from accerl_lerobot.checkpoint.layout import CHECKPOINTS, LAST, PRETRAINED, displaced, relocate
-from accerl_lerobot.checkpoint.safety import Origin, check_remote_code, read_json
-from accerl_lerobot.config.ranges import DatasetConfig, LearningRate, Range, Section, Steps, Threads
+from accerl_lerobot.checkpoint.safety import Origin, read_json
+from accerl_lerobot.config.ranges import Commit, DatasetConfig, LearningRate, Range, Section, Steps, Threads
 from accerl_lerobot.demos.backbone import BackboneConfig, write_backbone
 from accerl_lerobot.errors import InputError, check_absent
 from accerl_lerobot.experience import SUCCESS
@@ -31,14 +31,15 @@ from accerl_lerobot.policies.config import discovery, register_policies
 
 logger = logging.getLogger(__name__)
 
-CODE_REVISION = "--code_revision="
+TRUST = "--trust_remote_code="
 HELD_OUT = re.compile(r"\bstep (\d+): eval_loss=(\S+)")
 """LeRobot's report of a loss on held-out episodes."""
+PROGRESS = re.compile(r"\bstep:(\d+\.?\d*)([KM]?) .*\bloss:(nan|inf|\d+\.?\d*)\b")
 CANDIDATES = 10
 """Checkpoints of which the best on held-out episodes is used."""
 REFUSED = "accerl refuses: "
 """Begins the last line of a trainer that met something it must not use; JSON follows."""
-LOG_EVERY = 25
+LOG_EVERY, WARMUP_STEPS = 25, 20
 NO_SFT = {"gaussian_actor": "only LeRobot's SAC trains it, lerobot-train does not; use act"}
 """LeRobot policy types that ``lerobot-train`` cannot fine-tune → why, and what to do."""
 
@@ -53,16 +54,11 @@ class SFTConfig(Section, section="sft"):
     """Frames per step."""
     lr: LearningRate = 1e-3
     """Peak learning rate; LeRobot's preset warms up and decays it over `steps`, if the policy type's does."""
-    warmup_steps: Steps = 20
-    """Without effect on a policy type whose preset has no warm-up, such as act."""
     pick: Literal["all", "successes", "failures"] = "all"
     """Episodes that are imitated, by their ``next.success``; the others stay in the dataset."""
     held_out: Annotated[float, Range("[0, 1)")] = 0.0
     """Share of each task's episodes that is not trained on: the checkpoint, one of ten, that predicts these
     actions best is used; 0: all are trained on, and the last checkpoint is used."""
-    num_workers: Annotated[int, Range("[0, 256]")] = 0
-    """Data-loading processes; 0 loads in the trainer, which is best for datasets that fit into memory, see
-    `guarded_train`."""
     num_threads: Threads = 2
     """CPU threads of the trainer."""
     init_path: str | None = None
@@ -71,19 +67,17 @@ class SFTConfig(Section, section="sft"):
     """Fields of LeRobot's own policy config for a new policy, ``type`` among them."""
     backbone: BackboneConfig | None = None
     """Write a random backbone of this size for the new policy instead of loading one from the Hub."""
-    trust_remote_code: bool = False
-    """True if Python code from a Hub repository that the policy names is run with your rights. It needs
-    `code_revision`. π0-FAST does without: its action tokeniser is read, not run."""
-    code_revision: str | None = None
-    """Commit of that repository, 40 hexadecimal digits: the one whose code you have read. No other is run."""
+    trust_remote_code: Commit | None = None
+    """Commit of the Hub repository that the policy names:
+    its Python code, which you have read, runs with your rights, and no other does."""
     extra_args: list[str] = field(default_factory=list)
-    """Further ``lerobot-train`` arguments, e.g. ``--dataset.image_transforms.enable=true``."""
+    """Further ``lerobot-train`` arguments, which count more than ours, such as ``--num_workers=4``,
+    ``--dataset.image_transforms.enable=true`` or ``--policy.scheduler_warmup_steps=500``."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.init_path is None and "type" not in self.policy:
             raise InputError("sft.policy", self.policy, "name LeRobot's policy type, e.g. {type: smolvla}")
-        check_remote_code(self.trust_remote_code, self.code_revision, "sft")
 
 
 def sft_command(
@@ -108,14 +102,14 @@ def sft_command(
     policy |= {"device": device, "push_to_hub": False}
     preset = {
         "optimizer_lr": config.lr,
-        "scheduler_warmup_steps": config.warmup_steps,
+        "scheduler_warmup_steps": WARMUP_STEPS,
         "scheduler_decay_steps": config.steps,
     }
     policy |= {name: value for name, value in preset.items() if name in known}
     if config.init_path is not None and "pretrained_backbone_weights" in known:
         policy["pretrained_backbone_weights"] = None  # the checkpoint's replace them; spares their download
     command = [sys.executable, "-m", "accerl_lerobot.demos.guarded_train"]
-    command += [f"{CODE_REVISION}{config.code_revision}"] if config.code_revision else []
+    command += [f"{TRUST}{config.trust_remote_code}"] if config.trust_remote_code else []
     command += [f"--policy.{key}={_as_argument(value)}" for key, value in policy.items()]
     command += discovery(kind)
     named = {"repo_id": dataset.repo_id, "root": dataset.root, "revision": dataset.revision}
@@ -129,7 +123,7 @@ def sft_command(
         f"--output_dir={output_dir}",
         f"--steps={config.steps}",
         f"--batch_size={config.batch_size}",
-        f"--num_workers={config.num_workers}",
+        "--num_workers=0",  # best where the dataset fits into memory, see `guarded_train`
         f"--seed={seed}",
         f"--save_freq={every}",
         f"--log_freq={LOG_EVERY}",
@@ -271,13 +265,7 @@ def _as_argument(value: Any) -> str:
 
 def _parse_progress(line: str) -> tuple[int, float] | None:
     """LeRobot logs lines such as ``step:50 smpl:3K ep:40 epch:1.2 loss:0.512 grdn:… lr:…``."""
-    fields = dict(part.split(":", 1) for part in line.split() if part.count(":") == 1)
-    if "step" not in fields or "loss" not in fields:
+    if (found := PROGRESS.search(line)) is None:
         return None
-    try:
-        step = fields["step"]
-        scale = {"K": 1_000, "M": 1_000_000}.get(step[-1:], 1)
-        number = float(step if scale == 1 else step[:-1]) * scale
-        return int(number), float(fields["loss"])
-    except ValueError:
-        return None
+    scale = {"": 1, "K": 1_000, "M": 1_000_000}[found[2]]
+    return int(float(found[1]) * scale), float(found[3])

@@ -17,7 +17,7 @@ from typing import Any
 
 from accerl_lerobot.checkpoint import layout
 from accerl_lerobot.checkpoint.safety import Origin, check_folder, check_number, read_json
-from accerl_lerobot.config.parsing import CONSENT, read_recipe
+from accerl_lerobot.config.parsing import read_recipe
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import RunConfig, decode, encode
 from accerl_lerobot.engine.stopping import StoppedError, Stopping, WorkerError, pause_s
@@ -72,8 +72,6 @@ def resumed_run(path: Path | None, config: RunConfig) -> tuple[Path, str]:
     check_folder(directory, origin)
     before = decode(type(config), read_recipe(directory / layout.CONFIG))
     for name, (was, now) in _differences(encode(before), encode(config), "").items():
-        if not was and name.rpartition(".")[2] in CONSENT:
-            continue  # a pull has dropped it, and the command line allows it anew
         if not any(name == free or name.startswith(f"{free}.") for free in CHANGEABLE):
             remedy = f"the run was begun with {was!r}; leave it so, or begin a new run with --policy.path"
             raise InputError(name, now, remedy)

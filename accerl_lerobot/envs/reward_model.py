@@ -17,8 +17,8 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from accerl_lerobot.checkpoint.safety import Origin, brief, check_remote_code, read_json, tensor_shapes
-from accerl_lerobot.config.ranges import Range, Section
+from accerl_lerobot.checkpoint.safety import Origin, brief, read_json, tensor_shapes
+from accerl_lerobot.config.ranges import Commit, Range, Section
 from accerl_lerobot.envs.base import ChunkResult, World
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK, Observation
@@ -37,15 +37,9 @@ class RewardModelConfig(Section, section=REWARD_MODEL):
     """Hub revision."""
     threshold: Annotated[float, Range("(0, 1)")] = 0.5
     """Probability of success, or reward, above which an observation counts as a success."""
-    trust_remote_code: bool = False
-    """True if Python code that comes with the model's encoder on the Hub is run with your rights. It needs
-    `code_revision`."""
-    code_revision: str | None = None
-    """Commit of that code, 40 hexadecimal digits: the one that you have read. No other is run."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_remote_code(self.trust_remote_code, self.code_revision, REWARD_MODEL)
+    trust_remote_code: Commit | None = None
+    """Commit of the Hub repository that the model's encoder is from:
+    its Python code, which you have read, runs with your rights, and no other does."""
 
 
 @functools.lru_cache(maxsize=1)
@@ -82,7 +76,7 @@ def load_judge(config: RewardModelConfig) -> Callable[[Observation], bool]:
     check_processor(folder, names[0], origin, fetched=fetched)
     register_third_party_plugins()
     try:
-        with guarded(REWARD_MODEL, config.code_revision), contextlib.redirect_stdout(sys.stderr):
+        with guarded(REWARD_MODEL, config.trust_remote_code), contextlib.redirect_stdout(sys.stderr):
             theirs = LeRobotConfig.from_pretrained(folder)
             if theirs.observation_delta_indices is not None:
                 remedy = (

@@ -10,33 +10,28 @@ from __future__ import annotations
 
 import contextlib
 import re
-import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from huggingface_hub import DatasetCard, EvalResult, ModelCard, ModelCardData
+from huggingface_hub import DatasetCard, ModelCard, ModelCardData
 
 from accerl_lerobot.checkpoint import safety
 from accerl_lerobot.checkpoint.layout import AWAY, BACKBONE, CHECKPOINTS, PREPROCESSOR, PRETRAINED, SUMMARY
 from accerl_lerobot.checkpoint.layout import CONFIG as RECIPE
-from accerl_lerobot.config.parsing import DISCOVER, read_recipe
+from accerl_lerobot.config.parsing import read_recipe
 from accerl_lerobot.config.ranges import NewFolder, Pattern, Section
 from accerl_lerobot.console import number
 from accerl_lerobot.envs.base import lerobot_eval_arguments
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import discovery
-from accerl_lerobot.world_model.config import PIXELS
 
 POLICY, WORLD_MODEL, SUCCESS_MODEL = "policy", "world model", "success model"
 DATASET, RUN = "dataset", "run"
 
 CONFIG, WEIGHTS, POSTPROCESSOR = "config.json", "model.safetensors", "policy_postprocessor.json"
 INFO, CARD = "meta/info.json", "README.md"
-MANIFEST, MANIFEST_FORMAT = "accerl_manifest.json", 1
-"""File that a push adds: sizes and SHA-256 of the others but the card, which people edit on the Hub. It
-guards against accidents; whoever may write to the repository may write another manifest as well."""
 RECORD = "accerl_pulled.json"
 """File that a pull adds: the commit that the others are from."""
 LAST = f"checkpoints/last/{PRETRAINED}"
@@ -78,11 +73,9 @@ class PullConfig(Section):
     """``accerl pull``: an artifact from the Hub into a new folder, complete and checked or not at all."""
 
     repo_id: RepoId = ""
-    """``user/name`` on the Hub."""
+    """``user/name`` on the Hub; a model goes before a dataset of the same name."""
     revision: Annotated[str, Pattern(r".+", "a commit, tag or branch")] | None = None
     """Commit, tag or branch, which is resolved to a commit and recorded. None: the branch main."""
-    repo_type: RepoType | None = None
-    """model or dataset. None: whichever of them has this name."""
     output_dir: NewFolder = ""
     """Folder to create."""
 
@@ -102,10 +95,6 @@ def recognise(folder: Path, field: str = "path") -> str:
     missing = [name for name in NEEDED[artifact] if not (folder / name).exists()]
     if missing:
         remedy = f"looks like a {artifact} but lacks {', '.join(missing)}; name a complete folder"
-        raise InputError(field, str(folder), remedy)
-    version = read_json(folder / INFO).get("codebase_version") if artifact == DATASET else CODEBASE_VERSION
-    if version != CODEBASE_VERSION:
-        remedy = f"a LeRobotDataset of version {version}; convert it to {CODEBASE_VERSION} with LeRobot"
         raise InputError(field, str(folder), remedy)
     return artifact
 
@@ -158,10 +147,6 @@ TITLES = {
     WORLD_MODEL: "A world model for LeRobot policies",
     SUCCESS_MODEL: "A success model, which is a LeRobot reward model",
 }
-NUMBERS = {
-    "env steps": "env_steps", "episodes": "episodes", "updates": "updates", "seed": "seed",
-    "algorithm": "algorithm", "lag, mean": "lag_mean", "seconds of RL": "rl_s",
-}  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -231,51 +216,43 @@ def _read_evaluation(path: Path, policy: Path) -> dict[str, Any]:
 
 def model_card(repo_id: str, artifact: str, folder: Path, files: Files, provenance: Provenance) -> str:
     """README.md of a model repository; pictures and videos among `files` are shown."""
-    recipe, summary, validation = provenance.recipe, provenance.summary, provenance.validation
-    config = read_json(folder / LAST / CONFIG if artifact == RUN else folder / CONFIG)
-    env = recipe.get("env") or {}
+    recipe, summary, local = provenance.recipe, provenance.summary, repo_id.split("/")[1]
+    home, place = (LAST, RECIPE) if artifact == RUN else ("", f"{FOLDER}/{RECIPE}")
+    config, env = read_json(folder / home / CONFIG), recipe.get("env") or {}
     tags = ["accerl-lerobot", artifact.replace(" ", "-"), config.get("type"), env.get("type")]
     if summary:
         tags += ["reinforcement-learning", (recipe.get("algorithm") or {}).get("type")]
     sections = [recipe.get(name) or {} for name in ("dataset", "online")]
     # Beside a folder the name is a label, and no dataset on the Hub.
     datasets = [s["repo_id"] for s in sections if s.get("repo_id") and not s.get("root")]
-    measurements, local = _measurements(provenance), repo_id.split("/")[1]
+    stock = lerobot_eval_arguments(env)
     data = ModelCardData(
         library_name="lerobot",
         pipeline_tag="robotics",
         tags=list(dict.fromkeys(str(tag) for tag in tags if tag)),
         datasets=datasets or None,
         base_model=_base_model(recipe),
-        model_name=local,
-        eval_results=_results(measurements, env.get("type", "simulation")) or None,
     )
-    policy = f"{local}/{LAST}" if artifact == RUN else local
-    shown = sorted(name for name in files if name.startswith(f"{FOLDER}/") or "/" not in name)
-    # With one of its own, LeRobot finds the backbone only once a pull has set its place.
-    has_backbone = str(config.get("vlm_model_name") or "").startswith(("/", BACKBONE))
-    own_recipe = files.get(RECIPE if artifact == RUN else f"{FOLDER}/{RECIPE}", b"")
+    own_recipe = files.get(place, b"")
     card = ModelCard.from_template(
         data,
         template_str=Path(__file__).with_name("card.md.jinja").read_text(),
         mark=MARK,
-        heading=local,
-        title=TITLES[artifact],
-        type=config.get("type"),
-        measurements=measurements,
-        numbers={name: _shown(summary[key]) for name, key in NUMBERS.items() if summary.get(key) is not None},
-        validation=validation,
-        checks={
-            name: (_shown(check.get("value")), check.get("holds"))
-            for name, check in (validation.get("checks") or {}).items()
-        },
-        pictures=[name for name in shown if name.endswith((".png", ".gif", ".svg", ".jpg"))],
-        videos=[name for name in shown if name.endswith(".mp4")],
-        commands=_commands(repo_id, artifact, config, recipe),
-        stock=_stock(policy, config, env) if artifact in (POLICY, RUN) else None,
-        from_hub=artifact == POLICY and not has_backbone,
-        is_success_model=artifact == SUCCESS_MODEL,
         repo_id=repo_id,
+        local=local,
+        artifact=artifact,
+        title=TITLES[artifact],
+        config=config,
+        measurements=_measurements(provenance),
+        summary=summary,
+        validation=provenance.validation,
+        number=number,
+        shown=sorted(name for name in files if name.startswith(f"{FOLDER}/") or "/" not in name),
+        policy=f"{local}/{home}".rstrip("/"),
+        recipe_path=f"{local}/{place}" if recipe else None,
+        stock=[*discovery(config.get("type")), *stock] if stock else None,
+        # With one of its own, LeRobot finds the backbone only once a pull has set its place.
+        has_backbone=str(config.get("vlm_model_name") or "").startswith(("/", BACKBONE)),
         recipe=own_recipe.decode() if isinstance(own_recipe, bytes) else "",
     )
     return f"{card}\n"
@@ -321,57 +298,3 @@ def _measurements(provenance: Provenance) -> list[tuple[str, str, dict[str, Any]
         rows += [(when, next(iter(tasks)) if len(tasks) == 1 else "all tasks", result)]
         rows += [(when, task, each) for task, each in tasks.items() if len(tasks) > 1]
     return rows
-
-
-def _results(rows: list[tuple[str, str, dict[str, Any]]], env: str) -> list[EvalResult]:
-    """Latest measurements for the Hub's model index."""
-    latest = rows[-1][0] if rows else "before RL"
-    return [
-        EvalResult(
-            task_type="robotics",
-            task_name="robotics",
-            dataset_type=env,
-            dataset_name=f"{env} {task}",
-            dataset_config=task,
-            metric_type="success_rate",
-            metric_name="success rate",
-            metric_value=round(result["success"], 4),
-            metric_args={"n": result["n"], "ci95": [round(v, 4) for v in result["ci95"]]},
-        )
-        for when, task, result in rows
-        if when == latest != "before RL"
-    ]
-
-
-def _commands(repo_id: str, artifact: str, config: dict[str, Any], recipe: dict[str, Any]) -> list[str]:
-    """Commands of accerl that use what is pulled."""
-    local = repo_id.split("/")[1]
-    commands = [f"accerl pull --repo_id={repo_id} --output_dir={local}"]
-    if artifact in (POLICY, RUN) and recipe:
-        policy = f"{local}/{LAST}" if artifact == RUN else local
-        path = f"{local}/{RECIPE}" if artifact == RUN else f"{local}/{FOLDER}/{RECIPE}"
-        options = f"--config_path={path} --policy.path={policy}"
-        commands += [
-            f"accerl eval {options} --evaluation.episodes=100",
-            f"accerl train {options} --sft.steps=0",
-        ]
-    if artifact == WORLD_MODEL:
-        command = f"accerl world-model-eval --path={local} --dataset.repo_id=USER/DATASET"
-        model = config.get("model")
-        if isinstance(model, dict) and model.get("type", PIXELS) != PIXELS:
-            package = (recipe.get("world_model") or {}).get(DISCOVER) or "PACKAGE"
-            command += f" --{DISCOVER}={shlex.quote(str(package))}"
-        commands.append(command)
-    return commands
-
-
-def _stock(policy: str, config: Mapping[str, Any], env: Mapping[str, Any]) -> str | None:
-    """The command of stock ``lerobot-eval``, where it has this environment."""
-    if not (arguments := lerobot_eval_arguments(env)):
-        return None
-    command = [f"lerobot-eval --policy.path={policy}", *discovery(config.get("type")), *arguments]
-    return " \\\n  ".join([*command, "--eval.n_episodes=50 --eval.batch_size=5"])
-
-
-def _shown(value: Any) -> str:
-    return value if isinstance(value, str) else number(value)

@@ -105,7 +105,7 @@ def _status(error: HfHubHTTPError, role: str) -> str:
             return f"it is not there, or private; {LOGIN} that may {role} it"
         if code == 401 and not isinstance(error, RepositoryNotFoundError):
             return f"the Hub does not accept the token; {LOGIN} that may {role}"
-        return "it is not there, or the token's account may not see it; mind the spelling and repo_type"
+        return "it is not there, or the token's account may not see it; mind the spelling"
     if code == 403:
         return f"the token may not {role} here; use one with the right to {role}, and a user/ it belongs to"
     if code in (409, 412):

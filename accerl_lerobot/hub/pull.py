@@ -13,11 +13,9 @@ import json
 import shutil
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
-from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-import yaml
 from huggingface_hub import HfApi, hf_hub_download
 from huggingface_hub.errors import RepositoryNotFoundError
 from huggingface_hub.hf_api import RepoFile
@@ -25,16 +23,14 @@ from huggingface_hub.hf_api import RepoFile
 from accerl_lerobot.checkpoint import layout
 from accerl_lerobot.checkpoint.layout import CHECKPOINTS, PRETRAINED, relocate
 from accerl_lerobot.checkpoint.safety import brief, unsafe_name
-from accerl_lerobot.config.parsing import drop_consents, read_recipe
 from accerl_lerobot.engine.resuming import LOCK
-from accerl_lerobot.errors import InputError, check_absent, expanded
+from accerl_lerobot.errors import InputError, check_absent, expanded, make_folder
 from accerl_lerobot.hub import card
 from accerl_lerobot.hub.errors import check_commit, hub_errors
 
 CACHE, ATTRIBUTES = ".cache", ".gitattributes"
 CODE = (".py", ".pyc", ".pyd", ".so")
 """Suffixes of files that Python imports: a recipe beside one could name it as ``discover_packages_path``."""
-FILES_MOST = 100_000
 THREADS = 8
 BROKEN = (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError)
 
@@ -52,9 +48,8 @@ def pull(config: card.PullConfig) -> dict[str, Any]:
         files = _checked(listed, repo_id)
         # Named after the commit, so that an interrupted pull resumes and no other one's files are in it.
         temporary = home.parent / f".pulling-{commit[:16]}-{home.name}"
-        _make_room(home, temporary, sum(file.size for file in files.values()))
+        make_folder(temporary, "output_dir", again=True)
         # `snapshot_download` would ask for the names again, and these have been checked.
-        temporary.mkdir(exist_ok=True)
         pool = ThreadPoolExecutor(THREADS)
         options = {"repo_type": repo_type, "revision": commit, "local_dir": temporary}
         try:
@@ -67,7 +62,8 @@ def pull(config: card.PullConfig) -> dict[str, Any]:
         (temporary / card.RECORD).write_text(json.dumps(record, indent=2) + "\n")
         temporary.rename(home)
     except OSError as error:
-        raise _not_writable(home, error) from error
+        why = f"cannot be made ({error.strerror}); choose another"
+        raise InputError("output_dir", str(home), why) from error
     except BROKEN as error:
         shutil.rmtree(temporary)  # resuming would not make it better
         if isinstance(error, InputError):
@@ -79,58 +75,30 @@ def pull(config: card.PullConfig) -> dict[str, Any]:
 
 def _resolve(api: HfApi, config: card.PullConfig) -> tuple[str, str]:
     """Repository type, and the commit that the revision resolves to now."""
-    repo_id, commits = config.repo_id, {}
     missing: Exception | None = None
-    for repo_type in card.REPO_TYPES if config.repo_type is None else (config.repo_type,):
+    for repo_type in card.REPO_TYPES:
         try:
-            commits[repo_type] = api.repo_info(repo_id, repo_type=repo_type).sha
+            info = api.repo_info(config.repo_id, repo_type=repo_type, revision=config.revision)
+            return repo_type, check_commit(info.sha)
         except RepositoryNotFoundError as error:
             missing = missing or error
-    if len(commits) > 1:
-        raise InputError("repo_type", None, f"{repo_id} is a model and a dataset; say which")
-    if missing is not None and not commits:
-        raise missing
-    ((repo_type, commit),) = commits.items()
-    if config.revision is not None:
-        commit = api.repo_info(repo_id, repo_type=repo_type, revision=config.revision).sha
-    return repo_type, check_commit(commit)
+    assert missing is not None
+    raise missing
 
 
 def _checked(listed: Iterable[Any], repo_id: str) -> dict[str, RepoFile]:
     """Files that a server lists, by name; one with which it could write elsewhere is refused."""
-    files = list(islice((item for item in listed if isinstance(item, RepoFile)), FILES_MOST + 1))
-    if len(files) > FILES_MOST:
-        raise InputError("repo_id", repo_id, f"it has more than {FILES_MOST} files; split it")
-    for file in files:
-        name, parts = file.path, PurePosixPath(file.path).parts if not unsafe_name(file.path) else ()
+    files = [item for item in listed if isinstance(item, RepoFile)]
+    for name in (file.path for file in files):
+        parts = PurePosixPath(name).parts if not unsafe_name(name) else ()
         if not parts or name != "/".join(parts) or parts[0] in (CACHE, ".git") or "." in parts:
             why = f"it has a file named {ascii(name)[:200]}, which is not safe to write"
-            raise InputError("repo_id", repo_id, why)
-        if type(file.size) is not int or file.size < 0:
-            why = f"{ascii(name)[:99]} is listed with size {str(file.size)[:40]}; use another server"
             raise InputError("repo_id", repo_id, why)
     return {file.path: file for file in files}
 
 
-def _make_room(home: Path, temporary: Path, size: int) -> None:
-    """Refuses what the disk cannot hold."""
-    try:
-        home.parent.mkdir(parents=True, exist_ok=True)
-        fetched = sum(path.stat().st_size for path in temporary.rglob("*") if path.is_file())
-        free = shutil.disk_usage(home.parent).free + fetched
-    except OSError as error:
-        raise _not_writable(home, error) from error
-    if size > free:
-        why = f"{size / 1e9:,.1f} GB are to be fetched, and {free / 1e9:,.1f} are free there"
-        raise InputError("output_dir", str(home), f"{why}; choose another")
-
-
-def _not_writable(home: Path, error: OSError) -> InputError:
-    return InputError("output_dir", str(home), f"cannot be made ({error.strerror}); choose another")
-
-
 def _receive(folder: Path, home: Path, files: dict[str, RepoFile], repo_id: str) -> dict[str, Any]:
-    """Checks what came and adapts it to `home`; returns its type and how much of it was checked."""
+    """Checks what came and adapts it to `home`; returns its type and what of it is not kept."""
 
     def refuse(why: str) -> InputError:
         return InputError("repo_id", repo_id, f"{why}; pull again, or push it anew")
@@ -143,19 +111,11 @@ def _receive(folder: Path, home: Path, files: dict[str, RepoFile], repo_id: str)
             raise refuse(f"{name} came with {size} bytes instead of the {file.size} that the server lists")
         if not _is_listed(folder / name, file):
             raise refuse(f"{name} is not what the server lists: its hash is another")
-    pushed: dict[str, Any] = {}
-    if (folder / card.MANIFEST).is_file():
-        if (why := layout.defect(folder, card.MANIFEST, card.MANIFEST_FORMAT)) is not None:
-            raise refuse(f"it is not what was pushed: {why}")
-        pushed = layout.read_manifest(folder, card.MANIFEST)
-        (folder / card.MANIFEST).unlink()  # paths are set below, and then it does not hold any more
     (folder / ATTRIBUTES).unlink(missing_ok=True)
     numbers = sorted(p.name for p in folder.glob(f"{CHECKPOINTS}/*") if p.is_dir())
     if numbers and layout.LAST not in numbers:  # a repository has no links
         (folder / CHECKPOINTS / layout.LAST).symlink_to(numbers[-1])
     artifact = card.recognise(folder, "repo_id")
-    if artifact != (kind := pushed.get("kind", artifact)):
-        raise refuse(f"its {card.MANIFEST} says {ascii(kind)[:80]}, but this is a {artifact}")
     checkpoints = [folder / CHECKPOINTS / number for number in numbers if artifact == card.RUN]
     own = [checkpoint for checkpoint in checkpoints if (checkpoint / layout.MANIFEST).is_file()]
     for checkpoint in own:
@@ -166,18 +126,13 @@ def _receive(folder: Path, home: Path, files: dict[str, RepoFile], repo_id: str)
         relocate(policy, home / policy.relative_to(folder))
     if artifact == card.RUN:
         (folder / LOCK).touch()  # marks a run that can be resumed
-    dropped = _drop_consents(folder)
     code = sorted(path for path in folder.rglob("*") if path.name.endswith(CODE) and path.is_file())
     left_out = [path.relative_to(folder).as_posix() for path in code]
     for path in code:
         path.unlink()
     for checkpoint in own:
         layout.write_manifest(checkpoint)
-    checked = pushed.get("files", {}).keys()
-    counts = {"files": len(files), "checked": len(checked)}
-    counts["unchecked"] = len(files.keys() - checked - {card.CARD, card.MANIFEST, ATTRIBUTES})
-    left = {"left_out": left_out, "dropped": dropped}
-    return {"kind": artifact} | counts | {name: value for name, value in left.items() if value}
+    return {"kind": artifact, "files": len(files)} | ({"left_out": left_out} if left_out else {})
 
 
 def _is_listed(path: Path, file: RepoFile) -> bool:
@@ -187,17 +142,3 @@ def _is_listed(path: Path, file: RepoFile) -> bool:
     git = hashlib.sha1(b"blob %d\0" % file.size, usedforsecurity=False)
     with path.open("rb") as opened:
         return hashlib.file_digest(opened, lambda: git).hexdigest() == file.blob_id
-
-
-def _drop_consents(folder: Path) -> dict[str, dict[str, Any]]:
-    """Removes from all configs of runs what would let code run; returns it, by file."""
-    dropped: dict[str, dict[str, Any]] = {}
-    for path in sorted(p for p in folder.rglob(card.RECIPE) if p.is_file() and not p.is_symlink()):
-        try:
-            tree = read_recipe(path)
-        except InputError:
-            continue  # `parse` refuses it as well
-        if found := drop_consents(tree):
-            path.write_text(yaml.safe_dump(tree, sort_keys=False))
-            dropped[path.relative_to(folder).as_posix()] = found
-    return dropped

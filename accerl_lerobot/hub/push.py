@@ -18,7 +18,7 @@ from typing import Any
 
 import yaml
 from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, get_token, hf_hub_download
-from huggingface_hub.errors import EntryNotFoundError, RepositoryNotFoundError
+from huggingface_hub.errors import RepositoryNotFoundError
 
 from accerl_lerobot.checkpoint import layout
 from accerl_lerobot.errors import InputError
@@ -28,8 +28,10 @@ from accerl_lerobot.hub.errors import LOGIN, check_commit, hub_errors
 logger = logging.getLogger(__name__)
 
 BRANCH = "main"
-NOT_CONTENTS = (card.CARD, card.MANIFEST, card.RECORD, ".gitattributes")
-RESULTS = (".yaml", ".json", ".jsonl", ".png", ".jpg", ".gif", ".svg", ".mp4", ".html")
+NOT_CONTENTS = (card.CARD, card.RECORD, ".gitattributes")
+PICTURES = (".png", ".jpg", ".gif", ".svg", ".mp4")
+"""Endings of files that a card may show, which somebody may have added on the Hub."""
+RESULTS = (".yaml", ".json", ".jsonl", ".html", *PICTURES)
 WEIGHTS = (".safetensors", ".bin", ".pt", ".pth")
 RECORDS = (".json", ".jsonl", ".yaml", ".yml", ".md", ".txt", ".log", ".csv", ".html")
 VOCABULARIES = ("tokenizer.json", "vocab.json", "merges.txt", "added_tokens.json", "special_tokens_map.json")
@@ -56,7 +58,7 @@ def push(config: card.PushConfig) -> dict[str, Any]:
 
 
 def stage(config: card.PushConfig, folder: Path, artifact: str) -> tuple[card.Files, bool]:
-    """All files to upload but the manifest, and True if the card among them is the user's own."""
+    """All files to upload, and True if the card among them is the user's own."""
     provenance = card.find_provenance(folder, artifact, config.evaluation)
     files = contents(folder, artifact, config.include)
     for name, path in provenance.files.items():
@@ -78,31 +80,25 @@ def _upload(config: card.PushConfig, artifact: str, files: card.Files, own_card:
     api, repo_id = HfApi(), config.repo_id
     where: dict[str, Any] = {"repo_id": repo_id, "repo_type": card.repo_type(artifact)}
     parent = _parent(api, config, artifact)
-
-    def read(name: str) -> bytes | None:
-        try:
-            return Path(hf_hub_download(filename=name, revision=parent, **where)).read_bytes()
-        except EntryNotFoundError:
-            return None
-
-    previous = _previous_files(read(card.MANIFEST), artifact, repo_id)
-    readme = read(card.CARD)
-    if not own_card and readme is not None and card.MARK.encode() not in readme and readme.strip():
-        logger.warning("the README.md on the Hub is left as it is, somebody wrote it")
-        files[card.CARD] = readme
-    entries = {name: layout.entry(content) for name, content in files.items() if name != card.CARD}
-    manifest = layout.manifest_text(entries, format=card.MANIFEST_FORMAT, kind=artifact)
-    files = files | {card.MANIFEST: manifest.encode()}
+    listed = set(api.list_repo_files(revision=parent, **where))
+    if card.CARD in listed and not own_card:
+        readme = Path(hf_hub_download(filename=card.CARD, revision=parent, **where)).read_bytes()
+        if card.MARK.encode() not in readme and readme.strip():
+            logger.warning("the README.md on the Hub is left as it is, somebody wrote it")
+            files[card.CARD] = readme
+    theirs = {name for name in listed if "/" in name or not name.endswith((*PICTURES, *NOT_CONTENTS))}
+    needed = [name for name in card.NEEDED[artifact] if name != card.LAST]
+    if theirs and not all(any(name.startswith(each) for name in theirs) for each in needed):
+        raise InputError("repo_id", repo_id, f"it holds no {artifact} but other files; choose another name")
     operations = [CommitOperationAdd(name, content) for name, content in files.items()]
-    gone = previous - files.keys()
-    gone &= set(api.list_repo_files(revision=parent, **where)) if gone else set()
-    operations += [CommitOperationDelete(name, is_folder=False) for name in sorted(gone)]
+    operations += [CommitOperationDelete(name, is_folder=False) for name in sorted(theirs - files.keys())]
     message = f"{artifact.capitalize()} pushed with accerl-lerobot"
     commit = api.create_commit(
         operations=operations, commit_message=message, revision=BRANCH, parent_commit=parent, **where
     ).oid
     if artifact == card.DATASET:
         _tag(api, where, commit)
+    sizes = (len(file) if isinstance(file, bytes) else file.stat().st_size for file in files.values())
     return {
         "kind": artifact,
         **where,
@@ -110,7 +106,7 @@ def _upload(config: card.PushConfig, artifact: str, files: card.Files, own_card:
         "unchanged": commit == parent,
         "private": bool(api.repo_info(**where).private),
         "files": len(files),
-        "bytes": sum(int(entry["size"]) for entry in entries.values()),
+        "bytes": sum(sizes),
         "url": f"{api.endpoint}/{'datasets/' if artifact == card.DATASET else ''}{repo_id}",
     }
 
@@ -131,22 +127,6 @@ def _parent(api: HfApi, config: card.PushConfig, artifact: str) -> str:
         remedy = "this repository is public: add --private=false, or choose another name"
         raise InputError("private", True, remedy)
     return check_commit(info.sha)
-
-
-def _previous_files(manifest: bytes | None, artifact: str, repo_id: str) -> set[str]:
-    """Files of the last push there, which must have been of the same type."""
-    if manifest is None:
-        return set()
-    try:
-        content = json.loads(manifest)
-        kind, files = content["kind"], set(content["files"])
-    except (ValueError, KeyError, TypeError, RecursionError):
-        logger.warning("the %s on the Hub is broken, and is replaced", card.MANIFEST)
-        return set()
-    if kind != artifact:
-        remedy = f"it holds a {kind}, and this is a {artifact}; choose another name"
-        raise InputError("repo_id", repo_id, remedy)
-    return files
 
 
 def _tag(api: HfApi, where: dict[str, Any], commit: str) -> None:

@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import draccus
 
-from accerl_lerobot.checkpoint.safety import check_remote_code
 from accerl_lerobot.config.parsing import imported
-from accerl_lerobot.config.ranges import Device, Range, Section
+from accerl_lerobot.config.ranges import Commit, Device, Range, Section
 from accerl_lerobot.errors import InputError
 
 if TYPE_CHECKING:
@@ -123,11 +122,9 @@ class PolicyConfig(Section, section="policy"):
     discover_packages_path: str | None = field(default=None, metadata={"registers": True})
     """Package to import that registers the checkpoint's policy type, where that is not one of ours and the
     package is not an installed ``lerobot_policy_*``."""
-    trust_remote_code: bool = False
-    """True if Python code from a Hub repository that the checkpoint names, such as a vision encoder's, is run
-    with your rights. It needs `code_revision`."""
-    code_revision: str | None = None
-    """Commit of that repository, 40 hexadecimal digits: the one whose code you have read. No other is run."""
+    trust_remote_code: Commit | None = None
+    """Commit of the Hub repository that the checkpoint names, such as a vision encoder's:
+    its Python code, which you have read, runs with your rights, and no other does."""
     device: Device = "auto"
     """cpu, cuda, or auto."""
     precision: Literal["fp32", "bf16"] = "fp32"
@@ -143,10 +140,6 @@ class PolicyConfig(Section, section="policy"):
     """Denoising steps; None keeps the checkpoint's. Written into what is saved."""
     n_action_steps: Annotated[int, Range("[1, 100000]")] | None = None
     """Rows of a chunk that are executed before the next decision; None keeps the checkpoint's."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_remote_code(self.trust_remote_code, self.code_revision, "policy")
 
 
 Load = Callable[[PolicyConfig], "PolicyAdapter"]

@@ -165,12 +165,12 @@ def _check_beside(folder: Path, origin: Origin) -> None:
 
 
 @contextlib.contextmanager
-def guarded(section: str, code_revision: str | None = None) -> Iterator[None]:
+def guarded(section: str, commit: str | None = None) -> Iterator[None]:
     """While it lasts, transformers runs no code that comes with a model, and PyTorch unpickles nothing.
 
     Args:
         section: ``policy`` or ``sft``, for the error.
-        code_revision: commit of the one Hub repository whose code may be run; None: none may.
+        commit: commit of the one Hub repository whose code may be run; None: none may.
     """
     from transformers import dynamic_module_utils as dynamic
 
@@ -178,16 +178,16 @@ def guarded(section: str, code_revision: str | None = None) -> Iterator[None]:
     timeout = dynamic.TIME_OUT_REMOTE_CODE
 
     def fetch_pinned(name: Any, *arguments: Any, **options: Any) -> Any:
-        pinned = {} if code_revision is None else {"revision": code_revision}
+        pinned = {} if commit is None else {"revision": commit}
         return fetch(name, *arguments, **options | pinned)
 
     def look_first(file: Any) -> Any:  # transformers does so before it copies code to where it is run
         snapshot = Path(file).parent
-        pinned = code_revision is not None and f"snapshots/{code_revision}/" in Path(file).as_posix()
+        pinned = commit is not None and f"snapshots/{commit}/" in Path(file).as_posix()
         if not pinned:
             remedy = (
                 "code that came with a model, which would run with your rights; read it, then name its "
-                f"commit: {section}.trust_remote_code=true and {section}.code_revision"
+                f"commit in {section}.trust_remote_code"
             )
             raise InputError(f"{section}.trust_remote_code", f"{snapshot.name}/{Path(file).name}", remedy)
         return look(file)

@@ -184,7 +184,7 @@ def load_adapter(config: PolicyConfig, *, rehearsal: bool = False) -> LeRobotAda
     model_class: type[Model] = imported(POLICIES[lerobot_config.type][0])
     with (
         _refusing(config, "its network cannot be built as its config.json says"),
-        guarded("policy", config.code_revision),
+        guarded("policy", config.trust_remote_code),
         model_class.loading(),
         Unfilled(),
     ):
@@ -201,7 +201,7 @@ def load_adapter(config: PolicyConfig, *, rehearsal: bool = False) -> LeRobotAda
     hint = "" if (folder / BACKBONE).is_dir() else hint
     with _refusing(config, "its LeRobot processors did not load", tokenizer_hint=hint):
         overrides |= _tokenizer_overrides(lerobot_config, folder)
-        with guarded("policy", config.code_revision), model.loading():
+        with guarded("policy", config.trust_remote_code), model.loading():
             pre, post = make_pre_post_processors(
                 lerobot_config, pretrained_path=str(folder), preprocessor_overrides=overrides
             )

@@ -8,7 +8,6 @@ text of a run that got past the escaping could do nothing. Free of torch.
 from __future__ import annotations
 
 import base64
-import contextlib
 import os
 import time
 from dataclasses import dataclass
@@ -17,14 +16,11 @@ from typing import ClassVar
 from urllib.parse import quote
 
 from accerl_lerobot import __version__
-from accerl_lerobot.checkpoint.safety import brief
 from accerl_lerobot.config.ranges import Section
 from accerl_lerobot.errors import InputError, check_output, expanded
 
 NAME = "report.html"
 VIDEO_MB = 20
-MARK = '<meta name="generator" content="accerl report'
-"""Tells a page of ours from any other file; within its first 1000 characters."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,8 +32,7 @@ class ReportConfig(Section):
     runs: tuple[str, ...] = ()
     """Folders of runs of ``accerl train``; several make a page that compares them. Bare ones are runs."""
     output: str | None = None
-    """The page. None: ``report.html`` in the run's folder, or here if there are several. An older page of
-    accerl is replaced; any other file is left alone."""
+    """The page. None: ``report.html`` in the run's folder, or here if there are several."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -59,16 +54,9 @@ def write_report(config: ReportConfig) -> Path:
         raise InputError("runs", ",".join(config.runs), "name each run once")
     if output is None:
         output = runs[0].path / NAME if len(runs) == 1 else Path(NAME)
-    check_output(output, _is_ours)
+    check_output(output)
     now = time.time()
-    try:
-        page = comparison_page(runs, now) if len(runs) > 1 else run_page(runs[0], now)
-    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        why = f"{type(error).__name__}: {brief(error)}"
-        remedy = f"results in it are damaged, or of another version ({why}); restore them, or remove them"
-        raise InputError("runs", ",".join(config.runs), remedy) from error
+    page = comparison_page(runs, now) if len(runs) > 1 else run_page(runs[0], now)
     folder = output.resolve().parent
     template = Environment(
         loader=PackageLoader("accerl_lerobot", "report"), autoescape=True, undefined=StrictUndefined,
@@ -83,17 +71,8 @@ def write_report(config: ReportConfig) -> Path:
         base64=lambda path: base64.b64encode(path.read_bytes()).decode(),
         address=lambda path: quote(os.path.relpath(path.resolve(), folder)),
     )
-    part = output.with_name(f".{output.name}.part")
     try:
-        part.write_text(html, encoding="utf-8")
-        os.replace(part, output)
+        output.write_text(html, encoding="utf-8")
     except OSError as error:
-        with contextlib.suppress(OSError):
-            part.unlink()
         raise InputError("output", str(output), f"cannot be written: {error.strerror}") from error
     return output
-
-
-def _is_ours(path: Path) -> bool:
-    with path.open(encoding="utf-8", errors="replace") as file:
-        return MARK in file.read(1000)

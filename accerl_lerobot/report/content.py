@@ -13,11 +13,13 @@ import numpy as np
 import yaml
 
 from accerl_lerobot.checkpoint.layout import SUMMARY
+from accerl_lerobot.config.parsing import decode
 from accerl_lerobot.console import count, duration, number, percent, rate
+from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.sizes import lag_limits
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.report.charts import COLOURS, Chart, Series, line, rates
-from accerl_lerobot.report.read import Record, Run, apart, column, differences, newest, resolved, unread
+from accerl_lerobot.report.read import Record, Run, apart, column, differences, newest
 from accerl_lerobot.timeline import STATES
 from accerl_lerobot.timeline.read import read_timeline
 
@@ -47,10 +49,7 @@ WARNINGS = {
 LATE = 20
 """Updates at the end over which `WORRIES` are looked at."""
 WORRIES: dict[str, tuple[Callable[[float], bool], str]] = {
-    "low_weight": (
-        lambda x: x > 0.3,
-        "Many samples hardly counted: too stale, or trainer.lr too high",
-    ),
+    "low_weight": (lambda x: x > 0.3, "Many samples hardly counted: too stale, or trainer.lr too high"),
     "explained_variance": (
         lambda x: x < -0.05,
         "The critic explained less of the returns than their mean does",
@@ -121,12 +120,13 @@ class Section:
 
 def run_page(run: Run, now: float) -> dict[str, Any]:
     """Values for the template: the page of one run, at `now`, in seconds since 1970."""
-    config, why = resolved(run.config)
-    bound = None if config is None else lag_limits(config)[0]
-    found = unread(run.config) if config is None else differences(config)
-    rows = [(name, shown(value), shown(default)) for name, value, default in found]
+    text, bound = "", None
+    try:
+        bound = lag_limits(decode(RunConfig, run.config))[0]
+    except InputError as error:  # another version, or a package of the user's, wrote it
+        text = f"This accerl does not know all of the recipe's types or fields: {error}."
+    rows = [(name, shown(value), shown(default)) for name, value, default in differences(run.config)]
     tables = [("Fields that differ from the defaults", ("field", "value", "default"), rows)] if rows else []
-    text = f"This accerl does not know all of the recipe's types or fields: {why}." if why else ""
     videos = [(path, FILM if path.stem == "before_after" else path.name) for path in run.videos]
     success, *others = _training_sections(run, bound)
     sections = [
@@ -188,8 +188,6 @@ def warnings(run: Run, bound: int | None, now: float) -> Iterator[str]:
         yield "There are no metrics: the run has not come to its first record."
     if run.truncated:
         yield "The last line of metrics.jsonl is incomplete and left out: the run was writing it, or crashed."
-    if run.sessions > 1:
-        yield f"The run was resumed {count(run.sessions - 1, 'time')}; updates made twice count once."
     for name, (thing, what) in WARNINGS.items():
         if n := int(newest(run.rollout, name) or 0):
             yield f"{count(n, thing)} {what}."
@@ -343,7 +341,7 @@ def _headline(run: Run) -> str:
     names = (run.result or {}).get("tasks") or sorted((last[0].get("tasks") if last else None) or ())
     names = names or [env.get("task") or env.get("name") or env.get("type")]
     tasks = str(names[0]) if len(names) == 1 else count(len(names), "task")
-    if run.result is None:
+    if run.result is None or not run.outcomes:
         share = newest(run.rollout, "success_exploring")
         so_far = "" if share is None else f", with {percent(share)} success while exploring"
         of = run.section("trainer").get("updates")

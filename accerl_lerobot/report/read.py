@@ -9,9 +9,8 @@ Also the differences of a run's recipe from the defaults and from other runs.
 
 from __future__ import annotations
 
-import dataclasses
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,16 +19,13 @@ import numpy as np
 
 from accerl_lerobot.checkpoint.layout import CONFIG, SUMMARY
 from accerl_lerobot.checkpoint.safety import Origin, brief, check_folder
-from accerl_lerobot.config.parsing import TYPE, decode, encode, read_recipe
+from accerl_lerobot.config.parsing import encode, read_recipe
 from accerl_lerobot.console import ABSENT
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.metrics import METRICS
 
 Record = dict[str, Any]
-
-COUNTERS = ("env_steps", "decisions", "episodes")
-"""Counters of workers, which may restart at 0 when a run is resumed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,8 +40,6 @@ class Run:
     result: Record | None
     """summary.json; None: not finished."""
     truncated: bool
-    sessions: int
-    """1 + the number of times that it was resumed."""
     written: float
     videos: tuple[Path, ...]
 
@@ -71,15 +65,9 @@ class Run:
 
     @property
     def outcomes(self) -> list[Record]:
-        """``group``, ``success``, ``ci95`` and ``n`` before and after training; or the newest."""
-        result = self.result
-        if result is None:
-            return self.evaluations[-1:]
-        return [
-            {"group": when, **{key: result.get(f"{key}_{when}") for key in ("success", "ci95", "n")}}
-            for when in ("before", "after")
-            if result.get(f"success_{when}") is not None and result.get(f"ci95_{when}") is not None
-        ]
+        """Evaluations before and after training; of a run that is not finished, the newest."""
+        ends = [e for e in self.evaluations if e.get("group") in ("before", "after")]
+        return self.evaluations[-1:] if self.result is None else ends
 
     @property
     def wall_s(self) -> float | None:
@@ -104,7 +92,9 @@ def read_run(path: Path) -> Run:
     if not {"algorithm", "trainer"} <= config.keys():
         raise InputError("runs", str(path), f"no run in it: its {CONFIG} is not one of accerl train")
     lines, truncated = _lines(path / METRICS)
-    records, sessions = _continuous(lines)
+    records: dict[str, list[Record]] = {}
+    for line in lines:
+        records.setdefault(line["kind"], []).append(line)
     result = path / SUMMARY
     return Run(
         path=path,
@@ -113,7 +103,6 @@ def read_run(path: Path) -> Run:
         records=records,
         result=_mapping(result) if result.is_file() else None,
         truncated=truncated,
-        sessions=sessions,
         written=max(file.stat().st_mtime for file in path.iterdir() if file.suffix != ".html"),
         videos=tuple(sorted(path.glob("*.mp4"))),
     )
@@ -163,42 +152,6 @@ def _record(line: bytes) -> Record | None:
     return record if isinstance(record, dict) and isinstance(record.get("kind"), str) else None
 
 
-def _continuous(lines: list[Record]) -> tuple[dict[str, list[Record]], int]:
-    """Records by kind as if the run had never stopped, and the number of its sessions.
-
-    A resumed run counts seconds from 0 and updates from its checkpoint. Updates that an earlier session made
-    after that checkpoint were made again, so they are dropped; counters that fall are continued.
-    """
-    records: dict[str, list[Record]] = {}
-    newest_values: dict[str, float] = {}
-    offsets = dict.fromkeys(("wall_s", *COUNTERS), 0.0)
-    sessions, last_wall = 1, 0.0
-    for record in lines:
-        wall = _number(record, "wall_s", last_wall)
-        if wall < last_wall:
-            sessions += 1
-            offsets["wall_s"] += last_wall
-            # The first record of a session has the checkpoint's version, or is the first update after it.
-            checkpoint = _number(record, "update", 0) - (record["kind"] == "train")
-            for kind, earlier in records.items():
-                records[kind] = [r for r in earlier if _number(r, "update", 0) <= checkpoint]
-        last_wall = wall
-        if record["kind"] == "rollout":
-            for name in COUNTERS:
-                value = _number(record, name, 0.0)
-                if value < newest_values.get(name, 0.0):
-                    offsets[name] += newest_values[name]
-                newest_values[name] = value
-        moved = {name: _number(record, name, 0) + by for name, by in offsets.items() if by and name in record}
-        records.setdefault(record["kind"], []).append({**record, **moved})
-    return records, sessions
-
-
-def _number(record: Record, name: str, default: float) -> float:
-    value = record.get(name)
-    return value if isinstance(value, (int, float)) else default
-
-
 PLACES = ("output_dir", "job_name")
 """Fields that say where results go, which are never shown as differences."""
 
@@ -212,33 +165,11 @@ def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return fields
 
 
-def differences(config: Any, default: Any = None, prefix: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Dotted field, value and default, where the two differ.
-
-    Defaults are those of the types that were chosen: GIPO's for a run of GIPO. That it was chosen is a
-    difference too, and so is a section that is off unless it is given. Without a `default` of its type,
-    those of a section's fields count.
-    """
-    for field in dataclasses.fields(config):
-        name, value = f"{prefix}{field.name}", getattr(config, field.name)
-        usual = getattr(default, field.name) if type(default) is type(config) else _default(field)
-        if name in PLACES:
-            continue
-        if not dataclasses.is_dataclass(value):
-            if value != usual:
-                yield name, value, usual
-            continue
-        if usual is None:
-            yield name, getattr(value, TYPE, "given"), None
-        elif type(value) is not type(usual):
-            yield f"{name}.{TYPE}", getattr(value, TYPE), usual.type
-        yield from differences(value, usual, f"{name}.")
-
-
-def _default(field: dataclasses.Field[Any]) -> Any:
-    if field.default_factory is not dataclasses.MISSING:
-        return field.default_factory()
-    return ABSENT if field.default is dataclasses.MISSING else field.default
+def differences(tree: dict[str, Any]) -> list[tuple[str, Any, Any]]:
+    """Dotted field, value and default, where the two differ; a dash for a field of another type."""
+    usual = flat(encode(RunConfig()))
+    rows = ((name, value, usual.get(name, ABSENT)) for name, value in flat(tree).items())
+    return [row for row in rows if row[0] not in PLACES and row[1] != row[2]]
 
 
 def apart(trees: list[dict[str, Any]]) -> list[tuple[str, list[Any]]]:
@@ -246,19 +177,3 @@ def apart(trees: list[dict[str, Any]]) -> list[tuple[str, list[Any]]]:
     flats = [flat(tree) for tree in trees]
     rows = {key: [one.get(key, ABSENT) for one in flats] for one in flats for key in one}
     return [(key, row) for key, row in rows.items() if key not in PLACES and any(v != row[0] for v in row)]
-
-
-def unread(tree: dict[str, Any]) -> Iterator[tuple[str, Any, Any]]:
-    """As `differences`, of a recipe that this version cannot read: from the defaults of the usual types."""
-    usual = flat(encode(RunConfig()))
-    for name, value in flat(tree).items():
-        if name not in PLACES and value != usual.get(name, ABSENT):
-            yield name, value, usual.get(name, ABSENT)
-
-
-def resolved(tree: dict[str, Any]) -> tuple[RunConfig | None, str]:
-    """A run's recipe as a config, or why this version does not understand what another version wrote."""
-    try:
-        return decode(RunConfig, tree), ""
-    except InputError as error:
-        return None, str(error)

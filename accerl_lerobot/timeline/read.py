@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """A run's timeline as rows of intervals, and how its workers' time divides among the states.
 
-``accerl timeline``: runs as pictures, as Chrome traces, and as shares of their workers' time.
+``accerl timeline``: runs as a picture, and as shares of their workers' time.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +18,6 @@ from rich.box import SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
 
-from accerl_lerobot.checkpoint.layout import write_atomically
 from accerl_lerobot.checkpoint.safety import Origin, brief, check_folder
 from accerl_lerobot.config.ranges import NonNegative, Positive, Section
 from accerl_lerobot.errors import InputError, check_output, expanded
@@ -54,8 +52,6 @@ class Row:
     """int64 (n + 1,), nanoseconds since the timeline began; n intervals lie between them."""
     states: np.ndarray
     """uint8 (n,), of each interval."""
-    kept_from: int
-    """Nothing after this is missing."""
 
     @property
     def role(self) -> str:
@@ -161,9 +157,6 @@ def read_parts(folder: Path) -> list[Part]:
 
 
 def _part(path: Path, head: bytes, data: bytes) -> Part:
-    def damaged(why: str) -> InputError:
-        return InputError("runs", str(path), f"damaged ({why}); restore it, or remove it")
-
     try:
         _, process, number = path.name.removesuffix(SUFFIX).rsplit(".", 2)
         content = json.loads(head)
@@ -173,34 +166,27 @@ def _part(path: Path, head: bytes, data: bytes) -> Part:
         start, state = int(content["at_ns"]), STATES.index(content["state"])
         worker, place = str(content["worker"]), (int(process), int(number))
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise damaged(brief(error)) from error
+        why = f"damaged ({brief(error)}); restore it, or remove it"
+        raise InputError("runs", str(path), why) from error
     entries = np.frombuffer(data[: len(data) // 8 * 8], "<u8")  # a killed process leaves half an entry
     times = np.append(start, (entries >> np.uint64(BITS)).astype(np.int64))
     states = np.append(state, (entries % 2**BITS).astype(np.int64))
-    if (np.diff(times) < 0).any():
-        raise damaged("time goes back")
-    if (states >= len(STATES)).any():
-        raise damaged("no such state")
     return Part(worker, place, begins, times, states[:-1].astype(np.uint8))
 
 
 def _row(worker: str, parts: list[Part]) -> Row:
     times: np.ndarray = np.empty(0, np.int64)
     states: np.ndarray = np.empty(0, np.uint8)
-    kept_from, process = 0, -1
     for part in parts:
-        if part.number[0] != process and part.number[1]:
-            kept_from = int(part.times[0])
         if len(times):  # the last entries of a process that was being ended are cut where the next one begins
             times = times[: max(1, int(np.searchsorted(times, part.times[0], "right")))]
             states = np.append(states[: len(times) - 1], np.uint8(ABSENT))
         times, states = np.concatenate([times, part.times]), np.concatenate([states, part.states])
-        process = part.number[0]
     passed = (np.diff(times) > 0) | (states != ABSENT)  # the next part of a process follows at once
     times, states = np.append(times[:-1][passed], times[-1]), states[passed]
     change = np.flatnonzero(np.diff(states, prepend=-1) != 0)  # beats are no changes of state
     times = np.append(times[:-1][change], times[-1])
-    return Row(worker=worker, times=times, states=states[change], kept_from=kept_from)
+    return Row(worker=worker, times=times, states=states[change])
 
 
 def _place(row: Row) -> tuple[int, int, str]:
@@ -208,11 +194,7 @@ def _place(row: Row) -> tuple[int, int, str]:
     return ROLES.index(row.role) if row.role in ROLES else len(ROLES), int(number or 0), row.role
 
 
-PICTURE, TRACE = "timeline.png", "timeline.json"
-MARK = "accerl timeline"
-"""In a picture's metadata: made by us, and may be replaced."""
-TRACE_S = 60.0
-"""Seconds of a trace, around the middle of the picture."""
+PICTURE = "timeline.png"
 COLOURS = {
     "compute": "#3a7d44", "wait_in": "#dfe3e8", "wait_out": "#f0b429", "transport": "#5b8def",
     "weights": "#9b5de5", "checkpoint": "#8d6e63", "recovery": "#d64545", "training": "#a8c8a0",
@@ -237,8 +219,7 @@ class TimelineConfig(Section):
     seconds: Positive = 10.0
     """How much is drawn."""
     output: str | None = None
-    """The picture. None: ``timeline.png`` in the run's folder, or here if there are several. An older picture
-    of accerl is replaced; any other file is left alone."""
+    """The picture. None: ``timeline.png`` in the run's folder, or here if there are several."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -247,7 +228,7 @@ class TimelineConfig(Section):
 
 
 def show_timelines(config: TimelineConfig) -> dict[str, Any]:
-    """Reads the runs, writes picture and traces.
+    """Reads the runs, writes the picture.
 
     Returns:
         ``picture`` and ``runs``: of each, what is drawn, when it trained, and how its roles spent that time.
@@ -258,19 +239,14 @@ def show_timelines(config: TimelineConfig) -> dict[str, Any]:
         picture = timelines[0].run / PICTURE if len(timelines) == 1 else Path(PICTURE)
     if picture.suffix != ".png":
         raise InputError("output", str(picture), "the picture is a PNG; use a name that ends with .png")
-    check_output(picture, _is_ours)
+    check_output(picture)
     windows = [choose_window(timeline, config.start_s, config.seconds) for timeline in timelines]
-    part = picture.with_name(f".{picture.stem}.part.png")
-    draw(part, list(zip(timelines, windows, strict=True)))
-    os.replace(part, picture)
+    draw(picture, list(zip(timelines, windows, strict=True)))
     runs = []
     for timeline, window in zip(timelines, windows, strict=True):
-        middle, path = sum(window) / 2, timeline.run / TRACE
-        around = max(0.0, middle - TRACE_S / 2), min(timeline.seconds, middle + TRACE_S / 2)
-        write_atomically(path, json.dumps(trace(timeline, around)) + "\n")
         training = timeline.training()
         spent = timeline.shares(training)
-        run = {"run": str(timeline.run), "trace": str(path), "window_s": window, "training_s": training}
+        run = {"run": str(timeline.run), "window_s": window, "training_s": training}
         runs.append(run | {"shares": spent, "bubble": {role: bubble(own) for role, own in spent.items()}})
     return {"picture": str(picture), "runs": runs}
 
@@ -283,8 +259,6 @@ def choose_window(timeline: Timeline, start_s: float | None, seconds: float) -> 
         raise InputError("start_s", start_s, remedy)
     if start_s is None:
         first, last = max(timeline.training(), key=lambda window: window[1] - window[0])
-        kept = max(row.kept_from for row in timeline.rows) / 1e9  # from here on nothing is missing
-        first = max(first, min(kept, last - seconds))
         start_s = max(0.0, (first + last - seconds) / 2)
     return start_s, min(whole, start_s + seconds)
 
@@ -304,29 +278,6 @@ def timeline_table(result: dict[str, Any]) -> Table:
             if any(shares):
                 table.add_row(name, *("" if share is None else f"{100 * share:.1f}" for share in shares))
     return table
-
-
-def trace(timeline: Timeline, window: Window) -> dict[str, Any]:
-    """A window of a timeline in Google's "Trace Event Format", which Perfetto (ui.perfetto.dev) shows.
-
-    A process for each role, a thread for each worker, and a complete event for each interval; microseconds.
-    """
-    events: list[dict[str, Any]] = []
-    roles = list(dict.fromkeys(row.role for row in timeline.rows))
-    for pid, role in enumerate(roles, start=1):
-        meta = {"ph": "M", "pid": pid, "tid": 0}
-        events.append({**meta, "name": "process_name", "args": {"name": role}})
-        events.append({**meta, "name": "process_sort_index", "args": {"sort_index": pid}})
-    first, last = (round(1e9 * end) for end in window)
-    for tid, row in enumerate(timeline.rows, start=1):
-        place = {"pid": roles.index(row.role) + 1, "tid": tid}
-        events.append({"ph": "M", "name": "thread_name", **place, "args": {"name": row.worker}})
-        begins, ends = np.maximum(row.times[:-1], first), np.minimum(row.times[1:], last)
-        for i in np.flatnonzero((ends > begins) & (row.states != ABSENT)):
-            state, begin = STATES[row.states[i]], int(begins[i])
-            event = {"ph": "X", "name": state, "cat": row.role, **place}
-            events.append({**event, "ts": begin / 1e3, "dur": (int(ends[i]) - begin) / 1e3})
-    return {"traceEvents": events, "displayTimeUnit": "ms"}
 
 
 def draw(path: Path, parts: Sequence[tuple[Timeline, Window]]) -> None:
@@ -359,7 +310,7 @@ def draw(path: Path, parts: Sequence[tuple[Timeline, Window]]) -> None:
     axes[-1].set_xlabel("seconds")
     handles = [Patch(color=COLOURS[STATES[i]], label=STATES[i]) for i in np.flatnonzero(seen)]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles) or 1, frameon=False)
-    figure.savefig(path, metadata={"Software": MARK})
+    figure.savefig(path)
 
 
 def columns(row: Row, start: float, end: float) -> np.ndarray:
@@ -367,13 +318,3 @@ def columns(row: Row, start: float, end: float) -> np.ndarray:
     edges = np.linspace(1e9 * start, 1e9 * end, COLUMNS + 1)
     shares: np.ndarray = np.diff(row.until(edges), axis=0) / np.diff(edges)[:, None]
     return shares
-
-
-def _is_ours(picture: Path) -> bool:
-    from PIL import Image
-
-    try:
-        with Image.open(picture) as image:
-            return image.info.get("Software") == MARK
-    except OSError:
-        return False

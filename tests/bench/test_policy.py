@@ -21,7 +21,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def shrunk(config: BenchPolicyConfig, directory: Path) -> Any:
         made = build(config, directory)
-        made.num_vlm_layers, made.chunk_size, made.n_action_steps = 2, 4, 4
+        made.num_vlm_layers, made.chunk_size, made.n_action_steps, made.num_steps = 2, 4, 4, 2
         made.resize_imgs_with_padding = (64, 64)
         return made
 
@@ -31,7 +31,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(("precision", "low", "high"), [("fp32", 0.0, 1e-4), ("bf16", 0.0, 30.0)])
 def test_it_measures(small: None, precision: str, low: float, high: float) -> None:
     result = bench.bench_policy(
-        BenchPolicyConfig(batch=3, precision=precision, device="cpu", repeats=1, cameras=1, num_steps=2)
+        BenchPolicyConfig(batch=3, precision=precision, device="cpu", repeats=1, cameras=1)
     )
     assert 0 < result["parameters"]["trained"] < result["parameters"]["all"]
     assert list(result["memory_gb"]) == ["built", "decided", "updated"]

@@ -11,8 +11,8 @@ import yaml
 from accerl_lerobot.engine.config import RunConfig, encode, parse
 from accerl_lerobot.evaluation import Rate
 from benchmarks import efficiency as bench
-from benchmarks.efficiency import ARMS, BenchEfficiencyConfig, cells
-from benchmarks.study import Results, Study, together
+from benchmarks.efficiency import BenchEfficiencyConfig, cells
+from benchmarks.study import Results, together
 from tests.runs import tiny_run
 
 
@@ -92,25 +92,6 @@ def test_the_table_and_the_picture(result: dict[str, Any], tmp_path: Path):
     assert bench.table(result).row_count == 2
     bench.draw(tmp_path / "efficiency.png", result)
     assert (tmp_path / "efficiency.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_cells_differ_in_what_is_imagined_and_in_the_real_episodes(tmp_path: Path, tiny_checkpoint: Path):
-    config = small(tmp_path, tiny_checkpoint, arms=tuple(ARMS))
-    base = parse(RunConfig, [f"--config_path={config.recipe}"])
-    study = Study(config, cells(config, base))
-    assert len(study.cells) == 6 * 2 * 2 and study.cells[0].name == "none-4-seed3"
-    runs = {cell.name: run for cell, run in zip(study.cells, study.runs, strict=True)}
-    none, learned, frozen = (runs[f"{arm}-4-seed3"] for arm in ("none", "learned", "frozen"))
-    assert (none.imagination.share, learned.imagination.share) == (0, 0.5)
-    assert learned.imagination.learns and not frozen.imagination.learns
-    kinds = {arm: runs[f"{arm}-4-seed3"].imagination.model for arm in ("copy", "shuffled", "oracle")}
-    assert kinds == {arm: arm for arm in kinds}
-    assert {run.rollout.episodes for run in study.runs} == {4, 8}
-    assert {run.trainer.updates for run in study.runs} == {4}
-    # Where half of a batch is imagined, the other half asks half as much of what is real.
-    drawn = 1.25 * 4 * base.trainer.batch_decisions / (4 * 4)
-    assert none.replay.samples_per_insert == pytest.approx(drawn, abs=1)
-    assert learned.replay.samples_per_insert == pytest.approx(drawn / 2, abs=1)
 
 
 @pytest.mark.slow

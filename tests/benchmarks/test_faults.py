@@ -15,7 +15,6 @@ import pytest
 
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import CHECKPOINTS, TRAINING_STATE, save_checkpoint
-from accerl_lerobot.errors import InputError
 from accerl_lerobot.replay.buffer import MixedReplay
 from accerl_lerobot.replay.journal import EPISODES, Journal
 from accerl_lerobot.replay.pacing import ReplayConfig
@@ -125,18 +124,6 @@ def test_every_point_is_somewhere_that_a_target_can_be_hit():
     assert places("trainer", "nans") == places("trainer", "nan") == ["trainer.loss"]
     assert places("inference", "nans") == [], "a decision or two that replay refuses end nobody"
     assert ANYWHERE not in places("driver", "kill")[1:] and places("driver", "stop") == []
-
-
-def test_nothing_is_begun_where_something_is(tmp_path: Path):
-    with pytest.raises(InputError, match="the folder exists"):
-        bench_faults(BenchFaultsConfig(output_dir=str(tmp_path)))
-    new = str(tmp_path / "new")
-    with pytest.raises(InputError, match="nothing is imagined in this recipe"):
-        bench_faults(BenchFaultsConfig(output_dir=new, targets=("imagination",)))
-    recipe = str(Path(__file__).parents[2] / "recipes" / "quickstart.yaml")
-    with pytest.raises(InputError, match="the trainer of this recipe is one process"):
-        bench_faults(BenchFaultsConfig(output_dir=new, targets=("trainer rank",), recipe=recipe))
-    assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.slow

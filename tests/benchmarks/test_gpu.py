@@ -19,9 +19,7 @@ __all__ = ["small"]
 
 
 @pytest.mark.usefixtures("small")
-def test_it_measures_both_precisions_and_a_run_of_one_and_of_two_ranks(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_it_measures_both_precisions_and_a_run_of_one_and_of_two_ranks(tmp_path, monkeypatch):
     asked: list[tuple[str, ...]] = []
 
     def run(config: BenchGpuConfig, folder: Path, more: tuple[str, ...]) -> dict[str, Any]:

@@ -12,7 +12,6 @@ import pytest
 from accerl_lerobot.bench.throughput import BenchThroughputConfig, Block, bench_throughput
 from accerl_lerobot.bench.throughput import table as throughput_table
 from accerl_lerobot.console import Console
-from accerl_lerobot.errors import InputError
 from benchmarks import async_vs_sync
 from benchmarks.async_vs_sync import ARMS, BenchAsyncVsSyncConfig, bench_async_vs_sync
 from benchmarks.async_vs_sync import compare as compare_schedules
@@ -66,15 +65,6 @@ def test_speed_ups_are_of_neighbouring_blocks():
     assert found["largest_speed_up"] == pytest.approx(80.0 / 28.0)
     assert found["share_of_largest"]["blocks"] == pytest.approx([0.75, 0.9])
     assert found["processor_bound"] and len(found["blocks"]) == 6
-
-
-def test_the_bound_of_a_trace_counts_its_resets(tmp_path: Path):
-    """Decisions of 32 ms, and a reset of five of them after each 16: 42 + 8 ms a decision."""
-    path = tmp_path / "trace.txt"
-    sizes = {"worlds": 10, "latency_ms": 32.0, "decide_ms": 7.5, "decide_each_ms": 0.5}
-    for text, each in (("2\n2\nreset 10\n", 32 + 10 + 8), ("2\n2\n", 32 + 2 + 8)):
-        path.write_text(text)
-        assert MachineryConfig(**sizes, latency_trace=str(path)).world_bound == pytest.approx(10_000 / each)
 
 
 @pytest.mark.slow
@@ -136,16 +126,3 @@ def test_a_recipe_is_measured_under_two_schedules(tiny_checkpoint: Path, tmp_pat
     assert all(found["decisions_per_s"]["min"] > 0 for found in result["schedules"].values())
     shown = throughput_table(result)
     assert shown.row_count == 2
-
-
-@pytest.mark.parametrize(
-    ("make", "field"),
-    [
-        (lambda: bench_async_vs_sync(BenchAsyncVsSyncConfig(traces=("/nowhere",))), "traces"),
-        (lambda: MachineryConfig(latency_trace="/nowhere").open(), "latency_trace"),
-        (lambda: BenchThroughputConfig(), "policy_path"),
-    ],
-)
-def test_what_cannot_be_measured_is_refused(make, field: str):
-    with pytest.raises(InputError, match=field):
-        make()

@@ -37,13 +37,3 @@ def test_the_vocabulary_is_bounded_and_ids_are_those_of_the_config(tmp_path: Pat
     assert config.image_token_id == tokenizer.convert_tokens_to_ids("<image>")
     assert config.pad_token_id == tokenizer.pad_token_id
     assert all(len(tokenizer(token).input_ids) == 1 for token in SPECIAL_TOKENS)
-
-
-def test_the_vision_tower_has_the_sizes_asked_for(tmp_path: Path):
-    from transformers import AutoConfig
-
-    sizes = {"hidden": 48, "layers": 3, "vision_hidden": 32, "patch": 8, "image": 32}
-    config = AutoConfig.from_pretrained(write_backbone(tmp_path / "backbone", **sizes))
-    text, vision = config.text_config, config.vision_config
-    assert (text.hidden_size, text.num_hidden_layers, text.head_dim) == (48, 3, 12)
-    assert (vision.hidden_size, vision.patch_size, vision.image_size) == (32, 8, 32)

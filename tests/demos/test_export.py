@@ -35,12 +35,10 @@ def run(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
 
 
 def exported(run: Path, root: Path, *options: str) -> int:
-    return main(["export", f"--path={run}", f"--root={root}", "--processes=1", *options])
+    return main(["export", f"--path={run}", f"--root={root}", *options])
 
 
-def test_every_whole_episode_is_in_the_dataset_step_by_step(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_every_whole_episode_is_in_the_dataset_step_by_step(run, tmp_path, capsys):
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     capsys.readouterr()
@@ -87,13 +85,11 @@ def test_a_run_with_types_of_other_packages(run: Path, tmp_path: Path, capsys: p
     (other / "config.yaml").write_text(yaml.safe_dump(config))
     capsys.readouterr()
     assert exported(other, tmp_path / "set") == 2
-    assert "discover_packages_path=None: the run's environment is code of" in capsys.readouterr().err
-    assert exported(other, tmp_path / "set", "--discover_packages_path=accerl_lerobot.envs") == 0
+    assert "if you trust it, add --env.discover_packages_path=accerl_lerobot.envs" in capsys.readouterr().err
+    assert exported(other, tmp_path / "set", "--env.discover_packages_path=accerl_lerobot.envs") == 0
 
 
-def test_episodes_that_cannot_be_repeated_are_left_out(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_episodes_that_cannot_be_repeated_are_left_out(run, tmp_path, capsys):
     other = tmp_path / "run"
     other.mkdir()
     (other / "config.yaml").write_bytes((run / "config.yaml").read_bytes())

@@ -14,7 +14,7 @@ import pytest
 
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos import guarded_train, sft
-from accerl_lerobot.demos.sft import CODE_REVISION, REFUSED, SFTConfig, run_sft, sft_command
+from accerl_lerobot.demos.sft import REFUSED, TRUST, SFTConfig, run_sft, sft_command
 from accerl_lerobot.errors import InputError
 from tests.policies.checkpoints import write_act
 from tests.policies.test_loading import remote
@@ -54,9 +54,9 @@ def test_its_code_is_run_at_the_commit_that_is_named(tmp_path: Path, monkeypatch
     with hub(tmp_path):
         marker = remote(tmp_path, monkeypatch)
         with pytest.raises(SystemExit):  # no such commit here, and the Hub is offline
-            run(monkeypatch, lambda: _refusing(tokenise), f"{CODE_REVISION}{'f' * 40}")
+            run(monkeypatch, lambda: _refusing(tokenise), f"{TRUST}{'f' * 40}")
         assert not marker.exists()
-        assert run(monkeypatch, tokenise, f"{CODE_REVISION}{COMMIT}") == "UniversalActionProcessor"
+        assert run(monkeypatch, tokenise, f"{TRUST}{COMMIT}") == "UniversalActionProcessor"
     assert marker.exists() and sys.argv == ["lerobot-train"], "the argument is ours and not LeRobot's"
 
 
@@ -64,7 +64,7 @@ def _refusing(work: Callable[[], Any]) -> Any:
     try:
         return work()
     except OSError as error:
-        raise InputError("sft.code_revision", "", "no such commit") from error
+        raise InputError("sft.trust_remote_code", "", "no such commit") from error
 
 
 def test_a_refusal_is_one_line_of_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -102,15 +102,14 @@ def test_a_hostile_start_is_refused_before_anything_runs(tmp_path: Path, monkeyp
 
 
 def test_trust_is_asked_for_with_a_commit(tmp_path: Path):
-    with pytest.raises(InputError, match="^sft.code_revision=None: name the commit"):
-        SFTConfig(trust_remote_code=True)
-    with pytest.raises(InputError, match="^sft.code_revision='main': name a commit"):
-        SFTConfig(trust_remote_code=True, code_revision="main")
-    config = SFTConfig(steps=1, policy={"type": "act"}, trust_remote_code=True, code_revision=COMMIT)
+    for value in (True, "main", COMMIT[:39], COMMIT.upper(), f"{COMMIT}\n"):
+        with pytest.raises(InputError, match="^sft.trust_remote_code=.*: use the 40 hexadecimal digits"):
+            SFTConfig(trust_remote_code=value)
+    config = SFTConfig(steps=1, policy={"type": "act"}, trust_remote_code=COMMIT)
     command = sft_command(config, HUB, tmp_path / "sft", 0, "cpu")
-    assert f"{CODE_REVISION}{COMMIT}" in command
+    assert f"{TRUST}{COMMIT}" in command
     plain = sft_command(SFTConfig(steps=1, policy={"type": "act"}), HUB, tmp_path / "sft", 0, "cpu")
-    assert not [a for a in plain if a.startswith(CODE_REVISION)]
+    assert not [a for a in plain if a.startswith(TRUST)]
 
 
 def test_the_trainer_does_not_get_ray_s_token(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

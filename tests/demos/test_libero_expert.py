@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from accerl_lerobot.demos.record import DemosConfig, Episode, make_expert, play, record_demos
+from accerl_lerobot.demos.record import DemosConfig, Episode, disturbed, make_expert, played, record_demos
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.envs.libero import LiberoConfig
 from accerl_lerobot.errors import InputError
@@ -32,7 +32,8 @@ def config(task: str) -> LiberoConfig:
 def episode(settings: LiberoConfig, world, seed: int) -> Episode:
     (task,) = settings.tasks
     expert = make_expert(settings, world, task)
-    return play(world, expert, task=task, seed=seed, noise=0.1, push=0, fail=False)
+    actions = disturbed(expert, world.spec, seed, noise=0.1, push=0, fail=False)
+    return played(world, task, seed, actions)
 
 
 @needs_assets
@@ -44,17 +45,6 @@ def test_the_expert_solves_recorded_and_drawn_starts(task: str):
         assert all(episode(settings, world, seed).success for seed in STARTS)
     finally:
         world.close()
-
-
-@needs_assets
-def test_equal_seeds_give_equal_episodes_of_one_world():
-    settings = config("libero_goal/7")
-    world = make_world(settings)
-    try:
-        first, _, again = (episode(settings, world, seed) for seed in (5, 6, 5))
-    finally:
-        world.close()
-    assert np.array_equal(first.actions, again.actions)
 
 
 @needs_assets

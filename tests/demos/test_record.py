@@ -9,7 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from accerl_lerobot.demos.record import SIDECAR, DemosConfig, make_expert, play, record_demos
+from accerl_lerobot.demos.record import (
+    SIDECAR,
+    DemosConfig,
+    Episode,
+    disturbed,
+    make_expert,
+    played,
+    record_demos,
+)
 from accerl_lerobot.envs import EnvConfig, MetaWorldConfig, SimulatedConfig, make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.seeds import demo_seed
@@ -30,7 +38,7 @@ def rows(root: Path) -> list[dict]:
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pytest.importorskip("metaworld")
     root = tmp_path_factory.mktemp("demos") / "two"
-    config = DemosConfig(episodes=2, processes=2)
+    config = DemosConfig(episodes=2)
     assert record_demos(MetaWorldConfig(task=TASKS, max_steps=100), config, str(root)) == root
     return root
 
@@ -74,8 +82,9 @@ def test_frames_are_what_the_world_showed_when_the_action_was_chosen(recorded: P
     world.close()
 
 
-def test_the_content_does_not_depend_on_the_processes(recorded: Path, tmp_path: Path):
-    config = DemosConfig(episodes=2, processes=1)
+def test_the_content_does_not_depend_on_the_processes(recorded, tmp_path, monkeypatch):
+    monkeypatch.setattr("os.cpu_count", lambda: 1)
+    config = DemosConfig(episodes=2)
     record_demos(MetaWorldConfig(task=TASKS, max_steps=100), config, str(tmp_path / "one"))
     one, two = rows(tmp_path / "one"), rows(recorded)
     assert len(one) == len(two)
@@ -85,7 +94,7 @@ def test_the_content_does_not_depend_on_the_processes(recorded: Path, tmp_path: 
 
 def test_failures_are_recorded_on_request_spread_over_tasks(tmp_path: Path):
     env = SimulatedConfig(task="match,mirror", max_steps=60, hold=25)
-    config = DemosConfig(episodes=8, failure_share=0.5, processes=1)
+    config = DemosConfig(episodes=8, failure_share=0.5)
     record_demos(env, config, str(tmp_path / "mixed"), seed=3)
     data = rows(tmp_path / "mixed")
     outcome: dict[str, list[bool]] = {"Match the target": [], "Mirror the target": []}
@@ -99,14 +108,17 @@ def test_failures_are_recorded_on_request_spread_over_tasks(tmp_path: Path):
     assert sidecar["successes"] == 4 and sidecar["env"]["type"] == "simulated"
 
 
-def test_noise_is_in_the_recorded_action_and_seeded():
+def match(seed: int = 5, noise: float = 0.0, push: float = 0.0) -> Episode:
     config = SimulatedConfig(tolerance=0.01, max_steps=20)
     world = make_world(config)
     expert = make_expert(config, world, "match")
-    one, again, clean = (
-        play(world, expert, task="match", seed=5, noise=noise, push=0.0, fail=False)
-        for noise in (0.1, 0.1, 0.0)
+    return played(
+        world, "match", seed, disturbed(expert, world.spec, seed, noise=noise, push=push, fail=False)
     )
+
+
+def test_noise_is_in_the_recorded_action_and_seeded():
+    one, again, clean = match(noise=0.1), match(noise=0.1), match()
     assert np.array_equal(one.actions, again.actions) and one.actions.dtype == np.float32
     assert clean.success_at == 3 and np.ptp(clean.actions, axis=0).max() == 0
     assert 0.05 < (one.actions - clean.actions[0]).std() < 0.2
@@ -114,28 +126,19 @@ def test_noise_is_in_the_recorded_action_and_seeded():
 
 
 def test_an_expert_that_is_pushed_misses_by_more_the_more_it_is_pushed():
-    config = SimulatedConfig(tolerance=0.01, max_steps=20)
-    world = make_world(config)
-    clean, *pushed = (
-        play(
-            world, make_expert(config, world, "match"), task="match", seed=5, noise=0.0, push=push, fail=False
-        )
-        for push in (0.0, 0.1, 0.2)
-    )
+    clean, *pushed = (match(push=push) for push in (0.0, 0.1, 0.2))
     aside = [episode.actions[0] - clean.actions[0] for episode in pushed]
     assert all(np.ptp(episode.actions, axis=0).max() == 0 for episode in pushed), "the same all the way"
     assert 0 < np.linalg.norm(aside[0]) <= 0.1
     assert_close(aside[1], 2 * aside[0])
-    other = play(
-        world, make_expert(config, world, "match"), task="match", seed=6, noise=0.0, push=0.2, fail=False
-    )
+    other = match(seed=6, push=0.2)
     assert not np.allclose(other.actions[0] - clean.actions[0], aside[1], atol=1e-3)
     with pytest.raises(InputError, match="demos.push=3"):
         DemosConfig(push=3)
 
 
 def test_an_expert_that_cannot_succeed_is_reported_and_leaves_nothing(tmp_path: Path):
-    config = DemosConfig(episodes=1, processes=1, action_noise=1.0)
+    config = DemosConfig(episodes=1, action_noise=1.0)
     with pytest.raises(InputError, match="demos.action_noise=1.0: .*match"):
         record_demos(SimulatedConfig(tolerance=1e-6, max_steps=8), config, str(tmp_path / "none"))
     assert list(tmp_path.iterdir()) == []

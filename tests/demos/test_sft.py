@@ -10,7 +10,6 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -32,26 +31,13 @@ HUB = DatasetConfig(repo_id="a/b")
 LOCAL = DatasetConfig(repo_id="accerl/metaworld_tiny", root=str(ROOT))
 CAMERA = "observation.images.corner2"
 TINY = SFTConfig(
-    steps=2,
-    batch_size=4,
-    warmup_steps=1,
-    num_threads=1,
+    steps=2, batch_size=4, num_threads=1, backbone=BackboneConfig(hidden=32, patch=8, image=32),
     policy={
-        "type": "smolvla",
-        "num_vlm_layers": 2,
-        "num_expert_layers": 2,
-        "chunk_size": 4,
-        "n_action_steps": 4,
-        "max_state_dim": 4,
-        "max_action_dim": 4,
-        "resize_imgs_with_padding": [32, 32],
-        "num_steps": 2,
-        "expert_width_multiplier": 1.0,
-        "train_expert_only": False,
-        "freeze_vision_encoder": False,
+        "type": "smolvla", "num_vlm_layers": 2, "num_expert_layers": 2, "chunk_size": 4, "n_action_steps": 4,
+        "max_state_dim": 4, "max_action_dim": 4, "resize_imgs_with_padding": [32, 32], "num_steps": 2,
+        "expert_width_multiplier": 1.0, "train_expert_only": False, "freeze_vision_encoder": False,
     },
-    backbone=BackboneConfig(hidden=32, patch=8, image=32),
-)
+)  # fmt: skip
 
 
 def stock_dataset() -> Any:
@@ -72,22 +58,6 @@ def equal(one: dict[str, Any], other: dict[str, Any]) -> bool:
     )
 
 
-class Counting:
-    """A dataset that counts how often it is read."""
-
-    num_frames = 3
-
-    def __init__(self) -> None:
-        self.reads: list[int] = []
-
-    def __len__(self) -> int:
-        return 3
-
-    def __getitem__(self, index: int) -> dict[str, int]:
-        self.reads.append(index)
-        return {"index": index}
-
-
 def test_cached_items_are_the_stock_ones_at_every_reading():
     dataset = stock_dataset()
     cached = guarded_train.CachedDataset(dataset)
@@ -97,46 +67,6 @@ def test_cached_items_are_the_stock_ones_at_every_reading():
             assert equal(cached[index], dataset[index])
     assert cached[364]["action_is_pad"].tolist() == [False, True, True, True]
     assert cached.meta is dataset.meta and cached.num_frames == 365
-
-
-@pytest.mark.parametrize(
-    ("transforms", "streaming", "limit", "history", "expected"),
-    [
-        (False, False, 1000, 1, True),
-        (True, False, 1000, 1, False),
-        (False, True, 1000, 1, False),
-        (False, False, 100, 1, False),
-        (False, False, 1000, 2, False),  # twice the images
-    ],
-)
-def test_what_cannot_be_cached_is_read_the_stock_way(
-    monkeypatch: pytest.MonkeyPatch,
-    transforms: bool,
-    streaming: bool,
-    limit: int,
-    expected: bool,
-    history: int,
-):
-    from lerobot.scripts import lerobot_train
-
-    dataset = Counting()
-    dataset.meta = SimpleNamespace(camera_keys=["a"], features={"a": {"shape": (4, 4, 3)}})
-    got = []
-    monkeypatch.setattr(lerobot_train, "make_train_eval_datasets", lambda cfg: (dataset, "evaluation"))
-    options = SimpleNamespace(image_transforms=SimpleNamespace(enable=transforms), streaming=streaming)
-    monkeypatch.setattr(
-        lerobot_train,
-        "main",
-        lambda: got.extend(
-            lerobot_train.make_train_eval_datasets(
-                SimpleNamespace(dataset=options, policy=SimpleNamespace(n_obs_steps=history))
-            )
-        ),
-    )
-    monkeypatch.setattr(guarded_train, "MAX_BYTES", limit)
-    monkeypatch.setattr(sys, "argv", ["lerobot-train"])
-    guarded_train.main()
-    assert isinstance(got[0], guarded_train.CachedDataset) == expected and got[1] == "evaluation"
 
 
 def test_the_checkpoint_that_is_best_on_held_out_episodes_is_used(tmp_path: Path):
@@ -152,7 +82,7 @@ class TestPick:
     def dataset(self, tmp_path_factory: pytest.TempPathFactory) -> DatasetConfig:
         """Every second episode fails."""
         root = str(tmp_path_factory.mktemp("demos") / "dataset")
-        config = DemosConfig(episodes=4, failure_share=0.5, processes=1)
+        config = DemosConfig(episodes=4, failure_share=0.5)
         record_demos(SimulatedConfig(max_steps=16), config, root)
         return DatasetConfig(repo_id="a/b", root=root)
 
@@ -180,21 +110,6 @@ def test_two_steps_of_lerobot_s_trainer_give_a_checkpoint(tmp_path: Path):
     stats = stock_dataset().meta.stats["observation.state"]
     expected = (observation["observation.state"] - stats["mean"]) / (stats["std"] + 1e-8)
     assert_close(batch["observation.state"], expected)  # the dataset's normalisation
-
-
-@pytest.mark.slow
-def test_act_is_trained_as_well(tmp_path: Path):
-    small = {"dim_model": 32, "n_heads": 2, "dim_feedforward": 64, "n_encoder_layers": 1, "latent_dim": 4}
-    policy = {
-        "type": "act",
-        "chunk_size": 4,
-        "n_action_steps": 4,
-        "pretrained_backbone_weights": None,
-    } | small
-    config = SFTConfig(steps=2, batch_size=4, num_threads=1, policy=policy)
-    adapter = adapter_at(run_sft(config, LOCAL, tmp_path / "sft", seed=0))
-    assert adapter.policy.name == "act" and adapter.family.model.executed == 4
-    assert adapter.policy.config.optimizer_lr == config.lr
 
 
 def command_that(monkeypatch: pytest.MonkeyPatch, program: str) -> None:
@@ -249,22 +164,13 @@ def test_the_command_line(tmp_path: Path):
         TINY, DatasetConfig(repo_id="a/b", root="/data", revision="v1"), tmp_path / "sft", 3, "cpu"
     )
     assert command[:3] == [sys.executable, "-m", "accerl_lerobot.demos.guarded_train"]
-    for argument in (
-        "--policy.type=smolvla",
-        "--policy.resize_imgs_with_padding=[32, 32]",
-        "--policy.train_expert_only=false",
-        f"--policy.vlm_model_name={tmp_path / 'backbone'}",
-        "--policy.device=cpu",
-        "--policy.push_to_hub=false",
-        "--policy.optimizer_lr=0.001",
-        "--policy.scheduler_decay_steps=2",
-        "--dataset.repo_id=a/b",
-        "--dataset.root=/data",
-        "--dataset.revision=v1",
-        "--steps=2",
-        "--seed=3",
-    ):
-        assert argument in command
+    wanted = {
+        "--policy.type=smolvla", "--policy.resize_imgs_with_padding=[32, 32]", "--policy.device=cpu",
+        "--policy.train_expert_only=false", f"--policy.vlm_model_name={tmp_path / 'backbone'}",
+        "--policy.push_to_hub=false", "--policy.optimizer_lr=0.001", "--policy.scheduler_decay_steps=2",
+        "--dataset.repo_id=a/b", "--dataset.root=/data", "--dataset.revision=v1", "--steps=2", "--seed=3",
+    }  # fmt: skip
+    assert wanted <= set(command)
     start = tmp_path / "start"
     start.mkdir()
     (start / "config.json").write_text('{"type": "smolvla"}')
@@ -304,9 +210,7 @@ def test_a_start_that_cannot_be_fine_tuned(tmp_path: Path, stored: dict | None, 
         sft_command(SFTConfig(steps=1, init_path=str(tmp_path)), HUB, tmp_path / "sft", 0, "cpu")
 
 
-def test_a_moved_checkpoint_is_started_from_a_copy(
-    tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_moved_checkpoint_is_started_from_a_copy(tiny_checkpoint, tmp_path, monkeypatch):
     from accerl_lerobot.checkpoint.layout import relocate
     from accerl_lerobot.policies.config import PolicyConfig
     from accerl_lerobot.policies.saving import save_pretrained

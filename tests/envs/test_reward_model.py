@@ -156,5 +156,3 @@ def test_no_code_of_an_encoder_runs_unasked(encoder: Path, tmp_path: Path):
     with pytest.raises(InputError, match=r"^rollout\.reward_model\.trust_remote_code=.*code that came with"):
         load_judge(RewardModelConfig(path=str(tmp_path / "classifier")))
     assert not marker.exists()
-    with pytest.raises(InputError, match=r"rollout\.reward_model\.code_revision=None: name the commit"):
-        RewardModelConfig(path="a/b", trust_remote_code=True)

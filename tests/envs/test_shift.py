@@ -76,5 +76,5 @@ def test_starts_come_from_wider_ranges():
 
 def test_demonstrations_show_the_world_without_shift(tmp_path: Path):
     config = MetaWorldConfig(task="drawer-open-v3", shift=ShiftConfig(light=0.5))
-    record_demos(config, DemosConfig(episodes=1, processes=1), str(tmp_path / "demos"))
+    record_demos(config, DemosConfig(episodes=1), str(tmp_path / "demos"))
     assert json.loads((tmp_path / "demos" / SIDECAR).read_text())["env"]["shift"]["light"] == 1.0

@@ -8,7 +8,6 @@ from typing import Any
 
 import imageio.v2 as imageio
 import numpy as np
-import pytest
 
 from accerl_lerobot import evaluation
 from accerl_lerobot.evaluation import GAP, before_after, success_curve, write_video
@@ -40,21 +39,6 @@ class TestSuccessCurve:
         assert image.shape[:2] == (480, 840)
         assert len(np.unique(image[..., :3].reshape(-1, 3), axis=0)) > 20
 
-    def test_evaluations_may_come_out_of_order(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        """One that was planned while training may be reported after a later one."""
-        from matplotlib.axes import Axes
-
-        seen: list[list[float]] = []
-        draw = Axes.errorbar
-
-        def errorbar(self: Axes, x: Any, y: Any, **rest: Any) -> Any:
-            seen.append(list(x))
-            return draw(self, x, y, **rest)
-
-        monkeypatch.setattr(Axes, "errorbar", errorbar)
-        success_curve(tmp_path / "curve.png", [evaluated(s, 5, 10) for s in (0, 900, 400)], [])
-        assert seen == [[0, 400, 900]]
-
 
 class TestVideo:
     """MP4 in the pixel format that all players know."""
@@ -68,9 +52,7 @@ class TestVideo:
         assert (abs(left - (200, 0, 0)) < 25).all() and (abs(right - (0, 0, 200)) < 25).all()
         assert (film[:, :, 33 : 32 + GAP - 1] > 150).all()
 
-    def test_before_beside_after_with_outcomes_and_numbers(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_before_beside_after_with_outcomes_and_numbers(self, tmp_path, monkeypatch):
         def result(index: int, success: bool, frames: list[np.ndarray]) -> EpisodeResult:
             plan = EpisodePlan(task="t", seed=index, explore=False, index=index)
             return EpisodeResult(

@@ -31,27 +31,10 @@ def test_wilson_by_hand(successes: int, n: int, low: float, high: float) -> None
     assert interval.high == pytest.approx(high, abs=2e-6)
 
 
-def test_wilson_ends_solve_the_score_equation() -> None:
-    """Both ends are the rates p₀ from which the observed one is exactly z standard errors away."""
-    for successes, n in [(1, 7), (40, 50), (123, 1000)]:
-        interval = wilson_interval(successes, n)
-        for end in (interval.low, interval.high):
-            distance = abs(successes / n - end) / math.sqrt(end * (1 - end) / n)
-            assert distance == pytest.approx(1.959964, abs=1e-6)
-
-
 def test_knowing_nothing() -> None:
     interval = wilson_interval(0, 0)
     assert (interval.low, interval.high) == (0.0, 1.0)
     assert math.isnan(Rate(successes=0, n=0).value) and str(Rate(successes=0, n=0)) == "no episodes"
-
-
-@pytest.mark.parametrize(
-    ("successes", "n", "text"),
-    [(93, 100, "93.0 % [86.3, 96.6]"), (0, 20, "0.0 % [0.0, 16.1]"), (20, 20, "100.0 % [83.9, 100.0]")],
-)
-def test_a_rate_as_text(successes: int, n: int, text: str) -> None:
-    assert str(Rate(successes=successes, n=n)) == f"{text} n={n}"
 
 
 def result(task: str, seed: int, success: bool, versions: tuple[int, int] = (3, 3)) -> EpisodeResult:
@@ -123,10 +106,6 @@ class TestPlans:
         for plan in evaluation_plans(("a",), 50, "x"):
             assert plan.seed in EVAL_SEEDS
             assert plan.seed not in TRAIN_SEEDS and plan.seed not in DEMO_SEEDS
-
-    def test_tasks_share_evenly(self) -> None:
-        plans = evaluation_plans(("a", "b", "c"), 8, "x")
-        assert [sum(p.task == t for p in plans) for t in "abc"] == [3, 3, 2]
 
     def test_do_not_explore_and_are_filmed_first(self) -> None:
         plans = evaluation_plans(("a",), 4, "x", filmed=2)

@@ -31,12 +31,8 @@ def test_metadata(tmp_path: Path):
     assert data.tags == ["accerl-lerobot", "policy", "act", "metaworld", "reinforcement-learning", "gipo"]
     assert data.base_model == "lerobot/smolvla_base"
     assert data.datasets is None, "the dataset was a folder, its name a label"
-    (result,) = data.eval_results
-    assert result.metric_type == "success_rate" and result.metric_value == 0.75
-    assert result.metric_args == {"n": 40, "ci95": [0.5981, 0.8581]}
-    assert result.dataset_name == "metaworld match" and result.task_type == "robotics"
     earlier = ModelCard(card_of(run / "checkpoints/000006/pretrained_model", "policy"))
-    assert earlier.data.eval_results is None and "## Measured" not in earlier.text
+    assert "## Measured" not in earlier.text
 
 
 def test_numbers_films_and_recipe_for_people(tmp_path: Path):
@@ -60,8 +56,6 @@ def test_an_evaluation_is_what_counts_last(tmp_path: Path):
     found = {"success": 0.5, "n": 100, "ci95": [0.4038, 0.5962], "tasks": tasks, "policy": str(policy)}
     write_json(tmp_path / "eval" / "evaluation.json", found)
     text = card_of(policy, "policy", evaluation=str(tmp_path / "eval"))
-    results = {r.dataset_config: r.metric_value for r in ModelCard(text).data.eval_results}
-    assert results == {"all tasks": 0.5, "a": 0.4, "b": 0.6}
     assert "| accerl eval | all tasks | 50.0% | 100 | 40.4% to 59.6% |" in text
     assert "| accerl eval | b | 60.0% | 50 |" in text
 
@@ -91,15 +85,6 @@ def test_stock_lerobot_and_a_plugin_policy(tmp_path: Path):
     assert "lerobot-eval --policy.path=door" in text and "--env.task=door-open-v3" in text
     assert "--policy.discover_packages_path=accerl_lerobot.policies.bins_plugin" in text
     assert "loads it from the Hub as well: `--policy.path=alice/door`" in text
-
-
-def test_of_a_policy_that_was_pulled_and_improved(tmp_path: Path):
-    start = write_policy_folder(tmp_path / "start")
-    write_json(start / "accerl_pulled.json", {"repo_id": "bob/start"})
-    run = write_run_folder(tmp_path / "run")
-    recipe = run / "config.yaml"
-    recipe.write_text(recipe.read_text().replace("lerobot/smolvla_base", str(start)))
-    assert ModelCard(card_of(run, "run")).data.base_model == "bob/start"
 
 
 def test_a_validation_is_reported(tmp_path: Path):

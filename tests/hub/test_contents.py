@@ -36,7 +36,7 @@ def test_of_a_run_go_its_results_and_the_last_checkpoint(tmp_path: Path):
 
 def test_hidden_files_and_what_a_pull_left_stay_here(tmp_path: Path):
     folder = write_policy_folder(tmp_path / "policy")
-    for name in (".cache/huggingface/x.json", ".secret", "accerl_pulled.json", "accerl_manifest.json"):
+    for name in (".cache/huggingface/x.json", ".secret", "accerl_pulled.json"):
         write_json(folder / name, {})
     (folder / "linked").symlink_to(tmp_path)
     assert {n for n in contents(folder, "policy") if not (folder / n).exists()} == set()
@@ -45,13 +45,6 @@ def test_hidden_files_and_what_a_pull_left_stay_here(tmp_path: Path):
         for n in contents(folder, "policy")
         if "secret" in n or "cache" in n or "accerl_" in n or "link" in n
     }
-
-
-def test_what_lerobot_leaves_behind_of_a_recording_stays_here(tmp_path: Path):
-    for name in ("images/front/frame.png", "data/chunk-000/file-000.parquet"):
-        (tmp_path / name).parent.mkdir(parents=True)
-        (tmp_path / name).write_bytes(b"x")
-    assert set(contents(tmp_path, "dataset")) == {"data/chunk-000/file-000.parquet"}
 
 
 def test_a_backbone_elsewhere_is_brought(tmp_path: Path):

@@ -49,13 +49,6 @@ def copy_dataset(folder: Path) -> Path:
     return Path(shutil.copytree(TINY, folder))
 
 
-def test_an_old_dataset(tmp_path: Path):
-    info = copy_dataset(tmp_path / "dataset") / "meta" / "info.json"
-    info.write_text(info.read_text().replace("v3.0", "v2.1"))
-    with pytest.raises(InputError, match=r"version v2\.1; convert it to v3\.0"):
-        recognise(tmp_path / "dataset")
-
-
 def test_folders_one_above_say_which_below(tmp_path: Path):
     run = write_run_folder(tmp_path / "run")
     with pytest.raises(InputError, match="name the folder pretrained_model in it"):

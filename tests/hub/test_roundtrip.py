@@ -116,22 +116,8 @@ def test_policies_and_runs_load_wherever_they_are(hub: HubServer, run: Path, tmp
     assert hub.files("alice/run") == before, "there and back changes nothing"
 
 
-def test_a_policy_from_the_hub_can_be_improved_and_pushed_again(hub: HubServer, run: Path, tmp_path: Path):
-    accerl("push", f"--path={run / LAST}", "--repo_id=alice/policy")
-    config = PolicyConfig(path="alice/policy", device="cpu")
-    save_pretrained(load_adapter(config), tmp_path / "better", config)
-    stored = json.loads((tmp_path / "better" / "config.json").read_text())
-    assert stored["vlm_model_name"] == str(tmp_path / "better" / "backbone"), "as LeRobot wants it"
-    accerl("push", f"--path={tmp_path / 'better'}", "--repo_id=alice/better")
-    names = ("model.safetensors", "value_head.safetensors", "config.json", "policy_preprocessor.json")
-    first, second = hub.files("alice/policy"), hub.files("alice/better")
-    assert {n: first[n] for n in names} == {n: second[n] for n in names}
-
-
 @pytest.mark.parametrize("start", ["hub", pytest.param("folder", marks=pytest.mark.slow)])
-def test_a_run_that_was_pulled_can_be_gone_on_with(
-    hub: HubServer, tiny_checkpoint: Path, tmp_path: Path, start: str
-):
+def test_a_run_that_was_pulled_can_be_gone_on_with(hub, tiny_checkpoint, tmp_path, start):
     """With and without the checkpoint that it began from."""
     trainer = TrainerConfig(updates=3, batch_decisions=16, lr=1e-2, warmup_updates=0, value_warmup_updates=0)
     launch, evaluation = LaunchConfig(engine="local"), EvaluationConfig(episodes=2, videos=0)

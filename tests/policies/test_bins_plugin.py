@@ -33,7 +33,6 @@ SFT = SFTConfig(
     steps=60,
     batch_size=16,
     lr=5e-3,
-    warmup_steps=5,
     num_threads=1,
     policy={
         "type": "smolvla_bins",

@@ -220,7 +220,7 @@ def test_code_on_the_hub_is_refused(theirs: Repository):
     with guarded("policy"), pytest.raises(InputError) as caught:
         load(theirs.name, trust_remote_code=True)
     assert str(caught.value).startswith("policy.trust_remote_code=") and "their_code.py" in str(caught.value)
-    assert "policy.trust_remote_code=true and policy.code_revision" in caught.value.remedy
+    assert "commit in policy.trust_remote_code" in caught.value.remedy
     assert not theirs.marker.exists()
 
 

@@ -34,14 +34,6 @@ def test_thinning_keeps_every_extreme_and_the_mean() -> None:
     assert thinned.y.mean() == pytest.approx(y.mean(), abs=0.01)
 
 
-def test_thinning_by_hand() -> None:
-    """Twice as many points as there may be: each span is a pair."""
-    thinned = line("a", np.arange(2.0 * POINTS), np.tile([1.0, 3.0], POINTS))
-    assert np.allclose(thinned.y, 2) and thinned.low is not None and thinned.high is not None
-    assert np.allclose(thinned.low, 1) and np.allclose(thinned.high, 3)
-    assert thinned.x[:2].tolist() == [0.5, 2.5]
-
-
 def test_short_lines_stay_as_they_are_without_their_gaps() -> None:
     kept = line("a", np.array([1.0, 2.0, 3.0]), np.array([5.0, np.nan, 7.0]))
     assert kept.x.tolist() == [1, 3] and kept.y.tolist() == [5, 7] and kept.low is None

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -12,17 +11,12 @@ import pytest
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.report.read import column, newest, read_run
-from tests.report.folders import rollout_record, train_record, write_run
-
-
-def append(folder: Path, *records: dict[str, Any]) -> None:
-    with (folder / "metrics.jsonl").open("a") as file:
-        file.writelines(json.dumps(record) + "\n" for record in records)
+from tests.report.folders import write_run
 
 
 def test_a_finished_run(tmp_path: Path) -> None:
     run = read_run(write_run(tmp_path / "run"))
-    assert run.name == "run" and not run.truncated and run.sessions == 1
+    assert run.name == "run" and not run.truncated
     assert {kind: len(records) for kind, records in run.records.items()} == {
         "train": 40, "rollout": 40, "evaluation": 2,
     }  # fmt: skip
@@ -87,23 +81,6 @@ def test_damaged_files_are_named(tmp_path: Path, name: str, content: bytes, said
     with pytest.raises(InputError, match=said) as caught:
         read_run(folder)
     assert name in str(caught.value) and "\n" not in str(caught.value)
-
-
-def test_a_resumed_run_reads_as_one(tmp_path: Path) -> None:
-    """It died after update 40 and went on from a checkpoint of update 30, with all counters from 0."""
-    folder = write_run(tmp_path / "run", finished=False)
-    again = []
-    for update in (31, 32):
-        again.append({**train_record(update), "wall_s": 5.0 + update - 30})
-        again.append({**rollout_record(update - 30, 0, {}), "update": update, "wall_s": 5.0 + update - 30})
-    append(folder, *again)
-    run = read_run(folder)
-    assert run.sessions == 2
-    assert column(run.records["train"], "update").tolist() == list(range(1, 33))
-    # The first start wrote until second 50, when there were 1000 + 4000 env steps.
-    assert column(run.records["train"], "wall_s")[-2:].tolist() == [56.0, 57.0]
-    assert column(run.records["rollout"], "env_steps")[-2:].tolist() == [5100.0, 5200.0]
-    assert (np.diff(column(run.records["rollout"], "wall_s")) > 0).all()
 
 
 def test_columns_hold_numbers_only() -> None:

@@ -11,16 +11,8 @@ from pathlib import Path
 import pytest
 
 from accerl_lerobot import cli
-from accerl_lerobot.config.parsing import parse
 from accerl_lerobot.console import count, duration, number, percent, rate
-from accerl_lerobot.report import ReportConfig
 from tests.report.folders import write_run
-
-
-def test_runs_are_named_bare_or_not(tmp_path: Path) -> None:
-    assert parse(ReportConfig, ["a", "b,c", "--output=page.html"]).runs == ("a", "b,c")
-    assert parse(ReportConfig, ["--runs=a,b", "--output=page.html"]).runs == ("a", "b")
-    assert parse(ReportConfig, ["--output=page.html", "a"]).runs == ("a",)
 
 
 @pytest.mark.parametrize(

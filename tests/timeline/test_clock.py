@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import random
 import threading
 from pathlib import Path
@@ -103,7 +102,7 @@ def test_what_is_old_makes_room_and_is_counted(tmp_path: Path) -> None:
     # Two parts, each beyond its size by one batch of entries and a first line at most.
     assert len(files) == 2 and sum(f.stat().st_size for f in files) < 2 * (8 * (1000 + 512) + 1000)
     (row,) = read_timeline(tmp_path).rows
-    assert sum(len(part.states) for part in read_parts(tmp_path / TIMELINE)) >= 1000 and row.kept_from > 0
+    assert sum(len(part.states) for part in read_parts(tmp_path / TIMELINE)) >= 1000 and row.times[0] > 0
     kept = [(s, n) for s, n in zip(row.states.tolist(), np.diff(row.times).tolist(), strict=True) if n]
     assert merged(kept)[1:] == merged([(s, n) for s, n in spans if n])[-len(merged(kept)) + 1 :]
     assert PART_BYTES / 8 >= 400_000
@@ -125,31 +124,11 @@ def test_a_process_that_was_killed_leaves_all_but_what_was_on_its_way(tmp_path: 
             assert process.times.tolist() == [0, 0, 10**9, 3 * 10**9, 6 * 10**9][: len(process.times)]
 
 
-@pytest.mark.parametrize(
-    ("broken", "why"),
-    [
-        (b'{"timeline": 1}\n', "node"),
-        (b"no json\n", "Expecting value"),
-        (b"[1, 2]\n", "indices"),
-        ("format", "format 9"),
-        ("back", "time goes back"),
-        ("state", "no such state"),
-        ("name", "not enough values"),
-    ],
-)
-def test_a_damaged_file_is_named(tmp_path: Path, broken: bytes | str, why: str) -> None:
+@pytest.mark.parametrize(("head", "why"), [(b"no json", "Expecting value"), (b'{"timeline": 9}', "format 9")])
+def test_a_damaged_file_is_named(tmp_path: Path, head: bytes, why: str) -> None:
     write_worker(tmp_path, "trainer", [(COMPUTE, 1.0), (WAIT_IN, 1.0)])
     (path,) = (tmp_path / TIMELINE).iterdir()
-    head, entries = path.read_bytes().split(b"\n", 1)
-    if isinstance(broken, bytes):
-        path.write_bytes(broken)
-    elif broken == "name":
-        path = path.rename(path.with_name("notes.bin"))
-    elif broken == "format":
-        path.write_bytes(json.dumps({**json.loads(head), "timeline": 9}).encode() + b"\n")
-    else:
-        extra = (0).to_bytes(8, "little") if broken == "back" else (2**60 + 15).to_bytes(8, "little")
-        path.write_bytes(head + b"\n" + entries + extra)
+    path.write_bytes(head + b"\n")
     with pytest.raises(InputError, match=rf"{path.name}.*damaged \(.*{why}") as caught:
         read_timeline(tmp_path)
     assert caught.value.field == "runs"

@@ -39,7 +39,7 @@ K, COST = 4, 0.25
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> DatasetConfig:
     """Three successes and a failure."""
     root = tmp_path_factory.mktemp("demos") / "dataset"
-    config = DemosConfig(episodes=4, failure_share=0.25, processes=1)
+    config = DemosConfig(episodes=4, failure_share=0.25)
     record_demos(ENV, config, str(root))
     return DatasetConfig(repo_id="a/b", root=str(root))
 

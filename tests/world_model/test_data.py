@@ -153,7 +153,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[DatasetConfig, W
     """Six episodes of the simulated world, some of which fail."""
     root = tmp_path_factory.mktemp("demos") / "dataset"
     env = SimulatedConfig(max_steps=60, hold=25, image_size=16)
-    config = DemosConfig(episodes=6, failure_share=0.5, processes=1)
+    config = DemosConfig(episodes=6, failure_share=0.5)
     record_demos(env, config, str(root))
     world = make_world(env).spec
     spec = replace(

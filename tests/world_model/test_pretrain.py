@@ -36,7 +36,7 @@ from tests.world_model.test_pixels import awake, dots, model, rollout, windows
 
 def recorded(root: Path, episodes: int, seed: int) -> Path:
     env = SimulatedConfig(max_steps=60, hold=25, image_size=16)
-    of = DemosConfig(episodes=episodes, failure_share=0.5, processes=1)
+    of = DemosConfig(episodes=episodes, failure_share=0.5)
     return record_demos(env, of, str(root), seed)
 
 

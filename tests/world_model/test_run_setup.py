@@ -37,7 +37,7 @@ ENV = SimulatedConfig(max_steps=16, hold=8)
 
 
 def recorded(root: Path, episodes: int, seed: int) -> DatasetConfig:
-    of = DemosConfig(episodes=episodes, failure_share=0.5, processes=1)
+    of = DemosConfig(episodes=episodes, failure_share=0.5)
     return DatasetConfig(repo_id="a/b", root=str(record_demos(ENV, of, str(root), seed)))
 
 

@@ -8,13 +8,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from accerl_lerobot.algorithms import AlgorithmConfig, LossInputs, LossOutput, RatioConfig
-from accerl_lerobot.algorithms.objective import (
-    advantage_column,
-    assemble,
-    at_level,
-    mean_over_ratios,
-    ratio,
-)
+from accerl_lerobot.algorithms.objective import advantage_column, assemble, at_level, mean_over_ratios, ratio
 from accerl_lerobot.config.ranges import Range
 
 
