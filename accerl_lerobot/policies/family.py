@@ -38,7 +38,7 @@ class Encoded:
 
 
 class Action(NamedTuple):
-    """A family's answer for a batch."""
+    """A family's decisions for a batch."""
 
     chunk: Tensor
     """(B, K, A), K executed actions in the policy's normalised units."""
@@ -83,6 +83,10 @@ class Model(ABC):
     @abstractmethod
     def encode(self, batch: dict[str, Tensor]) -> Encoded:
         """Reads a preprocessed batch."""
+
+    def stock(self, batch: dict[str, Tensor], **noise: Tensor) -> Tensor:
+        """LeRobot's own chunk (B, K, A) in normalised units; where it denoises, from this ``noise``."""
+        return self.policy.predict_action_chunk(batch, **noise)
 
 
 class Family(nn.Module, ABC):
@@ -146,8 +150,11 @@ def exploring(requests: Sequence[Request], device: torch.device) -> Tensor:
     return torch.tensor([r.explore for r in requests], device=device)
 
 
-def refuse_compiled(config: Any) -> None:
-    """Refuses a LeRobot policy config whose sampler would be compiled."""
+def refuse_options(config: Any) -> None:
+    """Refuses options of LeRobot's policies under which the density would be another."""
+    if (rtc := getattr(config, "rtc_config", None)) is not None and rtc.enabled:
+        remedy = "real-time chunking changes the sampler's density; turn it off"
+        raise InputError("policy.rtc_config.enabled", True, remedy)
     if config.compile_model:
         remedy = "a compiled sampler rounds unlike the re-scoring pass; set it to false in config.json"
         raise InputError("policy.compile_model", True, remedy)

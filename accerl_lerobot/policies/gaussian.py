@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -37,28 +36,17 @@ from accerl_lerobot.policies.family import (
 )  # fmt: skip
 
 
-@dataclass(frozen=True, kw_only=True)
-class GaussianContext:
-    """`Encoded.context` of a Gaussian model."""
-
-    mean: Tensor
-    """fp32 (B, K, A), LeRobot's chunk."""
-    rows: Tensor
-    """(B, K, W), what the std is computed from."""
-
-
 class GaussianModel(Model):
-    """A LeRobot policy that predicts a chunk in one pass; `Encoded.context` is a `GaussianContext`."""
+    """A LeRobot policy that predicts a chunk in one pass.
+
+    `Encoded.context` is its chunk, fp32 (B, K, A), and the rows (B, K, W) that the std is computed from.
+    """
 
     executed: int
     """Rows that are executed in the environment."""
     action_dim: int
     row_width: int
     """W."""
-
-    def stock(self, batch: dict[str, Tensor]) -> Tensor:
-        """LeRobot's own chunk (B, K, A)."""
-        return self.policy.predict_action_chunk(batch)
 
 
 class StdHead(nn.Module):
@@ -112,8 +100,8 @@ class GaussianFamily(Family):
 
     def _gaussian(self, encoded: Encoded) -> tuple[Tensor, Tensor]:
         """Mean and std of the executed rows, each (B, L, A)."""
-        context, executed = encoded.context, self.model.executed
-        return context.mean[:, :executed], self.std(context.rows[:, :executed])
+        mean, rows = (part[:, : self.model.executed] for part in encoded.context)
+        return mean, self.std(rows)
 
 
 class ACT(GaussianModel):
@@ -152,5 +140,5 @@ class ACT(GaussianModel):
         return Encoded(
             features=features,
             mask=features.new_ones(features.shape[:2]).bool(),
-            context=GaussianContext(mean=mean.float(), rows=seen["rows"]),
+            context=(mean.float(), seen["rows"]),
         )

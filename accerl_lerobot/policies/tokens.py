@@ -61,10 +61,6 @@ class TokenModel(Model):
     def chunk(self, tokens: Tensor) -> Tensor:
         """Tokens (B, L), terminators to the end after the first, to the executed (B, K, A), normalised."""
 
-    def stock(self, batch: dict[str, Tensor]) -> Tensor:
-        """LeRobot's own greedy chunk (B, K, A) in normalised units, executed rows only."""
-        return self.policy.predict_action_chunk(batch)
-
     def stock_tokens(self, batch: dict[str, Tensor]) -> Tensor | None:
         """The tokens (B, L) behind `stock`, where many of them decode to one chunk."""
         return None

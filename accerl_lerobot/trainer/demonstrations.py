@@ -6,7 +6,6 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -23,19 +22,13 @@ ROWS, FRAMES = 5000, 20_000
 """Decisions, and env steps, that are read at most; of short datasets, decisions that begin at every step."""
 
 
-@dataclass(frozen=True)
-class WithDemonstrations:
+def with_demonstrations(
+    load: Load, dataset: DatasetConfig, decision_cost: float, config: PolicyConfig
+) -> Any:
     """Loads a policy whose trainer remembers demonstrations."""
-
-    load: Load
-    dataset: DatasetConfig
-    decision_cost: float
-
-    def __call__(self, config: PolicyConfig) -> Any:
-        """The adapter, with its demonstrations."""
-        adapter: Any = self.load(config)
-        adapter.demonstrations = partial(demonstrations, self.dataset, self.decision_cost)
-        return adapter
+    adapter: Any = load(config)
+    adapter.demonstrations = partial(demonstrations, dataset, decision_cost)
+    return adapter
 
 
 def unlike(meta: Any, wanted: dict[str, tuple[int, ...]]) -> str | None:

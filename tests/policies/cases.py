@@ -62,8 +62,6 @@ class Case:
     step: float = 0.02
     slack: float = 0.02
     """Step and relative error of finite differences: ReLUs bend, and smaller steps drown in rounding."""
-    one_token: bool = False
-    """True if the critic's features are one token, among which its query has nothing to choose."""
     context: Callable[[], contextlib.AbstractContextManager[None]] = contextlib.nullcontext
     """Holds whenever the policy is built."""
 
@@ -346,7 +344,6 @@ CASES = {
         close=(1e-3, 2e-3),
         step=0.005,
         slack=0.06,
-        one_token=True,
     ),
 }
 """The seven types, by their names in LeRobot."""
@@ -367,7 +364,6 @@ VARIANTS = {
         image=40,
         close=(1e-3, 2e-3),
         step=0.005,
-        one_token=True,
     )
 }
 """Other families, and configurations that take another path through the code."""

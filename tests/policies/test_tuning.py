@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import load_file
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.adapter import LeRobotAdapter, stack_observations
@@ -99,19 +98,6 @@ def test_full_and_expert(written: Callable[[str], Path], name: str):
 
 def test_lerobot_freezes_some_of_smolvla_by_itself(path: Path):
     assert policy_names(tuned(path)) < policy_names(tuned(path, mode="full"))
-
-
-def test_the_merged_weight_by_hand(path: Path, tmp_path: Path):
-    tuning = TuningConfig(mode="lora", rank=2, targets=r"model\.action_out_proj")
-    adapter = adapter_at(path, tuning=tuning)
-    layer = adapter.policy.model.action_out_proj
-    with torch.no_grad():
-        layer.lora_B["default"].weight.normal_()
-    save_pretrained(adapter, tmp_path / "saved", PolicyConfig(path=str(path), device="cpu", tuning=tuning))
-    product = layer.lora_B["default"].weight @ layer.lora_A["default"].weight
-    expected = layer.base_layer.weight + product
-    weight = load_file(tmp_path / "saved" / "model.safetensors")["model.action_out_proj.weight"]
-    assert_close(weight, expected)
 
 
 @pytest.mark.parametrize(

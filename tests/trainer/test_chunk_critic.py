@@ -20,7 +20,7 @@ from accerl_lerobot.policies.config import FlowSamplerConfig, PolicyConfig
 from accerl_lerobot.policies.family import Encoded
 from accerl_lerobot.policies.flow import FlowFamily, FlowShape
 from accerl_lerobot.policies.loading import load_adapter
-from accerl_lerobot.policies.teacher import TASK_BITS, Ensemble, Teacher, WithTeacher, state_of
+from accerl_lerobot.policies.teacher import TASK_BITS, Ensemble, Teacher, state_of, with_teacher
 from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.seeds import noise_seed
@@ -67,8 +67,8 @@ def chunks(segment: Segment) -> np.ndarray:
 
 def taught(checkpoint: Path, precision: Literal["fp32", "bf16"] = "fp32") -> LeRobotAdapter:
     """A policy and a teacher that sees one number and the task."""
-    load = WithTeacher(load_adapter, state=1, share=0.5, noise=0.1)
-    return load(PolicyConfig(path=str(checkpoint), device="cpu", precision=precision))
+    config = PolicyConfig(path=str(checkpoint), device="cpu", precision=precision)
+    return with_teacher(load_adapter, state=1, share=0.5, config=config, noise=0.1)
 
 
 def learner(
@@ -163,9 +163,8 @@ def requests(adapter: LeRobotAdapter, count: int) -> list[Request]:
 
 class TestActing:
     def test_whole_episodes_are_the_teachers_once_it_is_ready(self, tiny_checkpoint: Path):
-        adapter = WithTeacher(load_adapter, ENV.state_size, share=0.5, noise=0.0)(
-            PolicyConfig(path=str(tiny_checkpoint), device="cpu")
-        )
+        config = PolicyConfig(path=str(tiny_checkpoint), device="cpu")
+        adapter = with_teacher(load_adapter, ENV.state_size, share=0.5, config=config, noise=0.0)
         assert adapter.teacher is not None
         observation = requests(adapter, 1)[0].observation
         asked = [
