@@ -23,12 +23,7 @@ Level = Literal["token", "chunk"]
 
 @dataclass(frozen=True, kw_only=True)
 class AlgorithmConfig(Section, draccus.ChoiceRegistry, section="algorithm"):
-    """Base of every algorithm config; subclasses register under the name given on the command line.
-
-    Example:
-        >>> draccus.decode(AlgorithmConfig, {"type": "gipo", "sigma": 0.5}).type
-        'gipo'
-    """
+    """Base of every algorithm config; subclasses register under the name given on the command line."""
 
     update: ClassVar[str]
     """``module:class`` of the trainer's updates: made from adapter, algorithm and `TrainerConfig`, and, of a
@@ -82,10 +77,9 @@ class OffPolicyConfig(AlgorithmConfig):
 @AlgorithmConfig.register_subclass("self_imitation")
 @dataclass(frozen=True, kw_only=True)
 class SelfImitationConfig(OffPolicyConfig):
-    """Settings of self-imitation; it has no critic.
+    """Settings of self-imitation: without a critic, of the policy's own successful episodes as they come in.
 
-    It imitates the policy's own successful episodes as they come in: rejection fine-tuning without rounds,
-    or filtered behaviour cloning (related: arXiv 1806.05635). It is the baseline to beat at equal episodes.
+    Rejection fine-tuning without rounds, or filtered behaviour cloning (related: arXiv 1806.05635).
     """
 
 
@@ -129,8 +123,6 @@ class LossInputs:
     """bool (N, L), False for a factor that does not exist, such as a token after the terminator; its content
     is never looked at. None: all exist."""
     ratios_per_decision: float | None = None
-    """Mean number of ratios per decision, of the batch that this one is a micro-batch of.
-
-    With it the losses of micro-batches, weighted by their decisions, add up to that of the whole batch. None:
-    this is the whole batch.
-    """
+    """Mean number of ratios per decision of the batch that this one is a micro-batch of; with it the losses
+    of micro-batches, weighted by their decisions, add up to that of the batch. None: this is the whole
+    batch."""

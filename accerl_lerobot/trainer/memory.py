@@ -15,27 +15,17 @@ from accerl_lerobot.experience import ENVIRONMENT_STATE, Segment
 from accerl_lerobot.policies.teacher import TASK_BITS, task_code
 
 FIRST = 1024
-"""Rows that memory is asked for at first; doubled when they are full."""
+"""Rows that a column has space for at first; doubled when they are full."""
 
 
 class Memory:
-    """Rows of whole episodes.
-
-    Args:
-        n_step: decisions ahead that `following` points to.
-
-    Example:
-        >>> memory = Memory(capacity=100_000, gamma=0.98, n_step=4)
-        >>> rows = memory.add(segment, chunk)
-        >>> memory["reward"][rows], memory["following"][rows]
-    """
+    """Rows of whole episodes; `following` points `n_step` decisions ahead."""
 
     def __init__(self, capacity: int, gamma: float, n_step: int) -> None:
         self.capacity, self.gamma, self.n_step = capacity, gamma, n_step
         self.total = 0
         """Rows ever added."""
         self._columns: dict[str, np.ndarray] = {}
-        self._codes: dict[str, np.ndarray] = {}
         self.tasks: list[str] = []
 
     def __len__(self) -> int:
@@ -53,15 +43,7 @@ class Memory:
         return self._columns[name][: len(self)]
 
     def add(self, segment: Segment, chunk: np.ndarray) -> np.ndarray:
-        """Adds an episode.
-
-        Args:
-            segment: the whole of it.
-            chunk: float32 (T, K, A), what was executed, in normalised units.
-
-        Returns:
-            Its T rows.
-        """
+        """Adds a whole episode, whose T rows it returns; `chunk`, (T, K, A), was executed, normalised."""
         t = len(segment)
         if segment.origin.decision or not segment.episode or t > self.capacity:
             remedy = f"the memory holds whole episodes of at most algorithm.memory={self.capacity} decisions"
@@ -75,10 +57,9 @@ class Memory:
         discount = self.gamma**ahead
         seen = {name: values[:-1] for name, values in segment.observations.items()}
         environment = seen.pop(ENVIRONMENT_STATE, np.empty((t, 0))).reshape(t, -1)
-        if segment.task not in self._codes:
-            self._codes[segment.task] = task_code(segment.task)
+        if segment.task not in self.tasks:
             self.tasks.append(segment.task)
-        code = np.broadcast_to(self._codes[segment.task], (t, TASK_BITS))
+        code = np.broadcast_to(task_code(segment.task), (t, TASK_BITS))
         columns: dict[str, Any] = {
             "state": np.concatenate([environment, code], 1).astype(np.float32),
             "chunk": chunk,
@@ -89,25 +70,15 @@ class Memory:
             "success": np.full(t, segment.success),
             "task": np.full(t, self.tasks.index(segment.task)),
         }
-        columns |= seen
-        for name, values in columns.items():
-            self._write(name, rows, values, self.total + t)
         self.total += t
+        for name, values in (columns | seen).items():
+            column = self._columns.get(name, values[:0])
+            if len(column) < len(self):
+                more = min(max(FIRST, len(self), 2 * len(column)), self.capacity) - len(column)
+                column = np.concatenate([column, np.zeros((more, *values.shape[1:]), values.dtype)])
+                self._columns[name] = column
+            column[rows] = values
         return rows
-
-    def _write(self, name: str, rows: np.ndarray, values: np.ndarray, total: int) -> None:
-        """Sets rows (B,) of a column, made if new, to values (B, ...); `total` rows are there then."""
-        size = min(total, self.capacity)
-        column = self._columns.get(name)
-        if column is None or len(column) < size:
-            room = FIRST
-            while room < size:
-                room *= 2
-            grown = np.zeros((min(room, self.capacity), *values.shape[1:]), values.dtype)
-            if column is not None:
-                grown[: len(column)] = column
-            self._columns[name] = column = grown
-        column[rows] = values
 
     def observations(self, rows: np.ndarray) -> tuple[dict[str, np.ndarray], list[str]]:
         """The policy's observations, each (B, ...), and its instructions."""
@@ -122,4 +93,3 @@ class Memory:
     def restore(self, state: dict[str, Any]) -> None:
         """Resume from `state`."""
         self.total, self.tasks, self._columns = state["total"], list(state["tasks"]), dict(state["columns"])
-        self._codes = {task: task_code(task) for task in self.tasks}

@@ -48,11 +48,11 @@ def test_a_step_weighs_each_row_by_its_advantage(tiny_checkpoint: Path):
     rows = np.array([0, 1, 1])
     for _ in range(2):
         encoded = update.adapter.encode(*update.memory.observations(rows))
-        found = update.weight(rows, encoded)
+        found = update.losses(rows, encoded, torch.tensor([1.0, 2.0, 3.0]))
         square = 2 / 3  # the mean square of the returns 0, 1, 1 stays the same
-        expected = np.minimum(np.exp(np.array([0.0, 1.0, 1.0]) / math.sqrt(square) / 0.5), 5.0)
-        np.testing.assert_allclose(found, expected, rtol=1e-5)
-    assert update.auxiliary(rows, encoded)["value_loss"].item() == pytest.approx(2 / 3)
+        weight = np.minimum(np.exp(np.array([0.0, 1.0, 1.0]) / math.sqrt(square) / 0.5), 5.0)
+        assert found["imitation_loss"].item() == pytest.approx(weight @ [1, 2, 3] / 3, rel=1e-5)
+        assert found["value_loss"].item() == pytest.approx(2 / 3)
     metrics = update.learn(1)
     low, high = float(losses[0, 0, 0]), float(losses[1, 0, 0])
     assert min(low, 5 * high) < metrics["imitation_loss"] < max(low, 5 * high)
