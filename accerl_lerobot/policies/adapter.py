@@ -268,7 +268,7 @@ class LeRobotAdapter(PolicyAdapter):
         with self.autocast():
             encoded = self.encode(observations, tasks)
             score = self.family.score(encoded, {k: v.to(self.device) for k, v in latent.items()})
-        return Evaluation(*score, self._value(encoded))
+        return Evaluation(score.log_prob, score.entropy, self._value(encoded))
 
     @torch.no_grad()
     def values(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Tensor:

@@ -194,7 +194,11 @@ def guarded(section: str, code_revision: str | None = None) -> Iterator[None]:
         return load(file, *arguments, **options | {"weights_only": True})
 
     # Without a time-out of 0 it would ask the terminal.
-    wrapped = {"get_cached_module_file": fetch_pinned, "check_imports": look_first, "TIME_OUT_REMOTE_CODE": 0}
+    wrapped: dict[str, Any] = {
+        "get_cached_module_file": fetch_pinned,
+        "check_imports": look_first,
+        "TIME_OUT_REMOTE_CODE": 0,
+    }
     with patch.multiple(dynamic, **wrapped), patch.object(torch, "load", load_known):
         yield
 

@@ -236,7 +236,7 @@ def data_only() -> Iterator[None]:
     from lerobot.policies.pi0_fast import modeling_pi0_fast
     from lerobot.processor import tokenizer_processor
 
-    ours = {"AutoProcessor": FastTokenizer, "AutoTokenizer": _TextTokenizer}
+    ours: dict[str, Any] = {"AutoProcessor": FastTokenizer, "AutoTokenizer": _TextTokenizer}
     with patch.multiple(modeling_pi0_fast, **ours), patch.multiple(tokenizer_processor, **ours):
         yield
 

@@ -129,6 +129,13 @@ def test_the_chunk_is_the_tokens_bin_centres_in_the_environment_s_units(path: Pa
     assert short.chunk.shape == (1, DIMS) and short.latent["tokens"].shape == (DIMS,)
 
 
+def test_actions_are_executed_one_by_one_and_a_new_chunk_follows(loaded: tuple[Any, Any, Any]):
+    policy, pre, _ = loaded
+    batch = pre(observed(3))
+    chunk = policy.predict_action_chunk(batch)[:, :2]
+    assert torch.equal(torch.stack([policy.select_action(batch) for _ in range(4)], 1), chunk.repeat(1, 2, 1))
+
+
 def test_the_loss_by_hand(loaded: tuple[Any, Any, Any]):
     policy, pre, _ = loaded
     raw = observed(3)

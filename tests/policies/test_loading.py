@@ -25,7 +25,7 @@ from accerl_lerobot.policies.loading import load_adapter, load_lerobot_config, r
 from accerl_lerobot.policies.saving import save_pretrained
 from accerl_lerobot.testing import perturb
 from tests.policies.cases import CASES
-from tests.policies.checkpoints import edit_config, stock_chunk, write_smolvla
+from tests.policies.checkpoints import edit_config, write_smolvla
 from tests.policies.tiny import adapter_at, requests
 from tests.policies.tiny_pi import ACTIONS, COMMIT, KINDS, PALIGEMMA, SKIP, hub, write_pi
 
@@ -240,15 +240,17 @@ def test_missing_processors(damaged: Any):
 def test_torchvision_s_weights_are_not_asked_for(
     damaged: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
+    from lerobot.policies.factory import get_policy_class
+
     def download(*arguments: object, **options: object) -> None:
         raise AssertionError("the network")
 
     monkeypatch.setattr("torchvision.models._api.load_state_dict_from_url", download)
-    path, asked = damaged("act"), requests(1, image=16)[0]
+    path, stock = damaged("act"), get_policy_class("act")
     edit_config(path, pretrained_backbone_weights="ResNet18_Weights.IMAGENET1K_V1")
     with pytest.raises(AssertionError, match="the network"):
-        stock_chunk(path, asked)
-    stock_chunk(saved(path, tmp_path / "saved"), asked)
+        stock.from_pretrained(path)
+    stock.from_pretrained(saved(path, tmp_path / "saved"))
 
 
 # ---- LeRobot's internals: what the sampler is compared with at load
@@ -336,12 +338,6 @@ def test_a_checkpoint_on_the_hub_is_loaded_whole(
     assert decided("me/policy") == decided(path)
     with pytest.raises(InputError, match="not loadable from the Hub"):
         load_adapter(PolicyConfig(path="me/policy", revision="v9", device="cpu"))
-
-
-def test_tilde_is_the_home_folder(written: Any, monkeypatch: pytest.MonkeyPatch):
-    path = written("smolvla")
-    monkeypatch.setenv("HOME", str(path.parent))
-    assert decided(f"~/{path.name}") == decided(path)
 
 
 def test_overridden_steps_are_used_and_saved(written: Any, tmp_path: Path):
