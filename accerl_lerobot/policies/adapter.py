@@ -267,8 +267,8 @@ class LeRobotAdapter(PolicyAdapter):
     ) -> Evaluation:
         with self.autocast():
             encoded = self.encode(observations, tasks)
-            score = self.family.score(encoded, {k: v.to(self.device) for k, v in latent.items()})
-        return Evaluation(score.log_prob, score.entropy, self._value(encoded))
+            log_prob, entropy = self.family.score(encoded, {k: v.to(self.device) for k, v in latent.items()})
+        return Evaluation(log_prob, entropy, self._value(encoded))
 
     @torch.no_grad()
     def values(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Tensor:

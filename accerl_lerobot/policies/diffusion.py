@@ -32,19 +32,9 @@ from torch import Tensor
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Request
+from accerl_lerobot.policies import family
 from accerl_lerobot.policies.config import DiffusionSamplerConfig
-from accerl_lerobot.policies.family import (
-    Action,
-    Encoded,
-    Family,
-    Model,
-    Score,
-    exploring,
-    normal_entropy,
-    normal_log_prob,
-    refuse_options,
-    standard_normal,
-)  # fmt: skip
+from accerl_lerobot.policies.family import Action, Encoded, Family, Model, normal_entropy, normal_log_prob
 
 Network = Callable[[Tensor, int], Tensor]
 """(x (B, H, A), timestep) → what the network predicts, fp32 (B, H, A), given the observations."""
@@ -112,7 +102,7 @@ class Diffusion(Model):
 
     def __init__(self, policy: Any) -> None:
         config = policy.config
-        refuse_options(config)
+        family.refuse_options(config)
         steps, most = policy.diffusion.num_inference_steps, config.num_train_timesteps
         if steps > most:
             raise InputError("policy.num_steps", steps, f"use at most {most}, as many as it was trained with")
@@ -198,8 +188,8 @@ class DiffusionFamily(Family):
     def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
         """Samples; without exploration a DDPM policy still draws step noise, as LeRobot's does."""
         device = encoded.features.device
-        x, eps = standard_normal(requests, self.size, (len(self.schedule), *self.size), device=device)
-        return self.sample(encoded.context, x, eps, exploring(requests, device))
+        x, eps = self.noise(requests, self.size, (len(self.schedule), *self.size), device=device)
+        return self.sample(encoded.context, x, eps, self.exploring(requests, device))
 
     def sample(self, network: Network, x: Tensor, eps: Tensor, explore: Tensor) -> Action:
         """Denoises `x` (B, H, A) with step noise `eps` (B, N, H, A); as LeRobot where not `explore` (B,)."""
@@ -223,9 +213,9 @@ class DiffusionFamily(Family):
             log_prob = log_prob + self._rows(k, path[k + 1], mean, std)
         return log_prob[:, self._factors]
 
-    def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> Score:
+    def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         log_prob = self.log_prob(encoded.context, latent)
-        return Score(log_prob, entropy=log_prob.new_full((len(log_prob),), self.entropy))
+        return log_prob, log_prob.new_full((len(log_prob),), self.entropy)
 
     def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
         size = (len(encoded.features), *self.size)

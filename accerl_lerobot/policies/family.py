@@ -48,15 +48,6 @@ class Action(NamedTuple):
     """(B, L); zero where not exploring."""
 
 
-class Score(NamedTuple):
-    """Stored latents under the current weights."""
-
-    log_prob: Tensor
-    """(B, L), differentiable."""
-    entropy: Tensor
-    """(B,)."""
-
-
 class Model(ABC):
     """One LeRobot policy type; holds the policy and no weights of its own.
 
@@ -97,8 +88,8 @@ class Family(nn.Module, ABC):
         """Samples; where a request does not explore, LeRobot's own sampler."""
 
     @abstractmethod
-    def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> Score:
-        """Re-scores what `act` stored."""
+    def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Log-prob (B, L), differentiable, of what `act` stored, and entropy (B,)."""
 
     @abstractmethod
     def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
@@ -114,6 +105,18 @@ class Family(nn.Module, ABC):
     def factors(self, latent: dict[str, Tensor]) -> Tensor | None:
         """See `PolicyAdapter.factors`."""
         return None
+
+    @staticmethod
+    def noise(requests: Sequence[Request], *sizes: tuple[int, ...], device: torch.device) -> list[Tensor]:
+        """Standard normal tensors, each (B, *size), row i from request i's own seed, whatever its batch."""
+        generators = [np.random.default_rng(request.noise_seed) for request in requests]
+        draws = [[rng.standard_normal(size, dtype=np.float32) for size in sizes] for rng in generators]
+        return [torch.from_numpy(np.stack(column)).to(device) for column in zip(*draws, strict=True)]
+
+    @staticmethod
+    def exploring(requests: Sequence[Request], device: torch.device) -> Tensor:
+        """bool (B,)."""
+        return torch.tensor([request.explore for request in requests], device=device)
 
 
 LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
@@ -134,20 +137,6 @@ def pooled(features: Tensor, weights: Tensor) -> Tensor:
     """Weighted mean, fp32 (B, width), of features (B, P, width); weights (B, P) of any sum above 0."""
     weights = weights / weights.sum(-1, keepdim=True)
     return (weights[..., None] * features.float()).sum(1)
-
-
-def standard_normal(
-    requests: Sequence[Request], *sizes: tuple[int, ...], device: torch.device
-) -> list[Tensor]:
-    """Standard normal tensors, each (B, *size), row i from request i's own seed, whatever its batch."""
-    generators = [np.random.default_rng(request.noise_seed) for request in requests]
-    draws = [[rng.standard_normal(size, dtype=np.float32) for size in sizes] for rng in generators]
-    return [torch.from_numpy(np.stack(column)).to(device) for column in zip(*draws, strict=True)]
-
-
-def exploring(requests: Sequence[Request], device: torch.device) -> Tensor:
-    """bool (B,)."""
-    return torch.tensor([r.explore for r in requests], device=device)
 
 
 def refuse_options(config: Any) -> None:

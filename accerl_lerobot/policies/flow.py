@@ -25,17 +25,7 @@ from torch import Tensor
 
 from accerl_lerobot.experience import Request
 from accerl_lerobot.policies.config import FlowSamplerConfig
-from accerl_lerobot.policies.family import (
-    Action,
-    Encoded,
-    Family,
-    Model,
-    Score,
-    exploring,
-    normal_entropy,
-    normal_log_prob,
-    standard_normal,
-)  # fmt: skip
+from accerl_lerobot.policies.family import Action, Encoded, Family, Model, normal_entropy, normal_log_prob
 
 Velocity = Callable[[Tensor, Tensor], Tensor]
 """(x (B, K, D), t (B,)) → v (B, K, D), conditioned on the observations; output in fp32."""
@@ -99,8 +89,8 @@ class FlowFamily(Family):
     def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
         n, size = self.shape.num_steps, (self.shape.chunk_size, self.shape.padded_dim)
         # Noise of every step is drawn, though only the last is noisy: recorded runs used these numbers.
-        x0, eps = standard_normal(requests, size, (n, *size), device=encoded.features.device)
-        return self.sample(encoded.context, x0, eps[:, -1], exploring(requests, x0.device))
+        x0, eps = self.noise(requests, size, (n, *size), device=encoded.features.device)
+        return self.sample(encoded.context, x0, eps[:, -1], self.exploring(requests, x0.device))
 
     def sample(self, velocity: Velocity, x0: Tensor, eps: Tensor, explore: Tensor) -> Action:
         """Denoises `x0` (B, K, D), where `explore` (B,) with last noise `eps` (B, K, D), else as LeRobot."""
@@ -117,9 +107,9 @@ class FlowFamily(Family):
         x0, x = latent["path"].unbind(1)
         return self._rows(x, self.shape.integrate(velocity, x0))
 
-    def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> Score:
+    def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         log_prob = self.log_prob(encoded.context, latent)
-        return Score(log_prob, entropy=log_prob.new_full((len(log_prob),), self.entropy))
+        return log_prob, log_prob.new_full((len(log_prob),), self.entropy)
 
     def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
         size = (len(encoded.features), self.shape.chunk_size, self.shape.padded_dim)

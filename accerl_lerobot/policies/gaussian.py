@@ -23,17 +23,7 @@ from torch import Tensor, nn
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Request
 from accerl_lerobot.policies.config import GaussianSamplerConfig
-from accerl_lerobot.policies.family import (
-    Action,
-    Encoded,
-    Family,
-    Model,
-    Score,
-    exploring,
-    normal_entropy,
-    normal_log_prob,
-    standard_normal,
-)  # fmt: skip
+from accerl_lerobot.policies.family import Action, Encoded, Family, Model, normal_entropy, normal_log_prob
 
 
 class GaussianModel(Model):
@@ -79,16 +69,16 @@ class GaussianFamily(Family):
 
     def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
         mean, std = self._gaussian(encoded)
-        (eps,) = standard_normal(requests, tuple(mean.shape[1:]), device=mean.device)
-        explore = exploring(requests, mean.device)
+        (eps,) = self.noise(requests, tuple(mean.shape[1:]), device=mean.device)
+        explore = self.exploring(requests, mean.device)
         u = torch.where(explore[:, None, None], mean + std * eps, mean)
         counted = normal_log_prob(u, mean, std).sum(-1)
         return Action(u, {"u": u}, torch.where(explore[:, None], counted, 0.0))
 
-    def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> Score:
+    def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         mean, std = self._gaussian(encoded)
         log_prob = normal_log_prob(latent["u"], mean, std).sum(-1)
-        return Score(log_prob, entropy=normal_entropy(std).sum((1, 2)))
+        return log_prob, normal_entropy(std).sum((1, 2))
 
     def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
         mean, _ = self._gaussian(encoded)

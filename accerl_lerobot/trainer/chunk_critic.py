@@ -3,7 +3,7 @@
 
     new episodes → memory → steps of critic and teacher → steps of the policy, so many for each new decision
 
-`algorithms.chunk_critic` has the formulas. Until ``trainer.value_warmup_updates`` the policy explores alone.
+`ChunkCriticConfig` has the formulas. Until ``trainer.value_warmup_updates`` the policy explores alone.
 Then the teacher first learns to do what has been done so far, and from there what the critic says.
 
 Shapes: M members of the ensemble, B rows, S numbers of a state, (K, A) of a chunk.

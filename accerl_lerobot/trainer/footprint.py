@@ -41,7 +41,7 @@ class PolicyMemory(NamedTuple):
     """Most at a time while a batch is decided; copies of weights in bf16."""
     acting: int
     learning_batch: int
-    """Of a batch that waits for its gradient."""
+    """A batch that waits for its gradient."""
     learning: int
 
     def trainer(self, decisions: int, copies: int = 3) -> int:
@@ -133,8 +133,8 @@ def _prepare_gradient(adapter: LeRobotAdapter, action: Action, imitates: bool, b
         if imitates:
             return adapter.family.imitation_loss(encoded, action.chunk.expand(rows, -1, -1))
         latent = {name: tensor.expand(rows, *tensor.shape[1:]) for name, tensor in action.latent.items()}
-        score = adapter.family.score(encoded, latent)
-    return score.log_prob, adapter.value_head(encoded.features, encoded.mask)
+        log_prob, _ = adapter.family.score(encoded, latent)
+    return log_prob, adapter.value_head(encoded.features, encoded.mask)
 
 
 def _fake(adapter: LeRobotAdapter, mode: Any) -> None:

@@ -17,7 +17,7 @@ from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.experience import TASK, Request
 from accerl_lerobot.policies.adapter import stack_observations
 from accerl_lerobot.policies.config import DiffusionSamplerConfig, PolicyConfig
-from accerl_lerobot.policies.family import standard_normal
+from accerl_lerobot.policies.family import Family
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.rollout.worker import RolloutWorker, WorkerShare
 from accerl_lerobot.trainer.config import TrainerConfig
@@ -55,7 +55,7 @@ def test_not_exploring_is_lerobot_s_sampler_to_the_bit(
     observations, tasks = stack_observations(asked)
     assert adapter.self_check(observations, tasks) == 0.0
     sizes = (8, 2), (len(adapter.family.schedule), 8, 2)
-    noise, each = standard_normal(asked, *sizes, device=torch.device("cpu"))
+    noise, each = Family.noise(asked, *sizes, device=torch.device("cpu"))
     steps = list(each.transpose(0, 1))
     for scheduler in ("ddpm", "ddim"):
         monkeypatch.setattr(
@@ -102,7 +102,7 @@ def test_an_episode_is_the_one_that_stock_lerobot_plays(looking: Path):
     while not ended:
         request = Request(observation=observation, noise_seed=decisions, explore=False)
         chunk = adapter.decide([request], 0)[0].chunk
-        noise = standard_normal([request], size, device=torch.device("cpu"))[0]
+        noise = Family.noise([request], size, device=torch.device("cpu"))[0]
         for row in chunk:
             arrays = {k: np.asarray(v)[None] for k, v in policy_sees.items() if k != TASK}
             batch = adapter.processing.prepare(arrays, [str(policy_sees[TASK])])

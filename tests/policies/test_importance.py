@@ -35,7 +35,7 @@ class Case(NamedTuple):
     """Decisions of μ or π, with noise of a seed."""
     log_prob: Callable[[bool, dict[str, Tensor]], Tensor]
     entropy: Tensor
-    """Of μ, (B,)."""
+    """That of μ, (B,)."""
 
 
 def network(size: int, pi: bool) -> Callable[[Tensor, Any], Tensor]:
@@ -120,9 +120,9 @@ def gaussian(count: int = 40_000) -> Case:
         return family.act(encoded(pi, count), asked)
 
     def score(pi: bool, latent: dict[str, Tensor]) -> Tensor:
-        return family.score(encoded(pi, count), latent).log_prob
+        return family.score(encoded(pi, count), latent)[0]
 
-    return Case(act, score, family.score(encoded(MU, 2), {"u": torch.zeros(2, 2, 2)}).entropy)
+    return Case(act, score, family.score(encoded(MU, 2), {"u": torch.zeros(2, 2, 2)})[1])
 
 
 def payoff(chunk: Tensor) -> Tensor:
@@ -161,5 +161,5 @@ def test_the_learned_std_of_a_gaussian_does_not_shape_the_features():
     family, read = gaussian_family(), encoded(MU, 4)
     read.context[1].requires_grad_()
     action = family.act(read, [Request(observation={}, noise_seed=i) for i in range(4)])
-    family.score(read, action.latent).log_prob.sum().backward()
+    family.score(read, action.latent)[0].sum().backward()
     assert read.context[1].grad is None and family.std.out.weight.grad.abs().max() > 0

@@ -383,25 +383,6 @@ def test_another_sampler_is_pointed_out(written: Any, tmp_path: Path, caplog: py
 
 # ---- tokenisers of π0, π0.5 and π0-FAST
 
-REMOTE_CODE = """
-import json
-from pathlib import Path
-from transformers import PreTrainedTokenizerFast
-Path({marker!r}).touch()
-class UniversalActionProcessor:
-    @classmethod
-    def register_for_auto_class(cls): pass
-    @classmethod
-    def from_pretrained(cls, name, **options):
-        from huggingface_hub import snapshot_download
-        folder = Path(name) if Path(name).is_dir() else Path(snapshot_download(name))
-        made = cls()
-        made.__dict__.update(json.loads((folder / "processor_config.json").read_text()))
-        made.bpe_tokenizer = PreTrainedTokenizerFast.from_pretrained(folder)
-        return made
-"""
-"""Code in a tokeniser's repository, such as the class that LeRobot means to run."""
-
 
 def remote(cache: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Puts code into the Hub repository of FAST's tokeniser; it leaves a mark when it is run."""
@@ -409,7 +390,8 @@ def remote(cache: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
     snapshot = cache / f"models--{ACTIONS.replace('/', '--')}" / "snapshots" / COMMIT
     marker = cache / "was-run"
-    (snapshot / "processing_action_tokenizer.py").write_text(REMOTE_CODE.format(marker=str(marker)))
+    code = f"from pathlib import Path\nPath({str(marker)!r}).touch()\nclass UniversalActionProcessor: pass\n"
+    (snapshot / "processing_action_tokenizer.py").write_text(code)
     monkeypatch.setattr(dynamic_module_utils, "HF_MODULES_CACHE", str(cache / "modules"))
     return marker
 
@@ -457,17 +439,6 @@ def test_lerobot_s_checkpoint_needs_the_hub_and_ours_does_not(
     assert decided(tmp_path / "second") == expected
     assert named(tmp_path / "second") == {PALIGEMMA, ACTIONS}, "others find them where the original's were"
     assert not displaced(tmp_path / "second")
-
-
-def test_stock_lerobot_runs_the_code_of_fast_s_tokeniser(
-    written: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    from lerobot.policies.factory import get_policy_class
-
-    with hub(tmp_path / "hub"):
-        marker = remote(tmp_path / "hub", monkeypatch)
-        get_policy_class("pi0_fast").from_pretrained(written("pi0_fast"))
-    assert marker.exists(), "or the test above shows nothing"
 
 
 def test_tokenisers_named_by_their_path_move_along(damaged: Any, tmp_path: Path):

@@ -28,8 +28,7 @@ from accerl_lerobot.trainer import chunk_critic
 from accerl_lerobot.trainer.batch import NonFiniteError
 from accerl_lerobot.trainer.chunk_critic import ChunkCriticUpdate, Critic
 from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.trainer.memory import Memory
-from accerl_lerobot.trainer.off_policy import OffPolicyUpdate
+from accerl_lerobot.trainer.off_policy import Memory, OffPolicyUpdate
 from tests.replay.segments import make_segment
 from tests.runs import tiny_run
 

@@ -29,6 +29,7 @@ from accerl_lerobot.trainer import demonstrations as module
 from accerl_lerobot.trainer.chunk_critic import ChunkCriticUpdate
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.demonstrations import demonstrations, with_demonstrations
+from tests.replay.segments import make_segment
 from tests.runs import tiny_run
 from tests.trainer.test_chunk_critic import SECTIONS
 
@@ -51,20 +52,14 @@ def like() -> Segment:
     world = make_world(ENV)
     observation = world.reset(3, world.spec.tasks[0])
     seen = {name: np.stack([value] * 2) for name, value in observation.items() if name != "task"}
-    return Segment(
+    return make_segment(
+        "explored",
+        1,
         observations=seen,
         task=str(observation["task"]),
-        latent={},
-        log_prob=np.zeros((1, 1), np.float32),
-        value=np.zeros(1, np.float32),
         actions=np.zeros((1, K, world.spec.action_dim), np.float32),
-        reward=np.zeros(1, np.float32),
-        version=np.zeros(1, np.int64),
         steps=np.array([K]),
         terminated=True,
-        truncated=False,
-        success=False,
-        key="explored",
         origin=Origin("match", 0, 0),
         episode={"return": 0.0},
     )
