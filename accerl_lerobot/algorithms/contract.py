@@ -88,7 +88,7 @@ class SelfImitationConfig(OffPolicyConfig):
 class AWRConfig(OffPolicyConfig):
     """Settings of advantage-weighted regression (Peng et al., arXiv 1910.00177).
 
-        w = min(exp((R − V(o)) / (beta · s)), cap)
+        w = min(exp((R − V(o)) / (beta · s)), 20)
         L = E[w · imitation loss]  +  E[(R − V(o))²]
 
     R is the discounted return of the episode from the decision on, s the standard deviation of R − V(o) of
@@ -99,8 +99,6 @@ class AWRConfig(OffPolicyConfig):
 
     beta: Annotated[float, Range("(0, inf]")] = 1.0
     """Temperature in standard deviations of the advantage; ``inf`` weighs all decisions alike."""
-    cap: Annotated[float, Range("[1, inf)")] = 20.0
-    """Largest weight of a decision."""
 
 
 @AlgorithmConfig.register_subclass("chunk_critic")

@@ -29,6 +29,8 @@ from accerl_lerobot.trainer.update import BaseUpdate
 
 POLICY_BATCH = 64
 """Rows of one step of the policy."""
+CAP = 20.0
+"""Largest weight of a decision in AWR, the paper's."""
 FORGET = 0.99
 """Share of the mean square of R − V that a step keeps."""
 FIRST = 1024
@@ -241,7 +243,7 @@ class AWRUpdate(OffPolicyUpdate):
         square = float(error.detach().square().mean())
         self._variance = FORGET * self._variance + (1 - FORGET) * square if self._variance else square
         advantage = error.detach() / max(math.sqrt(self._variance), STD_EPSILON)
-        weight = weights(advantage, self.algorithm.beta, self.algorithm.cap)
+        weight = weights(advantage, self.algorithm.beta)
         return {"imitation_loss": (weight * imitation).mean(), "value_loss": error.square().mean()}
 
     def state(self) -> dict[str, Any]:
@@ -257,9 +259,9 @@ def drawn(rows: np.ndarray, count: int) -> np.ndarray:
     return rows[torch.randint(len(rows), (count,)).numpy()]
 
 
-def weights(advantage: Tensor, beta: float, cap: float) -> Tensor:
-    """min(exp(advantage / beta), cap), limited before the exponential, which would overflow."""
-    return (advantage / beta).clamp(max=math.log(cap)).exp()
+def weights(advantage: Tensor, beta: float) -> Tensor:
+    """min(exp(advantage / beta), CAP), limited before the exponential, which would overflow."""
+    return (advantage / beta).clamp(max=math.log(CAP)).exp()
 
 
 def mean(steps: Iterator[dict[str, float]]) -> dict[str, float]:
