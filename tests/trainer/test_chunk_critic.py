@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.seeds import noise_seed
 from accerl_lerobot.trainer import chunk_critic
 from accerl_lerobot.trainer.batch import NonFiniteError
-from accerl_lerobot.trainer.chunk_critic import ChunkCriticUpdate, Critic
+from accerl_lerobot.trainer.chunk_critic import ChunkCriticUpdate
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.off_policy import Memory, OffPolicyUpdate
 from tests.replay.segments import make_segment
@@ -64,9 +64,9 @@ def chunks(segment: Segment) -> np.ndarray:
     return np.zeros((len(segment), 4, 2), np.float32)
 
 
-def taught(checkpoint: Path, precision: Literal["fp32", "bf16"] = "fp32") -> LeRobotAdapter:
+def taught(checkpoint: Path) -> LeRobotAdapter:
     """A policy and a teacher that sees one number and the task."""
-    config = PolicyConfig(path=str(checkpoint), device="cpu", precision=precision)
+    config = PolicyConfig(path=str(checkpoint), device="cpu")
     return with_teacher(load_adapter, state=1, share=0.5, config=config, noise=0.1)
 
 
@@ -338,24 +338,6 @@ def test_less_memory_gives_the_same_step(tiny_checkpoint: Path):
     assert other == pytest.approx(metrics, rel=1e-5)
     for name, tensor in weights.items():
         np.testing.assert_allclose(others[name], tensor, rtol=1e-4, atol=1e-6)
-
-
-def test_the_critic_computes_in_fp32_beside_a_policy_in_bf16(
-    tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
-):
-    seen = set()
-    forward = Critic.forward
-
-    def spy(self: Critic, *inputs: torch.Tensor) -> torch.Tensor:
-        q = forward(self, *inputs)
-        seen.add((torch.is_autocast_enabled("cpu"), q.dtype))
-        return q
-
-    monkeypatch.setattr(Critic, "forward", spy)
-    config = TrainerConfig(warmup_updates=0, value_warmup_updates=0)
-    update = ChunkCriticUpdate(taught(tiny_checkpoint, "bf16"), ChunkCriticConfig(policy_steps=0.5), config)
-    metrics = update.step([episode([0.0, 0.0, 0.0, 1.0])])
-    assert np.isfinite(metrics["policy_loss"]) and seen == {(False, torch.float32)}
 
 
 def test_what_is_not_finite_is_skipped_and_ends_the_run(tiny_checkpoint: Path):

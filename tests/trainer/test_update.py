@@ -105,17 +105,6 @@ def test_micro_batches_add_up_when_decisions_have_different_numbers_of_factors(l
     assert not torch.allclose(blind.adapter.weight.grad, whole.adapter.weight.grad, rtol=1e-2)
 
 
-def test_what_a_latent_does_not_have_is_not_learnt_from():
-    update, other = make_update(), make_update()
-    segments, changed = with_counts(make_segments(LENGTHS)), with_counts(make_segments(LENGTHS))
-    for segment in changed:
-        missing = segment.latent["count"] < 2
-        segment.latent["x"][missing, 1] += 3.0
-        segment.log_prob[missing, 1] = np.nan
-    assert update.step(segments) == other.step(changed)
-    assert torch.equal(update.adapter.weight.grad, other.adapter.weight.grad)
-
-
 @pytest.mark.parametrize("micro_batch", [1000, 4])
 def test_values_are_recomputed_bootstraps_included(micro_batch: int):
     update = make_update(replace(PLAIN, micro_batch=micro_batch), gamma=0.9, lam=0.8)
