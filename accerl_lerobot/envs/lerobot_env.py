@@ -34,11 +34,7 @@ _NEEDS_MUJOCO = ("aloha", "metaworld", "robocasa")
 @EnvConfig.register_subclass("lerobot")
 @dataclass(frozen=True, kw_only=True)
 class LeRobotEnvConfig(EnvConfig):
-    """Which of LeRobot's environments, those of installed packages ``lerobot_env_*`` included.
-
-    Example:
-        >>> LeRobotEnvConfig(name="pusht", kwargs={"obs_type": "pixels_agent_pos"})
-    """
+    """Which of LeRobot's environments, those of installed packages ``lerobot_env_*`` included."""
 
     world = "accerl_lerobot.envs.lerobot_env:LeRobotWorld"
 

@@ -91,6 +91,8 @@ class Simulator:
         self._jacobian = np.zeros((2, 3, self.model.nv))
         self._renderers: dict[tuple[int, int], Any] = {}
         self._fixtures = _fixtures(self.env)
+        self._visible = self._mujoco.MjvOption()
+        self._visible.geomgroup[:2] = 0, 1  # visual meshes, not what collides
         data = self.data
         self._position, self._rotation = data.site_xpos[self._site], data.site_xmat[self._site].reshape(3, 3)
         self._ctrl, self._torques = data.ctrl, _compiled_torques()
@@ -221,12 +223,6 @@ class Simulator:
             renderer = self._renderers[height, width] = new_renderer(self.model, height, width)
         renderer.update_scene(self._seen, camera, self._visible)
         return np.ascontiguousarray(renderer.render()[:, ::-1])
-
-    @functools.cached_property
-    def _visible(self) -> Any:
-        option = self._mujoco.MjvOption()
-        option.geomgroup[:2] = 0, 1  # visual meshes, not what collides
-        return option
 
     def close(self) -> None:
         for renderer in self._renderers.values():

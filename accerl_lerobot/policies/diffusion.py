@@ -32,7 +32,6 @@ from torch import Tensor
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Request
-from accerl_lerobot.policies import family
 from accerl_lerobot.policies.config import DiffusionSamplerConfig
 from accerl_lerobot.policies.family import Action, Encoded, Family, Model, normal_entropy, normal_log_prob
 
@@ -61,11 +60,9 @@ class Schedule:
         return len(self.timesteps)
 
     def step(self, k: int, x: Tensor, output: Tensor, eta: float = 0.0) -> tuple[Tensor, Tensor]:
-        """Mean (B, H, A) and std, a scalar, of step k; with the default `eta` LeRobot's own.
+        """Mean (B, H, A) and std, a scalar, of step k, counted from the noise, 0 to N − 1.
 
-        Args:
-            k: counted from the noise, 0 to N − 1.
-            eta: of DDIM: 0 is LeRobot's own, 1 adds as much noise as DDPM.
+        `eta` is DDIM's: 0 is LeRobot's own, 1 adds as much noise as DDPM.
         """
         alpha, following = self.alphas[k], self.following[k]
         noise_share = 1 - alpha
@@ -102,7 +99,7 @@ class Diffusion(Model):
 
     def __init__(self, policy: Any) -> None:
         config = policy.config
-        family.refuse_options(config)
+        self.refuse_options(config)
         steps, most = policy.diffusion.num_inference_steps, config.num_train_timesteps
         if steps > most:
             raise InputError("policy.num_steps", steps, f"use at most {most}, as many as it was trained with")

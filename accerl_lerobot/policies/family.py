@@ -71,6 +71,16 @@ class Model(ABC):
         """Holds while LeRobot builds policy and processors."""
         return nullcontext()
 
+    @staticmethod
+    def refuse_options(config: Any) -> None:
+        """Refuses options of LeRobot's policies under which the density would be another."""
+        if (rtc := getattr(config, "rtc_config", None)) is not None and rtc.enabled:
+            remedy = "real-time chunking changes the sampler's density; turn it off"
+            raise InputError("policy.rtc_config.enabled", True, remedy)
+        if config.compile_model:
+            remedy = "a compiled sampler rounds unlike the re-scoring pass; set it to false in config.json"
+            raise InputError("policy.compile_model", True, remedy)
+
     @abstractmethod
     def encode(self, batch: dict[str, Tensor]) -> Encoded:
         """Reads a preprocessed batch."""
@@ -137,13 +147,3 @@ def pooled(features: Tensor, weights: Tensor) -> Tensor:
     """Weighted mean, fp32 (B, width), of features (B, P, width); weights (B, P) of any sum above 0."""
     weights = weights / weights.sum(-1, keepdim=True)
     return (weights[..., None] * features.float()).sum(1)
-
-
-def refuse_options(config: Any) -> None:
-    """Refuses options of LeRobot's policies under which the density would be another."""
-    if (rtc := getattr(config, "rtc_config", None)) is not None and rtc.enabled:
-        remedy = "real-time chunking changes the sampler's density; turn it off"
-        raise InputError("policy.rtc_config.enabled", True, remedy)
-    if config.compile_model:
-        remedy = "a compiled sampler rounds unlike the re-scoring pass; set it to false in config.json"
-        raise InputError("policy.compile_model", True, remedy)

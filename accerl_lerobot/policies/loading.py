@@ -136,12 +136,10 @@ def sizes_of(adapter: LeRobotAdapter) -> Sizes:
 def load_adapter(config: PolicyConfig, *, rehearsal: bool = False) -> LeRobotAdapter:
     """Loads policy, processors and critic; proves that the sampler is LeRobot's.
 
-    Args:
-        rehearsal: the weights are not read, and a decision is made in place of that proof.
+    In a `rehearsal` the weights are not read, and a decision is made in place of that proof.
 
     Raises:
-        InputError: see `load_lerobot_config`; weights or processors did not load, or do not act as LeRobot's
-            own sampler does, see `LeRobotAdapter.self_check`.
+        InputError: see `load_lerobot_config` and `LeRobotAdapter.self_check`; or a file did not load.
     """
     from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 

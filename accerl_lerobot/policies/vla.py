@@ -43,7 +43,7 @@ from scipy.fft import dct
 from torch import Tensor
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.policies.family import Encoded, refuse_options
+from accerl_lerobot.policies.family import Encoded
 from accerl_lerobot.policies.flow import FlowModel, Velocity, flow_shape
 from accerl_lerobot.policies.tokens import Choose, TokenContext, TokenModel
 
@@ -76,7 +76,7 @@ class SmolVLA(FlowModel):
 
     def __init__(self, policy: Any) -> None:
         config = policy.config
-        refuse_options(config)
+        self.refuse_options(config)
         if config.adapt_to_pi_aloha:
             raise InputError("policy.adapt_to_pi_aloha", True, "not supported in RL; train one without it")
         self.policy = policy
@@ -134,7 +134,7 @@ class Pi05(FlowModel):
 
     def __init__(self, policy: Any) -> None:
         config = policy.config
-        refuse_options(config)
+        self.refuse_options(config)
         self.policy = policy
         self.shape = flow_shape(config, config.num_inference_steps)
         language_model = policy.model.paligemma_with_expert.paligemma.model.language_model
@@ -256,7 +256,7 @@ class Pi0Fast(TokenModel):
 
     def __init__(self, policy: Any) -> None:
         config, tokenizer = policy.config, policy._paligemma_tokenizer
-        refuse_options(config)
+        self.refuse_options(config)
         if config.temperature != 0:
             remedy = "LeRobot's sampler has to be greedy here: set it to 0 in config.json; exploration has a "
             raise InputError("policy.temperature", config.temperature, f"{remedy}policy.sampler.temperature")

@@ -24,11 +24,8 @@ def write_policy(
 ) -> Path:
     """Saves a new policy and its processors as a LeRobot ``pretrained_model`` folder.
 
-    Args:
-        image: its side in pixels.
-        stats: in place of the default: states and actions of std 0.5 around 0, or within ±2.
-        prepare: changes the weights before they are saved.
-        fields: of LeRobot's policy config.
+    By the default `stats`, states and actions have a std of 0.5 around 0, or lie within ±2. `prepare` changes
+    the weights before they are saved; `fields` are of LeRobot's policy config.
     """
     import torch
     from lerobot.configs.types import FeatureType, PolicyFeature
