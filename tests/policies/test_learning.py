@@ -72,13 +72,7 @@ class Run:
 
 
 PI: dict[str, Any] = {"value_lr": 5e-3, "capacity": 512, "least": 64}
-SMALL: dict[str, Any] = {
-    "env": replace(ENV, image_size=8),
-    "updates": 40,
-    "batch": 96,
-    "least": 96,
-    "lr": 1e-3,
-}
+SMALL: dict[str, Any] = {"env": replace(ENV, image_size=8), "updates": 40, "batch": 96, "least": 96}
 RUNS = {
     "pi0": Run(
         write=lambda path: write_pi(path, "pi0", prompt=12, num_steps=2),
