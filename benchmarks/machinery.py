@@ -108,7 +108,6 @@ class MachineryConfig(Section):
             seed=seed,
             env=LatencyConfig(
                 max_steps=EPISODE * CHUNK,
-                terminate_on_success=False,
                 reward="dense",
                 image_size=self.image_size,
                 frame_ms=self.latency_ms,

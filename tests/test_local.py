@@ -81,7 +81,7 @@ def success(engine: Engine, episodes: int = 128) -> float:
 def learning_run(checkpoint: Path, **sections: Any) -> RunConfig:
     """Two decisions an episode, and a reward at every step: about the easiest task with a future."""
     defaults: dict[str, Any] = {
-        "env": SimulatedConfig(max_steps=8, tolerance=0.3, reward="dense", terminate_on_success=False),
+        "env": SimulatedConfig(max_steps=8, tolerance=0.3, reward="dense"),
         "policy": PolicyConfig(
             path=str(checkpoint), device="cpu", sampler=FlowSamplerConfig(noise_level=0.6)
         ),

@@ -113,7 +113,7 @@ def test_those_kept_waiting_go_when_the_schedule_changes_or_the_run_ends():
 
 def run_of(schedule: Any, updates: int = 6) -> RunConfig:
     return RunConfig(
-        env=LatencyConfig(max_steps=16, terminate_on_success=False, frame_ms=3.0, latency_cv=0.5),
+        env=LatencyConfig(max_steps=16, reward="dense", frame_ms=3.0, latency_cv=0.5),
         rollout=RolloutConfig(workers=2, worlds=2, segment_length=4, decision_cost=0.0),
         inference=InferenceConfig(max_batch=3),
         replay=ReplayConfig(capacity=256, min_decisions=16, ahead=16, samples_per_insert=1.0),

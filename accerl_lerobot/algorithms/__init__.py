@@ -8,10 +8,10 @@ this package imports pulls in torch, so a run can be parsed before torch is load
 
 from __future__ import annotations
 
-from accerl_lerobot.algorithms.chunk_critic import ChunkCriticConfig
 from accerl_lerobot.algorithms.contract import (
     AlgorithmConfig,
     AWRConfig,
+    ChunkCriticConfig,
     Level,
     LossInputs,
     OffPolicyConfig,

@@ -10,10 +10,8 @@ a segment: nothing if the episode *terminated* (bootstrap 0); V of the observati
 (*truncated*) or the segment was cut in mid-episode. Treating a truncation as a termination would teach the
 critic that time limits are deaths.
 
-`values` and `bootstrap_value` must come from the critic of now: those stored with a sample are stale by its
-lag.
-
-*Normalisation* is over the whole batch: per micro-batch it would compare a decision only with its neighbours.
+Values must come from the critic of now: those stored with a sample are stale by its lag. *Normalisation* is
+over the whole batch: per micro-batch it would compare a decision only with its neighbours.
 
 Shape letters: S segments, T decisions of the longest one.
 """
@@ -42,18 +40,11 @@ def gae(
     gamma: float,
     lam: float,
 ) -> tuple[Tensor, Tensor]:
-    """Advantages and returns of a padded batch of segments, without gradient.
+    """Advantages and returns, each (S, T) and 0 at padding, of segments of `lengths` (S,), without gradient.
 
-    Args:
-        rewards: (S, T), summed over each chunk. Padding may hold anything, NaN included; so may `values`.
-        values: (S, T), V of the observation before each decision.
-        bootstrap_value: (S,), V of the observation after the last decision; ignored where `terminated`.
-        terminated: bool (S,), the episode is over. False for truncated and for cut segments.
-        lengths: int (S,), 1 to T.
-        lam: λ per decision.
-
-    Returns:
-        Advantages (S, T), not normalised, and returns (S, T), the targets of the critic; both 0 at padding.
+    `rewards` (S, T) are summed over each chunk, `values` (S, T) are V before each decision; padding may hold
+    anything, NaN included. `bootstrap_value` (S,), V after the last one, does not count where `terminated`,
+    bool (S,): True if the episode is over, False for truncated and for cut segments.
     """
     t = rewards.shape[1]
     padding = ~decision_mask(lengths, t)
@@ -70,10 +61,9 @@ def gae(
 
 
 def moments(x: Tensor, mask: Tensor) -> Tensor:
-    """(sum, sum of squares, count) of the entries where `mask` is True, float64 (3,).
+    """(sum, sum of squares, count) of the entries where `mask` is True, (3,); others may be NaN.
 
-    float64, because the variance is the difference of two nearly equal numbers when the mean is large. Other
-    entries may hold anything, NaN included.
+    In float64, because the variance is the difference of two nearly equal numbers when the mean is large.
     """
     wide = x.detach().double().masked_fill(~mask, 0.0)
     return torch.stack([wide.sum(), wide.square().sum(), mask.sum().double()])

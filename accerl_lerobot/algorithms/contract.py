@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import draccus
 
-from accerl_lerobot.config.ranges import NonNegative, Range, Section, Share
+from accerl_lerobot.config.ranges import NonNegative, Positive, Range, Section, Share
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -23,12 +23,7 @@ Level = Literal["token", "chunk"]
 
 @dataclass(frozen=True, kw_only=True)
 class AlgorithmConfig(Section, draccus.ChoiceRegistry, section="algorithm"):
-    """Base of every algorithm config; subclasses register under the name given on the command line.
-
-    Example:
-        >>> draccus.decode(AlgorithmConfig, {"type": "gipo", "sigma": 0.5}).type
-        'gipo'
-    """
+    """Base of every algorithm config; subclasses register under the name given on the command line."""
 
     update: ClassVar[str]
     """``module:class`` of the trainer's updates: made from adapter, algorithm and `TrainerConfig`, and, of a
@@ -82,10 +77,9 @@ class OffPolicyConfig(AlgorithmConfig):
 @AlgorithmConfig.register_subclass("self_imitation")
 @dataclass(frozen=True, kw_only=True)
 class SelfImitationConfig(OffPolicyConfig):
-    """Settings of self-imitation; it has no critic.
+    """Settings of self-imitation: without a critic, of the policy's own successful episodes as they come in.
 
-    It imitates the policy's own successful episodes as they come in: rejection fine-tuning without rounds,
-    or filtered behaviour cloning (related: arXiv 1806.05635). It is the baseline to beat at equal episodes.
+    Rejection fine-tuning without rounds, or filtered behaviour cloning (related: arXiv 1806.05635).
     """
 
 
@@ -94,7 +88,7 @@ class SelfImitationConfig(OffPolicyConfig):
 class AWRConfig(OffPolicyConfig):
     """Settings of advantage-weighted regression (Peng et al., arXiv 1910.00177).
 
-        w = min(exp((R − V(o)) / (beta · s)), cap)
+        w = min(exp((R − V(o)) / (beta · s)), 20)
         L = E[w · imitation loss]  +  E[(R − V(o))²]
 
     R is the discounted return of the episode from the decision on, s the standard deviation of R − V(o) of
@@ -105,8 +99,31 @@ class AWRConfig(OffPolicyConfig):
 
     beta: Annotated[float, Range("(0, inf]")] = 1.0
     """Temperature in standard deviations of the advantage; ``inf`` weighs all decisions alike."""
-    cap: Annotated[float, Range("[1, inf)")] = 20.0
-    """Largest weight of a decision."""
+
+
+@AlgorithmConfig.register_subclass("chunk_critic")
+@dataclass(frozen=True, kw_only=True)
+class ChunkCriticConfig(OffPolicyConfig):
+    """Settings of off-policy learning from a critic over (simulator state, executed chunk) and a teacher.
+
+        critic   y = (1 − m)·[Σ_{j<n} γ^j r_j + γ^n (mean Q' − std Q')(s_n, μ(s_n))] + m·R  for each Q_i(s, c)
+        teacher  L = E[(std Q − mean Q)(s, μ(s))] / E|Q| + ½·E_successes ‖μ(s) − c‖² / 0.3²
+        policy   L = E[imitation loss of π(o) on μ(s)] + ½·E‖h(features(o)) − s‖²
+
+    n is 4 decisions, m is ¼, s is ``observation.environment_state``, which the policy never reads (asymmetric
+    actor-critic, arXiv 1710.06542). The teacher μ is a small network of s, acts in part of the exploring
+    episodes and labels every observation in memory (DAgger, arXiv 1011.0686); h is a linear map that exists
+    only while training. Related: TD3+BC (arXiv 2106.06860), RLPD (2302.02948), Q-chunking (2507.07969).
+    """
+
+    update = "accerl_lerobot.trainer.chunk_critic:ChunkCriticUpdate"
+
+    gamma: Share = 0.98
+    """Discount per decision."""
+    critic_steps: Positive = 2.0
+    """Gradient steps of the critic for each new decision; the teacher makes half as many."""
+    teacher_episodes: Share = 0.5
+    """Share of exploring episodes in which the teacher acts, after ``trainer.value_warmup_updates``."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,8 +146,6 @@ class LossInputs:
     """bool (N, L), False for a factor that does not exist, such as a token after the terminator; its content
     is never looked at. None: all exist."""
     ratios_per_decision: float | None = None
-    """Mean number of ratios per decision, of the batch that this one is a micro-batch of.
-
-    With it the losses of micro-batches, weighted by their decisions, add up to that of the whole batch. None:
-    this is the whole batch.
-    """
+    """Mean number of ratios per decision of the batch that this one is a micro-batch of; with it the losses
+    of micro-batches, weighted by their decisions, add up to that of the batch. None: this is the whole
+    batch."""

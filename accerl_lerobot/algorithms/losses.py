@@ -9,13 +9,9 @@ GIPO: a Gaussian trust weight on the log-ratio instead of a clip (arXiv 2603.039
     L = −E[ω · ρ · Â]  +  the shared terms of `objective`
 
 The gradient is −E[ω ρ Â ∇log π]. At ρ = 1 it is the plain policy gradient; ω·ρ never exceeds exp(σ²/2) and
-fades to 0 the further the current policy has moved from the one that acted, in both directions. PPO drops
-such samples at an edge, and only on one side.
-
-Deviations from the paper:
-    * the KL to the behaviour policy is estimated from samples (`objective.kl_from_behaviour`), not summed
-      over token bins, because a flow policy has no bins;
-    * log ρ is clamped, see `objective.LOG_RATIO_CLAMP`.
+fades to 0 the further the current policy has moved from the one that acted, in both directions. Deviations
+from the paper: the KL is estimated from samples (`objective.kl_from_behaviour`), because a flow policy has no
+token bins to sum over, and log ρ is clamped.
 
 PPO with a clip (Schulman et al., arXiv 1707.06347), asymmetric as in DAPO (arXiv 2503.14476, section 3.1).
 

@@ -21,7 +21,7 @@ Masks, of ratios that exist, are applied by filling and not by indexing, so noth
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from accerl_lerobot.algorithms.contract import Level, LossInputs, RatioConfig
@@ -30,18 +30,11 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 LOG_RATIO_CLAMP = 20.0
-"""|log ρ| is limited to this before the exponential.
-
-float32 overflows at 88 and the effective sample size squares ρ, so anything below 44 is finite; 20 leaves
-room for sums over a batch. Beyond it the gradient of ρ is zero.
-"""
+"""Limit of |log ρ|, beyond which the gradient of ρ is zero: float32 overflows at 88, and ρ is squared and
+summed."""
 KL_LINEAR_ABOVE = 3.0
-"""Above this log ρ (ρ ≈ 20) the KL penalty grows linearly instead of exponentially.
-
-Its gradient is (ρ − 1)·∇log π per sample: unbounded in ρ, so one stale sample could decide a whole update.
-The linear continuation has the same slope at the joint, still pulls π back, and is biased only for samples
-that far away.
-"""
+"""Above this log ρ (ρ ≈ 20) the KL penalty is continued linearly: its gradient, (ρ − 1)·∇log π, is unbounded,
+so that one stale sample could decide a whole update."""
 USUAL_CLIP = (0.2, 0.2)
 """Range (low, high) of the reported clip fraction of algorithms that clip nothing, so that runs compare."""
 LOW_WEIGHT = 0.1
@@ -89,10 +82,9 @@ def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
 
 
 def mean_over_ratios(x: Tensor, inputs: LossInputs, level: Level) -> Tensor:
-    """Mean of (N, F) over all ratios that exist, a scalar.
+    """Mean of (N, F) over all ratios that exist, a scalar; all weigh the same.
 
-    Where decisions have different numbers of factors all factors weigh the same. Averaging over each
-    decision's own first would weigh them by 1/F and bias the policy gradient towards decisions with few.
+    Averaging over each decision's own first would bias the policy gradient towards decisions with few.
     """
     if inputs.factors is None:
         return x.mean()
@@ -109,11 +101,7 @@ def advantage_column(inputs: LossInputs) -> Tensor:
 
 @dataclass(frozen=True, kw_only=True)
 class Samples:
-    """Inputs of one batch's metrics, without gradient.
-
-    Quantiles, the effective sample size and explained variance of a batch are not means of those of its
-    micro-batches, so they are computed once, from the samples of all micro-batches and ranks.
-    """
+    """Inputs of the metrics that are no means over micro-batches, such as quantiles, without gradient."""
 
     log_ratio: Tensor
     """(N, F), 0 where a ratio does not exist."""
@@ -137,10 +125,11 @@ class Samples:
 
     def joined(self, rows: Tensor) -> Samples:
         """The samples of a whole batch, from the `rows` of its parts in any order, laid end to end."""
-        log_ratio, weight, keep, narrow = rows.split([*[self.log_ratio.shape[1]] * 3, 2], dim=1)
-        value, returns = narrow.unbind(1)
-        return Samples(
-            log_ratio=log_ratio, weight=weight, keep=keep.bool(), value=value, returns=returns, clip=self.clip
+        f = self.log_ratio.shape[1]
+        log_ratio, weight, keep, *narrow = rows.split([f, f, f, 1, 1], dim=1)
+        value, returns = (column[:, 0] for column in narrow)
+        return replace(
+            self, log_ratio=log_ratio, weight=weight, keep=keep.bool(), value=value, returns=returns
         )
 
     def metrics(self) -> dict[str, Tensor]:
@@ -177,8 +166,7 @@ class LossOutput:
     loss: Tensor
     """(), call ``backward`` on it."""
     means: dict[str, Tensor]
-    """Means over decisions, scalars without gradient. Those of micro-batches, weighted by their decisions,
-    add up to that of the whole batch; ``decisions`` is a count."""
+    """Means over decisions, scalars without gradient; ``decisions`` is a count."""
     samples: Samples
     """Per-decision values behind the metrics that are no means over decisions."""
 
@@ -199,11 +187,8 @@ def assemble(
 ) -> LossOutput:
     """Adds the shared terms to a policy loss and measures the batch.
 
-    Args:
-        policy_loss: (), with gradient.
-        log_ratio: (N, F), log π/μ with gradient, from `at_level`.
-        weight: (N, F), how much of each sample's gradient the algorithm keeps, ω.
-        clip: see `Samples.clip`.
+    `log_ratio` (N, F), log π/μ with gradient, is from `at_level`; `weight` (N, F) is how much of each
+    sample's gradient the algorithm keeps, ω.
     """
     value_loss = (inputs.value - inputs.returns).square().mean()
     mean_entropy = inputs.entropy.mean()

@@ -101,10 +101,9 @@ def _load(
     first, see `isolation`. An oracle has no success model.
     """
     imagination, executed = config.imagination, getattr(policy, "n_action_steps", 1)
-    for name, wanted in (("reward", "success"), ("terminate_on_success", True)):
-        if (value := getattr(config.env, name, wanted)) != wanted:
-            why = f"use {wanted} with imagination.share: imagined rollouts end with a success, and pay for it"
-            raise InputError(f"env.{name}", value, why)
+    if (reward := getattr(config.env, "reward", "success")) != "success":
+        why = "use success with imagination.share: imagined rollouts end with a success, and pay for it"
+        raise InputError("env.reward", reward, why)
     with closing(make_world(config.env)) as environment:
         world = environment.spec
     imagination.imagined_replay(config.replay).check(

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import functools
 import json
 import logging
 import shutil
@@ -140,14 +141,14 @@ def make_engine(
 ) -> Engine:
     """The engine that ``launch.engine`` names; see `RayEngine` for the arguments."""
     if isinstance(config.algorithm, ChunkCriticConfig):
-        from accerl_lerobot.policies.teacher import WithTeacher
+        from accerl_lerobot.policies.teacher import with_teacher
 
         size, algorithm = history * config.env.state_size, config.algorithm
-        load = WithTeacher(loader(load), size, algorithm.teacher_episodes)
+        load = functools.partial(with_teacher, loader(load), size, algorithm.teacher_episodes)
     if isinstance(config.algorithm, OffPolicyConfig) and (dataset := demonstrations_of(config)) is not None:
-        from accerl_lerobot.trainer.demonstrations import WithDemonstrations
+        from accerl_lerobot.trainer.demonstrations import with_demonstrations
 
-        load = WithDemonstrations(loader(load), dataset, config.rollout.decision_cost)
+        load = functools.partial(with_demonstrations, loader(load), dataset, config.rollout.decision_cost)
     if config.launch.engine == "local":
         from accerl_lerobot.engine.local import LocalEngine
 

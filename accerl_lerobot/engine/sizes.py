@@ -82,11 +82,10 @@ def policy_gib(config: RunConfig) -> float:
 
     On a GPU they are not in the machine's memory. Nothing is known of a policy that an SFT will make.
     """
-    from accerl_lerobot.policies.loading import policy_sizes, rehearsed_config, resolve_device
+    from accerl_lerobot.policies.loading import policy_sizes, resolve_device
 
     if config.policy.path is None or resolve_device(config.policy.device).type != "cpu":
         return 0.0
-    rehearsed_config(config.policy)
     sizes, processes, copies = policy_sizes(config.policy), 1, trained_copies(config)
     if config.launch.engine != "local":
         processes = config.trainer.ranks + config.inference.workers

@@ -11,8 +11,8 @@ import difflib
 import shlex
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
 import draccus
@@ -138,6 +138,11 @@ class EpisodeWorld(World):
         """Share of the time limit gone."""
         return self._steps / self.spec.max_steps
 
+    def _privileged(self, *numbers: np.ndarray) -> np.ndarray:
+        """``observation.environment_state`` of a simulator's numbers, the time gone, and the task."""
+        task = task_code(self.spec.tasks, self._task)
+        return np.concatenate([*numbers, [self.late], task]).astype(np.float32)
+
     def reset(self, seed: int, task: str) -> Observation:
         if task not in self.spec.tasks:
             raise InputError("task", task, f"this world has: {', '.join(self.spec.tasks)}")
@@ -235,10 +240,58 @@ def expand_tasks(text: str, groups: Mapping[str, Sequence[str]]) -> tuple[str, .
     return tuple(found)
 
 
-def check_cameras(cameras: Sequence[str], text: str) -> None:
-    """Refuses `text` of ``env.camera`` where it names none, or one twice."""
-    if not cameras or len(set(cameras)) < len(cameras):
-        raise InputError("env.camera", text, "name each camera once, separated by commas")
+@dataclass(frozen=True, kw_only=True)
+class SuiteConfig(EnvConfig):
+    """Base of the simulators that have many tasks and cameras."""
+
+    groups: ClassVar[Callable[[], Mapping[str, Sequence[str]]]]
+    """Tasks of each group that `task` may name."""
+    STATE_NUMBERS: ClassVar[int]
+    """Numbers of ``observation.environment_state`` that are the simulator's."""
+
+    task: str
+    camera: str
+    image_size: int
+    environment_state: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        expand_tasks(self.task, type(self).groups())
+        if not self.cameras or len(set(self.cameras)) < len(self.cameras):
+            raise InputError("env.camera", self.camera, "name each camera once, separated by commas")
+
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """The tasks that `task` stands for."""
+        return expand_tasks(self.task, type(self).groups())
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The camera names that `camera` stands for."""
+        return names(self.camera)
+
+    @property
+    def state_size(self) -> int:
+        if not self.environment_state:
+            return 0
+        return self.STATE_NUMBERS + 1 + len(task_code(self.tasks, self.tasks[0]))
+
+
+def unit_spec(
+    config: Any, images: Iterable[str], instruction: Callable[[str], str], state: int, action: int, fps: int
+) -> WorldSpec:
+    """Spec of a world whose images are squares and whose actions lie in [−1, 1]."""
+    return WorldSpec(
+        images=dict.fromkeys(images, (config.image_size, config.image_size, 3)),
+        state_dim=state,
+        action_dim=action,
+        action_low=np.full(action, -1, np.float32),
+        action_high=np.full(action, 1, np.float32),
+        fps=fps,
+        max_steps=config.max_steps,
+        tasks=config.tasks,
+        instructions=tuple(map(instruction, config.tasks)),
+    )
 
 
 def task_code(tasks: Sequence[str], task: str) -> np.ndarray:
@@ -246,18 +299,12 @@ def task_code(tasks: Sequence[str], task: str) -> np.ndarray:
     return np.eye(len(tasks))[tasks.index(task)] if len(tasks) > 1 else np.zeros(0)
 
 
-_PLUGIN = "accerl_lerobot.envs.lerobot_plugin"
-_FIELDS_OF_PLUGIN = {
-    "metaworld": ("task", "camera", "image_size", "max_steps", "lighting"),
-    "libero": ("task", "camera", "image_size", "max_steps", "rendering"),
-}
-
-
 def lerobot_eval_arguments(env: Mapping[str, Any]) -> list[str]:
     """``--env.…`` and seed of stock ``lerobot-eval`` for an environment; none if LeRobot cannot have it."""
-    if (kind := env.get("type")) in _FIELDS_OF_PLUGIN:
-        fields: dict[str, Any] = {"discover_packages_path": _PLUGIN, "type": f"accerl_{kind}"}
-        fields |= {name: env[name] for name in _FIELDS_OF_PLUGIN[kind] if name in env}
+    if (kind := env.get("type")) in ("metaworld", "libero"):
+        plugin = {"discover_packages_path": "accerl_lerobot.envs.lerobot_plugin", "type": f"accerl_{kind}"}
+        shared = ("task", "camera", "image_size", "max_steps", "rendering")
+        fields: dict[str, Any] = plugin | {name: env[name] for name in shared if name in env}
     elif kind == "lerobot":
         fields = {"type": env.get("name"), **(env.get("kwargs") or {})}
     else:
@@ -270,9 +317,8 @@ class HistoryWorld(World):
     """A world whose observations hold its last states, in a dimension of `length` in front of each array.
 
     LeRobot's ``n_obs_steps`` counts env steps, not decisions, so the last states of a chunk are looked at one
-    by one; all before them are passed without a picture. An episode begins with copies of its first
-    observation, as in LeRobot's own queues. Should the world cut an episode short of ``spec.max_steps``, the
-    last observation stands for those that were not looked at.
+    by one, those before them are not. An episode begins with copies of its first observation, as in LeRobot's
+    queues; where one ends early, its last observation stands for those that were not looked at.
     """
 
     def __init__(self, world: World, length: int) -> None:
@@ -296,18 +342,11 @@ class HistoryWorld(World):
             self._seen.append(results[-1].observation)
             if results[-1].done:
                 break
-        last, taken = results[-1], sum(r.steps for r in results)
         if results[0].steps > 1:  # some were passed unseen; `length` follow, unless it was cut
             self._seen.extend([self._seen[-1]] * (self._length - len(results)))
-        self._left -= taken
-        return ChunkResult(
-            observation=self._observation(),
-            rewards=np.concatenate([r.rewards for r in results]),
-            terminated=last.terminated,
-            truncated=last.truncated,
-            success=last.success,
-            info=last.info,
-        )
+        rewards = np.concatenate([r.rewards for r in results])
+        self._left -= len(rewards)
+        return replace(results[-1], observation=self._observation(), rewards=rewards)
 
     def render(self, height: int, width: int) -> np.ndarray:
         return self._world.render(height, width)

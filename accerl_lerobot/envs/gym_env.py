@@ -6,6 +6,7 @@ Importing this file loads no Gymnasium; making the world does.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import math
 from dataclasses import dataclass, field
@@ -69,11 +70,8 @@ class GymConfig(EnvConfig):
         """See the base class; only the environment knows, so it is made to ask."""
         if not self.environment_state:
             return 0
-        world = GymWorld(self)
-        try:
-            return len(world.reset(0, world.spec.tasks[0])[ENVIRONMENT_STATE])
-        finally:
-            world.close()
+        with contextlib.closing(GymWorld(self)) as world:
+            return len(world.reset(0, self.id)[ENVIRONMENT_STATE])
 
 
 class GymWorld(EpisodeWorld):
@@ -148,12 +146,10 @@ class GymWorld(EpisodeWorld):
             self._pictures[camera] = resized(picture, size, size) if size else picture.copy()
         observation |= {f"observation.images.{name}": picture for name, picture in self._pictures.items()}
         if config.environment_state:
-            privileged = state
-            if config.environment_state != ("state",):
-                privileged = self._vector("environment_state", raw, config.environment_state)
-            observation[ENVIRONMENT_STATE] = np.append(privileged, self._steps / config.max_steps).astype(
-                np.float32
-            )
+            keys, own = config.environment_state, config.environment_state == ("state",)
+            numbers = state if own else self._vector("environment_state", raw, keys)
+            late = np.float32(self._steps / config.max_steps)
+            observation[ENVIRONMENT_STATE] = np.append(numbers, late)
         return observation
 
     def _vector(self, name: str, raw: dict[str, np.ndarray], keys: tuple[str, ...]) -> np.ndarray:

@@ -34,11 +34,7 @@ _NEEDS_MUJOCO = ("aloha", "metaworld", "robocasa")
 @EnvConfig.register_subclass("lerobot")
 @dataclass(frozen=True, kw_only=True)
 class LeRobotEnvConfig(EnvConfig):
-    """Which of LeRobot's environments, those of installed packages ``lerobot_env_*`` included.
-
-    Example:
-        >>> LeRobotEnvConfig(name="pusht", kwargs={"obs_type": "pixels_agent_pos"})
-    """
+    """Which of LeRobot's environments, those of installed packages ``lerobot_env_*`` included."""
 
     world = "accerl_lerobot.envs.lerobot_env:LeRobotWorld"
 
@@ -91,9 +87,8 @@ class LeRobotWorld(EpisodeWorld):
         _check_hub(config, getattr(self._lerobot_config, "hub_path", None))
         self._before, self._after = self._lerobot_config.get_env_processors()
         with redirect_stdout(io.StringIO()):  # LeRobot prints, and results go there
-            self._vectors = make_env(
-                self._lerobot_config, n_envs=1, trust_remote_code=config.trust_remote_code
-            )
+            trust = config.trust_remote_code
+            self._vectors = make_env(self._lerobot_config, n_envs=1, trust_remote_code=trust)
         self._envs = _single_envs(self._vectors)
         self.spec = self._look()
         close_at_exit(self)
@@ -102,7 +97,9 @@ class LeRobotWorld(EpisodeWorld):
         self._raw, _ = self._envs[task].reset(seed=seed)
 
     def _step(self, action: np.ndarray) -> Step:
-        processed = self._processed(action[None])[0]
+        import torch
+
+        processed = self._after({"action": torch.from_numpy(action[None])})["action"].numpy()[0]
         self._raw, reward, ended, cut, info = self._envs[self._task].step(processed)
         return Step(
             success=bool(info.get("is_success", False)),
@@ -127,11 +124,7 @@ class LeRobotWorld(EpisodeWorld):
         self._task = task
         self._raw, _ = env.reset(seed=0)
         observation = self._observe()
-        images: dict[str, tuple[int, int, int]] = {
-            key: (image.shape[0], image.shape[1], image.shape[2])
-            for key, image in observation.items()
-            if isinstance(image, np.ndarray) and key.startswith(_IMAGE)
-        }
+        images: dict[str, Any] = {k: np.shape(v) for k, v in observation.items() if k.startswith(_IMAGE)}
         if not images or _STATE not in observation:
             shown = ", ".join(k for k in observation if k != TASK) or "neither"
             remedy = f"a policy needs images and a state, {self.config.name} shows {shown}"
@@ -164,11 +157,6 @@ class LeRobotWorld(EpisodeWorld):
                 # LeRobot has divided by 255; rounding brings every one of the 256 values back.
                 observation[name] = (value[0].permute(1, 2, 0) * 255).round().byte().numpy().copy()
         return observation
-
-    def _processed(self, actions: np.ndarray) -> np.ndarray:
-        import torch
-
-        return self._after({"action": torch.from_numpy(actions)})["action"].numpy()
 
     def _instruction(self, task: str) -> str:
         env = self._envs[task]

@@ -13,16 +13,7 @@ from typing import Annotated, Literal
 import numpy as np
 
 from accerl_lerobot.config.ranges import Range
-from accerl_lerobot.envs.base import (
-    EnvConfig,
-    EpisodeWorld,
-    Step,
-    WorldSpec,
-    check_cameras,
-    expand_tasks,
-    names,
-    task_code,
-)
+from accerl_lerobot.envs.base import EnvConfig, EpisodeWorld, Step, SuiteConfig, unit_spec
 from accerl_lerobot.envs.libero_simulator import FPS, MAX_OBJECTS, OBJECT_NUMBERS, ROBOT_NUMBERS, Simulator
 from accerl_lerobot.envs.libero_tasks import instruction, suites
 from accerl_lerobot.envs.metaworld import diverged
@@ -37,7 +28,7 @@ ACTION_DIM = 7
 
 @EnvConfig.register_subclass("libero")
 @dataclass(frozen=True, kw_only=True)
-class LiberoConfig(EnvConfig):
+class LiberoConfig(SuiteConfig):
     """Which LIBERO tasks, seen how.
 
     Evaluation begins at the 50 recorded states of a task, demonstrations and exploration at placements drawn
@@ -46,6 +37,8 @@ class LiberoConfig(EnvConfig):
 
     expert = "accerl_lerobot.demos.libero_expert:libero_expert"
     world = "accerl_lerobot.envs.libero:LiberoWorld"
+    groups = staticmethod(suites)
+    STATE_NUMBERS = ROBOT_NUMBERS + MAX_OBJECTS * OBJECT_NUMBERS
 
     task: str = "libero_object"
     """Suites (libero_spatial, libero_object, libero_goal, libero_10, libero_90), or single tasks such as
@@ -71,26 +64,8 @@ class LiberoConfig(EnvConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        expand_tasks(self.task, suites())
-        check_cameras(self.cameras, self.camera)
         if self.assets and not (expanded(self.assets, "env.assets") / "scenes").is_dir():
             raise InputError("env.assets", self.assets, "no folder of LIBERO's assets: it holds no scenes/")
-
-    @property
-    def state_size(self) -> int:
-        if not self.environment_state:
-            return 0
-        return ROBOT_NUMBERS + MAX_OBJECTS * OBJECT_NUMBERS + 1 + len(task_code(self.tasks, self.tasks[0]))
-
-    @property
-    def tasks(self) -> tuple[str, ...]:
-        """The tasks that `task` stands for, ``suite/number``."""
-        return expand_tasks(self.task, suites())
-
-    @property
-    def cameras(self) -> tuple[str, ...]:
-        """The camera names that `camera` stands for."""
-        return names(self.camera)
 
 
 def image_key(camera: str) -> str:
@@ -103,18 +78,8 @@ class LiberoWorld(EpisodeWorld):
 
     def __init__(self, config: LiberoConfig) -> None:
         self.config = config
-        size = config.image_size
-        self.spec = WorldSpec(
-            images={image_key(camera): (size, size, 3) for camera in config.cameras},
-            state_dim=STATE_DIM,
-            action_dim=ACTION_DIM,
-            action_low=np.full(ACTION_DIM, -1, np.float32),
-            action_high=np.full(ACTION_DIM, 1, np.float32),
-            fps=FPS,
-            max_steps=config.max_steps,
-            tasks=config.tasks,
-            instructions=tuple(map(instruction, config.tasks)),
-        )
+        images = map(image_key, config.cameras)
+        self.spec = unit_spec(config, images, instruction, STATE_DIM, ACTION_DIM, FPS)
         self._simulators: dict[str, Simulator] = {}
 
     @property
@@ -143,12 +108,10 @@ class LiberoWorld(EpisodeWorld):
 
     def _observe(self) -> Observation:
         simulator, size = self.simulator, self.config.image_size
-        observation: Observation = {
-            image_key(camera): simulator.render(camera, size, size) for camera in self.config.cameras
-        }
+        cameras = self.config.cameras
+        observation: Observation = {image_key(name): simulator.render(name, size, size) for name in cameras}
         observation["observation.state"] = simulator.state()
         if self.config.environment_state:
-            state = simulator.everything(), [self.late], task_code(self.spec.tasks, self._task)
-            observation[ENVIRONMENT_STATE] = np.concatenate(state).astype(np.float32)
+            observation[ENVIRONMENT_STATE] = self._privileged(simulator.everything())
         observation[TASK] = instruction(self._task)
         return observation

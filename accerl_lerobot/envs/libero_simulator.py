@@ -13,11 +13,12 @@ import io
 import re
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
+from unittest.mock import patch
 
 import numpy as np
 
 from accerl_lerobot.envs.libero_tasks import bddl_file, load_libero, recorded_states
-from accerl_lerobot.envs.metaworld import import_mujoco, new_renderer
+from accerl_lerobot.envs.metaworld import draw_fast, import_mujoco, new_renderer
 from accerl_lerobot.seeds import EVAL_SEEDS
 
 FPS = 20
@@ -90,6 +91,8 @@ class Simulator:
         self._jacobian = np.zeros((2, 3, self.model.nv))
         self._renderers: dict[tuple[int, int], Any] = {}
         self._fixtures = _fixtures(self.env)
+        self._visible = self._mujoco.MjvOption()
+        self._visible.geomgroup[:2] = 0, 1  # visual meshes, not what collides
         data = self.data
         self._position, self._rotation = data.site_xpos[self._site], data.site_xmat[self._site].reshape(3, 3)
         self._ctrl, self._torques = data.ctrl, _compiled_torques()
@@ -178,18 +181,17 @@ class Simulator:
     def everything(self) -> np.ndarray:
         """Robot and objects of interest, float64 (57,), as they are now; absent objects are zeros."""
         data = self.data
-        robot = (
+        arm = (
             data.qpos[self._joints],
             data.qvel[self._dofs],
             data.site_xpos[self._site],
             data.xquat[self._hand],
-            data.qpos[self._fingers],
-            data.qvel[self._finger_dofs],
         )
+        fingers = data.qpos[self._fingers], data.qvel[self._finger_dofs]
         numbers = np.zeros((MAX_OBJECTS, OBJECT_NUMBERS))
         for row, name in zip(numbers, self.env.obj_of_interest, strict=False):
             row[:3], row[3:7], row[7] = *self.pose(name), self.opening(name)
-        return np.concatenate([*robot, numbers.ravel()])
+        return np.concatenate([*arm, *fingers, numbers.ravel()])
 
     def pose(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Position (3,) and quaternion (4,), w first, of an object, a fixture or a region in the world."""
@@ -222,12 +224,6 @@ class Simulator:
         renderer.update_scene(self._seen, camera, self._visible)
         return np.ascontiguousarray(renderer.render()[:, ::-1])
 
-    @functools.cached_property
-    def _visible(self) -> Any:
-        option = self._mujoco.MjvOption()
-        option.geomgroup[:2] = 0, 1  # visual meshes, not what collides
-        return option
-
     def close(self) -> None:
         for renderer in self._renderers.values():
             renderer.close()
@@ -258,12 +254,10 @@ def _compiled_torques() -> Any:
 
 
 def operational_space_torques(arm: Arm, aim: Aim) -> np.ndarray:
-    """Torques of operational space control (Khatib, 1987) with the settings of robosuite's OSC_POSE.
+    """Torques (7,) in Nm of operational space control (Khatib, 1987) with the settings of robosuite's
+    OSC_POSE.
 
     Position and rotation are uncoupled; what freedom is left to the joints goes to the pose of rest.
-
-    Returns:
-        float64 (7,), in Nm.
     """
     dofs = arm.dofs
     n = len(dofs)
@@ -298,8 +292,7 @@ def operational_space_torques(arm: Arm, aim: Aim) -> np.ndarray:
 class SensorClock:
     """When robosuite's sensors read: once in each 50 ms, with its own sums of 2 ms.
 
-    Args:
-        readings: how many were forced since the reset.
+    So many `readings` were forced since the reset.
     """
 
     def __init__(self, readings: int) -> None:
@@ -344,13 +337,13 @@ def _build(task: str, assets: str) -> Any:
     def build() -> Any:
         return ControlEnv(str(bddl_file(task)), use_camera_obs=False, has_offscreen_renderer=False).env
 
+    def smaller(xml: str) -> Any:
+        """Space for 5,000 contacts is 1.3 GB of addresses for each simulation: no process could be forked."""
+        return compiled(re.sub(r"<size [^>]*>", f'<size memory="{ARENA}"/>', xml))
+
     compiled = MjSim.from_xml_string
-    # Space for 5,000 contacts is 1.3 GB of addresses for each simulation, and no process could be forked.
-    MjSim.from_xml_string = lambda xml: compiled(re.sub(r"<size [^>]*>", f'<size memory="{ARENA}"/>', xml))
-    try:
+    with patch.object(MjSim, "from_xml_string", smaller):
         env = _placed(build, 0)
-    finally:
-        MjSim.from_xml_string = compiled
     env.hard_reset = False  # the scene is always the same: no need to compile it anew for each episode
     return env
 
@@ -389,10 +382,7 @@ def _make_cheap(model: Any) -> None:
 
     What collides is not touched: that are hulls of vertices, which all stay.
     """
-    model.vis.quality.offsamples = 0
-    model.vis.quality.shadowsize = 0
-    model.light_castshadow[:] = 0
-    model.mat_reflectance[:] = 0
+    draw_fast(model)
     for mesh in range(model.nmesh):
         at, count = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
         if count <= MAX_FACES:

@@ -15,7 +15,6 @@ import contextlib
 import ctypes
 import functools
 import importlib
-import importlib.util
 import json
 import math
 import os
@@ -31,16 +30,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 
 from accerl_lerobot.config.ranges import Positive, Range, Section
-from accerl_lerobot.envs.base import (
-    EnvConfig,
-    EpisodeWorld,
-    Step,
-    WorldSpec,
-    check_cameras,
-    expand_tasks,
-    names,
-    task_code,
-)
+from accerl_lerobot.envs.base import EnvConfig, EpisodeWorld, Step, SuiteConfig, unit_spec
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Observation
 
@@ -51,7 +41,7 @@ if TYPE_CHECKING:
 @functools.cache
 def _tables() -> dict[str, Any]:
     """LeRobot's MetaWorld tables: a JSON file in its package, as importing it costs seconds and memory."""
-    spec = importlib.util.find_spec("lerobot")
+    spec = find_spec("lerobot")
     if spec is None or not spec.submodule_search_locations:
         raise ModuleNotFoundError("LeRobot is not installed: pip install lerobot[metaworld]", name="lerobot")
     path = Path(spec.submodule_search_locations[0]) / "envs" / "metaworld_config.json"
@@ -198,19 +188,19 @@ def _headless() -> bool:
 
 CAMERAS = ("topview", "corner", "corner2", "corner3", "corner4", "behindGripper", "gripperPOV")
 STATE_DIM = 4
-RAW_DIM = 39
-"""Numbers of MetaWorld's own observation."""
 ACTION_DIM = 4
 FPS = 80
 
 
 @EnvConfig.register_subclass("metaworld")
 @dataclass(frozen=True, kw_only=True)
-class MetaWorldConfig(EnvConfig):
+class MetaWorldConfig(SuiteConfig):
     """Which MetaWorld tasks, seen how."""
 
     expert = "accerl_lerobot.demos.record:metaworld_expert"
     world = "accerl_lerobot.envs.metaworld:MetaWorld"
+    groups = staticmethod(groups)
+    STATE_NUMBERS = 39
 
     task: str = "drawer-open-v3"
     """Task names separated by commas, or LeRobot's groups: easy, medium, hard, very_hard, all. A world keeps
@@ -221,8 +211,8 @@ class MetaWorldConfig(EnvConfig):
     """Height and width of every image in pixels."""
     max_steps: Annotated[int, Range("[1, 500]")] = 500
     """Episode limit in env steps; reaching it truncates."""
-    lighting: Literal["cheap", "default"] = "cheap"
-    """``cheap`` (no shadows, reflections or multisampling: ten times faster in software) or ``default``."""
+    rendering: Literal["stock", "fast"] = "fast"
+    """``stock`` or ``fast`` (no shadows, reflections or multisampling: ten times faster in software)."""
     environment_state: bool = False
     """True if observations hold ``observation.environment_state``: MetaWorld's own 39 numbers, objects and
     goal included, the share of `max_steps` gone, and which of several tasks it is. For
@@ -231,27 +221,11 @@ class MetaWorldConfig(EnvConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        expand_tasks(self.task, groups())
-        check_cameras(self.cameras, self.camera)
         if unknown := [name for name in self.cameras if name not in CAMERAS]:
             raise InputError("env.camera", self.camera, f"{unknown[0]!r} is none of: {', '.join(CAMERAS)}")
 
-    @property
-    def state_size(self) -> int:
-        return RAW_DIM + 1 + len(task_code(self.tasks, self.tasks[0])) if self.environment_state else 0
-
     def nominal(self) -> MetaWorldConfig:
         return replace(self, shift=ShiftConfig())
-
-    @property
-    def tasks(self) -> tuple[str, ...]:
-        """The task names `task` stands for."""
-        return expand_tasks(self.task, groups())
-
-    @property
-    def cameras(self) -> tuple[str, ...]:
-        """The camera names `camera` stands for."""
-        return names(self.camera)
 
 
 class MetaWorld(EpisodeWorld):
@@ -266,18 +240,8 @@ class MetaWorld(EpisodeWorld):
             if find_spec(package) is None:
                 raise ModuleNotFoundError(f"No module named {package!r}", name=package)
         self.config = config
-        size = config.image_size
-        self.spec = WorldSpec(
-            images={f"observation.images.{camera}": (size, size, 3) for camera in config.cameras},
-            state_dim=STATE_DIM,
-            action_dim=ACTION_DIM,
-            action_low=np.full(ACTION_DIM, -1, np.float32),
-            action_high=np.full(ACTION_DIM, 1, np.float32),
-            fps=FPS,
-            max_steps=config.max_steps,
-            tasks=config.tasks,
-            instructions=tuple(map(description, config.tasks)),
-        )
+        images = [f"observation.images.{camera}" for camera in config.cameras]
+        self.spec = unit_spec(config, images, description, STATE_DIM, ACTION_DIM, FPS)
         self._sims: dict[str, Any] = {}
         self._eyes: dict[str, Any] = {}
         self._film: dict[str, Any] = {}
@@ -340,24 +304,18 @@ class MetaWorld(EpisodeWorld):
         sim.seeded_rand_vec = True
         model = sim.model
         model.cam("corner2").pos[:] = (0.75, 0.075, 0.7)  # as LeRobot's wrapper does
-        if self.config.lighting == "cheap":
-            model.vis.quality.offsamples = 0
-            model.vis.quality.shadowsize = 0
-            model.light_castshadow[:] = 0
-            model.mat_reflectance[:] = 0
+        if self.config.rendering == "fast":
+            draw_fast(model)
         self.config.shift.apply(sim, self.config.cameras)
         self._eyes[task] = new_renderer(model, self.config.image_size, self.config.image_size)
         return sim
 
     def _observe(self) -> Observation:
-        observation: Observation = {
-            f"observation.images.{camera}": self._frame(self._eyes[self._task], camera)
-            for camera in self.config.cameras
-        }
+        eyes, cameras = self._eyes[self._task], self.config.cameras
+        observation: Observation = {f"observation.images.{name}": self._frame(eyes, name) for name in cameras}
         observation["observation.state"] = self._raw[:STATE_DIM].astype(np.float32)
         if self.config.environment_state:
-            state = self._raw, [self.late], task_code(self.spec.tasks, self._task)
-            observation[ENVIRONMENT_STATE] = np.concatenate(state).astype(np.float32)
+            observation[ENVIRONMENT_STATE] = self._privileged(self._raw)
         observation[TASK] = description(self._task)
         return observation
 
@@ -366,6 +324,13 @@ class MetaWorld(EpisodeWorld):
         image = renderer.render()
         # corner2 hangs upside down in MetaWorld's scene; LeRobot turns it, and so do its datasets.
         return np.ascontiguousarray(image[::-1, ::-1]) if camera == "corner2" else image
+
+
+def draw_fast(model: Any) -> None:
+    """Has MuJoCo draw no shadows and reflections, and without multisampling."""
+    model.vis.quality.offsamples = model.vis.quality.shadowsize = 0
+    model.light_castshadow[:] = 0
+    model.mat_reflectance[:] = 0
 
 
 def diverged(data: Any) -> bool:

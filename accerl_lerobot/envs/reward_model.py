@@ -44,11 +44,8 @@ class RewardModelConfig(Section, section=REWARD_MODEL):
 
 @functools.lru_cache(maxsize=1)
 def load_judge(config: RewardModelConfig) -> Callable[[Observation], bool]:
-    """Loads a reward model, one for all worlds of a process; the result tells if an observation is a success.
-
-    Raises:
-        InputError: there is none, it cannot be loaded, or it judges several observations at once.
-    """
+    """Loads a reward model, one for all worlds of a process; the result tells if an observation is a
+    success."""
     import torch
     from lerobot.configs.rewards import RewardModelConfig as LeRobotConfig
     from lerobot.processor import PolicyProcessorPipeline
@@ -56,74 +53,58 @@ def load_judge(config: RewardModelConfig) -> Callable[[Observation], bool]:
     from lerobot.utils.import_utils import register_third_party_plugins
 
     from accerl_lerobot.checkpoint.layout import BACKBONE
-    from accerl_lerobot.policies.guard import (
-        WEIGHTS,
-        check_origin,
-        check_processor,
-        fetched_checkpoint,
-        guarded,
-    )
+    from accerl_lerobot.policies import guard
 
     assert config.path is not None
     origin = Origin(f"{REWARD_MODEL}.path", config.path)
-    folder = fetched_checkpoint(config.path, config.revision, origin.field)
+    folder = guard.fetched_checkpoint(config.path, config.revision, origin.field)
     fetched = not Path(config.path).expanduser().exists()
     stored = read_json(folder / "config.json", origin)
-    check_origin(stored.get("model_name"), folder / BACKBONE, "config.json: model_name", origin, fetched)
+    guard.check_origin(
+        stored.get("model_name"), folder / BACKBONE, "config.json: model_name", origin, fetched
+    )
     names = [path.name for path in folder.glob("*_preprocessor.json")]
     if len(names) != 1:
         raise origin.refuse("*_preprocessor.json", f"{len(names)} of them; lerobot-train writes one")
-    check_processor(folder, names[0], origin, fetched=fetched)
+    guard.check_processor(folder, names[0], origin, fetched=fetched)
     register_third_party_plugins()
     try:
-        with guarded(REWARD_MODEL, config.trust_remote_code), contextlib.redirect_stdout(sys.stderr):
+        with guard.guarded(REWARD_MODEL, config.trust_remote_code), contextlib.redirect_stdout(sys.stderr):
             theirs = LeRobotConfig.from_pretrained(folder)
             if theirs.observation_delta_indices is not None:
-                remedy = (
-                    f"{theirs.type} looks at several observations at once; use one that judges each alone"
-                )
-                raise InputError(origin.field, config.path, remedy)
+                remedy = "looks at several observations at once; use one that judges each alone"
+                raise InputError(origin.field, config.path, f"{theirs.type} {remedy}")
             theirs.device = "cpu"
             model = get_reward_model_class(theirs.type).from_pretrained(folder, config=theirs)
-            overrides = {"device_processor": {"device": "cpu"}}
-            prepare = PolicyProcessorPipeline.from_pretrained(
-                folder, config_filename=names[0], overrides=overrides
-            )
+            on_cpu = {"device_processor": {"device": "cpu"}}
+            prepare = PolicyProcessorPipeline.from_pretrained(folder, names[0], overrides=on_cpu)
     except InputError:
         raise
     except Exception as error:  # LeRobot takes the files at their word, and may fail over any of them
         remedy = f"it cannot be loaded as one of LeRobot's reward models ({brief(error)})"
         raise InputError(origin.field, config.path, remedy) from error
-    mine, there = model.state_dict(), tensor_shapes(folder / WEIGHTS, origin).keys()
-    held = {mine[name].data_ptr() for name in there & mine.keys()}  # some have several names
-    if wrong := [name for name, tensor in mine.items() if tensor.data_ptr() not in held]:
-        raise origin.refuse(
-            WEIGHTS, f"{len(wrong)} tensors are missing, {wrong[0]} for instance; save it again"
-        )
+    mine, there = model.state_dict(), tensor_shapes(folder / guard.WEIGHTS, origin)
+    held = {mine[name].data_ptr() for name in there if name in mine}  # some have several names
+    if missing := [name for name, tensor in mine.items() if tensor.data_ptr() not in held]:
+        remedy = f"{len(missing)} tensors are missing, such as {missing[0]}; save it again"
+        raise origin.refuse(guard.WEIGHTS, remedy)
     wanted = {name: tuple(feature.shape) for name, feature in theirs.input_features.items()}
 
     @torch.no_grad()
     def succeeded(observation: Observation) -> bool:
         batch: dict[str, Any] = {TASK: [observation[TASK]]}
         for name, shape in wanted.items():
-            value = _tensor(observation, name)
+            value = torch.from_numpy(np.asarray(observation.get(name, np.zeros(0))))[None]
+            value = value.permute(0, 3, 1, 2).float() / 255 if value.dim() == 4 else value.float()
             if value.shape[1:] != shape:
-                remedy = f"its {name} is {shape}, the environment's {tuple(value.shape[1:])}"
+                offers = tuple(value.shape[1:]) if name in observation else "is missing"
+                remedy = f"its {name} is {shape}, the environment's {offers}"
                 raise InputError(origin.field, config.path, remedy)
             batch[name] = value
         batch = prepare(batch)
         if hasattr(model, "predict_reward"):
             return bool(model.predict_reward(batch, threshold=config.threshold)[0])
         return bool(model.compute_reward(batch)[0] > config.threshold)
-
-    def _tensor(observation: Observation, name: str) -> torch.Tensor:
-        if name not in observation:
-            offers = ", ".join(key for key in observation if key != TASK)
-            raise InputError(
-                origin.field, config.path, f"no {name} in the environment, which offers {offers}"
-            )
-        value = torch.from_numpy(np.asarray(observation[name]))[None]
-        return value.permute(0, 3, 1, 2).float() / 255 if value.dim() == 4 else value.float()
 
     return succeeded
 

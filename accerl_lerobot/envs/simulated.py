@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import numpy as np
 
 from accerl_lerobot.config.ranges import Positive, Range
-from accerl_lerobot.envs.base import EnvConfig, EpisodeWorld, Step, WorldSpec, names
+from accerl_lerobot.envs.base import EnvConfig, EpisodeWorld, Step, names, unit_spec
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Observation
 
@@ -44,9 +44,8 @@ class SimulatedConfig(EnvConfig):
     tolerance: Positive = 0.25
     """Largest distance in any dimension; targets lie within ±0.8."""
     reward: Literal["success", "dense"] = "success"
-    """``success`` (1.0 at the first success, else 0.0) or ``dense`` (1 − distance, each step)."""
-    terminate_on_success: bool = True
-    """True if the first success ends the episode."""
+    """``success`` (1.0 at the first success, which ends the episode) or ``dense`` (1 − distance at each step;
+    no success ends the episode)."""
     environment_state: bool = False
     """True if observations hold ``observation.environment_state``: the state, and the share of `max_steps`
     gone."""
@@ -73,18 +72,8 @@ class SimulatedWorld(EpisodeWorld):
 
     def __init__(self, config: SimulatedConfig) -> None:
         self.config = config
-        size = config.image_size
-        self.spec = WorldSpec(
-            images={f"observation.images.{CAMERA}": (size, size, 3)},
-            state_dim=STATE_DIM,
-            action_dim=ACTION_DIM,
-            action_low=np.full(ACTION_DIM, -1, np.float32),
-            action_high=np.full(ACTION_DIM, 1, np.float32),
-            fps=80,
-            max_steps=config.max_steps,
-            tasks=config.tasks,
-            instructions=tuple(INSTRUCTIONS[task] for task in config.tasks),
-        )
+        image = f"observation.images.{CAMERA}"
+        self.spec = unit_spec(config, [image], INSTRUCTIONS.__getitem__, STATE_DIM, ACTION_DIM, fps=80)
         self._target: np.ndarray = np.zeros(ACTION_DIM, np.float32)
         self._recent: collections.deque[np.ndarray] = collections.deque(maxlen=config.hold)
 
@@ -102,9 +91,8 @@ class SimulatedWorld(EpisodeWorld):
         self._recent.append(action)
         distance = float(np.abs(self._mean() - self.solution).max())
         success = len(self._recent) == self.config.hold and distance <= self.config.tolerance
-        ended = (success or self._success) and self.config.terminate_on_success
-        dense = 1.0 - distance if self.config.reward == "dense" else None
-        return Step(success=success, ended=ended, reward=dense)
+        dense = self.config.reward == "dense"
+        return Step(success=success, ended=success and not dense, reward=1.0 - distance if dense else None)
 
     def render(self, height: int, width: int) -> np.ndarray:
         image = np.full((height, width, 3), 40, np.uint8)

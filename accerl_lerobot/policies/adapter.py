@@ -26,7 +26,13 @@ from accerl_lerobot.policies.family import Encoded, Family, Model, pooled
 from accerl_lerobot.policies.teacher import PREFIX, Teacher
 
 HIDDEN = 128
-"""Width of the critic's hidden layer."""
+OBS_STATE = "observation.state"
+IMAGES = "observation.image"
+"""How images' names begin: ``observation.images.<camera>``, or LeRobot's name for a lone camera."""
+CONSTANT = 1e-6
+"""Environment units in one normalised unit, below which an action counts as constant."""
+SELF_CHECK_TOLERANCE = 1e-5
+"""Largest difference, in normalised action units, between our sampler and LeRobot's; fp32 noise is 1e-6."""
 
 
 class ValueHead(nn.Module):
@@ -54,15 +60,6 @@ class ValueHead(nn.Module):
         scores = (features @ self.query) / features.shape[-1] ** 0.5
         weights = torch.softmax(scores.masked_fill(~mask, float("-inf")), -1)
         return self.out(torch.relu(self.hidden(self.norm(pooled(features, weights))))).float()[:, 0]
-
-
-OBS_STATE = "observation.state"
-IMAGES = "observation.image"
-"""How images' names begin: ``observation.images.<camera>``, or LeRobot's name for a lone camera."""
-CONSTANT = 1e-6
-"""Environment units in one normalised unit, below which an action counts as constant."""
-SELF_CHECK_TOLERANCE = 1e-5
-"""Largest difference, in normalised action units, between our sampler and LeRobot's; fp32 noise is 1e-6."""
 
 
 class Evaluation(NamedTuple):
@@ -94,10 +91,7 @@ class PolicyAdapter(nn.Module, ABC):
     def evaluate(
         self, observations: dict[str, np.ndarray], tasks: Sequence[str], latent: dict[str, Tensor]
     ) -> Evaluation:
-        """Re-scores stored latents, each (B, ...), differentiably.
-
-        Observations, each (B, ...), are raw, as in `Segment.observations`; with them come B instructions.
-        """
+        """Re-scores stored latents, each (B, ...), differentiably; observations, each (B, ...), are raw."""
 
     @abstractmethod
     def values(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Tensor:
@@ -121,18 +115,11 @@ class PolicyAdapter(nn.Module, ABC):
         """Writes `weights`, from `copy_weights`, as ``pretrained_model`` into `directory`."""
 
     def load_trainable(self, tensors: dict[str, np.ndarray]) -> None:
-        """Copies published weights in place: all of them, or none when they do not fit.
-
-        Raises:
-            ValueError: names or shapes differ from `trainable`.
-        """
+        """Copies published weights in place: all of them, or none where names or shapes do not fit."""
         parameters = self.trainable()
-        if parameters.keys() != tensors.keys():
-            names = sorted(parameters.keys() ^ tensors.keys())[:4]
-            raise ValueError(f"published weights differ by name: {names}")
-        for name, parameter in parameters.items():
-            if (shape := tensors[name].shape) != tuple(parameter.shape):
-                raise ValueError(f"published {name} has shape {shape}, not {tuple(parameter.shape)}")
+        mine, theirs = ({(k, tuple(v.shape)) for k, v in of.items()} for of in (parameters, tensors))
+        if mine != theirs:
+            raise ValueError(f"published weights differ by name or shape: {sorted(mine ^ theirs)[:4]}")
         with torch.no_grad():
             for name, parameter in parameters.items():
                 array, on_cpu = tensors[name], parameter.device.type == "cpu"
@@ -143,10 +130,7 @@ class PolicyAdapter(nn.Module, ABC):
                     parameter.copy_(part_of(torch.tensor(array), parameter))
 
     def view_trainable(self) -> dict[str, np.ndarray]:
-        """`trainable` as NumPy arrays, to be copied before the next update.
-
-        On a CPU they are the parameters' own memory, else copies of them.
-        """
+        """`trainable` as NumPy arrays; on a CPU the parameters' own memory, to be copied before an update."""
         named = {name: whole(parameter.detach()) for name, parameter in self.trainable().items()}
         return {name: tensor.to("cpu", torch.float32).numpy() for name, tensor in named.items()}
 
@@ -198,10 +182,7 @@ class Processing:
 
 
 def example_requests(policy_config: Any, rename_map: dict[str, str]) -> list[Request]:
-    """Two requests with random observations for this policy, and instructions of unequal length.
-
-    `rename_map`: environment feature name → policy feature name.
-    """
+    """Two requests with random observations for this policy, and instructions of unequal length."""
     rng, steps = np.random.default_rng(0), policy_config.n_obs_steps
     env_name = {policy: env for env, policy in rename_map.items()}
     batch = (2,) if steps == 1 else (2, steps)
@@ -240,9 +221,9 @@ class LeRobotAdapter(PolicyAdapter):
         self.precision = precision
         self.policy.eval()
         self.teacher: Teacher | None = None
-        """Acts in its place in part of the exploring episodes; given by `teacher.WithTeacher`."""
+        """Acts in its place in part of the exploring episodes; given by `teacher.with_teacher`."""
         self.demonstrations: Callable[[Segment], Iterator[Segment]] | None = None
-        """Remembered by off-policy learning from the start; given by `demonstrations.WithDemonstrations`."""
+        """Remembered by off-policy learning from the start; set by `demonstrations.with_demonstrations`."""
 
     def encode(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Encoded:
         """Reads raw observations, each (B, ...), and B instructions, for the family; differentiable."""
@@ -268,14 +249,14 @@ class LeRobotAdapter(PolicyAdapter):
         if self.teacher is not None:
             executed = self.teacher.replace(executed, requests)
         chunk = self.processing.unnormalise(executed).cpu().numpy()
-        value, log_prob = self._value(encoded).cpu().numpy(), action.log_prob.float().cpu().numpy()
+        values, log_probs = self._value(encoded).tolist(), action.log_prob.float().cpu().numpy()
         latents = {k: v.cpu().numpy() for k, v in action.latent.items()}
         return [
             Decision(
                 chunk=chunk[i],
                 latent={k: v[i] for k, v in latents.items()},
-                log_prob=log_prob[i],
-                value=float(value[i]),
+                log_prob=log_probs[i],
+                value=values[i],
                 version=version,
             )
             for i in range(len(requests))
@@ -286,8 +267,8 @@ class LeRobotAdapter(PolicyAdapter):
     ) -> Evaluation:
         with self.autocast():
             encoded = self.encode(observations, tasks)
-            score = self.family.score(encoded, {k: v.to(self.device) for k, v in latent.items()})
-        return Evaluation(score.log_prob, score.entropy, self._value(encoded))
+            log_prob, entropy = self.family.score(encoded, {k: v.to(self.device) for k, v in latent.items()})
+        return Evaluation(log_prob, entropy, self._value(encoded))
 
     @torch.no_grad()
     def values(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Tensor:
@@ -323,26 +304,18 @@ class LeRobotAdapter(PolicyAdapter):
         """Largest difference between our sampler without exploration and LeRobot's own on equal noise.
 
         Raises:
-            InputError: above `SELF_CHECK_TOLERANCE`, or LeRobot's internals have changed.
+            InputError: above `SELF_CHECK_TOLERANCE`: log-probs would be those of another policy.
         """
-        cause: Exception | None = None
-        try:
-            batch = self.processing.prepare(observations, tasks)
-            difference = self.family.difference(batch, self.model.encode(batch))
-            self.policy.reset()
-            if difference <= SELF_CHECK_TOLERANCE:
-                return difference
-            reason = f"differs from its sampler by {difference:.2e}"
-        except (AttributeError, ImportError, KeyError, NotImplementedError, TypeError) as error:
-            cause, reason = error, f"cannot drive it ({type(error).__name__}: {error})"
         import lerobot
 
-        remedy = (
-            f"the adapter of {self.policy.name} does not fit LeRobot {lerobot.__version__}: it {reason}, so "
-            "log-probs would be those of another policy; install the LeRobot version that this package pins, "
-            "or correct the adapter"
-        )
-        raise InputError("lerobot", lerobot.__version__, remedy) from cause
+        batch = self.processing.prepare(observations, tasks)
+        difference = self.family.difference(batch, self.model.encode(batch))
+        self.policy.reset()
+        if difference <= SELF_CHECK_TOLERANCE:
+            return difference
+        fits = f"the adapter of {self.policy.name} does not fit LeRobot {lerobot.__version__}"
+        remedy = f"{fits}: it differs from its sampler by {difference:.2e}; install the pinned version"
+        raise InputError("lerobot", lerobot.__version__, remedy)
 
     def _value(self, encoded: Encoded) -> Tensor:
         return self.value_head(encoded.features, encoded.mask)

@@ -167,12 +167,10 @@ USES_HISTORY = ("diffusion",)
 
 
 def register_policy(policy_type: str, model: str, *families: str) -> None:
-    """Gives a LeRobot policy type of another package a likelihood, where the type is registered with LeRobot.
+    """Gives a policy type of another package, which is registered with LeRobot, a likelihood.
 
-    Args:
-        policy_type: its name in LeRobot's registry.
-        model: ``module:class``, of that package, of its `FlowModel` or another `family.Model`.
-        families: names of the samplers that suit it, the default one first.
+    `model` is ``module:class``, of that package, of its `FlowModel` or another `family.Model`; `families` are
+    the names of the samplers that suit it, the default one first.
     """
     module = model.partition(":")[0]
     POLICIES[policy_type] = (model, families)
@@ -193,9 +191,7 @@ def register_policies(wanted: str | None = None) -> None:
 
 def discovery(policy_type: str | None) -> list[str]:
     """Arguments by which stock LeRobot commands find this type; none for LeRobot's own."""
-    if policy_type not in PLUGINS:
-        return []
-    return [f"--policy.discover_packages_path={PLUGINS[policy_type]}"]
+    return [f"--policy.discover_packages_path={PLUGINS[policy_type]}"] if policy_type in PLUGINS else []
 
 
 def check_type(policy_type: Any, field: str, prefix: str = "") -> str:
@@ -235,8 +231,7 @@ def override(policy_config: Any, config: PolicyConfig) -> None:
         # The checkpoint has them; LeRobot would download torchvision's first, even when told to stay offline.
         policy_config.pretrained_backbone_weights = None
     if config.num_steps is not None:
-        name = steps_field(policy_config)
-        if name is None:
+        if (name := steps_field(policy_config)) is None:
             remedy = f"a {policy_config.type} policy does not denoise; leave the field out"
             raise InputError("policy.num_steps", config.num_steps, remedy)
         setattr(policy_config, name, config.num_steps)

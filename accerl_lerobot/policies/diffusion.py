@@ -33,40 +33,10 @@ from torch import Tensor
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Request
 from accerl_lerobot.policies.config import DiffusionSamplerConfig
-from accerl_lerobot.policies.family import (
-    Action,
-    Encoded,
-    Family,
-    Model,
-    Score,
-    exploring,
-    normal_entropy,
-    normal_log_prob,
-    refuse_compiled,
-    standard_normal,
-)  # fmt: skip
+from accerl_lerobot.policies.family import Action, Encoded, Family, Model, normal_entropy, normal_log_prob
 
 Network = Callable[[Tensor, int], Tensor]
 """(x (B, H, A), timestep) → what the network predicts, fp32 (B, H, A), given the observations."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class DiffusionShape:
-    """The sizes a chunk is sampled in."""
-
-    horizon: int
-    """H rows that are denoised."""
-    executed: int
-    """Rows that are executed in the environment (LeRobot's n_action_steps)."""
-    first: int = 0
-    """The first of them; those before it stand for the past (LeRobot's n_obs_steps − 1)."""
-    action_dim: int
-    """A."""
-
-    @property
-    def rows(self) -> slice:
-        """The executed ones."""
-        return slice(self.first, self.first + self.executed)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,11 +60,9 @@ class Schedule:
         return len(self.timesteps)
 
     def step(self, k: int, x: Tensor, output: Tensor, eta: float = 0.0) -> tuple[Tensor, Tensor]:
-        """Mean (B, H, A) and std, a scalar, of step k; with the default `eta` LeRobot's own.
+        """Mean (B, H, A) and std, a scalar, of step k, counted from the noise, 0 to N − 1.
 
-        Args:
-            k: counted from the noise, 0 to N − 1.
-            eta: of DDIM: 0 is LeRobot's own, 1 adds as much noise as DDPM.
+        `eta` is DDIM's: 0 is LeRobot's own, 1 adds as much noise as DDPM.
         """
         alpha, following = self.alphas[k], self.following[k]
         noise_share = 1 - alpha
@@ -123,19 +91,22 @@ class Diffusion(Model):
     `predict_action_chunk` wants a time dimension that its preprocessor does not add; `stock` adds it.
     """
 
+    size: tuple[int, int]
+    """(H, A)."""
+    rows: slice
+    """The executed ones among the H."""
+    schedule: Schedule
+
     def __init__(self, policy: Any) -> None:
         config = policy.config
-        refuse_compiled(config)
+        self.refuse_options(config)
         steps, most = policy.diffusion.num_inference_steps, config.num_train_timesteps
         if steps > most:
             raise InputError("policy.num_steps", steps, f"use at most {most}, as many as it was trained with")
         self.policy = policy
-        self.shape = DiffusionShape(
-            horizon=config.horizon,
-            executed=min(config.n_action_steps, config.horizon - config.n_obs_steps + 1),
-            first=config.n_obs_steps - 1,
-            action_dim=config.action_feature.shape[0],
-        )
+        self.size = (config.horizon, config.action_feature.shape[0])
+        first = config.n_obs_steps - 1  # rows before it stand for the past
+        self.rows = slice(first, min(first + config.n_action_steps, config.horizon))
         scheduler = policy.diffusion.noise_scheduler
         scheduler.set_timesteps(steps)
         timesteps = tuple(int(t) for t in scheduler.timesteps)
@@ -164,7 +135,7 @@ class Diffusion(Model):
             features=condition[:, None], mask=condition.new_ones(len(condition), 1).bool(), context=network
         )
 
-    def stock(self, batch: dict[str, Tensor], noise: Tensor) -> tuple[Tensor, Tensor]:
+    def stock_and_noise(self, batch: dict[str, Tensor], noise: Tensor) -> tuple[Tensor, Tensor]:
         """LeRobot's own chunk from noise (B, H, A), and the step noise (B, N, H, A) that it drew.
 
         It draws from the global generator, which is put back.
@@ -173,7 +144,7 @@ class Diffusion(Model):
         self.policy.reset()
         with torch.random.fork_rng([noise.device] if noise.device.type == "cuda" else []):
             torch.manual_seed(0)
-            chunk = self.policy.predict_action_chunk(self._with_time(batch), noise=noise)
+            chunk = self.stock(self._with_time(batch), noise=noise)
             torch.manual_seed(0)
             for k, timestep in enumerate(self.schedule.timesteps):
                 if self.schedule.scheduler == "DDPM" and timestep > 0:
@@ -202,31 +173,23 @@ class DiffusionFamily(Family):
     def __init__(self, model: Diffusion, sampler: DiffusionSamplerConfig) -> None:
         super().__init__()
         self.model, self.sampler = model, sampler
-        self.shape, self.schedule = model.shape, model.schedule
-        one_step = len(self.schedule) == 1
-        self._factors = self.shape.rows if one_step else slice(0, self.shape.horizon)
+        self.size, self.rows, self.schedule = model.size, model.rows, model.schedule
+        self._factors = self.rows if len(self.schedule) == 1 else slice(None)
         """L rows. Those without a density are left out: as constant factors they would dilute means."""
         zero = torch.zeros(1, 1, 1)
         stds = [self._exploring_step(k, zero, zero)[1] for k in range(len(self.schedule))]
-        entries = [int(self._mask(k, zero.device).sum()) * self.shape.action_dim for k in range(len(stds))]
+        entries = [int(self._mask(k, zero.device).sum()) * self.size[1] for k in range(len(stds))]
         self.entropy = sum(n * float(normal_entropy(std)) for n, std in zip(entries, stds, strict=True))
         """Differential entropy of the steps; no weight changes it."""
 
     def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
         """Samples; without exploration a DDPM policy still draws step noise, as LeRobot's does."""
-        size = (self.shape.horizon, self.shape.action_dim)
         device = encoded.features.device
-        x, eps = standard_normal(requests, size, (len(self.schedule), *size), device=device)
-        return self.sample(encoded.context, x, eps, exploring(requests, device))
+        x, eps = self.noise(requests, self.size, (len(self.schedule), *self.size), device=device)
+        return self.sample(encoded.context, x, eps, self.exploring(requests, device))
 
     def sample(self, network: Network, x: Tensor, eps: Tensor, explore: Tensor) -> Action:
-        """Denoises a batch, some samples exploring and the others by LeRobot's own steps.
-
-        Args:
-            x: (B, H, A) initial noise.
-            eps: (B, N, H, A) standard normal, the step noise.
-            explore: (B,) bool.
-        """
+        """Denoises `x` (B, H, A) with step noise `eps` (B, N, H, A); as LeRobot where not `explore` (B,)."""
         path, log_prob = [x], x.new_zeros(x.shape[:2])
         for k, timestep in enumerate(self.schedule.timesteps):
             output = network(x, timestep)
@@ -236,7 +199,7 @@ class DiffusionFamily(Family):
             x = torch.where(explore[:, None, None], mean + std * eps[:, k], stock)
             log_prob = log_prob + torch.where(explore[:, None], self._rows(k, x, mean, std), 0.0)
             path.append(x)
-        return Action(x[:, self.shape.rows], {"path": torch.stack(path, 1)}, log_prob[:, self._factors])
+        return Action(x[:, self.rows], {"path": torch.stack(path, 1)}, log_prob[:, self._factors])
 
     def log_prob(self, network: Network, latent: dict[str, Tensor]) -> Tensor:
         """Log-density of stored chains under the current network, (B, L), differentiable."""
@@ -247,18 +210,15 @@ class DiffusionFamily(Family):
             log_prob = log_prob + self._rows(k, path[k + 1], mean, std)
         return log_prob[:, self._factors]
 
-    def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> Score:
+    def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         log_prob = self.log_prob(encoded.context, latent)
-        return Score(log_prob, entropy=log_prob.new_full((len(log_prob),), self.entropy))
+        return log_prob, log_prob.new_full((len(log_prob),), self.entropy)
 
     def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
-        size = (len(encoded.features), self.shape.horizon, self.shape.action_dim)
-        device = encoded.features.device
-        noise = torch.randn(size, generator=torch.Generator().manual_seed(0)).to(device)
-        stock, eps = self.model.stock(batch, noise)
-        ours = self.sample(
-            encoded.context, noise, eps, torch.zeros(len(noise), dtype=torch.bool, device=device)
-        )
+        size = (len(encoded.features), *self.size)
+        noise = torch.randn(size, generator=torch.Generator().manual_seed(0)).to(encoded.features.device)
+        stock, eps = self.model.stock_and_noise(batch, noise)
+        ours = self.sample(encoded.context, noise, eps, torch.zeros_like(noise[:, 0, 0], dtype=torch.bool))
         return float((ours.chunk - stock).abs().max())
 
     def _exploring_step(self, k: int, x: Tensor, output: Tensor) -> tuple[Tensor, Tensor]:
@@ -273,6 +233,6 @@ class DiffusionFamily(Family):
     def _mask(self, k: int, device: torch.device) -> Tensor:
         """bool (H, 1): rows of step k's outcome that belong to the density."""
         last = k == len(self.schedule) - 1
-        mask = torch.full((self.shape.horizon, 1), not last, dtype=torch.bool, device=device)
-        mask[self.shape.rows] = True
+        mask = torch.full((self.size[0], 1), not last, dtype=torch.bool, device=device)
+        mask[self.rows] = True
         return mask

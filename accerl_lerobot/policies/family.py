@@ -38,7 +38,7 @@ class Encoded:
 
 
 class Action(NamedTuple):
-    """A family's answer for a batch."""
+    """A family's decisions for a batch."""
 
     chunk: Tensor
     """(B, K, A), K executed actions in the policy's normalised units."""
@@ -46,15 +46,6 @@ class Action(NamedTuple):
     """Each (B, ...): what was sampled, all that `Family.score` needs beside the observations."""
     log_prob: Tensor
     """(B, L); zero where not exploring."""
-
-
-class Score(NamedTuple):
-    """Stored latents under the current weights."""
-
-    log_prob: Tensor
-    """(B, L), differentiable."""
-    entropy: Tensor
-    """(B,)."""
 
 
 class Model(ABC):
@@ -80,9 +71,23 @@ class Model(ABC):
         """Holds while LeRobot builds policy and processors."""
         return nullcontext()
 
+    @staticmethod
+    def refuse_options(config: Any) -> None:
+        """Refuses options of LeRobot's policies under which the density would be another."""
+        if (rtc := getattr(config, "rtc_config", None)) is not None and rtc.enabled:
+            remedy = "real-time chunking changes the sampler's density; turn it off"
+            raise InputError("policy.rtc_config.enabled", True, remedy)
+        if config.compile_model:
+            remedy = "a compiled sampler rounds unlike the re-scoring pass; set it to false in config.json"
+            raise InputError("policy.compile_model", True, remedy)
+
     @abstractmethod
     def encode(self, batch: dict[str, Tensor]) -> Encoded:
         """Reads a preprocessed batch."""
+
+    def stock(self, batch: dict[str, Tensor], **noise: Tensor) -> Tensor:
+        """LeRobot's own chunk (B, K, A) in normalised units; where it denoises, from this ``noise``."""
+        return self.policy.predict_action_chunk(batch, **noise)
 
 
 class Family(nn.Module, ABC):
@@ -93,8 +98,8 @@ class Family(nn.Module, ABC):
         """Samples; where a request does not explore, LeRobot's own sampler."""
 
     @abstractmethod
-    def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> Score:
-        """Re-scores what `act` stored."""
+    def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Log-prob (B, L), differentiable, of what `act` stored, and entropy (B,)."""
 
     @abstractmethod
     def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
@@ -110,6 +115,18 @@ class Family(nn.Module, ABC):
     def factors(self, latent: dict[str, Tensor]) -> Tensor | None:
         """See `PolicyAdapter.factors`."""
         return None
+
+    @staticmethod
+    def noise(requests: Sequence[Request], *sizes: tuple[int, ...], device: torch.device) -> list[Tensor]:
+        """Standard normal tensors, each (B, *size), row i from request i's own seed, whatever its batch."""
+        generators = [np.random.default_rng(request.noise_seed) for request in requests]
+        draws = [[rng.standard_normal(size, dtype=np.float32) for size in sizes] for rng in generators]
+        return [torch.from_numpy(np.stack(column)).to(device) for column in zip(*draws, strict=True)]
+
+    @staticmethod
+    def exploring(requests: Sequence[Request], device: torch.device) -> Tensor:
+        """bool (B,)."""
+        return torch.tensor([request.explore for request in requests], device=device)
 
 
 LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
@@ -130,24 +147,3 @@ def pooled(features: Tensor, weights: Tensor) -> Tensor:
     """Weighted mean, fp32 (B, width), of features (B, P, width); weights (B, P) of any sum above 0."""
     weights = weights / weights.sum(-1, keepdim=True)
     return (weights[..., None] * features.float()).sum(1)
-
-
-def standard_normal(
-    requests: Sequence[Request], *sizes: tuple[int, ...], device: torch.device
-) -> list[Tensor]:
-    """Standard normal tensors, each (B, *size), row i from request i's own seed, whatever its batch."""
-    generators = [np.random.default_rng(request.noise_seed) for request in requests]
-    draws = [[rng.standard_normal(size, dtype=np.float32) for size in sizes] for rng in generators]
-    return [torch.from_numpy(np.stack(column)).to(device) for column in zip(*draws, strict=True)]
-
-
-def exploring(requests: Sequence[Request], device: torch.device) -> Tensor:
-    """bool (B,)."""
-    return torch.tensor([r.explore for r in requests], device=device)
-
-
-def refuse_compiled(config: Any) -> None:
-    """Refuses a LeRobot policy config whose sampler would be compiled."""
-    if config.compile_model:
-        remedy = "a compiled sampler rounds unlike the re-scoring pass; set it to false in config.json"
-        raise InputError("policy.compile_model", True, remedy)

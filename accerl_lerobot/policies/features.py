@@ -78,19 +78,13 @@ def check_features(
 ) -> None:
     """Compares what a policy, or the policy that a dataset makes, needs with what is offered to it.
 
-    Args:
-        rename_map: offered name → needed name.
-        field: named in the error, with its `value`.
-
-    Raises:
-        InputError: a feature is missing or of another shape, the rates differ, none of the environment's
-            tasks is in the dataset, or `rename_map` renames nothing or gives two features one name.
+    `rename_map` is offered name → needed name; the error names `field` and its `value`.
     """
     renames = "policy.rename_map"
     sources = {name for name in offered.shapes if name != ACTION}
-    for name in rename_map.keys() - sources:
+    if unknown := sorted(rename_map.keys() - sources):
         names = ", ".join(sorted(sources))
-        raise InputError(renames, name, f"the {offerer} has no such feature; it offers {names}")
+        raise InputError(renames, unknown[0], f"the {offerer} has no such feature; it offers {names}")
     shapes: dict[str, tuple[int, ...]] = {}
     for name, shape in offered.shapes.items():
         new = rename_map.get(name, name)
@@ -101,12 +95,8 @@ def check_features(
         image = len(shape) == 3
         if name not in shapes:
             same = [k for k, other in shapes.items() if len(other) == len(shape) and k != ACTION]
-            remedy = (
-                "; choose env.camera (env.images of gym), or map names with policy.rename_map"
-                if image
-                else ""
-            )
             offers = ", ".join(same) or "none"
+            remedy = "; choose env.camera (env.images of gym), or map names with policy.rename_map" * image
             raise InputError(field, value, f"no {name} in the {offerer}, which offers {offers}{remedy}")
         skip = 1 if image and needed.any_size else len(shape)
         if shapes[name][:skip] != shape[:skip]:

@@ -23,21 +23,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Request
 from accerl_lerobot.policies.config import FlowSamplerConfig
-from accerl_lerobot.policies.family import (
-    Action,
-    Encoded,
-    Family,
-    Model,
-    Score,
-    exploring,
-    normal_entropy,
-    normal_log_prob,
-    refuse_compiled,
-    standard_normal,
-)  # fmt: skip
+from accerl_lerobot.policies.family import Action, Encoded, Family, Model, normal_entropy, normal_log_prob
 
 Velocity = Callable[[Tensor, Tensor], Tensor]
 """(x (B, K, D), t (B,)) → v (B, K, D), conditioned on the observations; output in fp32."""
@@ -76,10 +64,6 @@ class FlowModel(Model):
 
     shape: FlowShape
 
-    def stock(self, batch: dict[str, Tensor], noise: Tensor) -> Tensor:
-        """LeRobot's own chunk (B, K, A) in normalised units from noise (B, K, D)."""
-        return self.policy.predict_action_chunk(batch, noise=noise)
-
 
 def flow_shape(config: Any, num_steps: int) -> FlowShape:
     """The sizes in a LeRobot flow policy's config."""
@@ -90,14 +74,6 @@ def flow_shape(config: Any, num_steps: int) -> FlowShape:
         padded_dim=config.max_action_dim,
         action_dim=config.action_feature.shape[0],
     )
-
-
-def refuse_options(config: Any) -> None:
-    """Refuses options of LeRobot's policies that would change the sampler's density."""
-    if config.rtc_config is not None and config.rtc_config.enabled:
-        remedy = "real-time chunking changes the sampler's density; turn it off"
-        raise InputError("policy.rtc_config.enabled", True, remedy)
-    refuse_compiled(config)
 
 
 class FlowFamily(Family):
@@ -113,17 +89,11 @@ class FlowFamily(Family):
     def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
         n, size = self.shape.num_steps, (self.shape.chunk_size, self.shape.padded_dim)
         # Noise of every step is drawn, though only the last is noisy: recorded runs used these numbers.
-        x0, eps = standard_normal(requests, size, (n, *size), device=encoded.features.device)
-        return self.sample(encoded.context, x0, eps[:, -1], exploring(requests, x0.device))
+        x0, eps = self.noise(requests, size, (n, *size), device=encoded.features.device)
+        return self.sample(encoded.context, x0, eps[:, -1], self.exploring(requests, x0.device))
 
     def sample(self, velocity: Velocity, x0: Tensor, eps: Tensor, explore: Tensor) -> Action:
-        """Denoises a batch, some samples exploring and the others by the stock ODE.
-
-        Args:
-            x0: (B, K, D) initial noise.
-            eps: (B, K, D) standard normal, the noise of the last step.
-            explore: (B,) bool; False samples take the stock path, equal to LeRobot's sampler.
-        """
+        """Denoises `x0` (B, K, D), where `explore` (B,) with last noise `eps` (B, K, D), else as LeRobot."""
         mean = self.shape.integrate(velocity, x0)
         x = torch.where(explore[:, None, None], mean + self._std(x0) * eps, mean)
         return Action(
@@ -137,14 +107,14 @@ class FlowFamily(Family):
         x0, x = latent["path"].unbind(1)
         return self._rows(x, self.shape.integrate(velocity, x0))
 
-    def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> Score:
+    def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         log_prob = self.log_prob(encoded.context, latent)
-        return Score(log_prob, entropy=log_prob.new_full((len(log_prob),), self.entropy))
+        return log_prob, log_prob.new_full((len(log_prob),), self.entropy)
 
     def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
         size = (len(encoded.features), self.shape.chunk_size, self.shape.padded_dim)
         x0 = torch.randn(size, generator=torch.Generator().manual_seed(0)).to(encoded.features.device)
-        stock = self.model.stock(batch, x0.clone())
+        stock = self.model.stock(batch, noise=x0.clone())
         ours = self.shape.integrate(encoded.context, x0)[..., : self.shape.action_dim]
         return float((ours - stock).abs().max())
 

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -24,41 +23,20 @@ from torch import Tensor, nn
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Request
 from accerl_lerobot.policies.config import GaussianSamplerConfig
-from accerl_lerobot.policies.family import (
-    Action,
-    Encoded,
-    Family,
-    Model,
-    Score,
-    exploring,
-    normal_entropy,
-    normal_log_prob,
-    standard_normal,
-)  # fmt: skip
-
-
-@dataclass(frozen=True, kw_only=True)
-class GaussianContext:
-    """`Encoded.context` of a Gaussian model."""
-
-    mean: Tensor
-    """fp32 (B, K, A), LeRobot's chunk."""
-    rows: Tensor
-    """(B, K, W), what the std is computed from."""
+from accerl_lerobot.policies.family import Action, Encoded, Family, Model, normal_entropy, normal_log_prob
 
 
 class GaussianModel(Model):
-    """A LeRobot policy that predicts a chunk in one pass; `Encoded.context` is a `GaussianContext`."""
+    """A LeRobot policy that predicts a chunk in one pass.
+
+    `Encoded.context` is its chunk, fp32 (B, K, A), and the rows (B, K, W) that the std is computed from.
+    """
 
     executed: int
     """Rows that are executed in the environment."""
     action_dim: int
     row_width: int
     """W."""
-
-    def stock(self, batch: dict[str, Tensor]) -> Tensor:
-        """LeRobot's own chunk (B, K, A)."""
-        return self.policy.predict_action_chunk(batch)
 
 
 class StdHead(nn.Module):
@@ -91,16 +69,16 @@ class GaussianFamily(Family):
 
     def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
         mean, std = self._gaussian(encoded)
-        (eps,) = standard_normal(requests, tuple(mean.shape[1:]), device=mean.device)
-        explore = exploring(requests, mean.device)
+        (eps,) = self.noise(requests, tuple(mean.shape[1:]), device=mean.device)
+        explore = self.exploring(requests, mean.device)
         u = torch.where(explore[:, None, None], mean + std * eps, mean)
         counted = normal_log_prob(u, mean, std).sum(-1)
         return Action(u, {"u": u}, torch.where(explore[:, None], counted, 0.0))
 
-    def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> Score:
+    def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         mean, std = self._gaussian(encoded)
         log_prob = normal_log_prob(latent["u"], mean, std).sum(-1)
-        return Score(log_prob, entropy=normal_entropy(std).sum((1, 2)))
+        return log_prob, normal_entropy(std).sum((1, 2))
 
     def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
         mean, _ = self._gaussian(encoded)
@@ -112,8 +90,8 @@ class GaussianFamily(Family):
 
     def _gaussian(self, encoded: Encoded) -> tuple[Tensor, Tensor]:
         """Mean and std of the executed rows, each (B, L, A)."""
-        context, executed = encoded.context, self.model.executed
-        return context.mean[:, :executed], self.std(context.rows[:, :executed])
+        mean, rows = (part[:, : self.model.executed] for part in encoded.context)
+        return mean, self.std(rows)
 
 
 class ACT(GaussianModel):
@@ -152,5 +130,5 @@ class ACT(GaussianModel):
         return Encoded(
             features=features,
             mask=features.new_ones(features.shape[:2]).bool(),
-            context=GaussianContext(mean=mean.float(), rows=seen["rows"]),
+            context=(mean.float(), seen["rows"]),
         )

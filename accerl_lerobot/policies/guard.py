@@ -16,6 +16,7 @@ from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -86,8 +87,10 @@ def check_checkpoint(folder: Path, origin: Origin, *, fetched: bool = False) -> 
     for name in (WEIGHTS, VALUE_HEAD, FAMILY):
         if safe_join(folder, name, origin).exists():
             tensor_shapes(folder / name, origin)
-    if safe_join(folder, OURS, origin).exists():
-        check_ours(read_json(folder / OURS, origin), origin)
+    ours = read_json(folder / OURS, origin) if safe_join(folder, OURS, origin).exists() else {}
+    for key in ("sampler", "rename_map"):
+        if not isinstance(ours.get(key, {}), dict):
+            raise origin.refuse(f"{OURS}: {key}", "a mapping is wanted; remove the file to start without it")
     _check_beside(folder, origin)
     return config
 
@@ -121,19 +124,10 @@ def check_statistics(folder: Path, origin: Origin) -> None:
                 deque(read_tensors(folder / step["state_file"], origin), maxlen=0)
 
 
-def check_ours(ours: dict[str, Any], origin: Origin) -> None:
-    """Checks the content of ``accerl.json``."""
-    for key in ("sampler", "rename_map"):
-        if not isinstance(ours.get(key, {}), dict):
-            raise origin.refuse(f"{OURS}: {key}", "a mapping is wanted; remove the file to start without it")
-
-
 def check_origin(name: Any, own: Path | None, what: str, origin: Origin, fetched: bool) -> None:
     """Checks that a backbone or tokeniser is the checkpoint's own, the Hub's, or at a path of a local one's.
 
-    Args:
-        own: the checkpoint's own folder of it, where it may have one.
-        what: file and key that say so, for the error.
+    `own` is the checkpoint's own folder of it; `what` says file and key, for the error.
     """
     if name is None:
         return
@@ -168,14 +162,11 @@ def _check_beside(folder: Path, origin: Origin) -> None:
 def guarded(section: str, commit: str | None = None) -> Iterator[None]:
     """While it lasts, transformers runs no code that comes with a model, and PyTorch unpickles nothing.
 
-    Args:
-        section: ``policy`` or ``sft``, for the error.
-        commit: commit of the one Hub repository whose code may be run; None: none may.
+    `commit` is that of the one Hub repository whose code may be run; `section` is for the error.
     """
     from transformers import dynamic_module_utils as dynamic
 
     fetch, look, load = dynamic.get_cached_module_file, dynamic.check_imports, torch.load
-    timeout = dynamic.TIME_OUT_REMOTE_CODE
 
     def fetch_pinned(name: Any, *arguments: Any, **options: Any) -> Any:
         pinned = {} if commit is None else {"revision": commit}
@@ -202,15 +193,14 @@ def guarded(section: str, commit: str | None = None) -> Iterator[None]:
             raise InputError(f"{section}.path", str(file)[:200], f"{remedy} where you trust it")
         return load(file, *arguments, **options | {"weights_only": True})
 
-    dynamic.get_cached_module_file, dynamic.check_imports = fetch_pinned, look_first
-    dynamic.TIME_OUT_REMOTE_CODE = 0  # or it would ask the terminal
-    torch.load = load_known
-    try:
+    # Without a time-out of 0 it would ask the terminal.
+    wrapped: dict[str, Any] = {
+        "get_cached_module_file": fetch_pinned,
+        "check_imports": look_first,
+        "TIME_OUT_REMOTE_CODE": 0,
+    }
+    with patch.multiple(dynamic, **wrapped), patch.object(torch, "load", load_known):
         yield
-    finally:
-        dynamic.get_cached_module_file, dynamic.check_imports = fetch, look
-        dynamic.TIME_OUT_REMOTE_CODE = timeout
-        torch.load = load
 
 
 class Unfilled(TorchFunctionMode):

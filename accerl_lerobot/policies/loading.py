@@ -26,6 +26,7 @@ from accerl_lerobot.checkpoint.safety import Origin, brief, read_json, read_tens
 from accerl_lerobot.config.parsing import discover, imported
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK
+from accerl_lerobot.policies import guard
 from accerl_lerobot.policies.adapter import (
     LeRobotAdapter,
     Processing,
@@ -44,18 +45,6 @@ from accerl_lerobot.policies.config import (
     sampler_config,
 )  # fmt: skip
 from accerl_lerobot.policies.family import Model
-from accerl_lerobot.policies.guard import (
-    CONFIG,
-    FAMILY,
-    OURS,
-    VALUE_HEAD,
-    WEIGHTS,
-    Unfilled,
-    check_statistics,
-    fetched_checkpoint,
-    guarded,
-    input_error,
-)  # fmt: skip
 from accerl_lerobot.policies.saving import tune
 
 logger = logging.getLogger(__name__)
@@ -75,37 +64,17 @@ class Sizes(NamedTuple):
 
 _rehearsed: dict[str, Sizes] = {}
 """Checkpoints and configs that need no other rehearsal in this process."""
-NAMED = 3
-"""Tensors of a kind that an error names."""
 
 
 def resolve_device(name: str, field: str = "policy.device") -> torch.device:
     """The device of this name; ``auto`` is CUDA when there is one. The error names `field`."""
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        device = torch.device(name)
-    except RuntimeError:
-        device = torch.device("meta")
-    if device.type not in ("cpu", "cuda"):
-        raise InputError(field, name, "use cpu, cuda or auto")
-    if device.type == "cuda" and not torch.cuda.is_available():
+    here = torch.cuda.is_available()
+    device = torch.device(("cuda" if here else "cpu") if name == "auto" else name)
+    if device.type == "cuda" and not here:
         raise InputError(field, name, "no CUDA device here; use cpu or auto")
-    count = torch.cuda.device_count() if device.type == "cuda" else 1
-    if (device.index or 0) >= count:
+    if device.type == "cuda" and (device.index or 0) >= (count := torch.cuda.device_count()):
         raise InputError(field, name, f"there are {count} such devices here, numbered from 0")
     return device
-
-
-def no_tf32(device: torch.device) -> None:
-    """Makes fp32 mean fp32 on a GPU, where torch convolves with 10 bits of mantissa unless told otherwise.
-
-    For batches of different sizes cuDNN chooses other algorithms; what they round differently is divided by
-    the std of the noise in every log-prob.
-    """
-    if device.type == "cuda":
-        torch.backends.cudnn.allow_tf32 = False
-        torch.backends.cuda.matmul.allow_tf32 = False
 
 
 def load_lerobot_config(config: PolicyConfig) -> Any:
@@ -129,7 +98,13 @@ def load_lerobot_config(config: PolicyConfig) -> Any:
 
 
 def rehearsed_config(config: PolicyConfig) -> Any:
-    """`load_lerobot_config` of a checkpoint that has been loaded and has acted once in a child process.
+    """`load_lerobot_config` of a checkpoint that has passed `policy_sizes`."""
+    policy_sizes(config)
+    return load_lerobot_config(config)
+
+
+def policy_sizes(config: PolicyConfig) -> Sizes:
+    """`Sizes` of a checkpoint's policy, which has been loaded and has acted once in a child process.
 
     The child has limits of memory and time (`isolation`), and it does not read the weights. Networks of more
     than `ACTS_MOST` numbers are built and do not act.
@@ -139,26 +114,17 @@ def rehearsed_config(config: PolicyConfig) -> Any:
     """
     folder = _checkpoint_folder(config)
     _registered_type(config, folder)  # before the fork: it imports all of LeRobot's policies
-    key = _key(config, folder)
+    files = [(str(path), path.stat()) for path in sorted(folder.rglob("*")) if path.is_file()]
+    key = repr((config, [(path, stat.st_size, stat.st_mtime_ns) for path, stat in files]))
     if key not in _rehearsed:
         _rehearsed[key] = Sizes(*rehearsed(replace(config, precision="fp32"), sizes_of))
-    return load_lerobot_config(config)
-
-
-def policy_sizes(config: PolicyConfig) -> Sizes:
-    """`Sizes` of the policy of `rehearsed_config`, which has been called."""
-    return _rehearsed[_key(config, _checkpoint_folder(config))]
+    return _rehearsed[key]
 
 
 def rehearsed[T](config: PolicyConfig, task: Callable[[LeRobotAdapter], T]) -> T:
-    """Result, which JSON can hold, of `task` with the policy of `rehearsed_config`, in a child process."""
+    """Result, which JSON can hold, of `task` with the policy of `policy_sizes`, in a child process."""
     there, origin = replace(config, device="cpu"), Origin("policy.path", config.path)
     return rehearse(lambda: task(load_adapter(there, rehearsal=True)), _checkpoint_folder(config), origin)
-
-
-def _key(config: PolicyConfig, folder: Path) -> str:
-    files = sorted(path for path in folder.rglob("*") if path.is_file())
-    return repr((config, [(str(path), path.stat().st_size, path.stat().st_mtime_ns) for path in files]))
 
 
 def sizes_of(adapter: LeRobotAdapter) -> Sizes:
@@ -170,12 +136,10 @@ def sizes_of(adapter: LeRobotAdapter) -> Sizes:
 def load_adapter(config: PolicyConfig, *, rehearsal: bool = False) -> LeRobotAdapter:
     """Loads policy, processors and critic; proves that the sampler is LeRobot's.
 
-    Args:
-        rehearsal: the weights are not read, and a decision is made in place of that proof.
+    In a `rehearsal` the weights are not read, and a decision is made in place of that proof.
 
     Raises:
-        InputError: see `load_lerobot_config`; weights or processors did not load, or do not act as LeRobot's
-            own sampler does, see `LeRobotAdapter.self_check`.
+        InputError: see `load_lerobot_config` and `LeRobotAdapter.self_check`; or a file did not load.
     """
     from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 
@@ -184,24 +148,25 @@ def load_adapter(config: PolicyConfig, *, rehearsal: bool = False) -> LeRobotAda
     model_class: type[Model] = imported(POLICIES[lerobot_config.type][0])
     with (
         _refusing(config, "its network cannot be built as its config.json says"),
-        guarded("policy", config.trust_remote_code),
+        guard.guarded("policy", config.trust_remote_code),
         model_class.loading(),
-        Unfilled(),
+        guard.Unfilled(),
     ):
         policy = get_policy_class(lerobot_config.type)(lerobot_config)
-    load_weights(policy, model_class, folder / WEIGHTS, config.path, read=not rehearsal)
+    load_weights(policy, model_class, folder / guard.WEIGHTS, config.path, read=not rehearsal)
     device = torch.device(lerobot_config.device)
     policy.to(device).eval()
     model = model_class(policy)  # type: ignore[call-arg]
-    if config.precision == "fp32":
-        no_tf32(device)
+    if config.precision == "fp32" and device.type == "cuda":
+        # torch convolves with 10 bits of mantissa there. For batches of different sizes cuDNN chooses other
+        # algorithms; what they round differently is divided by the std of the noise in every log-prob.
+        torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = False
     overrides = {"device_processor": {"device": str(device)}}
-    check_statistics(folder, origin)
-    hint = f"; a tokeniser that cannot be had from the Hub goes into {BACKBONE}/ beside {CONFIG}"
-    hint = "" if (folder / BACKBONE).is_dir() else hint
-    with _refusing(config, "its LeRobot processors did not load", tokenizer_hint=hint):
+    guard.check_statistics(folder, origin)
+    hint = f"a tokeniser that cannot be had from the Hub goes into {BACKBONE}/ beside {guard.CONFIG}"
+    with _refusing(config, f"its LeRobot processors did not load; {hint}"):
         overrides |= _tokenizer_overrides(lerobot_config, folder)
-        with guarded("policy", config.trust_remote_code), model.loading():
+        with guard.guarded("policy", config.trust_remote_code), model.loading():
             pre, post = make_pre_post_processors(
                 lerobot_config, pretrained_path=str(folder), preprocessor_overrides=overrides
             )
@@ -212,7 +177,7 @@ def load_adapter(config: PolicyConfig, *, rehearsal: bool = False) -> LeRobotAda
         family = imported(sampler.family)(model, sampler)
         critic = ValueHead(model.width)
         adapter = LeRobotAdapter(policy, processing, model, family, critic, config.precision)
-        if (folder / OURS).is_file():
+        if (folder / guard.OURS).is_file():
             _load_ours(adapter, folder, origin)
         requests = example_requests(lerobot_config, config.rename_map)
         if not rehearsal:
@@ -225,17 +190,16 @@ def load_adapter(config: PolicyConfig, *, rehearsal: bool = False) -> LeRobotAda
 
 
 @contextlib.contextmanager
-def _refusing(config: PolicyConfig, what: str, tokenizer_hint: str = "") -> Iterator[None]:
+def _refusing(config: PolicyConfig, what: str) -> Iterator[None]:
     """LeRobot takes files at their word, and may fail over any of it: one line for all that is raised."""
     try:
         yield
     except InputError:
         raise
     except Exception as error:
-        if (ours := input_error(error)) is not None:
+        if (ours := guard.input_error(error)) is not None:
             raise ours from error
-        hint = tokenizer_hint if "tokenizer_processor" in str(error) else ""
-        raise InputError("policy.path", config.path, f"{what} ({brief(error)}){hint}") from error
+        raise InputError("policy.path", config.path, f"{what} ({brief(error)})") from error
 
 
 def _checkpoint_folder(config: PolicyConfig) -> Path:
@@ -243,41 +207,39 @@ def _checkpoint_folder(config: PolicyConfig) -> Path:
     if config.path is None:
         remedy = "give a LeRobot checkpoint directory or Hub id, or an sft section"
         raise InputError("policy.path", None, remedy)
-    return fetched_checkpoint(config.path, config.revision, "policy.path")
+    return guard.fetched_checkpoint(config.path, config.revision, "policy.path")
 
 
 def _registered_type(config: PolicyConfig, folder: Path) -> Any:
     """The checkpoint's policy type; packages that may have it are imported."""
     discover(config.discover_packages_path, "policy")
-    kind = read_json(folder / CONFIG, Origin("policy.path", config.path)).get("type")
+    kind = read_json(folder / guard.CONFIG, Origin("policy.path", config.path)).get("type")
     register_policies(str(kind))
     return kind
 
 
 def _load_ours(adapter: LeRobotAdapter, folder: Path, origin: Origin) -> None:
     """Loads critic and family, and says where this run's options differ from those they were made with."""
-    ours = json.loads((folder / OURS).read_text())
-    there = ours.get("sampler", {})
+    there = json.loads((folder / guard.OURS).read_text()).get("sampler", {})
     here = draccus.encode(adapter.family.sampler, SamplerConfig)
-    differing = [k for k in here if k in there and there[k] != here[k]]
-    if differing:
+    if differing := [k for k in here if k in there and there[k] != here[k]]:
         logger.warning(
             "this run explores unlike the one that made the checkpoint (evaluation is not affected): %s",
             ", ".join(f"policy.sampler.{k}={here[k]}, there {there[k]}" for k in differing),
         )
-    state = dict(read_tensors(folder / FAMILY, origin)) if (folder / FAMILY).is_file() else {}
+    state = dict(read_tensors(folder / guard.FAMILY, origin)) if (folder / guard.FAMILY).is_file() else {}
     mine = adapter.family.state_dict()
     if {k: v.shape for k, v in state.items()} == {k: v.shape for k, v in mine.items()}:
         adapter.family.load_state_dict(state)
     elif state and mine:
         logger.warning("the checkpoint's weights of the sampler are not loaded: they are of another shape")
-    if (folder / VALUE_HEAD).is_file():
-        state = dict(read_tensors(folder / VALUE_HEAD, origin))
+    if (folder / guard.VALUE_HEAD).is_file():
+        state = dict(read_tensors(folder / guard.VALUE_HEAD, origin))
         try:
             adapter.value_head.load_state_dict(state)
         except RuntimeError as error:
             remedy = f"it is no critic of this policy; remove it to start anew ({brief(error)})"
-            raise origin.refuse(VALUE_HEAD, remedy) from error
+            raise origin.refuse(guard.VALUE_HEAD, remedy) from error
 
 
 def _use_backbone(lerobot_config: Any, folder: Path, path: str | None) -> None:
@@ -310,7 +272,7 @@ def _tokenizer_overrides(lerobot_config: Any, folder: Path) -> dict[str, dict[st
 
 def _keep_names(lerobot_config: Any, preprocessor: Any, folder: Path) -> None:
     """Undoes the two functions above in what will be saved, once tokenisers are loaded."""
-    stored = json.loads((folder / CONFIG).read_text())
+    stored = json.loads((folder / guard.CONFIG).read_text())
     for field in CONFIG_FOLDERS.keys() - {"vlm_model_name"}:
         if hasattr(lerobot_config, field) and field in stored:
             setattr(lerobot_config, field, stored[field])
@@ -332,14 +294,7 @@ class _Name(str):
 
 @torch.no_grad()
 def load_weights(policy: Any, model: type[Model], file: Path, path: str | None, *, read: bool = True) -> None:
-    """Fills a policy from a file.
-
-    Args:
-        read: False: only names and shapes are compared.
-
-    Raises:
-        InputError: a tensor is missing, unexpected, of another shape, or holds NaN or infinity.
-    """
+    """Fills a policy from a file with the same tensors, or only compares names and shapes if not `read`."""
     origin = Origin("policy.path", path)
     shapes = {name: shape for name, (_, shape) in tensor_shapes(file, origin).items()}
     mine, stored = policy.state_dict(), _names(shapes, policy)
@@ -349,20 +304,17 @@ def load_weights(policy: Any, model: type[Model], file: Path, path: str | None, 
     missing = sorted(k for k in absent if mine[k].data_ptr() not in held)
     unexpected = sorted(stored.keys() - mine.keys())
     if missing or unexpected:
-        counts = f"{len(missing)} tensors missing {missing[:NAMED]}, {len(unexpected)} unexpected "
-        remedy = f"{counts}{unexpected[:NAMED]}; config.json and {file.name} disagree"
+        counts = f"{len(missing)} tensors missing {missing[:3]}, {len(unexpected)} unexpected "
+        remedy = f"{counts}{unexpected[:3]}; config.json and {file.name} disagree"
         raise InputError("policy.path", path, f"the weights did not load: {remedy}")
-    places: dict[str, list[str]] = {}
     for name, theirs in stored.items():
         if mine[name].shape != shapes[theirs]:
             sizes = f"{shapes[theirs]} in the file, {tuple(mine[name].shape)} in the policy"
             remedy = f"the weights did not load: size mismatch for {name}, {sizes}"
             raise InputError("policy.path", path, remedy)
-        places.setdefault(theirs, []).append(name)
-    if read:
-        for theirs, tensor in read_tensors(file, origin):
-            for name in places.get(theirs, ()):
-                mine[name].copy_(tensor)
+    for theirs, tensor in read_tensors(file, origin) if read else ():
+        for name in (name for name, place in stored.items() if place == theirs):
+            mine[name].copy_(tensor)
 
 
 def _names(shapes: dict[str, Any], policy: Any) -> dict[str, str]:

@@ -97,18 +97,14 @@ class Weights(NamedTuple):
 
 def copy_weights(adapter: LeRobotAdapter) -> Weights:
     """A copy to be saved while the adapter is trained on."""
-    modules = (adapter.value_head, adapter.family)
     policy = merged_state_dict(adapter.policy) or adapter.policy.state_dict()
-    return Weights(_copied(policy), *(_copied(module.state_dict()) for module in modules))
+    return Weights(*map(_copied, (policy, adapter.value_head.state_dict(), adapter.family.state_dict())))
 
 
 def save_pretrained(
     adapter: LeRobotAdapter, directory: Path, config: PolicyConfig, weights: Weights | None = None
 ) -> None:
-    """Writes LeRobot's ``pretrained_model`` layout, and what is ours beside it, into `directory`.
-
-    `weights` are from `copy_weights`; None: the adapter's current ones.
-    """
+    """Writes LeRobot's ``pretrained_model`` layout, and ours beside it; without `weights`, those of now."""
     weights = weights or copy_weights(adapter)
     directory.mkdir(parents=True, exist_ok=True)
     _save_backbone(adapter.policy.config, adapter.processing.preprocessor, directory)
@@ -116,11 +112,10 @@ def save_pretrained(
     adapter.processing.preprocessor.save_pretrained(directory)
     adapter.processing.postprocessor.save_pretrained(directory)
     relocate(directory, directory)
-    for name, tensors in ((VALUE_HEAD, weights.value_head), (FAMILY, weights.family)):
-        if tensors:
-            save_file(tensors, directory / name)
-    sampler = draccus.encode(adapter.family.sampler, SamplerConfig)
-    ours = {"sampler": sampler, "rename_map": config.rename_map}
+    save_file(weights.value_head, directory / VALUE_HEAD)
+    if weights.family:
+        save_file(weights.family, directory / FAMILY)
+    ours = {"sampler": draccus.encode(adapter.family.sampler, SamplerConfig), "rename_map": config.rename_map}
     (directory / OURS).write_text(json.dumps(ours, indent=2) + "\n")
 
 
@@ -128,10 +123,9 @@ def _save_backbone(lerobot_config: Any, preprocessor: Any, directory: Path) -> N
     """Writes the backbone folder of a checkpoint in `directory`, unless its backbone is on the Hub."""
     if not hasattr(lerobot_config, "vlm_model_name"):
         for step in preprocessor.steps:
-            if (tokenizer := getattr(step, "input_tokenizer", None)) is not None:
-                tokenizer.save_pretrained(directory / BACKBONE)
-            if (tokenizer := getattr(step, "action_tokenizer", None)) is not None:
-                tokenizer.save_pretrained(directory / FAST)
+            for name, folder in (("input_tokenizer", BACKBONE), ("action_tokenizer", FAST)):
+                if (tokenizer := getattr(step, name, None)) is not None:
+                    tokenizer.save_pretrained(directory / folder)
         return
     source = Path(lerobot_config.vlm_model_name)
     if source.is_absolute() and source.resolve() != (directory / BACKBONE).resolve():

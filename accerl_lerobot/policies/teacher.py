@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -53,13 +52,10 @@ class Ensemble(nn.Module):
 
 
 class Teacher(nn.Module):
-    """Chunks from the simulator's state.
+    """Chunks from the simulator's state; once `ready`, it acts in a `share` of exploring episodes.
 
     All its tensors are parameters, so that they are published with the policy's weights; those that no
     gradient reaches are set by the trainer.
-
-    Args:
-        share: share of exploring episodes in which it acts, once it is `ready`.
     """
 
     def __init__(self, state: int, chunk: tuple[int, int], share: float, noise: float = NOISE) -> None:
@@ -120,20 +116,10 @@ def task_code(task: str) -> np.ndarray:
     return np.where(bits & 1, 1.0, -1.0).astype(np.float32)
 
 
-@dataclass(frozen=True)
-class WithTeacher:
+def with_teacher(load: Load, state: int, share: float, config: PolicyConfig, noise: float = NOISE) -> Any:
     """Loads a policy and gives it an untrained teacher that reads `state` numbers of the simulator."""
-
-    load: Load
-    state: int
-    share: float
-    noise: float = NOISE
-
-    def __call__(self, config: PolicyConfig) -> Any:
-        """The adapter, with its teacher."""
-        adapter: Any = self.load(config)
-        policy = adapter.policy.config
-        chunk = policy.n_action_steps, policy.action_feature.shape[0]
-        teacher = Teacher(self.state + TASK_BITS, chunk, self.share, self.noise)
-        adapter.teacher = teacher.to(adapter.device)
-        return adapter
+    adapter: Any = load(config)
+    policy = adapter.policy.config
+    chunk = policy.n_action_steps, policy.action_feature.shape[0]
+    adapter.teacher = Teacher(state + TASK_BITS, chunk, share, noise).to(adapter.device)
+    return adapter

@@ -27,7 +27,7 @@ from torch import Tensor, nn
 
 from accerl_lerobot.experience import Request
 from accerl_lerobot.policies.config import TokenSamplerConfig
-from accerl_lerobot.policies.family import Action, Encoded, Family, Model, Score, exploring
+from accerl_lerobot.policies.family import Action, Encoded, Family, Model
 
 Choose = Callable[[Tensor, int], Tensor]
 """(logits (B, V), position) → tokens (B,), int64."""
@@ -60,10 +60,6 @@ class TokenModel(Model):
     @abstractmethod
     def chunk(self, tokens: Tensor) -> Tensor:
         """Tokens (B, L), terminators to the end after the first, to the executed (B, K, A), normalised."""
-
-    def stock(self, batch: dict[str, Tensor]) -> Tensor:
-        """LeRobot's own greedy chunk (B, K, A) in normalised units, executed rows only."""
-        return self.policy.predict_action_chunk(batch)
 
     def stock_tokens(self, batch: dict[str, Tensor]) -> Tensor | None:
         """The tokens (B, L) behind `stock`, where many of them decode to one chunk."""
@@ -112,14 +108,14 @@ class TokenFamily(Family):
     def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
         """Samples; where a request does not explore, the most likely token."""
         device, length = encoded.features.device, self.model.length
-        explore = exploring(requests, device)
+        explore = self.exploring(requests, device)
         draws = np.stack([np.random.default_rng(r.noise_seed).random(length) for r in requests])
         uniform = torch.from_numpy(draws).to(device)
         tokens, log_prob = self._decide(encoded, explore, uniform)
         counted = explore[:, None] & existing(tokens, self.model.terminator)
         return Action(self.model.chunk(tokens), {"tokens": tokens}, torch.where(counted, log_prob, 0.0))
 
-    def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> Score:
+    def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Re-scores; the entropy is that of the distributions the factors were drawn from."""
         tokens = latent["tokens"]
         factors = existing(tokens, self.model.terminator)
@@ -129,10 +125,8 @@ class TokenFamily(Family):
         log_prob = token_log_prob(logits, tokens[:, :used], temperature)
         entropy = token_entropy(logits, temperature)
         missing = (0, tokens.shape[1] - used)
-        return Score(
-            log_prob=torch.where(factors, nn.functional.pad(log_prob, missing), 0.0),
-            entropy=torch.where(factors[:, :used], entropy, 0.0).sum(1),
-        )
+        log_prob = torch.where(factors, nn.functional.pad(log_prob, missing), 0.0)
+        return log_prob, torch.where(factors[:, :used], entropy, 0.0).sum(1)
 
     def factors(self, latent: dict[str, Tensor]) -> Tensor | None:
         terminator = self.model.terminator

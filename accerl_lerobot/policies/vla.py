@@ -22,7 +22,6 @@ switched off in what is loaded and saved: a policy that explores will begin othe
 from __future__ import annotations
 
 import contextlib
-import functools
 import json
 import logging
 import shutil
@@ -30,6 +29,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -44,23 +44,16 @@ from torch import Tensor
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.family import Encoded
-from accerl_lerobot.policies.flow import FlowModel, Velocity, flow_shape, refuse_options
+from accerl_lerobot.policies.flow import FlowModel, Velocity, flow_shape
 from accerl_lerobot.policies.tokens import Choose, TokenContext, TokenModel
-
-logger = logging.getLogger(__name__)
 
 
 def _run(
     network: Any, embedded: Tensor, mask: Tensor, places: Tensor, cache: Any = None
 ) -> tuple[Tensor, Any]:
     """Hidden states of a language model on tokens at these places, and its key-value cache."""
-    (hidden, _), cache = network.forward(
-        attention_mask=mask,
-        position_ids=places,
-        past_key_values=cache,
-        inputs_embeds=[embedded, None],
-        use_cache=True,
-    )
+    given = {"position_ids": places, "past_key_values": cache, "inputs_embeds": [embedded, None]}
+    (hidden, _), cache = network.forward(attention_mask=mask, use_cache=True, **given)
     return hidden, cache
 
 
@@ -83,7 +76,7 @@ class SmolVLA(FlowModel):
 
     def __init__(self, policy: Any) -> None:
         config = policy.config
-        refuse_options(config)
+        self.refuse_options(config)
         if config.adapt_to_pi_aloha:
             raise InputError("policy.adapt_to_pi_aloha", True, "not supported in RL; train one without it")
         self.policy = policy
@@ -125,8 +118,8 @@ class SmolVLABins(TokenModel):
     def chunk(self, tokens: Tensor) -> Tensor:
         return self.policy.decode_tokens(tokens).view(len(tokens), self.rows, -1)
 
-    def stock(self, batch: dict[str, Tensor]) -> Tensor:
-        return self.policy.predict_action_chunk(batch)[:, : self.rows]
+    def stock(self, batch: dict[str, Tensor], **noise: Tensor) -> Tensor:
+        return super().stock(batch, **noise)[:, : self.rows]
 
 
 VLM = "model.paligemma_with_expert.paligemma."
@@ -141,7 +134,7 @@ class Pi05(FlowModel):
 
     def __init__(self, policy: Any) -> None:
         config = policy.config
-        refuse_options(config)
+        self.refuse_options(config)
         self.policy = policy
         self.shape = flow_shape(config, config.num_inference_steps)
         language_model = policy.model.paligemma_with_expert.paligemma.model.language_model
@@ -200,11 +193,10 @@ class FastTokenizer:
     bpe_tokenizer: Any
     """Merges characters into tokens, a `PreTrainedTokenizerFast`."""
     scale: float
-    """By which coefficients are multiplied before they are rounded."""
+    """Factor on coefficients before they are rounded."""
     min_token: int
     """The coefficient that character 0 stands for."""
     folder: Path
-    """Where its files are."""
 
     @classmethod
     def from_pretrained(cls, name: str, **options: Any) -> FastTokenizer:
@@ -218,13 +210,9 @@ class FastTokenizer:
         folder = Path(name)
         if not folder.is_dir():
             folder = Path(snapshot_download(name, allow_patterns=["*.json"]))
-        config = json.loads((folder / "processor_config.json").read_text())
-        return cls(
-            bpe_tokenizer=PreTrainedTokenizerFast.from_pretrained(folder),
-            scale=config["scale"],
-            min_token=config["min_token"],
-            folder=folder,
-        )
+        sizes = json.loads((folder / "processor_config.json").read_text())
+        merges = PreTrainedTokenizerFast.from_pretrained(folder)
+        return cls(bpe_tokenizer=merges, scale=sizes["scale"], min_token=sizes["min_token"], folder=folder)
 
     def __call__(self, chunks: Any) -> list[list[int]]:
         """Tokens of each of the chunks (B, K, A)."""
@@ -248,15 +236,9 @@ def data_only() -> Iterator[None]:
     from lerobot.policies.pi0_fast import modeling_pi0_fast
     from lerobot.processor import tokenizer_processor
 
-    modules = (modeling_pi0_fast, tokenizer_processor)
-    kept = [(module.AutoProcessor, module.AutoTokenizer) for module in modules]
-    for module in modules:
-        module.AutoProcessor, module.AutoTokenizer = FastTokenizer, _TextTokenizer
-    try:
+    ours: dict[str, Any] = {"AutoProcessor": FastTokenizer, "AutoTokenizer": _TextTokenizer}
+    with patch.multiple(modeling_pi0_fast, **ours), patch.multiple(tokenizer_processor, **ours):
         yield
-    finally:
-        for module, (processor, tokenizer) in zip(modules, kept, strict=True):
-            module.AutoProcessor, module.AutoTokenizer = processor, tokenizer
 
 
 class _TextTokenizer:
@@ -274,7 +256,7 @@ class Pi0Fast(TokenModel):
 
     def __init__(self, policy: Any) -> None:
         config, tokenizer = policy.config, policy._paligemma_tokenizer
-        refuse_options(config)
+        self.refuse_options(config)
         if config.temperature != 0:
             remedy = "LeRobot's sampler has to be greedy here: set it to 0 in config.json; exploration has a "
             raise InputError("policy.temperature", config.temperature, f"{remedy}policy.sampler.temperature")
@@ -298,12 +280,8 @@ class Pi0Fast(TokenModel):
         images, image_masks = self.policy._preprocess_images(batch)
         prompt, known = batch[OBS_LANGUAGE_TOKENS], batch[OBS_LANGUAGE_ATTENTION_MASK]
         bos = torch.full_like(prompt[:, :1], self.policy._paligemma_tokenizer.bos_token_id)
-        embedded, pad, att, _, _ = model.embed_prefix_fast(
-            images,
-            image_masks,
-            torch.cat([prompt, bos], 1),
-            torch.cat([known, torch.ones_like(known[:, :1])], 1),
-        )
+        prompt, known = torch.cat([prompt, bos], 1), torch.cat([known, torch.ones_like(known[:, :1])], 1)
+        embedded, pad, att, _, _ = model.embed_prefix_fast(images, image_masks, prompt, known)
         mask = prepare_attention_masks_4d(att, dtype=embedded.dtype)
         features, cache = _run(network, embedded, mask, torch.cumsum(pad, dim=1) - 1)
 
@@ -336,12 +314,12 @@ class Pi0Fast(TokenModel):
 
     def chunk(self, tokens: Tensor) -> Tensor:
         rows, dims = self.policy.config.n_action_steps, self.policy.config.action_feature.shape[0]
-        with _undecodable_once():
+        with _undecodable_quietly():
             return self.policy.detokenize_actions(tokens, action_horizon=rows, action_dim=dims)
 
-    def stock(self, batch: dict[str, Tensor]) -> Tensor:
-        with _undecodable_once():
-            return super().stock(batch)
+    def stock(self, batch: dict[str, Tensor], **noise: Tensor) -> Tensor:
+        with _undecodable_quietly():
+            return super().stock(batch, **noise)
 
     def stock_tokens(self, batch: dict[str, Tensor]) -> Tensor:
         return self.policy.model.sample_actions_fast_kv_cache(
@@ -352,22 +330,13 @@ class Pi0Fast(TokenModel):
         )
 
 
-@functools.cache
-def _warn_undecodable() -> None:
-    logger.warning("tokens that FAST cannot decode were drawn; such a chunk is all zeros")
-
-
 def _passes(record: logging.LogRecord) -> bool:
-    """Passes LeRobot's complaint about a sequence that it cannot decode once, in our words."""
-    complains = str(record.msg).startswith("Error decoding tokens")
-    if complains:
-        _warn_undecodable()
-    return not complains and not str(record.msg).startswith("Tokens: ")
+    return not str(record.msg).startswith(("Error decoding tokens", "Tokens: "))
 
 
 @contextlib.contextmanager
-def _undecodable_once() -> Iterator[None]:
-    """LeRobot writes two lines for each such sequence, and a policy that explores draws many."""
+def _undecodable_quietly() -> Iterator[None]:
+    """LeRobot logs two lines for each sequence that it cannot decode, and exploring draws many."""
     logging.root.addFilter(_passes)
     try:
         yield

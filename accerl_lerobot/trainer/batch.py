@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -21,8 +21,7 @@ from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.experience import Segment
 
 if TYPE_CHECKING:
-    from accerl_lerobot.trainer.off_policy import OffPolicyUpdate
-    from accerl_lerobot.trainer.update import Update
+    from accerl_lerobot.trainer.update import BaseUpdate
 
 Part = tuple[dict[str, np.ndarray], list[str], dict[str, Tensor]]
 """Observations, tasks and latents of some decisions, as `PolicyAdapter.evaluate` takes them."""
@@ -76,39 +75,29 @@ def pick(
     return {k: v[rows] for k, v in observations.items()}, [tasks[i] for i in rows]
 
 
-class Turn(NamedTuple):
-    """One run of the network in an update."""
-
-    rows: np.ndarray
-    own: bool
-    """False: the rank has no rows left and lends its network for one that is somebody else's."""
-
-
-def turns(rows: np.ndarray, size: int, rank: int, ranks: int) -> list[Turn]:
-    """A rank's share of rows, consecutive ones, in parts of at most `size`.
+def turns(rows: np.ndarray, size: int, rank: int, ranks: int) -> list[tuple[np.ndarray, bool]]:
+    """A rank's share of rows, consecutive ones, in parts of at most `size`; True beside its own.
 
     Every rank gets as many parts, because all ranks have to run a network of which each keeps a part: who has
     no rows left repeats the first of all, and what comes of it is not counted.
     """
     shares = np.array_split(rows, ranks)
     mine = shares[rank]
-    own = [Turn(mine[start : start + size], own=True) for start in range(0, len(mine), size)]
+    own = [(mine[start : start + size], True) for start in range(0, len(mine), size)]
     most = math.ceil(len(shares[0]) / size)
-    return own + [Turn(rows[:1], own=False)] * (most - len(own))
+    return own + [(rows[:1], False)] * (most - len(own))
 
 
 MAX_NONFINITE = 5
-"""Updates with a non-finite loss or gradient are skipped and counted; so many in a row are an error."""
+"""Steps with a non-finite loss or gradient are skipped and counted; so many in a row are an error."""
 
 
 class NonFiniteError(RuntimeError):
-    """Too many updates in a row had a non-finite loss or gradient."""
+    """Too many steps in a row had a non-finite loss or gradient."""
 
 
 @contextmanager
-def keeping(
-    directory: Path | None, update: Update | OffPolicyUpdate, segments: Sequence[Segment]
-) -> Iterator[None]:
+def keeping(directory: Path | None, update: BaseUpdate, segments: Sequence[Segment]) -> Iterator[None]:
     """Keeps the segments of an update, made inside, that raises `NonFiniteError`, for people to look at.
 
     ``nonfinite-000123.json`` and ``.safetensors`` in the run's `directory`, if there is one, hold what would

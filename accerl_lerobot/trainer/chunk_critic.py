@@ -3,7 +3,7 @@
 
     new episodes → memory → steps of critic and teacher → steps of the policy, so many for each new decision
 
-`algorithms.chunk_critic` has the formulas. Until ``trainer.value_warmup_updates`` the policy explores alone.
+`ChunkCriticConfig` has the formulas. Until ``trainer.value_warmup_updates`` the policy explores alone.
 Then the teacher first learns to do what has been done so far, and from there what the critic says.
 
 Shapes: M members of the ensemble, B rows, S numbers of a state, (K, A) of a chunk.
@@ -28,7 +28,7 @@ from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.family import Encoded, pooled
 from accerl_lerobot.policies.teacher import Ensemble, Teacher
 from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.trainer.off_policy import OffPolicyUpdate, mean
+from accerl_lerobot.trainer.off_policy import OffPolicyUpdate, drawn, mean
 
 MEMBERS = 6
 MONTE_CARLO = 0.25
@@ -71,7 +71,7 @@ class Critic(nn.Module):
 
 
 class ChunkCriticUpdate(OffPolicyUpdate):
-    """The arguments are those of `off_policy.OffPolicyUpdate`."""
+    """Updates of critic, teacher and policy."""
 
     n_step = 4
 
@@ -84,6 +84,8 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         self.slow = copy.deepcopy(self.critic).requires_grad_(False)
         self.reader = nn.Linear(adapter.model.width, len(self.teacher.mean)).to(device)
         """Reads the scaled state off the policy's features."""
+        # The teacher lies beside the policy's weights.
+        self.networks = {"critic": self.critic, "slow": self.slow, "reader": self.reader}
         self.optimizers = {
             "critic": torch.optim.AdamW(self.critic.parameters(), lr=config.value_lr, weight_decay=1e-3),
             "teacher": torch.optim.AdamW(self.teacher.network.parameters(), lr=TEACHER_LR, weight_decay=1e-4),
@@ -125,30 +127,27 @@ class ChunkCriticUpdate(OffPolicyUpdate):
     def target(self, rows: np.ndarray) -> Tensor:
         return self.teacher(self.tensor("state", rows))
 
-    def auxiliary(self, rows: np.ndarray, encoded: Encoded) -> dict[str, Tensor]:
+    def losses(self, rows: np.ndarray, encoded: Encoded, imitation: Tensor) -> dict[str, Tensor]:
         features = pooled(encoded.features, encoded.mask)
         state = self.teacher.scaled(self.tensor("state", rows))
-        return {"perception_loss": PERCEPTION * (self.reader(features) - state).square().mean()}
+        perception = PERCEPTION * (self.reader(features) - state).square().mean()
+        return super().losses(rows, encoded, imitation) | {"perception_loss": perception}
 
     def state(self) -> dict[str, Any]:
         return super().state() | {
-            "networks": {name: copied(module) for name, module in self._networks().items()},
+            "networks": {name: copied(module) for name, module in self.networks.items()},
             "optimizers": {name: optimizer_state(optimizer) for name, optimizer in self.optimizers.items()},
             "outcomes": {name: list(last) for name, last in self._outcomes.items()},
         }
 
     def restore(self, state: dict[str, Any]) -> None:
         super().restore(state)
-        for name, module in self._networks().items():
+        for name, module in self.networks.items():
             module.load_state_dict(state["networks"][name])
         for name, optimizer in self.optimizers.items():
             restore_optimizer(optimizer, state["optimizers"][name])
         for name, last in self._outcomes.items():
             last.extend(state["outcomes"][name])
-
-    def _networks(self) -> dict[str, nn.Module]:
-        """All but the teacher, which lies beside the policy's weights."""
-        return {"critic": self.critic, "slow": self.slow, "reader": self.reader}
 
     @torch.no_grad()
     def _scale_states(self) -> None:
@@ -167,7 +166,7 @@ class ChunkCriticUpdate(OffPolicyUpdate):
             self.teacher.high.copy_(high + margin)
         known = won if len(won) >= BATCH else np.arange(len(self.memory))
         for _ in range(FIRST_STEPS):
-            rows = known[torch.randint(len(known), (BATCH,)).numpy()]
+            rows = drawn(known, BATCH)
             loss = (self.teacher(self.tensor("state", rows)) - self.tensor("chunk", rows)).square().mean()
             self._descend("teacher", loss)
         # Or the teacher would at once climb a critic that knows nothing.
@@ -176,12 +175,9 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         with torch.no_grad():
             self.teacher.ready.fill_(1)
 
-    def _draw(self) -> np.ndarray:
-        return torch.randint(len(self.memory), (BATCH,)).numpy()
-
     def _critic_step(self, bounds: tuple[float, float]) -> dict[str, float]:
         """One gradient step of the ensemble; ``bounds`` of the returns seen, which no target leaves."""
-        rows = self._draw()
+        rows = drawn(self.imitable(), BATCH)
         names = ("state", "chunk", "reward", "discount", "return")
         state, chunk, reward, discount, returns = (self.tensor(name, rows) for name in names)
         following = self.tensor("state", self.memory["following"][rows])
@@ -209,10 +205,10 @@ class ChunkCriticUpdate(OffPolicyUpdate):
 
     def _teacher_step(self, won: np.ndarray) -> dict[str, float]:
         """One gradient step of the teacher; `won` are the rows of successful episodes."""
-        state = self.tensor("state", self._draw())
+        state = self.tensor("state", drawn(self.imitable(), BATCH))
         q = self.critic(self.teacher.scaled(state), self.teacher(state))
         loss = -pessimistic(q).mean() / q.detach().abs().mean().clamp(min=SMALLEST_SCALE)
-        rows = won[torch.randint(len(won), (BATCH,)).numpy()]
+        rows = drawn(won, BATCH)
         gap = self.teacher(self.tensor("state", rows)) - self.tensor("chunk", rows)
         distance = gap.square().mean() / DISTANCE**2
         self._descend("teacher", loss + IMITATION * distance)

@@ -38,22 +38,18 @@ class TrainerConfig(Section, section="trainer"):
     value_warmup_updates: Steps = 20
     """First updates, in which only the critic head learns: advantages of an untrained one are noise."""
     advantage_memory: Annotated[float, Range("[0, 1)")] = 0.0
-    """Advantages are normalised by the moments of this batch and of those before it, of which each
-    earlier one is weighted by this factor once more; 0: this batch alone.
-
-    A small batch may hold nothing but failures. Its advantages are then the critic's noise, which its own
-    standard deviation would make as loud as any.
-    """
+    """Advantages are normalised by the moments of this batch and of those before it, of which each earlier
+    one is weighted by this factor once more; 0: this batch alone. A small batch may hold nothing but
+    failures; its advantages are then the critic's noise, which its own standard deviation would make as loud
+    as any."""
     grad_clip: Positive = 1.0
     """Largest gradient norm of the policy, and of the critic head, each by itself."""
     betas: tuple[Annotated[float, Range("[0, 1)")], Annotated[float, Range("[0, 1)")]] = (0.9, 0.95)
     hold_back: Steps = 0
     """Updates by which published weights are held back: lag on purpose, to study it; 0: none."""
     probe_every: Steps = 25
-    """Updates between two measurements of the mismatch between acting and learning; 0: none.
-
-    While it waits for one, the trainer holds a copy of the policy's weights.
-    """
+    """Updates between two measurements of the mismatch between acting and learning; 0: none. While it waits
+    for one, the trainer holds a copy of the policy's weights."""
     num_threads: Threads = 1
     """CPU threads of each rank."""
     ranks: Annotated[int, Range("[1, 1024]")] = 1
@@ -83,8 +79,7 @@ class TrainerConfig(Section, section="trainer"):
     def gpu_shares(self, gpus: float, others: int) -> tuple[float, float]:
         """Share of a GPU for each rank, and for each of the `others`, processes with a network.
 
-        More than half a GPU each keeps two ranks off the same one, which NCCL refuses; where there are more
-        GPUs than ranks, the others have those that are left. Without GPUs all run on the CPU.
+        More than half a GPU each keeps two ranks off the same one, which NCCL refuses.
         """
         if not gpus:
             return 0.0, 0.0

@@ -6,9 +6,8 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -23,19 +22,13 @@ ROWS, FRAMES = 5000, 20_000
 """Decisions, and env steps, that are read at most; of short datasets, decisions that begin at every step."""
 
 
-@dataclass(frozen=True)
-class WithDemonstrations:
+def with_demonstrations(
+    load: Load, dataset: DatasetConfig, decision_cost: float, config: PolicyConfig
+) -> Any:
     """Loads a policy whose trainer remembers demonstrations."""
-
-    load: Load
-    dataset: DatasetConfig
-    decision_cost: float
-
-    def __call__(self, config: PolicyConfig) -> Any:
-        """The adapter, with its demonstrations."""
-        adapter: Any = self.load(config)
-        adapter.demonstrations = partial(demonstrations, self.dataset, self.decision_cost)
-        return adapter
+    adapter: Any = load(config)
+    adapter.demonstrations = partial(demonstrations, dataset, decision_cost)
+    return adapter
 
 
 def unlike(meta: Any, wanted: dict[str, tuple[int, ...]]) -> str | None:
@@ -51,12 +44,8 @@ def demonstrations(dataset: DatasetConfig, decision_cost: float, like: Segment) 
     """Reads whole episodes, each up to ``like.actions.shape[1]`` times: from its first step, its second, ….
 
     An episode ends with its first ``next.success``; without that feature, all episodes are successes. Rewards
-    are ``next.reward``, or 1 for success. A dataset whose observations or actions are not those of the
-    environment is not read, which is logged.
-
-    Args:
-        decision_cost: taken off each decision's reward, as of explored ones.
-        like: an explored episode, of which names and shapes are taken.
+    are ``next.reward``, or 1 for success, less `decision_cost` for each decision. Names and shapes are those
+    of `like`, an explored episode; a dataset of others is not read, which is logged.
     """
     meta = open_metadata(dataset)
     wanted = {name: rows.shape[1:] for name, rows in like.observations.items()}
@@ -77,38 +66,44 @@ def recorded(
     enough: int,
     decision_cost: float = 0.0,
 ) -> Iterator[Segment]:
-    """Reads whole episodes as `demonstrations` does.
+    """Reads whole episodes as `demonstrations` does, in decisions of `chunk` env steps.
 
-    Args:
-        meta: what `open_metadata` gives for `dataset`.
-        wanted: shape of the observations that are read and of ``action``, by name.
-        chunk: env steps of a decision.
-        most: decisions of one reading of the dataset; episodes beyond it are left out.
-        enough: decisions in all, up to which episodes are read again from their second step on, ….
+    `wanted` are the shapes of the observations that are read and of ``action``, by name. `most` decisions are
+    of one reading of the dataset; it is read again, from second steps on, …, up to `enough` in all.
     """
     phases = min(chunk, max(1, enough * chunk // meta.total_frames))
     share = min(1.0, most * chunk / meta.total_frames)
     episodes = range(math.ceil(share * meta.total_episodes))
     with opened(dataset, meta, episodes) as data:
         for index in episodes:
-            episode = _episode(index, frames_of(data, index), wanted)
-            for phase in range(min(phases, len(episode.rewards))):
-                yield _segment(episode, phase, chunk, decision_cost)
+            columns, rewards, success, task = _episode(frames_of(data, index), wanted)
+            end, actions = len(rewards), columns.pop("action")
+            for phase in range(min(phases, end)):
+                starts = np.arange(phase, end, chunk)
+                t, reward = len(starts), np.add.reduceat(rewards, starts)
+                yield Segment(
+                    observations={name: rows[[*starts, end - 1]] for name, rows in columns.items()},
+                    task=task,
+                    latent={},
+                    log_prob=np.zeros((t, 0), np.float32),
+                    value=np.zeros(t, np.float32),
+                    actions=actions[np.minimum(starts[:, None] + np.arange(chunk), end - 1)],
+                    reward=reward - np.float32(decision_cost),
+                    version=np.zeros(t, np.int64),
+                    steps=np.minimum(chunk, end - starts),
+                    terminated=True,
+                    truncated=False,
+                    success=success,
+                    key="demonstration",
+                    origin=Origin(task="", seed=index, decision=0),
+                    episode={"return": float(reward.sum()), "decisions": float(t)},
+                )
 
 
-class _Episode(NamedTuple):
-    """An episode up to its first success, T env steps."""
-
-    number: int
-    columns: dict[str, np.ndarray]
-    """Observations and actions, each (T, ...)."""
-    rewards: np.ndarray
-    """float32 (T,)."""
-    success: bool
-    task: str
-
-
-def _episode(index: int, frames: Iterator[dict[str, Any]], wanted: dict[str, tuple[int, ...]]) -> _Episode:
+def _episode(
+    frames: Iterator[dict[str, Any]], wanted: dict[str, tuple[int, ...]]
+) -> tuple[dict[str, np.ndarray], np.ndarray, bool, str]:
+    """Observations and actions, each (T, ...), and rewards (T,) up to the first success; it, and the task."""
     rows: list[dict[str, np.ndarray]] = []
     rewards: list[float] = []
     for frame in frames:
@@ -120,33 +115,7 @@ def _episode(index: int, frames: Iterator[dict[str, Any]], wanted: dict[str, tup
     if REWARD not in frame:
         rewards[-1] = float(success)
     columns = {name: np.stack([row[name] for row in rows]) for name in wanted}
-    return _Episode(index, columns, np.array(rewards, np.float32), success, task)
-
-
-def _segment(episode: _Episode, phase: int, chunk: int, decision_cost: float) -> Segment:
-    """The decisions of an episode from env step `phase` on."""
-    end = len(episode.rewards)
-    starts = np.arange(phase, end, chunk)
-    t = len(starts)
-    reward = np.add.reduceat(episode.rewards, starts)
-    seen = [*starts, end - 1]
-    return Segment(
-        observations={name: rows[seen] for name, rows in episode.columns.items() if name != "action"},
-        task=episode.task,
-        latent={},
-        log_prob=np.zeros((t, 0), np.float32),
-        value=np.zeros(t, np.float32),
-        actions=episode.columns["action"][np.minimum(starts[:, None] + np.arange(chunk), end - 1)],
-        reward=reward - np.float32(decision_cost),
-        version=np.zeros(t, np.int64),
-        steps=np.minimum(chunk, end - starts),
-        terminated=True,
-        truncated=False,
-        success=episode.success,
-        key="demonstration",
-        origin=Origin(task="", seed=episode.number, decision=0),
-        episode={"return": float(reward.sum()), "decisions": float(t)},
-    )
+    return columns, np.array(rewards, np.float32), success, task
 
 
 def _array(value: Any, shape: tuple[int, ...]) -> np.ndarray:

@@ -31,20 +31,18 @@ FLOAT32 = 4
 
 
 class PolicyMemory(NamedTuple):
-    """Bytes."""
+    """Bytes: of a batch whatever its size, and of each decision in it."""
 
     weights: int
     """All parameters, in float32 whatever ``policy.precision``."""
     trained: int
     """Parameters that are trained, the critic's included."""
     acting_batch: int
-    """Most at a time while a batch is decided, whatever its size; copies of weights in bf16."""
+    """Most at a time while a batch is decided; copies of weights in bf16."""
     acting: int
-    """The same, for each of its decisions."""
     learning_batch: int
-    """A batch that waits for its gradient, whatever its size."""
+    """A batch that waits for its gradient."""
     learning: int
-    """The same, for each of its decisions."""
 
     def trainer(self, decisions: int, copies: int = 3) -> int:
         """A rank that learns from `decisions` at a time; `copies` are the gradient and Adam's moments."""
@@ -90,9 +88,7 @@ class Counter(TorchDispatchMode):
 def policy_memory(adapter: LeRobotAdapter, *, imitates: bool, checkpointing: bool = False) -> PolicyMemory:
     """Measures an adapter on the CPU, which is of no use afterwards.
 
-    Args:
-        imitates: learns by `Family.imitation_loss`, as off-policy algorithms do, not by a likelihood ratio.
-        checkpointing: ``trainer.activation_checkpointing``.
+    `imitates` is true of off-policy algorithms, `checkpointing` is ``trainer.activation_checkpointing``.
     """
     from torch._subclasses.fake_tensor import FakeTensorMode
 
@@ -137,8 +133,8 @@ def _prepare_gradient(adapter: LeRobotAdapter, action: Action, imitates: bool, b
         if imitates:
             return adapter.family.imitation_loss(encoded, action.chunk.expand(rows, -1, -1))
         latent = {name: tensor.expand(rows, *tensor.shape[1:]) for name, tensor in action.latent.items()}
-        score = adapter.family.score(encoded, latent)
-    return score.log_prob, adapter.value_head(encoded.features, encoded.mask)
+        log_prob, _ = adapter.family.score(encoded, latent)
+    return log_prob, adapter.value_head(encoded.features, encoded.mask)
 
 
 def _fake(adapter: LeRobotAdapter, mode: Any) -> None:

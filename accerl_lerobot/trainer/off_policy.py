@@ -2,6 +2,8 @@
 """Updates from a memory of all episodes: the loop that off-policy algorithms share, self-imitation, and AWR.
 
 demonstrations, then new episodes → memory → gradient steps of the policy, so many for each new decision
+
+Shapes: B rows, E numbers of the environment state, K executed actions of A dims.
 """
 
 from __future__ import annotations
@@ -17,65 +19,127 @@ from torch import Tensor
 from accerl_lerobot.algorithms import AWRConfig, OffPolicyConfig
 from accerl_lerobot.algorithms.advantages import STD_EPSILON
 from accerl_lerobot.algorithms.objective import lag_metrics
-from accerl_lerobot.checkpoint.tensors import optimizer_state, restore_optimizer
-from accerl_lerobot.experience import Segment
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.experience import ENVIRONMENT_STATE, Segment
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.family import Encoded
-from accerl_lerobot.policies.teacher import PREFIX
-from accerl_lerobot.trainer.batch import MAX_NONFINITE, NonFiniteError
+from accerl_lerobot.policies.teacher import TASK_BITS, task_code
 from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.trainer.memory import Memory
-from accerl_lerobot.trainer.probe import CRITIC
+from accerl_lerobot.trainer.update import BaseUpdate
 
 POLICY_BATCH = 64
 """Rows of one step of the policy."""
+CAP = 20.0
+"""Largest weight of a decision in AWR, the paper's."""
 FORGET = 0.99
 """Share of the mean square of R − V that a step keeps."""
+FIRST = 1024
+"""Rows that a column has space for at first; doubled when they are full."""
 
 
-class OffPolicyUpdate:
-    """Has the methods of `update.Update`, and stands in its place. As it is, imitates successful episodes.
+class Memory:
+    """Rows of whole episodes; `following` points `n_step` decisions ahead."""
 
-    Args:
-        config: the optimiser; ``batch_decisions`` of new experience make one update.
-    """
+    def __init__(self, capacity: int, gamma: float, n_step: int) -> None:
+        self.capacity, self.gamma, self.n_step = capacity, gamma, n_step
+        self.total = 0
+        """Rows ever added."""
+        self._columns: dict[str, np.ndarray] = {}
+        self.tasks: list[str] = []
+
+    def __len__(self) -> int:
+        return min(self.total, self.capacity)
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """A column, (len, ...).
+
+        ``state`` float32 (E + 16), the environment's, if it offers any, and what stands for the task;
+        ``chunk`` float32 (K, A); ``following``, the row `n_step` decisions on; ``reward``, discounted, of
+        the decisions before that; ``discount``, of what follows, 0 where the episode ends before;
+        ``return``, discounted, of the episode from here on; ``success``, of the episode; ``task``, a place
+        in `tasks`; ``observation.*``.
+        """
+        return self._columns[name][: len(self)]
+
+    def add(self, segment: Segment, chunk: np.ndarray) -> np.ndarray:
+        """Adds a whole episode, whose T rows it returns; `chunk`, (T, K, A), was executed, normalised."""
+        t = len(segment)
+        if segment.origin.decision or not segment.episode or t > self.capacity:
+            remedy = f"the memory holds whole episodes of at most algorithm.memory={self.capacity} decisions"
+            raise InputError("rollout.segment_length", t, remedy)
+        rows = (self.total + np.arange(t)) % self.capacity
+        returns = np.zeros(t + 1)
+        for i in reversed(range(t)):
+            returns[i] = segment.reward[i] + self.gamma * returns[i + 1]
+        ahead = np.minimum(self.n_step, t - np.arange(t))
+        ends = np.arange(t) + ahead == t
+        discount = self.gamma**ahead
+        seen = {name: values[:-1] for name, values in segment.observations.items()}
+        environment = seen.pop(ENVIRONMENT_STATE, np.empty((t, 0))).reshape(t, -1)
+        if segment.task not in self.tasks:
+            self.tasks.append(segment.task)
+        code = np.broadcast_to(task_code(segment.task), (t, TASK_BITS))
+        columns: dict[str, Any] = {
+            "state": np.concatenate([environment, code], 1).astype(np.float32),
+            "chunk": chunk,
+            "reward": (returns[:-1] - discount * returns[np.arange(t) + ahead]).astype(np.float32),
+            "discount": np.where(ends, 0.0, discount).astype(np.float32),
+            "following": np.where(ends, rows, rows[0] + np.arange(t) + ahead) % self.capacity,
+            "return": returns[:-1].astype(np.float32),
+            "success": np.full(t, segment.success),
+            "task": np.full(t, self.tasks.index(segment.task)),
+        }
+        self.total += t
+        for name, values in (columns | seen).items():
+            column = self._columns.get(name, values[:0])
+            if len(column) < len(self):
+                more = min(max(FIRST, len(self), 2 * len(column)), self.capacity) - len(column)
+                column = np.concatenate([column, np.zeros((more, *values.shape[1:]), values.dtype)])
+                self._columns[name] = column
+            column[rows] = values
+        return rows
+
+    def observations(self, rows: np.ndarray) -> tuple[dict[str, np.ndarray], list[str]]:
+        """The policy's observations, each (B, ...), and its instructions."""
+        seen = {k: v[rows] for k, v in self._columns.items() if k.startswith("observation.")}
+        return seen, [self.tasks[i] for i in self._columns["task"][rows]]
+
+    def state(self) -> dict[str, Any]:
+        """All that `restore` needs; see `snapshot`."""
+        columns = {name: self[name].copy() for name in self._columns}
+        return {"total": self.total, "tasks": list(self.tasks), "columns": columns}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Resume from `state`."""
+        self.total, self.tasks, self._columns = state["total"], list(state["tasks"]), dict(state["columns"])
+
+
+class OffPolicyUpdate(BaseUpdate):
+    """Updates for each ``batch_decisions`` of new experience; as it is, imitates successful episodes."""
 
     n_step = 1
     """Decisions after which a target bootstraps."""
 
     def __init__(self, adapter: LeRobotAdapter, algorithm: OffPolicyConfig, config: TrainerConfig) -> None:
-        self.adapter, self.config = adapter, config
+        super().__init__(adapter, config)
         self.policy_steps = algorithm.policy_steps
         self.memory = Memory(algorithm.memory, algorithm.gamma, self.n_step)
-        self.version = self.skipped = self._skipped_in_a_row = 0
         self._owed: dict[str, float] = {}
-        self._schedule_updates = config.updates
-        self._policy = [p for k, p in adapter.trainable().items() if not k.startswith((CRITIC, PREFIX))]
-        self.optimizer = torch.optim.AdamW(self._policy, lr=config.lr, betas=config.betas, weight_decay=0.0)
 
     def step(self, segments: Sequence[Segment]) -> dict[str, float]:
-        """Learns from new episodes and from those before; the version rises by one.
-
-        Returns:
-            Its metrics.
-
-        Raises:
-            InputError: a segment is not a whole episode.
-            NonFiniteError: see `update.Update.step`.
-        """
         if not self.memory.total and self.adapter.demonstrations is not None:
             for demonstration in self.adapter.demonstrations(segments[0]):
                 self.remember(demonstration)
         for segment in segments:
             if not segment.truncated:  # the simulator diverged: nothing follows, and nothing failed
                 self.remember(segment)
-        metrics = {"decisions": float(sum(map(len, segments))), "memory_decisions": float(len(self.memory))}
         rewards = np.concatenate([segment.reward for segment in segments])
-        metrics |= {"reward_mean": float(rewards.mean())}
+        metrics = {"decisions": float(len(rewards)), "memory_decisions": float(len(self.memory))}
+        metrics["reward_mean"] = float(rewards.mean())
         if len(self.memory):
             metrics |= self.learn(len(rewards))
         versions = torch.from_numpy(np.concatenate([segment.version for segment in segments]))
-        metrics |= {name: float(value) for name, value in lag_metrics(versions, self.version).items()}
+        metrics |= lag_metrics(versions, self.version)
         self.version += 1
         return metrics | {"skipped": float(self.skipped)}
 
@@ -91,37 +155,20 @@ class OffPolicyUpdate:
         """Chunks (B, K, A) for the policy to imitate, in normalised units."""
         return self.tensor("chunk", rows)
 
-    def weight(self, rows: np.ndarray, encoded: Encoded) -> Tensor | float:
-        """Factor on the imitation loss of each row, (B,) or one for all; arguments as of `auxiliary`."""
-        return 1.0
+    def losses(self, rows: np.ndarray, encoded: Encoded, imitation: Tensor) -> dict[str, Tensor]:
+        """Losses of a step of the policy, by name, each a scalar and already weighted.
 
-    def auxiliary(self, rows: np.ndarray, encoded: Encoded) -> dict[str, Tensor]:
-        """Further losses of a step of the policy, by name, already weighted.
-
-        Args:
-            rows: (B,) of the memory.
-            encoded: their observations, differentiable.
+        `rows` (B,) are of the memory, `encoded` their observations, `imitation` (B,) LeRobot's training loss.
         """
-        return {}
+        return {"imitation_loss": imitation.mean()}
 
     def state(self) -> dict[str, Any]:
-        """A copy of all that `restore` needs, the policy's weights apart; see `snapshot`."""
-        return {
-            "version": self.version,
-            "skipped": (self.skipped, self._skipped_in_a_row),
-            "schedule_updates": self._schedule_updates,
-            "owed": dict(self._owed),
-            "memory": self.memory.state(),
-            "optimizer": optimizer_state(self.optimizer),
-        }
+        return super().state() | {"owed": dict(self._owed), "memory": self.memory.state()}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Resume from `state`; the adapter has its weights already."""
-        self.version = state["version"]
-        self.skipped, self._skipped_in_a_row = state["skipped"]
-        self._schedule_updates, self._owed = state["schedule_updates"], dict(state["owed"])
+        super().restore(state)
+        self._owed = dict(state["owed"])
         self.memory.restore(state["memory"])
-        restore_optimizer(self.optimizer, state["optimizer"])
 
     def steps(self, name: str, each: float, new: int) -> range:
         """As many steps as are due at ``each`` for a new decision; what is left over is due later."""
@@ -133,7 +180,7 @@ class OffPolicyUpdate:
     def policy_learns(self, new: int) -> dict[str, float]:
         """The policy's steps of this update; none before ``value_warmup_updates``."""
         start = self.config.value_warmup_updates
-        lr = self.config.lr * self.config.lr_share(self.version, start=start, updates=self._schedule_updates)
+        lr = self.config.lr * self.lr_share(start)
         self.optimizer.param_groups[0]["lr"] = lr
         metrics = {"lr": lr}
         if self.version >= start and len(rows := self.imitable()):
@@ -151,15 +198,14 @@ class OffPolicyUpdate:
 
     def _policy_step(self, imitable: np.ndarray) -> dict[str, float]:
         """One gradient step on rows drawn from `imitable`."""
-        rows = imitable[torch.randint(len(imitable), (POLICY_BATCH,)).numpy()]
+        rows = drawn(imitable, POLICY_BATCH)
         metrics: dict[str, float] = {}
         self.optimizer.zero_grad(set_to_none=True)
         for part in np.array_split(rows, math.ceil(len(rows) / self.config.micro_batch)):
             with self.adapter.autocast():
                 encoded = self.adapter.encode(*self.memory.observations(part))
                 imitation = self.adapter.family.imitation_loss(encoded, self.target(part)).float()
-            weighted = (self.weight(part, encoded) * imitation).mean()
-            losses = {"imitation_loss": weighted} | self.auxiliary(part, encoded)
+            losses = self.losses(part, encoded, imitation)
             losses = {name: len(part) / len(rows) * value for name, value in losses.items()}
             torch.stack(list(losses.values())).sum().backward()
             for name, value in losses.items():
@@ -173,20 +219,6 @@ class OffPolicyUpdate:
             self.skip("a step of the policy", loss, norm)
         return metrics | {"policy_loss": loss, "grad_norm": norm}
 
-    def skip(self, step: str, loss: float, norm: float) -> None:
-        """Counts a step that was left out because its loss or gradient is not finite.
-
-        Raises:
-            NonFiniteError: `MAX_NONFINITE` of them since the policy's last step.
-        """
-        self.skipped += 1
-        self._skipped_in_a_row += 1
-        if self._skipped_in_a_row >= MAX_NONFINITE:
-            raise NonFiniteError(
-                f"{self._skipped_in_a_row} steps in a row had a non-finite loss or gradient (the last one, "
-                f"{step}: loss {loss:g}, gradient norm {norm:g}); lower trainer.lr or trainer.value_lr"
-            )
-
 
 class AWRUpdate(OffPolicyUpdate):
     """Advantage-weighted regression, see `AWRConfig`; the critic is the adapter's."""
@@ -196,27 +228,23 @@ class AWRUpdate(OffPolicyUpdate):
         self.algorithm = algorithm
         self._variance = 0.0
         """Mean square of R − V, over some hundred steps."""
-        value = {"params": list(adapter.value_head.parameters()), "lr": config.value_lr}
-        self.optimizer.add_param_group(value)
+        self.optimizer.add_param_group({"params": self._value, "lr": config.value_lr})
 
     def learn(self, new: int) -> dict[str, float]:
-        share = self.config.lr_share(self.version, updates=self._schedule_updates)
-        self.optimizer.param_groups[1]["lr"] = self.config.value_lr * share
+        self.optimizer.param_groups[1]["lr"] = self.config.value_lr * self.lr_share()
         return super().learn(new)
 
     def imitable(self) -> np.ndarray:
         """See the base class: of failures too, what went better than expected."""
         return np.arange(len(self.memory))
 
-    def weight(self, rows: np.ndarray, encoded: Encoded) -> Tensor:
-        error = self._error(rows, encoded).detach()
-        square = float(error.square().mean())
+    def losses(self, rows: np.ndarray, encoded: Encoded, imitation: Tensor) -> dict[str, Tensor]:
+        error = self.tensor("return", rows) - self.adapter.value_head(encoded.features, encoded.mask)
+        square = float(error.detach().square().mean())
         self._variance = FORGET * self._variance + (1 - FORGET) * square if self._variance else square
-        advantage = error / max(math.sqrt(self._variance), STD_EPSILON)
-        return weights(advantage, self.algorithm.beta, self.algorithm.cap)
-
-    def auxiliary(self, rows: np.ndarray, encoded: Encoded) -> dict[str, Tensor]:
-        return {"value_loss": self._error(rows, encoded).square().mean()}
+        advantage = error.detach() / max(math.sqrt(self._variance), STD_EPSILON)
+        weight = weights(advantage, self.algorithm.beta)
+        return {"imitation_loss": (weight * imitation).mean(), "value_loss": error.square().mean()}
 
     def state(self) -> dict[str, Any]:
         return super().state() | {"variance": self._variance}
@@ -225,15 +253,15 @@ class AWRUpdate(OffPolicyUpdate):
         super().restore(state)
         self._variance = state["variance"]
 
-    def _error(self, rows: np.ndarray, encoded: Encoded) -> Tensor:
-        """R − V(o), (B,), with the critic's gradient."""
-        value: Tensor = self.adapter.value_head(encoded.features, encoded.mask)
-        return self.tensor("return", rows) - value
+
+def drawn(rows: np.ndarray, count: int) -> np.ndarray:
+    """So many of the rows, with repetition, by torch's global generator."""
+    return rows[torch.randint(len(rows), (count,)).numpy()]
 
 
-def weights(advantage: Tensor, beta: float, cap: float) -> Tensor:
-    """min(exp(advantage / beta), cap), limited before the exponential, which would overflow."""
-    return (advantage / beta).clamp(max=math.log(cap)).exp()
+def weights(advantage: Tensor, beta: float) -> Tensor:
+    """min(exp(advantage / beta), CAP), limited before the exponential, which would overflow."""
+    return (advantage / beta).clamp(max=math.log(CAP)).exp()
 
 
 def mean(steps: Iterator[dict[str, float]]) -> dict[str, float]:

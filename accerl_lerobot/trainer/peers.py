@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import ray
-from ray.exceptions import GetTimeoutError, RayActorError, RayError
+from ray.exceptions import RayActorError, RayError
 
 from accerl_lerobot.algorithms import AlgorithmConfig
 from accerl_lerobot.checkpoint import snapshot
@@ -29,9 +29,8 @@ from accerl_lerobot.policies.config import Load, PolicyConfig, loader
 from accerl_lerobot.trainer.config import TrainerConfig
 
 if TYPE_CHECKING:
-    from accerl_lerobot.trainer.off_policy import OffPolicyUpdate
     from accerl_lerobot.trainer.ranks import Ranks, Rendezvous
-    from accerl_lerobot.trainer.update import Update
+    from accerl_lerobot.trainer.update import BaseUpdate
 
 LOAD_S = 600.0
 """How long a rank may take to load its policy."""
@@ -67,7 +66,7 @@ class LearnerSettings(NamedTuple):
         torch.manual_seed(self.seed)
         return loader(self.load)(self.policy)
 
-    def begin(self, adapter: Any, ranks: Ranks) -> Update | OffPolicyUpdate:
+    def begin(self, adapter: Any, ranks: Ranks) -> BaseUpdate:
         """The updates, from the state on; what ranks share out is shared out then."""
         from accerl_lerobot.trainer.update import make_update
 
@@ -124,23 +123,20 @@ class TrainerRank:
 
 
 class Peers:
-    """The others, as the first rank sees them.
-
-    `actors` are handles of `TrainerRank`, of rank 1, 2 …; none where there is one rank.
-    """
+    """The others, as the first rank sees them: `actors` are handles of `TrainerRank`, of rank 1, 2 …."""
 
     def __init__(self, actors: Sequence[Any], config: TrainerConfig) -> None:
         self._actors, self._config = list(actors), config
 
-    def begin(self, settings: LearnerSettings) -> Update | OffPolicyUpdate:
+    def begin(self, settings: LearnerSettings) -> BaseUpdate:
         """Loads the first rank's policy and meets the others, once they have loaded theirs."""
         from accerl_lerobot.trainer import ranks
 
         adapter = settings.adapter()
         if not self._actors:
-            return settings.begin(adapter, ranks.Ranks())
-        self._collect("ready", [actor.ready.remote() for actor in self._actors], LOAD_S)
-        nodes = self._collect("node", [actor.node.remote() for actor in self._actors], LOAD_S)
+            return settings.begin(adapter, ranks.ALONE)
+        # Actors of one thread: by then they have loaded their policies.
+        nodes = _collect("node", [actor.node.remote() for actor in self._actors], LOAD_S)
         address = ranks.LOOPBACK
         if set(nodes) != {str(ray.get_runtime_context().get_node_id())}:
             address = ray.util.get_node_ip_address()
@@ -164,55 +160,47 @@ class Peers:
         except Exception as error:
             # Who waits for the first rank is silent too: it is another's silence only if it was waited for.
             waited = time.monotonic() - began > PATIENCE * self._config.rank_timeout_s
-            if calls and (lost := self._failure(method, calls, silence=waited, own=error)) is not None:
+            if calls and (lost := _failure(method, calls, silence=waited, own=error)) is not None:
                 raise lost from error
             raise
-        self._collect(method, calls, self._config.rank_timeout_s)
+        if calls:
+            _collect(method, calls, self._config.rank_timeout_s)
 
     def lending(self, method: str) -> AbstractContextManager[None]:
         """As `joining`, for what takes all ranks only where each keeps a part of the weights."""
         return self.joining(method) if self._config.zero else nullcontext()
 
-    def _collect(self, method: str, calls: list[Any], timeout_s: float) -> list[Any]:
-        try:
-            return list(ray.get(calls, timeout=timeout_s)) if calls else []
-        except GetTimeoutError as error:
-            missing = self._names(ray.wait(calls, num_returns=len(calls), timeout=0)[1], calls)
-            raise RankError(f"trainer {missing} did not do {method} within {timeout_s:.0f} s") from error
-        except RayError as error:
-            raise self._failure(method, calls) or error from error
 
-    def _failure(
-        self, method: str, calls: list[Any], silence: bool = True, own: Exception | None = None
-    ) -> RankError | None:
-        """The others' fault, if there is any: first the dead, then the silent, then the rest.
-
-        Args:
-            silence: whether silence is a fault.
-            own: what the first rank has raised; what all ranks raise alike is not theirs.
-        """
-        done, silent = ray.wait(calls, num_returns=len(calls), timeout=BLAME_S)
-        failures = {call: error for call in done if (error := _error(call)) is not None}
-        # A process that is gone made the others fail; what they say of it is only that it is gone.
-        guilty = [call for call, error in failures.items() if isinstance(error, RayActorError)]
-        if not guilty and silent and silence:
-            return RankError(f"trainer {self._names(silent, calls)} did not do {method}: no answer")
-        guilty = guilty or [
-            c for c, e in failures.items() if own is None or type(getattr(e, "cause", None)) is not type(own)
-        ]
-        if not guilty:
-            return None
-        return RankError(
-            f"trainer {self._names(guilty[:1], calls)} failed in {method}:\n{failures[guilty[0]]}"
-        )
-
-    def _names(self, some: Sequence[Any], calls: list[Any]) -> str:
-        return ", ".join(f"rank {rank}" for rank, call in enumerate(calls, 1) if call in some)
-
-
-def _error(call: Any) -> RayError | None:
+def _collect(method: str, calls: list[Any], timeout_s: float) -> list[Any]:
     try:
-        ray.get(call, timeout=0)
-    except RayError as error:
-        return error
-    return None
+        return list(ray.get(calls, timeout=timeout_s))
+    except RayError as error:  # no answer in time is one, too
+        raise _failure(method, calls) or error from error
+
+
+def _failure(
+    method: str, calls: list[Any], silence: bool = True, own: Exception | None = None
+) -> RankError | None:
+    """The others' fault, if any: first of the dead, then, if `silence` is one, of the silent, then the rest.
+
+    `own` is what the first rank has raised; what all ranks raise alike is not theirs.
+    """
+    done, silent = ray.wait(calls, num_returns=len(calls), timeout=BLAME_S)
+    failures: dict[Any, RayError] = {}
+    for call in done:
+        try:
+            ray.get(call)
+        except RayError as error:
+            failures[call] = error
+    # A process that is gone made the others fail; what they say of it is only that it is gone.
+    guilty = [call for call, error in failures.items() if isinstance(error, RayActorError)]
+    if not guilty and silent and silence:
+        names = ", ".join(f"rank {calls.index(call) + 1}" for call in silent)
+        return RankError(f"trainer {names} did not do {method}: no answer")
+    alike = {
+        call for call, error in failures.items() if own and type(getattr(error, "cause", 0)) is type(own)
+    }
+    guilty += [call for call in failures if call not in alike]
+    if not guilty:
+        return None
+    return RankError(f"trainer rank {calls.index(guilty[0]) + 1} failed in {method}:\n{failures[guilty[0]]}")

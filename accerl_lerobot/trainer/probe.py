@@ -20,7 +20,7 @@ from accerl_lerobot.checkpoint.tensors import part_of, whole
 from accerl_lerobot.policies.adapter import PolicyAdapter
 from accerl_lerobot.trainer.batch import Batch, Part
 from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.trainer.ranks import Ranks
+from accerl_lerobot.trainer.ranks import ALONE, Ranks
 from accerl_lerobot.trainer.sharding import swapped_in
 
 CRITIC = "value_head."
@@ -32,8 +32,8 @@ CLIP = 0.2
 class Probe:
     """One copy of the policy's trainable weights after the other, without the critic's."""
 
-    def __init__(self, adapter: PolicyAdapter, config: TrainerConfig, ranks: Ranks | None = None) -> None:
-        self.adapter, self._config, self._ranks = adapter, config, ranks or Ranks()
+    def __init__(self, adapter: PolicyAdapter, config: TrainerConfig, ranks: Ranks = ALONE) -> None:
+        self.adapter, self._config, self._ranks = adapter, config, ranks
         self._live = [p for name, p in adapter.trainable().items() if not name.startswith(CRITIC)]
         self._copy: list[Tensor] = []
         self._version: int | None = None

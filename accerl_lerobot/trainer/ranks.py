@@ -47,6 +47,9 @@ class Ranks:
         )
 
 
+ALONE = Ranks()
+
+
 class Group(Ranks):
     """One of several ranks, once all of them have come."""
 

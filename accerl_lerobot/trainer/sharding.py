@@ -32,11 +32,7 @@ from accerl_lerobot.trainer.config import TrainerConfig
 def arrange(adapter: PolicyAdapter, config: TrainerConfig) -> None:
     """Prepares an adapter for `trainer.sharding` and `trainer.activation_checkpointing`, in place.
 
-    Args:
-        adapter: on every rank with the same weights; called before anybody takes hold of its parameters.
-
-    Raises:
-        InputError: the policy has no block that can forget.
+    It has the same weights on every rank; nobody may have taken hold of its parameters.
     """
     if not (config.zero or config.activation_checkpointing):
         return
@@ -102,11 +98,7 @@ def swapped_in(
 class Watch(TorchFunctionMode):
     """Which modules one evaluation calls, and where it uses which parameter.
 
-    Args:
-        evaluate: runs the adapter's network once.
-
-    Attributes:
-        blocks: see the top of this file; none within another.
+    `blocks`, see the top of this file, are those found; none is within another.
     """
 
     def __init__(self, adapter: PolicyAdapter, evaluate: Callable[[], object]) -> None:

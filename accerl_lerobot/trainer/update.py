@@ -12,9 +12,9 @@ Shapes: S segments, T decisions of the longest one, N decisions in all.
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,62 +28,98 @@ from accerl_lerobot.config.parsing import imported
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.policies.adapter import PolicyAdapter
+from accerl_lerobot.policies.teacher import PREFIX
 from accerl_lerobot.trainer.batch import MAX_NONFINITE, Batch, NonFiniteError, collate, pick, turns
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.probe import CRITIC, Probe
-from accerl_lerobot.trainer.ranks import Ranks
+from accerl_lerobot.trainer.ranks import ALONE, Ranks
 from accerl_lerobot.trainer.sharding import arrange, synchronise
-
-if TYPE_CHECKING:
-    from accerl_lerobot.trainer.off_policy import OffPolicyUpdate
 
 
 def make_update(
-    adapter: Any, algorithm: AlgorithmConfig, config: TrainerConfig, ranks: Ranks | None = None
-) -> Update | OffPolicyUpdate:
+    adapter: Any, algorithm: AlgorithmConfig, config: TrainerConfig, ranks: Ranks = ALONE
+) -> BaseUpdate:
     """The updates that belong to an algorithm; see `Update` for the arguments."""
     shared = [ranks] if isinstance(algorithm, RatioConfig) else []
     return imported(algorithm.update)(adapter, algorithm, config, *shared)
 
 
-class Update:
-    """The optimiser around one adapter; of several ranks, each has one, and all make the same steps.
+class BaseUpdate(ABC):
+    """The optimiser around one adapter, and what the updates of all algorithms share."""
 
-    Args:
-        adapter: the policy; its parameters are others afterwards where ranks keep parts of them.
-        ranks: those that make each update; None: this process alone.
+    def __init__(self, adapter: Any, config: TrainerConfig) -> None:
+        self.adapter, self.config = adapter, config
+        self.version = self.skipped = self._skipped_in_a_row = 0
+        self._schedule_updates = config.updates
+        named = adapter.trainable().items()
+        self._policy = [p for k, p in named if not k.startswith((CRITIC, PREFIX))]
+        self._value = [p for k, p in named if k.startswith(CRITIC)]
+        self.optimizer = torch.optim.AdamW(self._policy, lr=config.lr, betas=config.betas, weight_decay=0.0)
+
+    @abstractmethod
+    def step(self, segments: Sequence[Segment]) -> dict[str, float]:
+        """Learns from new segments and returns metrics; the version rises by one."""
+
+    def state(self) -> dict[str, Any]:
+        """A copy of all that `restore` needs, the policy's weights apart; see `snapshot`."""
+        return {
+            "version": self.version,
+            "skipped": (self.skipped, self._skipped_in_a_row),
+            "schedule_updates": self._schedule_updates,
+            "optimizer": optimizer_state(self.optimizer),
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Resume from `state`; the adapter has its weights already."""
+        self.version = state["version"]
+        self.skipped, self._skipped_in_a_row = state["skipped"]
+        self._schedule_updates = state["schedule_updates"]
+        restore_optimizer(self.optimizer, state["optimizer"])
+
+    def lr_share(self, start: int = 0) -> float:
+        """Share of the peak of a learning rate that begins with update `start`."""
+        # A resumed run with more updates keeps the schedule that it began with, so that rates do not jump.
+        return self.config.lr_share(self.version, start=start, updates=self._schedule_updates)
+
+    def skip(self, step: str, loss: float, norm: float) -> None:
+        """Counts a step that was left out because its loss or gradient is not finite.
+
+        Raises:
+            NonFiniteError: `MAX_NONFINITE` of them since the policy's last step.
+        """
+        self.skipped += 1
+        self._skipped_in_a_row += 1
+        if self._skipped_in_a_row >= MAX_NONFINITE:
+            raise NonFiniteError(
+                f"{self._skipped_in_a_row} steps in a row had a non-finite loss or gradient (the last one, "
+                f"{step}: loss {loss:g}, gradient norm {norm:g}); lower trainer.lr or trainer.value_lr"
+            )
+
+
+class Update(BaseUpdate):
+    """Updates by a likelihood ratio; of several ranks, each has one, and all make the same steps.
+
+    Parameters of the adapter are others afterwards where `ranks` keep parts of them.
     """
 
     def __init__(
-        self,
-        adapter: PolicyAdapter,
-        algorithm: RatioConfig,
-        config: TrainerConfig,
-        ranks: Ranks | None = None,
+        self, adapter: PolicyAdapter, algorithm: RatioConfig, config: TrainerConfig, ranks: Ranks = ALONE
     ) -> None:
-        self.adapter, self.algorithm, self.config = adapter, algorithm, config
-        self.ranks = ranks or Ranks()
+        self.algorithm, self.ranks = algorithm, ranks
         self.ranks.begin_alike(list(adapter.trainable().values()))
         arrange(adapter, config)
-        self.version = self.skipped = self._skipped_in_a_row = 0
+        super().__init__(adapter, config)
         self._moments = torch.zeros(3, dtype=torch.float64)
         self._probe = Probe(adapter, config, self.ranks)
-        named = adapter.trainable()
-        self._policy = [p for k, p in named.items() if not k.startswith(CRITIC)]
-        self._value = [p for k, p in named.items() if k.startswith(CRITIC)]
-        self._schedule_updates = config.updates
-        groups = [{"params": self._policy}, {"params": self._value}]
-        self.optimizer = torch.optim.AdamW(groups, lr=config.lr, betas=config.betas, weight_decay=0.0)
+        self.optimizer.add_param_group({"params": self._value})
 
     def step(self, segments: Sequence[Segment]) -> dict[str, float]:
-        """Applies one optimiser step and returns its metrics; the version rises by one.
-
-        Raises:
-            NonFiniteError: `MAX_NONFINITE` updates in a row were not finite; this one changes nothing.
-        """
         batch = collate(segments)
         mismatch = self._probe.read(batch)
-        lr, value_lr = self._set_rates()
+        lr = self.config.lr * self.lr_share(self.config.value_warmup_updates)
+        value_lr = self.config.value_lr * self.lr_share()
+        for group, rate in zip(self.optimizer.param_groups, (lr, value_lr), strict=True):
+            group["lr"] = rate
         self.optimizer.zero_grad(set_to_none=True)
         metrics = self._backward(batch)
         fault_point("trainer.backward")
@@ -99,7 +135,7 @@ class Update:
             self.optimizer.step()
             self._skipped_in_a_row = 0
         else:
-            self._skip(metrics["loss"], norm, value_norm)
+            self.skip("an update", metrics["loss"], norm + value_norm)
         metrics |= mismatch | lag_metrics(torch.from_numpy(batch.version), self.version)
         self.version += 1
         self._probe.renew(self.version)
@@ -107,44 +143,12 @@ class Update:
         return metrics | norms | {"lr": lr, "value_lr": value_lr, "skipped": float(self.skipped)}
 
     def state(self) -> dict[str, Any]:
-        """A copy of all that `restore` needs, the policy's weights apart; see `snapshot`."""
-        return {
-            "version": self.version,
-            "skipped": (self.skipped, self._skipped_in_a_row),
-            "schedule_updates": self._schedule_updates,
-            "moments": self._moments.clone(),
-            "optimizer": optimizer_state(self.optimizer),
-            "probe": self._probe.state(),
-        }
+        return super().state() | {"moments": self._moments.clone(), "probe": self._probe.state()}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Resume from `state`; the adapter has its weights already."""
-        self.version = state["version"]
-        self.skipped, self._skipped_in_a_row = state["skipped"]
-        self._schedule_updates = state["schedule_updates"]
+        super().restore(state)
         self._moments = state["moments"]
-        restore_optimizer(self.optimizer, state["optimizer"])
         self._probe.restore(state["probe"])
-
-    def _set_rates(self) -> tuple[float, float]:
-        """Sets the learning rates of policy and critic for this update, and returns them."""
-        # A resumed run with more updates keeps the schedule that it began with, so that rates do not jump.
-        share = partial(self.config.lr_share, self.version, updates=self._schedule_updates)
-        lr = self.config.lr * share(start=self.config.value_warmup_updates)
-        value_lr = self.config.value_lr * share()
-        for group, rate in zip(self.optimizer.param_groups, (lr, value_lr), strict=True):
-            group["lr"] = rate
-        return lr, value_lr
-
-    def _skip(self, loss: float, norm: float, value_norm: float) -> None:
-        self.skipped += 1
-        self._skipped_in_a_row += 1
-        if self._skipped_in_a_row >= MAX_NONFINITE:
-            raise NonFiniteError(
-                f"{self._skipped_in_a_row} updates in a row had a non-finite loss or gradient (the last one: "
-                f"loss {loss:g}, gradient norm of the policy {norm:g}, of the critic {value_norm:g}); "
-                "lower trainer.lr"
-            )
 
     def _backward(self, batch: Batch) -> dict[str, float]:
         """Accumulates gradients over micro-batches; returns metrics of the whole batch."""

@@ -39,8 +39,7 @@ RESEND_S = 0.2
 class TrainerWorker:
     """Becomes a threaded Ray actor in `launch`: `run` on one thread, everything else beside it.
 
-    Args:
-        directory: of the run, for batches that nothing could be learnt from; None: they are not kept.
+    The run's `directory` is for batches that nothing could be learnt from.
     """
 
     def __init__(
@@ -90,7 +89,7 @@ class TrainerWorker:
         return self._update.version
 
     def join(self, reader: Endpoint) -> int:
-        """Has another replica receive the weights; it gets none older than the version that is returned."""
+        """Has another replica receive the weights, none older than the version that is returned."""
         if not self._publishing.wait(FIRST_S):
             raise TimeoutError(f"the trainer has published no weights for {FIRST_S:g} s")
         assert self._publisher is not None

@@ -10,13 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot.algorithms import (
-    AlgorithmConfig,
-    GIPOConfig,
-    LossInputs,
-    PPOConfig,
-    RatioConfig,
-)
+from accerl_lerobot.algorithms import AlgorithmConfig, GIPOConfig, LossInputs, PPOConfig, RatioConfig
 from accerl_lerobot.algorithms.objective import LOG_RATIO_CLAMP
 from tests.algorithms import oracle
 from tests.algorithms.inputs import gradient, make_inputs, one

@@ -15,7 +15,6 @@ from accerl_lerobot.algorithms import AlgorithmConfig, GIPOConfig, PPOConfig, Ra
 from accerl_lerobot.algorithms.objective import (
     KL_LINEAR_ABOVE,
     Samples,
-    at_level,
     kl_from_behaviour,
     lag_metrics,
     mean_over_ratios,
@@ -30,27 +29,6 @@ each_level = pytest.mark.parametrize("level", ["token", "chunk"])
 each_algorithm = pytest.mark.parametrize(
     "config", [AlgorithmConfig.get_choice_class(name)() for name in ALGORITHMS], ids=str
 )
-
-
-@pytest.mark.parametrize(
-    ("level", "expected"), [("token", [1.0, 2.0, 4.0, 8.0, 16.0, 32.0]), ("chunk", [63.0])]
-)
-def test_sums_by_hand(level: Any, expected: list[float]) -> None:
-    assert at_level(X, make_inputs(n=1, factors=6), level).tolist() == [expected]
-
-
-@pytest.mark.parametrize(
-    ("level", "expected", "there"),
-    [
-        ("token", [1.0, 2.0, 4.0, 8.0, 0.0, 0.0], [True, True, True, True, False, False]),
-        ("chunk", [15.0], [True]),
-    ],
-)
-def test_factors_that_do_not_exist_by_hand(level: Any, expected: list[float], there: list[bool]) -> None:
-    inputs = replace(make_inputs(n=1, factors=6), factors=FACTORS)
-    holes = X.masked_fill(~FACTORS, torch.nan)
-    assert at_level(holes, inputs, level).tolist() == [expected]
-    assert present(FACTORS, level).tolist() == [there]
 
 
 def test_means_weigh_existing_factors_alike() -> None:

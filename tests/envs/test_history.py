@@ -13,7 +13,7 @@ from accerl_lerobot.envs.base import ChunkResult
 from accerl_lerobot.experience import TASK, Observation
 
 STATE, IMAGE = "observation.state", "observation.images.front"
-WORLD = SimulatedConfig(max_steps=11, tolerance=0.4, terminate_on_success=False, image_size=8)
+WORLD = SimulatedConfig(max_steps=11, tolerance=0.4, reward="dense", image_size=8)
 
 
 def chunks(count: int, rows: int, dims: int = 2, seed: int = 0) -> list[np.ndarray]:

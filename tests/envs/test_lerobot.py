@@ -118,21 +118,6 @@ def test_stock_lerobot_sees_our_world(plugin):
     world.close()
 
 
-def test_the_expert_succeeds_through_the_plugin(plugin):
-    from accerl_lerobot.demos.record import make_expert
-    from accerl_lerobot.envs.lerobot_plugin import AccerlEnv
-
-    config = MetaWorldConfig(task="handle-press-v3")
-    env = AccerlEnv(config, "handle-press-v3")
-    env.reset(seed=0)
-    expert, terminated = make_expert(config, env._world, "handle-press-v3"), False
-    while not terminated:
-        seen, reward, terminated, truncated, info = env.step(np.clip(expert(), -1, 1))
-        assert not truncated and info["is_success"] == terminated
-    assert reward == 1.0 and env.observation_space["pixels"].contains(seen["pixels"])
-    env.close()
-
-
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 
 

@@ -48,7 +48,7 @@ def test_same_states_and_frames_as_lerobot():
     actions = np.random.default_rng(0).uniform(-1, 1, (3, 4)).astype(np.float32)
     # LeRobot's pictures first: once ours has an OpenGL context, theirs would be drawn into it.
     theirs = [stock.reset(seed=11)[0], *(stock.step(action)[0] for action in actions)]
-    world = make_world(MetaWorldConfig(task="push-v3", image_size=480, lighting="default"))
+    world = make_world(MetaWorldConfig(task="push-v3", image_size=480, rendering="stock"))
     ours = world.reset(11, "push-v3")
     assert np.array_equal(theirs[0]["agent_pos"].astype(np.float32), ours["observation.state"])
     for action, raw in zip(actions, theirs[1:], strict=True):

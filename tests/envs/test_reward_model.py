@@ -93,7 +93,7 @@ def test_episodes_succeed_and_end_as_it_says(encoder: Path, tmp_path: Path):
     *_, last = solved(make_world(ENV), 0)
     assert last.success and last.rewards.sum() == 1
     lasting = make_world(
-        replace(ENV, terminate_on_success=False), reward_model=RewardModelConfig(path=str(tmp_path / "never"))
+        replace(ENV, reward="dense"), reward_model=RewardModelConfig(path=str(tmp_path / "never"))
     )
     results = solved(lasting, 0)
     assert sum(r.steps for r in results) == ENV.max_steps and results[-1].truncated

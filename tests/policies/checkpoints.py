@@ -8,10 +8,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from accerl_lerobot.experience import Request
-
 
 def write_policy(
     directory: Path,
@@ -28,11 +24,8 @@ def write_policy(
 ) -> Path:
     """Saves a new policy and its processors as a LeRobot ``pretrained_model`` folder.
 
-    Args:
-        image: its side in pixels.
-        stats: in place of the default: states and actions of std 0.5 around 0, or within ±2.
-        prepare: changes the weights before they are saved.
-        fields: of LeRobot's policy config.
+    By the default `stats`, states and actions have a std of 0.5 around 0, or lie within ±2. `prepare` changes
+    the weights before they are saved; `fields` are of LeRobot's policy config.
     """
     import torch
     from lerobot.configs.types import FeatureType, PolicyFeature
@@ -68,16 +61,8 @@ def with_backbone(directory: Path, image: int) -> dict[str, Any]:
     """Fields of a policy on a tiny SmolVLM, which is written beside the policy's folder."""
     from accerl_lerobot.demos.backbone import write_backbone
 
-    sizes = {
-        "hidden": 32,
-        "heads": 2,
-        "kv_heads": 1,
-        "vision_hidden": 16,
-        "vision_layers": 1,
-        "vision_heads": 2,
-        "patch": 8,
-        "image": image,
-    }
+    sizes = {"hidden": 32, "heads": 2, "kv_heads": 1, "patch": 8, "image": image}
+    sizes |= {"vision_hidden": 16, "vision_layers": 1, "vision_heads": 2}
     backbone = write_backbone(directory.parent / f"{directory.name}-backbone", ["Match the target"], **sizes)
     return {
         "image": image,
@@ -90,63 +75,36 @@ def with_backbone(directory: Path, image: int) -> dict[str, Any]:
 
 
 def write_smolvla(
-    directory: Path,
-    *,
-    image: int = 32,
-    state_dim: int = 4,
-    padded_dim: int = 2,
-    chunk: int = 4,
-    executed: int = 4,
-    num_steps: int = 3,
-    **options: Any,
-) -> Path:
+    directory: Path, *, image: int = 32, state_dim: int = 4, padded_dim: int = 2, chunk: int = 4,
+    executed: int = 4, num_steps: int = 3, **options: Any,
+) -> Path:  # fmt: skip
     """Saves a random SmolVLA with identity-like normalisation as a LeRobot ``pretrained_model`` folder."""
     small = {
-        "num_expert_layers": 2,
-        "chunk_size": chunk,
-        "n_action_steps": executed,
-        "state_dim": state_dim,
-        "max_state_dim": state_dim,
-        "max_action_dim": padded_dim,
-        "num_steps": num_steps,
-        "tokenizer_max_length": 48,
-        "expert_width_multiplier": 1.0,
-        "train_expert_only": False,
-    }
+        "chunk_size": chunk, "n_action_steps": executed, "num_steps": num_steps, "tokenizer_max_length": 48,
+        "state_dim": state_dim, "max_state_dim": state_dim, "max_action_dim": padded_dim,
+        "num_expert_layers": 2, "expert_width_multiplier": 1.0, "train_expert_only": False,
+    }  # fmt: skip
     return write_policy(directory, "smolvla", **(with_backbone(directory, image) | small | options))
 
 
 def write_act(directory: Path, *, chunk: int = 5, executed: int = 3, **options: Any) -> Path:
     """An ACT of 11 M parameters, nearly all of them in the smallest ResNet that LeRobot allows."""
     small = {
-        "chunk_size": chunk,
-        "n_action_steps": executed,
-        "dim_model": 32,
-        "n_heads": 2,
-        "dim_feedforward": 64,
-        "n_encoder_layers": 2,
-        "n_vae_encoder_layers": 1,
-        "latent_dim": 4,
-        "pretrained_backbone_weights": None,
-    }
+        "chunk_size": chunk, "n_action_steps": executed, "pretrained_backbone_weights": None,
+        "dim_model": 32, "n_heads": 2, "dim_feedforward": 64, "latent_dim": 4,
+        "n_encoder_layers": 2, "n_vae_encoder_layers": 1,
+    }  # fmt: skip
     return write_policy(directory, "act", **(small | options))
 
 
 def write_diffusion(directory: Path, *, horizon: int = 8, executed: int = 3, **options: Any) -> Path:
     """A diffusion policy with a U-Net of 0.07 M parameters beside the smallest ResNet that LeRobot allows."""
     small = {
-        "n_obs_steps": 1,
-        "horizon": horizon,
-        "n_action_steps": executed,
-        "down_dims": (16, 32),
-        "n_groups": 4,
-        "diffusion_step_embed_dim": 16,
-        "num_train_timesteps": 20,
-        "num_inference_steps": 4,
-        "spatial_softmax_num_keypoints": 4,
+        "n_obs_steps": 1, "horizon": horizon, "n_action_steps": executed, "pretrained_backbone_weights": None,
+        "down_dims": (16, 32), "n_groups": 4, "diffusion_step_embed_dim": 16, "num_train_timesteps": 20,
+        "num_inference_steps": 4, "spatial_softmax_num_keypoints": 4,
         "use_group_norm": True,  # batch norm wants images above 32 pixels when LeRobot builds it
-        "pretrained_backbone_weights": None,
-    }
+    }  # fmt: skip
     return write_policy(directory, "diffusion", **(small | options))
 
 
@@ -178,28 +136,3 @@ def edit_config(path: Path, **changes: Any) -> None:
     """Puts other values into a checkpoint's ``config.json``."""
     config = json.loads((path / "config.json").read_text())
     (path / "config.json").write_text(json.dumps(config | changes))
-
-
-def stock_chunk(path: Path, request: Request, **options: Any) -> np.ndarray:
-    """Stock LeRobot's chunk for a checkpoint and one observation: (1, K, A) in the world's units.
-
-    Args:
-        path: the checkpoint.
-        request: what is observed.
-        options: of LeRobot's `predict_action_chunk`.
-    """
-    import torch
-    from lerobot.configs.policies import PreTrainedConfig
-    from lerobot.policies.factory import get_policy_class, make_pre_post_processors
-
-    kind = PreTrainedConfig.from_pretrained(path).type
-    policy = get_policy_class(kind).from_pretrained(path)
-    pre, post = make_pre_post_processors(policy.config, pretrained_path=str(path))
-    batch = {"task": request.observation["task"]}
-    for key in policy.config.input_features:
-        value = torch.from_numpy(np.asarray(request.observation[key]))
-        batch[key] = value.permute(2, 0, 1) / 255.0 if value.dtype == torch.uint8 else value
-    batch = pre(batch)
-    if kind == "diffusion":  # its sampler wants a time dimension
-        batch["observation.state"] = batch["observation.state"][:, None]
-    return post(policy.predict_action_chunk(batch, **options)).numpy()

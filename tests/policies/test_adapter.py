@@ -3,25 +3,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot.policies.adapter import LeRobotAdapter, ValueHead, stack_observations
+from accerl_lerobot.policies.adapter import ValueHead, stack_observations
+from accerl_lerobot.policies.config import GaussianSamplerConfig
 from tests.policies.checkpoints import write_act
-from tests.policies.tiny import TEXTS, adapter_at, requests
+from tests.policies.tiny import adapter_at, requests
 from tests.rounding import assert_close
 
 
-def prepared(adapter: LeRobotAdapter, count: int = 3) -> tuple[dict, dict]:
-    observations, tasks = stack_observations(requests(count))
-    return observations, adapter.processing.prepare(observations, tasks)
-
-
 def test_images_are_scaled_and_states_normalised(tiny_checkpoint: Path):
-    raw, batch = prepared(adapter_at(tiny_checkpoint))
+    raw, tasks = stack_observations(requests(3))
+    batch = adapter_at(tiny_checkpoint).processing.prepare(raw, tasks)
     image = batch["observation.images.front"]
     assert image.shape == (3, 3, 32, 32) and image.dtype == torch.float32
     assert np.array_equal(
@@ -41,17 +39,19 @@ def test_a_lone_camera_may_be_called_as_in_lerobot_s_pusht(tmp_path: Path):
     assert np.array_equal(batch["observation.image"][0, 2, 5, 7].numpy(), np.float32(image[5, 7, 2]) / 255)
 
 
-def test_instructions_get_lerobot_s_newline_and_padding(tiny_checkpoint: Path):
-    adapter = adapter_at(tiny_checkpoint)
-    _, batch = prepared(adapter)
-    tokenizer = adapter.policy.model.vlm_with_expert.processor.tokenizer
-    tokens, mask = batch["observation.language.tokens"], batch["observation.language.attention_mask"]
-    assert len({int(row.sum()) for row in mask}) == 3, "the batch is padded"
-    for text, row, real in zip(TEXTS, tokens, mask, strict=True):
-        assert tokenizer.decode(row[real]) == text + "\n"
+def test_act_s_std_starts_where_it_is_configured_and_stays_within_bounds(written: Callable[[str], Path]):
+    # The checkpoint's action std is 0.5, so that is the factor from normalised to executed.
+    adapter = adapter_at(written("act"), GaussianSamplerConfig(std=0.24))
+    asked, still = (requests(200, image=16, explore=explore) for explore in (True, False))
 
+    def added() -> np.ndarray:
+        noisy, stock = (np.stack([d.chunk for d in adapter.decide(some, 0)]) for some in (asked, still))
+        return (noisy - stock) / 0.5
 
-# ---- the critic
+    assert abs(added().mean()) < 0.03 and added().std() == pytest.approx(0.24, rel=0.05)
+    with torch.no_grad():
+        adapter.family.std.out.bias.copy_(torch.tensor([50.0, -50.0]))
+    assert added().std((0, 1)) == pytest.approx([0.6, 0.06], rel=0.06)
 
 
 def head() -> ValueHead:
@@ -69,11 +69,8 @@ def inputs() -> tuple[torch.Tensor, torch.Tensor]:
     return features, torch.tensor([[True, True, True, False], [True, True, False, False]])
 
 
-def test_a_new_critic_says_zero():
-    assert torch.equal(ValueHead(6)(*inputs()), torch.zeros(2))
-
-
 def test_initial_weights_depend_on_the_seed_alone_and_not_on_what_was_drawn_before():
+    assert torch.equal(ValueHead(6)(*inputs()), torch.zeros(2)), "a new critic says 0"
     heads = []
     for seed, draws in ((3, 0), (3, 1000), (4, 0)):
         torch.manual_seed(seed)
@@ -108,8 +105,3 @@ def test_its_gradient_stops_at_the_features():
     critic(features, mask).sum().backward()
     assert all(p.grad is not None and p.grad.abs().max() > 0 for p in critic.parameters())
     assert features.grad is None
-
-
-def test_half_precision_features_are_read_in_full():
-    features, mask = inputs()
-    assert head()(features.bfloat16(), mask).dtype == torch.float32

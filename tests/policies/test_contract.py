@@ -20,9 +20,9 @@ from accerl_lerobot.experience import Request
 from accerl_lerobot.policies.adapter import LeRobotAdapter, Processing, stack_observations
 from accerl_lerobot.policies.config import POLICIES, PolicyConfig, SamplerConfig
 from accerl_lerobot.policies.saving import save_pretrained
-from accerl_lerobot.testing import check_batches, check_gradient, log_ratio, perturb, stored
+from accerl_lerobot.testing import check_batches, check_gradient, check_saved, log_ratio, perturb, stored
 from tests.policies.cases import CASES, VARIANTS, Case
-from tests.policies.tiny import adapter_at, check_journey
+from tests.policies.tiny import adapter_at
 from tests.policies.tiny_pi import hub
 from tests.rounding import assert_close
 
@@ -88,19 +88,6 @@ def test_decisions_and_ratio_one_do_not_depend_on_the_batch(policy: Policy):
 
 
 @SAMPLERS
-def test_other_weights_give_the_ratio_of_a_slow_computation(policy: Policy):
-    adapter, asked = policy.adapter, policy.asked[:4]
-    decisions = adapter.decide(asked, 0)
-    latent, old = stored(decisions)
-    perturb(adapter, policy.case.moved, seed=1)
-    expected = np.asarray(policy.case.slow(adapter, asked, latent)) - old.double().sum(1).numpy()
-    change = log_ratio(adapter, asked, decisions).numpy()
-    relative, absolute = policy.case.close
-    assert np.allclose(change, expected, rtol=relative, atol=absolute)
-    assert np.abs(change).max() > 0.05, "the weights must have moved the policy"
-
-
-@SAMPLERS
 def test_no_global_generator_is_read_or_moved(policy: Policy):
     adapter, asked = policy.adapter, policy.asked[:6]
     together = pickle.dumps(adapter.decide(asked, 7))
@@ -136,25 +123,13 @@ def test_all_that_is_observed_and_the_seed_matter(policy: Policy):
 
 
 @SAMPLERS
-def test_ratio_one_after_save_and_load_and_a_segment_s_journey(policy: Policy, tmp_path: Path):
-    adapter, asked = policy.adapter, policy.asked[:7]
+def test_ratio_one_after_save_and_load(policy: Policy, tmp_path: Path):
+    adapter, asked = policy.adapter, policy.asked[:6]
     perturb(adapter, 0.1)
-    check_journey(adapter, asked, policy.path, tmp_path / "saved")
+    config = PolicyConfig(path=str(policy.path), device="cpu", sampler=adapter.family.sampler)
+    check_saved(adapter, asked, config, tmp_path / "saved")
     untouched = adapter_at(policy.path, adapter.family.sampler)
-    assert log_ratio(untouched, asked[:6], adapter.decide(asked[:6], 0)).abs().max() > 1e-3
-
-
-@SAMPLERS
-def test_gradients_reach_every_trainable_parameter(policy: Policy):
-    adapter, asked = policy.adapter, policy.asked[:8]
-    perturb(adapter, 0.1)  # heads start at zero, where only their output layers have a gradient
-    latent, _ = stored(adapter.decide(asked, 0))
-    evaluation = adapter.evaluate(*stack_observations(asked), latent)
-    (evaluation.log_prob.sum() + evaluation.value.sum()).backward()
-    trainable = adapter.trainable()
-    silent = [k for k, p in trainable.items() if p.grad is None or not p.grad.abs().max() > 0]
-    assert silent == ["value_head.query"] * policy.case.one_token
-    assert all(any(part in k for k in trainable) for part in policy.case.parts)
+    assert log_ratio(untouched, asked, adapter.decide(asked, 0)).abs().max() > 1e-3
 
 
 @SAMPLERS
@@ -174,9 +149,9 @@ def test_not_exploring_is_lerobot_s_own_policy_and_is_not_scored(policy: Policy)
     decisions = adapter.decide(asked, 0)
     chunks = np.stack([d.chunk for d in decisions])
     assert not any(d.log_prob.any() for d in decisions)
-    if policy.case.stock is not None:
-        batch = adapter.processing.prepare(observations, tasks)
-        stock = policy.case.stock(adapter, batch, asked, stored(decisions)[0])
+    if policy.case.kind != "diffusion":  # it draws step noise, see `test_diffusion`
+        batch, latent = adapter.processing.prepare(observations, tasks), stored(decisions)[0]
+        stock = adapter.model.stock(batch, **({"noise": latent["path"][:, 0]} if "path" in latent else {}))
         rows = policy.case.chunk[0]
         assert np.array_equal(chunks, adapter.processing.unnormalise(stock)[:, :rows].numpy())
     exploring = np.stack([d.chunk for d in adapter.decide(policy.asked[:6], 0)])
@@ -235,18 +210,6 @@ def test_training_touches_neither_normalisation_nor_buffers_nor_what_is_frozen(
     assert moved == {p.data_ptr() for k, p in trainable.items() if k.startswith("policy.")}
 
 
-@pytest.mark.parametrize("name", ["smolvla", "pi0", "pi05"])
-def test_the_value_loss_does_not_reach_the_backbone(written, name: str):  # noqa: ANN001
-    adapter = adapter_at(written(name))
-    perturb(adapter, 0.1)
-    asked = CASES[name].requests(4)
-    latent, _ = stored(adapter.decide(asked, 0))
-    adapter.evaluate(*stack_observations(asked), latent).value.square().sum().backward()
-    reached = {k for k, p in adapter.trainable().items() if p.grad is not None and p.grad.abs().max() > 0}
-    critic = {k for k in adapter.trainable() if k.startswith("value_head.")}
-    assert reached == critic
-
-
 @pytest.mark.parametrize("name", ["smolvla", "pi0", "pi05", "pi0_fast", "smolvla_bins"])
 def test_the_network_runs_in_bfloat16_and_log_probs_and_weights_are_float32(
     written: Callable[[str], Path], name: str
@@ -268,13 +231,6 @@ def test_the_network_runs_in_bfloat16_and_log_probs_and_weights_are_float32(
     evaluation.log_prob.sum().backward()
     assert all(p.dtype == torch.float32 for p in half.trainable().values())
     assert any(p.grad is not None and p.grad.abs().max() > 0 for p in half.trainable().values())
-
-
-@TYPES
-def test_example_is_what_evaluate_takes(policy: Policy):
-    observations, tasks, latent = policy.adapter.example()
-    evaluation = policy.adapter.evaluate(observations, tasks, latent)
-    assert len(evaluation.log_prob) == len(tasks) == 2 and len(tasks[0]) != len(tasks[1])
 
 
 @TYPES

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,11 +13,10 @@ import torch
 from torch import Tensor
 
 from accerl_lerobot.policies.config import FlowSamplerConfig
-from accerl_lerobot.policies.flow import FlowFamily, FlowShape, Velocity
+from accerl_lerobot.policies.flow import FlowFamily, FlowShape
 from accerl_lerobot.testing import stored
 from tests.policies import oracle
-from tests.policies.cases import CASES
-from tests.policies.tiny import adapter_at, deviation, requests
+from tests.policies.tiny import adapter_at, requests
 
 STD = 0.3
 CONFIG = FlowSamplerConfig(noise_level=STD)
@@ -116,75 +115,9 @@ def test_gradient_against_finite_differences():
     assert torch.autograd.gradcheck(score, [p.clone().requires_grad_() for p in parameters], atol=1e-6)
 
 
-def test_entropy_is_minus_the_expected_log_density():
-    shape, count = sizes(2), 4000
-    x0, eps = draws(shape, count=count)
-    log_prob = family(shape).sample(velocity, x0, eps, explore_all(x0)).log_prob
-    error = log_prob.sum(1).std().item() / math.sqrt(count)
-    assert family(shape).entropy == pytest.approx(-log_prob.sum(1).mean().item(), abs=4 * error)
-
-
-# ---- importance weights: E_μ[ρ f(a)] = E_π[f(a)] for the action the environment executes. "ρ = 1 at equal
-# weights" and "E_μ[ρ] = 1" also hold for log-probs that leave out padded dims; this identity does not.
-
-SHAPE = FlowShape(num_steps=3, chunk_size=2, executed=1, padded_dim=3, action_dim=1)
-WIDE = FlowSamplerConfig(noise_level=0.4)
-SAMPLES = 150_000
-EXACT, WRONG = 4.0, 10.0
-"""Monte-Carlo errors: agreement is below the first, a detected mistake above the second."""
-
-
-def network(perturbation: float, drift: float) -> Velocity:
-    """A nonlinear mix of all K·D entries, in which the executed one hangs on every other.
-
-    Args:
-        perturbation: size of a fixed random change of all weights.
-        drift: added to the velocity of padded dims; a third of it is taken from that of real ones.
-    """
-    base, other = torch.Generator().manual_seed(7), torch.Generator().manual_seed(8)
-    size = SHAPE.chunk_size * SHAPE.padded_dim
-    mix = 0.3 * torch.randn(size, size, generator=base)
-    mix[0] = torch.tensor([0.2, 0.9, 0.9, 0.5, 0.5, 0.5])
-    mix += perturbation * torch.randn(size, size, generator=other)
-    added = torch.where(torch.arange(SHAPE.padded_dim) < SHAPE.action_dim, -drift / 3, drift)
-
-    def velocity(x: Tensor, t: Tensor) -> Tensor:
-        return torch.tanh(x.flatten(1) @ mix.T + 0.5 * t[:, None]).view(x.shape) + added
-
-    return velocity
-
-
-MU, PI = network(0.0, 0.0), network(0.1, 0.3)
-
-
-def act(velocity: Velocity, seed: int) -> tuple[Tensor, dict[str, Tensor], Tensor]:
-    """(executed action (B,), latent, log-prob (B,))."""
-    generator = torch.Generator().manual_seed(seed)
-    size = (SAMPLES, SHAPE.chunk_size, SHAPE.padded_dim)
-    x0, eps = (torch.randn(size, generator=generator) for _ in range(2))
-    chunk, latent, log_prob = family(SHAPE, WIDE).sample(velocity, x0, eps, explore_all(x0))
-    return chunk[:, 0, 0], latent, log_prob.sum(1)
-
-
-def payoff(action: Tensor) -> Tensor:
-    return torch.tanh(2 * action + 0.5) + 0.2 * action**2
-
-
-def test_weighted_samples_of_mu_are_samples_of_pi():
-    action, latent, behaviour = act(MU, 11)
-    ratio = (family(SHAPE, WIDE).log_prob(PI, latent).sum(1) - behaviour).exp()
-    new, old = payoff(act(PI, 12)[0]), payoff(act(MU, 13)[0])
-    assert deviation(old, new) > WRONG, "the weights must matter, or the test shows nothing"
-    assert deviation(ratio, torch.ones(2)) < EXACT
-    assert deviation(ratio * payoff(action), new) < EXACT
-
-
-# ---- on SmolVLA
-
-
-@pytest.fixture(scope="module")
-def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return CASES["smolvla"].write(tmp_path_factory.mktemp("smolvla") / "pretrained_model")
+@pytest.fixture
+def path(written: Callable[[str], Path]) -> Path:
+    return written("smolvla")
 
 
 def test_the_executed_noise_has_the_configured_size(path: Path):
@@ -210,8 +143,7 @@ def test_published_weights_that_do_not_fit_change_nothing(path: Path):
     good = adapter.export_trainable()
     moved = {k: v + 1 for k, v in good.items()}
     first, *_, last = moved
-    with pytest.raises(ValueError, match=f"published weights differ by name: .*{first}"):
-        adapter.load_trainable({k: v for k, v in moved.items() if k != first})
-    with pytest.raises(ValueError, match=rf"published {last} has shape \(7,\), not"):
-        adapter.load_trainable(moved | {last: np.zeros(7, np.float32)})
+    for wrong in ({k: v for k, v in moved.items() if k != first}, moved | {last: np.zeros(7, np.float32)}):
+        with pytest.raises(ValueError, match="published weights differ by name or shape"):
+            adapter.load_trainable(wrong)
     assert all(np.array_equal(a, good[k]) for k, a in adapter.export_trainable().items())

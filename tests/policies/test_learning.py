@@ -37,7 +37,14 @@ from tests.policies.checkpoints import write_act, write_bins, write_diffusion
 from tests.policies.tiny_pi import write_pi
 from tests.runs import collect, drive, tiny_run
 
-ENV = SimulatedConfig(max_steps=8, tolerance=0.3, reward="dense", terminate_on_success=False)
+ENV = SimulatedConfig(max_steps=8, tolerance=0.3, reward="dense")
+
+
+def write_diffusion_that_looks_back(path: Path) -> Path:
+    sizes = {"observation.state": 4, "action": 2}
+    stats = {key: {"min": -torch.ones(n), "max": torch.ones(n)} for key, n in sizes.items()}
+    steps = {"noise_scheduler_type": "DDIM", "prediction_type": "sample", "num_inference_steps": 2}
+    return write_diffusion(path, image=8, n_obs_steps=2, executed=4, stats=stats, **steps)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,84 +71,39 @@ class Run:
     """Least rise of the mean reward in an update."""
 
 
-def write_diffusion_that_looks_back(path: Path) -> Path:
-    sizes = {"observation.state": 4, "action": 2}
-    return write_diffusion(
-        path,
-        image=8,
-        n_obs_steps=2,
-        executed=4,
-        noise_scheduler_type="DDIM",
-        prediction_type="sample",
-        num_inference_steps=2,
-        stats={key: {"min": -torch.ones(n), "max": torch.ones(n)} for key, n in sizes.items()},
-    )
-
-
 PI: dict[str, Any] = {"value_lr": 5e-3, "capacity": 512, "least": 64}
+SMALL: dict[str, Any] = {"env": replace(ENV, image_size=8), "updates": 40, "batch": 96, "least": 96}
 RUNS = {
     "pi0": Run(
         write=lambda path: write_pi(path, "pi0", prompt=12, num_steps=2),
         sampler=FlowSamplerConfig(noise_level=0.6),
-        updates=50,
-        lr=5e-3,
-        **PI,
-        success=(0.4, 0.7),
-        gain=2.0,
-        reward=0.5,
+        updates=50, lr=5e-3, **PI, success=(0.4, 0.7), gain=2.0, reward=0.5,
     ),
     "pi05": Run(
         write=lambda path: write_pi(path, "pi05", prompt=40, num_steps=1),
         sampler=FlowSamplerConfig(noise_level=0.6),
-        updates=50,
-        batch=64,
-        lr=3e-3,
-        **PI,
-        gain=0.4,
+        updates=50, batch=64, lr=3e-3, **PI, gain=0.4,
     ),
     "pi0_fast": Run(
         write=lambda path: write_pi(path, "pi0_fast", prompt=40, num_steps=5),
-        algorithm=GIPOConfig(gamma=0.5, level="token"),
-        updates=40,
-        lr=3e-3,
-        **PI,
-        gain=0.7,
-        reward=0.2,
+        updates=40, lr=3e-3, **PI, gain=0.7, reward=0.2,
     ),
     "smolvla_bins": Run(
         write=lambda path: write_bins(path, chunk=2, executed=2, num_bins=16),
         env=replace(ENV, max_steps=4, hold=2),
         algorithm=GIPOConfig(gamma=0.5, entropy_coef=0.03),
-        updates=80,
-        batch=256,
-        lr=4e-3,
-        success=(0.25, 0.5),
-        reward=0.5,
+        updates=80, batch=256, lr=4e-3, success=(0.25, 0.5), reward=0.5,
     ),
     "act": Run(
         write=lambda path: write_act(path, image=8, chunk=4, executed=4),
-        sampler=GaussianSamplerConfig(std=0.4),
-        env=replace(ENV, image_size=8),
-        updates=40,
-        batch=96,
-        least=96,
-        lr=1e-3,
-        success=(0.4, 0.6),
-        reward=1.0,
+        sampler=GaussianSamplerConfig(std=0.4), **SMALL, lr=1e-3, success=(0.4, 0.6), reward=1.0,
     ),
     "diffusion": Run(
         write=write_diffusion_that_looks_back,
-        sampler=DiffusionSamplerConfig(std_min=0.3),
-        env=replace(ENV, image_size=8),
-        history=2,
-        updates=40,
-        batch=96,
-        least=96,
-        lr=1e-3,
-        success=(0.4, 0.5),
-        reward=0.5,
+        sampler=DiffusionSamplerConfig(std_min=0.3), history=2,
+        **SMALL, lr=1e-3, success=(0.4, 0.5), reward=0.5,
     ),
-}
+}  # fmt: skip
 
 
 def played(engine: Engine, episodes: int = 128) -> tuple[float, float]:

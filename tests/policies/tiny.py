@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from accerl_lerobot.experience import TASK, Origin, Request, Segment
@@ -19,8 +18,6 @@ from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.config import PolicyConfig, SamplerConfig
 from accerl_lerobot.policies.loading import load_adapter
 from accerl_lerobot.rollout.segments import SegmentBuilder
-from accerl_lerobot.testing import TOLERANCE, check_saved
-from tests.rounding import assert_close
 
 TEXTS = ("Match the target", "Go", "Mirror the target slowly, then stay")
 """Texts of different lengths, so that a batch pads some of them."""
@@ -75,27 +72,3 @@ def deviation(one: Tensor, other: Tensor) -> float:
     """Difference of two means in units of its standard error."""
     error = math.sqrt(one.var().item() / len(one) + other.var().item() / len(other))
     return abs(one.mean().item() - other.mean().item()) / error
-
-
-def check_journey(adapter: LeRobotAdapter, asked: Sequence[Request], path: Path, saved: Path) -> None:
-    """ρ = 1 for a segment of decisions, each made alone, re-scored together by what was saved and loaded.
-
-    Args:
-        adapter: of perturbed weights, else nothing is shown.
-        asked: one more than there are decisions.
-        path: the checkpoint it was loaded from.
-        saved: where to save it, new.
-    """
-    count, sampler = len(asked) - 1, adapter.family.sampler
-    segment = as_segment(asked, adapter, count)
-    config = PolicyConfig(path=str(path), device="cpu", sampler=sampler)
-    with torch.no_grad():
-        evaluation = check_saved(adapter, asked[:count], config, saved).evaluate(
-            {k: v[:-1] for k, v in segment.observations.items()},
-            [str(r.observation[TASK]) for r in asked[:count]],
-            {k: torch.from_numpy(v) for k, v in segment.latent.items()},
-        )
-    ratio = (evaluation.log_prob - torch.from_numpy(segment.log_prob)).sum(1).exp()
-    assert (ratio - 1).abs().max() <= TOLERANCE
-    assert_close(evaluation.value, segment.value)
-    assert np.abs(segment.value).max() > 0, "the critic was saved and loaded, not made anew"

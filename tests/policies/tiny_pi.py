@@ -139,19 +139,9 @@ def hub(cache: Path) -> Iterator[None]:
 
 
 def write_pi(
-    directory: Path,
-    kind: str,
-    *,
-    state_dim: int = 4,
-    padded_dim: int = 2,
-    chunk: int = 4,
-    executed: int = 4,
-    num_steps: int = 3,
-    prompt: int = 48,
-    seed: int = 1,
-    whole: bool = True,
-    **fields: Any,
-) -> Path:
+    directory: Path, kind: str, *, state_dim: int = 4, padded_dim: int = 2, chunk: int = 4, executed: int = 4,
+    num_steps: int = 3, prompt: int = 48, seed: int = 1, whole: bool = True, **fields: Any,
+) -> Path:  # fmt: skip
     """Saves a random policy with identity-like normalisation as LeRobot does; call it within `small`.
 
     Args:
@@ -163,21 +153,11 @@ def write_pi(
     cache = directory.parent / f"{directory.name}-hub"
     with hub(cache), data_only():
         write_policy(
-            directory,
-            kind,
-            image=IMAGE,
-            state_dim=state_dim,
-            seed=seed,
-            prepare=_spread,
-            chunk_size=chunk,
-            n_action_steps=executed,
-            max_state_dim=state_dim,
-            max_action_dim=padded_dim,
-            image_resolution=(IMAGE, IMAGE),
-            tokenizer_max_length=prompt,
-            **({"num_inference_steps": num_steps} if kind in KINDS else fast),
-            **fields,
-        )
+            directory, kind, image=IMAGE, state_dim=state_dim, seed=seed, prepare=_spread,
+            chunk_size=chunk, n_action_steps=executed, max_state_dim=state_dim, max_action_dim=padded_dim,
+            image_resolution=(IMAGE, IMAGE), tokenizer_max_length=prompt,
+            **({"num_inference_steps": num_steps} if kind in KINDS else fast), **fields,
+        )  # fmt: skip
     if whole:
         write_tokenizer(directory / BACKBONE)
         shutil.rmtree(cache)

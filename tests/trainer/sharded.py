@@ -171,13 +171,7 @@ def work(rank: int, size: int, place: Any, names: Sequence[str], states: Path, r
 
 
 def joined(rank: int, size: int, place: Any) -> ranks.Group:
-    """A rank of a group.
-
-    Args:
-        rank: which one.
-        size: how many there are.
-        place: a queue that tells where they meet.
-    """
+    """A rank of a group of `size`; the queue `place` tells where they meet."""
     use_only(LOOPBACK)
     if rank == 0:
         store, rendezvous = create(LOOPBACK, size, TIMEOUT_S)

@@ -31,14 +31,14 @@ def learner(checkpoint: Path, algorithm: AWRConfig, **trainer: Any) -> AWRUpdate
 
 def test_weights_by_hand():
     advantage = torch.tensor([-1.0, 0.0, 0.5, 2.0, 1e6])
-    expected = [math.exp(-2), 1, math.exp(1), 10, 10]
-    np.testing.assert_allclose(weights(advantage, beta=0.5, cap=10.0), expected, rtol=1e-6)
-    np.testing.assert_allclose(weights(advantage, beta=math.inf, cap=10.0), 1)
+    expected = [math.exp(-2), 1, math.exp(1), 20, 20]
+    np.testing.assert_allclose(weights(advantage, beta=0.5), expected, rtol=1e-6)
+    np.testing.assert_allclose(weights(advantage, beta=math.inf), 1)
 
 
 def test_a_step_weighs_each_row_by_its_advantage(tiny_checkpoint: Path):
     """Two decisions with known returns, a critic that says 0, and imitation losses of 1 and 3."""
-    update = learner(tiny_checkpoint, AWRConfig(policy_steps=1.0, beta=0.5, cap=5.0), lr=0.0, value_lr=0.0)
+    update = learner(tiny_checkpoint, AWRConfig(policy_steps=1.0, beta=0.5), lr=0.0, value_lr=0.0)
     for value, reward in ((1.0, 0.0), (3.0, 1.0)):
         update.remember(episode([reward], actions=np.full((1, 4, 2), value, np.float32)))
     losses = update.adapter.processing.normalise(torch.tensor([1.0, 3.0])[:, None, None].expand(2, 4, 2))
@@ -48,14 +48,14 @@ def test_a_step_weighs_each_row_by_its_advantage(tiny_checkpoint: Path):
     rows = np.array([0, 1, 1])
     for _ in range(2):
         encoded = update.adapter.encode(*update.memory.observations(rows))
-        found = update.weight(rows, encoded)
+        found = update.losses(rows, encoded, torch.tensor([1.0, 2.0, 3.0]))
         square = 2 / 3  # the mean square of the returns 0, 1, 1 stays the same
-        expected = np.minimum(np.exp(np.array([0.0, 1.0, 1.0]) / math.sqrt(square) / 0.5), 5.0)
-        np.testing.assert_allclose(found, expected, rtol=1e-5)
-    assert update.auxiliary(rows, encoded)["value_loss"].item() == pytest.approx(2 / 3)
+        weight = np.minimum(np.exp(np.array([0.0, 1.0, 1.0]) / math.sqrt(square) / 0.5), 20.0)
+        assert found["imitation_loss"].item() == pytest.approx(weight @ [1, 2, 3] / 3, rel=1e-5)
+        assert found["value_loss"].item() == pytest.approx(2 / 3)
     metrics = update.learn(1)
     low, high = float(losses[0, 0, 0]), float(losses[1, 0, 0])
-    assert min(low, 5 * high) < metrics["imitation_loss"] < max(low, 5 * high)
+    assert min(low, 20 * high) < metrics["imitation_loss"] < max(low, 20 * high)
 
 
 def test_the_critic_learns_returns_and_leaves_the_policy_alone(tiny_checkpoint: Path):

@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import logging
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,11 +24,12 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE, Origin, Segment
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.loading import load_adapter
-from accerl_lerobot.policies.teacher import WithTeacher
+from accerl_lerobot.policies.teacher import with_teacher
 from accerl_lerobot.trainer import demonstrations as module
 from accerl_lerobot.trainer.chunk_critic import ChunkCriticUpdate
 from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.trainer.demonstrations import WithDemonstrations, demonstrations
+from accerl_lerobot.trainer.demonstrations import demonstrations, with_demonstrations
+from tests.replay.segments import make_segment
 from tests.runs import tiny_run
 from tests.trainer.test_chunk_critic import SECTIONS
 
@@ -50,20 +52,14 @@ def like() -> Segment:
     world = make_world(ENV)
     observation = world.reset(3, world.spec.tasks[0])
     seen = {name: np.stack([value] * 2) for name, value in observation.items() if name != "task"}
-    return Segment(
+    return make_segment(
+        "explored",
+        1,
         observations=seen,
         task=str(observation["task"]),
-        latent={},
-        log_prob=np.zeros((1, 1), np.float32),
-        value=np.zeros(1, np.float32),
         actions=np.zeros((1, K, world.spec.action_dim), np.float32),
-        reward=np.zeros(1, np.float32),
-        version=np.zeros(1, np.int64),
         steps=np.array([K]),
         terminated=True,
-        truncated=False,
-        success=False,
-        key="explored",
         origin=Origin("match", 0, 0),
         episode={"return": 0.0},
     )
@@ -120,8 +116,9 @@ def test_a_dataset_of_something_else_is_left_out(
 def test_the_memory_begins_with_them_and_is_restored_without(
     dataset: DatasetConfig, like: Segment, tiny_checkpoint: Path
 ):
-    load = WithDemonstrations(WithTeacher(load_adapter, ENV.state_size, share=0.5, noise=0.1), dataset, COST)
-    adapter = load(PolicyConfig(path=str(tiny_checkpoint), device="cpu"))
+    load = partial(with_teacher, load_adapter, ENV.state_size, 0.5)
+    policy = PolicyConfig(path=str(tiny_checkpoint), device="cpu")
+    adapter = with_demonstrations(load, dataset, COST, policy)
     config = TrainerConfig(value_warmup_updates=100)
     update = ChunkCriticUpdate(adapter, ChunkCriticConfig(), config)
     rows = sum(map(len, demonstrations(dataset, COST, like)))

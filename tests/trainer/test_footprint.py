@@ -18,7 +18,6 @@ from accerl_lerobot.policies.loading import load_adapter
 from accerl_lerobot.testing import stored
 from accerl_lerobot.trainer import footprint
 from accerl_lerobot.trainer.footprint import Counter, PolicyMemory, policy_memory
-from tests.policies.checkpoints import write_act
 from tests.policies.tiny_pi import small, write_pi
 
 MIB = 2**20
@@ -47,11 +46,6 @@ def test_what_waits_for_the_gradient_is_what_autograd_keeps():
         kept = (x @ weight).sigmoid().sum()  # sigmoid keeps its result, 8,000 bytes; the sum has 4
     assert counter.now == 8004
     del kept
-
-
-@pytest.fixture
-def act(tmp_path: Path) -> LeRobotAdapter:
-    return load_adapter(PolicyConfig(path=str(write_act(tmp_path / "act")), device="cpu"))
 
 
 def pi0(folder: Path, **tuning: str) -> LeRobotAdapter:
@@ -83,26 +77,6 @@ def test_less_is_kept_by_imitation_by_few_trained_weights_and_by_blocks_that_for
         assert found.weights == whole.weights and found.learning < whole.learning
         forgetting = policy_memory(pi0(tmp_path / "pi0", mode="full"), imitates=False, checkpointing=True)
         assert forgetting.learning < whole.learning
-
-
-def test_a_decision_of_act_is_the_difference_between_batches(act: LeRobotAdapter):
-    memory = policy_memory(act, imitates=False)
-    observations, tasks, latent = act.example()
-    kept = []
-    for rows in (1, 2):
-        some = {name: array[:rows] for name, array in observations.items()}
-        with Counter() as counter:
-            evaluation = act.evaluate(some, tasks[:rows], {k: v[:rows] for k, v in latent.items()})
-        kept.append(counter.now)
-        del evaluation
-    assert memory.learning == pytest.approx(kept[1] - kept[0], rel=0.1)
-    assert memory.learning_batch == pytest.approx(2 * kept[0] - kept[1], rel=0.1)
-
-
-def test_sums_are_those_of_the_parts():
-    memory = PolicyMemory(1000, 100, acting_batch=3, acting=10, learning_batch=7, learning=50)
-    assert memory.trainer(8) == 1000 + 3 * 100 + 7 + 8 * 50
-    assert memory.replica(4) == 1043
 
 
 PROCESS = """

@@ -17,7 +17,6 @@ import torch
 
 from accerl_lerobot.algorithms import GIPOConfig
 from accerl_lerobot.checkpoint import snapshot
-from accerl_lerobot.engine.config import LaunchConfig, RunConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.trainer.batch import turns
 from accerl_lerobot.trainer.config import TrainerConfig
@@ -86,9 +85,6 @@ def assert_same_metrics(found: list[dict[str, float]], expected: list[dict[str, 
             assert mine[key] == close, f"{name}, update {update}: {key}"
 
 
-# ---- with other processes
-
-
 @pytest.mark.slow
 def test_ranks_make_the_updates_of_one(made: Any, alone: dict[str, dict[str, Any]]):
     name, results = made
@@ -144,18 +140,15 @@ def test_the_cases_meet_what_they_are_for(alone: dict[str, dict[str, Any]]):
     assert all(metrics["grad_norm"] > 0.05 for metrics in whole[1:]), "clipped, once the policy learns"
 
 
-# ---- shares
-
-
 @pytest.mark.parametrize("ranks", [1, 2, 3, 4, 7])
 @pytest.mark.parametrize(("count", "size"), [(1, 1), (1, 5), (2, 1), (5, 2), (13, 3), (13, 100), (64, 4)])
 def test_every_row_is_somebodys_and_all_run_equally_often(count: int, size: int, ranks: int):
     rows = 100 + np.arange(count)
     shares = [turns(rows, size, rank, ranks) for rank in range(ranks)]
     assert len({len(share) for share in shares}) == 1, "as many turns each"
-    assert np.concatenate([t.rows for share in shares for t in share if t.own]).tolist() == rows.tolist()
-    assert all(1 <= len(t.rows) <= size for share in shares for t in share)
-    sizes = [sum(len(t.rows) for t in share if t.own) for share in shares]
+    assert np.concatenate([part for share in shares for part, own in share if own]).tolist() == rows.tolist()
+    assert all(1 <= len(part) <= size for share in shares for part, _ in share)
+    sizes = [sum(len(part) for part, own in share if own) for share in shares]
     assert max(sizes) - min(sizes) <= 1
     assert len(shares[0]) == math.ceil(math.ceil(count / ranks) / size), "no turn more than it takes"
 
@@ -164,9 +157,6 @@ def test_a_trainer_alone_gets_what_it_gives():
     rows = np.arange(5)
     said = Ranks().each(lambda some: torch.from_numpy(some * 2.0), rows, size=2)
     assert said.tolist() == [0.0, 2.0, 4.0, 6.0, 8.0]
-
-
-# ---- blocks
 
 
 def watch(adapter: LinearAdapter) -> Watch:
@@ -217,20 +207,9 @@ def test_a_policy_without_blocks_cannot_forget():
         arrange(LinearAdapter(), TrainerConfig(activation_checkpointing=True))
 
 
-# ---- what is refused when a run is parsed
-
-
 def test_more_ranks_than_decisions_are_refused():
     with pytest.raises(InputError, match=r"trainer\.ranks=9: use at most .*, 8"):
         TrainerConfig(ranks=9, batch_decisions=8)
-
-
-def test_ranks_want_workers():
-    with pytest.raises(InputError, match=r"trainer\.ranks=2: launch\.engine=local is one process"):
-        RunConfig(trainer=TrainerConfig(ranks=2), launch=LaunchConfig(engine="local"))
-
-
-# ---- GPUs
 
 
 @pytest.mark.parametrize(

@@ -59,9 +59,6 @@ def critic_values(update: Update, segments: Sequence[Segment]) -> list[np.ndarra
     return [update.adapter.values(s.observations, [s.task] * (len(s) + 1)).numpy() for s in segments]
 
 
-# ---- batches
-
-
 def test_collate_lays_segments_end_to_end():
     segments = make_segments((2, 3), version=4)
     segments[1].terminated = True
@@ -79,14 +76,6 @@ def test_collate_lays_segments_end_to_end():
     ]
     assert batch.lengths.tolist() == [2, 3] and batch.terminated.tolist() == [False, True]
     assert batch.version.tolist() == [4] * 5
-
-
-def test_collate_copies_so_that_a_stored_segment_cannot_change():
-    segments = make_segments((3,))
-    batch = collate(segments)
-    batch.latent["x"][:] = 9.0
-    batch.reward[:] = 9.0
-    assert not (segments[0].latent["x"] == 9.0).any() and not (segments[0].reward == 9.0).any()
 
 
 @pytest.mark.parametrize("micro_batch", [1, 4, 5, 12, 13, 1000])
@@ -114,20 +103,6 @@ def test_micro_batches_add_up_when_decisions_have_different_numbers_of_factors(l
     assert_close(parts.adapter.weight.grad, whole.adapter.weight.grad)
     blind.step(make_segments(LENGTHS))
     assert not torch.allclose(blind.adapter.weight.grad, whole.adapter.weight.grad, rtol=1e-2)
-
-
-def test_what_a_latent_does_not_have_is_not_learnt_from():
-    update, other = make_update(), make_update()
-    segments, changed = with_counts(make_segments(LENGTHS)), with_counts(make_segments(LENGTHS))
-    for segment in changed:
-        missing = segment.latent["count"] < 2
-        segment.latent["x"][missing, 1] += 3.0
-        segment.log_prob[missing, 1] = np.nan
-    assert update.step(segments) == other.step(changed)
-    assert torch.equal(update.adapter.weight.grad, other.adapter.weight.grad)
-
-
-# ---- targets
 
 
 @pytest.mark.parametrize("micro_batch", [1000, 4])
@@ -176,9 +151,6 @@ def test_advantages_are_normalised_over_the_batch():
     assert_close(*gradients)
 
 
-# ---- schedules
-
-
 def test_learning_rates_warm_up_and_stay():
     config = replace(PLAIN, warmup_updates=4)
     assert [config.lr_share(i) for i in range(6)] == [0.25, 0.5, 0.75, 1.0, 1.0, 1.0]
@@ -212,19 +184,6 @@ def test_a_run_that_is_extended_keeps_the_schedule_that_it_began_with():
     assert [longer.step(make_segments(LENGTHS, seed=i))["lr"] for i in range(3)] == pytest.approx([0.02] * 3)
 
 
-def test_at_learning_rate_zero_nothing_of_the_policy_moves():
-    update = make_update(replace(PLAIN, lr=0.0))
-    before = update.adapter.copy()
-    for i in range(4):
-        update.step(make_segments(LENGTHS, seed=i))
-    after = update.adapter.copy()
-    assert torch.equal(after["policy.weight"], before["policy.weight"])
-    assert not torch.equal(after["value_head.weight"], before["value_head.weight"])
-    frozen = make_update(replace(PLAIN, lr=0.0, value_lr=0.0))
-    frozen.step(make_segments(LENGTHS))
-    assert all(torch.equal(p, before[k]) for k, p in frozen.adapter.copy().items())
-
-
 def test_gradients_of_policy_and_critic_are_each_clipped_to_their_norm():
     update = make_update(replace(PLAIN, grad_clip=0.01))
     metrics = update.step(make_segments(LENGTHS))
@@ -235,9 +194,6 @@ def test_gradients_of_policy_and_critic_are_each_clipped_to_their_norm():
             p.grad.norm() for k, p in named if k.startswith("value_head.") is mine and p.grad is not None
         ]
         assert torch.stack(grads).norm() == pytest.approx(0.01, rel=1e-3)
-
-
-# ---- what is not finite
 
 
 def nonfinite(seed: int = 0) -> list[Segment]:
@@ -253,7 +209,8 @@ def test_a_loss_that_is_not_finite_is_skipped_and_counted():
     assert metrics["skipped"] == 1 and not math.isfinite(metrics["loss"])
     assert all(torch.equal(p, before[k]) for k, p in update.adapter.copy().items())
     assert update.version == 1
-    assert update.step(make_segments(LENGTHS))["skipped"] == 1
+    metrics = update.step(make_segments(LENGTHS))
+    assert metrics["skipped"] == metrics["lag_mean"] == metrics["lag_max"] == 1
     after = update.adapter.copy()
     assert all(torch.isfinite(p).all() for p in after.values())
     assert not torch.equal(after["policy.weight"], before["policy.weight"])
@@ -275,21 +232,9 @@ def test_so_many_in_a_row_are_an_error_and_a_finite_one_between_starts_the_count
     update.step(make_segments(LENGTHS))
     for _ in range(MAX_NONFINITE - 1):
         update.step(nonfinite())
-    with pytest.raises(NonFiniteError, match="5 updates in a row"):
+    with pytest.raises(NonFiniteError, match="5 steps in a row"):
         update.step(nonfinite())
     assert update.skipped == 2 * MAX_NONFINITE - 1
-
-
-# ---- versions
-
-
-def test_the_version_counts_updates_and_the_lag_is_measured_before_the_step():
-    update = make_update()
-    for version in range(3):
-        assert update.version == version
-        metrics = update.step(make_segments((2, 2), version=0))
-        assert metrics["lag_mean"] == metrics["lag_max"] == version
-    assert update.version == 3
 
 
 def test_the_memory_of_advantages_by_hand():

@@ -7,11 +7,10 @@ not a module, because LeRobot's plugin loader looks for submodules.
 
 from __future__ import annotations
 
-import abc
 import dataclasses
 import functools
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import gymnasium as gym
 import numpy as np
@@ -42,14 +41,9 @@ class AccerlEnv(gym.Env):
         self.metadata = self.metadata | {"render_fps": spec.fps}
         self._max_episode_steps = config.max_steps  # LeRobot's rollout asks for it under this name
         images = {_camera(key): gym.spaces.Box(0, 255, size, np.uint8) for key, size in spec.images.items()}
-        self.observation_space = gym.spaces.Dict(
-            {
-                "pixels": gym.spaces.Dict(images),
-                "agent_pos": gym.spaces.Box(-np.inf, np.inf, (spec.state_dim,), np.float32),
-            }
-        )
+        state = gym.spaces.Box(-np.inf, np.inf, (spec.state_dim,), np.float32)
+        self.observation_space = gym.spaces.Dict({"pixels": gym.spaces.Dict(images), "agent_pos": state})
         self.action_space = gym.spaces.Box(spec.action_low, spec.action_high, dtype=np.float32)
-        self._last: dict[str, Any] = {}
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -57,15 +51,13 @@ class AccerlEnv(gym.Env):
         super().reset(seed=seed)
         if seed is None:
             seed = int(self.np_random.integers(2**32))
-        self._last = self._format(self._world.reset(seed, self.task))
-        return self._last, {"is_success": False}
+        return self._format(self._world.reset(seed, self.task)), {"is_success": False}
 
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         result = self._world.step_chunk(np.asarray(action, np.float32)[None])
-        if result.observation is not None:  # after a termination the last frame stands, as nobody acts on it
-            self._last = self._format(result.observation)
         info = {"is_success": result.success, **result.info}
-        return self._last, float(result.rewards[0]), result.terminated, result.truncated, info
+        observation = self._format(result.observation)
+        return observation, float(result.rewards[0]), result.terminated, result.truncated, info
 
     def render(self) -> np.ndarray:
         return self._world.render(VIDEO_SIZE, VIDEO_SIZE)
@@ -81,6 +73,8 @@ class AccerlEnv(gym.Env):
 @dataclass
 class AccerlEnvConfig(EnvConfig):
     """The fields that LeRobot needs of any world of ours."""
+
+    world: ClassVar[type[WorldConfig]]
 
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(default_factory=dict)
@@ -98,14 +92,13 @@ class AccerlEnvConfig(EnvConfig):
             self.features_map[name] = key
 
     @property
-    @abc.abstractmethod
     def world_config(self) -> WorldConfig:
-        """The world behind every environment made from this config."""
-
-    def _filled[T](self, world: type[T], **sections: Any) -> T:
-        """A config of ours with the fields that this one has too."""
-        names = (own.name for own in dataclasses.fields(world))  # type: ignore[arg-type]
-        return world(**{name: getattr(self, name) for name in names if hasattr(self, name)} | sections)
+        """The world behind every environment made from this config: its fields that this one has too."""
+        names = {own.name for own in dataclasses.fields(self.world)}
+        given = {name: value for name, value in vars(self).items() if name in names}
+        if "shift" in given:
+            given["shift"] = ShiftConfig(**given["shift"])
+        return self.world(**given)
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
@@ -115,15 +108,13 @@ class AccerlEnvConfig(EnvConfig):
         self, n_envs: int, use_async_envs: bool = False
     ) -> dict[str, dict[int, gym.vector.VectorEnv]]:
         """One vector environment per task, as ``{task: {0: vector}}``."""
-        config, vectors = self.world_config, {}
+        config, vectors, kind = self.world_config, {}, gym.vector.SyncVectorEnv
+        if use_async_envs and n_envs > 1:
+            kind = functools.partial(gym.vector.AsyncVectorEnv, context="forkserver")
         for task in make_world(config).spec.tasks:
             # A finished environment waits for its batch without simulating an episode nobody sees.
             make = freeze_after_episode_end(functools.partial(AccerlEnv, config, task))
-            if use_async_envs and n_envs > 1:
-                vector = gym.vector.AsyncVectorEnv([make] * n_envs, context="forkserver")
-            else:
-                vector = gym.vector.SyncVectorEnv([make] * n_envs)
-            vectors[task] = {0: vector}
+            vectors[task] = {0: kind([make] * n_envs)}
         return vectors
 
 
@@ -132,23 +123,23 @@ class AccerlEnvConfig(EnvConfig):
 class AccerlMetaWorldEnvConfig(AccerlEnvConfig):
     """`MetaWorldConfig` as LeRobot spells configs; see there for the meaning and range of each field."""
 
+    world = MetaWorldConfig
+
     task: str | None = "drawer-open-v3"
     fps: int = FPS
     camera: str = "corner2"
     image_size: int = 64
     max_steps: int = 500
-    lighting: Literal["cheap", "default"] = "cheap"
+    rendering: Literal["stock", "fast"] = "fast"
     shift: dict[str, Any] = field(default_factory=dict)
-
-    @property
-    def world_config(self) -> MetaWorldConfig:
-        return self._filled(MetaWorldConfig, shift=ShiftConfig(**self.shift))
 
 
 @EnvConfig.register_subclass("accerl_libero")
 @dataclass
 class AccerlLiberoEnvConfig(AccerlEnvConfig):
     """`LiberoConfig` as LeRobot spells configs; see there for the meaning and range of each field."""
+
+    world = LiberoConfig
 
     task: str | None = "libero_object"
     fps: int = LIBERO_FPS
@@ -157,10 +148,6 @@ class AccerlLiberoEnvConfig(AccerlEnvConfig):
     max_steps: int = 280
     rendering: Literal["stock", "fast"] = "stock"
     assets: str = ""
-
-    @property
-    def world_config(self) -> LiberoConfig:
-        return self._filled(LiberoConfig)
 
 
 def _camera(key: str) -> str:

@@ -53,29 +53,26 @@ class ParallelDecoder(nn.Module):
     def forward(self, images: list[Tensor], tokens: Tensor, mask: Tensor, state: Tensor | None) -> Tensor:
         """The queries' hidden states (B, K·A, width).
 
-        Args:
-            images: each (B, 3, H, W) in [-1, 1].
-            mask: bool (B, T), True where a token is no padding.
+        Images are (B, 3, H, W) in [-1, 1]; `mask`, bool (B, T), is True where a token is no padding.
         """
         parts = [self.vlm.connector(self.vlm.vision_model(pixel_values=i).last_hidden_state) for i in images]
         parts.append(self.vlm.text_model.get_input_embeddings()(tokens))
-        blocks = [0] * len(parts)
-        seen = sum(part.shape[1] for part in parts[:-1])
+        blocks, words = [0] * len(parts), len(parts) - 1
         if state is not None and self.state_proj is not None:
             parts.append(self.state_proj(state)[:, None])
             blocks.append(1)
         parts.append(self.queries.expand(len(tokens), -1, -1))
         blocks.append(2)
-        real = torch.ones(len(tokens), sum(p.shape[1] for p in parts), dtype=torch.bool, device=mask.device)
-        real[:, seen : seen + mask.shape[1]] = mask
+        real = [torch.ones_like(part[..., 0], dtype=torch.bool) for part in parts]
+        real[words] = mask
         sizes = torch.tensor([p.shape[1] for p in parts], device=mask.device)
         block = torch.tensor(blocks, device=mask.device).repeat_interleave(sizes)
         # Padding is seen by none but sees, so that no row of the softmax is empty.
-        attention = (block[None, :] <= block[:, None])[None, None] & real[:, None, None, :]
+        attention = (block[None, :] <= block[:, None])[None, None] & torch.cat(real, 1)[:, None, None]
         hidden: Tensor = self.vlm.text_model(
             inputs_embeds=torch.cat(parts, 1),
             attention_mask=attention,
-            position_ids=(real.long().cumsum(1) - 1).clamp(min=0),
+            position_ids=(torch.cat(real, 1).long().cumsum(1) - 1).clamp(min=0),
             use_cache=False,
         ).last_hidden_state
         return hidden[:, -len(self.queries) :]
@@ -88,11 +85,7 @@ class ParallelDecoder(nn.Module):
 
 
 class SmolVLABinsPolicy(PreTrainedPolicy):
-    """The policy as LeRobot knows it: greedy; a chunk is the centres of the most likely bins.
-
-    Args:
-        config: its config; `load_vlm_weights` is False afterwards.
-    """
+    """The policy as LeRobot knows it: greedy; a chunk is the centres of the most likely bins."""
 
     config_class = SmolVLABinsConfig
     name = "smolvla_bins"
@@ -136,9 +129,8 @@ class SmolVLABinsPolicy(PreTrainedPolicy):
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
         """Cross-entropy of the demonstrated bins, over rows that belong to the episode.
 
-        Args:
-            batch: preprocessed, with ``action`` (B, K, A) and ``action_is_pad`` (B, K).
-            reduction: mean, or none for one loss per sample.
+        `batch` is preprocessed, with ``action`` (B, K, A) and ``action_is_pad`` (B, K); ``reduction="none"``
+        gives one loss per sample.
         """
         actions = batch[ACTION]
         tokens = self.encode_actions(actions)
@@ -149,10 +141,7 @@ class SmolVLABinsPolicy(PreTrainedPolicy):
         weights = rows[..., None].expand_as(losses)
         each = (losses * weights).sum((1, 2)) / weights.sum((1, 2)).clamp(min=1)
         loss = each if reduction == "none" else (losses * weights).sum() / weights.sum().clamp(min=1)
-        with torch.no_grad():
-            distance = (self.decode_tokens(logits.argmax(-1)) - actions).abs()
-            l1 = (distance * weights).sum() / weights.sum().clamp(min=1)
-        return loss, {"loss": loss.mean().item(), "l1": l1.item()}
+        return loss, {"loss": loss.mean().item()}
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
