@@ -83,9 +83,7 @@ class LightInference:
 
 def _decision(request: Request, version: int) -> Decision:
     chunk = np.random.default_rng(request.noise_seed).uniform(-1, 1, (4, 2)).astype(np.float32)
-    return Decision(
-        chunk=chunk, latent={"x": chunk}, log_prob=np.zeros(4, np.float32), value=0.0, version=version
-    )
+    return Decision(chunk=chunk, latent={"x": chunk}, log_prob=np.zeros(4, np.float32), version=version)
 
 
 class FalteringRollout(RolloutWorker):

@@ -83,7 +83,7 @@ def imagining(
         checkpoint,
         env=ENV,
         imagination=adjusted(ImaginationConfig, **constants)(**(fields | config)),
-        rollout=RolloutConfig(worlds=4, segment_length=4, episodes=episodes, time_limit="fail"),
+        rollout=RolloutConfig(worlds=4, segment_length=4, episodes=episodes),
         trainer=TrainerConfig(updates=12, batch_decisions=16, warmup_updates=2, value_warmup_updates=2),
         **(sections or {}),
     )

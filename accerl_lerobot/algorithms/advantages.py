@@ -6,9 +6,8 @@
     R_t = Â_t + V_t
 
 r_t is the reward summed over a whole chunk, so γ and λ are per decision. What follows the last decision of
-a segment: nothing if the episode *terminated* (bootstrap 0); V of the observation after it if time ran out
-(*truncated*) or the segment was cut in mid-episode. Treating a truncation as a termination would teach the
-critic that time limits are deaths.
+a segment: nothing if the episode *terminated* (bootstrap 0), by its time limit too; V of the observation
+after it if the segment was cut in mid-episode.
 
 `values` and `bootstrap_value` must come from the critic of now: those stored with a sample are stale by its
 lag.
@@ -48,7 +47,7 @@ def gae(
         rewards: (S, T), summed over each chunk. Padding may hold anything, NaN included; so may `values`.
         values: (S, T), V of the observation before each decision.
         bootstrap_value: (S,), V of the observation after the last decision; ignored where `terminated`.
-        terminated: bool (S,), the episode is over. False for truncated and for cut segments.
+        terminated: bool (S,), the episode is over. False for segments cut in mid-episode.
         lengths: int (S,), 1 to T.
         lam: λ per decision.
 

@@ -180,7 +180,6 @@ class RunConfig(Section):
             ("replay.samples_per_insert", self.replay.samples_per_insert, 1.0, "draws from its own memory"),
             ("trainer.ranks", self.trainer.ranks, 1, "is learnt by one process"),
             ("imagination.share", self.imagination.share, 0.0, "learns from real episodes only"),
-            ("rollout.time_limit", self.rollout.time_limit, "fail", "sees the time that is left"),
         ):
             if value != wanted:
                 raise InputError(name, value, f"{only} {why}; use {wanted}")

@@ -69,7 +69,6 @@ def make_imagination(config: RunConfig, on_segment: Callable[[Segment], object])
         config.imagination,
         on_segment,
         decision_cost=config.rollout.decision_cost,
-        time_limit_fails=config.rollout.time_limit == "fail",
         seed=config.seed,
     )
 

@@ -268,14 +268,13 @@ class LeRobotAdapter(PolicyAdapter):
         if self.teacher is not None:
             executed = self.teacher.replace(executed, requests)
         chunk = self.processing.unnormalise(executed).cpu().numpy()
-        value, log_prob = self._value(encoded).cpu().numpy(), action.log_prob.float().cpu().numpy()
+        log_prob = action.log_prob.float().cpu().numpy()
         latents = {k: v.cpu().numpy() for k, v in action.latent.items()}
         return [
             Decision(
                 chunk=chunk[i],
                 latent={k: v[i] for k, v in latents.items()},
                 log_prob=log_prob[i],
-                value=float(value[i]),
                 version=version,
             )
             for i in range(len(requests))

@@ -66,7 +66,7 @@ class Journal:
             "steps": segment.steps.tolist(),
             "versions": segment.version.tolist(),
             "rewards": segment.reward.tolist(),
-            "ended": segment.terminated or segment.truncated,
+            "ended": segment.terminated,
             "success": segment.success,
             "action_dim": segment.actions.shape[-1],
             "actions": base64.b64encode(actions.astype("<f4").tobytes()).decode(),

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -61,10 +61,6 @@ class RolloutConfig(Section, section="rollout"):
     """Largest number of decisions in a segment."""
     decision_cost: NonNegative = 0.01
     """Subtracted from the reward of every decision, so that faster is better."""
-    time_limit: Literal["truncate", "fail"] = "fail"
-    """How the learner treats the end of an episode by its time limit. fail: like a termination, the return
-    ends there. truncate: V of the last observation stands for what would have followed, as in tasks without
-    an end; where success is counted within a limit, failures then go unpunished."""
     episodes: Steps = 0
     """Exploring episodes in all; 0: as many as the updates need. Once they are played, learning goes on while
     replay has something to give, which is little unless more is imagined, and then ends.
@@ -299,15 +295,13 @@ class RolloutRunner:
         return SegmentBuilder(observation, self.config.segment_length, origin)
 
     def _emit(self, episode: ActiveEpisode, result: ChunkResult) -> None:
-        failed = result.truncated and self.config.time_limit == "fail"
-        terminated, truncated = result.terminated or failed, result.truncated and not failed
         totals: dict[str, float] = {}
-        if terminated or truncated:
+        if result.done:
             totals = {"return": episode.episode_return, "steps": episode.steps}
             totals |= {"decisions": episode.decisions, "success": float(result.success)}
         self._sequence += 1
         key = f"{self.name}.{self._sequence}"
-        segment = episode.builder.cut(key, terminated, truncated, result.success, totals)
+        segment = episode.builder.cut(key, result.done, result.success, totals)
         if episode.plan.explore:
             self._on_segment(segment)
 

@@ -67,8 +67,7 @@ class OffPolicyUpdate:
             for demonstration in self.adapter.demonstrations(segments[0]):
                 self.remember(demonstration)
         for segment in segments:
-            if not segment.truncated:  # the simulator diverged: nothing follows, and nothing failed
-                self.remember(segment)
+            self.remember(segment)
         metrics = {"decisions": float(sum(map(len, segments))), "memory_decisions": float(len(self.memory))}
         rewards = np.concatenate([segment.reward for segment in segments])
         metrics |= {"reward_mean": float(rewards.mean())}

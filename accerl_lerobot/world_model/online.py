@@ -178,7 +178,7 @@ class OnlineLearner:
         begun = sorted(parts)
         ordered = [parts[decision] for decision in begun]
         ends = list(accumulate(map(len, ordered)))
-        if begun != [0, *ends[:-1]] or not (ordered[-1].terminated or ordered[-1].truncated):
+        if begun != [0, *ends[:-1]] or not ordered[-1].terminated:
             return None
         self._unfinished.pop(name, None)
         return ordered

@@ -51,15 +51,9 @@ class CountingAdapter:
             for name in NAMES:
                 read.append(self.weights[name])
                 time.sleep(self.delay)
-            answers.append(
-                Decision(
-                    chunk=np.array([read]),
-                    latent={},
-                    log_prob=np.zeros(1, np.float32),
-                    value=float(request.noise_seed),
-                    version=version,
-                )
-            )
+            latent = {"seed": np.array(request.noise_seed)}
+            zero = np.zeros(1, np.float32)
+            answers.append(Decision(chunk=np.array([read]), latent=latent, log_prob=zero, version=version))
         self._leave()
         return answers
 
@@ -133,7 +127,7 @@ def test_answers_go_to_those_who_asked_in_their_order(play):
     async def scene(worker, adapter):
         seeds = [[1, 2, 3], [4], [5, 6], [7, 8], [9]]
         answers = await asyncio.gather(*(worker.decide(requests(*some)) for some in seeds))
-        assert [[int(d.value) for d in some] for some in answers] == seeds
+        assert [[int(d.latent["seed"]) for d in some] for some in answers] == seeds
 
     play(scene, max_batch=4, max_wait_s=0.01)
 
@@ -267,8 +261,8 @@ def test_a_caller_who_gave_up_does_not_disturb_the_others(play):
         quitter.cancel()
         await asyncio.gather(quitter, return_exceptions=True)
         adapter.gate.set()
-        assert (await patient)[0].value == 1.0
-        assert (await worker.decide(requests(2)))[0].value == 2.0
+        assert (await patient)[0].latent["seed"] == 1
+        assert (await worker.decide(requests(2)))[0].latent["seed"] == 2
 
     play(scene, adapter, max_batch=2, max_wait_s=1.0)
 

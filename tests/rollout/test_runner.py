@@ -13,7 +13,7 @@ from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutConfig
 from tests.rollout.worlds import CHUNK, Recorder, ScriptedWorld, evaluate, explore
 
-CONFIG = RolloutConfig(worlds=1, segment_length=3, decision_cost=0.0, time_limit="truncate")
+CONFIG = RolloutConfig(worlds=1, segment_length=3, decision_cost=0.0)
 
 
 def steps_seen(segment) -> list[float]:
@@ -30,28 +30,15 @@ def test_an_episode_is_cut_into_segments_without_a_gap():
         assert segment.latent["x"][:, 0].tolist() == steps_seen(segment)[:-1]
 
 
-@pytest.mark.parametrize(
-    ("end", "terminated", "truncated", "success"),
-    [("success", True, False, True), ("failure", True, False, False), ("limit", False, True, False)],
-)
-def test_the_last_segment_says_how_the_episode_ended(end, terminated, truncated, success):
+@pytest.mark.parametrize(("end", "success"), [("success", True), ("failure", False), ("limit", False)])
+def test_the_last_segment_says_how_the_episode_ended(end, success):
     recorder = Recorder([ScriptedWorld(steps=8, end=end)], [explore()], CONFIG)
     recorder.play()
     cut, last = recorder.segments
-    assert (cut.terminated, cut.truncated, cut.success) == (False, False, False)
-    assert (last.terminated, last.truncated, last.success) == (terminated, truncated, success)
+    assert (cut.terminated, cut.success) == (False, False)
+    assert (last.terminated, last.success) == (True, success)
     assert steps_seen(last) == [6, 8]
-
-
-def test_a_time_limit_may_count_as_a_failure():
-    """The return ends there, so the learner sees a termination; the episode itself is reported as before."""
-    config = replace(CONFIG, time_limit="fail")
-    recorder = Recorder([ScriptedWorld(steps=8, end="limit")], [explore()], config)
-    recorder.play()
-    cut, last = recorder.segments
-    assert (cut.terminated, cut.truncated) == (False, False)
-    assert (last.terminated, last.truncated, last.success) == (True, False, False)
-    assert last.episode["decisions"] == 4 and not recorder.results[0].success
+    assert last.episode["decisions"] == 4 and recorder.results[0].success is success
 
 
 def test_an_episode_that_ends_within_a_chunk_counts_the_steps_that_were_made():
@@ -94,7 +81,7 @@ def test_results_name_the_oldest_and_the_newest_weights():
         assert request is not None
         chunk = np.zeros((CHUNK, 1), np.float32)
         empty = np.zeros(1, np.float32)
-        decision = Decision(chunk=chunk, latent={"x": empty}, log_prob=empty, value=0.0, version=version)
+        decision = Decision(chunk=chunk, latent={"x": empty}, log_prob=empty, version=version)
         request = recorder.runner.advance(0, decision)
     assert recorder.results[0].versions == (3, 5)
     assert recorder.segments[0].version.tolist() == [4, 3, 5]
@@ -180,7 +167,7 @@ def simulated_episode(film: bool, seed: int, tolerance: float) -> EpisodeResult:
         target = np.asarray(request.observation["observation.state"])[:2]
         chunk = target + np.random.default_rng(request.noise_seed).normal(0, 1.0, (7, 2))
         decision = Decision(
-            chunk=chunk.astype(np.float32), latent={}, log_prob=np.zeros(1, np.float32), value=0.0, version=1
+            chunk=chunk.astype(np.float32), latent={}, log_prob=np.zeros(1, np.float32), version=1
         )
         request = recorder.runner.advance(0, decision)
     return recorder.results[0]

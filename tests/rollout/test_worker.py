@@ -107,7 +107,7 @@ class Stage:
 
 def a_decision(request: Request | None = None) -> Decision:
     zeros = np.zeros((4, 2), np.float32)
-    return Decision(chunk=zeros, latent={"x": zeros}, log_prob=np.zeros(4, np.float32), value=0.0, version=0)
+    return Decision(chunk=zeros, latent={"x": zeros}, log_prob=np.zeros(4, np.float32), version=0)
 
 
 def drawn(request: Request) -> Decision:

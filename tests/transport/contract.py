@@ -90,9 +90,7 @@ def messages() -> list[Any]:
         "task": "öffne 🚪",
     }
     chunk = draw.normal(size=(4, 2)).astype(np.float32)
-    decision = Decision(
-        chunk=chunk, latent={"x": chunk}, log_prob=chunk[0], value=float("nan"), version=2**40
-    )
+    decision = Decision(chunk=chunk, latent={"x": chunk}, log_prob=chunk[0], version=2**40)
     return [
         arrays,
         [Request(observation=observation, noise_seed=2**63 + 5), Request(observation={}, noise_seed=0)],
