@@ -96,7 +96,7 @@ def messages() -> list[Any]:
         [Request(observation=observation, noise_seed=2**63 + 5), Request(observation={}, noise_seed=0)],
         [decision],
         [make_segment("a", 3), make_segment("b", 2, episode={"return": 1.0})],
-        [True, None, 1, -0.0, float("inf"), "", (1, [2, {}]), np.float32(1.5), np.int64(-3)],
+        [True, None, 1, -0.0, float("inf"), "", (1, [2, {3: {}}])],
     ]
 
 
