@@ -20,7 +20,7 @@ from accerl_lerobot.engine.config import LaunchConfig, RunConfig
 from accerl_lerobot.engine.loop import Progress
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import evaluation_plans
-from accerl_lerobot.inference.batcher import dealt, merge_metrics
+from accerl_lerobot.inference.batcher import merge_metrics
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.replay.pacing import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, ReplayConfig, Turns
 from accerl_lerobot.rollout.runner import RolloutConfig
@@ -259,7 +259,6 @@ def test_what_services_say_merge_metrics():
     assert found["wait_mean_s"] == pytest.approx((0.1 * 6 + 0.3 * 4) / 10)
     assert (found["wait_max_s"], found["version"], found["busy_share"]) == (0.5, 6.0, pytest.approx(0.4))
     assert merge_metrics([one]) == one and merge_metrics([]) == {}
-    assert dealt(5, 2) == [3, 2] and dealt(2, 2) == [1, 1]
 
 
 def test_services_without_callers_are_refused():

@@ -86,7 +86,7 @@ class LocalEngine(Engine):
         self._outbox: deque[Segment] = deque()
         count = config.rollout.worlds * config.rollout.workers
         worlds = [make_world(config.env, history, config.rollout.reward_model) for _ in range(count)]
-        self._plans = EpisodePlans(tasks, seed=config.seed, budget=config.rollout.episodes or None)
+        self._plans = EpisodePlans(tasks, config.seed, config.rollout.episodes or None)
         self._runner = RolloutRunner(
             worlds,
             lambda: self._plans.next(self._exploring),

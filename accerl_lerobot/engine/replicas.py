@@ -345,14 +345,14 @@ class RolloutWorkers(Replicas[RolloutSlot]):
             worker.assign(was["outstanding"])
 
     def _new(self, worker: RolloutSlot) -> Any:
-        from accerl_lerobot.rollout.worker import RolloutWorker, WorkerShare
+        from accerl_lerobot.rollout.worker import RolloutWorker
 
         c, place = self._config, self._plan.places[worker.name]
         actor = ray.remote(RolloutWorker).options(**actor_options(place), max_concurrency=4, **NO_HUB_TOKEN)
         # A node that does not see the run's folder would write a timeline that nobody finds.
         timeline = None if place.node.unseen else timeline_folder(c)
-        share = WorkerShare(worker.index, worker.incarnation, worker.budget)
-        return actor.remote(c.env, c.rollout, self._tasks, c.seed, share, self._history, timeline)
+        place_in_run = (worker.index, worker.incarnation, worker.budget, self._history)
+        return actor.remote(c.env, c.rollout, self._tasks, c.seed, *place_in_run, timeline)
 
     def _restart(self, worker: RolloutSlot, error: Exception) -> None:
         if not self._relocate(worker, error):  # that its node has left is not the worker's fault

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from accerl_lerobot.algorithms import RatioConfig
 from accerl_lerobot.errors import InputError, expanded
-from accerl_lerobot.replay.pacing import decisions_under_way, lag_bound
+from accerl_lerobot.replay.pacing import lag_bound
 
 if TYPE_CHECKING:
     from accerl_lerobot.engine.config import RunConfig
@@ -140,8 +140,5 @@ def lag_limits(config: RunConfig) -> tuple[int, int]:
 
 
 def under_way(config: RunConfig) -> int:
-    """Decisions on their way to replay."""
-    rollout = config.rollout
-    return decisions_under_way(
-        workers=rollout.workers, worlds=rollout.worlds, segment_length=rollout.segment_length
-    )
+    """Decisions that environments of equal speed make while a segment is on its way to replay."""
+    return config.rollout.workers * config.rollout.worlds * config.rollout.segment_length

@@ -35,11 +35,9 @@ class Done:
     actions: np.ndarray
     """float32 (env steps, A), as they were executed, one after the other."""
     steps: tuple[int, ...]
-    """Env steps of each decision."""
+    """Of each decision; so are `versions` and `rewards`, of which its cost is taken off."""
     versions: tuple[int, ...]
-    """Versions of the weights behind each decision."""
     rewards: tuple[float, ...]
-    """Rewards of each decision, its cost taken off."""
     ended: bool
     """True if the episode ended with it."""
     success: bool

@@ -37,12 +37,10 @@ IN_TRANSIT = 1024
 
 
 class News(NamedTuple):
-    """Answer to workers that imagine."""
+    """Answer to workers that imagine: real segments, and the cursor to ask with the next time."""
 
     segments: list[Segment]
-    """Real ones that have come since."""
     cursor: int
-    """To ask with the next time."""
     ended: bool
     """No more will come."""
     closed: bool
@@ -104,8 +102,7 @@ class ReplayWorker:
     async def insert(self, segments: list[Segment]) -> bool:
         """Stores segments of one source once the pace allows it; returns when more may be collected.
 
-        Returns:
-            False when the run is over and they were not stored.
+        False when the run is over and they were not stored.
 
         Raises:
             ServiceStoppedError: storing has failed, now or before; `run` says why.
@@ -140,14 +137,11 @@ class ReplayWorker:
         def ended() -> bool:
             return self._closed or self._replay.exhausted(num_decisions)
 
-        def ready() -> bool:
-            return self._replay.may_sample(num_decisions)
-
         started = time.monotonic()
         self._batch = num_decisions
         async with self._changed:
             while True:
-                await self._changed.wait_for(lambda: ended() or (self._turns.may_draw() and ready()))
+                await self._changed.wait_for(lambda: ended() or (self._turns.may_draw() and self._ready))
                 if ended():
                     return []
                 self._clock.enter(COMPUTE)
@@ -163,7 +157,7 @@ class ReplayWorker:
 
     @asynccontextmanager
     async def _changing(self) -> AsyncIterator[None]:
-        """Lets everybody who waits look again at what is changed inside."""
+        """Has everybody who waits look again."""
         async with self._changed:
             yield
             self._changed.notify_all()
@@ -203,11 +197,8 @@ class ReplayWorker:
         """Writes its part of ``training_state``, as it was when the trainer had made `version` updates."""
         self._clock.enter(CHECKPOINT)
         fault_point("replay.save")
-        state = {
-            "replay": self._replay.state(version),
-            "rng": copy.deepcopy(self._rng),
-            "real_count": self._real_count,
-        }
+        replay, rng = self._replay.state(version), copy.deepcopy(self._rng)
+        state = {"replay": replay, "rng": rng, "real_count": self._real_count}
         self._clock.enter(WAIT_IN)
         await asyncio.to_thread(snapshot.save, directory / "replay", state)
 

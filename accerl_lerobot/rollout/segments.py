@@ -23,7 +23,7 @@ class SegmentBuilder:
 
     @property
     def latest(self) -> Observation:
-        """The observation the next decision is about."""
+        """The observation that the next decision is about."""
         return self.observations[-1]
 
     @property
@@ -31,11 +31,9 @@ class SegmentBuilder:
         return len(self.decisions) >= self.length
 
     def state(self) -> dict[str, Any]:
-        """All that `restore` needs; see `snapshot`."""
         return dict(vars(self))
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Goes on from what `state` gave."""
         vars(self).update(state)
 
     def add(

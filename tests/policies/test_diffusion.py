@@ -26,7 +26,7 @@ from accerl_lerobot.policies.diffusion import DiffusionFamily, DiffusionShape, S
 from accerl_lerobot.policies.family import Action, standard_normal
 from accerl_lerobot.policies.loading import load_adapter
 from accerl_lerobot.rollout.runner import RolloutConfig
-from accerl_lerobot.rollout.worker import RolloutWorker, WorkerShare
+from accerl_lerobot.rollout.worker import RolloutWorker
 from accerl_lerobot.trainer.config import TrainerConfig
 from tests.policies.checkpoints import edit_config, write_diffusion
 from tests.policies.tiny import adapter_at, deviation, requests
@@ -276,7 +276,7 @@ def test_a_world_without_a_history_is_refused_in_words(looking: Path):
 
 
 def test_a_rollout_process_asks_with_the_history():
-    worker = RolloutWorker(WORLD, RolloutConfig(worlds=1), ("match",), 0, WorkerShare(0), OBSERVED)
+    worker = RolloutWorker(WORLD, RolloutConfig(worlds=1), ("match",), 0, history=OBSERVED)
     asked: list[Request] = []
 
     def decide(due: list[Request]) -> list[Request]:

