@@ -222,7 +222,7 @@ class RayEngine(Engine):
 
     def _start(self) -> None:
         from accerl_lerobot.replay.worker import ReplayWorker
-        from accerl_lerobot.trainer.peers import LearnerSettings, TrainerRank
+        from accerl_lerobot.trainer.peers import SHARE, LearnerSettings, TrainerRank
         from accerl_lerobot.trainer.worker import TrainerWorker
 
         c, timeline = self._config, timeline_folder(self._config)
@@ -233,7 +233,8 @@ class RayEngine(Engine):
             return ray.remote(kind).options(**options).remote(*arguments)
 
         # The ranks first: Ray fills the GPU that is fullest, and each of them needs more than half of one.
-        learner = LearnerSettings(c.policy, c.algorithm, c.trainer, c.seed, self._state, self._load)
+        wait_s = SHARE * self._limit
+        learner = LearnerSettings(c.policy, c.algorithm, c.trainer, c.seed, self._state, self._load, wait_s)
         names = [f"trainer rank {rank}" for rank in range(1, c.trainer.ranks)]
         ranks = [make(name, TrainerRank, 1, rank, learner) for rank, name in enumerate(names, start=1)]
         trainer = make("trainer", TrainerWorker, 4, learner, timeline, ranks, journal_folder(c))
