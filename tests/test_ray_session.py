@@ -19,7 +19,7 @@ import pytest
 
 from accerl_lerobot.engine import ray_session
 from accerl_lerobot.engine.config import LaunchConfig
-from accerl_lerobot.engine.ray_session import RaySession, RayWatch, process_kind
+from accerl_lerobot.engine.ray_session import RaySession, process_kind
 from accerl_lerobot.engine.stopping import WorkerError
 from accerl_lerobot.errors import InputError
 from tests.light_workers import light_ray
@@ -358,15 +358,16 @@ def test_a_process_of_ray_that_is_lost_is_named_and_a_new_ray_is_started(
 
 
 def test_who_goes_on_is_not_taken_for_stopped(raylet: psutil.Process):
-    watch = RayWatch(stall_s=3600.0)
+    own = RaySession(LaunchConfig(stall_s=3600.0))
+    own.watch()
     raylet.suspend()
     while raylet.status() != psutil.STATUS_STOPPED:
         time.sleep(0.01)
-    assert not watch.look() and watch._stopped
+    assert not own.lost and own._stopped
     raylet.resume()
-    while watch._stopped:
-        assert not watch.look()
-    watch.close()
+    while own._stopped:
+        assert not own.lost
+    own.close()
 
 
 HANGS = """
@@ -374,12 +375,13 @@ import os, signal, sys, time
 import psutil
 from accerl_lerobot import guardian
 from accerl_lerobot.engine import ray_session
+from accerl_lerobot.engine.config import LaunchConfig
 gcs_server = psutil.Process(int(sys.argv[1]))
 ray_session.ray_processes = lambda: {gcs_server: "gcs_server"}
 ray_session.kill_ray = lambda processes: None
 ray_session.GIVE_UP_S = 0.1
 guardian.explain(remedy="to resume: accerl train --resume=true")
-ray_session.RayWatch(300.0)
+ray_session.RaySession(LaunchConfig()).watch()
 os.kill(int(sys.argv[1]), signal.SIGKILL)
 time.sleep(600)
 """

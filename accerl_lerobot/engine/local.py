@@ -20,7 +20,7 @@ import numpy as np
 
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import PRETRAINED, TRAINING_STATE, WEIGHTS, WORLD_MODEL
-from accerl_lerobot.engine.config import RunConfig, journal_folder, timeline_folder
+from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.loop import Engine, Progress, Saved, check_new, episode_key
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.errors import InputError
@@ -52,7 +52,7 @@ class LocalEngine(Engine):
         state: Path | None = None,
         load: Load | None = None,
     ) -> None:
-        self._clock = open_clock(timeline_folder(config), LOCAL)
+        self._clock = open_clock(config.timeline_folder, LOCAL)
         import torch
 
         from accerl_lerobot.trainer.update import make_update
@@ -68,7 +68,7 @@ class LocalEngine(Engine):
             self._acting = loader(load)(config.policy)
             self._acting.load_trainable(self._adapter.export_trainable())
         imagination = config.imagination
-        folder, counted = journal_folder(config), config.rollout.episodes > 0
+        folder, counted = config.folder, config.rollout.episodes > 0
         journal = None if folder is None else Journal(folder / EPISODES)
         imagined = imagination.imagined_replay(config.replay)
         self._replay = MixedReplay(config.replay, imagined, imagination.share, counted, journal)
@@ -120,7 +120,7 @@ class LocalEngine(Engine):
         if self._exploring and self._replay.may_sample(n):
             segments = self._replay.sample(n, self._update.version, self._rng)
             if segments:
-                with keeping(journal_folder(self._config), self._update, segments):
+                with keeping(self._config.folder, self._update, segments):
                     updates.append(self._update.step(segments) | {"update": float(self._update.version)})
                 self._publish()
         self._clock.enter(WAIT_IN)

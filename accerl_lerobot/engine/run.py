@@ -42,7 +42,7 @@ from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.record import REPO_ID, record_demos
 from accerl_lerobot.engine import ray_session, resuming
-from accerl_lerobot.engine.config import RunConfig, encode, parse, timeline_folder
+from accerl_lerobot.engine.config import RunConfig, encode, parse
 from accerl_lerobot.engine.loop import Engine, Loop, Times, run_plans
 from accerl_lerobot.engine.preflight import check_placement, check_policy, check_start, check_world
 from accerl_lerobot.engine.sizes import check_memory
@@ -239,7 +239,7 @@ def execute(
     times = Times(started=started, warm_s=time.monotonic() - started, before_s=before_s)
     with contextlib.ExitStack() as stack:  # flushes the log, whatever fails
         stop = stack.enter_context(Stopping())
-        times.clock = stack.enter_context(contextlib.closing(open_clock(timeline_folder(config), "driver")))
+        times.clock = stack.enter_context(contextlib.closing(open_clock(config.timeline_folder, "driver")))
         log = stack.enter_context(contextlib.closing(MetricsLog(directory, config.wandb, encode(config))))
         session = None
         if config.launch.engine != "local":
