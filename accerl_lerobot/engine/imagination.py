@@ -51,41 +51,30 @@ LEARN = "imagination.learn."
 """Prefix of the config sections of datasets."""
 MAX_PENDING = 2
 """Messages to replay that may be pending before imagination pauses."""
-PAUSE_S = 0.02
-"""Sleep of a worker with nothing to do."""
+PAUSE_S, POLL_S = 0.02, 0.2
+"""Sleep of a worker with nothing to do, and interval at which replay is asked for new real segments."""
 SWAP_S = 30.0
 """Largest wait of a checkpoint for a promoted model to be taken over."""
-POLL_S = 0.2
-"""Interval at which replay is asked for new real segments."""
 
 
 def make_imagination(config: RunConfig, on_segment: Callable[[Segment], object]) -> Imagination:
     """Builds the imagination of a run; its ``policy.path`` must be set."""
     world, model, success = _load(config, load_lerobot_config(config.policy))
-    return Imagination(
-        model,
-        success,
-        world,
-        config.imagination,
-        on_segment,
-        decision_cost=config.rollout.decision_cost,
-        seed=config.seed,
-    )
+    cost, seed = config.rollout.decision_cost, config.seed
+    return Imagination(model, success, world, config.imagination, on_segment, decision_cost=cost, seed=seed)
 
 
 def make_learner(config: RunConfig) -> OnlineLearner:
     """Builds the learner of a run's world model, which starts at the saved one."""
     world, model, success = _load(config, load_lerobot_config(config.policy))
     assert success is not None  # only an oracle has none
-    roles = load_roles(Path(str(config.imagination.path)), IMAGINATION)
-    loaded = load_datasets(named_datasets(config.imagination.learn, LEARN), model.spec)
+    learn, roles = config.imagination.learn, load_roles(Path(str(config.imagination.path)), IMAGINATION)
     offline: list[Episode] = []
     held_out: list[Episode] = []
-    for episode in chain(*loaded.values()):
+    for episode in chain(*load_datasets(named_datasets(learn, LEARN), model.spec).values()):
         (offline if roles.get(episode.key, LEARNT) == LEARNT else held_out).append(episode)
     longest = _longest(world, model.spec.chunk)
-    settings = (config.imagination.learn, offline, held_out, roles, longest, config.seed)
-    return OnlineLearner(learned_part(model), success, *settings)
+    return OnlineLearner(learned_part(model), success, learn, offline, held_out, roles, longest, config.seed)
 
 
 def check_imagination(config: RunConfig) -> None:
@@ -98,10 +87,10 @@ def check_imagination(config: RunConfig) -> None:
 def _load(
     config: RunConfig, policy: Any, *, first: bool = False
 ) -> tuple[WorldSpec, WorldModel, SuccessPairsRewardModel | None]:
-    """The environment, and the models for it, which are checked to fit it and the policy.
+    """The environment, and the models for it, which are checked to fit it and LeRobot's config of the policy.
 
-    `policy` is LeRobot's config. If nobody has loaded the files before (`first`), a child process does so
-    first, see `isolation`. An oracle has no success model.
+    If nobody has loaded the files before (`first`), a child process does so first, see `isolation`. An oracle
+    has no success model.
     """
     imagination, executed = config.imagination, getattr(policy, "n_action_steps", 1)
     for name, wanted in (("reward", "success"), ("terminate_on_success", True)):
@@ -130,9 +119,8 @@ def _load(
 
 
 def check_fit(spec: WorldModelSpec, world: WorldSpec, executed: int, history: int) -> None:
-    """Refuses a world model that does not fit environment and policy, before a run begins.
-
-    The policy executes so many actions per decision, and its observations hold `history` env steps.
+    """Refuses a world model that does not fit environment and policy, which executes so many actions per
+    decision and sees `history` env steps.
     """
     field, again = f"{IMAGINATION}.path", "train one of this world"
     if missing := [camera for camera in world.images if camera not in spec.cameras]:
@@ -180,8 +168,7 @@ class _Worker:
         torch.manual_seed(config.seed)
         self._limit, self._cursor = config.launch.stall_s, 0
         self._core = self._make(config)
-        self._changing = threading.Lock()
-        """Held while the core changes, but not during a validation, which is of a copy."""
+        self._changing = threading.Lock()  # held while the core changes; a validation is of a copy
         if state is not None:
             saved = snapshot.load(state / self.state_name)
             self._core.restore(saved["core"])
@@ -192,7 +179,7 @@ class _Worker:
         raise NotImplementedError
 
     def ready(self) -> int:
-        """Returns this process's id once the models are loaded."""
+        """This process's id, once the models are loaded."""
         return os.getpid()
 
     def metrics(self) -> dict[str, float]:
@@ -269,12 +256,11 @@ class ImaginationWorker(_Worker):
             segments = news.fresh()
             self._clock.enter(CHECKPOINT)
             with self._changing:
-                self._clock.enter(COMPUTE)
                 may_promote = self._may_promote  # first: the last model comes before the word that it is
                 if self._promoted:
                     self._clock.enter(WEIGHT_SYNC)
                     self._core.swap(self._promoted.pop())
-                    self._clock.enter(COMPUTE)
+                self._clock.enter(COMPUTE)
                 for segment in segments:
                     self._core.remember(segment)
                 self._cursor = news.cursor
@@ -321,8 +307,7 @@ class WorldLearningWorker(_Worker):
     def run(self, imaginer: Any, replay: Any) -> None:
         """Trains until replay is closed."""
         news, learner = _News(replay, self._cursor), self._core
-        may_promote: bool | None = None
-        hold: bool | None = None  # as last reported
+        held = expected = None  # as last reported
         while not news.closed:
             self._clock.enter(TRANSPORT)
             segments = news.fresh()
@@ -331,12 +316,11 @@ class WorldLearningWorker(_Worker):
                     learner.add(segment)
                 self._cursor = news.cursor
             last = news.ended
-            due = learner.validation_due(last=False) and not last
-            if hold is not due:
-                hold = due
+            if held is not (hold := learner.validation_due(last=False) and not last):
+                held = hold
                 _await(replay.hold.remote(hold))
-            if may_promote is not learner.may_promote(last):
-                may_promote = learner.may_promote(last)
+            if expected is not (may_promote := learner.may_promote(last)):
+                expected = may_promote
                 _await(imaginer.expect.remote(may_promote))
             if learner.pending_steps >= 1:
                 self._clock.enter(CHECKPOINT)

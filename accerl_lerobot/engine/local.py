@@ -68,9 +68,8 @@ class LocalEngine(Engine):
             self._acting = loader(load)(config.policy)
             self._acting.load_trainable(self._adapter.export_trainable())
         imagination = config.imagination
-        folder, counted = config.folder, config.rollout.episodes > 0
-        journal = None if folder is None else Journal(folder / EPISODES)
-        imagined = imagination.imagined_replay(config.replay)
+        journal = None if config.folder is None else Journal(config.folder / EPISODES)
+        imagined, counted = imagination.imagined_replay(config.replay), config.rollout.episodes > 0
         self._replay = MixedReplay(config.replay, imagined, imagination.share, counted, journal)
         self._imagination = self._world_learner = None
         if imagination.share:
@@ -166,9 +165,8 @@ class LocalEngine(Engine):
 
     def _restore(self, directory: Path) -> None:
         if not (directory / f"{LOCAL}.json").is_file():
-            raise InputError(
-                "launch.engine", "local", "this run was asynchronous; resume it with launch.engine=ray"
-            )
+            remedy = "this run was asynchronous; resume it with launch.engine=ray"
+            raise InputError("launch.engine", "local", remedy)
         self._adapter.load_trainable(snapshot.load(directory / WEIGHTS))
         self._update.restore(snapshot.load(directory / "trainer"))
         self._replay.restore(snapshot.load(directory / "replay"))
@@ -182,8 +180,8 @@ class LocalEngine(Engine):
         self._outbox.extend(engine["outbox"])
         self._plans.restore(engine["plans"])
         self._runner.restore(engine["runner"])
-        requests = ((slot, self._runner.request(slot)) for slot in range(len(self._runner)))
-        self._due = {slot: request for slot, request in requests if request is not None}
+        slots = range(len(self._runner))
+        self._due = {slot: request for slot in slots if (request := self._runner.request(slot))}
         if self._imagination is not None:
             imagined = snapshot.load(directory / IMAGINATION)
             self._imagination.restore(imagined["imagination"])
@@ -213,8 +211,7 @@ class LocalEngine(Engine):
             request = self._due.get(slot)
             if request is None or (request.explore and not self._exploring):
                 self._due.pop(slot, None)
-                fresh = self._runner.start(slot)
-                if fresh is not None:
+                if (fresh := self._runner.start(slot)) is not None:
                     self._due[slot] = fresh
         may_explore = self._replay.may_insert()
         slots = [s for s, r in self._due.items() if may_explore or not r.explore]
@@ -222,8 +219,7 @@ class LocalEngine(Engine):
             return
         decisions = self._acting.decide([self._due[s] for s in slots], self._acting_version)
         for slot, decision in zip(slots, decisions, strict=True):
-            request = self._runner.advance(slot, decision)
-            if request is None:
+            if (request := self._runner.advance(slot, decision)) is None:
                 del self._due[slot]
             else:
                 self._due[slot] = request

@@ -63,8 +63,7 @@ def check_world(env: EnvConfig, reward_model: RewardModelConfig | None = None) -
 def check_policy(config: RunConfig, spec: WorldSpec, *, own: bool = False) -> int:
     """Refuse a checkpoint that does not fit the environment; returns its ``n_obs_steps``.
 
-    Args:
-        own: the run has written this checkpoint itself, or has tried its files already.
+    Its files are not tried first if the run has done so, or written them itself (`own`).
     """
     from accerl_lerobot.policies.loading import load_lerobot_config, rehearsed_config
 
@@ -87,11 +86,10 @@ def check_start(config: RunConfig, say: Callable[[str], object] = str) -> int:
     resolve_device(config.policy.device)  # refuses one that is not there
     if 0 < config.trainer.updates <= config.trainer.value_warmup_updates:
         logger.warning(
-            "the policy will not change: trainer.updates=%d is not above trainer.value_warmup_updates=%d, "
-            "and in those only the critic learns; use more updates, or a shorter warm-up",
-            config.trainer.updates,
-            config.trainer.value_warmup_updates,
-        )
+            "the policy will not change: only the critic learns in the first trainer.value_warmup_updates=%d, "
+            "and trainer.updates=%d; use more updates, or a shorter warm-up",
+            config.trainer.value_warmup_updates, config.trainer.updates,
+        )  # fmt: skip
     check_wandb(config.wandb)
     say("looking at policy, environment and data …")
     policy = policy_to_be(config)

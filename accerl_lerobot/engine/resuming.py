@@ -51,9 +51,7 @@ def resume_command(directory: Path) -> str:
 def resumed_run(path: Path | None, config: RunConfig) -> tuple[Path, str]:
     """The folder of the run that a config file belongs to, and the name of the checkpoint to resume from.
 
-    Args:
-        path: ``--config_path``: ``RUN/config.yaml`` or ``RUN/checkpoints/NNNNNN/config.yaml``.
-        config: the run as it is to be resumed.
+    `path` is ``RUN/config.yaml`` or ``RUN/checkpoints/NNNNNN/config.yaml``.
 
     Raises:
         InputError: the file is of no run, a setting differs that must not, or there is nothing left to do.
@@ -97,9 +95,8 @@ class Recovery:
     def next(self, checkpoints: Path, console: Console, error: WorkerError, furthest: int) -> Path:
         """The checkpoint to resume from; waits longer each time without progress in between.
 
-        Args:
-            furthest: the latest update so far. A run that gets further each time is not stuck, though it may
-                be hit again before its next checkpoint.
+        A run is not stuck whose latest update (`furthest`) is another each time, though it may be hit again
+        before its next checkpoint.
         """
         try:
             path, passed = layout.newest_whole(checkpoints)
@@ -173,12 +170,8 @@ def _differences(before: Any, now: Any, name: str) -> dict[str, tuple[Any, Any]]
 def locked(directory: Path, field: str, in_use: str) -> Iterator[int]:
     """Keep other processes out of a folder, which is made if need be.
 
-    Args:
-        field: that the folder was given by.
-        in_use: remedy of the error if another process has locked it.
-
-    Returns:
-        A file descriptor to hand to child processes that are to keep it locked.
+    Gives a file descriptor to hand to child processes that are to keep it locked. If another process has
+    locked it, the error names `field`, and `in_use` as the remedy.
     """
     make_folder(directory, field, again=True)
     with (directory / LOCK).open("w") as file:

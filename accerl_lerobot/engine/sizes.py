@@ -29,10 +29,7 @@ DISK_BYTES = 2**29
 
 
 def check_memory(config: RunConfig) -> None:
-    """Refuse sizes far beyond this machine's memory, and weights that it cannot hold.
-
-    Nodes of a cluster that is joined may have more.
-    """
+    """Refuse sizes far beyond this machine, and weights that it cannot hold; a cluster may have more."""
     total = memory_gib("MemTotal")
     if total is None or config.launch.address is not None:
         return
@@ -65,7 +62,7 @@ def memory_parts_gib(config: RunConfig, history: int = 1) -> dict[str, float]:
         "rollout.worlds": rollout.workers * rollout.worlds * simulator,
         "rollout.segment_length": under_way(config) * pictures,
         "replay.capacity": config.replay.capacity * pictures,
-        **({"algorithm.memory": config.remembered * pictures} if config.remembered else {}),
+        "algorithm.memory": config.remembered * pictures,
         "evaluation.videos": frames * 3 * FILM[0] ** 2 / GIB,
     }
 

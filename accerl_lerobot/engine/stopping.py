@@ -114,11 +114,11 @@ def deferred() -> Iterator[None]:
 
 def _cancel_alarms(left: threading.Event) -> None:
     """Cancel the alarm that follows a signal, until and when the context is left."""
-    while not left.wait(1.0):
+    ended = False
+    while not ended:
+        ended = left.wait(1.0)
         if arrived():
             signal.alarm(0)
-    if arrived():
-        signal.alarm(0)
 
 
 class Stopping:
