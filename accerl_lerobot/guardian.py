@@ -82,7 +82,6 @@ def _tell(**message: Any) -> None:
 
 
 def _dismiss(owner: int) -> None:
-    """Has the guardian do its work now, and waits for it."""
     if os.getpid() != owner or _process is None:
         return
     _tell(bye=True)
@@ -109,7 +108,6 @@ def left_behind(identity: str, folders: Sequence[str]) -> list[psutil.Process]:
 
 
 def _listen(parent: int) -> dict[str, Any]:
-    """All that the parent tells until it ends."""
     told: dict[str, Any] = {"folders": [], "cause": "", "remedy": "", "bye": False}
     text = b""
     while not told["bye"]:

@@ -149,7 +149,6 @@ def _is_of(task: str, known: Sequence[str]) -> bool:
 
 
 def _longest(world: WorldSpec, chunk: int) -> int:
-    """Decisions of a rollout at most."""
     return math.ceil(world.max_steps / chunk)
 
 
@@ -183,7 +182,6 @@ class _Worker:
         return os.getpid()
 
     def metrics(self) -> dict[str, float]:
-        """See the class of the core."""
         self._clock.beat()
         metrics: dict[str, float] = self._core.metrics()
         return metrics
@@ -233,7 +231,6 @@ class ImaginationWorker(_Worker):
         self._may_promote = may_promote
 
     def move(self, inference: Endpoint) -> None:
-        """Sends requests to this endpoint from now on."""
         self._deciding.move(inference)
 
     def save(self, directory: Path) -> None:

@@ -69,7 +69,6 @@ def end(workers: Iterable[WorkerSlot], *, lost: bool = False) -> None:
 
 
 def _fail(worker: WorkerSlot, error: Exception, text: str = "") -> None:
-    """Restart a worker that has failed, or raise what ends the engine."""
     if worker.restart is None:
         raise WorkerError(text or f"{worker.name} worker failed for good:\n{error}") from error
     worker.restart(error)
@@ -206,7 +205,6 @@ class RayEngine(Engine):
         return {w.name: int(w.call("ready", timeout=self._limit)) for w in self._everyone()}
 
     def batching(self) -> BatcherStats:
-        """Batches of the inference replicas so far."""
         return self._inference.batching()
 
     def _everyone(self) -> Iterator[WorkerSlot]:
@@ -255,7 +253,6 @@ class RayEngine(Engine):
         self._rollouts.run(self._deciding, self._inserting)
 
     def _move(self, index: int, inference: Endpoint) -> None:
-        """Tell the clients of an inference replica its new endpoint."""
         self._deciding[index] = inference
         self._rollouts.move(index, inference)
         if self._imagining and index == len(self._deciding) - 1:
@@ -319,7 +316,6 @@ class RayEngine(Engine):
         return episodes
 
     def _hear(self, worker: WorkerSlot, timeout: float = 0.0) -> Any:
-        """An answer that has come."""
         try:
             return worker.answer(timeout)
         except RayError as error:

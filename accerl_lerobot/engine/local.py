@@ -200,7 +200,6 @@ class LocalEngine(Engine):
 
     @property
     def _exploring(self) -> bool:
-        """True if there are updates left to make."""
         if not self._training or self._update.version >= self._config.trainer.updates:
             return False
         return not self._replay.exhausted(self._config.trainer.batch_decisions)
@@ -263,7 +262,6 @@ class LocalEngine(Engine):
             self._acting_version = number
 
     def _store(self) -> None:
-        """Store waiting segments while replay takes them."""
         while self._outbox and self._replay.may_insert(REAL):
             segment = self._outbox.popleft()
             if not self._replay.insert(segment):

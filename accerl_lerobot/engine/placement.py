@@ -91,7 +91,6 @@ class Plan:
     places: dict[str, Place]
 
     def rows(self) -> Iterator[str]:
-        """The plan as lines for people, one for each node."""
         for node in self.nodes:
             here = Counter(
                 (name.rstrip("0123456789 "), place.gpus)
@@ -142,7 +141,6 @@ def roles_of(config: RunConfig) -> list[Role]:
 
 
 def candidates(nodes: Sequence[Node], role: Role) -> list[Node]:
-    """The nodes that a role may be on."""
     if role.selector is None:
         return [nodes[0]]
     if role.selector == ALL:
@@ -177,7 +175,6 @@ def plan_workers(nodes: Sequence[Node], config: RunConfig) -> Plan:
 
 
 def _sites(nodes: Sequence[Node], role: Role) -> list[Node]:
-    """The nodes that a role may be on, and that see the files it needs."""
     named = candidates(nodes, role)
     seeing = [node for node in named if not (role.network and node.unseen)]
     if seeing == named or (role.selector == ALL and seeing):

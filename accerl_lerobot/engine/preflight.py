@@ -86,7 +86,7 @@ def check_start(config: RunConfig, say: Callable[[str], object] = str) -> int:
     resolve_device(config.policy.device)  # refuses one that is not there
     if 0 < config.trainer.updates <= config.trainer.value_warmup_updates:
         logger.warning(
-            "the policy will not change: only the critic learns in the first trainer.value_warmup_updates=%d, "
+            "the policy will not change: the first trainer.value_warmup_updates=%d are the critic's alone, "
             "and trainer.updates=%d; use more updates, or a shorter warm-up",
             config.trainer.value_warmup_updates, config.trainer.updates,
         )  # fmt: skip
@@ -252,7 +252,6 @@ def check_sft_policy(config: SFTConfig) -> Any:
             near = " or ".join(difflib.get_close_matches(key, names, n=3))
             remedy = f"LeRobot's {kind} has no such field{f'; did you mean {near}?' if near else ''}"
             raise InputError(f"sft.policy.{key}", value, remedy)
-    for key, value in fields.items():
         if isinstance(value, int):
             span = Range("[1, 10000]" if key in SIZES else "[-1, 1000000]")
             check(Annotated[int, span], int(value), f"sft.policy.{key}")
@@ -260,7 +259,12 @@ def check_sft_policy(config: SFTConfig) -> Any:
         # Without a device LeRobot looks for one.
         return draccus.decode(PreTrainedConfig.get_choice_class(kind), {"device": "cpu"} | fields)
     except draccus.utils.DraccusException as error:
-        raise _as_input_error(error, fields) from error
+        chain: list[Any] = [error]
+        while (cause := chain[-1].__cause__ or chain[-1].__context__) is not None:
+            chain.append(cause)
+        key = next((e.key_path[0] for e in chain if getattr(e, "key_path", ())), None)
+        name, value = ("sft.policy", fields) if key is None else (f"sft.policy.{key}", fields.get(key))
+        raise InputError(name, value, f"LeRobot says: {' '.join(str(chain[-1]).split())}") from error
 
 
 def sft_policy(config: SFTConfig) -> Any:
@@ -281,18 +285,6 @@ def sft_policy(config: SFTConfig) -> Any:
     except Exception as error:  # LeRobot takes the file at its word, and may fail over any of it
         remedy = f"its config.json is not one of this LeRobot's policies ({brief(error)})"
         raise InputError("sft.init_path", config.init_path, remedy) from error
-
-
-def _as_input_error(error: BaseException, fields: dict[str, Any]) -> InputError:
-    chain = [error]
-    while (cause := chain[-1].__cause__ or chain[-1].__context__) is not None:
-        chain.append(cause)
-    located = next((e for e in chain if getattr(e, "key_path", ())), None)
-    text = " ".join(str(chain[-1]).split())
-    if located is None:
-        return InputError("sft.policy", fields, f"LeRobot says: {text}")
-    key = located.key_path[0]  # type: ignore[attr-defined]
-    return InputError(f"sft.policy.{key}", fields.get(key), f"LeRobot says: {text}")
 
 
 def check_placement(config: RunConfig) -> list[str]:

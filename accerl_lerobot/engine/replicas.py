@@ -171,7 +171,6 @@ class Replicas[W: WorkerSlot](ABC):
             worker.occupy(self._new(worker))
 
     def workers(self) -> Iterator[W]:
-        """All workers of this kind, once they have been started."""
         return (worker for worker in self._all if worker.actor is not None)
 
     @abstractmethod
@@ -200,20 +199,14 @@ class RolloutSlot(WorkerSlot):
         """True if replay has all episodes of the budget."""
 
     @property
-    def report(self) -> Report | None:
-        """Last report of the process."""
-        report: Report | None = self.told
-        return report
-
-    @property
     def counters(self) -> dict[str, float]:
         """Counters of the process."""
-        return {} if self.report is None else self.report.counters
+        return {} if self.told is None else dict(self.told.counters)
 
     @property
     def next_incarnation(self) -> int:
         """Incarnation of another process in this place."""
-        return incarnation_after(self.incarnation, 0 if self.report is None else self.report.starts)
+        return incarnation_after(self.incarnation, 0 if self.told is None else self.told.starts)
 
     def take(self, report: Report) -> list[EpisodeResult]:
         """Note a report; the episodes in it."""
@@ -227,13 +220,13 @@ class RolloutSlot(WorkerSlot):
         ]
 
     def assign(self, plans: list[EpisodePlan]) -> None:
-        """Add planned episodes."""
         self.outstanding |= {episode_key(plan): plan for plan in plans}
         self.unsent += plans
 
     def hung(self, limit: float) -> str:
         """Also a world that does not return, and inference that is not found."""
-        if (report := self.report) is None:
+        report: Report | None = self.told
+        if report is None:
             return super().hung(max(START_S, limit))
         if why := super().hung(limit):
             return why
@@ -275,7 +268,6 @@ class RolloutWorkers(Replicas[RolloutSlot]):
             worker.moved = inference
 
     def plan(self, plans: list[EpisodePlan]) -> None:
-        """See `Engine.plan`."""
         check_new(plans, {key for worker in self._all for key in worker.outstanding})
         for worker in self._all:
             worker.assign(plans[worker.index :: len(self._all)])
@@ -285,8 +277,8 @@ class RolloutWorkers(Replicas[RolloutSlot]):
         for worker in self._all:
             if worker.ask("report", training, worker.unsent, self.in_turn, worker.moved):
                 worker.unsent = []
-                if worker.moved is not None and worker.report is not None:
-                    worker.told = replace(worker.report, away_s=0.0)  # that was about the old endpoint
+                if worker.moved is not None and worker.told is not None:
+                    worker.told = replace(worker.told, away_s=0.0)  # that was about the old endpoint
                 worker.moved = None
 
     def counters(self) -> dict[str, float]:
@@ -309,19 +301,15 @@ class RolloutWorkers(Replicas[RolloutSlot]):
     @property
     def stuck_s(self) -> float:
         """How long the slowest worker or world has been at what it does now."""
-        reports = [worker.report for worker in self._all if worker.report is not None]
+        reports = [worker.told for worker in self._all if worker.told is not None]
         return max((max(report.in_world_s, report.stuck_s) for report in reports), default=0.0)
 
     def save(self, directory: Path) -> None:
         """Write the rollout workers' part of ``training_state``."""
-        slots = [
-            {
-                "incarnation": worker.next_incarnation - 1,
-                "budget": worker.budget,
-                "outstanding": list(worker.outstanding.values()),
-            }
-            for worker in self._all
-        ]
+        slots = []
+        for worker in self._all:
+            outstanding, incarnation = list(worker.outstanding.values()), worker.next_incarnation - 1
+            slots.append({"incarnation": incarnation, "budget": worker.budget, "outstanding": outstanding})
         snapshot.save(directory / ROLLOUT, {"past": self.counters(), "slots": slots})
 
     def _restore(self, directory: Path) -> None:

@@ -99,7 +99,7 @@ class Recovery:
         before its next checkpoint.
         """
         try:
-            path, passed = layout.newest_whole(checkpoints)
+            path = _newest(checkpoints, layout.LAST, console)
         except InputError:
             raise error from None
         stuck = path.name == self._begun and furthest <= self._furthest
@@ -107,8 +107,6 @@ class Recovery:
         self._begun, self._furthest = path.name, max(furthest, self._furthest)
         if self._times > self._most:
             raise error
-        for why in passed:
-            console.say(f"passed over checkpoint {why}")
         pause = pause_s(self._times - 1)
         when = f" in {pause:.0f} s" if pause else ""
         reason = f"the disk of {checkpoints.parent} is full" if is_full(error) else error
@@ -125,7 +123,11 @@ def checkpoint_of(directory: Path, wanted: str, console: Console) -> Path | None
             (directory / name).unlink(missing_ok=True)
         shutil.rmtree(directory / "tensorboard", ignore_errors=True)
         return None
-    path, passed = layout.newest_whole(directory / layout.CHECKPOINTS, wanted)
+    return _newest(directory / layout.CHECKPOINTS, wanted, console)
+
+
+def _newest(checkpoints: Path, wanted: str, console: Console) -> Path:
+    path, passed = layout.newest_whole(checkpoints, wanted)
     for why in passed:
         console.say(f"passed over checkpoint {why}")
     return path

@@ -415,7 +415,6 @@ def _rate(results: list[EpisodeResult]) -> Rate:
 
 
 def _written(value: Any) -> str:
-    """A value as the command line has it."""
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
     return f"[{','.join(map(_written, value))}]" if isinstance(value, list | tuple) else str(value)

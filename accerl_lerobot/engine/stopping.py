@@ -28,7 +28,6 @@ def arrived() -> bool:
 
 
 def _listen() -> None:
-    """Have signals noted from now on."""
     global _pipe, _arrived
     if _pipe is None:
         _pipe = os.pipe()

@@ -91,7 +91,6 @@ class InferenceWorker:
         self._clock.enter(WAIT_IN)
 
     async def ready(self) -> int:
-        """Return this process's id once the policy is loaded."""
         return os.getpid()
 
     async def listen(self) -> Address:
@@ -141,7 +140,6 @@ class InferenceWorker:
         }
 
     async def batching(self) -> BatcherStats:
-        """Batches so far."""
         stats = self._batcher.stats
         # Copied in one go each: the other thread adds to them.
         return replace(stats, batch_sizes=Counter(stats.batch_sizes), waits=Counter(stats.waits))

@@ -184,7 +184,6 @@ class Replay:
         self.available_decisions += entry.size if entry.available else 0
 
     def _depart(self, entry: _Entry, how: str) -> None:
-        """Books a segment that has left under ``<how>_*``."""
         entry.segment, entry.left = None, how
         self.stored_decisions -= entry.size
         self.available_decisions -= entry.size if entry.available else 0

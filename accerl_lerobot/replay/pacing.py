@@ -3,14 +3,9 @@
 
 Everything is counted in decisions. On entering the store each segment gets a whole number of draws, ⌊r⌋ or
 ⌈r⌉ with r = samples_per_insert, such that the average is r (`entitle`). A segment with draws left is
-*available*:
-
-    may_sample = stored ≥ min_decisions  and  available ≥ batch
-    may_insert = stored < min_decisions  or   available < ahead
-
-With batch ≤ ahead one of them holds at any time. Nothing depends on totals since the run began, so evicting,
-retiring or resuming cannot upset the pace. Rollouts wait on insert instead of having their segments thrown
-away later, because what is thrown away first is what took longest, and those are the failures.
+*available*. With batch ≤ ahead, one of `may_sample` and `may_insert` holds at any time. Rollouts wait on
+insert instead of having their segments thrown away later, because what is thrown away first is what took
+longest, and those are the failures.
 
     asynchronous   nobody waits for anybody, within the pace
     overlap        the next batch is collected while one is learned from, and then both wait for each other

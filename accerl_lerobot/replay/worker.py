@@ -85,7 +85,6 @@ class ReplayWorker:
         self._clock.enter(WAIT_IN)
 
     async def ready(self) -> int:
-        """Answers once this process is up; returns its id."""
         return os.getpid()
 
     async def listen(self) -> Address:
@@ -163,12 +162,10 @@ class ReplayWorker:
             self._changed.notify_all()
 
     async def learnt(self) -> None:
-        """The trainer's word that it has learned from a batch."""
         async with self._changing():
             self._turns.learnt()
 
     async def follow(self, schedule: Schedule) -> None:
-        """From now on, turns are taken like this."""
         async with self._changing():
             self._turns.schedule = schedule
 
@@ -189,7 +186,6 @@ class ReplayWorker:
             self._replay.held = held
 
     async def end_real(self) -> None:
-        """Every real episode has been played and stored."""
         async with self._changing():
             self._replay.real_ended = True
 
@@ -219,7 +215,6 @@ class ReplayWorker:
         return self._batch > 0 and self._replay.may_sample(self._batch)
 
     async def close(self) -> None:
-        """Ends all waiting; nothing is stored or drawn any more."""
         async with self._changing():
             self._closed = True
 

@@ -39,7 +39,6 @@ class SegmentBuilder:
     def add(
         self, decision: Decision, actions: np.ndarray, reward: float, steps: int, following: Observation
     ) -> None:
-        """Records one executed decision."""
         self.decisions.append(decision)
         self.actions.append(actions)
         self.rewards.append(reward)

@@ -102,7 +102,6 @@ class RolloutWorker:
         self._clock.enter(WAIT_IN)
 
     def ready(self) -> int:
-        """Answers once the worlds exist; returns this process's id."""
         return os.getpid()
 
     def report(

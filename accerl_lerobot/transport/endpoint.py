@@ -26,7 +26,6 @@ class Endpoint:
     """Ray's handle of its process."""
 
     def kill(self) -> None:
-        """End its process."""
         import ray
 
         ray.kill(self.actor)
@@ -95,7 +94,6 @@ class ReconnectingClient(Client):
         """Reason of the last loss of the connection."""
 
     def move(self, endpoint: Endpoint) -> None:
-        """Connect there with the next call."""
         self._next.append(endpoint)
         self._away_since = None
         self._moved.set()

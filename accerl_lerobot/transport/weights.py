@@ -95,7 +95,6 @@ class WeightPublisher:
                 self._readers.remove(late[0])
 
     def close(self) -> None:
-        """End all connections."""
         for reader in self._readers:
             reader.client.close()
         self._readers.clear()

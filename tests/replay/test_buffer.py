@@ -65,11 +65,6 @@ def test_nonfinite_segments_are_dropped_and_counted(field: str, bad: float) -> N
     assert replay.counters.dropped_nonfinite == 1 and replay.counters.inserted_segments == 0
 
 
-def test_integer_observations_are_not_searched_for_nan() -> None:
-    images = {"observation.images.top": np.zeros((5, 2, 2, 3), np.uint8)}
-    assert make_replay().insert(make_segment("a", observations=images))
-
-
 def test_the_least_used_are_drawn_first() -> None:
     replay = make_replay(samples_per_insert=3.0)
     rng = np.random.default_rng(0)

@@ -55,13 +55,9 @@ def test_every_decision_costs():
     recorder.play()
     assert np.concatenate([s.reward for s in recorder.segments]).tolist() == [1.75] * 4
     assert recorder.results[0].episode_return == pytest.approx(4 * 1.75)
-
-
-def test_an_evaluation_reports_the_environments_own_return():
-    config = replace(CONFIG, decision_cost=0.25)
-    recorder = Recorder([ScriptedWorld(steps=8)], [replace(explore(), explore=False)], config)
-    recorder.play()
-    assert recorder.results[0].episode_return == 8.0
+    evaluation = Recorder([ScriptedWorld(steps=8)], [replace(explore(), explore=False)], config)
+    evaluation.play()
+    assert evaluation.results[0].episode_return == 8.0, "the environment's own"
 
 
 def test_episode_totals_come_with_the_last_segment_only():
@@ -181,9 +177,3 @@ def test_filming_changes_nothing(seed: int, tolerance: float, success: bool):
     assert plain.success is success and plain.frames == []
     assert len(filmed.frames) >= filmed.steps // 2 and all(f.shape == (8, 8, 3) for f in filmed.frames)
     assert replace(filmed, plan=plain.plan, frames=[]) == plain
-
-
-def test_closing_closes_the_worlds():
-    worlds = [ScriptedWorld(), ScriptedWorld()]
-    Recorder(worlds, [], CONFIG).runner.close()
-    assert all(world.closed for world in worlds)

@@ -15,7 +15,6 @@ import pytest
 
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.experience import Decision, Request, Segment
-from accerl_lerobot.replay.buffer import is_finite
 from accerl_lerobot.rollout import worker as module
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutConfig
 from accerl_lerobot.rollout.worker import AT_THE_DOOR, RolloutWorker
@@ -133,12 +132,6 @@ def stage() -> Iterator[Callable[..., Stage]]:
         assert not one.thread.is_alive()
 
 
-def test_nothing_runs_before_it_is_told_to(stage):
-    one = stage(lambda segments: True)
-    time.sleep(0.05)
-    assert one.order(training=False).counters["decisions"] == 0 and one.explored == 0
-
-
 def test_training_episodes_reach_replay_and_the_report(stage):
     inserted: list[Segment] = []
     one = stage(lambda segments: inserted.extend(segments) or True)
@@ -219,16 +212,6 @@ def test_a_worker_outlives_its_inference_and_plays_what_it_would_have_played(sta
     assert played_out[0] == played_out[1]
 
 
-def test_a_restarted_worker_uses_other_keys_and_other_seeds():
-    plans = []
-    for incarnation in (0, 1):
-        worker = RolloutWorker(WORLD, RolloutConfig(), ("match",), 0, incarnation=incarnation)
-        worker.report(True, [])
-        plans.append([worker._plans.next(exploring=True) for _ in range(20)])
-    seeds = [{plan.seed for plan in some} for some in plans]
-    assert len(seeds[0]) == 20 and not seeds[0] & seeds[1]
-
-
 def test_a_world_that_hangs_shows_in_the_report(stage, monkeypatch: pytest.MonkeyPatch):
     release = threading.Event()
     one = stage(lambda segments: True)
@@ -263,13 +246,3 @@ def test_a_thread_that_hangs_outside_of_a_world_shows_in_the_report(stage, monke
     assert one.order(True).in_world_s == 0
     release.set()
     one.until(lambda: len(one.episodes) >= 2 and one.order(True).stuck_s < 0.4)
-
-
-def test_what_is_not_finite_is_sent_where_it_is_ordered(stage, monkeypatch: pytest.MonkeyPatch):
-    """Replay refuses and counts it."""
-    visits = iter([True])
-    monkeypatch.setattr(module, "fault_point", lambda point: point == "rollout.send" and next(visits, False))
-    inserted: list[Segment] = []
-    one = stage(lambda segments: inserted.extend(segments) or True)
-    one.until(lambda: len(inserted) >= 4)
-    assert [is_finite(segment) for segment in inserted[:4]] == [False, True, True, True]

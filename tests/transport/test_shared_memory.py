@@ -236,18 +236,6 @@ def test_other_users_are_refused_at_both_ends(stage, monkeypatch: pytest.MonkeyP
     assert end.recv(1) == b"" and not one.server._connections
 
 
-def test_nothing_is_left_with_a_name(stage):
-    one = stage()
-    one.caller().send(1)
-    one.await_asked(1)
-    names = [line.split()[-1] for line in Path("/proc/net/unix").read_text().splitlines()[1:]]
-    assert f"@{one.server.address.name}" in names
-    assert len(one.server.address.name) >= 32 and not list(Path("/dev/shm").glob("*accerl*"))
-    other = SharedMemoryServer(one.asked.append, copy=False)
-    assert other.address.name != one.server.address.name
-    other.close()
-
-
 def test_a_service_that_takes_nothing_is_not_waited_for_for_ever(stage, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(shared_memory, "CONNECT_S", 0.05)
     one = stage()
