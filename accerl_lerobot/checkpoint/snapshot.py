@@ -68,7 +68,7 @@ def load(path: Path) -> Any:
 
 
 def to_json(value: Any, place: str, arrays: dict[str, np.ndarray]) -> Any:
-    """What JSON can hold of a tree; its arrays go into `arrays`, by number.
+    """A tree as JSON can hold it; its arrays go into `arrays`, by number.
 
     Raises:
         TypeError: the tree holds something of a kind that is not known; names its place.
@@ -81,7 +81,7 @@ def to_json(value: Any, place: str, arrays: dict[str, np.ndarray]) -> Any:
         arrays[name] = np.asarray(array, order="C")
         return {MARK: mark, "name": name}
 
-    cls = type(value)
+    cls: Any = type(value)
     if value is None or cls in _PLAIN:
         return value
     if cls is np.ndarray:
@@ -97,7 +97,7 @@ def to_json(value: Any, place: str, arrays: dict[str, np.ndarray]) -> Any:
             return parts
         keys = [to_json(key, f"{place}.key", arrays) for key in parts]
         return {MARK: "map", "items": [list(item) for item in zip(keys, parts.values(), strict=True)]}
-    if kind_named(cls.__name__) is cls:
+    if kind_named(cls.__name__) == cls:
         fields = {f: to_json(getattr(value, f), f"{place}.{f}", arrays) for f in field_names(cls)}
         return {MARK: cls.__name__, "fields": fields}
     if isinstance(value, np.generic):

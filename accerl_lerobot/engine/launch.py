@@ -100,7 +100,7 @@ class RayEngine(Engine):
         self._inference = InferenceReplicas(config, self._version, state, load, self._move)
         self._others: list[WorkerSlot] = []
         self._imagining: list[WorkerSlot] = []
-        """Of the others, the one that imagines, and the one that trains the world model."""
+        """The one that imagines, and the one that trains the world model; both are among the others."""
         self._updates: list[dict[str, float]] = []
         self._schedule: Schedule = ASYNCHRONOUS
         self._training = self._real_ended = self._done = self._closed = False

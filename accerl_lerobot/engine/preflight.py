@@ -262,9 +262,9 @@ def check_sft_policy(config: SFTConfig) -> Any:
         chain: list[Any] = [error]
         while (cause := chain[-1].__cause__ or chain[-1].__context__) is not None:
             chain.append(cause)
-        key = next((e.key_path[0] for e in chain if getattr(e, "key_path", ())), None)
-        name, value = ("sft.policy", fields) if key is None else (f"sft.policy.{key}", fields.get(key))
-        raise InputError(name, value, f"LeRobot says: {' '.join(str(chain[-1]).split())}") from error
+        where = next((e.key_path[0] for e in chain if getattr(e, "key_path", ())), None)
+        name, given = ("sft.policy", fields) if where is None else (f"sft.policy.{where}", fields.get(where))
+        raise InputError(name, given, f"LeRobot says: {' '.join(str(chain[-1]).split())}") from error
 
 
 def sft_policy(config: SFTConfig) -> Any:

@@ -35,7 +35,7 @@ class Done:
     actions: np.ndarray
     """float32 (env steps, A), as they were executed, one after the other."""
     steps: tuple[int, ...]
-    """Of each decision; so are `versions` and `rewards`, of which its cost is taken off."""
+    """Env steps of each decision; `rewards` have its cost taken off."""
     versions: tuple[int, ...]
     rewards: tuple[float, ...]
     ended: bool

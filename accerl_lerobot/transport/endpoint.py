@@ -21,7 +21,7 @@ class Endpoint:
     method: Any
     """Method of its Ray actor handle."""
     address: Address | None = None
-    """Of its shared memory; None: it can only be reached through Ray."""
+    """Address of its shared memory; None: it can only be reached through Ray."""
     actor: Any = None
     """Ray's handle of its process."""
 
