@@ -73,19 +73,11 @@ def to_json(value: Any, place: str, arrays: dict[str, np.ndarray]) -> Any:
     Raises:
         TypeError: the tree holds something of a kind that is not known; names its place.
     """
-
-    def named(array: np.ndarray, mark: str) -> Any:
-        if array.dtype.kind not in "biuf":
-            raise TypeError(f"{place}: an array of {array.dtype} cannot be saved")
-        name = str(len(arrays))
-        arrays[name] = np.asarray(array, order="C")
-        return {MARK: mark, "name": name}
-
     cls: Any = type(value)
     if value is None or cls in _PLAIN:
         return value
     if cls is np.ndarray:
-        return named(value, "array")
+        return _stored(value, "array", place, arrays)
     if cls is list:
         return [to_json(part, f"{place}.{i}", arrays) for i, part in enumerate(value)]
     if cls is tuple:
@@ -105,10 +97,18 @@ def to_json(value: Any, place: str, arrays: dict[str, np.ndarray]) -> Any:
     if isinstance(value, bool | int | float | str):
         return value
     if cls.__module__ == "torch":
-        return named(value.detach().cpu().numpy(), "tensor")
+        return _stored(value.detach().cpu().numpy(), "tensor", place, arrays)
     if isinstance(value, np.random.Generator):
         return {MARK: "generator", "state": value.bit_generator.state}
     raise TypeError(f"{place}: a {cls.__name__} cannot be saved")
+
+
+def _stored(array: np.ndarray, mark: str, place: str, arrays: dict[str, np.ndarray]) -> dict[str, str]:
+    if array.dtype.kind not in "biuf":
+        raise TypeError(f"{place}: an array of {array.dtype} cannot be saved")
+    name = str(len(arrays))
+    arrays[name] = np.asarray(array, order="C")
+    return {MARK: mark, "name": name}
 
 
 def from_json(value: Any, arrays: dict[str, np.ndarray]) -> Any:
