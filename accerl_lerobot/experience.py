@@ -58,8 +58,6 @@ class Decision:
     log_prob: np.ndarray
     """float32 (L,), one entry per factor (for a flow policy one per row of the chunk that has a density); the
     chunk's is their sum."""
-    value: float
-    """V(observation) by the critic of the same version."""
     version: int
     """Number of optimiser steps behind the weights that decided."""
 
@@ -81,9 +79,8 @@ class Origin(NamedTuple):
 class Segment:
     """T consecutive decisions of one episode, plus the observation after the last one.
 
-    Exactly one of three things ends a segment: the episode `terminated` (bootstrap 0), it was `truncated` by
-    the time limit (bootstrap with V of the last observation), or neither, when the segment is cut in
-    mid-episode (same bootstrap).
+    It ends because the episode `terminated`, by its time limit too (bootstrap 0), or is cut in mid-episode
+    (bootstrap with V of the last observation).
     """
 
     observations: dict[str, np.ndarray]
@@ -94,8 +91,6 @@ class Segment:
     """Each (T, ...)."""
     log_prob: np.ndarray
     """float32 (T, L), of the behaviour policy."""
-    value: np.ndarray
-    """float32 (T,), of the behaviour critic; stale by the time it is trained on."""
     actions: np.ndarray
     """float32 (T, K, A), the chunks within the world's bounds; the first `steps` of each were executed."""
     reward: np.ndarray
@@ -105,7 +100,6 @@ class Segment:
     steps: np.ndarray
     """int64 (T,), env steps each decision executed."""
     terminated: bool
-    truncated: bool
     success: bool
     """True if the episode had succeeded when the segment ended."""
     key: str

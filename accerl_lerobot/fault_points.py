@@ -16,14 +16,9 @@ HANDLER = "ACCERL_FAULT_HANDLER"
 
 
 def fault_point(name: str, path: Path | None = None) -> bool:
-    """Mark a place where a fault can be injected.
+    """Mark a place where a fault can be injected; `path` was just written there.
 
-    Args:
-        name: unique to the place.
-        path: file or folder that was just written there.
-
-    Returns:
-        True if the value computed there is to be made non-finite.
+    Returns True if the value computed there is to be made non-finite.
     """
     return _handle is not None and _handle(name, path)
 

@@ -11,6 +11,7 @@ left alone: they unlink semaphores and end by themselves once the processes that
 from __future__ import annotations
 
 import atexit
+import contextlib
 import json
 import os
 import secrets
@@ -66,11 +67,8 @@ def remove(folder: Path) -> None:
 
 
 def explain(cause: str = "", remedy: str = "") -> None:
-    """Sets the line that is printed if this process ends abruptly.
-
-    Args:
-        cause: what happened; empty: what was set before, or that it was killed.
-        remedy: what to do; empty: what was set before. Without one, nothing is printed.
+    """Sets the line that is printed if this process ends abruptly; empty: as it was. Without a remedy there
+    is none, and without a cause it was killed.
     """
     _tell(**{key: text for key, text in (("cause", cause), ("remedy", remedy)) if text})
 
@@ -78,52 +76,38 @@ def explain(cause: str = "", remedy: str = "") -> None:
 def _tell(**message: Any) -> None:
     start()
     assert _process is not None and _process.stdin is not None
-    try:
+    with contextlib.suppress(OSError, ValueError):  # somebody has killed it; nothing here depends on it
         _process.stdin.write(json.dumps(message).encode() + b"\n")
         _process.stdin.flush()
-    except (OSError, ValueError):  # somebody has killed it; nothing here depends on it
-        return
 
 
 def _dismiss(owner: int) -> None:
-    """Has the guardian do its work now, and waits for it."""
     if os.getpid() != owner or _process is None:
         return
     _tell(bye=True)
-    try:
+    with contextlib.suppress(subprocess.TimeoutExpired):
         _process.wait(END_S + LOOK_S)
-    except subprocess.TimeoutExpired:
-        return
 
 
 def left_behind(identity: str, folders: Sequence[str]) -> list[psutil.Process]:
     """Living processes with this mark, or of those folders, but those that end by themselves."""
-    found = []
+
+    def is_ours(process: psutil.Process) -> bool:
+        if variables := process.environ():
+            return identity in variables.get(MARK, "").split()
+        # Ray's agents wipe their environment when they change their title; they keep their logs open.
+        return any(file.path.startswith(f"{folder}/") for file in process.open_files() for folder in folders)
+
+    left = []
     for process in psutil.process_iter():
-        try:
-            if _is_ours(process, identity, folders) and _must_end(process):
-                found.append(process)
-        except psutil.Error:  # it has ended meanwhile, or is of another user
-            continue
-    return found
-
-
-def _is_ours(process: psutil.Process, identity: str, folders: Sequence[str]) -> bool:
-    if variables := process.environ():
-        return identity in variables.get(MARK, "").split()
-    # Ray's agents wipe their environment when they change their title; they keep their logs open.
-    return any(file.path.startswith(f"{folder}/") for file in process.open_files() for folder in folders)
-
-
-def _must_end(process: psutil.Process) -> bool:
-    words = process.cmdline()
-    return process.status() != psutil.STATUS_ZOMBIE and not any(
-        end in word for end in SELF_ENDING for word in words[:5]
-    )
+        with contextlib.suppress(psutil.Error):  # it has ended meanwhile, or is of another user
+            ends = any(end in word for end in SELF_ENDING for word in process.cmdline()[:5])
+            if is_ours(process) and process.status() != psutil.STATUS_ZOMBIE and not ends:
+                left.append(process)
+    return left
 
 
 def _listen(parent: int) -> dict[str, Any]:
-    """All that the parent tells until it ends."""
     told: dict[str, Any] = {"folders": [], "cause": "", "remedy": "", "bye": False}
     text = b""
     while not told["bye"]:
@@ -150,10 +134,8 @@ def main(identity: str) -> None:
     deadline = time.monotonic() + END_S
     while time.monotonic() < deadline and (left := left_behind(identity, told["folders"])):
         for process in left:
-            try:
+            with contextlib.suppress(psutil.Error):
                 process.kill()
-            except psutil.Error:
-                continue
         psutil.wait_procs(left, timeout=0.5)
     for folder in told["folders"]:
         shutil.rmtree(folder, ignore_errors=True)

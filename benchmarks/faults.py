@@ -174,10 +174,7 @@ class Start:
 
     def ranks(self) -> list[str]:
         """Changes that give the trainer another rank, where it has none."""
-        if self._module is TRAIN:
-            return []
-        wait = f"--trainer.rank_timeout_s={self._stall_s}"
-        return ["--trainer.ranks=2", wait]
+        return [] if self._module is TRAIN else ["--trainer.ranks=2"]
 
     def _policy(self, console: Console) -> list[str]:
         """Arguments that name it, after a run that has made it."""

@@ -45,7 +45,6 @@ def light_config(
             warmup_updates=5,
             value_warmup_updates=2,
             ranks=ranks,
-            rank_timeout_s=stall_s,
         ),
         evaluation=EvaluationConfig(episodes=100, before=False, videos=0),
         launch=LaunchConfig(stall_s=stall_s, max_restarts=1_000_000),

@@ -57,7 +57,7 @@ class SimulatedAdapter(PolicyAdapter):
     def decide(self, requests: Sequence[Request], version: int) -> list[Decision]:
         c = self.config
         time.sleep((c.decide_ms + c.decide_each_ms * len(requests)) / 1000)
-        gain, value = float(self.gain), float(self.value_head.bias)
+        gain = float(self.gain)
         decisions = []
         for request in requests:
             target = np.asarray(request.observation[OBS_STATE])[: c.action_dim]
@@ -65,13 +65,7 @@ class SimulatedAdapter(PolicyAdapter):
             u = (gain * target + STD * noise * request.explore).astype(np.float32)
             log_prob = -0.5 * np.square(noise).sum(1) - c.action_dim * np.log(STD * np.sqrt(2 * np.pi))
             decisions.append(
-                Decision(
-                    chunk=u,
-                    latent={"u": u},
-                    log_prob=log_prob.astype(np.float32),
-                    value=value,
-                    version=version,
-                )
+                Decision(chunk=u, latent={"u": u}, log_prob=log_prob.astype(np.float32), version=version)
             )
         return decisions
 

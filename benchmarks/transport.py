@@ -76,7 +76,6 @@ def decision() -> Decision:
         chunk=np.zeros((CHUNK, ACTIONS), np.float32),
         latent={"noise": np.zeros((CHUNK, LATENT), np.float32)},
         log_prob=np.zeros(CHUNK, np.float32),
-        value=0.5,
         version=7,
     )
 

@@ -20,7 +20,7 @@ from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE
 from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.inference.batcher import BatcherStats
-from accerl_lerobot.rollout.worker import Report, RolloutWorker, WorkerShare
+from accerl_lerobot.rollout.worker import Report, RolloutWorker
 from accerl_lerobot.trainer.peers import LearnerSettings
 from accerl_lerobot.transport.endpoint import Endpoint
 from accerl_lerobot.transport.shared_memory import Address, serve_on_loop
@@ -83,17 +83,15 @@ class LightInference:
 
 def _decision(request: Request, version: int) -> Decision:
     chunk = np.random.default_rng(request.noise_seed).uniform(-1, 1, (4, 2)).astype(np.float32)
-    return Decision(
-        chunk=chunk, latent={"x": chunk}, log_prob=np.zeros(4, np.float32), value=0.0, version=version
-    )
+    return Decision(chunk=chunk, latent={"x": chunk}, log_prob=np.zeros(4, np.float32), version=version)
 
 
 class FalteringRollout(RolloutWorker):
     """The first process in the first seat fails when it is to report for the third time."""
 
-    def __init__(self, env: Any, config: Any, tasks: Any, seed: int, share: WorkerShare, *rest: Any) -> None:
-        super().__init__(env, config, tasks, seed, share, *rest)
-        self._left = 2 if (share.index, share.incarnation) == (0, 0) else 1_000_000
+    def __init__(self, env: Any, config: Any, tasks: Any, seed: int, *where: Any) -> None:
+        super().__init__(env, config, tasks, seed, *where)
+        self._left = 2 if where[:2] == (0, 0) else 1_000_000
 
     def report(self, *arguments: Any) -> Report:
         self._left -= 1

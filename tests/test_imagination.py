@@ -83,7 +83,7 @@ def imagining(
         checkpoint,
         env=ENV,
         imagination=adjusted(ImaginationConfig, **constants)(**(fields | config)),
-        rollout=RolloutConfig(worlds=4, segment_length=4, episodes=episodes, time_limit="fail"),
+        rollout=RolloutConfig(worlds=4, segment_length=4, episodes=episodes),
         trainer=TrainerConfig(updates=12, batch_decisions=16, warmup_updates=2, value_warmup_updates=2),
         **(sections or {}),
     )
@@ -257,21 +257,6 @@ def test_one_that_hangs_is_found_when_it_is_saved(kind: type, tmp_path: Path):
     with held, pytest.raises(TimeoutError, match=message):
         worker.save(tmp_path)
     assert not held.locked()
-
-
-@pytest.mark.slow
-def test_asynchronously_a_run_ends_when_its_episodes_are_used_up(tiny_checkpoint: Path):
-    from accerl_lerobot.engine.launch import RayEngine
-
-    config = imagining(tiny_checkpoint, share=0.0, episodes=7)
-    engine = RayEngine(replace(config, rollout=replace(config.rollout, workers=2)), ("match",))
-    try:
-        engine.train()
-        history = drive(engine)
-    finally:
-        engine.close()
-    assert 0 < history[-1].version < 12
-    assert sum(e.plan.explore for p in history for e in p.episodes) == 7
 
 
 def test_what_does_not_fit_is_refused_before_the_run_begins(

@@ -118,24 +118,6 @@ def test_a_run_ends_by_itself_and_closing_leaves_no_process(engine):
     assert [name for name, pid in pids.items() if not gone(pid)] == []
 
 
-@pytest.mark.slow
-def test_both_transports_play_the_same_episodes(engine, monkeypatch: pytest.MonkeyPatch):
-    """Every decision of an evaluation is drawn from its request's seed, so one that differs shows."""
-    played = []
-    for shared in (False, available()):
-        monkeypatch.setattr(replicas, "available", lambda shared=shared: shared)
-        one = engine(env=replace(SLOW, reward="dense"), rollout=TWO, launch=LaunchConfig(stall_s=120))
-        (deciding,), inserting = one._rollouts._inference, one._rollouts._replay
-        assert [end.address is None for end in (deciding, inserting)] == [not shared] * 2
-        one.plan(evaluation_plans(("match",), 10, "eval"))
-        results = sorted(collect(one, "eval", 10), key=lambda result: result.plan.index)
-        played.append([(r.plan, r.success, r.episode_return, r.steps, r.decisions) for r in results])
-        one.train()
-        assert drive(one)[-1].replay["trained_decisions"] >= 12 * 16
-        one.close()
-    assert played[0] == played[1] and len({line[2] for line in played[0]}) == 10
-
-
 def test_what_cannot_be_done_is_refused_and_an_exception_in_the_trainer_ends_the_run(engine, tmp_path: Path):
     one = engine(trainer=ENDLESS)
     one.plan(evaluation_plans(("match",), 2, "a"))

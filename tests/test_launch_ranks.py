@@ -20,7 +20,7 @@ from safetensors.torch import load_file
 
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import PRETRAINED, STEP, TRAINING_STATE, WEIGHTS
-from accerl_lerobot.engine.config import RunConfig
+from accerl_lerobot.engine.config import LaunchConfig, RunConfig
 from accerl_lerobot.engine.launch import RayEngine
 from accerl_lerobot.engine.stopping import WorkerError
 from accerl_lerobot.evaluation import evaluation_plans
@@ -33,7 +33,7 @@ pytestmark = pytest.mark.slow
 UPDATES = 12
 TWO = TrainerConfig(
     updates=1000, batch_decisions=16, warmup_updates=0, value_warmup_updates=1, probe_every=3,
-    ranks=2, sharding="zero3", rank_timeout_s=15.0,
+    ranks=2, sharding="zero3",
 )  # fmt: skip
 
 
@@ -59,7 +59,7 @@ def probes(updates: list[dict[str, float]]) -> list[float]:
 
 @pytest.fixture(scope="module")
 def story(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Story]:
-    config = tiny_run(tiny_checkpoint, trainer=TWO)
+    config = tiny_run(tiny_checkpoint, trainer=TWO, launch=LaunchConfig(stall_s=40.0))
     directory = tmp_path_factory.mktemp("saved")
     engine = RayEngine(config, ("match",))
     try:

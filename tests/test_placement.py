@@ -14,7 +14,7 @@ import pytest
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine import placement
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig
-from accerl_lerobot.engine.placement import Node, Plan, place_workers, plan_workers
+from accerl_lerobot.engine.placement import Node, Plan, plan_workers
 from accerl_lerobot.engine.run import execute
 from accerl_lerobot.engine.stopping import WorkerError
 from accerl_lerobot.errors import InputError
@@ -169,26 +169,6 @@ def test_a_rollout_worker_whose_node_has_left_goes_to_one_that_is_there():
 def test_a_cluster_that_is_none_is_refused_when_the_recipe_is_read(fields: dict[str, Any], match: str):
     with pytest.raises(InputError, match=match):
         LaunchConfig(**fields)
-
-
-def test_a_node_that_leaves_while_it_is_asked_is_planned_without(monkeypatch: pytest.MonkeyPatch):
-    there = [frozenset({"key0", "key1"})]
-    asked: list[int] = []
-
-    def nodes(config: object) -> list[Node]:
-        asked.append(len(there[0]))
-        if len(asked) == 1:
-            there[0] = frozenset({"key0"})
-            raise WorkerError("node 1 could not report its versions")
-        return cluster((8, 0))
-
-    monkeypatch.setattr(placement, "alive_nodes", lambda: there[0])
-    monkeypatch.setattr(placement, "_nodes", nodes)
-    assert set(where(place_workers(run())).values()) == {(0, 0.0)} and asked == [2, 1]
-    asked.clear()
-    there[0] = frozenset({"key0"})
-    with pytest.raises(WorkerError, match="could not report"):  # it is there, and broken
-        place_workers(run())
 
 
 def test_whatever_is_planned_fits():

@@ -121,15 +121,6 @@ def test_checkpoints_of_another_image_size(write: Any, tmp_path: Path, capsys: p
         assert not out.exists()
 
 
-def test_a_smolvla_of_another_size_fits(tiny_checkpoint: Path):
-    from accerl_lerobot.policies.config import PolicyConfig
-    from accerl_lerobot.policies.loading import load_lerobot_config
-
-    needed = policy_features(load_lerobot_config(PolicyConfig(path=str(tiny_checkpoint))))
-    assert needed.any_size and needed.shapes[FRONT] == (3, 32, 32)
-    check_features(needed, with_shape(OFFERED, FRONT, (3, 480, 640)), {}, "policy.path", "")
-
-
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [

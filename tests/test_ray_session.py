@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -19,7 +20,7 @@ import pytest
 
 from accerl_lerobot.engine import ray_session
 from accerl_lerobot.engine.config import LaunchConfig
-from accerl_lerobot.engine.ray_session import RaySession, RayWatch, process_kind
+from accerl_lerobot.engine.ray_session import RaySession, process_kind
 from accerl_lerobot.engine.stopping import WorkerError
 from accerl_lerobot.errors import InputError
 from tests.light_workers import light_ray
@@ -115,52 +116,22 @@ def test_who_joins_a_cluster_has_the_user_s_token_and_nothing_else(bare: pytest.
     assert "mine" not in ray_session.forwarded_environment().values()
 
 
-def test_what_the_user_has_set_is_kept(bare: pytest.MonkeyPatch):
-    bare.setenv("OMP_NUM_THREADS", "7")
-    bare.setenv("RAY_TMPDIR", "there")
-    ray_session.prepare()
-    assert os.environ["RAY_TMPDIR"] == "there"
-    assert os.environ["OMP_NUM_THREADS"] == "7" and os.environ["OMP_WAIT_POLICY"] == "PASSIVE"
+LOOPBACK = {"127.0.0.1", "::1", "::ffff:127.0.0.1"}
 
 
-def test_a_ray_that_is_imported_already_has_read_its_environment(bare: pytest.MonkeyPatch):
-    bare.setitem(sys.modules, "ray", sys)
-    ray_session.prepare()
-    assert not {TOKEN, TOKEN_PATH} & os.environ.keys() and not set(ray_session.PRIVATE) & os.environ.keys()
-
-
-def own_processes() -> set[int]:
+def own_processes() -> list[psutil.Process]:
     """This process and all below it."""
-    parents = {}
-    for folder in Path("/proc").glob("[0-9]*"):
-        try:
-            parents[int(folder.name)] = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
-        except OSError:
-            continue
-    found = {os.getpid()}
-    while below := {pid for pid, parent in parents.items() if parent in found} - found:
-        found |= below
-    return found
+    return [psutil.Process(), *psutil.Process().children(recursive=True)]
 
 
 def listening() -> list[str]:
-    """Addresses, in the kernel's hexadecimal, at which own processes accept TCP connections."""
-    inodes = set()
-    for pid in own_processes():
-        try:
-            inodes |= {os.readlink(f) for f in Path(f"/proc/{pid}/fd").iterdir() if f.is_symlink()}
-        except OSError:
-            continue
-    rows = [
-        line.split()
-        for name in ("tcp", "tcp6")
-        for line in Path("/proc/net", name).read_text().splitlines()[1:]
-    ]
-    return [row[1].partition(":")[0] for row in rows if row[3] == "0A" and f"socket:[{row[9]}]" in inodes]
-
-
-LOOPBACK = {"0100007F", "0000000000000000FFFF00000100007F", "00000000000000000000000001000000"}
-"""127.0.0.1, the same as IPv6, and ::1, as a little-endian kernel writes them."""
+    """Addresses at which own processes accept TCP connections."""
+    found = []
+    for process in own_processes():
+        with contextlib.suppress(psutil.Error):
+            sockets = process.net_connections("tcp")
+            found += [one.laddr.ip for one in sockets if one.status == psutil.CONN_LISTEN]
+    return found
 
 
 @pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="no /proc/net")
@@ -185,12 +156,9 @@ def test_workers_know_where_the_token_is_and_not_what(light_ray: None):
     there = ray.get(ray.remote(lambda: dict(os.environ)).remote())
     assert there[TOKEN_PATH] == os.environ[TOKEN_PATH]
     assert TOKEN not in there and not any(token in value for value in there.values())
-    for pid in own_processes():
-        try:
-            said = Path(f"/proc/{pid}/environ").read_bytes() + Path(f"/proc/{pid}/cmdline").read_bytes()
-        except OSError:
-            continue
-        assert token.encode() not in said, pid
+    for process in own_processes():
+        with contextlib.suppress(psutil.Error):
+            assert token not in " ".join([*process.environ().values(), *process.cmdline()]), process
 
 
 def test_a_client_without_the_token_is_refused(light_ray: None):
@@ -358,15 +326,16 @@ def test_a_process_of_ray_that_is_lost_is_named_and_a_new_ray_is_started(
 
 
 def test_who_goes_on_is_not_taken_for_stopped(raylet: psutil.Process):
-    watch = RayWatch(stall_s=3600.0)
+    own = RaySession(LaunchConfig(stall_s=3600.0))
+    own.watch()
     raylet.suspend()
     while raylet.status() != psutil.STATUS_STOPPED:
         time.sleep(0.01)
-    assert not watch.look() and watch._stopped
+    assert not own.lost and own._stopped
     raylet.resume()
-    while watch._stopped:
-        assert not watch.look()
-    watch.close()
+    while own._stopped:
+        assert not own.lost
+    own.close()
 
 
 HANGS = """
@@ -374,12 +343,13 @@ import os, signal, sys, time
 import psutil
 from accerl_lerobot import guardian
 from accerl_lerobot.engine import ray_session
+from accerl_lerobot.engine.config import LaunchConfig
 gcs_server = psutil.Process(int(sys.argv[1]))
 ray_session.ray_processes = lambda: {gcs_server: "gcs_server"}
 ray_session.kill_ray = lambda processes: None
 ray_session.GIVE_UP_S = 0.1
 guardian.explain(remedy="to resume: accerl train --resume=true")
-ray_session.RayWatch(300.0)
+ray_session.RaySession(LaunchConfig()).watch()
 os.kill(int(sys.argv[1]), signal.SIGKILL)
 time.sleep(600)
 """

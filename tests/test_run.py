@@ -16,8 +16,7 @@ from accerl_lerobot.engine import resuming, run
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig
 from accerl_lerobot.engine.loop import Engine, Progress, Saved
 from accerl_lerobot.engine.stopping import WorkerError
-from accerl_lerobot.envs import MetaWorldConfig, SimulatedConfig
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
@@ -131,15 +130,6 @@ def test_without_a_name_the_folder_is_named_after_the_time(
     monkeypatch.chdir(tmp_path)
     path = run.make_output_dir(local_run(tiny_checkpoint, None, job_name="mine"))
     assert path.is_dir() and path.parts[0] == "outputs" and path.name.endswith("_mine")
-
-
-def test_a_policy_that_does_not_fit_the_world_is_refused_before_any_worker_starts(
-    tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setattr(run, "make_engine", lambda *_: pytest.fail("a worker was started"))
-    config = local_run(tiny_checkpoint, tmp_path, env=MetaWorldConfig())
-    with pytest.raises(InputError, match=r"policy.path"):
-        run.execute(config, tmp_path, Console())
 
 
 class Scripted(Engine):

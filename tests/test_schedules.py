@@ -3,13 +3,9 @@
 
 from __future__ import annotations
 
-import asyncio
 import functools
-import os
-import signal
 from collections import Counter
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,7 +16,7 @@ from accerl_lerobot.engine.config import LaunchConfig, RunConfig
 from accerl_lerobot.engine.loop import Progress
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import evaluation_plans
-from accerl_lerobot.inference.batcher import dealt, merge_metrics
+from accerl_lerobot.inference.batcher import merge_metrics
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.replay.pacing import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, ReplayConfig, Turns
 from accerl_lerobot.rollout.runner import RolloutConfig
@@ -31,7 +27,7 @@ from benchmarks.simulated_world import LatencyConfig
 from tests.light_workers import light_ray
 from tests.replay.segments import make_segment
 from tests.replay.test_worker import BATCH, play, start, waits
-from tests.runs import collect, drive, polls
+from tests.runs import collect, polls
 
 __all__ = ["light_ray"]
 
@@ -98,19 +94,6 @@ def test_with_overlap_one_batch_is_collected_meanwhile():
     play(scene, ReplayConfig(capacity=64, min_decisions=8, ahead=16, samples_per_insert=1.0))
 
 
-def test_those_kept_waiting_go_when_the_schedule_changes_or_the_run_ends():
-    async def scene(worker: Any) -> None:
-        await worker.follow(SYNCHRONOUS)
-        asked = start(worker.sample(BATCH, 0))
-        await waits(asked)
-        kept = start(worker.insert([make_segment("a", 8)]))
-        assert await waits(kept)
-        await worker.follow(ASYNCHRONOUS)
-        assert await asyncio.wait_for(kept, 5)
-
-    play(scene)
-
-
 def run_of(schedule: Any, updates: int = 6) -> RunConfig:
     return RunConfig(
         env=LatencyConfig(max_steps=16, reward="dense", frame_ms=3.0, latency_cv=0.5),
@@ -167,58 +150,6 @@ def test_a_run_in_turn(light_ray: None, schedule: Any, monkeypatch: pytest.Monke
         engine.close()
 
 
-class _Dies:
-    """A policy whose first process ends in the middle of a batch of so many, once there have been updates."""
-
-    def __init__(self, policy: Any, size: int, died: Path) -> None:
-        self._policy, self._size, self._died = policy, size, died
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._policy, name)
-
-    def decide(self, requests: list[Any], version: int) -> Any:
-        if len(requests) == self._size and version >= 3 and not self._died.exists():
-            self._died.touch()
-            os.kill(os.getpid(), signal.SIGKILL)
-        return self._policy.decide(requests, version)
-
-
-def load_dying(config: SimulatedPolicyConfig, size: int, died: Path, policy: Any) -> Any:
-    return _Dies(load_simulated(config, policy), size, died)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("schedule", "lag"), [(SYNCHRONOUS, 0.0), (OVERLAP, 1.0)])
-@pytest.mark.parametrize(("size", "ahead"), [(3, 0.0), (1, 1.0)], ids=["none answered", "three of four"])
-def test_in_turn_a_service_that_is_lost_is_waited_for_and_the_round_is_finished(
-    light_ray: None, tmp_path: Path, schedule: Any, lag: float, size: int, ahead: float
-):
-    """Callers that had their answer go on, and are a decision ahead of the one that has to ask again."""
-    from accerl_lerobot.engine.launch import RayEngine
-
-    died = tmp_path / "died"
-    policy = SimulatedPolicyConfig(decide_ms=1.0, update_ms=5.0)
-    engine = RayEngine(
-        run_of(schedule, updates=20), ("match",), load=functools.partial(load_dying, policy, size, died)
-    )
-    try:
-        engine.train()
-        history: list[Progress] = drive(engine)
-        updates = [update for progress in history for update in progress.updates]
-        assert [u["update"] for u in updates] == [float(i + 1) for i in range(20)]
-        assert died.exists() and history[-1].inference["restarts"] == 1.0
-        assert history[-1].rollout["restarts"] == 0.0
-        lags = [u["lag_max"] for u in updates]
-        assert max(lags[:3]) <= lag and max(lags) <= lag + ahead
-        if schedule == SYNCHRONOUS:
-            assert lags[-10:] == [ahead] * 10
-        # The one that came later decides for all four together, too.
-        sizes = Counter(engine.batching().batch_sizes)
-        assert sizes[3] + sizes[1] > 0.9 * sizes.total()
-    finally:
-        engine.close()
-
-
 @pytest.mark.slow
 def test_several_services_share_the_worlds_out(light_ray: None, monkeypatch: pytest.MonkeyPatch):
     from accerl_lerobot.engine.launch import RayEngine
@@ -259,7 +190,6 @@ def test_what_services_say_merge_metrics():
     assert found["wait_mean_s"] == pytest.approx((0.1 * 6 + 0.3 * 4) / 10)
     assert (found["wait_max_s"], found["version"], found["busy_share"]) == (0.5, 6.0, pytest.approx(0.4))
     assert merge_metrics([one]) == one and merge_metrics([]) == {}
-    assert dealt(5, 2) == [3, 2] and dealt(2, 2) == [1, 1]
 
 
 def test_services_without_callers_are_refused():

@@ -6,9 +6,8 @@
     R_t = Â_t + V_t
 
 r_t is the reward summed over a whole chunk, so γ and λ are per decision. What follows the last decision of
-a segment: nothing if the episode *terminated* (bootstrap 0); V of the observation after it if time ran out
-(*truncated*) or the segment was cut in mid-episode. Treating a truncation as a termination would teach the
-critic that time limits are deaths.
+a segment: nothing if the episode *terminated* (bootstrap 0), by its time limit too; V of the observation
+after it if the segment was cut in mid-episode.
 
 Values must come from the critic of now: those stored with a sample are stale by its lag. *Normalisation* is
 over the whole batch: per micro-batch it would compare a decision only with its neighbours.
@@ -44,7 +43,7 @@ def gae(
 
     `rewards` (S, T) are summed over each chunk, `values` (S, T) are V before each decision; padding may hold
     anything, NaN included. `bootstrap_value` (S,), V after the last one, does not count where `terminated`,
-    bool (S,): True if the episode is over, False for truncated and for cut segments.
+    bool (S,): True if the episode is over, False for segments cut in mid-episode.
     """
     t = rewards.shape[1]
     padding = ~decision_mask(lengths, t)

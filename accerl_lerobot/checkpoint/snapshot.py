@@ -12,6 +12,7 @@ were registered with `kind`.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -25,6 +26,7 @@ from accerl_lerobot.errors import InputError
 
 MARK = "$"
 """Key of a JSON object that stands for something JSON does not know."""
+_PLAIN = (bool, int, float, str)
 _KINDS: dict[str, type[Any]] = {}
 
 
@@ -47,7 +49,7 @@ def save(path: Path, tree: Any) -> None:
         TypeError: the tree holds something of a kind that is not known; names its place.
     """
     arrays: dict[str, np.ndarray] = {}
-    text = json.dumps(_encode(tree, path.name, arrays))
+    text = json.dumps(to_json(tree, path.name, arrays))
     path.parent.mkdir(parents=True, exist_ok=True)
     save_file(arrays, path.with_suffix(".safetensors"))
     path.with_suffix(".json").write_text(text + "\n")
@@ -58,63 +60,71 @@ def load(path: Path) -> Any:
     file = path.with_suffix(".json")
     try:
         text, arrays = file.read_text(), load_file(path.with_suffix(".safetensors"))
-        return _decode(json.loads(text), arrays)
+        return from_json(json.loads(text), arrays)
     except (OSError, ValueError, KeyError, TypeError, RecursionError, SafetensorError) as error:
         said = " ".join(str(error).split())[:160]
         remedy = f"not a state that accerl has saved ({said}); resume from another checkpoint"
         raise InputError("checkpoint", str(file), remedy) from error
 
 
-def _encode(value: Any, place: str, arrays: dict[str, np.ndarray]) -> Any:
-    def within(key: object, part: Any) -> Any:
-        return _encode(part, f"{place}.{key}", arrays)
+def to_json(value: Any, place: str, arrays: dict[str, np.ndarray]) -> Any:
+    """A tree as JSON can hold it; its arrays go into `arrays`, by number.
 
-    def stored(array: np.ndarray) -> str:
-        if array.dtype.kind not in "biuf":
-            raise TypeError(f"{place}: an array of {array.dtype} cannot be saved")
-        name = str(len(arrays))
-        arrays[name] = np.asarray(array, order="C")
-        return name
-
-    if value is None or isinstance(value, (bool, int, float, str)):
+    Raises:
+        TypeError: the tree holds something of a kind that is not known; names its place.
+    """
+    cls: Any = type(value)
+    if value is None or cls in _PLAIN:
         return value
+    if cls is np.ndarray:
+        return _stored(value, "array", place, arrays)
+    if cls is list:
+        return [to_json(part, f"{place}.{i}", arrays) for i, part in enumerate(value)]
+    if cls is tuple:
+        items = [to_json(part, f"{place}.{i}", arrays) for i, part in enumerate(value)]
+        return {MARK: "tuple", "items": items}
+    if cls is dict:
+        parts = {key: to_json(part, f"{place}.{key}", arrays) for key, part in value.items()}
+        if MARK not in parts and all(isinstance(key, str) for key in parts):
+            return parts
+        keys = [to_json(key, f"{place}.key", arrays) for key in parts]
+        return {MARK: "map", "items": [list(item) for item in zip(keys, parts.values(), strict=True)]}
+    if kind_named(cls.__name__) == cls:
+        fields = {f: to_json(getattr(value, f), f"{place}.{f}", arrays) for f in field_names(cls)}
+        return {MARK: cls.__name__, "fields": fields}
     if isinstance(value, np.generic):
         return value.item()
-    if isinstance(value, np.ndarray):
-        return {MARK: "array", "name": stored(value)}
-    if type(value).__module__ == "torch":
-        return {MARK: "tensor", "name": stored(value.detach().cpu().numpy())}
+    if isinstance(value, bool | int | float | str):
+        return value
+    if cls.__module__ == "torch":
+        return _stored(value.detach().cpu().numpy(), "tensor", place, arrays)
     if isinstance(value, np.random.Generator):
         return {MARK: "generator", "state": value.bit_generator.state}
-    if type(value) is list:
-        return [within(i, part) for i, part in enumerate(value)]
-    if type(value) is tuple:
-        return {MARK: "tuple", "items": [within(i, part) for i, part in enumerate(value)]}
-    if type(value) is dict:
-        if all(isinstance(key, str) for key in value) and MARK not in value:
-            return {key: within(key, part) for key, part in value.items()}
-        items = [[within("key", key), within(key, part)] for key, part in value.items()]
-        return {MARK: "map", "items": items}
-    name = type(value).__name__
-    if kind_named(name) is type(value):
-        names = field_names(type(value))
-        return {MARK: name, "fields": {field: within(field, getattr(value, field)) for field in names}}
-    raise TypeError(f"{place}: a {name} cannot be saved")
+    raise TypeError(f"{place}: a {cls.__name__} cannot be saved")
 
 
-def _decode(value: Any, arrays: dict[str, np.ndarray]) -> Any:
+def _stored(array: np.ndarray, mark: str, place: str, arrays: dict[str, np.ndarray]) -> dict[str, str]:
+    if array.dtype.kind not in "biuf":
+        raise TypeError(f"{place}: an array of {array.dtype} cannot be saved")
+    name = str(len(arrays))
+    arrays[name] = np.asarray(array, order="C")
+    return {MARK: mark, "name": name}
+
+
+def from_json(value: Any, arrays: dict[str, np.ndarray]) -> Any:
+    """The tree that `to_json` was given."""
     if isinstance(value, list):
-        return [_decode(part, arrays) for part in value]
+        return [from_json(part, arrays) for part in value]
     if not isinstance(value, dict):
         return value
     if MARK not in value:
-        return {key: _decode(part, arrays) for key, part in value.items()}
+        return {key: from_json(part, arrays) for key, part in value.items()}
     if (name := value[MARK]) in _READERS:
         return _READERS[name](value, arrays)
     cls = kind_named(name)
     if cls is None:
         raise ValueError(f"no kind of thing is called {name!r}")
-    return cls(**{key: _decode(part, arrays) for key, part in value["fields"].items()})
+    return cls(**{key: from_json(part, arrays) for key, part in value["fields"].items()})
 
 
 def _tensor(value: dict[str, Any], arrays: dict[str, np.ndarray]) -> Any:
@@ -133,13 +143,14 @@ _READERS: dict[str, Callable[[dict[str, Any], dict[str, np.ndarray]], Any]] = {
     "array": lambda value, arrays: arrays[value["name"]],
     "tensor": _tensor,
     "generator": _generator,
-    "tuple": lambda value, arrays: tuple(_decode(part, arrays) for part in value["items"]),
+    "tuple": lambda value, arrays: tuple(from_json(part, arrays) for part in value["items"]),
     "map": lambda value, arrays: {
-        _decode(key, arrays): _decode(part, arrays) for key, part in value["items"]
+        from_json(key, arrays): from_json(part, arrays) for key, part in value["items"]
     },
 }
 
 
+@functools.cache
 def field_names(cls: type[Any]) -> tuple[str, ...]:
     """Fields of a dataclass or named tuple, in order."""
     if dataclasses.is_dataclass(cls):

@@ -65,10 +65,10 @@ class LaunchConfig(Section, section="launch"):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.engine == "local":
-            one = "launch.engine=local is one process"
             for name, default in (("schedule", ASYNCHRONOUS), ("address", None), ("placement", {})):
                 if (value := getattr(self, name)) != default:
-                    raise InputError(f"launch.{name}", value, f"{one}; leave it out")
+                    remedy = "launch.engine=local is one process; leave it out"
+                    raise InputError(f"launch.{name}", value, remedy)
         for role, nodes in self.placement.items():
             if role not in ROLES or not nodes.strip():
                 remedy = f"use one of {', '.join(ROLES)}, and a node's number, a resource, or all"
@@ -121,6 +121,16 @@ class RunConfig(Section):
     checkpoints, ``RUN/checkpoints/last/config.yaml``."""
 
     @property
+    def folder(self) -> Path | None:
+        """Folder of the run; None: nothing is kept."""
+        return None if self.output_dir is None else Path(self.output_dir).absolute()
+
+    @property
+    def timeline_folder(self) -> Path | None:
+        """Where the timeline of a run's workers is kept; None: nowhere."""
+        return None if self.folder is None else self.folder / TIMELINE
+
+    @property
     def saves(self) -> bool:
         """True if there are checkpoints on the way."""
         return bool(self.save_every_updates or self.save_every_s)
@@ -139,30 +149,23 @@ class RunConfig(Section):
             raise InputError("policy.path", self.policy.path, remedy)
         if isinstance(self.algorithm, OffPolicyConfig):
             self._check_off_policy()
-        if self.trainer.hold_back >= self.replay.max_lag:
-            remedy = (
-                f"use more than trainer.hold_back, {self.trainer.hold_back}, or all is thrown away as too old"
-            )
+        if (held := self.trainer.hold_back) >= self.replay.max_lag:
+            remedy = f"use more than trainer.hold_back, {held}, or all is thrown away as too old"
             raise InputError("replay.max_lag", self.replay.max_lag, remedy)
-        for name, count in (
-            ("inference.workers", self.inference.workers),
-            ("trainer.ranks", self.trainer.ranks),
-        ):
+        counts = {"inference.workers": self.inference.workers, "trainer.ranks": self.trainer.ranks}
+        for name, count in counts.items():
             if count > 1 and self.launch.engine == "local":
                 remedy = "launch.engine=local is one process; use launch.engine=ray, or 1"
                 raise InputError(name, count, remedy)
         if self.inference.workers > self.rollout.workers:
             remedy = f"use at most rollout.workers, {self.rollout.workers}, or some have nobody to answer"
             raise InputError("inference.workers", self.inference.workers, remedy)
-        batch, imagination = self.trainer.batch_decisions, self.imagination
+        batch, length = self.trainer.batch_decisions, self.rollout.segment_length
         if self.trainer.updates:
             # `engine.imagination` checks that a whole imagined rollout fits too.
-            self.replay.check(batch_decisions=batch, segment_decisions=self.rollout.segment_length)
-        if imagination.share and self.launch.schedule != ASYNCHRONOUS:
-            remedy = "use asynchronous: imagination takes no turns"
-            raise InputError("launch.schedule", self.launch.schedule, remedy)
-        if self.rollout.episodes and self.launch.schedule != ASYNCHRONOUS:
-            remedy = "use asynchronous, or leave out rollout.episodes: a paused environment is waited for"
+            self.replay.check(batch_decisions=batch, segment_decisions=length)
+        if self.launch.schedule != ASYNCHRONOUS and (self.imagination.share or self.rollout.episodes):
+            remedy = "use asynchronous, or leave out imagination.share and rollout.episodes"
             raise InputError("launch.schedule", self.launch.schedule, remedy)
 
     def _check_off_policy(self) -> None:
@@ -180,18 +183,6 @@ class RunConfig(Section):
             ("replay.samples_per_insert", self.replay.samples_per_insert, 1.0, "draws from its own memory"),
             ("trainer.ranks", self.trainer.ranks, 1, "is learnt by one process"),
             ("imagination.share", self.imagination.share, 0.0, "learns from real episodes only"),
-            ("rollout.time_limit", self.rollout.time_limit, "fail", "sees the time that is left"),
         ):
             if value != wanted:
                 raise InputError(name, value, f"{only} {why}; use {wanted}")
-
-
-def journal_folder(config: RunConfig) -> Path | None:
-    """Where a run's journal is kept; None: nowhere."""
-    return None if config.output_dir is None else Path(config.output_dir).absolute()
-
-
-def timeline_folder(config: RunConfig) -> Path | None:
-    """Where the timeline of a run's workers is kept; None: nowhere."""
-    folder = journal_folder(config)
-    return None if folder is None else folder / TIMELINE

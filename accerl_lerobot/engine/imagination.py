@@ -49,27 +49,17 @@ from accerl_lerobot.world_model.success_model import SuccessPairsRewardModel
 LEARN = "imagination.learn.dataset"
 MAX_PENDING = 2
 """Messages to replay that may be pending before imagination pauses."""
-PAUSE_S = 0.02
-"""Sleep of a worker with nothing to do."""
+PAUSE_S, POLL_S = 0.02, 0.2
+"""Sleep of a worker with nothing to do, and interval at which replay is asked for new real segments."""
 SWAP_S = 30.0
 """Largest wait of a checkpoint for a promoted model to be taken over."""
-POLL_S = 0.2
-"""Interval at which replay is asked for new real segments."""
 
 
 def make_imagination(config: RunConfig, on_segment: Callable[[Segment], object]) -> Imagination:
     """Builds the imagination of a run; its ``policy.path`` must be set."""
     world, model, success = _load(config, load_lerobot_config(config.policy))
-    return Imagination(
-        model,
-        success,
-        world,
-        config.imagination,
-        on_segment,
-        decision_cost=config.rollout.decision_cost,
-        time_limit_fails=config.rollout.time_limit == "fail",
-        seed=config.seed,
-    )
+    cost, seed = config.rollout.decision_cost, config.seed
+    return Imagination(model, success, world, config.imagination, on_segment, decision_cost=cost, seed=seed)
 
 
 def make_learner(config: RunConfig) -> OnlineLearner:
@@ -81,8 +71,7 @@ def make_learner(config: RunConfig) -> OnlineLearner:
     offline = [episode for episode in known if roles.get(episode.key, LEARNT) == LEARNT]
     held_out = [episode for episode in known if roles.get(episode.key, LEARNT) != LEARNT]
     longest = _longest(world, model.spec.chunk)
-    settings = (config.imagination.learn, offline, held_out, roles, longest, config.seed)
-    return OnlineLearner(learned_part(model), success, *settings)
+    return OnlineLearner(learned_part(model), success, learn, offline, held_out, roles, longest, config.seed)
 
 
 def check_imagination(config: RunConfig) -> None:
@@ -95,10 +84,10 @@ def check_imagination(config: RunConfig) -> None:
 def _load(
     config: RunConfig, policy: Any, *, first: bool = False
 ) -> tuple[WorldSpec, WorldModel, SuccessPairsRewardModel | None]:
-    """The environment, and the models for it, which are checked to fit it and the policy.
+    """The environment, and the models for it, which are checked to fit it and LeRobot's config of the policy.
 
-    `policy` is LeRobot's config. If nobody has loaded the files before (`first`), a child process does so
-    first, see `isolation`. An oracle has no success model.
+    If nobody has loaded the files before (`first`), a child process does so first, see `isolation`. An oracle
+    has no success model.
     """
     imagination, executed = config.imagination, getattr(policy, "n_action_steps", 1)
     if (reward := getattr(config.env, "reward", "success")) != "success":
@@ -126,9 +115,8 @@ def _load(
 
 
 def check_fit(spec: WorldModelSpec, world: WorldSpec, executed: int, history: int) -> None:
-    """Refuses a world model that does not fit environment and policy, before a run begins.
-
-    The policy executes so many actions per decision, and its observations hold `history` env steps.
+    """Refuses a world model that does not fit environment and policy, which executes so many actions per
+    decision and sees `history` env steps.
     """
     field, again = f"{IMAGINATION}.path", "train one of this world"
     if missing := [camera for camera in world.images if camera not in spec.cameras]:
@@ -157,7 +145,6 @@ def _is_of(task: str, known: Sequence[str]) -> bool:
 
 
 def _longest(world: WorldSpec, chunk: int) -> int:
-    """Decisions of a rollout at most."""
     return math.ceil(world.max_steps / chunk)
 
 
@@ -176,8 +163,7 @@ class _Worker:
         torch.manual_seed(config.seed)
         self._limit, self._cursor = config.launch.stall_s, 0
         self._core = self._make(config)
-        self._changing = threading.Lock()
-        """Held while the core changes, but not during a validation, which is of a copy."""
+        self._changing = threading.Lock()  # held while the core changes; a validation is of a copy
         if state is not None:
             saved = snapshot.load(state / self.state_name)
             self._core.restore(saved["core"])
@@ -188,11 +174,10 @@ class _Worker:
         raise NotImplementedError
 
     def ready(self) -> int:
-        """Returns this process's id once the models are loaded."""
+        """This process's id, once the models are loaded."""
         return os.getpid()
 
     def metrics(self) -> dict[str, float]:
-        """See the class of the core."""
         self._clock.beat()
         metrics: dict[str, float] = self._core.metrics()
         return metrics
@@ -242,7 +227,6 @@ class ImaginationWorker(_Worker):
         self._may_promote = may_promote
 
     def move(self, inference: Endpoint) -> None:
-        """Sends requests to this endpoint from now on."""
         self._deciding.move(inference)
 
     def save(self, directory: Path) -> None:
@@ -265,12 +249,11 @@ class ImaginationWorker(_Worker):
             segments = news.fresh()
             self._clock.enter(CHECKPOINT)
             with self._changing:
-                self._clock.enter(COMPUTE)
                 may_promote = self._may_promote  # first: the last model comes before the word that it is
                 if self._promoted:
                     self._clock.enter(WEIGHT_SYNC)
                     self._core.swap(self._promoted.pop())
-                    self._clock.enter(COMPUTE)
+                self._clock.enter(COMPUTE)
                 for segment in segments:
                     self._core.remember(segment)
                 self._cursor = news.cursor
@@ -317,8 +300,7 @@ class WorldLearningWorker(_Worker):
     def run(self, imaginer: Any, replay: Any) -> None:
         """Trains until replay is closed."""
         news, learner = _News(replay, self._cursor), self._core
-        may_promote: bool | None = None
-        hold: bool | None = None  # as last reported
+        held = expected = None  # as last reported
         while not news.closed:
             self._clock.enter(TRANSPORT)
             segments = news.fresh()
@@ -327,12 +309,11 @@ class WorldLearningWorker(_Worker):
                     learner.add(segment)
                 self._cursor = news.cursor
             last = news.ended
-            due = learner.validation_due(last=False) and not last
-            if hold is not due:
-                hold = due
+            if held is not (hold := learner.validation_due(last=False) and not last):
+                held = hold
                 _await(replay.hold.remote(hold))
-            if may_promote is not learner.may_promote(last):
-                may_promote = learner.may_promote(last)
+            if expected is not (may_promote := learner.may_promote(last)):
+                expected = may_promote
                 _await(imaginer.expect.remote(may_promote))
             if learner.pending_steps >= 1:
                 self._clock.enter(CHECKPOINT)

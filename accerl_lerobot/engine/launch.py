@@ -31,7 +31,7 @@ import ray
 from ray.exceptions import RayActorError, RayError, RayTaskError
 
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE, saved_version
-from accerl_lerobot.engine.config import RunConfig, journal_folder, timeline_folder
+from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.loop import Engine, Progress, Saved
 from accerl_lerobot.engine.placement import actor_options, place_workers
 from accerl_lerobot.engine.ray_session import RaySession
@@ -48,23 +48,20 @@ from accerl_lerobot.world_model.config import IMAGINATION, WORLD_LEARNING
 logger = logging.getLogger(__name__)
 
 POLL_S = 0.5
-GONE_S = 3.0
-"""How long a killed process may take to be gone."""
-BLAME_S = 10.0
-"""How long to wait for the failure that another failure is the consequence of."""
+GONE_S, BLAME_S = 3.0, 10.0
+"""How long to wait for a killed process, and for the failure that another is the consequence of."""
 
 
-def end(workers: Iterable[WorkerSlot], *, told: bool = True) -> None:
-    """End workers and wait until they are gone, so that nothing writes any more when others start.
+def end(workers: Iterable[WorkerSlot], *, lost: bool = False) -> None:
+    """End workers, by Ray unless that is `lost`, and wait until they are gone.
 
-    Args:
-        told: True: Ray tells them to end, which a stopped process does not hear; False: Ray is lost.
+    Nothing writes any more then, when others start. A process that is stopped does not hear Ray.
     """
     workers = list(workers)
-    for worker in workers if told else ():
+    for worker in () if lost else workers:
         ray.kill(worker.actor)
     processes = [worker.process for worker in workers if worker.process is not None]
-    left = psutil.wait_procs(processes, timeout=GONE_S if told else 0.0)[1]
+    left = psutil.wait_procs(processes, timeout=0.0 if lost else GONE_S)[1]
     for process in left:
         with contextlib.suppress(psutil.NoSuchProcess):
             process.kill()
@@ -72,17 +69,15 @@ def end(workers: Iterable[WorkerSlot], *, told: bool = True) -> None:
 
 
 def _fail(worker: WorkerSlot, error: Exception, text: str = "") -> None:
-    """Restart a worker that has failed, or raise what ends the engine."""
     if worker.restart is None:
         raise WorkerError(text or f"{worker.name} worker failed for good:\n{error}") from error
     worker.restart(error)
 
 
 class RayEngine(Engine):
-    """The asynchronous engine.
+    """The asynchronous engine of a run whose ``policy.path`` is set.
 
     Args:
-        config: the run; its ``policy.path`` must be set.
         history: env steps that an observation holds, the policy's ``n_obs_steps``.
         state: the ``training_state`` to resume from, without the episodes under way; None: begin.
         load: makes the policy's adapter, in the processes that have one; None: of LeRobot's checkpoint.
@@ -104,9 +99,8 @@ class RayEngine(Engine):
         self._rollouts = RolloutWorkers(config, tasks, history, state)
         self._inference = InferenceReplicas(config, self._version, state, load, self._move)
         self._others: list[WorkerSlot] = []
-        """All other workers."""
         self._imagining: list[WorkerSlot] = []
-        """The one that imagines, and the one that trains the world model."""
+        """The one that imagines, and the one that trains the world model; both are among the others."""
         self._updates: list[dict[str, float]] = []
         self._schedule: Schedule = ASYNCHRONOUS
         self._training = self._real_ended = self._done = self._closed = False
@@ -130,12 +124,11 @@ class RayEngine(Engine):
         self.follow(self._config.launch.schedule)
         self._inference.trainer = self._trainer.actor
         self._trainer.work = self._trainer.actor.run.remote(self._replay.actor, self._deciding)
-        for worker in self._imagining[:1]:
-            # The last replica: the first ones may have one rollout worker more.
-            asks = self._deciding[-1]
-            worker.work = worker.actor.run.remote(asks, self._inserting, self._replay.actor)
-        for worker in self._imagining[1:]:
-            worker.work = worker.actor.run.remote(self._imagining[0].actor, self._replay.actor)
+        # The last replica: the first ones may have one rollout worker more.
+        asks: tuple[Any, ...] = (self._deciding[-1], self._inserting)
+        for worker in self._imagining:
+            worker.work = worker.actor.run.remote(*asks, self._replay.actor)
+            asks = (worker.actor,)  # the learner of the world model talks to the one that imagines
 
     def follow(self, schedule: Schedule) -> None:
         """Change the schedule of collecting and learning, see `replay.pacing`."""
@@ -198,9 +191,10 @@ class RayEngine(Engine):
             return
         self._closed = True
         try:
-            if lost := bool(self._ray.lost):
+            lost = bool(self._ray.lost)
+            if lost:
                 self._ray.close()
-            end(self._everyone(), told=not lost)
+            end(self._everyone(), lost=lost)
             if not self._keeps_ray:
                 self._ray.close()
         except Exception:
@@ -211,7 +205,6 @@ class RayEngine(Engine):
         return {w.name: int(w.call("ready", timeout=self._limit)) for w in self._everyone()}
 
     def batching(self) -> BatcherStats:
-        """Batches of the inference replicas so far."""
         return self._inference.batching()
 
     def _everyone(self) -> Iterator[WorkerSlot]:
@@ -222,39 +215,36 @@ class RayEngine(Engine):
 
     def _start(self) -> None:
         from accerl_lerobot.replay.worker import ReplayWorker
-        from accerl_lerobot.trainer.peers import LearnerSettings, TrainerRank
+        from accerl_lerobot.trainer.peers import SHARE, LearnerSettings, TrainerRank
         from accerl_lerobot.trainer.worker import TrainerWorker
 
-        c, timeline = self._config, timeline_folder(self._config)
+        c, state, timeline = self._config, self._state, self._config.timeline_folder
         plan, imagination = place_workers(c), c.imagination
 
-        def make(name: str, kind: type, concurrency: int, *arguments: Any) -> Any:
+        def make(name: str, kind: type, concurrency: int, *arguments: Any) -> WorkerSlot:
             options = actor_options(plan.places[name]) | {"max_concurrency": concurrency}
-            return ray.remote(kind).options(**options).remote(*arguments)
+            worker = WorkerSlot(name, ray.remote(kind).options(**options).remote(*arguments))
+            self._others.append(worker)
+            return worker
 
         # The ranks first: Ray fills the GPU that is fullest, and each of them needs more than half of one.
-        learner = LearnerSettings(c.policy, c.algorithm, c.trainer, c.seed, self._state, self._load)
-        names = [f"trainer rank {rank}" for rank in range(1, c.trainer.ranks)]
-        ranks = [make(name, TrainerRank, 1, rank, learner) for rank, name in enumerate(names, start=1)]
-        trainer = make("trainer", TrainerWorker, 4, learner, timeline, ranks, journal_folder(c))
+        wait_s = SHARE * self._limit
+        learner = LearnerSettings(c.policy, c.algorithm, c.trainer, c.seed, state, self._load, wait_s)
+        others = range(1, c.trainer.ranks)
+        ranks = [make(f"trainer rank {rank}", TrainerRank, 1, rank, learner).actor for rank in others]
+        self._trainer = make("trainer", TrainerWorker, 4, learner, timeline, ranks, c.folder)
         self._inference.start(plan)
         imagined = imagination.imagined_replay(c.replay) if imagination.share else None
-        counted = c.rollout.episodes > 0
-        stores = (c.replay, c.seed, imagined, counted, self._state, journal_folder(c), timeline)
-        self._replay = self._add("replay", make("replay", ReplayWorker, 1000, *stores))
-        for name, rank in zip(names, ranks, strict=True):
-            self._add(name, rank)
-        self._trainer = self._add("trainer", trainer)
+        stores = (c.replay, c.seed, imagined, c.rollout.episodes > 0, state, c.folder, timeline)
+        self._replay = make("replay", ReplayWorker, 1000, *stores)
         if imagination.share:
             from accerl_lerobot.engine.imagination import ImaginationWorker, WorldLearningWorker
 
-            kinds: dict[str, type] = {IMAGINATION: ImaginationWorker}
-            kinds |= {WORLD_LEARNING: WorldLearningWorker} if imagination.learns else {}
-            for name, kind in kinds.items():
-                self._imagining.append(self._add(name, make(name, kind, 4, c, self._state, timeline)))
+            self._imagining.append(make(IMAGINATION, ImaginationWorker, 4, c, state, timeline))
+            if imagination.learns:
+                self._imagining.append(make(WORLD_LEARNING, WorldLearningWorker, 4, c, state, timeline))
         self._rollouts.start(plan)
-        ready = [(worker, worker.actor.ready.remote()) for worker in self._everyone()]
-        for worker, reference in ready:
+        for worker, reference in [(w, w.actor.ready.remote()) for w in self._everyone()]:
             here = plan.places[worker.name].node.number == 0
             worker.await_start(reference, max(START_S, self._limit), here)
         self._deciding = self._inference.open()  # the rollout workers share this list, see `_move`
@@ -262,12 +252,7 @@ class RayEngine(Engine):
         self._replay.work = self._replay.actor.run.remote()
         self._rollouts.run(self._deciding, self._inserting)
 
-    def _add(self, name: str, actor: Any) -> WorkerSlot:
-        self._others.append(WorkerSlot(name, actor))
-        return self._others[-1]
-
     def _move(self, index: int, inference: Endpoint) -> None:
-        """Tell the clients of an inference replica its new endpoint."""
         self._deciding[index] = inference
         self._rollouts.move(index, inference)
         if self._imagining and index == len(self._deciding) - 1:
@@ -331,7 +316,6 @@ class RayEngine(Engine):
         return episodes
 
     def _hear(self, worker: WorkerSlot, timeout: float = 0.0) -> Any:
-        """An answer that has come."""
         try:
             return worker.answer(timeout)
         except RayError as error:

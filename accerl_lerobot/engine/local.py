@@ -20,7 +20,7 @@ import numpy as np
 
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import PRETRAINED, TRAINING_STATE, WEIGHTS, WORLD_MODEL
-from accerl_lerobot.engine.config import RunConfig, journal_folder, timeline_folder
+from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.loop import Engine, Progress, Saved, check_new, episode_key
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.errors import InputError
@@ -52,7 +52,7 @@ class LocalEngine(Engine):
         state: Path | None = None,
         load: Load | None = None,
     ) -> None:
-        self._clock = open_clock(timeline_folder(config), LOCAL)
+        self._clock = open_clock(config.timeline_folder, LOCAL)
         import torch
 
         from accerl_lerobot.trainer.update import make_update
@@ -68,9 +68,8 @@ class LocalEngine(Engine):
             self._acting = loader(load)(config.policy)
             self._acting.load_trainable(self._adapter.export_trainable())
         imagination = config.imagination
-        folder, counted = journal_folder(config), config.rollout.episodes > 0
-        journal = None if folder is None else Journal(folder / EPISODES)
-        imagined = imagination.imagined_replay(config.replay)
+        journal = None if config.folder is None else Journal(config.folder / EPISODES)
+        imagined, counted = imagination.imagined_replay(config.replay), config.rollout.episodes > 0
         self._replay = MixedReplay(config.replay, imagined, imagination.share, counted, journal)
         self._imagination = self._world_learner = None
         if imagination.share:
@@ -86,7 +85,7 @@ class LocalEngine(Engine):
         self._outbox: deque[Segment] = deque()
         count = config.rollout.worlds * config.rollout.workers
         worlds = [make_world(config.env, history, config.rollout.reward_model) for _ in range(count)]
-        self._plans = EpisodePlans(tasks, seed=config.seed, budget=config.rollout.episodes or None)
+        self._plans = EpisodePlans(tasks, config.seed, config.rollout.episodes or None)
         self._runner = RolloutRunner(
             worlds,
             lambda: self._plans.next(self._exploring),
@@ -120,7 +119,7 @@ class LocalEngine(Engine):
         if self._exploring and self._replay.may_sample(n):
             segments = self._replay.sample(n, self._update.version, self._rng)
             if segments:
-                with keeping(journal_folder(self._config), self._update, segments):
+                with keeping(self._config.folder, self._update, segments):
                     updates.append(self._update.step(segments) | {"update": float(self._update.version)})
                 self._publish()
         self._clock.enter(WAIT_IN)
@@ -166,9 +165,8 @@ class LocalEngine(Engine):
 
     def _restore(self, directory: Path) -> None:
         if not (directory / f"{LOCAL}.json").is_file():
-            raise InputError(
-                "launch.engine", "local", "this run was asynchronous; resume it with launch.engine=ray"
-            )
+            remedy = "this run was asynchronous; resume it with launch.engine=ray"
+            raise InputError("launch.engine", "local", remedy)
         self._adapter.load_trainable(snapshot.load(directory / WEIGHTS))
         self._update.restore(snapshot.load(directory / "trainer"))
         self._replay.restore(snapshot.load(directory / "replay"))
@@ -182,8 +180,8 @@ class LocalEngine(Engine):
         self._outbox.extend(engine["outbox"])
         self._plans.restore(engine["plans"])
         self._runner.restore(engine["runner"])
-        requests = ((slot, self._runner.request(slot)) for slot in range(len(self._runner)))
-        self._due = {slot: request for slot, request in requests if request is not None}
+        slots = range(len(self._runner))
+        self._due = {slot: request for slot in slots if (request := self._runner.request(slot))}
         if self._imagination is not None:
             imagined = snapshot.load(directory / IMAGINATION)
             self._imagination.restore(imagined["imagination"])
@@ -202,7 +200,6 @@ class LocalEngine(Engine):
 
     @property
     def _exploring(self) -> bool:
-        """True if there are updates left to make."""
         if not self._training or self._update.version >= self._config.trainer.updates:
             return False
         return not self._replay.exhausted(self._config.trainer.batch_decisions)
@@ -213,8 +210,7 @@ class LocalEngine(Engine):
             request = self._due.get(slot)
             if request is None or (request.explore and not self._exploring):
                 self._due.pop(slot, None)
-                fresh = self._runner.start(slot)
-                if fresh is not None:
+                if (fresh := self._runner.start(slot)) is not None:
                     self._due[slot] = fresh
         may_explore = self._replay.may_insert()
         slots = [s for s, r in self._due.items() if may_explore or not r.explore]
@@ -222,8 +218,7 @@ class LocalEngine(Engine):
             return
         decisions = self._acting.decide([self._due[s] for s in slots], self._acting_version)
         for slot, decision in zip(slots, decisions, strict=True):
-            request = self._runner.advance(slot, decision)
-            if request is None:
+            if (request := self._runner.advance(slot, decision)) is None:
                 del self._due[slot]
             else:
                 self._due[slot] = request
@@ -267,7 +262,6 @@ class LocalEngine(Engine):
             self._acting_version = number
 
     def _store(self) -> None:
-        """Store waiting segments while replay takes them."""
         while self._outbox and self._replay.may_insert(REAL):
             segment = self._outbox.popleft()
             if not self._replay.insert(segment):

@@ -58,12 +58,10 @@ class Progress:
 
 
 class Saved(NamedTuple):
-    """Files of one checkpoint."""
+    """Version of the policy in a checkpoint, and metrics of updates that `Engine.poll` will not report."""
 
     version: int
-    """Version of the policy: updates behind it."""
     updates: list[dict[str, float]]
-    """Metrics of updates that `Engine.poll` has not reported and will not report."""
 
 
 class Engine(ABC):
@@ -113,9 +111,9 @@ def episode_key(plan: EpisodePlan) -> tuple[str, int]:
 def check_new(plans: Sequence[EpisodePlan], outstanding: Container[tuple[str, int]]) -> None:
     """Check the argument of `Engine.plan`."""
     keys = [episode_key(plan) for plan in plans]
-    for plan, key in zip(plans, keys, strict=True):
-        if key in outstanding or keys.count(key) > 1:
-            raise ValueError(f"episode {plan.index} of {plan.group!r} is planned twice")
+    for group, index in keys:
+        if (group, index) in outstanding or keys.count((group, index)) > 1:
+            raise ValueError(f"episode {index} of {group!r} is planned twice")
 
 
 def run_plans(
@@ -138,10 +136,9 @@ def run_plans(
 
 @dataclass(kw_only=True)
 class Times:
-    """Seconds of a run, those before it was resumed included."""
+    """Seconds of a run; `started` is when this process began, on `time.monotonic`."""
 
     started: float
-    """When this process began, by the monotonic clock."""
     warm_s: float
     """Warm start."""
     rl_s: float = 0.0
@@ -155,7 +152,7 @@ class Times:
 
     @property
     def wall_s(self) -> float:
-        """All of them."""
+        """Seconds since the run began."""
         return (self.before_s or 0.0) + time.monotonic() - self.started
 
 
@@ -181,10 +178,8 @@ class Loop:
         self.evaluations: list[dict[str, Any]] = []
         self.curve: list[tuple[float, float]] = []
         self.recent: list[bool] = []
-        self.explored = 0
-        """Exploring episodes that have ended."""
-        self.won = 0
-        """Successes among them."""
+        self.explored = self.won = 0
+        """Exploring episodes that have ended, and successes among them."""
         self.lags: list[float] = []
         self.lag_max = self.mismatch_max = 0.0
         self.during: dict[str, list[EpisodeResult]] = {}
@@ -208,7 +203,7 @@ class Loop:
                 filmed = snapshot.load(self.directory / FILMED)
         else:
             if evaluation.before:
-                self.before, filmed = self._evaluate("before", evaluation.episodes, 0.0)
+                self.before, filmed = self._evaluate("before", 0.0)
                 snapshot.save(self.directory / FILMED, [result for result in filmed if result.frames])
             self.base = self.engine.poll().rollout
             if self.config.saves:
@@ -221,7 +216,7 @@ class Loop:
                 f"none of {self.explored} exploring episodes succeeded; where success is the only reward "
                 "there was nothing to learn from: see docs/troubleshooting.md"
             )
-        after, results = self._evaluate("after", evaluation.episodes, self.steps)
+        after, results = self._evaluate("after", self.steps)
         if any(result.frames for result in filmed):
             film = self.directory / "before_after.mp4"
             before_after(film, (filmed, self.before), (results, after), fps=20)
@@ -234,7 +229,6 @@ class Loop:
         return dict(summary)
 
     def _state(self) -> dict[str, Any]:
-        """Everything that `_restore` needs; see `snapshot`."""
         spent = {"rl_s": self._rl_s, "wall_s": self.times.wall_s, "warm_s": self.times.warm_s}
         return {name: getattr(self, name) for name in _STATE} | {"log": self.log.state(), "times": spent}
 
@@ -256,17 +250,12 @@ class Loop:
         self, before: dict[str, Any] | None, after: dict[str, Any], last: Progress
     ) -> dict[str, Any]:
         before = before or {}
+        keys = ("success", "n", "ci95", "tasks")
         return {
-            "success_before": before.get("success"),
-            "success_after": after["success"],
+            **{f"{key}_before": before.get(key) for key in keys},
+            **{f"{key}_after": after[key] for key in keys},
             "n": after["n"],
             "ci95": {"before": before.get("ci95"), "after": after["ci95"]},
-            "n_before": before.get("n"),
-            "n_after": after["n"],
-            "ci95_before": before.get("ci95"),
-            "ci95_after": after["ci95"],
-            "tasks_before": before.get("tasks"),
-            "tasks_after": after["tasks"],
             "env_steps": int(self.steps),
             "decisions": int(self._since(last, "decisions")),
             "episodes": int(self._since(last, "episodes")),
@@ -304,21 +293,19 @@ class Loop:
                 every = config.evaluation.every_updates
                 if every and progress.version // every > self.evaluated:
                     self.evaluated = progress.version // every
-                    self._plan_during(self.evaluated)
-                asked = self.stop.asked is not None
-                if self._is_due(progress.version) or asked:
+                    group = f"during-{self.evaluated}"
+                    self.during[group] = []
+                    self._plan(config.evaluation.episodes_during, group)
+                if self._is_due(progress.version) or self.stop.asked is not None:
                     self._save()
-                if asked:
-                    raise_if_stopped(self.stop, self.directory)
+                raise_if_stopped(self.stop, self.directory)
 
     @property
     def _rl_s(self) -> float:
-        """Seconds of training so far."""
         since = self._training_since
         return self.times.rl_s + (0.0 if since is None else time.monotonic() - since)
 
     def _is_due(self, version: int) -> bool:
-        """True if a checkpoint is due."""
         updates, seconds = self.config.save_every_updates, self.config.save_every_s
         by_time = bool(seconds) and time.monotonic() - self._saved_at > seconds
         return by_time or bool(updates and version // updates > self.saved)
@@ -355,18 +342,14 @@ class Loop:
                 if len(results) == self.config.evaluation.episodes_during:
                     self._report(episode.plan.group, results, self._steps(progress), progress.version)
 
-    def _plan_during(self, number: int) -> None:
-        group = f"during-{number}"
-        self.during[group] = []
-        episodes = self.config.evaluation.episodes_during
-        self.engine.plan(evaluation_plans(self.tasks, episodes, group, seed=self.config.seed))
+    def _plan(self, episodes: int, group: str, filmed: int = 0) -> None:
+        seed = self.config.seed
+        self.engine.plan(evaluation_plans(self.tasks, episodes, group, seed=seed, filmed=filmed))
 
-    def _evaluate(
-        self, group: str, episodes: int, steps: float
-    ) -> tuple[dict[str, Any], list[EpisodeResult]]:
+    def _evaluate(self, group: str, steps: float) -> tuple[dict[str, Any], list[EpisodeResult]]:
         self.times.clock.enter(EVALUATION)
-        seed, videos = self.config.seed, self.config.evaluation
-        self.engine.plan(evaluation_plans(self.tasks, episodes, group, seed=seed, filmed=videos.videos))
+        episodes = self.config.evaluation.episodes
+        self._plan(episodes, group, filmed=self.config.evaluation.videos)
         # An evaluation planned while training may end only now.
         results = run_plans(self.engine, episodes, group, self.console, self._meanwhile)
         return self._report(group, results, steps, results[0].versions[1]), results
@@ -387,8 +370,6 @@ class Loop:
         return summary
 
     def _save(self) -> None:
-        """Write a checkpoint."""
-
         def write(folder: Path) -> int:
             saved = self.engine.save(folder)
             self._record_updates(saved.updates)
@@ -405,7 +386,7 @@ class Loop:
         self.console.say(f"checkpoint {path / layout.PRETRAINED}")
 
     def _since(self, progress: Progress, key: str) -> float:
-        """A rollout counter since training began, evaluation episodes while training included."""
+        """A rollout counter since training began, evaluations meanwhile included."""
         return progress.rollout.get(key, 0.0) - self.base.get(key, 0.0)
 
     def _steps(self, progress: Progress) -> float:
@@ -414,9 +395,8 @@ class Loop:
     def _status(self, progress: Progress) -> str:
         success = f"{np.mean(self.recent):.0%}" if self.recent else "…"
         lag = f"{self.lags[-1]:.0f}" if self.lags else "…"
-        words = (
-            f"exploring success {success} · lag {lag} · {self._since(progress, 'decisions'):.0f} decisions"
-        )
+        decisions = f"{self._since(progress, 'decisions'):.0f} decisions"
+        words = f"exploring success {success} · lag {lag} · {decisions}"
         if self.evaluations:
             newest = self.evaluations[-1]
             words += f" · evaluation {newest['success']:.0%} at update {newest['version_max']}"

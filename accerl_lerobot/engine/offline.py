@@ -10,6 +10,7 @@ import contextlib
 import json
 import logging
 import math
+import shutil
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -20,14 +21,7 @@ import torch
 import yaml
 
 from accerl_lerobot.algorithms import OffPolicyConfig
-from accerl_lerobot.checkpoint.layout import (
-    CHECKPOINTS,
-    CONFIG,
-    PRETRAINED,
-    SUMMARY,
-    save_checkpoint,
-    write_atomically,
-)
+from accerl_lerobot.checkpoint import layout
 from accerl_lerobot.config.parsing import encode
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError
@@ -61,7 +55,7 @@ def learn_offline(config: OfflineRun, directory: Path, console: Console) -> dict
     torch.set_num_threads(config.trainer.num_threads)
     policy, meta = rehearsed_config(config.policy), open_metadata(config.dataset)
     wanted = _check(config, policy, meta)
-    write_atomically(directory / CONFIG, yaml.safe_dump(encode(config), sort_keys=False))
+    layout.write_atomically(directory / layout.CONFIG, yaml.safe_dump(encode(config), sort_keys=False))
     adapter = load_adapter(config.policy)
     # One step for each update, instead of so many for each new decision.
     assert isinstance(config.algorithm, OffPolicyConfig)
@@ -84,19 +78,18 @@ def learn_offline(config: OfflineRun, directory: Path, console: Console) -> dict
                 recent = []
 
     def write(folder: Path) -> int:
-        adapter.save(folder / PRETRAINED, config.policy, adapter.copy_weights())
-        (folder / CONFIG).write_bytes((directory / CONFIG).read_bytes())
-        version: int = update.version
-        return version
+        adapter.save(folder / layout.PRETRAINED, config.policy, adapter.copy_weights())
+        shutil.copyfile(directory / layout.CONFIG, folder / layout.CONFIG)
+        return int(update.version)
 
-    path = save_checkpoint(directory / CHECKPOINTS, write)
+    path = layout.save_checkpoint(directory / layout.CHECKPOINTS, write)
     losses = {"before": before, "after": _imitation(update)}
     summary: dict[str, Any] = plain(
         counts
         | {"algorithm": algorithm.type, "updates": update.version, "imitation_loss": losses}
-        | {"wall_s": time.monotonic() - started, "policy": str(path / PRETRAINED)}
+        | {"wall_s": time.monotonic() - started, "policy": str(path / layout.PRETRAINED)}
     )
-    write_atomically(directory / SUMMARY, json.dumps(summary, indent=2) + "\n")
+    layout.write_atomically(directory / layout.SUMMARY, json.dumps(summary, indent=2) + "\n")
     return summary
 
 
@@ -139,10 +132,8 @@ def _remember(
             frames += int(segment.steps.sum())
             stage.update(min(frames, meta.total_frames))
     if len(outcomes) < meta.total_episodes:
-        logger.warning(
-            "%d of %d episodes fit into %d decisions, the others are left out",
-            len(outcomes), meta.total_episodes, most,
-        )  # fmt: skip
+        left = f"{len(outcomes)} of {meta.total_episodes} episodes fit into {most} decisions"
+        logger.warning("%s, the others are left out", left)
     counts = {"episodes": len(outcomes), "successes": sum(outcomes.values()), "decisions": len(update.memory)}
     if not counts["successes"]:
         remedy = "none of its episodes is a success; there is nothing to imitate"

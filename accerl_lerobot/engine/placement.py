@@ -52,7 +52,6 @@ class Node:
     key: str
     """Ray's id."""
     name: str
-    """Its address."""
     cpus: float
     gpus: float
     resources: frozenset[str] = frozenset()
@@ -65,14 +64,16 @@ class Node:
 
 
 class Role(NamedTuple):
-    """The workers of a kind."""
+    """The workers of a kind, and their nodes, see `LaunchConfig.placement`."""
 
     name: str
     workers: list[str]
     selector: str | None
-    """Nodes, see `LaunchConfig.placement`; None: the one where the run is started."""
-    network: bool = True
-    """True if they need a share of a GPU, and files."""
+
+    @property
+    def network(self) -> bool:
+        """True if they need a share of a GPU, and files."""
+        return self.name != "rollout"
 
 
 class Place(NamedTuple):
@@ -90,7 +91,6 @@ class Plan:
     places: dict[str, Place]
 
     def rows(self) -> Iterator[str]:
-        """The plan as lines for people, one for each node."""
         for node in self.nodes:
             here = Counter(
                 (name.rstrip("0123456789 "), place.gpus)
@@ -104,11 +104,7 @@ class Plan:
             yield f"{node}, {node.cpus:g} CPUs, {node.gpus:g} GPUs: {', '.join(parts) or 'nothing'}"
 
     def moved(self, name: str, alive: frozenset[str]) -> Plan:
-        """The plan with a rollout worker, whose node has left, on another one.
-
-        It goes to the node with the fewest rollout workers for its cores, among node 0 and those that have
-        any.
-        """
+        """The plan with a rollout worker, whose node has left, on node 0 or another that has some."""
         load = Counter({0: 0})
         load.update(place.node.number for other, place in self.places.items() if other.startswith("rollout "))
         left = [node for node in self.nodes if node.number in load and node.key in alive]
@@ -133,28 +129,25 @@ def this_machine() -> Node:
 
 def roles_of(config: RunConfig) -> list[Role]:
     """The roles of a run besides replay, in the order in which they are placed."""
-    placement, c = config.launch.placement, config
-    ranks = ["trainer", *(f"trainer rank {i}" for i in range(1, c.trainer.ranks))]
+    c = config
     imagining = ["imagination"] * bool(c.imagination.share) + ["world learning"] * c.imagination.learns
-    rollouts = [f"rollout {i}" for i in range(c.rollout.workers)]
-    roles = [
-        Role("trainer", ranks, placement.get("trainer")),
-        Role("inference", numbered("inference", c.inference.workers), placement.get("inference")),
-        Role("imagination", imagining, placement.get("imagination")),
-        Role("rollout", rollouts, placement.get("rollout"), network=False),
-    ]
-    return [role for role in roles if role.workers]
+    workers = {
+        "trainer": ["trainer", *(f"trainer rank {i}" for i in range(1, c.trainer.ranks))],
+        "inference": numbered("inference", c.inference.workers),
+        "imagination": imagining,
+        "rollout": [f"rollout {i}" for i in range(c.rollout.workers)],
+    }
+    return [Role(name, own, c.launch.placement.get(name)) for name, own in workers.items() if own]
 
 
 def candidates(nodes: Sequence[Node], role: Role) -> list[Node]:
-    """The nodes that a role may be on."""
     if role.selector is None:
         return [nodes[0]]
     if role.selector == ALL:
         return list(nodes)
     chosen = [node for node in nodes if role.selector in (str(node.number), *node.resources)]
     if not chosen:
-        names = sorted({name for node in nodes for name in node.resources})
+        names = sorted({name for node in nodes for name in node.resources if ":" not in name})
         known = f"numbers 0 to {len(nodes) - 1}" + (f" and resources {', '.join(names)}" if names else "")
         remedy = f"no node of the cluster is called that; there are {known}"
         raise InputError(f"{SECTION}.{role.name}", role.selector, remedy)
@@ -182,27 +175,23 @@ def plan_workers(nodes: Sequence[Node], config: RunConfig) -> Plan:
 
 
 def _sites(nodes: Sequence[Node], role: Role) -> list[Node]:
-    """The nodes that a role may be on, and that see the files it needs."""
     named = candidates(nodes, role)
     seeing = [node for node in named if not (role.network and node.unseen)]
     if seeing == named or (role.selector == ALL and seeing):
         return seeing
     blind = next(node for node in named if node.unseen)
-    remedy = (
-        f"{blind} does not see {blind.unseen}, which its workers read or write; "
-        "share it under the same path, or leave the field out"
+    remedy = "which its workers read or write; share it under the same path, or leave the field out"
+    raise InputError(
+        f"{SECTION}.{role.name}", role.selector, f"{blind} does not see {blind.unseen}, {remedy}"
     )
-    raise InputError(f"{SECTION}.{role.name}", role.selector, remedy)
 
 
 def _gpu_shares(roles: list[Role], sites: dict[str, list[Node]], config: RunConfig) -> dict[str, float]:
     """Share of a GPU for each process of a role; roles on the same nodes share what these have."""
     shares: dict[str, float] = {}
-    if config.policy.device == "cpu":
-        return shares
     groups: dict[tuple[int, ...], list[Role]] = {}
     for role in roles:
-        if role.network:
+        if role.network and config.policy.device != "cpu":
             groups.setdefault(tuple(node.number for node in sites[role.name]), []).append(role)
     for group in groups.values():
         here = sites[group[0].name]
@@ -211,11 +200,10 @@ def _gpu_shares(roles: list[Role], sites: dict[str, list[Node]], config: RunConf
             remedy = f"there is no GPU on {', '.join(map(str, here))}; use auto, cpu or other nodes"
             raise InputError("policy.device", config.policy.device, remedy)
         others = sum(len(role.workers) for role in group if role.name != "trainer")
-        if any(role.name == "trainer" for role in group):
-            of_rank, of_other = config.trainer.gpu_shares(gpus, max(1, others))
-        else:
-            of_rank, of_other = 0.0, 1 / math.ceil(others / gpus) if gpus else 0.0
-        shares |= {role.name: of_rank if role.name == "trainer" else of_other for role in group}
+        share = 1 / math.ceil(others / gpus) if gpus and others else 0.0
+        if group[0].name == "trainer":
+            shares["trainer"], share = config.trainer.gpu_shares(gpus, max(1, others))
+        shares |= {role.name: share for role in group if role.name != "trainer"}
     return shares
 
 
@@ -235,14 +223,7 @@ def _take_gpu(sites: list[Node], free: dict[int, list[float]], share: float, rol
 
 def place_workers(config: RunConfig) -> Plan:
     """Plan where the workers of a run go on the nodes that Ray has now."""
-    known = alive_nodes()
-    try:
-        nodes = _nodes(config)
-    except WorkerError:
-        if known <= alive_nodes():
-            raise
-        nodes = _nodes(config)  # one has left, which Ray finds out when it is asked for something
-    plan = plan_workers(nodes, config)
+    plan = plan_workers(_nodes(config), config)
     for row in plan.rows():
         logger.info("%s", row)
     return plan
@@ -293,60 +274,46 @@ def _nodes(config: RunConfig) -> list[Node]:
             name=row["NodeManagerAddress"],
             cpus=row["Resources"].get("CPU", 0.0),
             gpus=row["Resources"].get("GPU", 0.0),
-            resources=frozenset(name for name in row["Resources"] if _is_custom(name)),
+            resources=frozenset(row["Resources"]) - {"CPU", "GPU", "memory", "object_store_memory"},
         )
         for number, row in enumerate(rows)
     ]
     if config.launch.address is None and len(nodes) == 1:
         return nodes
     wanted = {0}.union(*({n.number for n in candidates(nodes, role)} for role in roles_of(config)))
-    return _checked(nodes, wanted, config)
-
-
-def _is_custom(name: str) -> bool:
-    own = ("CPU", "GPU", "memory", "object_store_memory")
-    return name not in own and not name.startswith(("node:", "accelerator_type:"))
-
-
-def _checked(nodes: list[Node], wanted: set[int], config: RunConfig) -> list[Node]:
-    """Compare the versions on the `wanted` nodes with ours, and ask whether they see the run's folders."""
-    import ray
-    from ray.exceptions import GetTimeoutError, RayError, RayTaskError
-
     folders = {"the run's folder": config.output_dir, "policy.path": config.policy.path}
-    files = [  # of folders that are here
-        (f"{name}, {folder}", Path(folder).absolute())
+    files = {  # of folders that are here
+        f"{name}, {folder}": Path(folder).absolute()
         for name, folder in folders.items()
         if folder is not None and Path(folder).is_dir()
-    ]
-    here, task = node_versions(), ray.remote(report_node)
-    asked = {
-        node.number: task.options(**actor_options(Place(node))).remote([path for _, path in files])
-        for node in nodes
-        if node.number in wanted
     }
-    checked = []
-    for node in nodes:
-        if node.number not in asked:
-            checked.append(node)
-            continue
-        try:
-            versions, seen = ray.get(asked[node.number], timeout=REPORT_S)
-        except GetTimeoutError as error:
-            raise WorkerError(f"{node} has not reported its versions within {REPORT_S:.0f} s") from error
-        except RayTaskError as error:
-            last = str(error).strip().splitlines()[-1]
-            remedy = f"{node} cannot say its versions ({last}); install the same on all"
-            raise InputError(FIELD, config.launch.address, remedy) from error
-        except RayError as error:
-            raise WorkerError(f"{node} could not report its versions:\n{error}") from error
-        for name, version in here.items():
-            if versions[name] != version:
-                remedy = f"{node} has {name} {versions[name]}, and this is {version}; install the same on all"
-                raise InputError(FIELD, config.launch.address, remedy)
-        unseen = [name for (name, _), sees in zip(files, seen, strict=True) if not sees]
-        checked.append(replace(node, unseen=unseen[0] if unseen else ""))
-    return checked
+    task, paths = ray.remote(report_node), list(files.values())
+    asked = {n: task.options(**actor_options(Place(nodes[n]))).remote(paths) for n in sorted(wanted)}
+    for number, reference in asked.items():
+        seen = _report(nodes[number], reference, str(config.launch.address))
+        unseen = [name for name, sees in zip(files, seen, strict=True) if not sees]
+        nodes[number] = replace(nodes[number], unseen=unseen[0] if unseen else "")
+    return nodes
+
+
+def _report(node: Node, reference: Any, address: str) -> list[bool]:
+    """Folders that a node sees, if its versions are ours."""
+    import ray
+    from ray.exceptions import RayError, RayTaskError
+
+    try:
+        versions, seen = ray.get(reference, timeout=REPORT_S)
+    except RayTaskError as error:
+        last = str(error).strip().splitlines()[-1]
+        remedy = f"{node} cannot say its versions ({last}); install the same on all"
+        raise InputError(FIELD, address, remedy) from error
+    except RayError as error:
+        raise WorkerError(f"{node} did not report its versions:\n{error}") from error
+    for name, version in node_versions().items():
+        if versions[name] != version:
+            remedy = f"{node} has {name} {versions[name]}, and this is {version}; install the same on all"
+            raise InputError(FIELD, address, remedy)
+    return list(seen)
 
 
 def node_versions() -> dict[str, str]:

@@ -63,8 +63,7 @@ def check_world(env: EnvConfig, reward_model: RewardModelConfig | None = None) -
 def check_policy(config: RunConfig, spec: WorldSpec, *, own: bool = False) -> int:
     """Refuse a checkpoint that does not fit the environment; returns its ``n_obs_steps``.
 
-    Args:
-        own: the run has written this checkpoint itself, or has tried its files already.
+    Its files are not tried first if the run has done so, or written them itself (`own`).
     """
     from accerl_lerobot.policies.loading import load_lerobot_config, rehearsed_config
 
@@ -87,11 +86,10 @@ def check_start(config: RunConfig, say: Callable[[str], object] = str) -> int:
     resolve_device(config.policy.device)  # refuses one that is not there
     if 0 < config.trainer.updates <= config.trainer.value_warmup_updates:
         logger.warning(
-            "the policy will not change: trainer.updates=%d is not above trainer.value_warmup_updates=%d, "
-            "and in those only the critic learns; use more updates, or a shorter warm-up",
-            config.trainer.updates,
-            config.trainer.value_warmup_updates,
-        )
+            "the policy will not change: the first trainer.value_warmup_updates=%d are the critic's alone, "
+            "and trainer.updates=%d; use more updates, or a shorter warm-up",
+            config.trainer.value_warmup_updates, config.trainer.updates,
+        )  # fmt: skip
     check_wandb(config.wandb)
     say("looking at policy, environment and data …")
     policy = policy_to_be(config)
@@ -254,7 +252,6 @@ def check_sft_policy(config: SFTConfig) -> Any:
             near = " or ".join(difflib.get_close_matches(key, names, n=3))
             remedy = f"LeRobot's {kind} has no such field{f'; did you mean {near}?' if near else ''}"
             raise InputError(f"sft.policy.{key}", value, remedy)
-    for key, value in fields.items():
         if isinstance(value, int):
             span = Range("[1, 10000]" if key in SIZES else "[-1, 1000000]")
             check(Annotated[int, span], int(value), f"sft.policy.{key}")
@@ -262,7 +259,12 @@ def check_sft_policy(config: SFTConfig) -> Any:
         # Without a device LeRobot looks for one.
         return draccus.decode(PreTrainedConfig.get_choice_class(kind), {"device": "cpu"} | fields)
     except draccus.utils.DraccusException as error:
-        raise _as_input_error(error, fields) from error
+        chain: list[Any] = [error]
+        while (cause := chain[-1].__cause__ or chain[-1].__context__) is not None:
+            chain.append(cause)
+        where = next((e.key_path[0] for e in chain if getattr(e, "key_path", ())), None)
+        name, given = ("sft.policy", fields) if where is None else (f"sft.policy.{where}", fields.get(where))
+        raise InputError(name, given, f"LeRobot says: {' '.join(str(chain[-1]).split())}") from error
 
 
 def sft_policy(config: SFTConfig) -> Any:
@@ -283,18 +285,6 @@ def sft_policy(config: SFTConfig) -> Any:
     except Exception as error:  # LeRobot takes the file at its word, and may fail over any of it
         remedy = f"its config.json is not one of this LeRobot's policies ({brief(error)})"
         raise InputError("sft.init_path", config.init_path, remedy) from error
-
-
-def _as_input_error(error: BaseException, fields: dict[str, Any]) -> InputError:
-    chain = [error]
-    while (cause := chain[-1].__cause__ or chain[-1].__context__) is not None:
-        chain.append(cause)
-    located = next((e for e in chain if getattr(e, "key_path", ())), None)
-    text = " ".join(str(chain[-1]).split())
-    if located is None:
-        return InputError("sft.policy", fields, f"LeRobot says: {text}")
-    key = located.key_path[0]  # type: ignore[attr-defined]
-    return InputError(f"sft.policy.{key}", fields.get(key), f"LeRobot says: {text}")
 
 
 def check_placement(config: RunConfig) -> list[str]:

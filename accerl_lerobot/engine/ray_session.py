@@ -40,18 +40,14 @@ logger = logging.getLogger(__name__)
 FIELD = "launch.address"
 STARTS = 4
 """Attempts to start a private Ray, which gives up after 30 s; a busy machine may need more."""
-CONNECT_S = 5.0
-"""Timeout for a TCP connection to a cluster."""
-ANSWER_S = 60.0
-"""Timeout for ``ray status``, most of which is importing Ray."""
+CONNECT_S, ANSWER_S = 5.0, 60.0
+"""Timeouts for a TCP connection to a cluster, and for ``ray status``, most of which is importing Ray."""
 LOOK_S = 0.5
 """Between two looks at Ray's processes."""
 HURRY_S = 2.0
 """How long one of them may be stopped once the run has been asked to stop."""
-GIVE_UP_S = 30.0
-"""How long the main thread may take to end a lost Ray, before this process is ended."""
-GONE_S = 3.0
-"""How long a killed process may take to be gone."""
+GIVE_UP_S, GONE_S = 30.0, 3.0
+"""How long the main thread may take to end a lost Ray, before this process is ended, and a killed process."""
 
 WORKERS = {
     # Several CPU workers share the cores: spinning threads would cost more than they give.
@@ -84,7 +80,6 @@ RAY_PROCESSES = {
 REQUIRED = ("gcs_server", "raylet", "dashboard agent", "runtime env agent")
 """Processes among these without which Ray does not work: a raylet ends with its agents."""
 STATUS = ("-m", "ray.scripts.scripts", "status")
-"""Arguments of Python that ask a cluster for its status: ``ray status``."""
 UNAUTHORISED = ("Unauthenticated", "UNAUTHENTICATED", "InvalidAuthToken", "AuthenticationError")
 """One of these is in the answer to a missing or wrong token."""
 
@@ -117,7 +112,7 @@ def check_private() -> None:
 
 
 def has_token() -> bool:
-    """True if there is a token of the user's where Ray looks for one."""
+    """True if the user has a token where Ray looks for one."""
     if os.environ.get("RAY_AUTH_TOKEN"):
         return True
     path = os.environ.get("RAY_AUTH_TOKEN_PATH") or Path.home() / ".ray" / "auth_token"
@@ -163,12 +158,11 @@ def process_kind(command: Sequence[str]) -> str | None:
 
 def ray_processes() -> dict[psutil.Process, str]:
     """Ray's own processes below this one, and their kind."""
-    processes = {}
+    kinds = {}
     for process in psutil.Process().children(recursive=True):
         with contextlib.suppress(psutil.Error):
-            if kind := process_kind(process.cmdline()):
-                processes[process] = kind
-    return processes
+            kinds[process] = process_kind(process.cmdline())
+    return {process: kind for process, kind in kinds.items() if kind}
 
 
 def kill_ray(known: Iterable[psutil.Process] = ()) -> None:
@@ -217,8 +211,7 @@ def _join(launch: LaunchConfig) -> None:
     from ray.exceptions import AuthenticationError
 
     if not has_token():
-        remedy = "there is no token; start the cluster with RAY_AUTH_MODE=token and give its token by "
-        remedy += "RAY_AUTH_TOKEN_PATH"
+        remedy = "there is no token; start the cluster with RAY_AUTH_MODE=token, and set RAY_AUTH_TOKEN_PATH"
         raise InputError(FIELD, launch.address, remedy)
     check_cluster(launch)
     try:
@@ -271,17 +264,29 @@ def _complaint(address: str, env: dict[str, str] | None = None) -> str | None:
 
 
 class RaySession:
-    """Ray until it is closed. One that was there before is used and left running, and so is a cluster."""
+    """Ray until it is closed, and a watch over its own processes.
+
+    A Ray that was there before is used and left running, and so is a cluster. Ray takes a minute to notice
+    that its GCS is gone, then ends this process from C++, and a raylet that has been stopped blocks every
+    call for ever. So when a process has died, or has been stopped for ``launch.stall_s`` (after SIGTERM or
+    Ctrl-C, `HURRY_S` at most), a thread kills the others, which ends the calls that wait for them. If the
+    main thread does not get on then, it ends this process.
+    """
 
     def __init__(self, launch: LaunchConfig) -> None:
         self._launch, self._started = launch, False
-        self._watch: RayWatch | None = None
         self._lost = ""
+        self._thread: threading.Thread | None = None
+        self._closed, self._lock = threading.Event(), threading.Lock()
+        self._processes: dict[psutil.Process, str] = {}
+        """Required processes and their kind."""
+        self._stopped: dict[psutil.Process, float] = {}
+        """Since when they have been stopped, on `time.monotonic`."""
 
     @property
     def lost(self) -> str:
         """The process of Ray that has been lost, and how; empty: none."""
-        return self._lost if self._watch is None else self._watch.look()
+        return self._lost if self._thread is None else self._look()
 
     def start(self) -> None:
         """Start Ray unless it is there and none of its processes is lost."""
@@ -290,78 +295,52 @@ class RaySession:
         if ray.is_initialized():
             if not self._started or not self.lost:
                 return
-            logger.warning("%s, and Ray is started again", self.lost)
+            logger.warning("%s, and Ray is started again", self._lost)
             self.close()
         self._started, self._lost = True, ""
         start_ray(self._launch)
         if self._launch.address is None:
-            self._watch = RayWatch(self._launch.stall_s)
+            self.watch()
+
+    def watch(self) -> None:
+        """Watch Ray's processes below this one."""
+        self._processes, self._stopped, self._closed = {}, {}, threading.Event()
+        self._look()
+        self._thread = threading.Thread(target=self._watch, name="ray watch", daemon=True)
+        self._thread.start()
 
     def close(self) -> None:
         """End Ray, if it was started here. Safe to call twice."""
         import ray
 
-        self._lost, watch, self._watch = self.lost, self._watch, None
         if self._started and ray.is_initialized():
-            if watch is not None and self._lost:
-                kill_ray(watch.processes)
+            if self.lost:
+                kill_ray(self._processes)
             ray.shutdown()
-        if watch is not None:
-            watch.close()
         self._started = False
+        if self._thread is not None:
+            self._closed.set()
+            self._thread.join()
+            self._thread = None
 
-
-class RayWatch(threading.Thread):
-    """Watches Ray's own processes below this one.
-
-    Ray takes a minute to notice that its GCS is gone, then ends this process from C++, and a raylet that has
-    been stopped blocks every call for ever. When a process has died, or has been stopped for too long, this
-    thread kills the others, which ends the calls that wait for them. If the main thread does not get on then,
-    it ends this process.
-
-    Args:
-        stall_s: how long one may be stopped; after SIGTERM or Ctrl-C, `HURRY_S` at most.
-    """
-
-    def __init__(self, stall_s: float) -> None:
-        super().__init__(name="ray watch", daemon=True)
-        self.lost = ""
-        """See `RaySession.lost`."""
-        self.processes: dict[psutil.Process, str] = {}
-        """Required processes and their kind."""
-        self._stall_s = stall_s
-        self._stopped: dict[psutil.Process, float] = {}
-        """Since when they have been stopped, on `time.monotonic`."""
-        self._closed, self._lock = threading.Event(), threading.Lock()
-        self.look()
-        self.start()
-
-    def run(self) -> None:
-        """Look until something is lost, then make sure that this process gets on or ends."""
-        while not self.look():
+    def _watch(self) -> None:
+        while not self._look():
             if self._closed.wait(LOOK_S):
                 return
-        kill_ray(self.processes)
-        if self._closed.wait(GIVE_UP_S):
-            return
-        guardian.explain(cause=self.lost)
-        os._exit(1)
+        kill_ray(self._processes)
+        if not self._closed.wait(GIVE_UP_S):
+            guardian.explain(cause=self._lost)
+            os._exit(1)
 
-    def look(self) -> str:
-        """Look at every process once; see `RaySession.lost`."""
+    def _look(self) -> str:
         with self._lock:
-            if len(self.processes) < len(REQUIRED):
-                self.processes |= {p: kind for p, kind in ray_processes().items() if kind in REQUIRED}
-            for process, kind in self.processes.items() if not self.lost else ():
+            if len(self._processes) < len(REQUIRED):
+                self._processes |= {p: kind for p, kind in ray_processes().items() if kind in REQUIRED}
+            for process, kind in self._processes.items() if not self._lost else ():
                 if how := self._fate(process):
-                    self.lost = f"Ray's {kind} (process {process.pid}) {how}"
+                    self._lost = f"Ray's {kind} (process {process.pid}) {how}"
                     break
-            return self.lost
-
-    def close(self) -> None:
-        """End the watch."""
-        self._closed.set()
-        self.join()
+            return self._lost
 
     def _fate(self, process: psutil.Process) -> str:
         """How a process was lost; empty: it was not."""
@@ -375,5 +354,5 @@ class RayWatch(threading.Thread):
             self._stopped.pop(process, None)
             return ""
         stopped_s = time.monotonic() - self._stopped.setdefault(process, time.monotonic())
-        limit = min(HURRY_S, self._stall_s) if arrived() else self._stall_s
+        limit = min(HURRY_S, self._launch.stall_s) if arrived() else self._launch.stall_s
         return f"has been stopped for {stopped_s:.0f} s" if stopped_s > limit else ""

@@ -30,13 +30,13 @@ import ray
 from ray.exceptions import ActorUnavailableError, GetTimeoutError, RayActorError, RayError, RayTaskError
 
 from accerl_lerobot.checkpoint import snapshot
-from accerl_lerobot.engine.config import RunConfig, timeline_folder
+from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.loop import check_new, episode_key
 from accerl_lerobot.engine.placement import Plan, actor_options, alive_nodes
 from accerl_lerobot.engine.ray_session import NO_HUB_TOKEN
 from accerl_lerobot.engine.stopping import WorkerError, pause_s
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.inference.batcher import BatcherStats, dealt, merge_metrics, merge_stats
+from accerl_lerobot.inference.batcher import BatcherStats, merge_metrics, merge_stats
 from accerl_lerobot.metrics import numbered
 from accerl_lerobot.policies.config import Load
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, budgets, incarnation_after
@@ -91,11 +91,7 @@ class WorkerSlot:
         self._asked = 0.0
 
     def await_start(self, reference: Any, timeout: float, here: bool) -> None:
-        """Wait for the answer to ``ready``, its process id.
-
-        Args:
-            here: True on this node; a process of that number on another node must not be touched.
-        """
+        """Wait for the answer to ``ready``, its process id, which is of this node if `here`."""
         pid = self.result(reference, "ready", timeout)
         if here:
             with contextlib.suppress(psutil.NoSuchProcess):  # the next question will tell
@@ -146,17 +142,15 @@ class WorkerSlot:
         except RayError as error:
             raise WorkerError(f"{self.name} worker failed in {method}:\n{error}") from error
 
-    def count_restart(self, error: Exception, max_restarts: int) -> None:
-        """Count a restart."""
-        if time.monotonic() - self.since > STEADY_S:
-            self.restarts = 0
-        if self.restarts >= max_restarts:
-            times = f" after {self.restarts} restarts" if self.restarts else ""
-            raise WorkerError(f"{self.name} worker failed for good{times}:\n{error}") from error
-        self.restarts += 1
-
-    def end(self, error: Exception) -> None:
-        """End a process that is to be replaced."""
+    def end(self, error: Exception, max_restarts: int | None) -> None:
+        """End a process that is to be replaced, unless that was so too often; None: it does not count."""
+        if max_restarts is not None:
+            if time.monotonic() - self.since > STEADY_S:
+                self.restarts = 0
+            if self.restarts >= max_restarts:
+                times = f" after {self.restarts} restarts" if self.restarts else ""
+                raise WorkerError(f"{self.name} worker failed for good{times}:\n{error}") from error
+            self.restarts += 1
         logger.warning("%s worker is restarted: %s", self.name, str(error).strip().splitlines()[-1][:200])
         ray.kill(self.actor)
 
@@ -165,8 +159,7 @@ class Replicas[W: WorkerSlot](ABC):
     """Workers of one kind that can be restarted alone, `LaunchConfig.max_restarts` times in a row each."""
 
     def __init__(self, config: RunConfig, workers: list[W]) -> None:
-        self._config, self._launch = config, config.launch
-        self._all = workers
+        self._config, self._launch, self._all = config, config.launch, workers
         self._plan = Plan((), {})
         for worker in workers:
             worker.restart = partial(self._restart, worker)
@@ -178,7 +171,6 @@ class Replicas[W: WorkerSlot](ABC):
             worker.occupy(self._new(worker))
 
     def workers(self) -> Iterator[W]:
-        """All workers of this kind, once they have been started."""
         return (worker for worker in self._all if worker.actor is not None)
 
     @abstractmethod
@@ -191,11 +183,7 @@ class Replicas[W: WorkerSlot](ABC):
 
 
 class RolloutSlot(WorkerSlot):
-    """A rollout worker, and what its next process has to know.
-
-    Args:
-        budget: exploring episodes left; None: no end.
-    """
+    """A rollout worker, and what its next process has to know; `budget`: exploring episodes left."""
 
     def __init__(self, index: int, budget: int | None) -> None:
         super().__init__(f"rollout {index}")
@@ -211,15 +199,14 @@ class RolloutSlot(WorkerSlot):
         """True if replay has all episodes of the budget."""
 
     @property
-    def report(self) -> Report | None:
-        """Last report of the process."""
-        report: Report | None = self.told
-        return report
+    def counters(self) -> dict[str, float]:
+        """Counters of the process."""
+        return {} if self.told is None else dict(self.told.counters)
 
     @property
     def next_incarnation(self) -> int:
         """Incarnation of another process in this place."""
-        return incarnation_after(self.incarnation, 0 if self.report is None else self.report.starts)
+        return incarnation_after(self.incarnation, 0 if self.told is None else self.told.starts)
 
     def take(self, report: Report) -> list[EpisodeResult]:
         """Note a report; the episodes in it."""
@@ -233,13 +220,13 @@ class RolloutSlot(WorkerSlot):
         ]
 
     def assign(self, plans: list[EpisodePlan]) -> None:
-        """Add planned episodes."""
         self.outstanding |= {episode_key(plan): plan for plan in plans}
         self.unsent += plans
 
     def hung(self, limit: float) -> str:
         """Also a world that does not return, and inference that is not found."""
-        if (report := self.report) is None:
+        report: Report | None = self.told
+        if report is None:
             return super().hung(max(START_S, limit))
         if why := super().hung(limit):
             return why
@@ -281,7 +268,6 @@ class RolloutWorkers(Replicas[RolloutSlot]):
             worker.moved = inference
 
     def plan(self, plans: list[EpisodePlan]) -> None:
-        """See `Engine.plan`."""
         check_new(plans, {key for worker in self._all for key in worker.outstanding})
         for worker in self._all:
             worker.assign(plans[worker.index :: len(self._all)])
@@ -291,15 +277,15 @@ class RolloutWorkers(Replicas[RolloutSlot]):
         for worker in self._all:
             if worker.ask("report", training, worker.unsent, self.in_turn, worker.moved):
                 worker.unsent = []
-                if worker.moved is not None and worker.report is not None:
-                    worker.told = replace(worker.report, away_s=0.0)  # that was about the old endpoint
+                if worker.moved is not None and worker.told is not None:
+                    worker.told = replace(worker.told, away_s=0.0)  # that was about the old endpoint
                 worker.moved = None
 
     def counters(self) -> dict[str, float]:
         """Sums over all processes since the run began."""
         totals = self._past.copy()
         for worker in self._all:
-            totals.update(worker.report.counters if worker.report is not None else {})
+            totals.update(worker.counters)
         return dict(totals)
 
     @property
@@ -315,19 +301,15 @@ class RolloutWorkers(Replicas[RolloutSlot]):
     @property
     def stuck_s(self) -> float:
         """How long the slowest worker or world has been at what it does now."""
-        reports = [worker.report for worker in self._all if worker.report is not None]
+        reports = [worker.told for worker in self._all if worker.told is not None]
         return max((max(report.in_world_s, report.stuck_s) for report in reports), default=0.0)
 
     def save(self, directory: Path) -> None:
         """Write the rollout workers' part of ``training_state``."""
-        slots = [
-            {
-                "incarnation": worker.next_incarnation - 1,
-                "budget": worker.budget,
-                "outstanding": list(worker.outstanding.values()),
-            }
-            for worker in self._all
-        ]
+        slots = []
+        for worker in self._all:
+            outstanding, incarnation = list(worker.outstanding.values()), worker.next_incarnation - 1
+            slots.append({"incarnation": incarnation, "budget": worker.budget, "outstanding": outstanding})
         snapshot.save(directory / ROLLOUT, {"past": self.counters(), "slots": slots})
 
     def _restore(self, directory: Path) -> None:
@@ -345,23 +327,21 @@ class RolloutWorkers(Replicas[RolloutSlot]):
             worker.assign(was["outstanding"])
 
     def _new(self, worker: RolloutSlot) -> Any:
-        from accerl_lerobot.rollout.worker import RolloutWorker, WorkerShare
+        from accerl_lerobot.rollout.worker import RolloutWorker
 
         c, place = self._config, self._plan.places[worker.name]
         actor = ray.remote(RolloutWorker).options(**actor_options(place), max_concurrency=4, **NO_HUB_TOKEN)
         # A node that does not see the run's folder would write a timeline that nobody finds.
-        timeline = None if place.node.unseen else timeline_folder(c)
-        share = WorkerShare(worker.index, worker.incarnation, worker.budget)
-        return actor.remote(c.env, c.rollout, self._tasks, c.seed, share, self._history, timeline)
+        timeline = None if place.node.unseen else c.timeline_folder
+        slot = (worker.index, worker.incarnation, worker.budget)
+        return actor.remote(c.env, c.rollout, self._tasks, c.seed, *slot, self._history, timeline)
 
     def _restart(self, worker: RolloutSlot, error: Exception) -> None:
-        if not self._relocate(worker, error):  # that its node has left is not the worker's fault
-            worker.count_restart(error, self._launch.max_restarts)
-        worker.end(error)
+        moved = self._relocate(worker, error)  # that its node has left is not the worker's fault
+        worker.end(error, None if moved else self._launch.max_restarts)
         self._past["restarts"] += 1
-        self._past.update(worker.report.counters if worker.report is not None else {})
-        worker.incarnation = worker.next_incarnation
-        worker.moved = None
+        self._past.update(worker.counters)
+        worker.incarnation, worker.moved = worker.next_incarnation, None
         worker.unsent = list(worker.outstanding.values())
         worker.occupy(self._new(worker))
         self._run(worker)
@@ -386,23 +366,12 @@ class RolloutWorkers(Replicas[RolloutSlot]):
         worker.work = worker.actor.run.remote(inference, self._replay)
 
 
-class InferenceSlot(WorkerSlot):
-    """An inference replica."""
-
-    def __init__(self, index: int, name: str) -> None:
-        super().__init__(name)
-        self.index = index
-        self.lock_step = 0
-        """Worlds that are decided for together; 0: each for itself."""
-
-
-class InferenceReplicas(Replicas[InferenceSlot]):
+class InferenceReplicas(Replicas[WorkerSlot]):
     """The inference replicas of a run; rollout worker i asks replica i modulo their number.
 
     Args:
         version: of the first weights.
         state: the ``training_state`` that holds these; None: they are the policy's.
-        load: makes the policy's adapter; None: of LeRobot's checkpoint.
         moved: called with the index and new endpoint of a replica that has been restarted.
     """
 
@@ -414,10 +383,10 @@ class InferenceReplicas(Replicas[InferenceSlot]):
         load: Load | None,
         moved: Callable[[int, Endpoint], None],
     ) -> None:
-        names = numbered("inference", config.inference.workers)
-        super().__init__(config, [InferenceSlot(index, name) for index, name in enumerate(names)])
-        self._arguments = (config.policy, config.inference, version, state, load, timeline_folder(config))
+        super().__init__(config, [WorkerSlot(n) for n in numbered("inference", config.inference.workers)])
+        self._arguments = (config.policy, config.inference, version, state, load, config.timeline_folder)
         self._moved = moved
+        self._in_turn = False
         self.restarts = 0
         """Restarts of all replicas since this engine began."""
         self.trainer: Any = None
@@ -429,11 +398,9 @@ class InferenceReplicas(Replicas[InferenceSlot]):
 
     def lock_step(self, in_turn: bool) -> None:
         """Have each replica decide for all its worlds together, or not any more."""
-        rollout = self._config.rollout
-        clients = dealt(rollout.workers, len(self._all))
+        self._in_turn = in_turn
         for worker in self._all:
-            worker.lock_step = clients[worker.index] * rollout.worlds if in_turn else 0
-            worker.call("lock_step", worker.lock_step, timeout=self._launch.stall_s)
+            self._lock(worker)
 
     def metrics(self) -> dict[str, float]:
         """Last metrics, of all replicas as of one."""
@@ -444,18 +411,17 @@ class InferenceReplicas(Replicas[InferenceSlot]):
         """Batches of all replicas so far."""
         return merge_stats([worker.call("batching", timeout=self._launch.stall_s) for worker in self._all])
 
-    def _new(self, worker: InferenceSlot) -> Any:
+    def _new(self, worker: WorkerSlot) -> Any:
         from accerl_lerobot.inference.worker import InferenceWorker
 
         options = actor_options(self._plan.places[worker.name])
         actor = ray.remote(InferenceWorker).options(**options, max_concurrency=1000)
         return actor.remote(*self._arguments, worker.name)
 
-    def _restart(self, worker: InferenceSlot, error: Exception) -> None:
+    def _restart(self, worker: WorkerSlot, error: Exception) -> None:
         here, limit = self._plan.places[worker.name].node, self._launch.stall_s
         while True:
-            worker.count_restart(error, self._launch.max_restarts)
-            worker.end(error)
+            worker.end(error, self._launch.max_restarts)
             if here.key not in alive_nodes():
                 raise WorkerError(f"{worker.name} worker is lost: {here} has left:\n{error}") from error
             self.restarts += 1
@@ -464,22 +430,28 @@ class InferenceReplicas(Replicas[InferenceSlot]):
             try:  # to serve with the trainer's newest weights
                 worker.await_start(worker.actor.ready.remote(), max(START_S, limit), here.number == 0)
                 endpoint = self._serve(worker)
-                if worker.lock_step:
-                    worker.call("lock_step", worker.lock_step, timeout=limit)
+                if self._in_turn:
+                    self._lock(worker)
                 if self.trainer is not None:
                     self._await_weights(worker, endpoint)
                 break
             except (RayError, TimeoutError, WorkerError) as again:
                 worker.since, error = math.inf, again
-        self._moved(worker.index, endpoint)
+        self._moved(self._all.index(worker), endpoint)
         logger.info("%s worker is up again", worker.name)
 
-    def _serve(self, worker: InferenceSlot) -> Endpoint:
+    def _serve(self, worker: WorkerSlot) -> Endpoint:
         endpoint = worker.endpoint("decide", self._launch.stall_s)
         worker.work, worker.since = worker.actor.serve.remote(), time.monotonic()
         return endpoint
 
-    def _await_weights(self, worker: InferenceSlot, endpoint: Endpoint) -> None:
+    def _lock(self, worker: WorkerSlot) -> None:
+        rollout = self._config.rollout
+        clients = len(range(self._all.index(worker), rollout.workers, len(self._all)))
+        together = clients * rollout.worlds if self._in_turn else 0
+        worker.call("lock_step", together, timeout=self._launch.stall_s)
+
+    def _await_weights(self, worker: WorkerSlot, endpoint: Endpoint) -> None:
         """Wait until a new replica has weights as new as the trainer's were when it joined."""
         limit = self._launch.stall_s
         deadline = time.monotonic() + limit

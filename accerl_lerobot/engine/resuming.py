@@ -29,8 +29,7 @@ LOCK = ".lock"
 CHANGEABLE = (
     "resume", "output_dir", "evaluation", "launch", "wandb", "save_every_updates", "save_every_s",
     "trainer.updates", "trainer.num_threads", "trainer.ranks", "trainer.sharding",
-    "trainer.activation_checkpointing", "trainer.rank_timeout_s", "inference",
-    "imagination.discover_packages_path",
+    "trainer.activation_checkpointing", "inference", "imagination.discover_packages_path",
 )  # fmt: skip
 """Fields and sections that may change when a run is resumed: what is learned, and from what, stays."""
 WARM_START = "warm_start.json"
@@ -52,9 +51,7 @@ def resume_command(directory: Path) -> str:
 def resumed_run(path: Path | None, config: RunConfig) -> tuple[Path, str]:
     """The folder of the run that a config file belongs to, and the name of the checkpoint to resume from.
 
-    Args:
-        path: ``--config_path``: ``RUN/config.yaml`` or ``RUN/checkpoints/NNNNNN/config.yaml``.
-        config: the run as it is to be resumed.
+    `path` is ``RUN/config.yaml`` or ``RUN/checkpoints/NNNNNN/config.yaml``.
 
     Raises:
         InputError: the file is of no run, a setting differs that must not, or there is nothing left to do.
@@ -96,12 +93,11 @@ class Recovery:
     def next(self, checkpoints: Path, console: Console, error: WorkerError, furthest: int) -> Path:
         """The checkpoint to resume from; waits longer each time without progress in between.
 
-        Args:
-            furthest: the latest update so far. A run that gets further each time is not stuck, though it may
-                be hit again before its next checkpoint.
+        A run is not stuck whose latest update (`furthest`) is another each time, though it may be hit again
+        before its next checkpoint.
         """
         try:
-            path, passed = layout.newest_whole(checkpoints)
+            path = _newest(checkpoints, layout.LAST, console)
         except InputError:
             raise error from None
         stuck = path.name == self._begun and furthest <= self._furthest
@@ -109,8 +105,6 @@ class Recovery:
         self._begun, self._furthest = path.name, max(furthest, self._furthest)
         if self._times > self._most:
             raise error
-        for why in passed:
-            console.say(f"passed over checkpoint {why}")
         pause = pause_s(self._times - 1)
         when = f" in {pause:.0f} s" if pause else ""
         reason = f"the disk of {checkpoints.parent} is full" if is_full(error) else error
@@ -127,7 +121,11 @@ def checkpoint_of(directory: Path, wanted: str, console: Console) -> Path | None
             (directory / name).unlink(missing_ok=True)
         shutil.rmtree(directory / "tensorboard", ignore_errors=True)
         return None
-    path, passed = layout.newest_whole(directory / layout.CHECKPOINTS, wanted)
+    return _newest(directory / layout.CHECKPOINTS, wanted, console)
+
+
+def _newest(checkpoints: Path, wanted: str, console: Console) -> Path:
+    path, passed = layout.newest_whole(checkpoints, wanted)
     for why in passed:
         console.say(f"passed over checkpoint {why}")
     return path
@@ -172,12 +170,8 @@ def _differences(before: Any, now: Any, name: str) -> dict[str, tuple[Any, Any]]
 def locked(directory: Path, field: str, in_use: str) -> Iterator[int]:
     """Keep other processes out of a folder, which is made if need be.
 
-    Args:
-        field: that the folder was given by.
-        in_use: remedy of the error if another process has locked it.
-
-    Returns:
-        A file descriptor to hand to child processes that are to keep it locked.
+    Gives a file descriptor to hand to child processes that are to keep it locked. If another process has
+    locked it, the error names `field`, and `in_use` as the remedy.
     """
     make_folder(directory, field, again=True)
     with (directory / LOCK).open("w") as file:

@@ -43,7 +43,7 @@ from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.record import REPO_ID, record_demos
 from accerl_lerobot.engine import ray_session, resuming
-from accerl_lerobot.engine.config import RunConfig, encode, parse, timeline_folder
+from accerl_lerobot.engine.config import RunConfig, encode, parse
 from accerl_lerobot.engine.loop import Engine, Loop, Times, run_plans
 from accerl_lerobot.engine.preflight import check_placement, check_policy, check_start, check_world
 from accerl_lerobot.engine.sizes import check_memory
@@ -107,14 +107,12 @@ def start(
         if wanted is None:
             discard_unused(directory)
         raise
-    except StoppedError:
-        raise
     except BaseException as error:
         if is_full(error):
             console.say(f"the disk of {directory} is full; free some space, then {how}")
         elif isinstance(error, WorkerError) and error.brief:
             console.say(f"{error}; to resume: {how}")
-        else:
+        elif not isinstance(error, StoppedError):
             verb = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
             console.say(f"{verb}; to resume from the last checkpoint: {how}")
         raise
@@ -164,10 +162,9 @@ def demonstrations_of(config: RunConfig) -> DatasetConfig | None:
     if config.dataset.repo_id is not None:
         root = config.dataset.root
         return replace(config.dataset, root=None if root is None else str(Path(root).expanduser().absolute()))
-    own = None if config.output_dir is None else Path(config.output_dir).absolute() / layout.DEMOS
-    if own is None or not own.is_dir():
+    if config.folder is None or not (config.folder / layout.DEMOS).is_dir():
         return None
-    return replace(config.dataset, repo_id=REPO_ID, root=str(own))
+    return replace(config.dataset, repo_id=REPO_ID, root=str(config.folder / layout.DEMOS))
 
 
 def fine_tune(
@@ -179,11 +176,10 @@ def fine_tune(
 
     texts = task_texts(open_metadata(dataset))
     with console.stage("SFT", total=sft.steps) as stage:
-
-        def show(step: int, loss: float) -> None:
-            stage.update(step, f"loss {loss:.3f}")
-
-        return run_sft(sft, dataset, directory / "sft", seed, device, texts, on_step=show)
+        return run_sft(
+            sft, dataset, directory / "sft", seed, device, texts,
+            on_step=lambda step, loss: stage.update(step, f"loss {loss:.3f}"),
+        )  # fmt: skip
 
 
 def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfig:
@@ -226,21 +222,20 @@ def execute(
     spec = check_world(config.env)
     check_placement(replace(config, output_dir=str(directory)))
     if checkpoint is None:
-        _check_imagination(config, resumed=False)
+        _check_imagination(config)
         config = warm_start(config, directory, console)
     else:
         layout.go_back_to(checkpoint)
         config = resuming.continued(config, directory, checkpoint)
         if load is None:
             check_start(config)
-        _check_imagination(config, resumed=True)
+        _check_imagination(config)
         console.say(f"going on from {checkpoint}")
-    before_s = 0.0 if checkpoint is None else None
-    config = replace(config, output_dir=str(directory))
+    config, before_s = replace(config, output_dir=str(directory)), 0.0 if checkpoint is None else None
     times = Times(started=started, warm_s=time.monotonic() - started, before_s=before_s)
     with contextlib.ExitStack() as stack:  # flushes the log, whatever fails
         stop = stack.enter_context(Stopping())
-        times.clock = stack.enter_context(contextlib.closing(open_clock(timeline_folder(config), "driver")))
+        times.clock = stack.enter_context(contextlib.closing(open_clock(config.timeline_folder, "driver")))
         log = stack.enter_context(contextlib.closing(MetricsLog(directory, config.wandb, encode(config))))
         session = None
         if config.launch.engine != "local":
@@ -274,16 +269,11 @@ def execute(
                 config = resuming.continued(config, directory, checkpoint)
 
 
-def _check_imagination(config: RunConfig, resumed: bool) -> None:
-    if not config.imagination.share:
-        return
-    from accerl_lerobot.engine.imagination import check_imagination
+def _check_imagination(config: RunConfig) -> None:
+    if config.imagination.share:
+        from accerl_lerobot.engine.imagination import check_imagination
 
-    path = config.imagination.path
-    if resumed and path is not None and not Path(path).expanduser().is_dir():
-        remedy = "no such folder; the first world model of a run is not in its checkpoints: put a copy there"
-        raise InputError("imagination.path", path, remedy)
-    check_imagination(config)
+        check_imagination(config)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -291,7 +281,6 @@ class TrainResult:
     """Outcome of a run."""
 
     directory: Path
-    """Everything of the run; see the top of this file."""
     policy: Path
     """The improved policy, a LeRobot checkpoint."""
     before: Rate | None
@@ -321,15 +310,11 @@ class ActingPolicy:
         self._decisions = 0
 
     def act(self, observation: Observation) -> np.ndarray:
-        """One decision, with LeRobot's own sampler.
+        """The next K actions by LeRobot's own sampler, float32 (K, A), in the environment's units.
 
-        Args:
-            observation: ``observation.images.<camera>`` uint8 (H, W, 3), ``observation.state`` float32 (S,)
-                and ``task``, the instruction. For a policy with ``n_obs_steps`` above 1 each array begins
-                with that dimension, oldest first, as ``make_world(config, policy.history)`` gives them.
-
-        Returns:
-            float32 (K, A): the next K actions, in the environment's units.
+        An observation has ``observation.images.<camera>`` uint8 (H, W, 3), ``observation.state`` float32 (S,)
+        and ``task``, the instruction. For a policy with ``n_obs_steps`` above 1 each array begins with that
+        dimension, oldest first, as ``make_world(config, policy.history)`` gives them.
         """
         self._decisions += 1
         request = Request(observation=observation, noise_seed=self._decisions, explore=False)
@@ -337,11 +322,9 @@ class ActingPolicy:
 
 
 def load_config(recipe: str | Path | None = None, changes: Mapping[str, Any] | None = None) -> RunConfig:
-    """Settings of a run, as ``accerl train`` reads them.
+    """Settings of a run, as ``accerl train`` reads them from a YAML file; None: the defaults.
 
-    Args:
-        recipe: a YAML file; None: the defaults.
-        changes: field → value, such as ``{"env.task": "door-open-v3", "trainer.updates": 100}``.
+    `changes` are values by field, such as ``{"env.task": "door-open-v3", "trainer.updates": 100}``.
 
     Raises:
         InputError: a field does not exist, or a value does not fit.
@@ -379,11 +362,8 @@ def evaluate(
 ) -> EvaluationResult:
     """Success of a policy with LeRobot's own sampler, on starts that no run of this seed trains on.
 
-    Args:
-        config: its environment, seed and workers are used.
-        policy: a LeRobot checkpoint, on disk or the Hub; None: ``config.policy.path``.
-        episodes: how many; None: ``config.evaluation.episodes``.
-        revision: commit of `policy` on the Hub.
+    `config` has the environment, seed and workers, the `policy`, a LeRobot checkpoint on disk or the Hub (of
+    the commit `revision`), and the number of `episodes`, where these are not given.
     """
     if policy is not None:
         config = resuming.improving(config, policy)
@@ -392,12 +372,9 @@ def evaluate(
         config = replace(config, evaluation=replace(config.evaluation, episodes=episodes))
     with redirect_stdout(sys.stderr):
         results = play_evaluation(config, Console())
-    tasks = {
-        name: [r for r in results if r.plan.task == name] for name in sorted({r.plan.task for r in results})
-    }
-    return EvaluationResult(
-        success=_rate(results), tasks={name: _rate(of) for name, of in tasks.items()}, episodes=results
-    )
+    names = sorted({result.plan.task for result in results})
+    tasks = {name: _rate([result for result in results if result.plan.task == name]) for name in names}
+    return EvaluationResult(success=_rate(results), tasks=tasks, episodes=results)
 
 
 def load_policy(
@@ -421,14 +398,15 @@ def load_policy(
 
 
 def _result(directory: Path, summary: dict[str, Any]) -> TrainResult:
-    before = None
-    if summary["success_before"] is not None:
-        before = Rate(successes=round(summary["success_before"] * summary["n_before"]), n=summary["n_before"])
+    def rate(when: str) -> Rate:
+        n = summary[f"n_{when}"]
+        return Rate(successes=round(summary[f"success_{when}"] * n), n=n)
+
     return TrainResult(
         directory=directory,
         policy=directory / layout.CHECKPOINTS / layout.LAST / layout.PRETRAINED,
-        before=before,
-        after=Rate(successes=round(summary["success_after"] * summary["n_after"]), n=summary["n_after"]),
+        before=None if summary["success_before"] is None else rate("before"),
+        after=rate("after"),
         summary=summary,
     )
 
@@ -438,7 +416,6 @@ def _rate(results: list[EpisodeResult]) -> Rate:
 
 
 def _written(value: Any) -> str:
-    """A value as the command line has it."""
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
     return f"[{','.join(map(_written, value))}]" if isinstance(value, list | tuple) else str(value)

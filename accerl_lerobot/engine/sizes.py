@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from accerl_lerobot.algorithms import RatioConfig
 from accerl_lerobot.errors import InputError, expanded
-from accerl_lerobot.replay.pacing import decisions_under_way, lag_bound
+from accerl_lerobot.replay.pacing import lag_bound
 
 if TYPE_CHECKING:
     from accerl_lerobot.engine.config import RunConfig
@@ -29,10 +29,7 @@ DISK_BYTES = 2**29
 
 
 def check_memory(config: RunConfig) -> None:
-    """Refuse sizes far beyond this machine's memory, and weights that it cannot hold.
-
-    Nodes of a cluster that is joined may have more.
-    """
+    """Refuse sizes far beyond this machine, and weights that it cannot hold; a cluster may have more."""
     total = memory_gib("MemTotal")
     if total is None or config.launch.address is not None:
         return
@@ -65,7 +62,7 @@ def memory_parts_gib(config: RunConfig, history: int = 1) -> dict[str, float]:
         "rollout.worlds": rollout.workers * rollout.worlds * simulator,
         "rollout.segment_length": under_way(config) * pictures,
         "replay.capacity": config.replay.capacity * pictures,
-        **({"algorithm.memory": config.remembered * pictures} if config.remembered else {}),
+        "algorithm.memory": config.remembered * pictures,
         "evaluation.videos": frames * 3 * FILM[0] ** 2 / GIB,
     }
 
@@ -139,8 +136,5 @@ def lag_limits(config: RunConfig) -> tuple[int, int]:
 
 
 def under_way(config: RunConfig) -> int:
-    """Decisions on their way to replay."""
-    rollout = config.rollout
-    return decisions_under_way(
-        workers=rollout.workers, worlds=rollout.worlds, segment_length=rollout.segment_length
-    )
+    """Decisions that environments of equal speed make while a segment is on its way to replay."""
+    return config.rollout.workers * config.rollout.worlds * config.rollout.segment_length

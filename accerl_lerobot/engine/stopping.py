@@ -28,7 +28,6 @@ def arrived() -> bool:
 
 
 def _listen() -> None:
-    """Have signals noted from now on."""
     global _pipe, _arrived
     if _pipe is None:
         _pipe = os.pipe()
@@ -114,11 +113,11 @@ def deferred() -> Iterator[None]:
 
 def _cancel_alarms(left: threading.Event) -> None:
     """Cancel the alarm that follows a signal, until and when the context is left."""
-    while not left.wait(1.0):
+    ended = False
+    while not ended:
+        ended = left.wait(1.0)
         if arrived():
             signal.alarm(0)
-    if arrived():
-        signal.alarm(0)
 
 
 class Stopping:

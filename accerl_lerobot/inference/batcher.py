@@ -29,7 +29,7 @@ class BatcherStats:
     batch_sizes: Counter[int] = field(default_factory=Counter)
     """Observations in a batch → batches."""
     waits: Counter[int] = field(default_factory=Counter)
-    """k → requests that waited from `Batcher.add` to `Batcher.take` about `GRAIN` to the k-th, in seconds."""
+    """k → requests that waited about `GRAIN` to the k-th, in seconds."""
     wait_sum_s: float = 0.0
     wait_max_s: float = 0.0
 
@@ -72,15 +72,10 @@ class Batcher[R: Sized]:
         self._together, self._left = observations, 0
 
     def __len__(self) -> int:
-        """Requests that wait."""
         return len(self._waiting)
 
     def add(self, request: R, now: float) -> None:
-        """Queues a request.
-
-        Raises:
-            ValueError: it holds no observation.
-        """
+        """Queues a request, which holds an observation at least."""
         if len(request) == 0:
             raise ValueError("a request without observations")
         self._waiting.append((request, now))
@@ -92,8 +87,8 @@ class Batcher[R: Sized]:
         return deadline is not None and now >= deadline
 
     def next_deadline(self) -> float | None:
-        """When the next batch is due if nothing more arrives; a moment in the past if it is full, None if
-        empty or in lock step with others that are not here yet."""
+        """When the next batch is due if nothing more arrives; in the past if it is full, None if it is empty
+        or in lock step with others that are not here yet."""
         if not self._waiting:
             return None
         if self._together and not self._left:
@@ -123,14 +118,6 @@ class Batcher[R: Sized]:
         return batch
 
 
-LARGEST = ("wait_max_s", "swap_s", "publish_to_served_s")
-
-
-def dealt(workers: int, replicas: int) -> list[int]:
-    """Rollout workers of each replica."""
-    return [len(range(index, workers, replicas)) for index in range(replicas)]
-
-
 def merge_metrics(metrics: Sequence[dict[str, float]]) -> dict[str, float]:
     """Metrics as of one replica: sums of batches, means over requests, the oldest version; {} for none."""
     if len(metrics) < 2:
@@ -144,7 +131,7 @@ def merge_metrics(metrics: Sequence[dict[str, float]]) -> dict[str, float]:
         "wait_mean_s": waited / max(sum(observations), 1.0),
         "version": min(m["version"] for m in metrics),
         "busy_share": sum(m["busy_share"] for m in metrics) / len(metrics),
-        **{name: max(m[name] for m in metrics) for name in LARGEST},
+        **{name: max(m[name] for m in metrics) for name in ("wait_max_s", "swap_s", "publish_to_served_s")},
     }
 
 

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-import threading
 import time
 from collections import Counter, deque
 from dataclasses import dataclass, replace
@@ -79,23 +78,19 @@ class InferenceWorker:
         self._version = version
         if state is not None:
             self._adapter.load_trainable(snapshot.load(state / WEIGHTS))
-        self._newest = -1
-        """Version of the last weights that were published to it."""
-        self._published: list[PendingRequest] = []
-        """Weights that have come since the last batch."""
+        self._newest = -1  # version of the last weights that were published to it
+        self._published: list[PendingRequest] = []  # weights that have come since the last batch
         self._lock_step: deque[int] = deque(maxlen=1)
         self._swap_s = self._publish_to_served_s = 0.0
         self._unserved_since: float | None = None
         self._failure: BaseException | None = None
         self._over = False
-        self._iteration: float | None = None
-        """Start of the serving thread's last iteration; None while there is none."""
+        self._iteration: float | None = None  # start of the serving thread's last one, while it lives
         self._busy_s = self._busy_told_s = 0.0
         self._since = time.monotonic()
         self._clock.enter(WAIT_IN)
 
     async def ready(self) -> int:
-        """Return this process's id once the policy is loaded."""
         return os.getpid()
 
     async def listen(self) -> Address:
@@ -122,22 +117,8 @@ class InferenceWorker:
 
     async def serve(self) -> None:
         """Serve until the process ends, or raise the serving thread's exception."""
-        loop = asyncio.get_running_loop()
-        ended: asyncio.Future[None] = loop.create_future()
-
-        def tell(error: BaseException) -> None:
-            if not ended.done():
-                ended.set_exception(error)
-
-        def work() -> None:
-            try:
-                self._serve()
-            except BaseException as error:
-                loop.call_soon_threadsafe(tell, error)
-
-        threading.Thread(target=work, name="serve", daemon=True).start()
         try:
-            await ended
+            await asyncio.to_thread(self._serve)
         finally:
             self._over, self._iteration = True, None
             self._server.wake()
@@ -159,7 +140,6 @@ class InferenceWorker:
         }
 
     async def batching(self) -> BatcherStats:
-        """Batches so far."""
         stats = self._batcher.stats
         # Copied in one go each: the other thread adds to them.
         return replace(stats, batch_sizes=Counter(stats.batch_sizes), waits=Counter(stats.waits))
@@ -183,10 +163,10 @@ class InferenceWorker:
             self._failure, self._iteration = error, None
             self._server.poll(0.0)
             batch += self._published
-            while waiting := batch or self._batcher.take(time.monotonic()):
-                for asked in waiting:
-                    asked.fail(error)
-                batch = []
+            while len(self._batcher):
+                batch += self._batcher.take(time.monotonic())
+            for asked in batch:
+                asked.fail(error)
             self._server.close()
             raise
 
@@ -217,7 +197,7 @@ class InferenceWorker:
         self._published.clear()
 
     def _serve_batch(self, batch: list[PendingRequest]) -> None:
-        batch = [asked for asked in batch if not asked.gone]
+        batch = [asked for asked in batch if not asked.gone()]
         requests = [request for asked in batch for request in asked.message]
         started = time.monotonic()
         self._clock.enter(COMPUTE)

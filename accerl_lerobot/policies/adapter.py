@@ -249,14 +249,13 @@ class LeRobotAdapter(PolicyAdapter):
         if self.teacher is not None:
             executed = self.teacher.replace(executed, requests)
         chunk = self.processing.unnormalise(executed).cpu().numpy()
-        values, log_probs = self._value(encoded).tolist(), action.log_prob.float().cpu().numpy()
+        log_prob = action.log_prob.float().cpu().numpy()
         latents = {k: v.cpu().numpy() for k, v in action.latent.items()}
         return [
             Decision(
                 chunk=chunk[i],
                 latent={k: v[i] for k, v in latents.items()},
-                log_prob=log_probs[i],
-                value=values[i],
+                log_prob=log_prob[i],
                 version=version,
             )
             for i in range(len(requests))

@@ -25,80 +25,75 @@ from accerl_lerobot.replay.pacing import ReplayConfig, entitle
 DRAWS = 1024
 """Last draws that are remembered, to be taken back in `Replay.state`: a trainer draws one batch ahead, and
 goes on while it is saved."""
+LEAST = 0.5
+"""Share of a batch that is one, when no more will come."""
+ROOM = 0.9
+"""Share of the real store up to which it is filled without anything being drawn."""
 
 
 @kind
 @dataclass(kw_only=True)
 class ReplayCounters:
-    """Counters since the run began, resumptions included; in decisions where the name says so."""
+    """Counters since the run began, resumptions included; unused: never trained on."""
 
     inserted_segments: int = 0
     inserted_decisions: int = 0
     evicted_segments: int = 0
     evicted_decisions: int = 0
     evicted_unused: int = 0
-    """Segments evicted before they were ever trained on."""
     retired_segments: int = 0
     retired_decisions: int = 0
     retired_unused: int = 0
-    """Segments retired before they were ever trained on."""
     dropped_nonfinite: int = 0
     """Segments refused because they hold a NaN or an infinity."""
     trained_decisions: int = 0
     """Drawn by the trainer, repetitions counted."""
     unique_decisions: int = 0
     """Drawn at least once."""
-    unspent_draws: int = 0
-    """Draws that left with their segments, in decisions: what pacing failed to use."""
 
 
+@dataclass(eq=False)
 class _Entry:
     """A segment, which may be drawn `draws` times in all; once it has `left`, only the books of it."""
 
-    def __init__(self, segment: Segment, draws: int, uses: int = 0) -> None:
-        self.segment: Segment | None = segment
-        self.size, self.oldest = len(segment), int(segment.version.min())
-        self.draws, self.uses, self.left = draws, uses, ""
+    segment: Any
+    draws: int
+    uses: int = 0
+    left: str = ""
+
+    def __post_init__(self) -> None:
+        self.size, self.oldest = len(self.segment), int(self.segment.version.min())
 
     @property
-    def unspent(self) -> int:
-        """Draws left, in decisions."""
-        return (self.draws - self.uses) * self.size
+    def available(self) -> bool:
+        return self.uses < self.draws
 
 
 class Replay:
     """Segments in, batches of segments out; no clock, no process, no policy."""
 
     def __init__(self, config: ReplayConfig) -> None:
-        self.config = config
-        self.counters = ReplayCounters()
+        self.config, self.counters = config, ReplayCounters()
+        self.stored_decisions = 0
+        self.available_decisions = 0
+        """Decisions of the segments with draws left."""
         self._entries: deque[_Entry] = deque()  # oldest first
-        self._stored = 0
-        self._available = 0
         self._carry = 0.0
         self._drawn: deque[tuple[int, list[_Entry]]] = deque(maxlen=DRAWS)
         """The trainer's version and what it was given, of each of the last draws."""
 
     @property
-    def stored_decisions(self) -> int:
-        return self._stored
-
-    @property
-    def stored_segments(self) -> int:
-        return len(self._entries)
-
-    @property
-    def available_decisions(self) -> int:
-        """Decisions of the segments with draws left."""
-        return self._available
+    def segments(self) -> list[Segment]:
+        """All that is stored, the oldest first."""
+        return [entry.segment for entry in self._entries]
 
     def may_insert(self) -> bool:
         """True if rollouts should bring another segment now; `insert` does not refuse one too many."""
-        return self.config.may_insert(self._stored, self._available)
+        return self.config.may_insert(self.stored_decisions, self.available_decisions)
 
     def may_sample(self, batch_decisions: int) -> bool:
         """True if the trainer should draw a batch now; `sample` itself does not wait for the warm start."""
-        return self.config.may_sample(self._stored, self._available, batch_decisions)
+        return self.config.may_sample(self.stored_decisions, self.available_decisions, batch_decisions)
 
     def insert(self, segment: Segment) -> bool:
         """Stores a segment, by reference, and evicts the oldest ones if room is needed.
@@ -111,7 +106,7 @@ class Replay:
         if not is_finite(segment):
             self.counters.dropped_nonfinite += 1
             return False
-        while self._stored + n > self.config.capacity:
+        while self.stored_decisions + n > self.config.capacity:
             self._depart(self._entries.popleft(), "evicted")
         draws, self._carry = entitle(self.config.samples_per_insert, n, self._carry)
         self._add(_Entry(segment, draws))
@@ -122,38 +117,32 @@ class Replay:
     def sample(self, num_decisions: int, trainer_version: int, rng: np.random.Generator) -> list[Segment]:
         """Draws the available segments that were used least, in random order; retires those too old first.
 
-        Args:
-            num_decisions: at least 1; whole segments are drawn until there are as many.
-            trainer_version: updates made so far. No segment with a decision more than ``max_lag`` behind is
-                drawn.
-            rng: decides among segments used equally often.
-
-        Returns:
-            The segments, none twice; empty, with nothing counted as used, if fewer decisions are available.
-            That can happen although `may_sample` held, when segments were too old: try again later.
+        Whole segments are drawn until there are `num_decisions`, none twice; `rng` decides among those used
+        equally often. Empty, with nothing counted as used, if fewer decisions are available. That can happen
+        although `may_sample` held, when segments were too old: try again later.
         """
         self.retire(trainer_version)
-        if self._available < num_decisions:
+        if self.available_decisions < num_decisions:
             return []
-        available = [e for e in self._entries if e.unspent]
+        available = [entry for entry in self._entries if entry.available]
         shuffled = [available[i] for i in rng.permutation(len(available))]
         drawn: list[_Entry] = []
-        for entry in sorted(shuffled, key=lambda e: e.uses):
+        for entry in sorted(shuffled, key=lambda entry: entry.uses):
             self.counters.trained_decisions += entry.size
             self.counters.unique_decisions += 0 if entry.uses else entry.size
             entry.uses += 1
-            self._available -= 0 if entry.unspent else entry.size
+            self.available_decisions -= 0 if entry.available else entry.size
             drawn.append(entry)
             num_decisions -= entry.size
             if num_decisions <= 0:
                 break
         self._drawn.append((trainer_version, drawn))
-        return [entry.segment for entry in drawn if entry.segment is not None]
+        return [entry.segment for entry in drawn]
 
     def metrics(self) -> dict[str, float]:
         """Everything worth logging, by name."""
-        names = ("stored_segments", "stored_decisions", "available_decisions")
-        counts = asdict(self.counters) | {name: getattr(self, name) for name in names}
+        counts = asdict(self.counters) | {"stored_segments": len(self._entries)}
+        counts |= {name: getattr(self, name) for name in ("stored_decisions", "available_decisions")}
         return {name: float(count) for name, count in counts.items()}
 
     def state(self, version: int | None = None) -> dict[str, Any]:
@@ -165,68 +154,51 @@ class Replay:
         late = [] if version is None else [entries for made, entries in self._drawn if made >= version]
         if late and len(late) == self._drawn.maxlen:
             raise RuntimeError(f"replay has given more than {DRAWS} batches since update {version}")
-        back: Counter[_Entry] = Counter(entry for entries in late for entry in entries)
+        back = Counter(entry for entries in late for entry in entries)
         counters = replace(self.counters)
         for entry, count in back.items():
-            unused = count == entry.uses
             counters.trained_decisions -= count * entry.size
-            counters.unique_decisions -= entry.size if unused else 0
-            if entry.left:
-                counters.unspent_draws += count * entry.size
-                name = f"{entry.left}_unused"
-                setattr(counters, name, getattr(counters, name) + unused)
+            if count == entry.uses:
+                counters.unique_decisions -= entry.size
+                if entry.left:
+                    _count(counters, f"{entry.left}_unused", 1)
         entries = [{"segment": e.segment, "draws": e.draws, "uses": e.uses - back[e]} for e in self._entries]
         return {"counters": counters, "entries": entries, "carry": self._carry}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Goes on from what `state` gave."""
-        if self.counters != ReplayCounters():
-            raise RuntimeError("restore before the first insert")
+        """Resumes from `state`, before the first insert."""
         self.counters, self._carry = state["counters"], state["carry"]
         for held in state["entries"]:
             self._add(_Entry(**held))
 
-    @property
-    def segments(self) -> list[Segment]:
-        """All that is stored, the oldest first."""
-        return [e.segment for e in self._entries if e.segment is not None]
-
     def retire(self, trainer_version: int) -> None:
         """Takes out what is too old for a trainer that has made so many updates."""
         cutoff = trainer_version - self.config.max_lag
-        old = [e for e in self._entries if e.oldest < cutoff]
-        if old:
-            self._entries = deque(e for e in self._entries if e.oldest >= cutoff)
-        for entry in old:
+        for entry in [entry for entry in self._entries if entry.oldest < cutoff]:
+            self._entries.remove(entry)
             self._depart(entry, "retired")
 
     def _add(self, entry: _Entry) -> None:
         self._entries.append(entry)
-        self._stored += entry.size
-        self._available += entry.size if entry.unspent else 0
+        self.stored_decisions += entry.size
+        self.available_decisions += entry.size if entry.available else 0
 
     def _depart(self, entry: _Entry, how: str) -> None:
-        """Books a segment that has left under ``<how>_*``."""
         entry.segment, entry.left = None, how
-        n, counters = entry.size, self.counters
-        self._stored -= n
-        self._available -= n if entry.unspent else 0
-        for name, amount in (("segments", 1), ("decisions", n), ("unused", int(entry.uses == 0))):
-            setattr(counters, f"{how}_{name}", getattr(counters, f"{how}_{name}") + amount)
-        counters.unspent_draws += entry.unspent
+        self.stored_decisions -= entry.size
+        self.available_decisions -= entry.size if entry.available else 0
+        for name, amount in (("segments", 1), ("decisions", entry.size), ("unused", entry.uses == 0)):
+            _count(self.counters, f"{how}_{name}", int(amount))
+
+
+def _count(counters: ReplayCounters, name: str, amount: int) -> None:
+    setattr(counters, name, getattr(counters, name) + amount)
 
 
 def is_finite(segment: Segment) -> bool:
     """True if no floating-point number of the segment is a NaN or an infinity."""
-    arrays = [segment.log_prob, segment.value, segment.reward, *segment.latent.values()]
-    arrays += segment.observations.values()
+    arrays = [segment.log_prob, segment.reward, *segment.latent.values(), *segment.observations.values()]
     return all(bool(np.isfinite(a).all()) for a in arrays if np.issubdtype(a.dtype, np.inexact))
-
-
-LEAST = 0.5
-"""Share of a batch that is one, when no more will come."""
-ROOM = 0.9
-"""Share of the real store up to which it is filled without anything being drawn."""
 
 
 class MixedReplay:
@@ -264,14 +236,16 @@ class MixedReplay:
 
     def may_insert(self, source: str = REAL) -> bool:
         """True if another segment of this source should be brought now."""
-        if source == REAL and self.held and self._patient:
-            return False
-        return self._of(source).may_insert() or (source == REAL and self._waits)
+        if source != REAL:
+            return self.imagined.may_insert()
+        return not (self.held and self._patient) and (self.real.may_insert() or self._waits)
 
     def insert(self, segment: Segment) -> bool:
         """See `Replay.insert`."""
-        stored = self._of(segment.source).insert(segment)
-        if stored and segment.source == REAL and self._journal is not None:
+        if segment.source != REAL:
+            return self.imagined.insert(segment)
+        stored = self.real.insert(segment)
+        if stored and self._journal is not None:
             self._journal.write(segment)
         return stored
 
@@ -288,11 +262,10 @@ class MixedReplay:
         """See `Replay.sample`: empty, with nothing counted as used, if a part cannot be had."""
         self.real.retire(trainer_version)
         self.imagined.retire(trainer_version)
-        parts = self._parts(num_decisions)
-        if parts is None:
-            return []
         drawn: list[Segment] = []
-        for replay, count in zip((self.real, self.imagined), parts, strict=True):
+        for replay, count in zip(
+            (self.real, self.imagined), self._parts(num_decisions) or (0, 0), strict=True
+        ):
             drawn += replay.sample(count, trainer_version, rng) if count else []
         return drawn
 
@@ -301,26 +274,21 @@ class MixedReplay:
         return {
             "real": self.real.state(version),
             "imagined": self.imagined.state(version),
-            "share": self.share,
-            "real_ended": self.real_ended,
-            "awaited": self.awaited,
-            "held": self.held,
             "journal": None if self._journal is None else self._journal.save(),
+            **{name: getattr(self, name) for name in _STATE},
         }
 
     def restore(self, state: dict[str, Any]) -> None:
         """See `Replay.restore`."""
         self.real.restore(state["real"])
         self.imagined.restore(state["imagined"])
-        for name in ("share", "real_ended", "awaited", "held"):
+        for name in _STATE:
             setattr(self, name, state[name])
         if self._journal is not None and state["journal"] is not None:
             self._journal.cut(state["journal"])
 
     def metrics(self) -> dict[str, float]:
-        """Metrics of the real store by their names; where anything is imagined, of the other one with
-        ``imagined_`` before them, and its share.
-        """
+        """Metrics of the real store, and as ``imagined_…`` of the other where anything is imagined."""
         if not (self.share or self.awaited or self.imagined.counters.inserted_segments):
             return self.real.metrics()
         imagined = {f"imagined_{k}": v for k, v in self.imagined.metrics().items()}
@@ -330,9 +298,6 @@ class MixedReplay:
     def _waits(self) -> bool:
         room = self.real.stored_decisions < ROOM * self.real.config.capacity
         return self._patient and self.awaited and not self.share and room
-
-    def _of(self, source: str) -> Replay:
-        return self.real if source == REAL else self.imagined
 
     def _parts(self, batch: int) -> tuple[int, int] | None:
         """Decisions to draw from either store; None if one of them cannot give its part."""
@@ -351,3 +316,6 @@ class MixedReplay:
         if imagined and not self.imagined.may_sample(imagined):
             return None
         return real, imagined
+
+
+_STATE = ("share", "real_ended", "awaited", "held")

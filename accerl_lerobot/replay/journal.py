@@ -35,11 +35,9 @@ class Done:
     actions: np.ndarray
     """float32 (env steps, A), as they were executed, one after the other."""
     steps: tuple[int, ...]
-    """Env steps of each decision."""
+    """Env steps of each decision; `rewards` have its cost taken off."""
     versions: tuple[int, ...]
-    """Versions of the weights behind each decision."""
     rewards: tuple[float, ...]
-    """Rewards of each decision, its cost taken off."""
     ended: bool
     """True if the episode ended with it."""
     success: bool
@@ -66,7 +64,7 @@ class Journal:
             "steps": segment.steps.tolist(),
             "versions": segment.version.tolist(),
             "rewards": segment.reward.tolist(),
-            "ended": segment.terminated or segment.truncated,
+            "ended": segment.terminated,
             "success": segment.success,
             "action_dim": segment.actions.shape[-1],
             "actions": base64.b64encode(actions.astype("<f4").tobytes()).decode(),

@@ -3,14 +3,9 @@
 
 Everything is counted in decisions. On entering the store each segment gets a whole number of draws, ⌊r⌋ or
 ⌈r⌉ with r = samples_per_insert, such that the average is r (`entitle`). A segment with draws left is
-*available*:
-
-    may_sample = stored ≥ min_decisions  and  available ≥ batch
-    may_insert = stored < min_decisions  or   available < ahead
-
-With batch ≤ ahead one of them holds at any time. Nothing depends on totals since the run began, so evicting,
-retiring or resuming cannot upset the pace. Rollouts wait on insert instead of having their segments thrown
-away later, because what is thrown away first is what took longest, and those are the failures.
+*available*. With batch ≤ ahead, one of `may_sample` and `may_insert` holds at any time. Rollouts wait on
+insert instead of having their segments thrown away later, because what is thrown away first is what took
+longest, and those are the failures.
 
     asynchronous   nobody waits for anybody, within the pace
     overlap        the next batch is collected while one is learned from, and then both wait for each other
@@ -58,7 +53,7 @@ class ReplayConfig(Section, section="replay"):
                 raise InputError(f"replay.{name}", getattr(self, name), remedy)
 
     def check(self, *, batch_decisions: int, segment_decisions: int) -> None:
-        """Refuses a pace that could stall or waste, given an update's batch and the longest segment."""
+        """Refuses a pace that could stall or waste."""
         if self.ahead < batch_decisions:
             remedy = f"use at least one batch, {batch_decisions}, or both sides wait for each other"
             raise InputError("replay.ahead", self.ahead, remedy)
@@ -94,11 +89,6 @@ def entitle(samples_per_insert: float, n: int, carry: float) -> tuple[int, float
     return draws, carry - draws * n
 
 
-def decisions_under_way(*, workers: int, worlds: int, segment_length: int) -> int:
-    """Decisions that environments of equal speed make while a segment is on its way to the door."""
-    return workers * worlds * segment_length
-
-
 def lag_bound(
     config: ReplayConfig, *, batch_decisions: int, in_flight: int, pickup: int = 0, prefetch: int = 0
 ) -> int:
@@ -113,11 +103,9 @@ def lag_bound(
     weights that decided were `pickup` updates old at most.
 
     Args:
-        batch_decisions: decisions one update draws at least.
         in_flight: most decisions inserted, by all workers, from the first decision of a segment until it is
-            inserted itself, its own included. With environments of about equal speed: `decisions_under_way`,
+            inserted itself, its own included. With environments of about equal speed: one segment of each,
             twice that to be safe. One worker that hangs breaks this; `max_lag` then retires its segment.
-        pickup: updates made while a publication travels to the inference service, or is held back.
         prefetch: batches drawn ahead of the update that uses them.
     """
     decisions = max(config.ahead, config.min_decisions) + 2 * in_flight + config.capacity
@@ -140,26 +128,24 @@ class Turns:
 
     def __init__(self, schedule: Schedule = ASYNCHRONOUS) -> None:
         self.schedule: Schedule = schedule
-        self._drawn = self._learnt = 0
+        self._under_way = 0
+        """Batches that the trainer has drawn and not learned from."""
 
     def may_collect(self, ready: bool) -> bool:
         """True if who has brought a segment may go on; `ready`: the pace would let a batch be drawn now."""
+        learning = self._under_way > 0
         if self.schedule == SYNCHRONOUS:
-            return not (ready or self._learning)
-        return self.schedule == ASYNCHRONOUS or not (ready and self._learning)
+            return not (ready or learning)
+        return self.schedule == ASYNCHRONOUS or not (ready and learning)
 
     def may_draw(self) -> bool:
         """True if the trainer may have its next batch."""
-        return self.schedule == ASYNCHRONOUS or not self._learning
+        return self.schedule == ASYNCHRONOUS or self._under_way <= 0
 
     def drawn(self) -> None:
         """The trainer has another batch."""
-        self._drawn += 1
+        self._under_way += 1
 
     def learnt(self) -> None:
         """It has learned from one, and in turn every reader has the weights."""
-        self._learnt += 1
-
-    @property
-    def _learning(self) -> bool:
-        return self._drawn > self._learnt
+        self._under_way -= 1

@@ -37,12 +37,10 @@ IN_TRANSIT = 1024
 
 
 class News(NamedTuple):
-    """Answer to workers that imagine."""
+    """Answer to workers that imagine: real segments, and the cursor to ask with the next time."""
 
     segments: list[Segment]
-    """Real ones that have come since."""
     cursor: int
-    """To ask with the next time."""
     ended: bool
     """No more will come."""
     closed: bool
@@ -87,7 +85,6 @@ class ReplayWorker:
         self._clock.enter(WAIT_IN)
 
     async def ready(self) -> int:
-        """Answers once this process is up; returns its id."""
         return os.getpid()
 
     async def listen(self) -> Address:
@@ -104,8 +101,7 @@ class ReplayWorker:
     async def insert(self, segments: list[Segment]) -> bool:
         """Stores segments of one source once the pace allows it; returns when more may be collected.
 
-        Returns:
-            False when the run is over and they were not stored.
+        False when the run is over and they were not stored.
 
         Raises:
             ServiceStoppedError: storing has failed, now or before; `run` says why.
@@ -140,14 +136,11 @@ class ReplayWorker:
         def ended() -> bool:
             return self._closed or self._replay.exhausted(num_decisions)
 
-        def ready() -> bool:
-            return self._replay.may_sample(num_decisions)
-
         started = time.monotonic()
         self._batch = num_decisions
         async with self._changed:
             while True:
-                await self._changed.wait_for(lambda: ended() or (self._turns.may_draw() and ready()))
+                await self._changed.wait_for(lambda: ended() or (self._turns.may_draw() and self._ready))
                 if ended():
                     return []
                 self._clock.enter(COMPUTE)
@@ -163,18 +156,16 @@ class ReplayWorker:
 
     @asynccontextmanager
     async def _changing(self) -> AsyncIterator[None]:
-        """Lets everybody who waits look again at what is changed inside."""
+        """Has everybody who waits look again."""
         async with self._changed:
             yield
             self._changed.notify_all()
 
     async def learnt(self) -> None:
-        """The trainer's word that it has learned from a batch."""
         async with self._changing():
             self._turns.learnt()
 
     async def follow(self, schedule: Schedule) -> None:
-        """From now on, turns are taken like this."""
         async with self._changing():
             self._turns.schedule = schedule
 
@@ -195,7 +186,6 @@ class ReplayWorker:
             self._replay.held = held
 
     async def end_real(self) -> None:
-        """Every real episode has been played and stored."""
         async with self._changing():
             self._replay.real_ended = True
 
@@ -203,11 +193,8 @@ class ReplayWorker:
         """Writes its part of ``training_state``, as it was when the trainer had made `version` updates."""
         self._clock.enter(CHECKPOINT)
         fault_point("replay.save")
-        state = {
-            "replay": self._replay.state(version),
-            "rng": copy.deepcopy(self._rng),
-            "real_count": self._real_count,
-        }
+        replay, rng = self._replay.state(version), copy.deepcopy(self._rng)
+        state = {"replay": replay, "rng": rng, "real_count": self._real_count}
         self._clock.enter(WAIT_IN)
         await asyncio.to_thread(snapshot.save, directory / "replay", state)
 
@@ -228,7 +215,6 @@ class ReplayWorker:
         return self._batch > 0 and self._replay.may_sample(self._batch)
 
     async def close(self) -> None:
-        """Ends all waiting; nothing is stored or drawn any more."""
         async with self._changing():
             self._closed = True
 

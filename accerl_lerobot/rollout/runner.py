@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -44,7 +44,6 @@ class ActiveEpisode:
     """All that was executed, by which `RolloutRunner.restore` brings the world back to where it was."""
 
     def request(self) -> Request:
-        """Request of its next decision."""
         seed = noise_seed(self.plan.seed, self.decisions)
         return Request(observation=self.builder.latest, noise_seed=seed, explore=self.plan.explore)
 
@@ -61,14 +60,9 @@ class RolloutConfig(Section, section="rollout"):
     """Largest number of decisions in a segment."""
     decision_cost: NonNegative = 0.01
     """Subtracted from the reward of every decision, so that faster is better."""
-    time_limit: Literal["truncate", "fail"] = "fail"
-    """How the learner treats the end of an episode by its time limit. fail: like a termination, the return
-    ends there. truncate: V of the last observation stands for what would have followed, as in tasks without
-    an end; where success is counted within a limit, failures then go unpunished."""
     episodes: Steps = 0
     """Exploring episodes in all; 0: as many as the updates need. Once they are played, learning goes on while
-    replay has something to give, which is little unless more is imagined, and then ends.
-    """
+    replay has something to give, which is little unless more is imagined, and then ends."""
     reward_model: RewardModelConfig = field(default_factory=RewardModelConfig)
     """The model that tells success, where the environment does not."""
 
@@ -101,9 +95,7 @@ def budgets(config: RolloutConfig) -> list[int | None]:
 def incarnation_after(incarnation: int, starts: int) -> int:
     """Number of the process that takes a worker's place, such that it meets none of its seeds again.
 
-    Args:
-        incarnation: of the one before.
-        starts: where that one was in its seeds when it last said so; it may have gone on since.
+    `starts` is where the one before was in its seeds when it last said so; it may have gone on since.
     """
     return max(incarnation, (starts + STARTS_PER_INCARNATION // 2) // STARTS_PER_INCARNATION) + 1
 
@@ -112,13 +104,7 @@ class EpisodePlans:
     """The episodes of one worker, in order."""
 
     def __init__(
-        self,
-        tasks: tuple[str, ...],
-        *,
-        seed: int,
-        worker: int = 0,
-        incarnation: int = 0,
-        budget: int | None = None,
+        self, tasks: tuple[str, ...], seed: int, budget: int | None, worker: int = 0, incarnation: int = 0
     ) -> None:
         self._tasks, self._seed, self._worker, self._budget = tasks, seed, worker, budget
         self.starts = incarnation * STARTS_PER_INCARNATION
@@ -148,11 +134,9 @@ class EpisodePlans:
         return self._budget is not None and self._budget <= 0
 
     def state(self) -> dict[str, Any]:
-        """All that `restore` needs; see `snapshot`."""
         return {"budget": self._budget, "starts": self.starts, "queued": list(self._queued)}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Goes on from what `state` gave."""
         self._budget, self.starts = state["budget"], state["starts"]
         self._queued.extend(state["queued"])
 
@@ -265,12 +249,11 @@ class RolloutRunner:
         return None if episode is None else episode.request()
 
     def state(self) -> dict[str, Any]:
-        """All that `restore` needs; see `snapshot`."""
         episodes = [None if e is None else vars(e) | {"builder": e.builder.state()} for e in self._episodes]
         return {"counters": replace(self.counters), "sequence": self._sequence, "episodes": episodes}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Goes on from what `state` gave: worlds are brought back by doing again what was done in them."""
+        """Resumes from `state`: worlds are brought back by doing again what was done in them."""
         self.counters, self._sequence = state["counters"], state["sequence"]
         for slot, (world, saved) in enumerate(zip(self._worlds, state["episodes"], strict=True)):
             if saved is None:
@@ -290,7 +273,6 @@ class RolloutRunner:
             self._episodes[slot] = ActiveEpisode(**saved | {"builder": builder})
 
     def close(self) -> None:
-        """Closes the worlds."""
         for world in self._worlds:
             world.close()
 
@@ -299,15 +281,11 @@ class RolloutRunner:
         return SegmentBuilder(observation, self.config.segment_length, origin)
 
     def _emit(self, episode: ActiveEpisode, result: ChunkResult) -> None:
-        failed = result.truncated and self.config.time_limit == "fail"
-        terminated, truncated = result.terminated or failed, result.truncated and not failed
-        totals: dict[str, float] = {}
-        if terminated or truncated:
-            totals = {"return": episode.episode_return, "steps": episode.steps}
-            totals |= {"decisions": episode.decisions, "success": float(result.success)}
+        totals: dict[str, float] = {"return": episode.episode_return, "steps": episode.steps}
+        totals |= {"decisions": episode.decisions, "success": float(result.success)}
         self._sequence += 1
         key = f"{self.name}.{self._sequence}"
-        segment = episode.builder.cut(key, terminated, truncated, result.success, totals)
+        segment = episode.builder.cut(key, result.done, result.success, totals if result.done else None)
         if episode.plan.explore:
             self._on_segment(segment)
 

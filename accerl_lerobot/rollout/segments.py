@@ -23,7 +23,7 @@ class SegmentBuilder:
 
     @property
     def latest(self) -> Observation:
-        """The observation the next decision is about."""
+        """The observation that the next decision is about."""
         return self.observations[-1]
 
     @property
@@ -31,17 +31,14 @@ class SegmentBuilder:
         return len(self.decisions) >= self.length
 
     def state(self) -> dict[str, Any]:
-        """All that `restore` needs; see `snapshot`."""
         return dict(vars(self))
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Goes on from what `state` gave."""
         vars(self).update(state)
 
     def add(
         self, decision: Decision, actions: np.ndarray, reward: float, steps: int, following: Observation
     ) -> None:
-        """Records one executed decision."""
         self.decisions.append(decision)
         self.actions.append(actions)
         self.rewards.append(reward)
@@ -52,7 +49,6 @@ class SegmentBuilder:
         self,
         key: str,
         terminated: bool = False,
-        truncated: bool = False,
         success: bool = False,
         episode: dict[str, float] | None = None,
     ) -> Segment:
@@ -64,13 +60,11 @@ class SegmentBuilder:
             task=str(self.observations[0][TASK]),
             latent={k: np.stack([d.latent[k] for d in self.decisions]) for k in names},
             log_prob=np.stack([d.log_prob for d in self.decisions]).astype(np.float32),
-            value=np.array([d.value for d in self.decisions], np.float32),
             actions=np.stack(self.actions).astype(np.float32),
             reward=np.array(self.rewards, np.float32),
             version=np.array([d.version for d in self.decisions], np.int64),
             steps=np.array(self.steps, np.int64),
             terminated=terminated,
-            truncated=truncated,
             success=success,
             key=key,
             source=self.source,

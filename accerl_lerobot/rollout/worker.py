@@ -54,31 +54,24 @@ class Report:
     counters: dict[str, float]
     """Since this process began."""
     in_world_s: float
-    """How long the world has been at what it does now, in seconds; 0 while none is stepped."""
+    """Seconds for which the world has been at what it does now; 0 while none is stepped."""
     stuck_s: float = 0.0
-    """How long ago the thread that steps worlds last did anything, in seconds; 0 while one is stepped."""
+    """Seconds since the thread that steps worlds last did anything; 0 while one is stepped."""
     spent: bool = False
     """Every exploring episode that was paid for has been played, and replay has it."""
     starts: int = 0
     """See `EpisodePlans.starts`."""
     away_s: float = 0.0
-    """For how long inference has not been where it was last said to be, in seconds."""
+    """Seconds for which inference has not been where it was last said to be."""
     away_why: str = ""
 
 
-@dataclass(frozen=True)
-class WorkerShare:
-    """One of several rollout workers, and its share of the episodes."""
-
-    index: int
-    incarnation: int = 0
-    """How often it has been restarted; part of the segments' keys, and of the seeds."""
-    budget: int | None = None
-    """Exploring episodes at most; None: no end."""
-
-
 class RolloutWorker:
-    """Becomes a threaded Ray actor in `launch`: `run` on one thread, `report` on another."""
+    """Becomes a threaded Ray actor in `launch`: `run` on one thread, `report` on another.
+
+    `incarnation` is how often it has been restarted, part of the segments' keys and of the seeds; `budget`
+    limits the exploring episodes.
+    """
 
     def __init__(
         self,
@@ -86,14 +79,14 @@ class RolloutWorker:
         config: RolloutConfig,
         tasks: tuple[str, ...],
         seed: int,
-        share: WorkerShare,
+        index: int = 0,
+        incarnation: int = 0,
+        budget: int | None = None,
         history: int = 1,
         timeline: Path | None = None,
     ) -> None:
-        self._clock = open_clock(timeline, f"rollout {share.index}")
-        self._plans = EpisodePlans(
-            tasks, seed=seed, worker=share.index, incarnation=share.incarnation, budget=share.budget
-        )
+        self._clock = open_clock(timeline, f"rollout {index}")
+        self._plans = EpisodePlans(tasks, seed, budget, index, incarnation)
         self._spent = False
         self._at_the_door = AT_THE_DOOR
         # Shared by the two threads: appending to and popping from a deque is atomic.
@@ -104,13 +97,11 @@ class RolloutWorker:
         self._outbox: list[Segment] = []
         self._deciding = ReconnectingClient("inference")
         worlds = [make_world(env, history, config.reward_model) for _ in range(config.worlds)]
-        name = f"rollout{share.index}.{share.incarnation}"
         callbacks = self._outbox.append, self._results.append
-        self._runner = RolloutRunner(worlds, self._next, config, name, *callbacks)
+        self._runner = RolloutRunner(worlds, self._next, config, f"rollout{index}.{incarnation}", *callbacks)
         self._clock.enter(WAIT_IN)
 
     def ready(self) -> int:
-        """Answers once the worlds exist; returns this process's id."""
         return os.getpid()
 
     def report(
@@ -168,9 +159,8 @@ class RolloutWorker:
                 del self._outbox[:size]
             self._spent = self._plans.spent and not self._runner.exploring and not at_the_door
             if not self._training.is_set():  # so that planned episodes need not wait for exploring ones
-                given_up = [slot for slot, request in due.items() if request.explore]
-                idle += given_up
-                due = {slot: request for slot, request in due.items() if slot not in given_up}
+                idle += [slot for slot, request in due.items() if request.explore]
+                due = {slot: request for slot, request in due.items() if not request.explore}
             idle = [slot for slot in idle if not self._begin(slot, due)]
             sendable = [slot for slot in due if len(at_the_door) < self._at_the_door or not due[slot].explore]
             for start in range(0, len(sendable), size):

@@ -61,9 +61,6 @@ class TrainerConfig(Section, section="trainer"):
     activation_checkpointing: bool = False
     """Repeated blocks of the network, a transformer's layers for instance, forget what they computed and
     compute it again for the gradient: less memory, about a third more work."""
-    rank_timeout_s: Positive = 120.0
-    """How long, in seconds, a rank waits for the others within an update. Then the trainer counts as
-    lost."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

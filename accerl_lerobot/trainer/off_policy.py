@@ -131,8 +131,7 @@ class OffPolicyUpdate(BaseUpdate):
             for demonstration in self.adapter.demonstrations(segments[0]):
                 self.remember(demonstration)
         for segment in segments:
-            if not segment.truncated:  # the simulator diverged: nothing follows, and nothing failed
-                self.remember(segment)
+            self.remember(segment)
         rewards = np.concatenate([segment.reward for segment in segments])
         metrics = {"decisions": float(len(rewards)), "memory_decisions": float(len(self.memory))}
         metrics["reward_mean"] = float(rewards.mean())

@@ -5,7 +5,7 @@
                         ◄── torch.distributed: values, gradients, parts of weights ──►
 
 What takes all ranks is done within `Peers.joining`: the others are told, do the same, and are waited for. One
-that dies or hangs ends the wait, at the latest after ``trainer.rank_timeout_s``, and is named in the error.
+that dies or hangs ends the wait, after `SHARE` of ``launch.stall_s`` at the latest, and the error names it.
 """
 
 from __future__ import annotations
@@ -34,8 +34,10 @@ if TYPE_CHECKING:
 
 LOAD_S = 600.0
 """How long a rank may take to load its policy."""
+SHARE = 0.4
+"""Share of ``launch.stall_s`` for which a rank waits for the others, so that the lost one is named first."""
 PATIENCE = 0.9
-"""Share of ``trainer.rank_timeout_s`` after which the first rank has waited for another."""
+"""Share of that after which the first rank has waited for another."""
 BLAME_S = 10.0
 """How long to wait for the failure that the first rank's own is the consequence of."""
 
@@ -57,6 +59,8 @@ class LearnerSettings(NamedTuple):
     """The ``training_state`` to resume from; None: begin."""
     load: Load | None = None
     """Makes the adapter; None: of LeRobot's checkpoint."""
+    timeout_s: float = 120.0
+    """How long a rank waits for the others within an update."""
 
     def adapter(self) -> Any:
         """Loads the policy."""
@@ -99,7 +103,7 @@ class TrainerRank:
         """Meets the others."""
         from accerl_lerobot.trainer import ranks
 
-        size, timeout_s = self._settings.trainer.ranks, self._settings.trainer.rank_timeout_s
+        size, timeout_s = self._settings.trainer.ranks, self._settings.timeout_s
         here = rendezvous.address == ranks.LOOPBACK
         ranks.use_only(ranks.LOOPBACK if here else ray.util.get_node_ip_address())
         store = ranks.join(rendezvous, size, timeout_s)
@@ -125,8 +129,8 @@ class TrainerRank:
 class Peers:
     """The others, as the first rank sees them: `actors` are handles of `TrainerRank`, of rank 1, 2 …."""
 
-    def __init__(self, actors: Sequence[Any], config: TrainerConfig) -> None:
-        self._actors, self._config = list(actors), config
+    def __init__(self, actors: Sequence[Any], config: TrainerConfig, timeout_s: float = 120.0) -> None:
+        self._actors, self._config, self._timeout_s = list(actors), config, timeout_s
 
     def begin(self, settings: LearnerSettings) -> BaseUpdate:
         """Loads the first rank's policy and meets the others, once they have loaded theirs."""
@@ -141,7 +145,7 @@ class Peers:
         if set(nodes) != {str(ray.get_runtime_context().get_node_id())}:
             address = ray.util.get_node_ip_address()
         ranks.use_only(address)
-        size, timeout_s = self._config.ranks, self._config.rank_timeout_s
+        size, timeout_s = self._config.ranks, self._timeout_s
         store, rendezvous = ranks.create(address, size, timeout_s)
         with self.joining("join", rendezvous):
             return settings.begin(adapter, ranks.Group(store, 0, size, adapter.device, timeout_s))
@@ -159,12 +163,12 @@ class Peers:
             yield
         except Exception as error:
             # Who waits for the first rank is silent too: it is another's silence only if it was waited for.
-            waited = time.monotonic() - began > PATIENCE * self._config.rank_timeout_s
+            waited = time.monotonic() - began > PATIENCE * self._timeout_s
             if calls and (lost := _failure(method, calls, silence=waited, own=error)) is not None:
                 raise lost from error
             raise
         if calls:
-            _collect(method, calls, self._config.rank_timeout_s)
+            _collect(method, calls, self._timeout_s)
 
     def lending(self, method: str) -> AbstractContextManager[None]:
         """As `joining`, for what takes all ranks only where each keeps a part of the weights."""

@@ -51,7 +51,7 @@ class TrainerWorker:
     ) -> None:
         self._clock = open_clock(timeline, "trainer")
         self._policy, self._config, self._directory = settings.policy, settings.trainer, directory
-        self._peers = Peers(peers, self._config)
+        self._peers = Peers(peers, self._config, settings.timeout_s)
         self._update = self._peers.begin(settings)
         self._lock = threading.Lock()
         self._kept: Any = None

@@ -37,17 +37,16 @@ class Client(ABC):
 
     @abstractmethod
     def send(self, message: Any) -> int:
-        """Send a message without waiting for its reply.
+        """Send a message without waiting for its reply; returns its ticket.
 
         Raises:
             ServiceStoppedError: the service is gone.
-            TimeoutError: it takes no message.
-            TypeError: the message cannot be sent.
+            TimeoutError: too many messages are under way.
         """
 
     @abstractmethod
     def done(self, timeout: float) -> list[tuple[int, Any]]:
-        """Replies that have come, with their tickets, each once; empty if none came within `timeout` seconds.
+        """Tickets and replies that have come, each once; waits `timeout` seconds for the first.
 
         Raises:
             ServiceStoppedError: the service failed, or is gone.
@@ -59,8 +58,7 @@ class Client(ABC):
 
     def ask(self, messages: Sequence[Any], timeout: float) -> list[Any]:
         """Send messages and wait for all replies; nothing else may be under way."""
-        under_way: dict[int, int] = {}
-        """Ticket → index of the message."""
+        under_way: dict[int, int] = {}  # ticket → index of the message
         replies: dict[int, Any] = {}
         deadline, sent = time.monotonic() + timeout, 0
         while len(replies) < len(messages):
@@ -78,10 +76,8 @@ class Client(ABC):
 class PendingRequest:
     """A message at the service; answered or failed once, on the thread that polls.
 
-    Args:
-        sent: on `time.monotonic`, which all processes of a node share.
-        gone: True once the answer is not awaited any more.
-        reply: sends a reply, or the error in its place.
+    `sent` is on `time.monotonic`, which all processes of a node share; `gone` tells that the answer is not
+    awaited any more; `reply` sends a reply, or the error in its place.
     """
 
     def __init__(
@@ -91,34 +87,26 @@ class PendingRequest:
         gone: Callable[[], bool],
         reply: Callable[[Any, BaseException | None], None],
     ) -> None:
-        self.message, self.sent = message, sent
-        self._gone, self._reply = gone, reply
-
-    @property
-    def gone(self) -> bool:
-        """True if the answer is not awaited any more."""
-        return self._gone()
+        self.message, self.sent, self.gone, self._reply = message, sent, gone, reply
 
     def answer(self, reply: Any) -> None:
         """Send the reply. In shared memory, the message's arrays are valid until then; see `decode`."""
-        if not self.gone:
+        if not self.gone():
             self._reply(reply, None)
 
     def fail(self, error: BaseException) -> None:
         """Raise a `ServiceStoppedError` that names this error at the client."""
-        if not self.gone:
+        if not self.gone():
             self._reply(None, error)
 
     def __len__(self) -> int:
-        """Length of the message, where that is a list."""
         return len(self.message)
 
 
 class Server:
     """A service for threads of its own process; transports add those of other processes.
 
-    Args:
-        take: gets every message, on the thread that polls; answers then or later.
+    `take` gets every message, on the thread that polls, and answers then or later.
     """
 
     def __init__(self, take: Callable[[PendingRequest], None]) -> None:

@@ -18,7 +18,6 @@ class Endpoint:
     """Address of a service, which a worker needs in order to call it."""
 
     name: str
-    """Name of the service, for messages."""
     method: Any
     """Method of its Ray actor handle."""
     address: Address | None = None
@@ -27,7 +26,6 @@ class Endpoint:
     """Ray's handle of its process."""
 
     def kill(self) -> None:
-        """End its process."""
         import ray
 
         ray.kill(self.actor)
@@ -47,8 +45,7 @@ class RayClient(Client):
         import ray
 
         self._ray, self._method = ray, method
-        self._tickets: dict[Any, int] = {}
-        """Reference → ticket."""
+        self._tickets: dict[Any, int] = {}  # by reference
         self._sent = 0
 
     def send(self, message: Any) -> int:
@@ -89,17 +86,14 @@ class ReconnectingClient(Client):
         self._next: deque[Endpoint] = deque(maxlen=1)
         self._moved = threading.Event()
         self._client: Client | None = None
-        self._messages: dict[int, Any] = {}
-        """Ticket → message that has not been answered."""
-        self._tickets: dict[int, int] = {}
-        """Ticket of the connection → ticket here."""
+        self._messages: dict[int, Any] = {}  # not answered yet, by ticket
+        self._tickets: dict[int, int] = {}  # ticket of the connection → ticket here
         self._sent = 0
         self._away_since: float | None = None
         self.why = ""
         """Reason of the last loss of the connection."""
 
     def move(self, endpoint: Endpoint) -> None:
-        """Connect there with the next call."""
         self._next.append(endpoint)
         self._away_since = None
         self._moved.set()

@@ -26,7 +26,6 @@ import socket
 import struct
 import time
 from collections.abc import Awaitable, Callable
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -51,19 +50,12 @@ ASK, ANSWER, FAIL = range(3)
 def available() -> bool:
     """True if this system has memfd, epoll and eventfd."""
     try:
-        os.close(new_memory(1))
+        os.close(os.memfd_create("accerl"))
         select.epoll().close()
         os.close(os.eventfd(0))
     except (AttributeError, OSError):
         return False
     return True
-
-
-def new_memory(size: int) -> int:
-    """Shared memory, as a file descriptor."""
-    file = os.memfd_create("accerl", os.MFD_CLOEXEC)
-    os.ftruncate(file, size)
-    return file
 
 
 def new_name() -> str:
@@ -100,26 +92,23 @@ class Token(NamedTuple):
     start: int
     """First byte of the message in the slot."""
     size: int
-    """Bytes of the message."""
     sent: float
     """On `time.monotonic`."""
 
 
 class Slot:
-    """Mapped shared memory of a fixed size, which lasts as long as something refers to it or a view of it.
-
-    Args:
-        file: descriptor, which can be closed afterwards.
-    """
+    """Mapped shared memory, which lasts as long as something refers to it or a view of it."""
 
     def __init__(self, file: int) -> None:
         self.size = os.fstat(file).st_size
         self.memory = mmap.mmap(file, self.size)
 
 
-def new_slot(size: int) -> int:
-    """Shared memory for at least `size` bytes; what is not written to takes none."""
-    return new_memory(max(LEAST, 1 << (size - 1).bit_length()))
+def new_slot(size: int) -> tuple[Slot, int]:
+    """A slot of at least `size` bytes, and its file descriptor; what is not written to takes no memory."""
+    file = os.memfd_create("accerl", os.MFD_CLOEXEC)
+    os.ftruncate(file, max(LEAST, 1 << (size - 1).bit_length()))
+    return Slot(file), file
 
 
 def send_token(connection: socket.socket, token: Token, file: int | None = None) -> None:
@@ -146,10 +135,9 @@ def receive_token(connection: socket.socket) -> tuple[Token, Slot | None] | None
 
 
 class Address(NamedTuple):
-    """Where processes of its node reach a service."""
+    """Where processes of a node, see `this_node`, reach a service."""
 
     node: str
-    """See `this_node`."""
     name: str
 
 
@@ -170,21 +158,17 @@ class SharedMemoryClient(Client):
         self._readable.register(self._socket, select.POLLIN)
         self._slots: list[Slot] = []
         self._free: list[int] = []
-        self._under_way: dict[int, int] = {}
-        """Ticket → slot."""
+        self._under_way: dict[int, int] = {}  # ticket → slot
         self._sent = 0
 
     def send(self, message: object) -> int:
-        encoded = encode(message)
+        encoded, file = encode(message), None
         if not self._free and len(self._slots) == SLOTS:
             raise TimeoutError(f"{self.name}: none of {SLOTS} messages under way has been answered")
-        index = self._free[-1] if self._free else len(self._slots)
-        file = None
+        index = self._free.pop() if self._free else len(self._slots)
         if index == len(self._slots) or self._slots[index].size < encoded.size:
-            file = new_slot(encoded.size + LEAST)
-            self._slots[index : index + 1] = [Slot(file)]
-        if self._free:
-            self._free.pop()
+            slot, file = new_slot(encoded.size + LEAST)
+            self._slots[index : index + 1] = [slot]
         encoded.write(self._slots[index].memory, 0)
         self._sent += 1
         self._under_way[self._sent] = index
@@ -236,26 +220,24 @@ def _connected(name: str, address: Address) -> socket.socket:
     while True:
         try:
             end.connect(f"\0{address.name}")
-            mine = same_user(end)
+            if same_user(end):
+                return end
+            reason = ": another user's process has taken its place"
             break
         except OSError as error:
             # The backlog may be full while the service is busy.
             if not isinstance(error, BlockingIOError) or time.monotonic() > deadline:
-                end.close()
-                raise ServiceStoppedError(f"{name} cannot be connected to: {error}") from error
+                reason = f" cannot be connected to: {error}"
+                break
         time.sleep(0.01)
-    if not mine:
-        end.close()
-        raise ServiceStoppedError(f"{name}: another user's process has taken its place")
-    return end
+    end.close()
+    raise ServiceStoppedError(f"{name}{reason}")
 
 
 class SharedMemoryServer(Server):
     """The service's end: `poll` accepts clients and hands over their messages, oldest first.
 
-    Args:
-        take: see `Server`.
-        copy: True: messages own their arrays; False: these are views, valid until the answer.
+    Messages own their arrays if `copy`; else these are views, valid until the answer.
     """
 
     def __init__(self, take: Callable[[PendingRequest], None], *, copy: bool) -> None:
@@ -282,9 +264,8 @@ class SharedMemoryServer(Server):
         events = self._epoll.poll(timeout)
         while events:
             for descriptor, _ in events:
-                connection = self._connections.get(descriptor)
-                if connection is not None:
-                    received += self._receive(connection)
+                if (connection := self._connections.get(descriptor)) is not None:
+                    self._receive(connection, received)
                 elif descriptor == self._listener.fileno():
                     self._accept()
                 elif descriptor == self._event.fileno():
@@ -311,21 +292,42 @@ class SharedMemoryServer(Server):
             end.close()
             return
         end.setblocking(False)
-        self._connections[end.fileno()] = _Connection(end, self._drop)
+        self._connections[end.fileno()] = _Connection(end)
         self._epoll.register(end, select.EPOLLIN)
 
-    def _receive(self, connection: _Connection) -> list[PendingRequest]:
-        """The client's next message; empty if there is none, or it is gone."""
+    def _receive(self, connection: _Connection, received: list[PendingRequest]) -> None:
+        """Take the client's next message, if there is one."""
         try:
-            received = receive_token(connection.socket)
+            packet = receive_token(connection.socket)
         except BlockingIOError:
-            return []
+            return
         except ConnectionError:
-            received = None
-        if received is None:
+            packet = None
+        if packet is None:
             self._drop(connection)
-            return []
-        return [connection.take(*received, self._copy)]
+            return
+        token, slot = packet
+        if slot is not None:
+            connection.slots[token.slot] = slot
+        message = decode(connection.slots[token.slot].memory, token.start, copy=self._copy)
+        reply = functools.partial(self._reply, connection, token)
+        sent = min(token.sent, time.monotonic())
+        received.append(PendingRequest(message, sent, lambda: connection.closed, reply))
+
+    def _reply(self, to: _Connection, asked: Token, reply: object, error: BaseException | None) -> None:
+        """Write it behind the message, whose arrays it may consist of, or into a larger slot."""
+        purpose = ANSWER if error is None else FAIL
+        encoded = encode(reply if error is None else str(stopped(error)))
+        start, file = aligned(asked.start + asked.size), None
+        if start + encoded.size > to.slots[asked.slot].size:
+            to.slots[asked.slot], file = new_slot(start + encoded.size)
+            start = 0
+        encoded.write(to.slots[asked.slot].memory, start)
+        token = Token(purpose, asked.slot, asked.ticket, start, encoded.size, asked.sent)
+        try:
+            send_token(to.socket, token, file)
+        except OSError:  # it has died, or does not read although it may have few messages under way
+            self._drop(to)
 
     def _drop(self, connection: _Connection) -> None:
         """Forget a client; its slots go with the last view of them."""
@@ -339,40 +341,13 @@ class SharedMemoryServer(Server):
 class _Connection:
     """One client as the service sees it."""
 
-    def __init__(self, end: socket.socket, drop: Callable[[_Connection], None]) -> None:
-        self.socket, self._drop = end, drop
-        self.closed = False
+    def __init__(self, end: socket.socket) -> None:
+        self.socket, self.closed = end, False
         self.slots: dict[int, Slot] = {}
-
-    def take(self, token: Token, slot: Slot | None, copy: bool) -> PendingRequest:
-        """The message of a token."""
-        if slot is not None:
-            self.slots[token.slot] = slot
-        message = decode(self.slots[token.slot].memory, token.start, copy=copy)
-        sent = min(token.sent, time.monotonic())
-        return PendingRequest(message, sent, lambda: self.closed, partial(self._reply, token))
-
-    def _reply(self, asked: Token, reply: object, error: BaseException | None) -> None:
-        """Write it behind the message, whose arrays it may consist of, or into a larger slot."""
-        purpose = ANSWER if error is None else FAIL
-        encoded = encode(reply if error is None else str(stopped(error)))
-        start, file = aligned(asked.start + asked.size), None
-        if start + encoded.size > self.slots[asked.slot].size:
-            file = new_slot(start + encoded.size)
-            self.slots[asked.slot], start = Slot(file), 0
-        encoded.write(self.slots[asked.slot].memory, start)
-        token = Token(purpose, asked.slot, asked.ticket, start, encoded.size, asked.sent)
-        try:
-            send_token(self.socket, token, file)
-        except OSError:  # it has died, or does not read although it may have few messages under way
-            self._drop(self)
 
 
 def serve_on_loop(answer: Callable[[Any], Awaitable[Any]]) -> SharedMemoryServer:
-    """Have a coroutine function answer messages, each in a task of the running event loop.
-
-    Messages own their arrays.
-    """
+    """Have a coroutine function answer messages, which own their arrays, in tasks of the running loop."""
     tasks: set[asyncio.Task[None]] = set()
 
     async def handle(request: PendingRequest) -> None:

@@ -33,11 +33,10 @@ Tensors = dict[str, np.ndarray]
 
 @kind
 class WeightUpdate(NamedTuple):
-    """All trained weights of one version."""
+    """All trained weights of one version, published at `published_s` on `time.time`."""
 
     version: int
     published_s: float
-    """On `time.time`, which machines share as well as their clocks are set."""
     tensors: Tensors
 
 
@@ -45,10 +44,8 @@ class WeightUpdate(NamedTuple):
 class _Reader:
     endpoint: Endpoint
     client: Client
-    under_way: set[int] = field(default_factory=set)
-    """Tickets of sets that it has not applied yet."""
-    sent: int | None = None
-    """Version of the last one."""
+    under_way: set[int] = field(default_factory=set)  # tickets of sets that it has not applied yet
+    sent: int | None = None  # version of the last one
 
 
 class WeightPublisher:
@@ -98,7 +95,6 @@ class WeightPublisher:
                 self._readers.remove(late[0])
 
     def close(self) -> None:
-        """End all connections."""
         for reader in self._readers:
             reader.client.close()
         self._readers.clear()
@@ -129,22 +125,16 @@ def _end(endpoint: Endpoint, error: Exception) -> None:
 
 
 class PublishDelay:
-    """Publishes weights some updates after they were made, for studies of what lag does to an algorithm.
-
-    Args:
-        updates: age of weights when they are published; 0: at once. As many copies are kept.
-    """
+    """Publishes weights some `updates` after they were made, for studies of what lag does."""
 
     def __init__(self, updates: int) -> None:
         self.updates = updates
         self._waiting: deque[tuple[int, Tensors]] = deque()
 
     def push(self, version: int, tensors: Tensors, *, last: bool = False) -> list[tuple[int, Tensors]]:
-        """Take the newest weights and return those that are due, oldest first; version 0 always is.
+        """Take the newest weights, which must not change; return those that are due, oldest first.
 
-        Args:
-            tensors: must not change afterwards.
-            last: no update follows, so return the newest.
+        Version 0 always is due, and only the newest if no update follows (`last`).
         """
         self._waiting.append((version, tensors))
         due = []

@@ -170,7 +170,7 @@ class OnlineLearner:
             self._unfinished.popitem(last=False)
         ordered = [parts[decision] for decision in sorted(parts)]
         starts = accumulate(map(len, ordered[:-1]), initial=0)
-        if sorted(parts) != [*starts] or not (ordered[-1].terminated or ordered[-1].truncated):
+        if sorted(parts) != [*starts] or not ordered[-1].terminated:
             return None
         self._unfinished.pop(name, None)
         return ordered

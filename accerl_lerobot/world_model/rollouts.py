@@ -142,7 +142,6 @@ class Imagination:
         on_segment: Callable[[Segment], object],
         *,
         decision_cost: float,
-        time_limit_fails: bool,
         seed: int,
     ) -> None:
         self.config = config
@@ -152,7 +151,7 @@ class Imagination:
         self._model, self._success, self._world = model, success, world
         self._roles: dict[str, str] = {}  # of episodes, see `Promotion`
         self._on_segment = on_segment
-        self._decision_cost, self._time_limit_fails = decision_cost, time_limit_fails
+        self._decision_cost = decision_cost
         self._starts: deque[Start] = deque(maxlen=config.memory)
         self._rng = np.random.default_rng((seed, 3))
         self._rows: list[SegmentBuilder | None] = [None] * config.rollouts
@@ -166,8 +165,8 @@ class Imagination:
         """Lets rollouts start where a real segment does, if its episode begins with it."""
         if not segment.origin.decision:
             self._starts.append(start_of(segment, self._model.spec))
-        if self.on and (segment.terminated or segment.truncated):
-            self.switch.add_real(segment.terminated and segment.success)
+        if self.on and segment.terminated:
+            self.switch.add_real(segment.success)
 
     def swap(self, promotion: Promotion) -> None:
         """Replaces the models; unfinished rollouts are dropped. A placebo stays one."""
@@ -279,8 +278,7 @@ class Imagination:
             if achieved or late or done:
                 self.counters["successes"] += achieved
                 self.switch.add_imagined(achieved)
-                terminated = achieved or done or (late and self._time_limit_fails)
-                self._end(i, terminated, late and not terminated, achieved)
+                self._end(i, True, achieved)
 
     def close(self) -> None:
         """Closes simulators, if the model has any."""
@@ -299,13 +297,13 @@ class Imagination:
             "on": float(self.on),
         }
 
-    def _end(self, i: int, terminated: bool = False, truncated: bool = False, success: bool = False) -> None:
+    def _end(self, i: int, terminated: bool = False, success: bool = False) -> None:
         row, self._rows[i] = self._rows[i], None
         self.counters["rollouts"] += 1
         if row is None or not row.decisions:
             return
         self._sequence += 1
-        segment = row.cut(f"{IMAGINATION}.{self._sequence}", terminated, truncated, success)
+        segment = row.cut(f"{IMAGINATION}.{self._sequence}", terminated, success)
         segment.world_version = self.version
         self._on_segment(segment)
 

@@ -22,16 +22,6 @@ def test_an_empty_batcher_is_never_due() -> None:
     assert not batcher.stats.batch_sizes and batcher.stats.metrics()["wait_mean_s"] == 0.0
 
 
-def test_a_full_batch_fires_at_once() -> None:
-    batcher = make_batcher()
-    for i in range(3):
-        batcher.add("a", now=5.0)
-        assert not batcher.due(now=5.0), i
-    batcher.add("a", now=5.0)
-    assert batcher.due(now=5.0)
-    assert batcher.take(now=5.0) == ["a"] * 4
-
-
 def test_a_batch_that_cannot_grow_is_full_and_the_clock_goes_on_with_the_rest() -> None:
     batcher = make_batcher()
     batcher.add("abc", now=0.0)

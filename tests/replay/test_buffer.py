@@ -27,7 +27,7 @@ def assert_books_balance(replay: Replay) -> None:
     c = replay.counters
     for unit in ("segments", "decisions"):
         gone = sum(getattr(c, f"{how}_{unit}") for how in ("evicted", "retired"))
-        assert getattr(c, f"inserted_{unit}") == getattr(replay, f"stored_{unit}") + gone
+        assert getattr(c, f"inserted_{unit}") == replay.metrics()[f"stored_{unit}"] + gone
     assert c.unique_decisions <= c.trained_decisions
     assert replay.stored_decisions <= replay.config.capacity
 
@@ -47,14 +47,14 @@ def test_one_large_segment_may_push_out_all_others() -> None:
     for i in range(3):
         replay.insert(make_segment(f"k{i}", 3))
     replay.insert(make_segment("long", 10))
-    assert replay.stored_segments == 1 and replay.counters.evicted_segments == 3
+    assert len(replay.segments) == 1 and replay.counters.evicted_segments == 3
     with pytest.raises(InputError, match=r"replay\.capacity=10: use at least 11"):
         replay.insert(make_segment("longer", 11))
     assert_books_balance(replay)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("field", ["log_prob", "value", "reward", "latent", "observations"])
+@pytest.mark.parametrize("field", ["log_prob", "reward", "latent", "observations"])
 def test_nonfinite_segments_are_dropped_and_counted(field: str, bad: float) -> None:
     replay = make_replay()
     segment = make_segment("a")
@@ -63,11 +63,6 @@ def test_nonfinite_segments_are_dropped_and_counted(field: str, bad: float) -> N
     array.flat[1] = bad
     assert not replay.insert(segment)
     assert replay.counters.dropped_nonfinite == 1 and replay.counters.inserted_segments == 0
-
-
-def test_integer_observations_are_not_searched_for_nan() -> None:
-    images = {"observation.images.top": np.zeros((5, 2, 2, 3), np.uint8)}
-    assert make_replay().insert(make_segment("a", observations=images))
 
 
 def test_the_least_used_are_drawn_first() -> None:
@@ -127,7 +122,6 @@ def test_nothing_older_than_max_lag_is_drawn() -> None:
     assert replay.counters.retired_segments == 1 and replay.counters.retired_unused == 1
     assert replay.sample(4, 11, rng) == []
     assert replay.counters.retired_segments == 2 and replay.counters.retired_unused == 1
-    assert replay.counters.unspent_draws == 8 + 4
     assert_books_balance(replay)
 
 
@@ -140,7 +134,7 @@ def test_a_trainer_that_resumed_behind_its_samples_retires_nothing() -> None:
 def test_books_balance_under_random_use() -> None:
     rng = np.random.default_rng(3)
     replay = make_replay(samples_per_insert=1.7, max_lag=3)
-    version, entitled = 0, 0
+    version = 0
     for i in range(3000):
         if rng.random() < 0.6:
             n = int(rng.integers(1, 7))
@@ -155,8 +149,6 @@ def test_books_balance_under_random_use() -> None:
         entries = replay._entries
         assert replay.available_decisions == sum(len(e.segment) for e in entries if e.uses < e.draws)
         assert all(e.uses <= e.draws <= 2 for e in entries)
-        entitled = c.trained_decisions + c.unspent_draws + sum(e.unspent for e in entries)
-        assert -1e-6 < 1.7 * c.inserted_decisions - entitled < 6 + 1e-6
     assert c.retired_segments > 20 and c.evicted_segments > 20 and version > 200
 
 
@@ -182,8 +174,6 @@ def test_what_is_saved_goes_on_as_if_it_had_never_been(tmp_path: Path) -> None:
     drawn = [keys(store.sample(12, 1, np.random.default_rng(1))) for store in (replay, resumed)]
     assert drawn[0] == drawn[1] and replay.metrics() == resumed.metrics()
     assert_books_balance(resumed)
-    with pytest.raises(RuntimeError, match="before the first insert"):
-        resumed.restore(replay.state())
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -76,9 +76,9 @@ def test_whole_episodes_are_found_among_others(tmp_path: Path):
         part("a1", 1, 0),
         part("b1", 2, 0),
         part("a2", 1, 2, terminated=True),
-        part("c2", 3, 2, truncated=True),  # the first part of which never came
+        part("c2", 3, 2, terminated=True),  # the first part of which never came
         part("g1", 4, 0),  # two of a group, which start alike
-        part("g2", 4, 2, truncated=True),
+        part("g2", 4, 2, terminated=True),
         part("h1", 4, 0, n=1),
         part("h2", 4, 1, terminated=True),
         part("b2", 2, 2),  # still under way

@@ -48,13 +48,6 @@ def test_either_door_has_its_own_pace():
     assert replay.metrics()["imagined_stored_decisions"] == replay.metrics()["stored_decisions"] == 16
 
 
-def test_without_a_share_it_is_a_replay_of_what_is_real():
-    replay = mixed(share=0.0)
-    fill(replay, REAL, 4)
-    fill(replay, IMAGINED, 4)
-    assert drawn(replay, 16) == {REAL: 16, IMAGINED: 0}
-
-
 def test_once_all_real_episodes_are_in_they_are_used_up_and_dreams_go_on():
     replay = mixed()
     fill(replay, REAL, 1)
@@ -118,12 +111,6 @@ def test_what_is_too_old_for_one_part_costs_the_other_nothing():
     fill(replay, IMAGINED, 4, version=0)
     assert replay.may_sample(16) and drawn(replay, 16, version=10) == {REAL: 0, IMAGINED: 0}
     assert replay.real.counters.trained_decisions == 0 and replay.imagined.counters.retired_segments == 4
-
-
-def test_a_segment_goes_where_it_belongs():
-    replay = mixed()
-    assert replay.insert(make_segment("a", 4, source=IMAGINED))
-    assert replay.imagined.stored_decisions == 4 and replay.real.stored_decisions == 0
 
 
 def test_real_episodes_that_are_counted_wait_for_what_has_to_learn_from_those_before():

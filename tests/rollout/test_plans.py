@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from accerl_lerobot.rollout.runner import (
-    STARTS_PER_INCARNATION,
     EpisodePlan,
     EpisodePlans,
     RolloutConfig,
@@ -40,15 +39,6 @@ def test_evaluations_go_first_and_nothing_is_explored_before_it_is_time():
     assert plans.next(exploring=False) == evaluate(index=1)
     assert plans.next(exploring=False) is None
     assert take(plans, 1)[0].explore
-
-
-def test_another_incarnation_repeats_no_seed():
-    seeds = []
-    for incarnation in range(3):
-        plans = make(incarnation=incarnation)
-        seeds.append({p.seed for p in take(plans, 400)})
-        assert train_seed(3, 0, incarnation * STARTS_PER_INCARNATION) in seeds[-1]
-    assert len(set.union(*seeds)) == 3 * 400
 
 
 def test_not_even_where_the_one_before_has_played_thousands():

@@ -13,7 +13,7 @@ from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutConfig
 from tests.rollout.worlds import CHUNK, Recorder, ScriptedWorld, evaluate, explore
 
-CONFIG = RolloutConfig(worlds=1, segment_length=3, decision_cost=0.0, time_limit="truncate")
+CONFIG = RolloutConfig(worlds=1, segment_length=3, decision_cost=0.0)
 
 
 def steps_seen(segment) -> list[float]:
@@ -30,28 +30,15 @@ def test_an_episode_is_cut_into_segments_without_a_gap():
         assert segment.latent["x"][:, 0].tolist() == steps_seen(segment)[:-1]
 
 
-@pytest.mark.parametrize(
-    ("end", "terminated", "truncated", "success"),
-    [("success", True, False, True), ("failure", True, False, False), ("limit", False, True, False)],
-)
-def test_the_last_segment_says_how_the_episode_ended(end, terminated, truncated, success):
+@pytest.mark.parametrize(("end", "success"), [("success", True), ("failure", False), ("limit", False)])
+def test_the_last_segment_says_how_the_episode_ended(end, success):
     recorder = Recorder([ScriptedWorld(steps=8, end=end)], [explore()], CONFIG)
     recorder.play()
     cut, last = recorder.segments
-    assert (cut.terminated, cut.truncated, cut.success) == (False, False, False)
-    assert (last.terminated, last.truncated, last.success) == (terminated, truncated, success)
+    assert (cut.terminated, cut.success) == (False, False)
+    assert (last.terminated, last.success) == (True, success)
     assert steps_seen(last) == [6, 8]
-
-
-def test_a_time_limit_may_count_as_a_failure():
-    """The return ends there, so the learner sees a termination; the episode itself is reported as before."""
-    config = replace(CONFIG, time_limit="fail")
-    recorder = Recorder([ScriptedWorld(steps=8, end="limit")], [explore()], config)
-    recorder.play()
-    cut, last = recorder.segments
-    assert (cut.terminated, cut.truncated) == (False, False)
-    assert (last.terminated, last.truncated, last.success) == (True, False, False)
-    assert last.episode["decisions"] == 4 and not recorder.results[0].success
+    assert last.episode["decisions"] == 4 and recorder.results[0].success is success
 
 
 def test_an_episode_that_ends_within_a_chunk_counts_the_steps_that_were_made():
@@ -68,13 +55,9 @@ def test_every_decision_costs():
     recorder.play()
     assert np.concatenate([s.reward for s in recorder.segments]).tolist() == [1.75] * 4
     assert recorder.results[0].episode_return == pytest.approx(4 * 1.75)
-
-
-def test_an_evaluation_reports_the_environments_own_return():
-    config = replace(CONFIG, decision_cost=0.25)
-    recorder = Recorder([ScriptedWorld(steps=8)], [replace(explore(), explore=False)], config)
-    recorder.play()
-    assert recorder.results[0].episode_return == 8.0
+    evaluation = Recorder([ScriptedWorld(steps=8)], [replace(explore(), explore=False)], config)
+    evaluation.play()
+    assert evaluation.results[0].episode_return == 8.0, "the environment's own"
 
 
 def test_episode_totals_come_with_the_last_segment_only():
@@ -94,7 +77,7 @@ def test_results_name_the_oldest_and_the_newest_weights():
         assert request is not None
         chunk = np.zeros((CHUNK, 1), np.float32)
         empty = np.zeros(1, np.float32)
-        decision = Decision(chunk=chunk, latent={"x": empty}, log_prob=empty, value=0.0, version=version)
+        decision = Decision(chunk=chunk, latent={"x": empty}, log_prob=empty, version=version)
         request = recorder.runner.advance(0, decision)
     assert recorder.results[0].versions == (3, 5)
     assert recorder.segments[0].version.tolist() == [4, 3, 5]
@@ -180,7 +163,7 @@ def simulated_episode(film: bool, seed: int, tolerance: float) -> EpisodeResult:
         target = np.asarray(request.observation["observation.state"])[:2]
         chunk = target + np.random.default_rng(request.noise_seed).normal(0, 1.0, (7, 2))
         decision = Decision(
-            chunk=chunk.astype(np.float32), latent={}, log_prob=np.zeros(1, np.float32), value=0.0, version=1
+            chunk=chunk.astype(np.float32), latent={}, log_prob=np.zeros(1, np.float32), version=1
         )
         request = recorder.runner.advance(0, decision)
     return recorder.results[0]
@@ -194,9 +177,3 @@ def test_filming_changes_nothing(seed: int, tolerance: float, success: bool):
     assert plain.success is success and plain.frames == []
     assert len(filmed.frames) >= filmed.steps // 2 and all(f.shape == (8, 8, 3) for f in filmed.frames)
     assert replace(filmed, plan=plain.plan, frames=[]) == plain
-
-
-def test_closing_closes_the_worlds():
-    worlds = [ScriptedWorld(), ScriptedWorld()]
-    Recorder(worlds, [], CONFIG).runner.close()
-    assert all(world.closed for world in worlds)

@@ -19,7 +19,6 @@ def decision(step: int, version: int = 0) -> Decision:
         chunk=np.zeros((2, 1), np.float32),
         latent={"x": np.array([step, -step], np.float32)},
         log_prob=np.array([step / 10], np.float64),
-        value=100.0 + step,
         version=version,
     )
 
@@ -49,7 +48,6 @@ def test_everything_about_a_decision_stays_together():
     segment = collected(3).cut("k")
     assert segment.latent["x"].tolist() == [[0, 0], [1, -1], [2, -2]]
     np.testing.assert_allclose(segment.log_prob[:, 0], [0, 0.1, 0.2], rtol=1e-6)
-    assert segment.value.tolist() == [100, 101, 102]
     np.testing.assert_allclose(segment.actions[:, 0, 0], [0, 0.1, 0.2], rtol=1e-6)
     assert segment.reward.tolist() == [0, 1, 2] and segment.origin == ("push-v3", 7, 0)
     assert segment.version.tolist() == [0, 1, 2] and segment.steps.tolist() == [1, 2, 3]
@@ -75,8 +73,8 @@ def test_full_at_its_length():
     assert not collected(3).full and collected(4).full
 
 
-@pytest.mark.parametrize(("terminated", "truncated"), [(False, False), (True, False), (False, True)])
-def test_how_it_ended_is_kept(terminated: bool, truncated: bool):
-    segment = collected(2).cut("k", terminated, truncated, episode={"return": 3.0})
-    assert (segment.terminated, segment.truncated) == (terminated, truncated)
+@pytest.mark.parametrize("terminated", [False, True])
+def test_how_it_ended_is_kept(terminated: bool):
+    segment = collected(2).cut("k", terminated, episode={"return": 3.0})
+    assert segment.terminated == terminated
     assert segment.episode == {"return": 3.0} and segment.source == "real" and segment.key == "k"

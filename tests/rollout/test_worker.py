@@ -15,10 +15,9 @@ import pytest
 
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.experience import Decision, Request, Segment
-from accerl_lerobot.replay.buffer import is_finite
 from accerl_lerobot.rollout import worker as module
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutConfig
-from accerl_lerobot.rollout.worker import AT_THE_DOOR, RolloutWorker, WorkerShare
+from accerl_lerobot.rollout.worker import AT_THE_DOOR, RolloutWorker
 from accerl_lerobot.transport.contract import ServiceStoppedError
 from tests.rollout.worlds import evaluate
 from tests.runs import HANGS_S
@@ -39,7 +38,7 @@ class Stage:
     """A worker whose loop runs on a thread; `inference` answers at once, `replay` as the test says."""
 
     def __init__(self, config: RolloutConfig, insert: Callable[[list[Segment]], Any]) -> None:
-        self.worker = RolloutWorker(WORLD, config, ("match",), 0, WorkerShare(0))
+        self.worker = RolloutWorker(WORLD, config, ("match",), 0)
         self.episodes: list[EpisodeResult] = []
         self.explored = 0
         self.over = False
@@ -107,7 +106,7 @@ class Stage:
 
 def a_decision(request: Request | None = None) -> Decision:
     zeros = np.zeros((4, 2), np.float32)
-    return Decision(chunk=zeros, latent={"x": zeros}, log_prob=np.zeros(4, np.float32), value=0.0, version=0)
+    return Decision(chunk=zeros, latent={"x": zeros}, log_prob=np.zeros(4, np.float32), version=0)
 
 
 def drawn(request: Request) -> Decision:
@@ -131,12 +130,6 @@ def stage() -> Iterator[Callable[..., Stage]]:
         one.worker.report(False, planned(8))  # something to ask for, whatever it waits for
         one.thread.join(timeout=HANGS_S)
         assert not one.thread.is_alive()
-
-
-def test_nothing_runs_before_it_is_told_to(stage):
-    one = stage(lambda segments: True)
-    time.sleep(0.05)
-    assert one.order(training=False).counters["decisions"] == 0 and one.explored == 0
 
 
 def test_training_episodes_reach_replay_and_the_report(stage):
@@ -219,16 +212,6 @@ def test_a_worker_outlives_its_inference_and_plays_what_it_would_have_played(sta
     assert played_out[0] == played_out[1]
 
 
-def test_a_restarted_worker_uses_other_keys_and_other_seeds():
-    plans = []
-    for incarnation in (0, 1):
-        worker = RolloutWorker(WORLD, RolloutConfig(), ("match",), 0, WorkerShare(0, incarnation))
-        worker.report(True, [])
-        plans.append([worker._plans.next(exploring=True) for _ in range(20)])
-    seeds = [{plan.seed for plan in some} for some in plans]
-    assert len(seeds[0]) == 20 and not seeds[0] & seeds[1]
-
-
 def test_a_world_that_hangs_shows_in_the_report(stage, monkeypatch: pytest.MonkeyPatch):
     release = threading.Event()
     one = stage(lambda segments: True)
@@ -242,7 +225,7 @@ def test_a_world_that_hangs_shows_in_the_report(stage, monkeypatch: pytest.Monke
 
 def test_who_has_not_been_set_to_work_is_not_away_from_inference():
     """Others may take long to start, and it is restarted if it seems to be."""
-    worker = RolloutWorker(WORLD, RolloutConfig(worlds=1), ("match",), 0, WorkerShare(0))
+    worker = RolloutWorker(WORLD, RolloutConfig(worlds=1), ("match",), 0)
     time.sleep(0.05)
     report = worker.report(True, [])
     assert (report.away_s, report.stuck_s, report.in_world_s) == (0.0, 0.0, 0.0)
@@ -263,13 +246,3 @@ def test_a_thread_that_hangs_outside_of_a_world_shows_in_the_report(stage, monke
     assert one.order(True).in_world_s == 0
     release.set()
     one.until(lambda: len(one.episodes) >= 2 and one.order(True).stuck_s < 0.4)
-
-
-def test_what_is_not_finite_is_sent_where_it_is_ordered(stage, monkeypatch: pytest.MonkeyPatch):
-    """Replay refuses and counts it."""
-    visits = iter([True])
-    monkeypatch.setattr(module, "fault_point", lambda point: point == "rollout.send" and next(visits, False))
-    inserted: list[Segment] = []
-    one = stage(lambda segments: inserted.extend(segments) or True)
-    one.until(lambda: len(inserted) >= 4)
-    assert [is_finite(segment) for segment in inserted[:4]] == [False, True, True, True]

@@ -68,13 +68,12 @@ class ScriptedWorld(World):
 
 
 def decide(request: Request, version: int = 0) -> Decision:
-    """A decision whose latent, log-prob and value all are the step it was made at: they can be told apart."""
+    """A decision whose latent and log-prob are the step it was made at: they can be told apart."""
     step = float(np.asarray(request.observation["observation.state"])[1])
     return Decision(
         chunk=np.zeros((CHUNK, 1), np.float32),
         latent={"x": np.array([step, step], np.float32)},
         log_prob=np.array([-step], np.float32),
-        value=step,
         version=version,
     )
 

@@ -96,7 +96,6 @@ def make_segments(lengths: Sequence[int], version: int = 0, seed: int = 0, **rep
             "task": f"task {seed}.{i}",
             "latent": {"x": rng.standard_normal((n, 2), dtype=np.float32)},
             "log_prob": rng.standard_normal((n, 2), dtype=np.float32) - 2.0,
-            "value": np.full(n, 100.0, np.float32),  # stale: no critic here says so
             "reward": rng.standard_normal(n, dtype=np.float32),
         }
         made.append(make_segment(f"{seed}.{i}", n, version, **fields | replace))

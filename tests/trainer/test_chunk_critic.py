@@ -364,7 +364,6 @@ SECTIONS: dict[str, Any] = {
     [
         ({"env": SimulatedConfig()}, r"algorithm\.type='chunk_critic': .*add --env\.environment_state=true"),
         ({"replay": ReplayConfig(samples_per_insert=2.0)}, r"replay\.samples_per_insert=2\.0: .*use 1\.0"),
-        ({"rollout": RolloutConfig(time_limit="truncate")}, r"rollout\.time_limit='truncate': .*use fail"),
         ({"trainer": TrainerConfig(ranks=2)}, r"trainer\.ranks=2: .*use 1"),
         ({"rollout": RolloutConfig(segment_length=3)}, r"rollout\.segment_length=3: .*use at least 4"),
     ],

@@ -19,7 +19,8 @@ from tests.light_workers import light_ray
 
 __all__ = ["light_ray"]
 
-THREE = TrainerConfig(ranks=3, rank_timeout_s=2.0)
+THREE = TrainerConfig(ranks=3)
+WAIT_S = 2.0
 
 
 class LightRank:
@@ -61,7 +62,7 @@ def peers(light_ray: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable
     def make(first: str, second: str) -> Peers:
         actors.extend(ray.remote(LightRank).options(num_cpus=0).remote() for _ in range(2))
         ray.get([actor.made.remote() for actor in actors])
-        return Peers([Split(actors[-2], first), Split(actors[-1], second)], THREE)
+        return Peers([Split(actors[-2], first), Split(actors[-1], second)], THREE, WAIT_S)
 
     yield make
     for actor in actors:
@@ -96,7 +97,7 @@ def test_one_that_is_gone_is_named_and_not_those_that_fail_for_it(
     """A collective that breaks breaks for all: what rank 1 and the first one say of it is of no use."""
     with pytest.raises(RankError, match=says) as lost, peers("fails", how).joining("step", ""):
         if how == "hangs":
-            time.sleep(THREE.rank_timeout_s)  # as a collective does
+            time.sleep(WAIT_S)  # as a collective does
         raise RuntimeError("connection closed by peer")
     assert "connection closed by peer" in str(lost.value.__cause__)
 

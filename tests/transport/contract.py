@@ -90,15 +90,13 @@ def messages() -> list[Any]:
         "task": "öffne 🚪",
     }
     chunk = draw.normal(size=(4, 2)).astype(np.float32)
-    decision = Decision(
-        chunk=chunk, latent={"x": chunk}, log_prob=chunk[0], value=float("nan"), version=2**40
-    )
+    decision = Decision(chunk=chunk, latent={"x": chunk}, log_prob=chunk[0], version=2**40)
     return [
         arrays,
         [Request(observation=observation, noise_seed=2**63 + 5), Request(observation={}, noise_seed=0)],
         [decision],
         [make_segment("a", 3), make_segment("b", 2, episode={"return": 1.0})],
-        [True, None, 1, -0.0, float("inf"), "", (1, [2, {}]), np.float32(1.5), np.int64(-3)],
+        [True, None, 1, -0.0, float("inf"), "", (1, [2, {3: {}}])],
     ]
 
 

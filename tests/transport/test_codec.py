@@ -43,19 +43,13 @@ class Stranger:
     a: int = 1
 
 
-ITSELF: list[Any] = []
-ITSELF.append(ITSELF)
-
-
 @pytest.mark.parametrize(
     ("message", "said"),
     [
-        (Stranger(), "a Stranger cannot be sent"),
-        ([{1, 2}], "a set cannot be sent"),
-        ({1: "a"}, "whose keys are not texts"),
-        (np.array([object()]), "an array of object cannot be sent"),
-        (np.array(["text"]), "an array of <U4 cannot be sent"),
-        (ITSELF, "what holds itself cannot be sent"),
+        (Stranger(), "message: a Stranger cannot be"),
+        ([{1, 2}], "message.0: a set cannot be"),
+        (np.array([object()]), "an array of object cannot be"),
+        (np.array(["text"]), "an array of <U4 cannot be"),
     ],
 )
 def test_what_cannot_be_sent_is_refused(message: Any, said: str):

@@ -25,12 +25,11 @@ SPEC = WorldModelSpec(
 )
 
 
-def decided(chunk: np.ndarray, value: float = 0.0, version: int = 0) -> Decision:
+def decided(chunk: np.ndarray, version: int = 0) -> Decision:
     return Decision(
         chunk=chunk.astype(np.float32),
         latent={"x": chunk.ravel().astype(np.float32)},
         log_prob=np.zeros(1, np.float32),
-        value=value,
         version=version,
     )
 
@@ -49,10 +48,10 @@ def real_episode(
             chunk = np.repeat(world.solution[None], K, 0)  # type: ignore[attr-defined]
         result = world.step_chunk(chunk)
         reward = float(result.rewards.sum()) - 0.01
-        builder.add(decided(chunk, value=0.1 * t), chunk, reward, result.steps, result.observation)
+        builder.add(decided(chunk), chunk, reward, result.steps, result.observation)
         if result.done or builder.full:
             key = f"{seed}.{len(segments)}"
-            segments.append(builder.cut(key, result.terminated, result.truncated, result.success))
+            segments.append(builder.cut(key, result.done, result.success))
         if result.done:
             break
     return segments
