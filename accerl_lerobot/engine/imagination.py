@@ -71,7 +71,8 @@ def make_learner(config: RunConfig) -> OnlineLearner:
     offline = [episode for episode in known if roles.get(episode.key, LEARNT) == LEARNT]
     held_out = [episode for episode in known if roles.get(episode.key, LEARNT) != LEARNT]
     longest = _longest(world, model.spec.chunk)
-    return OnlineLearner(learned_part(model), success, learn, offline, held_out, roles, longest, config.seed)
+    settings = (config.imagination.learn, offline, held_out, roles, longest, config.seed)
+    return OnlineLearner(learned_part(model), success, *settings)
 
 
 def check_imagination(config: RunConfig) -> None:
