@@ -120,7 +120,7 @@ class ChunkCriticConfig(OffPolicyConfig):
 
     gamma: Share = 0.98
     """Discount per decision."""
-    critic_steps: Positive = 2.0
+    critic_steps: Positive = 1.0
     """Gradient steps of the critic for each new decision; the teacher makes half as many."""
     teacher_episodes: Share = 0.5
     """Share of exploring episodes in which the teacher acts, after ``trainer.value_warmup_updates``."""

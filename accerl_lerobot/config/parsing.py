@@ -57,6 +57,24 @@ RECIPES = "recipes"
 TYPE = "type"
 """The key that picks one config of several, as in ``env.type``."""
 LONGEST_KEY = 80
+LEROBOT = {
+    "steps": "use trainer.updates or sft.steps",
+    "batch_size": "use trainer.batch_decisions or sft.batch_size",
+    "num_workers": "use rollout.workers",
+    "save_freq": "use save_every_updates or save_every_s",
+    "eval_freq": "use evaluation.every_updates",
+    "eval.n_episodes": "use evaluation.episodes",
+    "eval.batch_size": "use rollout.worlds and rollout.workers",
+    "rename_map": "use policy.rename_map",
+    "optimizer.lr": "use trainer.lr or sft.lr",
+    "policy.type": "use policy.path (a checkpoint) or sft.policy.type (a new policy)",
+    "policy.pretrained_path": "use policy.path",
+    "policy.use_amp": "use policy.precision=bf16",
+    "policy.use_peft": "use policy.tuning.mode=lora",
+    "policy.push_to_hub": "leave it out, and use accerl push --path=RUN --repo_id=USER/NAME afterwards",
+    "policy.repo_id": "leave it out, and use accerl push --path=RUN --repo_id=USER/NAME afterwards",
+}
+"""LeRobot's names of what has another name here → what to do."""
 REGISTERS = "registers"
 """In a field's metadata: the package that it names registers types of the section that the field is in."""
 CONSENT = {"trust_remote_code", "hub_path", DISCOVER, "extra_args", "address"}
@@ -424,7 +442,13 @@ def _unknown(key: str, value: Any, path: tuple[str, ...], names: list[str], whol
     """The error for a field that a config does not have: what it resembles, or where it belongs."""
     if len(key) > LONGEST_KEY:
         return InputError(key[:LONGEST_KEY], value, "no such field")
-    here = ".".join((*path, key))
+    here = dotted = ".".join((*path, key))
+    leaf = value
+    while dotted not in LEROBOT and isinstance(leaf, dict) and len(leaf) == 1:
+        ((below, leaf),) = leaf.items()
+        dotted += f".{below}"
+    if dotted in LEROBOT:
+        return InputError(dotted, leaf, f"the name is LeRobot's; {LEROBOT[dotted]}")
     near = [".".join((*path, name)) for name in difflib.get_close_matches(key, names, n=3)]
     near += [name for name in dotted_fields(whole) if name.rpartition(".")[2] == key and name != here]
     where = f"{'.'.join(path)} has" if path else "there are"
