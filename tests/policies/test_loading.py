@@ -385,14 +385,33 @@ def test_another_sampler_is_pointed_out(written: Any, tmp_path: Path, caplog: py
 # ---- tokenisers of π0, π0.5 and π0-FAST
 
 
+REMOTE_CODE = """
+import json
+from pathlib import Path
+from transformers import PreTrainedTokenizerFast
+Path({marker!r}).touch()
+class UniversalActionProcessor:
+    @classmethod
+    def register_for_auto_class(cls): pass
+    @classmethod
+    def from_pretrained(cls, name, **options):
+        from huggingface_hub import snapshot_download
+        folder = Path(name) if Path(name).is_dir() else Path(snapshot_download(name))
+        made = cls()
+        made.__dict__.update(json.loads((folder / "processor_config.json").read_text()))
+        made.bpe_tokenizer = PreTrainedTokenizerFast.from_pretrained(folder)
+        return made
+"""
+"""Code in a tokeniser's repository, such as the class that LeRobot means to run."""
+
+
 def remote(cache: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Puts code into the Hub repository of FAST's tokeniser; it leaves a mark when it is run."""
     from transformers import dynamic_module_utils
 
     snapshot = cache / f"models--{ACTIONS.replace('/', '--')}" / "snapshots" / COMMIT
     marker = cache / "was-run"
-    code = f"from pathlib import Path\nPath({str(marker)!r}).touch()\nclass UniversalActionProcessor: pass\n"
-    (snapshot / "processing_action_tokenizer.py").write_text(code)
+    (snapshot / "processing_action_tokenizer.py").write_text(REMOTE_CODE.format(marker=str(marker)))
     monkeypatch.setattr(dynamic_module_utils, "HF_MODULES_CACHE", str(cache / "modules"))
     return marker
 
