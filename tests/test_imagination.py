@@ -222,8 +222,8 @@ def test_it_runs_asynchronously(tiny_checkpoint: Path, world_model: Path, tmp_pa
         history: list[Progress] = []
         for progress in polls(engine):
             history.append(progress)
-            if progress.imagination.get("rollouts", 0) > 0:
-                os.kill(pids["inference"], signal.SIGKILL)  # rollouts find the next one, too
+            if progress.replay["inserted_segments"] > 0:  # what imagines from then on finds the next one, too
+                os.kill(pids["inference"], signal.SIGKILL)
                 history += drive(engine)
                 break
         engine.save(tmp_path / "saved")

@@ -87,12 +87,17 @@ def check_checkpoint(folder: Path, origin: Origin, *, fetched: bool = False) -> 
     for name in (WEIGHTS, VALUE_HEAD, FAMILY):
         if safe_join(folder, name, origin).exists():
             tensor_shapes(folder / name, origin)
-    ours = read_json(folder / OURS, origin) if safe_join(folder, OURS, origin).exists() else {}
+    if safe_join(folder, OURS, origin).exists():
+        check_ours(read_json(folder / OURS, origin), origin)
+    _check_beside(folder, origin)
+    return config
+
+
+def check_ours(ours: dict[str, Any], origin: Origin) -> None:
+    """Checks the content of ``accerl.json``."""
     for key in ("sampler", "rename_map"):
         if not isinstance(ours.get(key, {}), dict):
             raise origin.refuse(f"{OURS}: {key}", "a mapping is wanted; remove the file to start without it")
-    _check_beside(folder, origin)
-    return config
 
 
 def check_processor(folder: Path, name: str, origin: Origin, *, fetched: bool = False) -> None:
