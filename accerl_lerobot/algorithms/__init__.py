@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The objectives as the papers state them: typed tensors in, loss and diagnostics out.
 
-To add one: write its config, a `RatioConfig` with a `loss`, and register it under `AlgorithmConfig`; in a
-package of your own, which ``--algorithm.discover_packages_path`` names, it needs no change here. No file that
-this package imports pulls in torch, so a run can be parsed before torch is loaded.
+To add one, register a config under `AlgorithmConfig`: a `RatioConfig` with a `loss` that ends in
+`objective.assemble`, as in `losses`, or an `OffPolicyConfig` whose `update` names a subclass of
+`trainer.off_policy.OffPolicyUpdate`. In this package, import it below; in a package of your own, name that by
+``--algorithm.discover_packages_path``. No file that this package imports pulls in torch, so a run can be
+parsed before torch is loaded.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ class AlgorithmConfig(Section, draccus.ChoiceRegistry, section="algorithm"):
 
     update: ClassVar[str]
     """``module:class`` of the trainer's updates: made from adapter, algorithm and `TrainerConfig`, and, of a
-    `RatioConfig`, the ranks; with the methods of `trainer.update.Update`."""
+    `RatioConfig`, the ranks; a subclass of `trainer.update.BaseUpdate`."""
 
     discover_packages_path: str | None = field(default=None, metadata={"registers": True})
     """Package to import that registers ``algorithm.type``, where that is not one of ours."""

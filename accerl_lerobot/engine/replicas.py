@@ -8,6 +8,10 @@
     InferenceReplicas    restarted alone: nothing is lost, as a request carries its noise and clients ask
                          the successor again
 
+A process that ends is noticed by the call that waits for it (`launch.RayEngine._await_end`), one that hangs
+by `WorkerSlot.hung` after ``launch.stall_s``, a replica that takes no weights by `transport.weights`. Its
+successor gets the newest weights before clients are told its address (`_restart`, `_await_weights`).
+
 The engine waits for a restart, and the other workers go on meanwhile. Resuming a run works the same way.
 """
 

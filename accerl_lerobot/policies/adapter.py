@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The interface of a policy to the engine, π(chunk | observation) and V(observation), and LeRobot's adapter.
 
-`decide` acts, `evaluate` re-scores what was stored; both run the same code on the same weights, so the ratio
-at equal weights is 1.
+`decide` acts, `evaluate` re-scores what was stored; both use one `encode` and one `Family`, so at equal
+weights the ratio is 1 up to rounding. `trainer.probe` measures that in a run; `self_check` compares with
+LeRobot.
 """
 
 from __future__ import annotations

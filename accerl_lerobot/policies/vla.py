@@ -5,7 +5,7 @@ LeRobot's samplers run without gradient, so their parts are driven here: `embed_
 `denoise_step`. Each sampler is compared with the installed LeRobot's own whenever a policy is loaded.
 
 *Flow.* Images and instruction are read once, into a key-value cache; `denoise_step` works on a copy that it
-makes itself, so one cache serves every step of a chunk.
+makes itself, so one cache serves every step of a chunk. Sampling and log-probs are `flow.FlowFamily`'s.
 
 *Tokens of π0-FAST.* Both ways to the logits start from one pass over the prefix: images, prompt (which holds
 the state), BOS, all attending to each other. `generate` goes on token by token with the cache; `logits` shows

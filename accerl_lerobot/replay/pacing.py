@@ -92,7 +92,11 @@ def entitle(samples_per_insert: float, n: int, carry: float) -> tuple[int, float
 def lag_bound(
     config: ReplayConfig, *, batch_decisions: int, in_flight: int, pickup: int = 0, prefetch: int = 0
 ) -> int:
-    """The largest lag an update can see, in updates.
+    """The largest lag of a decision that is drawn from replay, in updates.
+
+    `engine.sizes.lag_limits` computes it, for people to read. `Replay.retire` enforces ``max_lag``, and
+    `may_insert` and `may_sample` the pace. Off-policy algorithms learn from a memory of their own,
+    `trainer.off_policy.Memory`, which nothing of this bounds.
 
         lag ≤ min(max_lag, pickup + drawn) + prefetch
         drawn = ⌊⌈samples_per_insert⌉ · (max(ahead, min_decisions) + 2·in_flight + capacity) / batch⌋ − 1
