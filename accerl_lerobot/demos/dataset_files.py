@@ -132,7 +132,9 @@ def checked(origin: Origin, whole: bool = False) -> Iterator[None]:
     from lerobot.datasets.dataset_reader import DatasetReader
 
     from accerl_lerobot.hub.errors import guard_client
+    from datasets import Image
 
+    decode = Image.decode_example
     load_metadata, load_data = LeRobotDatasetMetadata._load_metadata, DatasetReader._load_hf_dataset
 
     def checked_metadata(self: Any) -> None:
@@ -169,7 +171,15 @@ def checked(origin: Origin, whole: bool = False) -> Iterator[None]:
         rehearse(check, root, origin, "data/**/*")
         return load_data(self)
 
+    def checked_decode(self: Any, value: Any, token_per_repo_id: Any = None) -> Any:
+        try:
+            return decode(self, value, token_per_repo_id)
+        except Exception as error:
+            remedy = f"an image that is no PNG or JPEG, or broken ({brief(error)}); record it again"
+            raise origin.refuse(DATA, remedy) from error
+
     guard_client()
+    Image.decode_example = checked_decode
     LeRobotDatasetMetadata._load_metadata = checked_metadata
     DatasetReader._load_hf_dataset = checked_data
     try:
@@ -177,6 +187,7 @@ def checked(origin: Origin, whole: bool = False) -> Iterator[None]:
     finally:
         LeRobotDatasetMetadata._load_metadata = load_metadata
         DatasetReader._load_hf_dataset = load_data
+        Image.decode_example = decode
 
 
 def _cause(error: BaseException) -> str:

@@ -50,6 +50,8 @@ SIDECAR = Path("meta") / "accerl_demos.json"
 _logger = logging.getLogger(__name__)
 _MAX_EPISODES = 10_000
 _MAX_TRIES = 50
+MOST_PROCESSES = 8
+"""Simulators at once, each of some 100 MB; a container may see more cores than it has."""
 _VERSIONS = {name: name for name in ("lerobot", "metaworld", "robosuite", "mujoco", "numpy")}
 _VERSIONS |= {"libero": "hf-libero"}
 """Module → distribution."""
@@ -210,7 +212,7 @@ def simulated[Item, Result](
 
     The first are already under way when the context is entered; few finished ones wait in memory.
     """
-    processes, left = min(os.cpu_count() or 1, len(items)), iter(items)
+    processes, left = min(len(os.sched_getaffinity(0)), MOST_PROCESSES, len(items)), iter(items)
     with simulators(processes, _open_world, env_config) as pool:
         waiting = collections.deque(pool.submit(work, item) for item in itertools.islice(left, 2 * processes))
 

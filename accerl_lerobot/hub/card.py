@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -108,15 +108,20 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def _likely(folder: Path) -> str | None:
-    if (folder / INFO).is_file():
+    names = {name for name in (INFO, RECIPE, CHECKPOINTS) if (folder / name).exists()}
+    return likely(names, read_json(folder / CONFIG))
+
+
+def likely(names: Collection[str], config: dict[str, Any]) -> str | None:
+    """The artifact type, by names of files and folders at hand and the content of ``config.json``."""
+    if INFO in names:
         return DATASET
-    config = read_json(folder / CONFIG)
     if {"spec", "model"} <= config.keys():
         return WORLD_MODEL
     if "type" in config:
         # LeRobot stores n_obs_steps in a policy's config, and nothing like it in a reward model's.
         return POLICY if "n_obs_steps" in config else SUCCESS_MODEL
-    if (folder / CHECKPOINTS).is_dir() and (folder / RECIPE).is_file():
+    if {CHECKPOINTS, RECIPE} <= set(names):
         return RUN
     return None
 

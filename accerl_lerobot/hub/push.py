@@ -32,6 +32,8 @@ NOT_CONTENTS = (card.CARD, card.RECORD, ".gitattributes")
 PICTURES = (".png", ".jpg", ".gif", ".svg", ".mp4")
 """Endings of files that a card may show, which somebody may have added on the Hub."""
 RESULTS = (".yaml", ".json", ".jsonl", ".html", *PICTURES)
+FOLDERS = (card.FOLDER, layout.BACKBONE, layout.CHECKPOINTS, "meta", "data", "videos", "images")
+"""Top folders of what is pushed."""
 WEIGHTS = (".safetensors", ".bin", ".pt", ".pth")
 RECORDS = (".json", ".jsonl", ".yaml", ".yml", ".md", ".txt", ".log", ".csv", ".html")
 VOCABULARIES = ("tokenizer.json", "vocab.json", "merges.txt", "added_tokens.json", "special_tokens_map.json")
@@ -87,11 +89,19 @@ def _upload(config: card.PushConfig, artifact: str, files: card.Files, own_card:
             logger.warning("the README.md on the Hub is left as it is, somebody wrote it")
             files[card.CARD] = readme
     theirs = {name for name in listed if "/" in name or not name.endswith((*PICTURES, *NOT_CONTENTS))}
-    needed = [name for name in card.NEEDED[artifact] if name != card.LAST]
-    if theirs and not all(any(name.startswith(each) for name in theirs) for each in needed):
-        raise InputError("repo_id", repo_id, f"it holds no {artifact} but other files; choose another name")
+    there = {}
+    if card.CONFIG in listed:
+        there = card.read_json(Path(hf_hub_download(filename=card.CONFIG, revision=parent, **where)))
+    if theirs and (kind := card.likely(theirs | {name.split("/")[0] for name in theirs}, there)) != artifact:
+        held = f"a {kind}" if kind else "other files"
+        raise InputError(
+            "repo_id", repo_id, f"it holds {held}, and this is a {artifact}; choose another name"
+        )
+    stale = sorted(name for name in theirs - files.keys() if _ours(name))
+    if stale:
+        logger.warning("deleted on the Hub, as not in this push: %s", ", ".join(stale))
     operations = [CommitOperationAdd(name, content) for name, content in files.items()]
-    operations += [CommitOperationDelete(name, is_folder=False) for name in sorted(theirs - files.keys())]
+    operations += [CommitOperationDelete(name, is_folder=False) for name in stale]
     message = f"{artifact.capitalize()} pushed with accerl-lerobot"
     commit = api.create_commit(
         operations=operations, commit_message=message, revision=BRANCH, parent_commit=parent, **where
@@ -109,6 +119,12 @@ def _upload(config: card.PushConfig, artifact: str, files: card.Files, own_card:
         "bytes": sum(sizes),
         "url": f"{api.endpoint}/{'datasets/' if artifact == card.DATASET else ''}{repo_id}",
     }
+
+
+def _ours(name: str) -> bool:
+    """True for a file such as a push writes; others, a licence or a notebook, somebody added on the Hub."""
+    folder, _, below = name.partition("/")
+    return folder in FOLDERS if below else name.endswith((".json", ".jsonl", ".yaml", ".safetensors"))
 
 
 def _parent(api: HfApi, config: card.PushConfig, artifact: str) -> str:

@@ -316,3 +316,23 @@ def test_one_from_the_hub_is_checked_as_well(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr(dataset_metadata, "snapshot_download", lambda *_, **__: str(fetched))
     with pytest.raises(InputError, match="^dataset.repo_id='them/data': meta/info.json: data_path: "):
         open_metadata(DatasetConfig(repo_id="them/data"))
+
+
+def test_images_that_cannot_be_decoded(copied: Path):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    def png(side: int) -> bytes:
+        packed = io.BytesIO()
+        noise = np.random.default_rng(0).integers(0, 256, (side, side, 3), np.uint8)
+        Image.fromarray(noise).save(packed, "PNG")
+        return packed.getvalue()
+
+    data_with(copied, [{"bytes": png(32), "path": None}])
+    with pytest.raises(InputError, match="an image of 32 x 32 pixels, and its shape is"):
+        check_data(copied, info(), ORIGIN)
+    data_with(copied, [{"bytes": png(64)[:-5000], "path": None}])
+    with (
+        checked(ORIGIN),
+        pytest.raises(InputError, match="data: an image that is .*broken .*record it again"),
+    ):
+        LeRobotDataset("a/b", root=copied, video_backend="pyav")[0]

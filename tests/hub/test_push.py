@@ -137,7 +137,9 @@ def test_a_name_that_holds_something_else(hub, policy, tmp_path, pushed, refused
     assert "it is a dataset repository, and this is a policy" in refused(policy)
     hub.repos.clear()
     pushed(policy)
-    assert "it holds no run but other files" in refused(write_run_folder(tmp_path / "run"))
+    assert "it holds a policy, and this is a run; choose another name" in refused(
+        write_run_folder(tmp_path / "run")
+    )
     assert "it is a model repository, and this is a dataset" in refused(TINY)
     assert len(hub.repos) == 1 and len(hub.repo(NAME).commits) == 2
 
@@ -152,10 +154,11 @@ def test_what_is_private_does_not_go_where_all_can_see(hub, policy, pushed, refu
 def test_a_push_replaces_what_the_last_one_left_but_not_what_a_card_shows(hub, policy, pushed):
     (policy / "notes.json").write_text("{}")
     pushed(policy)
-    hub.plant(NAME, {"added on the Hub.gif": b"by hand"})
+    added = {"added on the Hub.gif": b"by hand", "LICENSE": b"mine", "notes/a.json": b"{}"}
+    hub.plant(NAME, added)
     (policy / "notes.json").unlink()
     pushed(policy)
-    assert "notes.json" not in hub.files(NAME) and hub.files(NAME)["added on the Hub.gif"] == b"by hand"
+    assert "notes.json" not in hub.files(NAME) and added.items() <= hub.files(NAME).items()
 
 
 def test_a_card_written_on_the_hub_stays(hub: HubServer, policy: Path, pushed: Push):
