@@ -132,6 +132,41 @@ def write_examples(scratch: Path) -> dict[str, Path]:
     return {name: scratch / name for name in ("world_model", "policy", "dataset")}
 
 
+def changed_rows(table: Any, rng: random.Random) -> Any:
+    """A parquet table of which cells, columns or rows are others."""
+    import pyarrow as pa
+
+    name = rng.choice(table.schema.names)
+    at, values = table.schema.get_field_index(name), table.column(name).to_pylist()
+    kind, row = rng.randrange(8), rng.randrange(len(values))
+    if kind == 0:
+        return table.slice(rng.randrange(2), rng.randrange(len(values) + 1))
+    if kind == 1:
+        return rng.choice((table.drop_columns([name]), table.append_column("more", table.column(name))))
+    if kind == 2:
+        return table.set_column(at, name, pa.array([rng.choice(VALUES)] * len(values)))
+    if isinstance(values[row], dict):
+        image = values[row]["bytes"]
+        others = (
+            b"%!PS-Adobe-3.0 EPSF-3.0\n",
+            b"GIF89a",
+            b"",
+            None,
+            b"\xff\xd8\xff\xe0",
+            b"#EXTM3U\nfile:///x",
+        )
+        values[row]["bytes"] = changed_bytes(image, rng) if rng.random() < 0.7 else rng.choice(others)
+        if rng.random() < 0.2:
+            values[row]["path"] = rng.choice(NAMES)
+        return table.set_column(at, name, pa.array(values, table.schema.field(name).type))
+    if isinstance(values[row], list) and rng.random() < 0.5:
+        changed = [*values[row]][: rng.randrange(5)] + [0.0] * rng.randrange(3)
+        values[row] = rng.choice((changed, [rng.choice(VALUES)] * 4, None))
+        return table.set_column(at, name, pa.array(values, pa.list_(pa.float32())))
+    values[row] = rng.choice(VALUES)
+    return table.set_column(at, name, pa.array(values))
+
+
 class Trial:
     """Runs checks and loaders on changed files, and counts what became of them."""
 
@@ -230,7 +265,7 @@ def checks(trial: Trial, at: dict[str, Path], times: int) -> None:
     info = json.loads((dataset / "meta/info.json").read_text())
     trial.trees("info.json", info, lambda t: check_info(t, origin), 150 * times)
     stats = {"action": json.loads((dataset / "meta/stats.json").read_text())["action"]}
-    trial.trees("stats.json", stats, lambda t: check_stats(t, origin), 100 * times)
+    trial.trees("stats.json", stats, lambda t: check_stats(t, info["features"], origin), 100 * times)
     for part in ("meta/info.json", "meta/tasks.parquet", "meta/episodes/chunk-000/file-000.parquet"):
         trial.files(part, dataset / part, metadata, 3 * times)
     data = dataset / "data/chunk-000/file-000.parquet"
@@ -277,6 +312,35 @@ def loaders(trial: Trial, at: dict[str, Path], times: int) -> None:
         )
 
 
+def rows(trial: Trial, dataset: Path, times: int) -> None:
+    """A dataset whose rows are others, as LeRobot loads it; then all of its frames are read."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    from accerl_lerobot.checkpoint.safety import Origin
+    from accerl_lerobot.demos.dataset_files import checked
+
+    path = dataset / "data/chunk-000/file-000.parquet"
+    good = path.read_bytes()
+    with pq.ParquetFile(path) as file:
+        table = file.read()
+
+    def load() -> None:
+        with checked(Origin("dataset.root", str(dataset)), whole=True):
+            loaded = LeRobotDataset("a/b", root=dataset, video_backend="pyav")
+            for index in range(0, len(loaded), 8):
+                loaded[index]
+
+    for number in range(times):
+        try:
+            pq.write_table(changed_rows(table, trial.rng), path)
+        except (pa.ArrowException, OverflowError, UnicodeError, TypeError, ValueError):
+            continue  # Arrow cannot make it
+        trial.one("load rows", load, number)
+    path.write_bytes(good)
+
+
 def main(seed: int, scratch: Path, times: int) -> dict[str, Any]:
     """Goes through all of it; gives what became of how many."""
     os.environ["HF_DATASETS_CACHE"] = str(scratch / "cache")
@@ -287,6 +351,7 @@ def main(seed: int, scratch: Path, times: int) -> dict[str, Any]:
     resource.setrlimit(resource.RLIMIT_AS, (taken + MEMORY, taken + MEMORY))
     checks(trial, at, times)
     loaders(trial, at, times)
+    rows(trial, at["dataset"], times // 4)
     outside = [path for path in trial.written() if not Path(path).is_relative_to(scratch)]
     return {"outcomes": dict(sorted(trial.outcomes.items())), "written": sorted(outside)[:20]}
 

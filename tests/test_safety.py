@@ -201,7 +201,7 @@ def test_pickled_weights_are_named_with_the_way_out(tmp_path: Path):
 
 
 TIMES = 30
-"""Factor on the shares of `tests.hostile`: about 24,000 files, of which about 138 are loaded."""
+"""Factor on the shares of `tests.hostile`: about 24,000 files, of which about 140 are loaded."""
 
 
 @pytest.mark.slow
@@ -216,7 +216,7 @@ def test_many_changed_files(tmp_path: Path):
     found = json.loads(done.stdout.splitlines()[-1])
     outcomes: dict[str, int] = found["outcomes"]
     assert sum(outcomes.values()) >= 23_000
-    assert sum(n for name, n in outcomes.items() if name.startswith(("load ", "open "))) >= 130
+    assert sum(n for name, n in outcomes.items() if name.startswith(("load ", "open "))) >= 140
     kinds = {name.rpartition(" ")[0] for name in outcomes}
     assert all(outcomes.get(f"{kind} refused", 0) > 0 for kind in kinds), "a check that never refuses"
     assert sum(n for name, n in outcomes.items() if name.endswith(" good")) > 5_000

@@ -67,7 +67,6 @@ LEROBOT = {
     "eval.batch_size": "use rollout.worlds and rollout.workers",
     "rename_map": "use policy.rename_map",
     "optimizer.lr": "use trainer.lr or sft.lr",
-    "policy.code_revision": "name the commit whose code you have read in policy.trust_remote_code",
     "policy.type": "use policy.path (a checkpoint) or sft.policy.type (a new policy)",
     "policy.pretrained_path": "use policy.path",
     "policy.use_amp": "use policy.precision=bf16",

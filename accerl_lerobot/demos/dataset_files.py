@@ -175,8 +175,7 @@ def checked(origin: Origin, whole: bool = False) -> Iterator[None]:
         try:
             return decode(self, value, token_per_repo_id)
         except Exception as error:
-            remedy = f"an image that is no PNG or JPEG, or broken ({brief(error)}); record it again"
-            raise origin.refuse(DATA, remedy) from error
+            raise _undecodable(error, DATA, origin) from error
 
     guard_client()
     Image.decode_example = checked_decode
@@ -202,7 +201,7 @@ def check_metadata(root: Path, origin: Origin, whole: bool = False) -> None:
     info = read_json(root / INFO, origin)
     check_info(info, origin)
     if safe_join(root, STATS, origin).exists():
-        check_stats(read_json(root / STATS, origin, STATS_MOST), origin)
+        check_stats(read_json(root / STATS, origin, STATS_MOST), info["features"], origin)
     if safe_join(root, TASKS, origin).exists() or (whole and info.get("total_tasks", 0)):
         with _parquet(root / TASKS, origin) as tasks:
             _check_plain(tasks, TASKS, origin)
@@ -247,15 +246,26 @@ def check_info(info: dict[str, Any], origin: Origin) -> None:
             raise origin.refuse(where, f"shape {str(shape)[:80]}; {wanted}")
 
 
-def check_stats(stats: dict[str, Any], origin: Origin) -> None:
+def check_stats(stats: dict[str, Any], features: dict[str, Any], origin: Origin) -> None:
     """Refuses a ``stats.json`` (feature → statistic → numbers) that no policy can be normalised by."""
     for name in (name for name in stats if name.startswith(LEARNED)):
-        try:
-            finite = all(np.isfinite(np.asarray(values)).all() for values in stats[name].values())
-        except (AttributeError, TypeError, ValueError):
-            finite = False
-        if not finite:
-            raise origin.refuse(f"{STATS}: {name}", "statistic → finite numbers is wanted; compute it again")
+        if not isinstance(stats[name], dict):
+            raise origin.refuse(f"{STATS}: {name}", "a mapping from statistics to numbers is wanted")
+        feature = features.get(name, {"dtype": "image"})
+        for statistic, values in stats[name].items():
+            where, again = f"{STATS}: {name}.{statistic}", "compute the statistics again"
+            try:
+                array = np.asarray(values)
+            except ValueError:
+                array = np.asarray(None)
+            if array.dtype.kind not in "biuf":
+                raise origin.refuse(where, f"numbers in lists of equal lengths are wanted; {again}")
+            plain = feature["dtype"] not in ("image", "video") and statistic != "count"
+            if plain and array.shape and list(array.shape) != list(feature["shape"]):
+                remedy = f"shape {list(array.shape)}, and the feature has {list(feature['shape'])}; {again}"
+                raise origin.refuse(where, remedy)
+            if not np.isfinite(array).all():
+                raise origin.refuse(where, f"a number that is not finite; {again}")
 
 
 def check_data(root: Path, info: dict[str, Any], origin: Origin) -> None:
@@ -343,6 +353,12 @@ def _check_episodes(file: pq.ParquetFile, frames: int, name: str, origin: Origin
         raise origin.refuse(name, f"an episode {span_text}; {AGAIN}")
 
 
+def _undecodable(error: Exception, where: str, origin: Origin) -> InputError:
+    return origin.refuse(
+        where, f"an image that is no PNG or JPEG, or broken ({brief(error)}); record it again"
+    )
+
+
 def _check_images(file: pq.ParquetFile, image: str, shape: list[int], name: str, origin: Origin) -> None:
     """Refuses images that are not PNG or JPEG of the right size in their rows, or that name other files."""
     import pyarrow as pa
@@ -363,8 +379,7 @@ def _check_images(file: pq.ParquetFile, image: str, shape: list[int], name: str,
                 with Image.open(io.BytesIO(cell), formats=("PNG", "JPEG")) as opened:  # reads the header
                     size = list(opened.size)
             except Exception as error:  # Pillow's plugins raise what they like
-                remedy = f"an image that is no PNG or JPEG, or broken ({brief(error)}); record it again"
-                raise origin.refuse(where, remedy) from error
+                raise _undecodable(error, where, origin) from error
             if size not in (shape[1::-1], shape[:0:-1]):
                 remedy = (
                     f"an image of {size[0]} x {size[1]} pixels, and its shape is {shape}; record it again"

@@ -250,12 +250,17 @@ class Loop:
         self, before: dict[str, Any] | None, after: dict[str, Any], last: Progress
     ) -> dict[str, Any]:
         before = before or {}
-        keys = ("success", "n", "ci95", "tasks")
         return {
-            **{f"{key}_before": before.get(key) for key in keys},
-            **{f"{key}_after": after[key] for key in keys},
+            "success_before": before.get("success"),
+            "success_after": after["success"],
             "n": after["n"],
             "ci95": {"before": before.get("ci95"), "after": after["ci95"]},
+            "n_before": before.get("n"),
+            "n_after": after["n"],
+            "ci95_before": before.get("ci95"),
+            "ci95_after": after["ci95"],
+            "tasks_before": before.get("tasks"),
+            "tasks_after": after["tasks"],
             "env_steps": int(self.steps),
             "decisions": int(self._since(last, "decisions")),
             "episodes": int(self._since(last, "episodes")),

@@ -2,7 +2,8 @@
 """The contract every world keeps, whatever simulator is behind it.
 
 Episode limits, auto-reset and task text are ours, because simulators disagree on them: a world never resets
-itself, `terminated` means the task is over (bootstrap 0), `truncated` that only time ran out (bootstrap V).
+itself, `terminated` means the task is over (bootstrap 0), `truncated` that only time ran out
+(learning takes that as an end, too).
 """
 
 from __future__ import annotations

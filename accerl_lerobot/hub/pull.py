@@ -49,6 +49,7 @@ def pull(config: card.PullConfig) -> dict[str, Any]:
         # Named after the commit, so that an interrupted pull resumes and no other one's files are in it.
         temporary = home.parent / f".pulling-{commit[:16]}-{home.name}"
         make_folder(temporary, "output_dir", again=True)
+        _check_room(temporary, sum(file.size for file in files.values()))
         # `snapshot_download` would ask for the names again, and these have been checked.
         pool = ThreadPoolExecutor(THREADS)
         options = {"repo_type": repo_type, "revision": commit, "local_dir": temporary}
@@ -94,7 +95,20 @@ def _checked(listed: Iterable[Any], repo_id: str) -> dict[str, RepoFile]:
         if not parts or name != "/".join(parts) or parts[0] in (CACHE, ".git") or "." in parts:
             why = f"it has a file named {ascii(name)[:200]}, which is not safe to write"
             raise InputError("repo_id", repo_id, why)
+    for file in files:
+        if type(file.size) is not int or file.size < 0:
+            why = f"{ascii(file.path)[:99]} is listed with size {str(file.size)[:40]}; use another server"
+            raise InputError("repo_id", repo_id, why)
     return {file.path: file for file in files}
+
+
+def _check_room(temporary: Path, size: int) -> None:
+    """Refuses what the disk cannot hold, beside what an interrupted pull has fetched of it."""
+    fetched = sum(path.stat().st_size for path in temporary.rglob("*") if path.is_file())
+    free = shutil.disk_usage(temporary).free + fetched
+    if size > free:
+        why = f"{size / 1e9:,.1f} GB are to be fetched, and {free / 1e9:,.1f} are free there"
+        raise InputError("output_dir", str(temporary.parent), f"{why}; choose another")
 
 
 def _receive(folder: Path, home: Path, files: dict[str, RepoFile], repo_id: str) -> dict[str, Any]:

@@ -83,15 +83,17 @@ def _upload(config: card.PushConfig, artifact: str, files: card.Files, own_card:
     where: dict[str, Any] = {"repo_id": repo_id, "repo_type": card.repo_type(artifact)}
     parent = _parent(api, config, artifact)
     listed = set(api.list_repo_files(revision=parent, **where))
+
+    def fetched(name: str) -> Path:
+        return Path(hf_hub_download(filename=name, revision=parent, **where))
+
     if card.CARD in listed and not own_card:
-        readme = Path(hf_hub_download(filename=card.CARD, revision=parent, **where)).read_bytes()
+        readme = fetched(card.CARD).read_bytes()
         if card.MARK.encode() not in readme and readme.strip():
             logger.warning("the README.md on the Hub is left as it is, somebody wrote it")
             files[card.CARD] = readme
     theirs = {name for name in listed if "/" in name or not name.endswith((*PICTURES, *NOT_CONTENTS))}
-    there = {}
-    if card.CONFIG in listed:
-        there = card.read_json(Path(hf_hub_download(filename=card.CONFIG, revision=parent, **where)))
+    there = card.read_json(fetched(card.CONFIG)) if card.CONFIG in listed else {}
     if theirs and (kind := card.likely(theirs | {name.split("/")[0] for name in theirs}, there)) != artifact:
         held = f"a {kind}" if kind else "other files"
         raise InputError(

@@ -25,9 +25,9 @@ from accerl_lerobot.replay.pacing import ReplayConfig, entitle
 DRAWS = 1024
 """Last draws that are remembered, to be taken back in `Replay.state`: a trainer draws one batch ahead, and
 goes on while it is saved."""
-LEAST = 0.5
+BATCH_SHARE = 0.5
 """Share of a batch that is one, when no more will come."""
-ROOM = 0.9
+FILL_SHARE = 0.9
 """Share of the real store up to which it is filled without anything being drawn."""
 
 
@@ -296,7 +296,7 @@ class MixedReplay:
 
     @property
     def _waits(self) -> bool:
-        room = self.real.stored_decisions < ROOM * self.real.config.capacity
+        room = self.real.stored_decisions < FILL_SHARE * self.real.config.capacity
         return self._patient and self.awaited and not self.share and room
 
     def _parts(self, batch: int) -> tuple[int, int] | None:
@@ -308,7 +308,7 @@ class MixedReplay:
             left = self.real.available_decisions
             if not self.share:
                 # Few episodes may be less than a batch: then they are one.
-                return (min(batch, left), 0) if left >= LEAST * batch else None
+                return (min(batch, left), 0) if left >= BATCH_SHARE * batch else None
             real = min(real, left)
         elif real and not self.real.may_sample(real):
             return None

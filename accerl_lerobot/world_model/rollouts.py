@@ -130,7 +130,7 @@ class Imagination:
     """A batch of imagined rollouts, each of which starts anew when it has ended.
 
     Without `success`, the model classifies successes itself. `decision_cost` is subtracted from every reward,
-    and the time limit is a failure or truncates.
+    and the time limit ends a rollout as a failure.
     """
 
     def __init__(

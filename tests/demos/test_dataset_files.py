@@ -291,12 +291,18 @@ def test_rows_are_what_their_features_say(copied: Path, change: Callable[[pa.Tab
 
 
 @pytest.mark.parametrize(
-    "statistics",
-    [{"mean": [0.0, float("nan")]}, {"std": [float("inf")] * 4}, {"mean": "x"}, {"mean": [[1], 2]}, 7],
+    ("statistics", "why"),
+    [
+        ({"mean": [0.0, 0.0, 0.0, float("nan")]}, "action.mean: a number that is not finite"),
+        ({"std": [float("inf")] * 4}, "action.std: a number that is not finite"),
+        ({"q99": [0.0] * 5}, r"action.q99: shape \[5\], and the feature has \[4\]"),
+        ({"mean": "x"}, "action.mean: numbers in lists of equal lengths"),
+        (7, "action: a mapping"),
+    ],
 )
-def test_statistics_can_normalise(copied: Path, statistics: Any):
+def test_statistics_can_normalise(copied: Path, statistics: Any, why: str):
     (copied / "meta/stats.json").write_text(json.dumps({"action": statistics}))
-    refused(copied, "meta/stats.json: action: statistic → finite numbers")
+    refused(copied, f"meta/stats.json: {why}")
 
 
 @pytest.mark.parametrize("part", ["meta/tasks.parquet", EPISODES])

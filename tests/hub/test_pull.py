@@ -233,11 +233,15 @@ def test_huggingface_hub_alone_writes_where_a_header_says(hub: HubServer, policy
 @pytest.mark.parametrize(
     ("entry", "words"),
     [
+        ({"size": float("inf")}, "with size inf"),
+        ({"size": 10**15}, "GB are to be fetched, and"),
         ({"path": ["x"]}, "['x'], which is not safe to write"),
         ({"path": "x" * 300}, "is not safe to write"),
     ],
 )
-def test_what_a_server_may_list(hub, policy, refused, entry, words):
+def test_what_a_server_may_list(
+    hub: HubServer, policy: Path, refused: Refusal, entry: dict[str, Any], words: str
+):
     entry = {"type": "file", "path": "x", "size": 1, "oid": "0" * 40} | entry
     hub.change = altered("/tree/", lambda listed: [*listed, entry])
     assert words in refused()
@@ -263,3 +267,26 @@ def test_no_run_that_was_pulled_lets_code_run(hub, pulled, tmp_path, capsys):
         assert "a file cannot allow this, only the command line can" in "".join(capsys.readouterr())
     assert cli.main(["export", f"--path={tmp_path / 'pulled'}", f"--root={tmp_path / 'set'}"]) == 2
     assert f"add --env.trust_remote_code=true --env.kwargs.hub_path={ARENA}" in capsys.readouterr().err
+
+
+def test_a_folder_that_is_there_is_not_touched(
+    hub: HubServer, policy: Path, tmp_path: Path, refused: Refusal
+):
+    (tmp_path / "pulled").mkdir()
+    (tmp_path / "pulled" / "mine").write_text("mine")
+    assert "the folder exists; choose another or remove it" in refused()
+    assert contents_of(tmp_path / "pulled") == {"mine": b"mine"} and hub.journal == []
+
+
+def test_names_of_which_one_would_be_written_over_the_other(
+    hub: HubServer, policy: Path, refused: Refusal, tmp_path: Path
+):
+    hub.plant(NAME, dict.fromkeys(("a", "a/b"), b"x"))
+    assert "does not work" in refused()
+    assert not (tmp_path / "pulled").exists()
+
+
+@pytest.mark.parametrize("data", [b"{", b"[" * 100_000, b"\xff", b"null", b"[[1]]"])
+def test_answers_that_are_no_answers(hub: HubServer, policy: Path, refused: Refusal, data: bytes):
+    hub.change = changed("/api/", lambda answer: body(answer, data))
+    assert refused().startswith(f"accerl: repo_id='{NAME}': ")
