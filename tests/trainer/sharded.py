@@ -6,6 +6,8 @@ Results travel as snapshots: every rank writes its own, and the test reads them.
 
 from __future__ import annotations
 
+import faulthandler
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -158,6 +160,7 @@ def cases() -> dict[str, Case]:
 
 def work(rank: int, size: int, place: Any, names: Sequence[str], states: Path, results: Path) -> None:
     """One rank: every named case, in every way of sharing, from the beginning and from one rank's state."""
+    faulthandler.enable()
     torch.set_num_threads(1)
     group = joined(rank, size, place)
     for name in names:
@@ -167,7 +170,14 @@ def work(rank: int, size: int, place: Any, names: Sequence[str], states: Path, r
             result = run(case, config, group)
             result["resumed"] = run(case, config, group, snapshot.load(states / name))
             snapshot.save(results / f"{name}-{sharding}-{rank}", result)
+    leave()
+
+
+def leave() -> None:
+    """Ends a rank once all are done; at the interpreter's own end, threads of PyTorch may abort."""
+    torch.distributed.barrier()
     torch.distributed.destroy_process_group()
+    os._exit(0)
 
 
 def joined(rank: int, size: int, place: Any) -> ranks.Group:

@@ -29,7 +29,7 @@ from accerl_lerobot.trainer.update import Update
 from tests.policies.cases import CASES as POLICIES
 from tests.policies.tiny import adapter_at, as_segment
 from tests.rounding import assert_close
-from tests.trainer.sharded import joined
+from tests.trainer.sharded import joined, leave
 
 DECISIONS = 5
 LEARNING = TrainerConfig(
@@ -90,7 +90,7 @@ def work(rank: int, size: int, place: Any, folder: Path) -> None:
     for name, case in CASES.items():
         config = TrainerConfig(**LEARNING.__dict__ | case.config)
         snapshot.save(folder / f"{name}-{rank}", learn(case, folder, config, group))
-    torch.distributed.destroy_process_group()
+    leave()
 
 
 @pytest.fixture(scope="module")
