@@ -14,6 +14,7 @@ import draccus
 from accerl_lerobot.config.parsing import imported
 from accerl_lerobot.config.ranges import Commit, Device, Range, Section
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.policies.deferred import import_policies
 
 if TYPE_CHECKING:
     from accerl_lerobot.policies.adapter import PolicyAdapter
@@ -178,8 +179,12 @@ def register_policy(policy_type: str, model: str, *families: str) -> None:
 
 
 def register_policies(wanted: str | None = None) -> None:
-    """Fills LeRobot's registry of policy types; if `wanted` is still missing, from its installed plugins."""
-    importlib.import_module("lerobot.policies")
+    """Fills LeRobot's registry of policy types, if `wanted` is missing from its installed plugins as well.
+
+    Of LeRobot's own types, the code of `wanted` alone is imported; of all if it is None or another's.
+    """
+    ours = wanted in POLICIES and PLUGINS.get(str(wanted), __name__).startswith("accerl_lerobot.")
+    import_policies(wanted if ours else None)
     for package in PLUGINS.values():
         importlib.import_module(package)
     from lerobot.configs.policies import PreTrainedConfig

@@ -113,7 +113,7 @@ def policy_sizes(config: PolicyConfig) -> Sizes:
         InputError: see `load_lerobot_config`, `load_adapter` and `isolation.rehearse`.
     """
     folder = _checkpoint_folder(config)
-    _registered_type(config, folder)  # before the fork: it imports all of LeRobot's policies
+    _registered_type(config, folder)  # before the fork: it imports the policy's code
     files = [(str(path), path.stat()) for path in sorted(folder.rglob("*")) if path.is_file()]
     key = repr((config, [(path, stat.st_size, stat.st_mtime_ns) for path, stat in files]))
     if key not in _rehearsed:

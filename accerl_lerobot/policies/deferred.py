@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Import one of LeRobot's policies without the code of all others.
+
+``lerobot.policies`` imports the config of each policy type, and with it that type's whole package: models and
+processors that pull in diffusers and much of transformers, a third of the time in which a process starts.
+Here such a package runs its own code when somebody asks it for something.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import importlib.metadata
+import sys
+import threading
+from collections.abc import Sequence
+from importlib.machinery import ModuleSpec, PathFinder
+from types import ModuleType
+from typing import Any
+
+PARENT = "lerobot.policies"
+_lock = threading.RLock()
+
+
+class _Package(ModuleType):
+    """A package whose code has not run; its modules can be imported."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__") and name != "__all__":
+            raise AttributeError(name)
+        run(self)
+        return getattr(self, name)
+
+
+def run(package: ModuleType) -> None:
+    """Runs the code of a package that was deferred."""
+    with _lock:
+        if isinstance(package, _Package):
+            package.__class__ = ModuleType  # type: ignore[assignment]
+            loader: Any = package.__spec__ and package.__spec__.loader
+            loader.run(package)
+
+
+class _Loader:
+    def __init__(self, loader: Any) -> None:
+        self.run = loader.exec_module
+
+    def create_module(self, spec: ModuleSpec) -> None:
+        """Python's own way."""
+
+    def exec_module(self, module: ModuleType) -> None:
+        module.__class__ = _Package
+
+
+class _Finder:
+    @staticmethod
+    def find_spec(name: str, path: Sequence[str] | None, target: Any = None) -> ModuleSpec | None:
+        if name.rpartition(".")[0] != PARENT:
+            return None
+        spec = PathFinder.find_spec(name, path)
+        if spec is not None and spec.submodule_search_locations is not None:
+            spec.loader = _Loader(spec.loader)  # type: ignore[assignment]
+        return spec
+
+
+def import_policies(wanted: str | None) -> None:
+    """Imports ``lerobot.policies``, and runs the package of one policy type, or of all."""
+    if PARENT not in sys.modules:
+        # transformers and diffusers each ask for all installed distributions, 0.7 s here.
+        metadata: Any = importlib.metadata
+        metadata.packages_distributions = functools.cache(metadata.packages_distributions)
+        sys.meta_path.insert(0, _Finder)
+        importlib.import_module(PARENT)
+        sys.meta_path.remove(_Finder)
+    for name in [name for name in sys.modules if name.rpartition(".")[0] == PARENT]:
+        if wanted is None or name == f"{PARENT}.{wanted}":
+            run(sys.modules[name])

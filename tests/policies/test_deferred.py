@@ -1,0 +1,25 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Only the code of the policy type that is wanted is imported, and any other as soon as it is asked for."""
+
+import subprocess
+import sys
+
+CODE = """
+import sys
+from accerl_lerobot.policies.config import register_policies
+
+register_policies("smolvla")
+loaded = [n for n in ("smolvla", "act", "groot") if f"lerobot.policies.{n}.processor_{n}" in sys.modules]
+assert loaded == ["smolvla"], loaded
+from lerobot.configs.policies import PreTrainedConfig
+assert {"smolvla", "act", "groot"} <= set(PreTrainedConfig.get_known_choices())
+from lerobot.policies.factory import get_policy_class
+from lerobot.policies.act import ACTPolicy
+assert get_policy_class("act") is ACTPolicy
+register_policies("of another package")
+assert "lerobot.policies.groot.processor_groot" in sys.modules
+"""
+
+
+def test_one_policy_is_imported_without_the_others():
+    subprocess.run([sys.executable, "-c", CODE], check=True, timeout=300)
