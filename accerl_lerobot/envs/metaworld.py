@@ -308,6 +308,7 @@ class MetaWorld(EpisodeWorld):
             draw_fast(model)
         self.config.shift.apply(sim, self.config.cameras)
         self._eyes[task] = new_renderer(model, self.config.image_size, self.config.image_size)
+        sim.touching_object = functools.partial(touching_object, sim)
         return sim
 
     def _observe(self) -> Observation:
@@ -324,6 +325,18 @@ class MetaWorld(EpisodeWorld):
         image = renderer.render()
         # corner2 hangs upside down in MetaWorld's scene; LeRobot turns it, and so do its datasets.
         return np.ascontiguousarray(image[::-1, ::-1]) if camera == "corner2" else image
+
+
+def touching_object(sim: Any, geom: int) -> bool:
+    """MetaWorld's function of this name, which loops over all contacts, with arrays.
+
+    The rewards of 14 tasks ask for it at every env step, where loops took a quarter of the simulation.
+    """
+    contact, force = sim.data.contact, sim.data.efc_force
+    pads = (sim.data.geom(name).id for name in ("leftpad_geom", "rightpad_geom"))
+    of_object = (contact.geom == geom).any(1)
+    pressing = (of_object & (contact.geom == pad).any(1) for pad in pads)
+    return all(force[contact.efc_address[which]].sum() > 0 for which in pressing)
 
 
 def draw_fast(model: Any) -> None:

@@ -41,6 +41,23 @@ def test_success_terminates_with_one_reward_and_a_last_picture(monkeypatch: pyte
     assert len(frames) == len(results) + 1, "one picture at the reset and one per chunk"
 
 
+def test_touch_is_told_as_metaworld_tells_it(monkeypatch: pytest.MonkeyPatch):
+    task, told = "push-v3", []
+    world = MetaWorld(MetaWorldConfig(task=task))
+    world.reset(0, task)
+    expert, sim = make_expert(world.config, world, task), world._sims[task]
+    ours, theirs = sim.touching_object, type(sim).touching_object
+
+    def both(geom: int) -> bool:
+        told.append((ours(geom), theirs(sim, geom)))
+        return told[-1][0]
+
+    monkeypatch.setattr(sim, "touching_object", both)
+    while not world.step_chunk(np.clip(expert(), -1, 1).astype(np.float32)[None]).done:
+        pass
+    assert {(False, False), (True, True)} == set(told)
+
+
 def test_same_states_and_frames_as_lerobot():
     gl.import_mujoco()
     stock_module = pytest.importorskip("lerobot.envs.metaworld")
