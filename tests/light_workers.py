@@ -19,7 +19,7 @@ import pytest
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE
 from accerl_lerobot.experience import Decision, Request
-from accerl_lerobot.inference.batcher import BatcherStats
+from accerl_lerobot.inference.batcher import Batcher
 from accerl_lerobot.rollout.worker import Report, RolloutWorker
 from accerl_lerobot.trainer.peers import LearnerSettings
 from accerl_lerobot.transport.endpoint import Endpoint
@@ -61,12 +61,12 @@ class LightInference:
         await self._broken
 
     async def listen(self) -> Address:
-        return serve_on_loop(self.decide).address
+        return serve_on_loop(self.receive).address
 
     async def fail(self) -> None:
         self._broken.set_exception(ArithmeticError("the forward pass fell over"))
 
-    async def decide(self, message: list[Request] | WeightUpdate) -> list[Decision] | None:
+    async def receive(self, message: list[Request] | WeightUpdate) -> list[Decision] | None:
         from accerl_lerobot.transport.contract import ServiceStoppedError
 
         if self._broken.done():
@@ -78,7 +78,7 @@ class LightInference:
 
     async def metrics(self) -> dict[str, float]:
         others = dict.fromkeys(("busy_share", "swap_s", "publish_to_served_s"), 0.0)
-        return BatcherStats().metrics() | others | {"version": float(self._version)}
+        return Batcher(1, 0.0).metrics() | others | {"version": float(self._version)}
 
 
 def _decision(request: Request, version: int) -> Decision:

@@ -37,7 +37,6 @@ from accerl_lerobot.engine.placement import actor_options, place_workers
 from accerl_lerobot.engine.ray_session import RaySession
 from accerl_lerobot.engine.replicas import START_S, InferenceReplicas, RolloutSlot, RolloutWorkers, WorkerSlot
 from accerl_lerobot.engine.stopping import WorkerError
-from accerl_lerobot.inference.batcher import BatcherStats
 from accerl_lerobot.policies.config import Load
 from accerl_lerobot.replay.pacing import ASYNCHRONOUS, Schedule
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
@@ -52,7 +51,7 @@ GONE_S, BLAME_S = 3.0, 10.0
 """How long to wait for a killed process, and for the failure that another is the consequence of."""
 
 
-def end(workers: Iterable[WorkerSlot], *, lost: bool = False) -> None:
+def end_all(workers: Iterable[WorkerSlot], *, lost: bool = False) -> None:
     """End workers, by Ray unless that is `lost`, and wait until they are gone.
 
     Nothing writes any more then, when others start. A process that is stopped does not hear Ray.
@@ -194,7 +193,7 @@ class RayEngine(Engine):
             lost = bool(self._ray.lost)
             if lost:
                 self._ray.close()
-            end(self._everyone(), lost=lost)
+            end_all(self._everyone(), lost=lost)
             if not self._keeps_ray:
                 self._ray.close()
         except Exception:
@@ -203,9 +202,6 @@ class RayEngine(Engine):
     def pids(self) -> dict[str, int]:
         """Process ids by worker: ``inference``, ``replay``, ``trainer``, ``rollout 0`` …; for fault tests."""
         return {w.name: int(w.call("ready", timeout=self._limit)) for w in self._everyone()}
-
-    def batching(self) -> BatcherStats:
-        return self._inference.batching()
 
     def _everyone(self) -> Iterator[WorkerSlot]:
         """All workers, those that others depend on first."""
@@ -332,7 +328,7 @@ class RayEngine(Engine):
         waiting = self._rollouts.outstanding or (self._training and not self._done)
         # Where one worker is to blame, that is found a moment later.
         silent = max(worker.silent_s() for worker in self._everyone())
-        suspect = max(silent, self._rollouts.stuck_s) > self._limit / 2
+        suspect = max(silent, self._rollouts.busy_s) > self._limit / 2
         if state != self._last_state or not waiting:
             self._last_state, self._last_change = state, now
         elif now - self._last_change > self._limit and not suspect:

@@ -40,7 +40,7 @@ from accerl_lerobot.engine.placement import Plan, actor_options, alive_nodes
 from accerl_lerobot.engine.ray_session import NO_HUB_TOKEN
 from accerl_lerobot.engine.stopping import WorkerError, pause_s
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.inference.batcher import BatcherStats, merge_metrics, merge_stats
+from accerl_lerobot.inference.batcher import merge_metrics
 from accerl_lerobot.metrics import numbered
 from accerl_lerobot.policies.config import Load
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, budgets, incarnation_after
@@ -146,7 +146,7 @@ class WorkerSlot:
         except RayError as error:
             raise WorkerError(f"{self.name} worker failed in {method}:\n{error}") from error
 
-    def end(self, error: Exception, max_restarts: int | None) -> None:
+    def discard(self, error: Exception, max_restarts: int | None) -> None:
         """End a process that is to be replaced, unless that was so too often; None: it does not count."""
         if max_restarts is not None:
             if time.monotonic() - self.since > STEADY_S:
@@ -234,10 +234,9 @@ class RolloutSlot(WorkerSlot):
             return super().hung(max(START_S, limit))
         if why := super().hung(limit):
             return why
-        if report.in_world_s > limit:
-            return f"its world has not returned for {report.in_world_s:.0f} s"
-        if report.stuck_s > limit:
-            return f"it has done nothing for {report.stuck_s:.0f} s"
+        if report.busy_s > limit:
+            what = "its world has not returned" if report.in_world else "it has done nothing"
+            return f"{what} for {report.busy_s:.0f} s"
         if report.away_s > AWAY_S and self.moved is None:
             return f"without inference, which is up, for {report.away_s:.0f} s: {report.away_why}"
         return ""
@@ -303,10 +302,9 @@ class RolloutWorkers(Replicas[RolloutSlot]):
         return all(worker.spent for worker in self._all)
 
     @property
-    def stuck_s(self) -> float:
-        """How long the slowest worker or world has been at what it does now."""
-        reports = [worker.told for worker in self._all if worker.told is not None]
-        return max((max(report.in_world_s, report.stuck_s) for report in reports), default=0.0)
+    def busy_s(self) -> float:
+        """How long the slowest worker has been at what it does now."""
+        return max((worker.told.busy_s for worker in self._all if worker.told is not None), default=0.0)
 
     def save(self, directory: Path) -> None:
         """Write the rollout workers' part of ``training_state``."""
@@ -342,7 +340,7 @@ class RolloutWorkers(Replicas[RolloutSlot]):
 
     def _restart(self, worker: RolloutSlot, error: Exception) -> None:
         moved = self._relocate(worker, error)  # that its node has left is not the worker's fault
-        worker.end(error, None if moved else self._launch.max_restarts)
+        worker.discard(error, None if moved else self._launch.max_restarts)
         self._past["restarts"] += 1
         self._past.update(worker.counters)
         worker.incarnation, worker.moved = worker.next_incarnation, None
@@ -411,10 +409,6 @@ class InferenceReplicas(Replicas[WorkerSlot]):
         merged = merge_metrics([worker.told for worker in self._all if worker.told])
         return merged | {"restarts": float(self.restarts)}
 
-    def batching(self) -> BatcherStats:
-        """Batches of all replicas so far."""
-        return merge_stats([worker.call("batching", timeout=self._launch.stall_s) for worker in self._all])
-
     def _new(self, worker: WorkerSlot) -> Any:
         from accerl_lerobot.inference.worker import InferenceWorker
 
@@ -425,7 +419,7 @@ class InferenceReplicas(Replicas[WorkerSlot]):
     def _restart(self, worker: WorkerSlot, error: Exception) -> None:
         here, limit = self._plan.places[worker.name].node, self._launch.stall_s
         while True:
-            worker.end(error, self._launch.max_restarts)
+            worker.discard(error, self._launch.max_restarts)
             if here.key not in alive_nodes():
                 raise WorkerError(f"{worker.name} worker is lost: {here} has left:\n{error}") from error
             self.restarts += 1
@@ -445,7 +439,7 @@ class InferenceReplicas(Replicas[WorkerSlot]):
         logger.info("%s worker is up again", worker.name)
 
     def _serve(self, worker: WorkerSlot) -> Endpoint:
-        endpoint = worker.endpoint("decide", self._launch.stall_s)
+        endpoint = worker.endpoint("receive", self._launch.stall_s)
         worker.work, worker.since = worker.actor.serve.remote(), time.monotonic()
         return endpoint
 

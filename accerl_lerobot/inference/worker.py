@@ -17,8 +17,8 @@ from __future__ import annotations
 import asyncio
 import os
 import time
-from collections import Counter, deque
-from dataclasses import dataclass, replace
+from collections import deque
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -29,7 +29,7 @@ from accerl_lerobot.checkpoint.layout import WEIGHTS
 from accerl_lerobot.config.ranges import Range, Section, Threads
 from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.fault_points import fault_point
-from accerl_lerobot.inference.batcher import Batcher, BatcherStats
+from accerl_lerobot.inference.batcher import Batcher
 from accerl_lerobot.policies.config import Load, PolicyConfig, loader
 from accerl_lerobot.timeline import COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
 from accerl_lerobot.transport.contract import PendingRequest, Server, stopped
@@ -98,7 +98,7 @@ class InferenceWorker:
         self._server = server = SharedMemoryServer(self._take, copy=False)
         return server.address
 
-    async def decide(self, message: list[Request] | WeightUpdate) -> list[Decision] | None:
+    async def receive(self, message: list[Request] | WeightUpdate) -> list[Decision] | None:
         """Answer a client's requests, in order, as part of some batch; or use weights from the next batch on.
 
         Raises:
@@ -132,17 +132,12 @@ class InferenceWorker:
         share = (busy_s - self._busy_told_s) / max(1e-9, now - self._since)
         self._since, self._busy_told_s = now, busy_s
         return {
-            **self._batcher.stats.metrics(),
+            **self._batcher.metrics(),
             "version": float(self._version),
             "busy_share": share,
             "swap_s": self._swap_s,
             "publish_to_served_s": self._publish_to_served_s,
         }
-
-    async def batching(self) -> BatcherStats:
-        stats = self._batcher.stats
-        # Copied in one go each: the other thread adds to them.
-        return replace(stats, batch_sizes=Counter(stats.batch_sizes), waits=Counter(stats.waits))
 
     def _serve(self) -> None:
         batch: list[PendingRequest] = []
