@@ -135,7 +135,7 @@ def test_every_logged_number_is_explained(tiny_checkpoint: Path) -> None:
     of_weights = ("version", "swap_s", "publish_to_served_s")
     rollout |= {f"inference_{k}" for k in (*Batcher(1, 0.0).metrics(), "busy_share", *of_weights)}
     ends = ("s", "_return", "_steps", "_decisions", "_success")
-    rollout |= {"restarts", "moved", "inference_restarts", "success_exploring"}
+    rollout |= {"restarts", "inference_restarts", "success_exploring"}
     rollout |= {"replay_insert_wait_s", "replay_sample_wait_s"}
     assert explained("rollout") == rollout | {f"replay_episode{end}" for end in ends}
 

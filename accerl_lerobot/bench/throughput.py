@@ -24,11 +24,8 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import Load
 from accerl_lerobot.replay.pacing import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, Schedule
 
-SETTLE = 2
-"""Updates after a change that are not counted, beside those that need nothing new."""
+SETTLE = 2  # updates after a change that are not counted, beside those that need nothing new
 ARMS: tuple[Schedule, ...] = (ASYNCHRONOUS, OVERLAP, SYNCHRONOUS)
-MOST_BUSY = 0.6
-"""Share of all cores above which the processors, and not what is slept, may be what is measured."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,17 +35,13 @@ class Block:
     schedule: str
     seconds: float
     updates: int
-    decisions_per_s: float
-    """Decisions learned from, repetitions included."""
+    decisions_per_s: float  # decisions learned from, repetitions included
     env_steps_per_s: float
     lag_mean: float
-    trainer_waits: float
-    """Share of its time in which the trainer had no batch."""
-    batch_size: float
-    """Observations of a forward pass."""
+    trainer_waits: float  # share of its time in which the trainer had no batch
+    batch_size: float  # observations of a forward pass
     inference_busy: float
-    processors: float
-    """Busy share of all cores, whoever uses them."""
+    processors: float  # busy share of all cores, whoever uses them
 
 
 class Measured:
@@ -174,7 +167,6 @@ def bench_throughput(config: BenchThroughputConfig) -> dict[str, Any]:
 
 
 def table(result: dict[str, Any]) -> Table:
-    """`result` for people."""
     columns = ("schedule", "env steps/s", "decisions/s learned from", "updates/s", "lag", "trainer waits")
     rows = []
     for name, one in result["schedules"].items():

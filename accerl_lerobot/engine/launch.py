@@ -1,15 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The asynchronous engine: places the workers, connects them and watches them.
-
-    rollout ×W ──requests──► inference ──decisions──► rollout   micro-asynchrony: others step meanwhile
-        │                        ▲
-        └──segments──► replay    │ weights, published without waiting
-                          │      │
-                          └──► trainer                          macro-asynchrony: no barrier, a measured lag
-
-    imagination ──requests──► inference ──decisions──► imagination ──segments──► replay
-       ▲                                                                 │
-       └────── world models that have passed ◄── world learning ◄──real──┘
+"""The asynchronous engine: places the workers, connects them as docs/architecture.md shows, and watches them.
 
 The trainer is the clock: when it has made its updates the run is over. A rollout worker or inference replica
 that ends is restarted alone, see `replicas`; the end of any other worker ends this engine with its traceback,
@@ -42,7 +32,6 @@ from accerl_lerobot.replay.pacing import ASYNCHRONOUS, Schedule
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.transport.contract import ServiceStoppedError
 from accerl_lerobot.transport.endpoint import Endpoint
-from accerl_lerobot.world_model.config import IMAGINATION, WORLD_LEARNING
 
 logger = logging.getLogger(__name__)
 
@@ -52,18 +41,16 @@ GONE_S, BLAME_S = 3.0, 10.0
 
 
 def end_all(workers: Iterable[WorkerSlot], *, lost: bool = False) -> None:
-    """End workers, by Ray unless that is `lost`, and wait until they are gone.
-
-    Nothing writes any more then, when others start. A process that is stopped does not hear Ray.
-    """
-    workers = list(workers)
-    for worker in () if lost else workers:
-        ray.kill(worker.actor)
-    processes = [worker.process for worker in workers if worker.process is not None]
+    """End workers, by Ray unless that is `lost`, and wait until they are gone and write nothing any more."""
+    processes = []
+    for worker in workers:
+        if not lost:
+            ray.kill(worker.actor)
+        processes += [worker.process] if worker.process else []
     left = psutil.wait_procs(processes, timeout=0.0 if lost else GONE_S)[1]
     for process in left:
         with contextlib.suppress(psutil.NoSuchProcess):
-            process.kill()
+            process.kill()  # one that is stopped does not hear Ray
     psutil.wait_procs(left, timeout=GONE_S)
 
 
@@ -98,8 +85,7 @@ class RayEngine(Engine):
         self._rollouts = RolloutWorkers(config, tasks, history, state)
         self._inference = InferenceReplicas(config, self._version, state, load, self._move)
         self._others: list[WorkerSlot] = []
-        self._imagining: list[WorkerSlot] = []
-        """The one that imagines, and the one that trains the world model; both are among the others."""
+        self._imagining: list[WorkerSlot] = []  # the one that imagines, and the world model's trainer
         self._updates: list[dict[str, float]] = []
         self._schedule: Schedule = ASYNCHRONOUS
         self._training = self._real_ended = self._done = self._closed = False
@@ -236,9 +222,8 @@ class RayEngine(Engine):
         if imagination.share:
             from accerl_lerobot.engine.imagination import ImaginationWorker, WorldLearningWorker
 
-            self._imagining.append(make(IMAGINATION, ImaginationWorker, 4, c, state, timeline))
-            if imagination.learns:
-                self._imagining.append(make(WORLD_LEARNING, WorldLearningWorker, 4, c, state, timeline))
+            for kind in (ImaginationWorker, WorldLearningWorker)[: 1 + imagination.learns]:
+                self._imagining.append(make(kind.name, kind, 4, c, state, timeline))
         self._rollouts.start(plan)
         for worker, reference in [(w, w.actor.ready.remote()) for w in self._everyone()]:
             here = plan.places[worker.name].node.number == 0
@@ -298,7 +283,6 @@ class RayEngine(Engine):
         self._replay.told = self._replay.call("metrics", timeout=self._limit)
 
     def _listen(self) -> list[EpisodeResult]:
-        """Pick up the answers that have come; the episodes among them."""
         episodes: list[EpisodeResult] = []
         for worker in self._everyone():
             answer = self._hear(worker)
@@ -308,7 +292,7 @@ class RayEngine(Engine):
                 episodes += worker.take(answer)
         if not self._real_ended and self._rollouts.spent:
             self._real_ended = True
-            self._replay.call("end_real", timeout=self._limit)
+            self._replay.call("change", real_ended=True, timeout=self._limit)
         return episodes
 
     def _hear(self, worker: WorkerSlot, timeout: float = 0.0) -> Any:

@@ -1,12 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The engine in one process, without Ray: the same parts, called in turn, deterministic for a seed.
 
-    every poll:   all environments get a decision and step it → segments enter replay, as the pace allows
-                  → all imagined rollouts get a decision and a step, if the pace allows it
-                  → one update, if the pace allows it
-
-For tests and debugging. Weights reach the acting policy at once, so the lag comes from replay alone, unless
-`trainer.hold_back` asks for more.
+Every poll all environments and all imagined rollouts get a decision and step it, and there is one update, as
+the pace allows. For tests and debugging. Weights reach the acting policy at once, so the lag comes from
+replay alone, unless `trainer.hold_back` asks for more.
 """
 
 from __future__ import annotations
@@ -37,8 +34,7 @@ from accerl_lerobot.world_model.config import IMAGINATION
 
 logger = logging.getLogger(__name__)
 
-LOCAL = "local"
-"""Name of this engine's own state."""
+LOCAL = "local"  # name of this engine's own state
 
 
 class LocalEngine(Engine):

@@ -107,14 +107,13 @@ def check_start(config: RunConfig, say: Callable[[str], object] = str) -> int:
     else:
         meta = check_training_data(config.sft, config.dataset, policy, spec, renames)
     history = int(policy.n_obs_steps)
-    if off_policy and meta is not None:
+    if off_policy and meta is not None:  # one that cannot be remembered is left out
         _say_if_unlike(config, spec, meta, history)
     check_disk(config.output_dir)
     return history
 
 
 def _say_if_unlike(config: RunConfig, spec: WorldSpec, meta: Any, history: int) -> None:
-    """Warns of a dataset whose episodes off-policy learning cannot remember."""
     from accerl_lerobot.trainer.demonstrations import unlike
 
     wanted: dict[str, tuple[int, ...]] = {STATE: (spec.state_dim,), **spec.images}
@@ -154,10 +153,8 @@ def check_training_data(
 
 
 def _check_new_policy(policy: Any, source: Features, sft: SFTConfig) -> None:
-    """Give a new policy the features that LeRobot will give it, and has LeRobot check them.
-
-    SmolVLA and π0 pad states and actions to a size of their own, and LeRobot does not compare it with theirs.
-    """
+    """Have LeRobot check the features that it will give a new policy, and compare what it does not: the sizes
+    to which SmolVLA and π0 pad states and actions."""
     from lerobot.configs.types import FeatureType, PolicyFeature
 
     for name, most in ((STATE, "max_state_dim"), (ACTION, "max_action_dim")):
@@ -203,7 +200,6 @@ def check_imitates(algorithm: AlgorithmConfig, config: PolicyConfig, policy: Any
 
 
 def _check_off_policy(config: RunConfig, spec: WorldSpec, policy: Any) -> None:
-    """Refuse policies that cannot imitate a chunk, and segments that are not whole episodes."""
     check_imitates(config.algorithm, config.policy, policy)
     decisions = math.ceil(spec.max_steps / getattr(policy, "n_action_steps", 1))
     if config.rollout.segment_length < decisions:

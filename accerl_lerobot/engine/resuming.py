@@ -37,14 +37,12 @@ WARM_START = "warm_start.json"
 
 
 def raise_if_stopped(stop: Stopping, directory: Path) -> None:
-    """End a run that was asked to stop."""
     if (number := stop.asked) is not None:
         how = resume_command(directory)
         raise StoppedError(number, f"stopped by {signal.Signals(number).name}; to resume: {how}")
 
 
 def resume_command(directory: Path) -> str:
-    """The command that resumes a run."""
     return f"accerl train --resume=true --config_path={shlex.quote(str(directory / layout.CONFIG))}"
 
 
@@ -132,7 +130,6 @@ def _newest(checkpoints: Path, wanted: str, console: Console) -> Path:
 
 
 def continued(config: RunConfig, directory: Path, checkpoint: Path) -> RunConfig:
-    """The run from its checkpoint on."""
     if config.policy.tuning.mode != "lora":
         return improving(config, checkpoint / layout.PRETRAINED)
     # A checkpoint has low-rank adapters merged; apart from what they adapt they are in the training state.
@@ -147,7 +144,6 @@ def continued(config: RunConfig, directory: Path, checkpoint: Path) -> RunConfig
 
 
 def _is_here(path: str) -> bool:
-    """True for a folder of this machine that exists, and for a Hub id."""
     on_the_hub = not path.startswith((".", "/", "~", f"{layout.AWAY}/")) and path.count("/") <= 1
     return on_the_hub or Path(path).expanduser().is_dir()
 

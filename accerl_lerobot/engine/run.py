@@ -221,16 +221,18 @@ def execute(
     layout.write_atomically(directory / layout.CONFIG, text)
     spec = check_world(config.env)
     check_placement(replace(config, output_dir=str(directory)))
-    if checkpoint is None:
-        _check_imagination(config)
-        config = warm_start(config, directory, console)
-    else:
+    if checkpoint is not None:
         layout.go_back_to(checkpoint)
         config = resuming.continued(config, directory, checkpoint)
         if load is None:
             check_start(config)
-        _check_imagination(config)
         console.say(f"going on from {checkpoint}")
+    if config.imagination.share:
+        from accerl_lerobot.engine.imagination import check_imagination
+
+        check_imagination(config)
+    if checkpoint is None:
+        config = warm_start(config, directory, console)
     config, before_s = replace(config, output_dir=str(directory)), 0.0 if checkpoint is None else None
     times = Times(started=started, warm_s=time.monotonic() - started, before_s=before_s)
     with contextlib.ExitStack() as stack:  # flushes the log, whatever fails
@@ -242,8 +244,7 @@ def execute(
             ray_session.prepare(joins=config.launch.address is not None)
             session = stack.enter_context(contextlib.closing(ray_session.RaySession(config.launch)))
         recovery = resuming.Recovery(config.launch.max_restarts)
-        while True:
-            # A run, or what is left of it, by one set of workers.
+        while True:  # a run, or what is left of it, by one set of workers
             history = 1 if load is not None else check_policy(config, spec, own=True)
             state = None if checkpoint is None else checkpoint / layout.TRAINING_STATE
             try:
@@ -267,13 +268,6 @@ def execute(
                 resuming.raise_if_stopped(stop, directory)
                 layout.go_back_to(checkpoint)
                 config = resuming.continued(config, directory, checkpoint)
-
-
-def _check_imagination(config: RunConfig) -> None:
-    if config.imagination.share:
-        from accerl_lerobot.engine.imagination import check_imagination
-
-        check_imagination(config)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -112,7 +112,6 @@ def deferred() -> Iterator[None]:
 
 
 def _cancel_alarms(left: threading.Event) -> None:
-    """Cancel the alarm that follows a signal, until and when the context is left."""
     ended = False
     while not ended:
         ended = left.wait(1.0)
@@ -124,8 +123,7 @@ class Stopping:
     """Notes the first signal; a second one interrupts at once."""
 
     def __init__(self) -> None:
-        self.asked: int | None = None
-        """The signal's number."""
+        self.asked: int | None = None  # the signal's number
         self._waits = True
         self._before: dict[int, Any] = {}
 

@@ -54,7 +54,6 @@ class Batcher[R: Sized]:
         self._observations += len(request)
 
     def due(self, now: float) -> bool:
-        """True if the next batch should be served."""
         deadline = self.next_deadline()
         return deadline is not None and now >= deadline
 

@@ -1,12 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The inference process: one device answers many environments.
 
-    consumes    requests from rollout workers; published weights
-    produces    decisions, each stamped with the version of the weights that made it
-    waits for   a full batch, or for the oldest request to have waited `max_wait_s`
-    weights     are swapped between batches: no batch ever sees two versions
-    ends        with the process; an exception fails all requests, and the engine restarts the process, which
-                has no state but weights
+A batch is decided when it is full or its oldest request has waited `max_wait_s`. Published weights are taken
+in between batches, so none sees two versions, and each decision is stamped with its own. An exception fails
+all requests and ends the process, which has no state but weights; the engine starts another one.
 
 One thread waits for clients and for the batcher's clock at once, runs the forward pass and replies. Ray's
 calls come in on the event loop beside it, which only hands them over.
@@ -36,8 +33,7 @@ from accerl_lerobot.transport.contract import PendingRequest, Server, stopped
 from accerl_lerobot.transport.shared_memory import Address, SharedMemoryServer
 from accerl_lerobot.transport.weights import WeightUpdate
 
-LOOK_S = 1.0
-"""Longest wait of the serving thread before it checks whether it should end."""
+LOOK_S = 1.0  # longest wait of the serving thread before it checks whether it should end
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,7 +107,6 @@ class InferenceWorker:
         return decisions
 
     async def lock_step(self, observations: int) -> None:
-        """See `Batcher.lock_step`."""
         self._lock_step.append(observations)
         self._server.wake()
 

@@ -66,6 +66,11 @@ class RolloutConfig(Section, section="rollout"):
     reward_model: RewardModelConfig = field(default_factory=RewardModelConfig)
     """The model that tells success, where the environment does not."""
 
+    @property
+    def in_flight(self) -> int:
+        """Decisions that environments of equal speed make while a segment is on its way to replay."""
+        return self.workers * self.worlds * self.segment_length
+
 
 @kind
 @dataclass(frozen=True, kw_only=True)
@@ -76,10 +81,8 @@ class EpisodePlan:
     seed: int
     explore: bool
     """True: sample and learn from it. False: LeRobot's stock sampler, for evaluation; no segment is made."""
-    index: int = 0
-    """Position in the evaluation it belongs to."""
-    group: str = "train"
-    """Which evaluation it belongs to."""
+    index: int = 0  # position in the evaluation it belongs to
+    group: str = "train"  # which evaluation it belongs to
     film: tuple[int, int] | None = None
     """Side in pixels and env steps per frame of a video for people; None: none. It executes a chunk in parts,
     which changes nothing else."""
@@ -107,13 +110,11 @@ class EpisodePlans:
         self, tasks: tuple[str, ...], seed: int, budget: int | None, worker: int = 0, incarnation: int = 0
     ) -> None:
         self._tasks, self._seed, self._worker, self._budget = tasks, seed, worker, budget
-        self.starts = incarnation * STARTS_PER_INCARNATION
-        """Where it is in the worker's seeds."""
+        self.starts = incarnation * STARTS_PER_INCARNATION  # where it is in the worker's seeds
         # Filled and emptied on different threads: appending to and popping from a deque is atomic.
         self._queued: deque[EpisodePlan] = deque()
 
     def queue(self, plans: Iterable[EpisodePlan]) -> None:
-        """Plans evaluation episodes."""
         self._queued.extend(plans)
 
     def next(self, exploring: bool) -> EpisodePlan | None:
@@ -151,8 +152,7 @@ class EpisodeResult:
     episode_return: float
     steps: int
     decisions: int
-    versions: tuple[int, int]
-    """Oldest and newest weights that decided in it."""
+    versions: tuple[int, int]  # oldest and newest weights that decided in it
     frames: list[np.ndarray] = field(default_factory=list)
     """uint8 (H, W, 3) each, when the plan asked for a film."""
 
@@ -165,8 +165,7 @@ class Counters:
     env_steps: int = 0
     decisions: int = 0
     episodes: int = 0
-    dropped_nonfinite: int = 0
-    """Decisions thrown away because the world returned NaN or infinity."""
+    dropped_nonfinite: int = 0  # decisions thrown away because the world returned NaN or infinity
 
 
 class RolloutRunner:
@@ -198,7 +197,6 @@ class RolloutRunner:
 
     @property
     def exploring(self) -> bool:
-        """True if an exploring episode is under way."""
         return any(episode is not None and episode.plan.explore for episode in self._episodes)
 
     def start(self, slot: int) -> Request | None:

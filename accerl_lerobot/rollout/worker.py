@@ -1,14 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The rollout process: steps its worlds while other observations wait for a decision.
 
-    consumes    decisions from inference
-    produces    segments for replay, results of episodes for the driver
-    waits for   a decision, only when every world has an observation under way
-    pauses      exploring worlds while replay does not take segments; evaluation goes on
-    ends        never unasked: a world that raises ends the process's `run`, and `launch` starts another
-    outlives    inference: its successor is asked again what has not been answered
-
-Imports neither torch nor LeRobot (unless its world does).
+It waits only when every world has an observation under way, and pauses exploring while replay does not take
+segments. It outlives inference, whose successor is asked again what has not been answered. A world that
+raises ends `run`, and the engine starts another process. Imports neither torch nor LeRobot, unless its world
+does.
 """
 
 from __future__ import annotations
@@ -37,30 +33,22 @@ from accerl_lerobot.transport.endpoint import Endpoint, ReconnectingClient
 
 PARTS = 2
 """A worker's worlds are asked for in so many parts: one is stepped while the other's decisions are made."""
-MAX_PENDING = 2
-"""Messages to replay that may be pending before exploring worlds pause."""
-PAUSE_S = 0.005
-"""Between two looks at whether there is something to do."""
+MAX_PENDING = 2  # messages to replay that may be pending before exploring worlds pause
+PAUSE_S = 0.005  # between two looks at whether there is something to do
 
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
     """A rollout worker's answer when it is asked how it is."""
 
-    episodes: list[EpisodeResult]
-    """Finished since the last report."""
-    counters: dict[str, float]
-    """Since this process began."""
+    episodes: list[EpisodeResult]  # finished since the last report
+    counters: dict[str, float]  # since this process began
     busy_s: float = 0.0
     """Seconds for which its thread has been at what it does now; 0 before `RolloutWorker.run`."""
-    in_world: bool = False
-    """True if that is to step or reset a world."""
-    spent: bool = False
-    """Every exploring episode that was paid for has been played, and replay has it."""
-    starts: int = 0
-    """See `EpisodePlans.starts`."""
-    away_s: float = 0.0
-    """Seconds for which inference has not been where it was last said to be."""
+    in_world: bool = False  # True if that is to step or reset a world
+    spent: bool = False  # every exploring episode that was paid for has been played, and replay has it
+    starts: int = 0  # see `EpisodePlans.starts`
+    away_s: float = 0.0  # seconds for which inference has not been where it was last said to be
     away_why: str = ""
 
 

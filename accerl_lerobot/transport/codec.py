@@ -19,8 +19,7 @@ import numpy as np
 from accerl_lerobot.checkpoint.snapshot import from_json, to_json
 
 SIZE = struct.Struct("<I")
-ALIGNMENT = 64
-"""Alignment of arrays in shared memory, in bytes: a cache line."""
+ALIGNMENT = 64  # alignment of arrays in shared memory, in bytes: a cache line
 _dumps = json.JSONEncoder(separators=(",", ":"), check_circular=False).encode
 
 

@@ -21,8 +21,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from typing import Any
 
-MAX_IN_FLIGHT = 32
-"""Messages that `Client.ask` has under way at most; a transport carries at least so many."""
+MAX_IN_FLIGHT = 32  # messages that `Client.ask` has under way at most; a transport carries at least so many
 
 
 class ServiceStoppedError(RuntimeError):

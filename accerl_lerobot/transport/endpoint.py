@@ -18,12 +18,9 @@ class Endpoint:
     """Address of a service, which a worker needs in order to call it."""
 
     name: str
-    method: Any
-    """Method of its Ray actor handle."""
-    address: Address | None = None
-    """Address of its shared memory; None: it can only be reached through Ray."""
-    actor: Any = None
-    """Ray's handle of its process."""
+    method: Any  # method of its Ray actor handle
+    address: Address | None = None  # address of its shared memory; None: it can only be reached through Ray
+    actor: Any = None  # Ray's handle of its process
 
     def kill(self) -> None:
         import ray
@@ -31,7 +28,6 @@ class Endpoint:
         ray.kill(self.actor)
 
     def connect(self) -> Client:
-        """Open a connection for this process."""
         if self.address is not None and available() and self.address.node == this_node():
             return SharedMemoryClient(self.name, self.address)
         return RayClient(self.name, self.method)
@@ -90,8 +86,7 @@ class ReconnectingClient(Client):
         self._tickets: dict[int, int] = {}  # ticket of the connection → ticket here
         self._sent = 0
         self._away_since: float | None = None
-        self.why = ""
-        """Reason of the last loss of the connection."""
+        self.why = ""  # reason of the last loss of the connection
 
     def move(self, endpoint: Endpoint) -> None:
         self._next.append(endpoint)

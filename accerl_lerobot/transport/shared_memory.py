@@ -34,21 +34,17 @@ from accerl_lerobot.transport.contract import Client, PendingRequest, Server, Se
 
 logger = logging.getLogger(__name__)
 
-CONNECT_S = 30.0
-"""Timeout for connecting to a service."""
-LEAST = 2**16
-"""Bytes of a slot at least; the reply is written behind the message."""
+CONNECT_S = 30.0  # timeout for connecting to a service
+LEAST = 2**16  # bytes of a slot at least; the reply is written behind the message
 SLOTS = 64
 """Slots of one client at most, and so messages that it may have under way. Their tokens fit into the buffers
 of the two sockets, so no end ever waits for the other one to read."""
 _TOKEN = struct.Struct("<BIQQQd")
-ASK, ANSWER, FAIL = range(3)
-"""Purpose of a token."""
+ASK, ANSWER, FAIL = range(3)  # purpose of a token
 
 
 @functools.cache
 def available() -> bool:
-    """True if this system has memfd, epoll and eventfd."""
     try:
         os.close(os.memfd_create("accerl"))
         select.epoll().close()
@@ -59,7 +55,6 @@ def available() -> bool:
 
 
 def new_name() -> str:
-    """A socket name that nobody can guess."""
     return f"accerl-{secrets.token_hex(16)}"
 
 
@@ -69,7 +64,6 @@ def new_socket() -> socket.socket:
 
 
 def listening(name: str, backlog: int) -> socket.socket:
-    """A socket that others connect to by this name."""
     listener = new_socket()
     listener.bind(f"\0{name}")
     listener.listen(backlog)
@@ -77,7 +71,6 @@ def listening(name: str, backlog: int) -> socket.socket:
 
 
 def same_user(connection: socket.socket) -> bool:
-    """True if the process at the other end belongs to this user."""
     size = struct.calcsize("3i")
     _, user, _ = struct.unpack("3i", connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, size))
     return bool(user == os.getuid())
@@ -89,11 +82,9 @@ class Token(NamedTuple):
     purpose: int
     slot: int
     ticket: int
-    start: int
-    """First byte of the message in the slot."""
+    start: int  # first byte of the message in the slot
     size: int
-    sent: float
-    """On `time.monotonic`."""
+    sent: float  # on `time.monotonic`
 
 
 class Slot:
