@@ -9,9 +9,9 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -26,6 +26,9 @@ from accerl_lerobot.transport.endpoint import Endpoint
 from accerl_lerobot.transport.shared_memory import Address, serve_on_loop
 from accerl_lerobot.transport.weights import WeightPublisher, WeightUpdate
 
+if TYPE_CHECKING:
+    from accerl_lerobot.engine.launch import RayEngine
+
 
 @pytest.fixture(scope="session")
 def light_ray() -> Iterator[None]:
@@ -38,6 +41,28 @@ def light_ray() -> Iterator[None]:
         start_ray()
     yield
     ray.shutdown()
+
+
+@pytest.fixture
+def light_engine(light_ray: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., RayEngine]]:
+    """Makes asynchronous engines with stand-ins for inference and trainer, and closes them."""
+    from accerl_lerobot.engine import launch
+    from accerl_lerobot.inference import worker as inference
+    from accerl_lerobot.trainer import worker as trainer
+    from tests.runs import tiny_run
+
+    monkeypatch.setattr(launch, "POLL_S", 0.05)
+    monkeypatch.setattr(inference, "InferenceWorker", LightInference)
+    monkeypatch.setattr(trainer, "TrainerWorker", LightTrainer)
+    made: list[RayEngine] = []
+
+    def make(state: Path | None = None, **sections: Any) -> RayEngine:
+        made.append(launch.RayEngine(tiny_run(Path("nowhere"), **sections), ("match",), state=state))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.close()
 
 
 NO_WEIGHTS = "a path without weights"

@@ -79,7 +79,7 @@ class Measured:
         steps = polls[-1].rollout["env_steps"] - first.rollout["env_steps"]
         total = sum(_seconds(u) for u in updates)
         batches = after["batches"] - before["batches"]
-        requests = _observations(after) - _observations(before)
+        requests = after["batches"] * after["batch_size_mean"] - before["batches"] * before["batch_size_mean"]
         return Block(
             schedule=schedule,
             seconds=total,
@@ -88,7 +88,7 @@ class Measured:
             env_steps_per_s=steps / wall,
             lag_mean=sum(u["lag_mean"] for u in updates) / len(updates),
             trainer_waits=sum(u["wait_s"] for u in updates) / total,
-            batch_size=requests / batches if batches else 0.0,
+            batch_size=requests / max(batches, 1.0),
             inference_busy=sum(p.inference["busy_share"] for p in polls) / len(polls),
             processors=psutil.cpu_percent() / 100,
         )
@@ -110,11 +110,6 @@ class Measured:
 
 def _seconds(update: dict[str, float]) -> float:
     return update["wait_s"] + update["update_s"] + update["publish_s"]
-
-
-def _observations(inference: dict[str, float]) -> int:
-    """Requests so far; rounded, as a mean times its divisor need not be whole."""
-    return round(inference["batches"] * inference["batch_size_mean"])
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -78,10 +78,9 @@ def check_imagination(config: RunConfig) -> None:
 def _load(
     config: RunConfig, policy: Any, *, first: bool = False
 ) -> tuple[WorldSpec, WorldModel, SuccessPairsRewardModel | None]:
-    """The environment, and the models for it, which are checked to fit it and LeRobot's config of the policy.
+    """The environment, and the models, which are checked to fit it and LeRobot's config of the policy.
 
-    If nobody has loaded the files before (`first`), a child process does so first, see `isolation`. An oracle
-    has no success model.
+    Files that nobody has loaded before are tried in a child process (`first`). Oracles have no success model.
     """
     imagination, executed = config.imagination, getattr(policy, "n_action_steps", 1)
     if (reward := getattr(config.env, "reward", "success")) != "success":

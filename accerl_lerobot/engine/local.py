@@ -122,6 +122,8 @@ class LocalEngine(Engine):
         episodes = list(self._episodes)
         self._episodes.clear()
         self._outstanding -= {episode_key(e.plan) for e in episodes}
+        parts = (part for part in (self._imagination, self._world_learner) if part is not None)
+        imagined = {name: value for part in parts for name, value in part.metrics().items()}
         return Progress(
             version=self._update.version,
             done=self._training and not self._exploring,
@@ -129,7 +131,7 @@ class LocalEngine(Engine):
             episodes=episodes,
             rollout={k: float(v) for k, v in asdict(self._runner.counters).items()},
             replay=self._replay.metrics(),
-            imagination=self._imagined(),
+            imagination=imagined,
             inference={"version": float(self._acting_version)},
         )
 
@@ -268,7 +270,3 @@ class LocalEngine(Engine):
                 self._world_learner.add(segment)
         if self._plans.spent and not self._outbox and not self._runner.exploring:
             self._replay.real_ended = True
-
-    def _imagined(self) -> dict[str, float]:
-        learner = {} if self._world_learner is None else self._world_learner.metrics()
-        return {} if self._imagination is None else self._imagination.metrics() | learner

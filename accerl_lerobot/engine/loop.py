@@ -142,23 +142,20 @@ class Times:
         return (self.before_s or 0.0) + time.monotonic() - self.started
 
 
+@dataclass(eq=False)
 class Loop:
     """Evaluates, trains, saves checkpoints, and writes the results; `stop` tells when to save and end."""
 
-    def __init__(
-        self,
-        config: RunConfig,
-        directory: Path,
-        console: Console,
-        log: MetricsLog,
-        engine: Engine,
-        tasks: tuple[str, ...],
-        times: Times,
-        stop: Stopping,
-    ) -> None:
-        self.config, self.engine, self.tasks = config, engine, tasks
-        self.directory, self.console, self.log = directory, console, log
-        self.times, self.stop = times, stop
+    config: RunConfig
+    directory: Path
+    console: Console
+    log: MetricsLog
+    engine: Engine
+    tasks: tuple[str, ...]
+    times: Times
+    stop: Stopping
+
+    def __post_init__(self) -> None:
         self.before: dict[str, Any] | None = None  # the evaluation before training, where there was one
         self.evaluations: list[dict[str, Any]] = []
         self.curve: list[tuple[float, float]] = []
@@ -188,7 +185,7 @@ class Loop:
                 self.before, filmed = self._evaluate("before", 0.0)
                 snapshot.save(self.directory / FILMED, [result for result in filmed if result.frames])
             self.base = self.engine.poll().rollout
-            if self.config.saves:
+            if self.config.save_every_updates or self.config.save_every_s:
                 self._save()
         last = self._train()
         self.steps = self._steps(last)

@@ -15,7 +15,6 @@ import time
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -43,7 +42,6 @@ logger = logging.getLogger(__name__)
 
 START_S = 600.0  # timeout for the start of a worker; `LaunchConfig.stall_s` counts from its first answer
 STEADY_S = 30.0  # A worker that has run for so long starts counting restarts anew
-AWAY_S = 10.0  # how long a rollout worker may fail to connect to its inference replica
 UNREACHABLE_S = 60.0
 """How long a process on another node may be out of reach before it is restarted, unless its node is found to
 have left, which Ray takes half of that to decide."""
@@ -174,8 +172,7 @@ class RolloutSlot(WorkerSlot):
         self.incarnation = 0  # grows with every process; part of its seeds and of its segments' keys
         self.outstanding: dict[tuple[str, int], EpisodePlan] = {}  # planned episodes without a result
         self.unsent: list[EpisodePlan] = []
-        self.moved: Endpoint | None = None
-        """New endpoint of its inference replica, until the process has been told."""
+        self.moved: Endpoint | None = None  # where its replica is now, until the process has been told
         self.spent = budget == 0  # True if replay has all episodes of the budget
 
     @property
@@ -199,15 +196,13 @@ class RolloutSlot(WorkerSlot):
         self.unsent += plans
 
     def hung(self, limit: float) -> str:
-        """Also a world that does not return, and inference that is not found."""
+        """Also a world that does not return."""
         report: Report | None = self.told
         if (why := super().hung(limit if report else max(START_S, limit))) or report is None:
             return why
         if report.busy_s > limit:
             what = "its world has not returned" if report.in_world else "it has done nothing"
             return f"{what} for {report.busy_s:.0f} s"
-        if report.away_s > AWAY_S and self.moved is None:
-            return f"without inference, which is up, for {report.away_s:.0f} s: {report.away_why}"
         return ""
 
 
@@ -245,10 +240,7 @@ class RolloutWorkers(Replicas[RolloutSlot]):
         """Ask each worker for a report, unless one is outstanding."""
         for worker in self._all:
             if worker.ask("report", training, worker.unsent, self.in_turn, worker.moved):
-                worker.unsent = []
-                if worker.moved is not None and worker.told is not None:
-                    worker.told = replace(worker.told, away_s=0.0)  # that was about the old endpoint
-                worker.moved = None
+                worker.unsent, worker.moved = [], None
 
     def counters(self) -> dict[str, float]:
         """Sums over all processes since the run began."""
@@ -332,12 +324,7 @@ class InferenceReplicas(Replicas[WorkerSlot]):
     """The inference replicas of a run; rollout worker i asks replica i modulo their number.
 
     A restart loses nothing, as a request carries its noise and clients ask the successor again. It gets the
-    newest weights before they are told its address.
-
-    Args:
-        version: of the first weights.
-        state: the ``training_state`` that holds these; None: they are the policy's.
-        moved: called with the index and new endpoint of a replica that has been restarted.
+    newest weights before they are told its address: `moved` is called with its index and endpoint.
     """
 
     def __init__(

@@ -77,7 +77,7 @@ def make_output_dir(config: Any) -> Path:
 
 
 def discard_unused(directory: Path) -> None:
-    """Remove the folder of a run that was refused before it did anything, so that its name is free again."""
+    """Free the name of a run that was refused before it did anything."""
     if {path.name for path in directory.iterdir()} <= {layout.CONFIG, resuming.LOCK}:
         shutil.rmtree(directory)
 

@@ -262,7 +262,8 @@ class RolloutRunner:
                 observation = world.step_chunk(chunk).observation
             builder = self._builder(plan, observation)
             builder.restore(saved["builder"])
-            if not _equal(observation, builder.latest):
+            latest = builder.latest
+            if not all(np.array_equal(observation.get(key), value) for key, value in latest.items()):
                 raise RuntimeError(
                     f"{plan.task} with seed {plan.seed} does not show again what it had shown after "
                     f"{len(saved['chunks'])} decisions, so its episodes cannot be resumed in the middle; "
@@ -315,10 +316,6 @@ def _execute(world: World, episode: ActiveEpisode, actions: np.ndarray) -> Chunk
         if result.done:
             break
     return replace(result, rewards=np.concatenate(rewards))
-
-
-def _equal(one: Observation, other: Observation) -> bool:
-    return one.keys() == other.keys() and all(np.array_equal(one[key], other[key]) for key in one)
 
 
 def _finite(observation: Observation) -> bool:

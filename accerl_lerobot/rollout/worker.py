@@ -48,8 +48,6 @@ class Report:
     in_world: bool = False  # True if that is to step or reset a world
     spent: bool = False  # every exploring episode that was paid for has been played, and replay has it
     starts: int = 0  # see `EpisodePlans.starts`
-    away_s: float = 0.0  # seconds for which inference has not been where it was last said to be
-    away_why: str = ""
 
 
 class RolloutWorker:
@@ -119,8 +117,6 @@ class RolloutWorker:
             in_world=in_world,
             spent=self._spent,
             starts=self._plans.starts,
-            away_s=self._deciding.away_s,
-            away_why=self._deciding.why,
         )
 
     def run(self, inference: Endpoint, replay: Endpoint) -> None:

@@ -217,11 +217,7 @@ class TimelineConfig(Section):
 
 
 def show_timelines(config: TimelineConfig) -> dict[str, Any]:
-    """Reads the runs, writes the picture.
-
-    Returns:
-        ``picture`` and ``runs``: of each, what is drawn, when it trained, and how its roles spent that time.
-    """
+    """Writes the ``picture``; of the ``runs``, what is drawn, when each trained and its roles' shares."""
     picture = None if config.output is None else expanded(config.output, "output")
     timelines = [read_timeline(Path(name).expanduser()) for name in config.runs]
     if picture is None:

@@ -48,10 +48,7 @@ class _Reader:
 class WeightPublisher:
     """Sends the newest weights to all replicas. One that fails is ended, and the engine replaces it.
 
-    Example:
-        >>> publisher = WeightPublisher([inference])
-        >>> publisher.publish(1, tensors)   # copies them
-        >>> publisher.flush()               # before `tensors` change; so are `resend` and `add`
+    Published tensors must not change before `flush` has returned, as `resend` and `add` send them too.
     """
 
     def __init__(self, readers: Iterable[Endpoint] = ()) -> None:

@@ -201,12 +201,11 @@ def test_a_worker_outlives_its_inference_and_plays_what_it_would_have_played(sta
         if lost:
             one.until(lambda one=one: len(one.held or []) >= 2, training=False)
             one.worker._deciding.move(played(broken))  # on another thread than the one that asks
-            one.until(lambda one=one: "fell over" in one.order(False).away_why, training=False)
-            assert one.order(False).away_s > 0.0 and one.evaluated == []
+            one.until(lambda one=one: one.worker._deciding._client is None, training=False)
+            assert one.order(False) and one.evaluated == []
             one.held = None
             one.worker.report(False, [], False, played(one._decide))
         one.until(lambda one=one: len(one.evaluated) == 12, training=False)
-        assert one.order(False).away_s == 0.0
         results = sorted(one.evaluated, key=lambda result: result.plan.index)
         played_out.append([(r.plan, r.success, r.episode_return, r.decisions) for r in results])
     assert played_out[0] == played_out[1]
@@ -223,12 +222,12 @@ def test_a_world_that_hangs_shows_in_the_report(stage, monkeypatch: pytest.Monke
     one.until(lambda: one.order(True).busy_s < 0.2)
 
 
-def test_who_has_not_been_set_to_work_is_not_away_from_inference():
-    """Others may take long to start, and it is restarted if it seems to be."""
+def test_who_has_not_been_set_to_work_does_not_hang():
+    """Others may take long to start."""
     worker = RolloutWorker(WORLD, RolloutConfig(worlds=1), ("match",), 0)
     time.sleep(0.05)
     report = worker.report(True, [])
-    assert (report.away_s, report.busy_s, report.in_world) == (0.0, 0.0, False)
+    assert (report.busy_s, report.in_world) == (0.0, False)
 
 
 def test_a_thread_that_hangs_outside_of_a_world_shows_in_the_report(stage, monkeypatch: pytest.MonkeyPatch):
