@@ -18,7 +18,6 @@ import numpy as np
 from accerl_lerobot.checkpoint import layout, snapshot
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import RunConfig
-from accerl_lerobot.engine.resuming import raise_if_stopped
 from accerl_lerobot.engine.stopping import Stopping
 from accerl_lerobot.evaluation import before_after, evaluation_plans, success_curve, summarise
 from accerl_lerobot.metrics import MetricsLog, plain
@@ -280,7 +279,7 @@ class Loop:
                     self._plan(config.evaluation.episodes_during, group)
                 if self._is_due(progress.version) or self.stop.asked is not None:
                     self._save()
-                raise_if_stopped(self.stop, self.directory)
+                self.stop.check()
 
     @property
     def _rl_s(self) -> float:
@@ -337,7 +336,7 @@ class Loop:
 
     def _meanwhile(self, progress: Progress) -> None:
         self._record(progress)
-        raise_if_stopped(self.stop, self.directory)
+        self.stop.check()
 
     def _report(self, group: str, results: list[EpisodeResult], steps: float, version: int) -> dict[str, Any]:
         summary = summarise(results) | {"env_steps": steps, "group": group}

@@ -236,7 +236,7 @@ def execute(
     config, before_s = replace(config, output_dir=str(directory)), 0.0 if checkpoint is None else None
     times = Times(started=started, warm_s=time.monotonic() - started, before_s=before_s)
     with contextlib.ExitStack() as stack:  # flushes the log, whatever fails
-        stop = stack.enter_context(Stopping())
+        stop = stack.enter_context(Stopping(resuming.resume_command(directory)))
         times.clock = stack.enter_context(contextlib.closing(open_clock(config.timeline_folder, "driver")))
         log = stack.enter_context(contextlib.closing(MetricsLog(directory, config.wandb, encode(config))))
         session = None
@@ -248,12 +248,8 @@ def execute(
             history = 1 if load is not None else check_policy(config, spec, own=True)
             state = None if checkpoint is None else checkpoint / layout.TRAINING_STATE
             try:
-                try:
-                    with console.stage("starting workers"), stop.at_once():
-                        engine = make_engine(config, spec.tasks, history, state, load, session)
-                except KeyboardInterrupt:
-                    resuming.raise_if_stopped(stop, directory)
-                    raise
+                with console.stage("starting workers"), stop.at_once():
+                    engine = make_engine(config, spec.tasks, history, state, load, session)
                 with contextlib.closing(engine):
                     loop = Loop(config, directory, console, log, engine, spec.tasks, times, stop)
                     return loop.run(state)
@@ -263,9 +259,9 @@ def execute(
                 if not isinstance(loss, WorkerError):
                     raise
                 times.clock.enter(RECOVERY)
-                resuming.raise_if_stopped(stop, directory)
+                stop.check()
                 checkpoint = recovery.next(directory / layout.CHECKPOINTS, console, loss, times.furthest)
-                resuming.raise_if_stopped(stop, directory)
+                stop.check()
                 layout.go_back_to(checkpoint)
                 config = resuming.continued(config, directory, checkpoint)
 

@@ -263,7 +263,7 @@ class RolloutRunner:
             builder = self._builder(plan, observation)
             builder.restore(saved["builder"])
             latest = builder.latest
-            if not all(np.array_equal(observation.get(key), value) for key, value in latest.items()):
+            if not all(np.array_equal(observation[key], latest[key]) for key in latest):
                 raise RuntimeError(
                     f"{plan.task} with seed {plan.seed} does not show again what it had shown after "
                     f"{len(saved['chunks'])} decisions, so its episodes cannot be resumed in the middle; "

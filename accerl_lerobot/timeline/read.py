@@ -280,7 +280,9 @@ def draw(path: Path, parts: Sequence[tuple[Timeline, Window]]) -> None:
     axes = figure.subplots(len(parts), squeeze=False, sharex=True, height_ratios=heights)[:, 0]
     seen = np.zeros(len(STATES))
     for ax, (timeline, (start, end)) in zip(axes, parts, strict=True):
-        shares = np.stack([columns(row, start, end) for row in timeline.rows])
+        edges = np.linspace(1e9 * start, 1e9 * end, COLUMNS + 1)
+        # (rows, columns, states), of each column's time; 0 where the worker is absent
+        shares = np.stack([np.diff(row.until(edges), axis=0) for row in timeline.rows]) / np.diff(edges)[0]
         seen += shares.sum(axis=(0, 1))
         image = np.clip(shares @ colours + 1 - shares.sum(axis=2, keepdims=True), 0, 1)
         extent = (0, end - start, len(shares), 0)
@@ -297,10 +299,3 @@ def draw(path: Path, parts: Sequence[tuple[Timeline, Window]]) -> None:
     handles = [Patch(color=COLOURS[STATES[i]], label=STATES[i]) for i in np.flatnonzero(seen)]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles) or 1, frameon=False)
     figure.savefig(path)
-
-
-def columns(row: Row, start: float, end: float) -> np.ndarray:
-    """Share of each state in each column of the picture, (columns, states); 0 where the worker is absent."""
-    edges = np.linspace(1e9 * start, 1e9 * end, COLUMNS + 1)
-    shares: np.ndarray = np.diff(row.until(edges), axis=0) / np.diff(edges)[:, None]
-    return shares

@@ -24,6 +24,7 @@ import secrets
 import select
 import socket
 import struct
+import sys
 import time
 from collections.abc import Awaitable, Callable
 from pathlib import Path
@@ -43,15 +44,9 @@ _TOKEN = struct.Struct("<BIQQQd")
 ASK, ANSWER, FAIL = range(3)  # purpose of a token
 
 
-@functools.cache
 def available() -> bool:
-    try:
-        os.close(os.memfd_create("accerl"))
-        select.epoll().close()
-        os.close(os.eventfd(0))
-    except (AttributeError, OSError):
-        return False
-    return True
+    """True on Linux, which has memfd, epoll, eventfd and sockets that only have a name."""
+    return sys.platform == "linux"
 
 
 def new_name() -> str:
@@ -87,19 +82,15 @@ class Token(NamedTuple):
     sent: float  # on `time.monotonic`
 
 
-class Slot:
-    """Mapped shared memory, which lasts as long as something refers to it or a view of it."""
-
-    def __init__(self, file: int) -> None:
-        self.size = os.fstat(file).st_size
-        self.memory = mmap.mmap(file, self.size)
+Slot = mmap.mmap
+"""Mapped shared memory, which lasts as long as something refers to it or a view of it."""
 
 
 def new_slot(size: int) -> tuple[Slot, int]:
     """A slot of at least `size` bytes, and its file descriptor; what is not written to takes no memory."""
     file = os.memfd_create("accerl", os.MFD_CLOEXEC)
     os.ftruncate(file, max(LEAST, 1 << (size - 1).bit_length()))
-    return Slot(file), file
+    return Slot(file, 0), file
 
 
 def send_token(connection: socket.socket, token: Token, file: int | None = None) -> None:
@@ -120,7 +111,7 @@ def receive_token(connection: socket.socket) -> tuple[Token, Slot | None] | None
         return None
     slot = None
     if files:
-        slot = Slot(files[0])
+        slot = Slot(files[0], 0)
         os.close(files[0])
     return Token._make(_TOKEN.unpack(packet)), slot
 
@@ -157,10 +148,10 @@ class SharedMemoryClient(Client):
         if not self._free and len(self._slots) == SLOTS:
             raise TimeoutError(f"{self.name}: none of {SLOTS} messages under way has been answered")
         index = self._free.pop() if self._free else len(self._slots)
-        if index == len(self._slots) or self._slots[index].size < encoded.size:
+        if index == len(self._slots) or len(self._slots[index]) < encoded.size:
             slot, file = new_slot(encoded.size + LEAST)
             self._slots[index : index + 1] = [slot]
-        encoded.write(self._slots[index].memory, 0)
+        encoded.write(self._slots[index], 0)
         self._sent += 1
         self._under_way[self._sent] = index
         try:
@@ -194,7 +185,7 @@ class SharedMemoryClient(Client):
         if slot is not None:
             self._slots[index] = slot
         self._free.append(index)
-        reply = decode(self._slots[index].memory, token.start)
+        reply = decode(self._slots[index], token.start)
         if token.purpose == FAIL:
             raise ServiceStoppedError(f"{self.name}: {reply}")
         return token.ticket, reply
@@ -300,7 +291,7 @@ class SharedMemoryServer(Server):
         token, slot = packet
         if slot is not None:
             connection.slots[token.slot] = slot
-        message = decode(connection.slots[token.slot].memory, token.start, copy=self._copy)
+        message = decode(connection.slots[token.slot], token.start, copy=self._copy)
         reply = functools.partial(self._reply, connection, token)
         sent = min(token.sent, time.monotonic())
         received.append(PendingRequest(message, sent, lambda: connection.closed, reply))
@@ -310,10 +301,10 @@ class SharedMemoryServer(Server):
         purpose = ANSWER if error is None else FAIL
         encoded = encode(reply if error is None else str(stopped(error)))
         start, file = aligned(asked.start + asked.size), None
-        if start + encoded.size > to.slots[asked.slot].size:
+        if start + encoded.size > len(to.slots[asked.slot]):
             to.slots[asked.slot], file = new_slot(start + encoded.size)
             start = 0
-        encoded.write(to.slots[asked.slot].memory, start)
+        encoded.write(to.slots[asked.slot], start)
         token = Token(purpose, asked.slot, asked.ticket, start, encoded.size, asked.sent)
         try:
             send_token(to.socket, token, file)
