@@ -168,6 +168,7 @@ class Counters:
     dropped_nonfinite: int = 0  # decisions thrown away because the world returned NaN or infinity
 
 
+@dataclass(eq=False)
 class RolloutRunner:
     """Drives a set of worlds, one per slot, through planned episodes.
 
@@ -176,24 +177,20 @@ class RolloutRunner:
     finished segments of exploring episodes, `on_episode` every finished episode.
     """
 
-    def __init__(
-        self,
-        worlds: Sequence[World],
-        next_plan: Callable[[], EpisodePlan | None],
-        config: RolloutConfig,
-        name: str,
-        on_segment: Callable[[Segment], object],
-        on_episode: Callable[[EpisodeResult], object],
-    ) -> None:
-        self.config, self.name = config, name
+    worlds: Sequence[World]
+    next_plan: Callable[[], EpisodePlan | None]
+    config: RolloutConfig
+    name: str
+    on_segment: Callable[[Segment], object]
+    on_episode: Callable[[EpisodeResult], object]
+
+    def __post_init__(self) -> None:
         self.counters = Counters()
-        self._worlds = list(worlds)
-        self._episodes: list[ActiveEpisode | None] = [None] * len(worlds)
-        self._next_plan, self._on_segment, self._on_episode = next_plan, on_segment, on_episode
+        self._episodes: list[ActiveEpisode | None] = [None] * len(self.worlds)
         self._sequence = 0
 
     def __len__(self) -> int:
-        return len(self._worlds)
+        return len(self.worlds)
 
     @property
     def exploring(self) -> bool:
@@ -201,11 +198,11 @@ class RolloutRunner:
 
     def start(self, slot: int) -> Request | None:
         """Begins the next planned episode in `slot`; None when nothing is planned."""
-        plan = self._next_plan()
+        plan = self.next_plan()
         if plan is None:
             self._episodes[slot] = None
             return None
-        observation = self._worlds[slot].reset(plan.seed, plan.task)
+        observation = self.worlds[slot].reset(plan.seed, plan.task)
         if not _finite(observation):
             raise RuntimeError(f"{plan.task} with seed {plan.seed}: the first observation is not finite")
         self._episodes[slot] = ActiveEpisode(plan, self._builder(plan, observation))
@@ -213,7 +210,7 @@ class RolloutRunner:
 
     def advance(self, slot: int, decision: Decision) -> Request | None:
         """Executes `decision`; the request is about the same episode, or the first of the next one."""
-        world, episode = self._worlds[slot], self._episodes[slot]
+        world, episode = self.worlds[slot], self._episodes[slot]
         assert episode is not None
         result = _execute(world, episode, decision.chunk)
         episode.chunks.append(decision.chunk)
@@ -253,7 +250,7 @@ class RolloutRunner:
     def restore(self, state: dict[str, Any]) -> None:
         """Resumes from `state`: worlds are brought back by doing again what was done in them."""
         self.counters, self._sequence = state["counters"], state["sequence"]
-        for slot, (world, saved) in enumerate(zip(self._worlds, state["episodes"], strict=True)):
+        for slot, (world, saved) in enumerate(zip(self.worlds, state["episodes"], strict=True)):
             if saved is None:
                 continue
             plan: EpisodePlan = saved["plan"]
@@ -272,7 +269,7 @@ class RolloutRunner:
             self._episodes[slot] = ActiveEpisode(**saved | {"builder": builder})
 
     def close(self) -> None:
-        for world in self._worlds:
+        for world in self.worlds:
             world.close()
 
     def _builder(self, plan: EpisodePlan, observation: Observation) -> SegmentBuilder:
@@ -286,7 +283,7 @@ class RolloutRunner:
         key = f"{self.name}.{self._sequence}"
         segment = episode.builder.cut(key, result.done, result.success, totals if result.done else None)
         if episode.plan.explore:
-            self._on_segment(segment)
+            self.on_segment(segment)
 
     def _finish(self, episode: ActiveEpisode, success: bool) -> None:
         self.counters.episodes += 1
@@ -300,7 +297,7 @@ class RolloutRunner:
             versions=(min(versions), max(versions)),
             frames=episode.frames,
         )
-        self._on_episode(result)
+        self.on_episode(result)
 
 
 def _execute(world: World, episode: ActiveEpisode, actions: np.ndarray) -> ChunkResult:
