@@ -9,6 +9,7 @@ is waited for without a word.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import importlib.metadata
 import logging
@@ -21,7 +22,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from accerl_lerobot.engine.ray_session import FIELD, start_ray
+from accerl_lerobot.engine.ray_session import FIELD, RaySession
 from accerl_lerobot.engine.stopping import WorkerError
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.metrics import numbered
@@ -206,16 +207,9 @@ def place_workers(config: RunConfig) -> Plan:
 
 def rehearse(config: RunConfig) -> list[str]:
     """The plan as lines, of a run that joins a cluster; leaves it as it was."""
-    import ray
-
-    joined = ray.is_initialized()
-    if not joined:
-        start_ray(config.launch)
-    try:
+    with contextlib.closing(RaySession(config.launch)) as session:
+        session.start()
         return list(place_workers(config).rows())
-    finally:
-        if not joined:
-            ray.shutdown()
 
 
 def actor_options(place: Place) -> dict[str, Any]:

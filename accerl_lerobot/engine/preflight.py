@@ -97,7 +97,11 @@ def check_start(config: RunConfig, say: Callable[[str], object] = str) -> int:
     spec = check_world(config.env, config.rollout.reward_model)
     off_policy = isinstance(config.algorithm, OffPolicyConfig)
     if off_policy:
-        _check_off_policy(config, spec, policy)
+        check_imitates(config.algorithm, config.policy, policy)
+        decisions = math.ceil(spec.max_steps / getattr(policy, "n_action_steps", 1))
+        if config.rollout.segment_length < decisions:
+            why = f"algorithm.type={config.algorithm.type} looks at whole episodes; use at least {decisions}"
+            raise InputError("rollout.segment_length", config.rollout.segment_length, why)
     renames, offered = config.policy.rename_map, env_features(spec)
     if config.policy.path is not None:
         check_features(policy_features(policy), offered, renames, "policy.path", config.policy.path)
@@ -197,14 +201,6 @@ def check_imitates(algorithm: AlgorithmConfig, config: PolicyConfig, policy: Any
     if getattr(policy, "use_relative_actions", False):
         remedy = f"algorithm.type={algorithm.type} keeps actions without the state they refer to"
         raise InputError("policy.use_relative_actions", True, f"{remedy}; use another algorithm.type")
-
-
-def _check_off_policy(config: RunConfig, spec: WorldSpec, policy: Any) -> None:
-    check_imitates(config.algorithm, config.policy, policy)
-    decisions = math.ceil(spec.max_steps / getattr(policy, "n_action_steps", 1))
-    if config.rollout.segment_length < decisions:
-        remedy = f"algorithm.type={config.algorithm.type} looks at whole episodes; use at least {decisions}"
-        raise InputError("rollout.segment_length", config.rollout.segment_length, remedy)
 
 
 def policy_to_be(config: RunConfig) -> Any:

@@ -49,20 +49,9 @@ def available() -> bool:
     return sys.platform == "linux"
 
 
-def new_name() -> str:
-    return f"accerl-{secrets.token_hex(16)}"
-
-
 def new_socket() -> socket.socket:
     """A socket whose messages keep their borders and order, and can carry file descriptors."""
     return socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-
-
-def listening(name: str, backlog: int) -> socket.socket:
-    listener = new_socket()
-    listener.bind(f"\0{name}")
-    listener.listen(backlog)
-    return listener
 
 
 def same_user(connection: socket.socket) -> bool:
@@ -225,8 +214,10 @@ class SharedMemoryServer(Server):
     def __init__(self, take: Callable[[PendingRequest], None], *, copy: bool) -> None:
         super().__init__(take)
         self._copy = copy
-        self.address = Address(this_node(), new_name())
-        self._listener = listening(self.address.name, SLOTS)
+        self.address = Address(this_node(), f"accerl-{secrets.token_hex(16)}")  # which nobody can guess
+        self._listener = new_socket()
+        self._listener.bind(f"\0{self.address.name}")
+        self._listener.listen(SLOTS)
         self._listener.setblocking(False)
         self._event = open(os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK), "rb+", buffering=0)  # noqa: SIM115
         self._epoll = select.epoll()
