@@ -198,16 +198,8 @@ def test_a_rollout_worker_that_fails_to_report_is_replaced(engine, monkeypatch: 
 
 
 def lose_inference(one: RayEngine, how: Callable[[str], object], name: str = "inference") -> list[Progress]:
-    """Nothing is lost or doubled, nobody else is to blame, and no version is older than one before.
-
-    Args:
-        one: an engine that nobody has asked for anything yet.
-        how: what is done to the service.
-        name: of the service.
-
-    Returns:
-        What was reported while it was away.
-    """
+    """Nothing is lost or doubled, nobody else is to blame, and no version is older than one before; what was
+    reported while the service was away."""
     one.train()
     updates: list[float] = []
     results: list[EpisodeResult] = []
