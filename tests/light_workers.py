@@ -66,10 +66,8 @@ def light_engine(light_ray: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[C
 
 
 NO_WEIGHTS = "a path without weights"
-HANGS = "hangs"
-"""A folder that whoever writes into it hangs."""
-FULL = "full"
-"""A folder that nothing can be written into."""
+HANGS = "hangs"  # a folder that whoever writes into it hangs
+FULL = "full"  # a folder that nothing can be written into
 
 
 class LightInference:
@@ -137,8 +135,7 @@ class LightTrainer:
         self._failure: str | None = None
         self._idle = False
         self._publishing = threading.Event()
-        self._ledger: list[dict[str, int]] = []
-        """Keys of each update's segments, and their decisions."""
+        self._ledger: list[dict[str, int]] = []  # keys of each update's segments, and their decisions
         if state is not None:
             self._ledger = snapshot.load(state / "trainer")["ledger"]
 

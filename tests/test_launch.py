@@ -40,8 +40,7 @@ class Story:
     before: list[EpisodeResult] = field(default_factory=list)
     after: list[EpisodeResult] = field(default_factory=list)
     history: list[Progress] = field(default_factory=list)
-    saved: int = -1
-    """Version saved in the middle of training."""
+    saved: int = -1  # version saved in the middle of training
     pids: set[int] = field(default_factory=set)
 
     @property

@@ -9,8 +9,7 @@ from pathlib import Path
 from accerl_lerobot.timeline import TIMELINE, Clock, Moment
 
 SECOND = 10**9
-UP = 10**15
-"""The monotonic clock's time when a test begins; the calendar shows twice that."""
+UP = 10**15  # the monotonic clock's time when a test begins; the calendar shows twice that
 
 
 class Hands:
