@@ -12,8 +12,7 @@ from contextlib import contextmanager
 from rich.console import Console as RichConsole
 from rich.progress import BarColumn, Progress, Task, TextColumn, TimeElapsedColumn
 
-PLAIN_EVERY_S = 15.0
-"""Seconds between two lines of one stage when the output is not a terminal."""
+PLAIN_EVERY_S = 15.0  # seconds between two lines of one stage when the output is not a terminal
 
 
 class Stage:

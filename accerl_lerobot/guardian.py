@@ -31,8 +31,7 @@ MARK = "ACCERL_GUARDED_BY"
 """Environment variable of guarded processes: the identities of their guardians, outermost first."""
 LOOK_S = 1.0
 """Seconds between two looks at whether the parent is still there, where a fork of it keeps the pipe open."""
-END_S = 10.0
-"""Longest time for ending all processes."""
+END_S = 10.0  # longest time for ending all processes
 SELF_ENDING = ("multiprocessing.resource_tracker", "accerl_lerobot/guardian.py")
 """Words of the command lines of processes that clean up and then end by themselves."""
 

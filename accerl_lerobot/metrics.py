@@ -21,8 +21,7 @@ import numpy as np
 from accerl_lerobot.config.ranges import Section
 from accerl_lerobot.fault_points import fault_point
 
-METRICS = "metrics.jsonl"
-"""Name of the file in a run's folder."""
+METRICS = "metrics.jsonl"  # name of the file in a run's folder
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,14 +38,11 @@ class MetricsLog:
     """Appends records to files in a run's folder; `close` flushes them. wandb is given the run's config."""
 
     def __init__(self, directory: Path, wandb: WandBConfig, config: dict[str, Any]) -> None:
-        from tensorboard.compat.proto.event_pb2 import Event, SessionLog
-        from tensorboard.compat.proto.summary_pb2 import Summary
-        from tensorboard.summary.writer.event_file_writer import EventFileWriter
+        from torch.utils.tensorboard import SummaryWriter
 
-        self._event, self._session, self._summary = Event, SessionLog, Summary
         self._path = directory / METRICS
         self._file = self._path.open("a", buffering=1)
-        self._board = EventFileWriter(str(directory / "tensorboard"))
+        self._board = SummaryWriter(directory / "tensorboard")
         self._started = time.monotonic()
         self._wandb = None
         if wandb.enable:
@@ -67,7 +63,6 @@ class MetricsLog:
 
     @property
     def wall_s(self) -> float:
-        """Seconds since this log was opened."""
         return time.monotonic() - self._started
 
     def write(self, kind: str, update: int, values: dict[str, Any]) -> None:
@@ -81,10 +76,8 @@ class MetricsLog:
         fault_point("driver.metrics")
         self._file.write(json.dumps(record) + "\n")
         scalars = {k: float(v) for k, v in finite.items() if isinstance(v, (int, float))}
-        summary = self._summary(
-            value=[self._summary.Value(tag=f"{kind}/{k}", simple_value=v) for k, v in scalars.items()]
-        )
-        self._board.add_event(self._event(wall_time=time.time(), step=update, summary=summary))
+        for name, value in scalars.items():
+            self._board.add_scalar(f"{kind}/{name}", value, update)
         if self._wandb is not None:
             self._wandb.log({f"{kind}/{k}": v for k, v in scalars.items()} | {"update": update})
 
@@ -98,12 +91,11 @@ class MetricsLog:
         """Goes on from what `state` gave, after `update` updates: what was written since is about others."""
         cut_back(self._path, state["bytes"])
         # TensorBoard forgets what older files have of this step and later ones.
-        begun = self._session(status=self._session.START)
-        self._board.add_event(self._event(wall_time=time.time(), step=update + 1, session_log=begun))
+        self._board.close()
+        self._board = type(self._board)(self._board.log_dir, purge_step=update + 1)
         self._started = time.monotonic() - state["wall_s"]
 
     def close(self) -> None:
-        """Flushes and closes everything."""
         self._file.close()
         self._board.close()
         if self._wandb is not None:

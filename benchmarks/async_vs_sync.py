@@ -22,13 +22,13 @@ from rich.console import Group
 
 from accerl_lerobot.bench import as_table, host, ranged, spread
 from accerl_lerobot.bench.latency import TRACE
-from accerl_lerobot.bench.throughput import ARMS, MOST_BUSY, Block
+from accerl_lerobot.bench.throughput import ARMS, Block
 from accerl_lerobot.config.ranges import Positive, Range, Repeats, Seed, Steps
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError, output_folder
 from accerl_lerobot.evaluation import Rate, drawing, evaluation_plans
 from accerl_lerobot.replay.pacing import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, Schedule
-from benchmarks.machinery import MachineryConfig
+from benchmarks.machinery import MOST_BUSY, MachineryConfig
 from benchmarks.records import as_markdown, write
 from benchmarks.simulated_world import read_trace
 

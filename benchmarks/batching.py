@@ -8,20 +8,18 @@ back in one run.
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import asdict, dataclass, replace
 from typing import Annotated, Any
 
 from rich.table import Table
 
 from accerl_lerobot.bench import as_table, host, ranged, spread
-from accerl_lerobot.bench.throughput import MOST_BUSY
+from accerl_lerobot.bench.throughput import Measured
 from accerl_lerobot.config.ranges import NonNegative, Positive, Range, Repeats
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError, output_folder
-from accerl_lerobot.inference.batcher import quantile
 from accerl_lerobot.replay.pacing import ASYNCHRONOUS
-from benchmarks.machinery import MachineryConfig
+from benchmarks.machinery import MOST_BUSY, MachineryConfig
 from benchmarks.records import as_markdown, write
 from benchmarks.simulated_world import read_trace
 
@@ -53,7 +51,7 @@ def bench_batching(config: BenchBatchingConfig) -> dict[str, Any]:
     """Measures all rules.
 
     Returns:
-        ``rules``: for each, decisions per second, waits in milliseconds, the batches' sizes and how busy the
+        ``rules``: for each, decisions per second, mean wait in milliseconds, mean batch size and how busy the
         service was; ``config`` and ``host``.
     """
     if config.latency_trace is not None:
@@ -77,14 +75,12 @@ def bench_batching(config: BenchBatchingConfig) -> dict[str, Any]:
 
 def summed(turns: list[dict[str, Any]]) -> dict[str, Any]:
     """Sums the turns of one rule: see `bench_batching`."""
-    waits = sum((Counter(turn["waits"]) for turn in turns), Counter())
-    sizes = sum((Counter(turn["sizes"]) for turn in turns), Counter())
+    batches = sum(turn["batches"] for turn in turns)
+    observations = sum(turn["observations"] for turn in turns)
     return {
         "decisions_per_s": spread([rate for turn in turns for rate in turn["decisions_per_s"]]),
-        "wait_p50_ms": 1000 * quantile(waits, 0.5),
-        "wait_p99_ms": 1000 * quantile(waits, 0.99),
-        "batch_size": sum(size * n for size, n in sizes.items()) / sizes.total(),
-        "batch_sizes": dict(sorted(sizes.items())),
+        "wait_mean_ms": 1000 * sum(turn["waited_s"] for turn in turns) / observations,
+        "batch_size": observations / batches,
         "inference_busy": sum(turn["inference_busy"] for turn in turns) / len(turns),
         "processor_bound": max(turn["processors"] for turn in turns) > MOST_BUSY,
     }
@@ -98,23 +94,30 @@ def table(result: dict[str, Any]) -> Table:
 def _measure(rule: BenchBatchingConfig, seconds: float, count: int) -> dict[str, Any]:
     with rule.open() as engine:
         engine.block(ASYNCHRONOUS, 0.0)  # what begins is not counted
-        before = engine.engine.batching()
+        before = _totals(engine)
         blocks = [engine.block(ASYNCHRONOUS, seconds) for _ in range(count)]
-        after = engine.engine.batching()
+        after = _totals(engine)
     return {
         "decisions_per_s": [block.decisions_per_s for block in blocks],
-        "waits": after.waits - before.waits,
-        "sizes": Counter(after.batch_sizes) - Counter(before.batch_sizes),
+        **{name: after[name] - before[name] for name in after},
         "inference_busy": sum(block.inference_busy for block in blocks) / count,
         "processors": max(block.processors for block in blocks),
     }
+
+
+def _totals(engine: Measured) -> dict[str, float]:
+    """Batches so far, observations in them, and how long these had waited; a request has one of them."""
+    metrics = engine.engine.poll().inference
+    observations = metrics["batches"] * metrics["batch_size_mean"]
+    waited_s = observations * metrics["wait_mean_s"]
+    return {"batches": metrics["batches"], "observations": observations, "waited_s": waited_s}
 
 
 def _name(wait_ms: float) -> str:
     return f"at most {wait_ms:g} ms" if wait_ms else "as they come"
 
 
-_COLUMNS = ("rule", "decisions/s", "batch", "wait p50", "wait p99", "service busy", "")
+_COLUMNS = ("rule", "decisions/s", "batch", "mean wait", "service busy", "")
 
 
 def _rows(result: dict[str, Any]) -> list[list[str]]:
@@ -123,8 +126,7 @@ def _rows(result: dict[str, Any]) -> list[list[str]]:
             name,
             ranged(found["decisions_per_s"], ".0f"),
             f"{found['batch_size']:.1f}",
-            f"{found['wait_p50_ms']:.1f} ms",
-            f"{found['wait_p99_ms']:.1f} ms",
+            f"{found['wait_mean_ms']:.1f} ms",
             f"{found['inference_busy']:.0%}",
             "processors busy" if found["processor_bound"] else "",
         ]

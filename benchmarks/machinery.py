@@ -28,6 +28,8 @@ from benchmarks.simulated_world import LatencyConfig, read_trace
 
 EPISODE = 16
 """Decisions of an episode."""
+MOST_BUSY = 0.6
+"""Share of all cores above which the processors, and not what is slept, may be what is measured."""
 CHUNK = 4
 
 

@@ -16,12 +16,12 @@ from typing import Annotated, Any
 from rich.table import Table
 
 from accerl_lerobot.bench import as_table, host, ranged, spread
-from accerl_lerobot.bench.throughput import MOST_BUSY, Block
+from accerl_lerobot.bench.throughput import Block
 from accerl_lerobot.config.ranges import NonNegative, Positive, Range, Repeats
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError, output_folder
 from accerl_lerobot.replay.pacing import ASYNCHRONOUS
-from benchmarks.machinery import MachineryConfig
+from benchmarks.machinery import MOST_BUSY, MachineryConfig
 from benchmarks.records import as_markdown, write
 from benchmarks.simulated_world import read_trace
 

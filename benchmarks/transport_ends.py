@@ -8,6 +8,7 @@ a lower priority than others have, which on a busy machine is most of what a cal
 from __future__ import annotations
 
 import mmap
+import secrets
 import socket
 import threading
 import time
@@ -20,13 +21,7 @@ from accerl_lerobot.engine.ray_session import start_ray
 from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.transport.contract import Client
 from accerl_lerobot.transport.endpoint import Endpoint
-from accerl_lerobot.transport.shared_memory import (
-    Address,
-    SharedMemoryServer,
-    listening,
-    new_name,
-    new_socket,
-)
+from accerl_lerobot.transport.shared_memory import Address, SharedMemoryServer, new_socket
 from benchmarks.transport import RAY, SHARED_MEMORY, SLOT, decision, request_of
 
 LONG_S = 120.0
@@ -56,8 +51,9 @@ class Answering:
 
     async def floor(self) -> str:
         """Name of a socket that sends bytes back."""
-        name = new_name()
-        listener = listening(name, 1)
+        name, listener = secrets.token_hex(16), new_socket()
+        listener.bind(f"\0{name}")
+        listener.listen(1)
 
         def serve() -> None:
             token, _ = listener.accept()

@@ -9,9 +9,9 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -19,12 +19,15 @@ import pytest
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE
 from accerl_lerobot.experience import Decision, Request
-from accerl_lerobot.inference.batcher import BatcherStats
+from accerl_lerobot.inference.batcher import Batcher
 from accerl_lerobot.rollout.worker import Report, RolloutWorker
 from accerl_lerobot.trainer.peers import LearnerSettings
 from accerl_lerobot.transport.endpoint import Endpoint
 from accerl_lerobot.transport.shared_memory import Address, serve_on_loop
 from accerl_lerobot.transport.weights import WeightPublisher, WeightUpdate
+
+if TYPE_CHECKING:
+    from accerl_lerobot.engine.launch import RayEngine
 
 
 @pytest.fixture(scope="session")
@@ -40,11 +43,31 @@ def light_ray() -> Iterator[None]:
     ray.shutdown()
 
 
+@pytest.fixture
+def light_engine(light_ray: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., RayEngine]]:
+    """Makes asynchronous engines with stand-ins for inference and trainer, and closes them."""
+    from accerl_lerobot.engine import launch
+    from accerl_lerobot.inference import worker as inference
+    from accerl_lerobot.trainer import worker as trainer
+    from tests.runs import tiny_run
+
+    monkeypatch.setattr(launch, "POLL_S", 0.05)
+    monkeypatch.setattr(inference, "InferenceWorker", LightInference)
+    monkeypatch.setattr(trainer, "TrainerWorker", LightTrainer)
+    made: list[RayEngine] = []
+
+    def make(state: Path | None = None, **sections: Any) -> RayEngine:
+        made.append(launch.RayEngine(tiny_run(Path("nowhere"), **sections), ("match",), state=state))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.close()
+
+
 NO_WEIGHTS = "a path without weights"
-HANGS = "hangs"
-"""A folder that whoever writes into it hangs."""
-FULL = "full"
-"""A folder that nothing can be written into."""
+HANGS = "hangs"  # a folder that whoever writes into it hangs
+FULL = "full"  # a folder that nothing can be written into
 
 
 class LightInference:
@@ -61,12 +84,12 @@ class LightInference:
         await self._broken
 
     async def listen(self) -> Address:
-        return serve_on_loop(self.decide).address
+        return serve_on_loop(self.receive).address
 
     async def fail(self) -> None:
         self._broken.set_exception(ArithmeticError("the forward pass fell over"))
 
-    async def decide(self, message: list[Request] | WeightUpdate) -> list[Decision] | None:
+    async def receive(self, message: list[Request] | WeightUpdate) -> list[Decision] | None:
         from accerl_lerobot.transport.contract import ServiceStoppedError
 
         if self._broken.done():
@@ -78,7 +101,7 @@ class LightInference:
 
     async def metrics(self) -> dict[str, float]:
         others = dict.fromkeys(("busy_share", "swap_s", "publish_to_served_s"), 0.0)
-        return BatcherStats().metrics() | others | {"version": float(self._version)}
+        return Batcher(1, 0.0).metrics() | others | {"version": float(self._version)}
 
 
 def _decision(request: Request, version: int) -> Decision:
@@ -112,8 +135,7 @@ class LightTrainer:
         self._failure: str | None = None
         self._idle = False
         self._publishing = threading.Event()
-        self._ledger: list[dict[str, int]] = []
-        """Keys of each update's segments, and their decisions."""
+        self._ledger: list[dict[str, int]] = []  # keys of each update's segments, and their decisions
         if state is not None:
             self._ledger = snapshot.load(state / "trainer")["ledger"]
 

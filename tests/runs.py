@@ -90,6 +90,16 @@ def drive(engine: Engine) -> list[Progress]:
     return history
 
 
+def until(engine: Engine, version: int) -> list[Progress]:
+    """Polls until so many updates have been made; everything that was reported."""
+    history: list[Progress] = []
+    for progress in polls(engine):
+        history.append(progress)
+        if progress.version >= version:
+            break
+    return history
+
+
 def trained(config: RunConfig, tasks: tuple[str, ...]) -> list[dict[str, float]]:
     """The metrics of all updates of a run, from making its engine to closing it."""
     running = make_engine(config, tasks, history=1)

@@ -45,11 +45,9 @@ class Story:
     saved: Path
     version: int
     updates: list[dict[str, float]]
-    served: int
-    """Version of the weights that inference had."""
+    served: int  # version of the weights that inference had
     error: str
-    addresses: set[str]
-    """At which its processes accepted connections."""
+    addresses: set[str]  # at which its processes accepted connections
 
 
 def probes(updates: list[dict[str, float]]) -> list[float]:

@@ -97,14 +97,8 @@ def test_a_random_policy_learns_the_task(tiny_checkpoint: Path):
 @pytest.mark.slow
 def test_weights_held_back_act_so_many_updates_late(tiny_checkpoint: Path):
     def lags(hold_back: int) -> tuple[list[float], Progress]:
-        trainer = TrainerConfig(
-            updates=14,
-            batch_decisions=16,
-            lr=1e-3,
-            value_warmup_updates=0,
-            hold_back=hold_back,
-            probe_every=4,
-        )
+        fields: dict[str, Any] = {"updates": 14, "batch_decisions": 16, "lr": 1e-3, "value_warmup_updates": 0}
+        trainer = TrainerConfig(**fields, hold_back=hold_back, probe_every=4)
         history, _ = train(tiny_run(tiny_checkpoint, trainer=trainer))
         assert max(u.get("logprob/mismatch_max", 0.0) for u in updates(history)) < 1e-4
         return [u["lag_mean"] for u in updates(history)], history[-1]

@@ -19,7 +19,7 @@ from tensorboard.backend.event_processing.event_file_loader import EventFileLoad
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import RunConfig, parse
 from accerl_lerobot.engine.run import make_engine
-from accerl_lerobot.inference.batcher import BatcherStats
+from accerl_lerobot.inference.batcher import Batcher
 from accerl_lerobot.metrics import MetricsLog, WandBConfig
 from accerl_lerobot.timeline import ROLES, STATES
 
@@ -133,9 +133,9 @@ def test_every_logged_number_is_explained(tiny_checkpoint: Path) -> None:
     assert explained("train") == (told - {"update"}) | with_ray
     rollout = progress.rollout.keys() | {f"replay_{k}" for k in progress.replay}
     of_weights = ("version", "swap_s", "publish_to_served_s")
-    rollout |= {f"inference_{k}" for k in (*BatcherStats().metrics(), "busy_share", *of_weights)}
+    rollout |= {f"inference_{k}" for k in (*Batcher(1, 0.0).metrics(), "busy_share", *of_weights)}
     ends = ("s", "_return", "_steps", "_decisions", "_success")
-    rollout |= {"restarts", "moved", "inference_restarts", "success_exploring"}
+    rollout |= {"restarts", "inference_restarts", "success_exploring"}
     rollout |= {"replay_insert_wait_s", "replay_sample_wait_s"}
     assert explained("rollout") == rollout | {f"replay_episode{end}" for end in ends}
 

@@ -16,7 +16,6 @@ from accerl_lerobot.engine import placement
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig
 from accerl_lerobot.engine.placement import Node, Plan, plan_workers
 from accerl_lerobot.engine.run import execute
-from accerl_lerobot.engine.stopping import WorkerError
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.policies.config import PolicyConfig
@@ -139,19 +138,6 @@ def test_what_has_a_network_stays_where_the_files_are():
 def test_cuda_is_not_looked_for_on_nodes_without():
     with pytest.raises(InputError, match=r"policy\.device='cuda': there is no GPU on node 1"):
         plan_workers(cluster((8, 1), (8, 0)), run(device="cuda", inference="1"))
-
-
-def test_a_rollout_worker_whose_node_has_left_goes_to_one_that_is_there():
-    plan = plan_workers(cluster((64, 0), (8, 0), (8, 0)), run(rollouts=24, rollout="all"))
-    assert rollouts_by_node(plan) == {0: 20, 1: 2, 2: 2}
-    left = frozenset({"key0", "key1"})
-    for name in [n for n, place in plan.places.items() if place.node.number == 2]:
-        plan = plan.moved(name, left)
-    assert rollouts_by_node(plan) == {0: 22, 1: 2}
-    moved = next(name for name, place in plan.places.items() if place.node.number == 1)
-    assert plan.moved(moved, frozenset({"key0"})).places[moved].node.number == 0
-    with pytest.raises(WorkerError, match="rollout 1 worker is lost, and no node is left"):
-        plan.moved("rollout 1", frozenset())  # a worker's loss may be noticed before its node's
 
 
 @pytest.mark.parametrize(

@@ -247,8 +247,8 @@ def test_a_ray_that_others_could_talk_to_is_not_started():
 class Stand:
     """Stands in for `ray`, and counts."""
 
-    def __init__(self, there: bool = False, failures: int = 0) -> None:
-        self.there, self.failures, self.calls = there, failures, list[str]()
+    def __init__(self, failures: int = 0) -> None:
+        self.there, self.failures, self.calls = False, failures, list[str]()
 
     def is_initialized(self) -> bool:
         return self.there
@@ -271,10 +271,15 @@ def hidden(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ray_session, "ray_processes", dict)
 
 
-def test_it_is_kept_for_those_who_come_later(hidden: None, monkeypatch: pytest.MonkeyPatch):
+@pytest.fixture
+def stand(hidden: None, monkeypatch: pytest.MonkeyPatch) -> Stand:
     stand = Stand()
     monkeypatch.setitem(sys.modules, "ray", stand)
     monkeypatch.setattr(ray_session, "start_ray", stand.init)
+    return stand
+
+
+def test_it_is_kept_for_those_who_come_later(stand: Stand):
     own = RaySession(LaunchConfig())
     own.start()
     own.start()
@@ -283,10 +288,8 @@ def test_it_is_kept_for_those_who_come_later(hidden: None, monkeypatch: pytest.M
     assert stand.calls == ["init", "shutdown"] and not stand.there
 
 
-def test_one_that_was_there_before_is_left_as_it_is(hidden: None, monkeypatch: pytest.MonkeyPatch):
-    stand = Stand(there=True)
-    monkeypatch.setitem(sys.modules, "ray", stand)
-    monkeypatch.setattr(ray_session, "start_ray", stand.init)
+def test_one_that_was_there_before_is_left_as_it_is(stand: Stand):
+    stand.there = True
     own = RaySession(LaunchConfig())
     own.start()
     own.close()
@@ -305,11 +308,8 @@ def raylet(monkeypatch: pytest.MonkeyPatch) -> Iterator[psutil.Process]:
 
 @pytest.mark.parametrize(("number", "how"), [(signal.SIGKILL, "died"), (signal.SIGSTOP, "been stopped for")])
 def test_a_process_of_ray_that_is_lost_is_named_and_a_new_ray_is_started(
-    number: signal.Signals, how: str, raylet: psutil.Process, monkeypatch: pytest.MonkeyPatch
+    stand: Stand, number: signal.Signals, how: str, raylet: psutil.Process, monkeypatch: pytest.MonkeyPatch
 ):
-    stand = Stand()
-    monkeypatch.setitem(sys.modules, "ray", stand)
-    monkeypatch.setattr(ray_session, "start_ray", stand.init)
     own = RaySession(LaunchConfig(stall_s=0.1))
     own.start()
     assert not own.lost

@@ -90,13 +90,7 @@ def go_on(run: Path, *arguments: str, config: str = "config.yaml") -> int:
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
 def test_a_run_that_was_asked_to_stop_goes_on_as_if_it_had_not(
-    number: int,
-    code: int,
-    whole: Path,
-    tiny_checkpoint: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    number: int, code: int, whole: Path, tiny_checkpoint: Path, tmp_path: Path, monkeypatch, capsys
 ):
     run = tmp_path / "run"
     with monkeypatch.context() as context:
@@ -114,11 +108,7 @@ def test_a_run_that_was_asked_to_stop_goes_on_as_if_it_had_not(
 
 
 def test_a_run_that_fell_over_goes_on_from_its_last_whole_checkpoint(
-    whole: Path,
-    tiny_checkpoint: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    whole: Path, tiny_checkpoint: Path, tmp_path: Path, monkeypatch, capsys
 ):
     run = tmp_path / "run"
     poll = LocalEngine.poll

@@ -8,7 +8,7 @@ and replay are real. The run with everything real is in ``test_resume.py``.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,60 +16,32 @@ import pytest
 
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE
-from accerl_lerobot.engine import launch
-from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.launch import RayEngine
 from accerl_lerobot.engine.loop import Progress
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import evaluation_plans
-from accerl_lerobot.inference import worker as inference_worker
 from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
-from accerl_lerobot.trainer import worker as trainer_worker
 from accerl_lerobot.trainer.config import TrainerConfig
 from benchmarks.simulated_world import LatencyConfig
-from tests.light_workers import LightInference, LightTrainer, light_ray
-from tests.runs import drive, polls, tiny_run
+from tests.light_workers import light_engine, light_ray
+from tests.runs import drive, polls, until
 
-__all__ = ["light_ray"]
+__all__ = ["light_engine", "light_ray"]
 
 UPDATES, DURING = 60, 12
 TWO = RolloutConfig(workers=2, worlds=2, segment_length=3)
 
 
 @pytest.fixture
-def engine(light_ray: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., RayEngine]]:
-    monkeypatch.setattr(launch, "POLL_S", 0.05)
-    monkeypatch.setattr(inference_worker, "InferenceWorker", LightInference)
-    monkeypatch.setattr(trainer_worker, "TrainerWorker", LightTrainer)
-    made: list[RayEngine] = []
-
-    def make(state: Path | None = None, **sections: Any) -> RayEngine:
-        made.append(RayEngine(run_of(**sections), ("match",), state=state))
-        return made[-1]
-
-    yield make
-    for one in made:
-        one.close()
-
-
-def run_of(**sections: Any) -> RunConfig:
+def engine(light_engine: Callable[..., RayEngine]) -> Callable[..., RayEngine]:
     defaults: dict[str, Any] = {
         "env": LatencyConfig(max_steps=16, frame_ms=4.0),
         "rollout": TWO,
         "replay": ReplayConfig(capacity=160, min_decisions=16, ahead=48, samples_per_insert=2.0, max_lag=40),
         "trainer": TrainerConfig(updates=UPDATES, batch_decisions=16),
     }
-    return tiny_run(Path("nowhere"), **{**defaults, **sections})
-
-
-def until(one: RayEngine, version: int) -> list[Progress]:
-    history = []
-    for progress in polls(one):
-        history.append(progress)
-        if progress.version >= version:
-            break
-    return history
+    return lambda state=None, **sections: light_engine(state, **{**defaults, **sections})
 
 
 def updates(history: list[Progress]) -> list[float]:

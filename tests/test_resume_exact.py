@@ -22,7 +22,7 @@ from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
-from tests.runs import drive, polls, tiny_run
+from tests.runs import drive, tiny_run, until
 
 CASES: dict[str, dict[str, Any]] = {
     "plain": {},
@@ -58,15 +58,6 @@ def told(history: list[Progress]) -> list[Any]:
     """All that a run says, and nothing of when it was asked."""
     episodes = [(e.plan, e.success, e.episode_return, e.versions) for p in history for e in p.episodes]
     return [[u for p in history for u in p.updates], episodes, history[-1].rollout, history[-1].replay]
-
-
-def until(engine: LocalEngine, version: int) -> list[Progress]:
-    history = []
-    for progress in polls(engine):
-        history.append(progress)
-        if progress.version >= version:
-            break
-    return history
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -16,8 +16,9 @@ from accerl_lerobot.engine.config import LaunchConfig, RunConfig
 from accerl_lerobot.engine.loop import Progress
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import evaluation_plans
+from accerl_lerobot.inference import worker as inference_worker
 from accerl_lerobot.inference.batcher import merge_metrics
-from accerl_lerobot.inference.worker import InferenceConfig
+from accerl_lerobot.inference.worker import InferenceConfig, InferenceWorker
 from accerl_lerobot.replay.pacing import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, ReplayConfig, Turns
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
@@ -105,24 +106,44 @@ def run_of(schedule: Any, updates: int = 6) -> RunConfig:
     )
 
 
-def drive_counting(engine: Any, monkeypatch: pytest.MonkeyPatch) -> tuple[list[Progress], Counter[int]]:
+class CountingInference(InferenceWorker):
+    """Counts batches by their observations."""
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self._sizes: Counter[int] = Counter()
+
+    def _serve_batch(self, batch: list[Any]) -> None:
+        super()._serve_batch(batch)
+        self._sizes[sum(map(len, batch))] += 1
+
+    async def sizes(self) -> Counter[int]:
+        return Counter(self._sizes)
+
+
+@pytest.fixture
+def counted(light_ray: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(launch, "POLL_S", 0.05)
+    monkeypatch.setattr(inference_worker, "InferenceWorker", CountingInference)
+
+
+def drive_counting(engine: Any) -> tuple[list[Progress], Counter[int]]:
     """Trains to the end; all that was reported, and the sizes of batches before the end.
 
     When training has ended nobody waits for the others any more, and until that is noticed there may be any
     number of batches of any size.
     """
-    monkeypatch.setattr(launch, "POLL_S", 0.05)
     history, sizes = [], [Counter[int](), Counter[int]()]
     for progress in polls(engine):
         history.append(progress)
         if progress.done:
             break
-        sizes.append(Counter(engine.batching().batch_sizes))
+        sizes.append(sum((w.call("sizes", timeout=60) for w in engine._inference.workers()), Counter()))
     return history, sizes[-2]  # another look after it has found the run in training
 
 
 @pytest.mark.parametrize("schedule", [SYNCHRONOUS, OVERLAP, ASYNCHRONOUS])
-def test_a_run_in_turn(light_ray: None, schedule: Any, monkeypatch: pytest.MonkeyPatch):
+def test_a_run_in_turn(counted: None, schedule: Any):
     """Episodes of one segment each, of all four worlds: a batch is exactly what they do in one round."""
     from accerl_lerobot.engine.launch import RayEngine
 
@@ -130,7 +151,7 @@ def test_a_run_in_turn(light_ray: None, schedule: Any, monkeypatch: pytest.Monke
     engine = RayEngine(run_of(schedule), ("match",), load=load)
     try:
         engine.train()
-        history, sizes = drive_counting(engine, monkeypatch)
+        history, sizes = drive_counting(engine)
         updates = [update for progress in history for update in progress.updates]
         assert [u["update"] for u in updates] == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
         lags = [u["lag_max"] for u in updates]
@@ -151,7 +172,7 @@ def test_a_run_in_turn(light_ray: None, schedule: Any, monkeypatch: pytest.Monke
 
 
 @pytest.mark.slow
-def test_several_services_share_the_worlds_out(light_ray: None, monkeypatch: pytest.MonkeyPatch):
+def test_several_services_share_the_worlds_out(counted: None):
     from accerl_lerobot.engine.launch import RayEngine
 
     run = run_of(SYNCHRONOUS)
@@ -168,7 +189,7 @@ def test_several_services_share_the_worlds_out(light_ray: None, monkeypatch: pyt
         pids = engine.pids()
         assert len({pids["inference 0"], pids["inference 1"]}) == 2
         engine.train()
-        history, sizes = drive_counting(engine, monkeypatch)
+        history, sizes = drive_counting(engine)
         # Two workers of two worlds ask the first service, one asks the second, each in lock step.
         assert sizes[4] + sizes[2] > 0.9 * sizes.total() >= 10
         # They do not wait for each other: the quicker one may begin the next round before the batch is whole.

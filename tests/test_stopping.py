@@ -11,7 +11,7 @@ import pytest
 
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.resuming import continued
-from accerl_lerobot.engine.stopping import Stopping, arrived, deferred
+from accerl_lerobot.engine.stopping import StoppedError, Stopping, arrived, deferred
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import PolicyConfig, TuningConfig
 
@@ -26,10 +26,10 @@ def test_a_signal_is_noted_first_and_interrupts_when_it_comes_again():
 
 @pytest.mark.parametrize("before", [False, True])
 def test_where_nothing_can_be_saved_the_first_signal_interrupts(before: bool):
-    with Stopping() as stop:
+    with Stopping("a command") as stop:
         if before:
             os.kill(os.getpid(), signal.SIGINT)
-        with pytest.raises(KeyboardInterrupt), stop.at_once():
+        with pytest.raises(StoppedError, match="stopped by SIGINT; to resume: a command"), stop.at_once():
             os.kill(os.getpid(), signal.SIGINT)
             pytest.fail("it goes on")
         assert stop.asked == signal.SIGINT

@@ -11,7 +11,7 @@ import psutil
 import pytest
 
 from accerl_lerobot.engine import launch, replicas
-from accerl_lerobot.engine.launch import end
+from accerl_lerobot.engine.launch import end_all
 from accerl_lerobot.engine.replicas import WorkerSlot
 
 
@@ -34,6 +34,6 @@ def test_only_a_process_of_this_node_is_ended_by_its_number(here: bool, monkeypa
         worker = WorkerSlot("somebody")
         worker.await_start(process.pid, 1.0, here)
         assert (worker.process == psutil.Process(process.pid)) is here
-        end([worker])
+        end_all([worker])
         assert (process.poll() is not None) is here
         process.kill()

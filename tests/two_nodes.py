@@ -174,8 +174,10 @@ def a_node_that_leaves_takes_nothing_along(made: Cluster, second: Any) -> None:
     made.remove_node(second, allow_graceful=False)
     for progress in polls(one):
         results += progress.episodes
-        moved = progress.rollout.get("moved", 0.0)
-        if moved == len(there) and sum(r.plan.group == "during" for r in results) >= 24:
+        if (
+            progress.rollout["restarts"] == len(there)
+            and sum(r.plan.group == "during" for r in results) >= 24
+        ):
             break
     version = progress.version
     assert sorted(r.plan.index for r in results if r.plan.group == "during") == list(range(24))

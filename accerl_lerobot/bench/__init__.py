@@ -37,7 +37,6 @@ def ranged(values: dict[str, Any], form: str) -> str:
 
 
 def as_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
-    """Rows for people."""
     shown = Table(*columns, title=title)
     for row in rows:
         shown.add_row(*row)

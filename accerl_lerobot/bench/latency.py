@@ -23,8 +23,7 @@ from accerl_lerobot.errors import output_folder
 from accerl_lerobot.seeds import train_seed
 
 TRACE = "trace.txt"
-RESET = "reset"
-"""First word of a trace's lines about resets."""
+RESET = "reset"  # first word of a trace's lines about resets
 QUANTILES = (0.5, 0.95, 0.99)
 
 
@@ -107,7 +106,6 @@ def described(seconds: np.ndarray) -> dict[str, float]:
 
 
 def table(result: dict[str, Any]) -> Table:
-    """`result` for people."""
     columns = ("", "mean", "p50", "p95", "p99", "longest", "CV", "how many")
     rows = []
     for name in ("decision", "reset"):

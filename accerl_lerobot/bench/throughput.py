@@ -24,11 +24,8 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import Load
 from accerl_lerobot.replay.pacing import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, Schedule
 
-SETTLE = 2
-"""Updates after a change that are not counted, beside those that need nothing new."""
+SETTLE = 2  # updates after a change that are not counted, beside those that need nothing new
 ARMS: tuple[Schedule, ...] = (ASYNCHRONOUS, OVERLAP, SYNCHRONOUS)
-MOST_BUSY = 0.6
-"""Share of all cores above which the processors, and not what is slept, may be what is measured."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,17 +35,13 @@ class Block:
     schedule: str
     seconds: float
     updates: int
-    decisions_per_s: float
-    """Decisions learned from, repetitions included."""
+    decisions_per_s: float  # decisions learned from, repetitions included
     env_steps_per_s: float
     lag_mean: float
-    trainer_waits: float
-    """Share of its time in which the trainer had no batch."""
-    batch_size: float
-    """Observations of a forward pass."""
+    trainer_waits: float  # share of its time in which the trainer had no batch
+    batch_size: float  # observations of a forward pass
     inference_busy: float
-    processors: float
-    """Busy share of all cores, whoever uses them."""
+    processors: float  # busy share of all cores, whoever uses them
 
 
 class Measured:
@@ -86,7 +79,7 @@ class Measured:
         steps = polls[-1].rollout["env_steps"] - first.rollout["env_steps"]
         total = sum(_seconds(u) for u in updates)
         batches = after["batches"] - before["batches"]
-        requests = _observations(after) - _observations(before)
+        requests = after["batches"] * after["batch_size_mean"] - before["batches"] * before["batch_size_mean"]
         return Block(
             schedule=schedule,
             seconds=total,
@@ -95,7 +88,7 @@ class Measured:
             env_steps_per_s=steps / wall,
             lag_mean=sum(u["lag_mean"] for u in updates) / len(updates),
             trainer_waits=sum(u["wait_s"] for u in updates) / total,
-            batch_size=requests / batches if batches else 0.0,
+            batch_size=requests / max(batches, 1.0),
             inference_busy=sum(p.inference["busy_share"] for p in polls) / len(polls),
             processors=psutil.cpu_percent() / 100,
         )
@@ -117,11 +110,6 @@ class Measured:
 
 def _seconds(update: dict[str, float]) -> float:
     return update["wait_s"] + update["update_s"] + update["publish_s"]
-
-
-def _observations(inference: dict[str, float]) -> int:
-    """Requests so far; rounded, as a mean times its divisor need not be whole."""
-    return round(inference["batches"] * inference["batch_size_mean"])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,7 +162,6 @@ def bench_throughput(config: BenchThroughputConfig) -> dict[str, Any]:
 
 
 def table(result: dict[str, Any]) -> Table:
-    """`result` for people."""
     columns = ("schedule", "env steps/s", "decisions/s learned from", "updates/s", "lag", "trainer waits")
     rows = []
     for name, one in result["schedules"].items():

@@ -33,8 +33,7 @@ from accerl_lerobot.seeds import train_seed
 
 OURS, EVERY_STEP, STOCK = "ours", "ours_every_step", "stock"
 _ARMS = (OURS, EVERY_STEP, STOCK)
-Decide = Callable[[], int]
-"""Steps an environment for one decision and returns the number of env steps."""
+Decide = Callable[[], int]  # steps an environment for one decision and returns the number of env steps
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +58,6 @@ class BenchWorldConfig(Section):
 
     @property
     def task(self) -> str:
-        """The task's name."""
         assert isinstance(self.env, MetaWorldConfig | LiberoConfig)
         return self.env.tasks[0]
 
@@ -89,7 +87,6 @@ def bench_world(config: BenchWorldConfig) -> dict[str, Any]:
 
 
 def table(result: dict[str, Any]) -> Table:
-    """`result` for people."""
     config, ratio = result["config"], result["ratio"]
     title = (
         f"{config['task']}, chunk {config['chunk']}: {ranged(ratio, '.1f')} times the env steps of LeRobot's"
@@ -105,7 +102,6 @@ _decide: Decide
 
 
 def _start(arm: str, config: BenchWorldConfig) -> None:
-    """Makes a process ready to measure one arm."""
     global _decide
     import_mujoco()
     if arm == STOCK:
@@ -150,7 +146,6 @@ def _stock(config: BenchWorldConfig, chunks: Iterator[np.ndarray]) -> Decide:
 
 
 def _stock_env(config: EnvConfig, task: str) -> Any:
-    """LeRobot's own environment of a task."""
     if isinstance(config, LiberoConfig):
         load_libero(config.assets)
         from lerobot.envs.libero import LiberoEnv
@@ -167,7 +162,6 @@ def _stock_env(config: EnvConfig, task: str) -> Any:
 
 
 def _measure(seconds: float) -> tuple[float, float]:
-    """Env steps and decisions a second."""
     steps = decisions = 0
     start = now = time.perf_counter()
     while now - start < seconds:

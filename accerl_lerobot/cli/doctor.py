@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from accerl_lerobot.checkpoint.safety import MIB, brief
 from accerl_lerobot.engine import sizes
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.replay.pacing import lag_limits
 
 if TYPE_CHECKING:
     from accerl_lerobot.engine.config import RunConfig
@@ -267,8 +268,8 @@ def _gib(size: float) -> str:
 def pace(config: RunConfig) -> Iterator[Check]:
     """How far apart collecting and learning may run under this recipe, and how much it collects."""
     replay, trainer = config.replay, config.trainer
-    in_flight = sizes.under_way(config)
-    bound, of_pace = sizes.lag_limits(config)
+    in_flight = config.rollout.in_flight
+    bound, of_pace = lag_limits(config)
     text = f"at most {bound} updates with {in_flight} decisions under way"
     if of_pace > bound:
         text += (

@@ -131,11 +131,6 @@ class RunConfig(Section):
         return None if self.folder is None else self.folder / TIMELINE
 
     @property
-    def saves(self) -> bool:
-        """True if there are checkpoints on the way."""
-        return bool(self.save_every_updates or self.save_every_s)
-
-    @property
     def remembered(self) -> int:
         """Decisions in the trainer's own memory at the end."""
         if not isinstance(self.algorithm, OffPolicyConfig):

@@ -1,16 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Imagined rollouts of a run: what imagines, the learner of its world model, and their two processes.
 
-    Imagination   consumes    decisions from inference, real segments from replay, promoted models
-                  produces    imagined segments for replay
-                  waits for   decisions; and replay, while segments are pending there
-                  outlives    inference: unanswered requests go to its successor
-    WorldLearning consumes    real segments from replay
-                  produces    world models that have passed validation, for imagination
-                  waits for   real experience
-
-Both end with the process, or when replay says that the run is over. Until a model has passed, batches are
-real; from then on the trainer waits for imagined segments as it does for real ones.
+Imagination consumes decisions, real segments and world models that have passed validation, and produces
+imagined segments; it waits for decisions, and while segments are pending at replay. The learner consumes real
+segments and produces world models. Both end when replay says that the run is over. Until a model has passed,
+batches are real; from then on the trainer waits for imagined segments as it does for real ones.
 """
 
 from __future__ import annotations
@@ -35,6 +29,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.policies.loading import load_lerobot_config, resolve_device
+from accerl_lerobot.replay.worker import News
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TRANSPORT, WAIT_IN, WAIT_OUT, WEIGHT_SYNC, open_clock
 from accerl_lerobot.transport.endpoint import Endpoint, ReconnectingClient
 from accerl_lerobot.world_model.config import IMAGINATION, WORLD_LEARNING
@@ -47,12 +42,10 @@ from accerl_lerobot.world_model.store import LEARNT, load_roles, load_world_mode
 from accerl_lerobot.world_model.success_model import SuccessPairsRewardModel
 
 LEARN = "imagination.learn.dataset"
-MAX_PENDING = 2
-"""Messages to replay that may be pending before imagination pauses."""
+MAX_PENDING = 2  # messages to replay that may be pending before imagination pauses
 PAUSE_S, POLL_S = 0.02, 0.2
 """Sleep of a worker with nothing to do, and interval at which replay is asked for new real segments."""
-SWAP_S = 30.0
-"""Largest wait of a checkpoint for a promoted model to be taken over."""
+SWAP_S = 30.0  # largest wait of a checkpoint for a promoted model to be taken over
 
 
 def make_imagination(config: RunConfig, on_segment: Callable[[Segment], object]) -> Imagination:
@@ -85,10 +78,9 @@ def check_imagination(config: RunConfig) -> None:
 def _load(
     config: RunConfig, policy: Any, *, first: bool = False
 ) -> tuple[WorldSpec, WorldModel, SuccessPairsRewardModel | None]:
-    """The environment, and the models for it, which are checked to fit it and LeRobot's config of the policy.
+    """The environment, and the models, which are checked to fit it and LeRobot's config of the policy.
 
-    If nobody has loaded the files before (`first`), a child process does so first, see `isolation`. An oracle
-    has no success model.
+    Files that nobody has loaded before are tried in a child process (`first`). Oracles have no success model.
     """
     imagination, executed = config.imagination, getattr(policy, "n_action_steps", 1)
     if (reward := getattr(config.env, "reward", "success")) != "success":
@@ -162,7 +154,7 @@ class _Worker:
 
         torch.set_num_threads(config.trainer.num_threads)
         torch.manual_seed(config.seed)
-        self._limit, self._cursor = config.launch.stall_s, 0
+        self._limit, self._cursor, self._asked = config.launch.stall_s, 0, -math.inf
         self._core = self._make(config)
         self._changing = threading.Lock()  # held while the core changes; a validation is of a copy
         if state is not None:
@@ -175,7 +167,6 @@ class _Worker:
         raise NotImplementedError
 
     def ready(self) -> int:
-        """This process's id, once the models are loaded."""
         return os.getpid()
 
     def metrics(self) -> dict[str, float]:
@@ -184,13 +175,21 @@ class _Worker:
         return metrics
 
     def save(self, directory: Path) -> None:
-        """Writes its part of a checkpoint."""
         with self._unchanging(self._limit):
             self._write(directory)
 
     def _write(self, directory: Path) -> None:
         saved = {"core": self._core.state(), "cursor": self._cursor}
         snapshot.save(directory / TRAINING_STATE / self.state_name, saved)
+
+    def _news(self, replay: Any, last: News) -> News:
+        """Real segments that replay has got since `last`; it is asked every `POLL_S`."""
+        self._clock.enter(TRANSPORT)
+        if time.monotonic() < self._asked + POLL_S:
+            return last._replace(segments=[])
+        news: News = _await(replay.news.remote(last.cursor))
+        self._asked = time.monotonic()
+        return news
 
     @contextmanager
     def _unchanging(self, patience_s: float) -> Iterator[None]:
@@ -224,7 +223,6 @@ class ImaginationWorker(_Worker):
         self._promoted.append(promotion)
 
     def expect(self, may_promote: bool) -> None:
-        """Notes whether another model may be promoted."""
         self._may_promote = may_promote
 
     def move(self, inference: Endpoint) -> None:
@@ -241,13 +239,12 @@ class ImaginationWorker(_Worker):
 
     def run(self, inference: Endpoint, inserting: Endpoint, replay: Any) -> None:
         """Imagines until replay is closed."""
-        news, reported = _News(replay, self._cursor), None
+        news, reported = News([], self._cursor, ended=False, closed=False), None
         deciding, connection = self._deciding, inserting.connect()
         deciding.move(inference)
         pending: set[int] = set()
         while not news.closed:
-            self._clock.enter(TRANSPORT)
-            segments = news.fresh()
+            news = self._news(replay, news)
             self._clock.enter(CHECKPOINT)
             with self._changing:
                 may_promote = self._may_promote  # first: the last model comes before the word that it is
@@ -255,14 +252,14 @@ class ImaginationWorker(_Worker):
                     self._clock.enter(WEIGHT_SYNC)
                     self._core.swap(self._promoted.pop())
                 self._clock.enter(COMPUTE)
-                for segment in segments:
+                for segment in news.segments:
                     self._core.remember(segment)
                 self._cursor = news.cursor
             # Both at once: a run that imagines nothing and expects no model has nothing to wait for.
             if reported != (self._core.on, may_promote):
                 reported = (self._core.on, may_promote)
                 share = self._share if self._core.on else 0.0
-                _await(replay.mix.remote(share, any(reported)))
+                _await(replay.change.remote(share=share, awaited=any(reported)))
             self._clock.enter(TRANSPORT)
             for ticket, stored in connection.done(0.0):
                 pending.discard(ticket)
@@ -300,19 +297,18 @@ class WorldLearningWorker(_Worker):
 
     def run(self, imaginer: Any, replay: Any) -> None:
         """Trains until replay is closed."""
-        news, learner = _News(replay, self._cursor), self._core
+        news, learner = News([], self._cursor, ended=False, closed=False), self._core
         held = expected = None  # as last reported
         while not news.closed:
-            self._clock.enter(TRANSPORT)
-            segments = news.fresh()
+            news = self._news(replay, news)
             with self._changing:
-                for segment in segments:
+                for segment in news.segments:
                     learner.add(segment)
                 self._cursor = news.cursor
             last = news.ended
             if held is not (hold := learner.validation_due(last=False) and not last):
                 held = hold
-                _await(replay.hold.remote(hold))
+                _await(replay.change.remote(held=hold))
             if expected is not (may_promote := learner.may_promote(last)):
                 expected = may_promote
                 _await(imaginer.expect.remote(may_promote))
@@ -331,24 +327,6 @@ class WorldLearningWorker(_Worker):
             else:
                 self._clock.enter(WAIT_IN)
                 time.sleep(PAUSE_S)
-
-
-class _News:
-    """New real segments in replay."""
-
-    def __init__(self, replay: Any, cursor: int) -> None:
-        self._replay, self._next = replay, 0.0
-        self.cursor = cursor
-        self.ended = self.closed = False
-
-    def fresh(self) -> list[Segment]:
-        """Real segments that have come since; asks every `POLL_S`."""
-        if time.monotonic() < self._next:
-            return []
-        news = _await(self._replay.news.remote(self.cursor))
-        self._next = time.monotonic() + POLL_S
-        self.cursor, self.ended, self.closed = news.cursor, news.ended, news.closed
-        return list(news.segments)
 
 
 def _await(reference: Any) -> Any:

@@ -1,15 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The asynchronous engine: places the workers, connects them and watches them.
-
-    rollout ×W ──requests──► inference ──decisions──► rollout   micro-asynchrony: others step meanwhile
-        │                        ▲
-        └──segments──► replay    │ weights, published without waiting
-                          │      │
-                          └──► trainer                          macro-asynchrony: no barrier, a measured lag
-
-    imagination ──requests──► inference ──decisions──► imagination ──segments──► replay
-       ▲                                                                 │
-       └────── world models that have passed ◄── world learning ◄──real──┘
+"""The asynchronous engine: places the workers, connects them as docs/architecture.md shows, and watches them.
 
 The trainer is the clock: when it has made its updates the run is over. A rollout worker or inference replica
 that ends is restarted alone, see `replicas`; the end of any other worker ends this engine with its traceback,
@@ -37,13 +27,11 @@ from accerl_lerobot.engine.placement import actor_options, place_workers
 from accerl_lerobot.engine.ray_session import RaySession
 from accerl_lerobot.engine.replicas import START_S, InferenceReplicas, RolloutSlot, RolloutWorkers, WorkerSlot
 from accerl_lerobot.engine.stopping import WorkerError
-from accerl_lerobot.inference.batcher import BatcherStats
 from accerl_lerobot.policies.config import Load
 from accerl_lerobot.replay.pacing import ASYNCHRONOUS, Schedule
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.transport.contract import ServiceStoppedError
 from accerl_lerobot.transport.endpoint import Endpoint
-from accerl_lerobot.world_model.config import IMAGINATION, WORLD_LEARNING
 
 logger = logging.getLogger(__name__)
 
@@ -52,19 +40,17 @@ GONE_S, BLAME_S = 3.0, 10.0
 """How long to wait for a killed process, and for the failure that another is the consequence of."""
 
 
-def end(workers: Iterable[WorkerSlot], *, lost: bool = False) -> None:
-    """End workers, by Ray unless that is `lost`, and wait until they are gone.
-
-    Nothing writes any more then, when others start. A process that is stopped does not hear Ray.
-    """
-    workers = list(workers)
-    for worker in () if lost else workers:
-        ray.kill(worker.actor)
-    processes = [worker.process for worker in workers if worker.process is not None]
+def end_all(workers: Iterable[WorkerSlot], *, lost: bool = False) -> None:
+    """End workers, by Ray unless that is `lost`, and wait until they are gone and write nothing any more."""
+    processes = []
+    for worker in workers:
+        if not lost:
+            ray.kill(worker.actor)
+        processes += [worker.process] if worker.process else []
     left = psutil.wait_procs(processes, timeout=0.0 if lost else GONE_S)[1]
     for process in left:
         with contextlib.suppress(psutil.NoSuchProcess):
-            process.kill()
+            process.kill()  # one that is stopped does not hear Ray
     psutil.wait_procs(left, timeout=GONE_S)
 
 
@@ -99,8 +85,7 @@ class RayEngine(Engine):
         self._rollouts = RolloutWorkers(config, tasks, history, state)
         self._inference = InferenceReplicas(config, self._version, state, load, self._move)
         self._others: list[WorkerSlot] = []
-        self._imagining: list[WorkerSlot] = []
-        """The one that imagines, and the one that trains the world model; both are among the others."""
+        self._imagining: list[WorkerSlot] = []  # the one that imagines, and the world model's trainer
         self._updates: list[dict[str, float]] = []
         self._schedule: Schedule = ASYNCHRONOUS
         self._training = self._real_ended = self._done = self._closed = False
@@ -194,7 +179,7 @@ class RayEngine(Engine):
             lost = bool(self._ray.lost)
             if lost:
                 self._ray.close()
-            end(self._everyone(), lost=lost)
+            end_all(self._everyone(), lost=lost)
             if not self._keeps_ray:
                 self._ray.close()
         except Exception:
@@ -203,9 +188,6 @@ class RayEngine(Engine):
     def pids(self) -> dict[str, int]:
         """Process ids by worker: ``inference``, ``replay``, ``trainer``, ``rollout 0`` …; for fault tests."""
         return {w.name: int(w.call("ready", timeout=self._limit)) for w in self._everyone()}
-
-    def batching(self) -> BatcherStats:
-        return self._inference.batching()
 
     def _everyone(self) -> Iterator[WorkerSlot]:
         """All workers, those that others depend on first."""
@@ -240,9 +222,8 @@ class RayEngine(Engine):
         if imagination.share:
             from accerl_lerobot.engine.imagination import ImaginationWorker, WorldLearningWorker
 
-            self._imagining.append(make(IMAGINATION, ImaginationWorker, 4, c, state, timeline))
-            if imagination.learns:
-                self._imagining.append(make(WORLD_LEARNING, WorldLearningWorker, 4, c, state, timeline))
+            for kind in (ImaginationWorker, WorldLearningWorker)[: 1 + imagination.learns]:
+                self._imagining.append(make(kind.name, kind, 4, c, state, timeline))
         self._rollouts.start(plan)
         for worker, reference in [(w, w.actor.ready.remote()) for w in self._everyone()]:
             here = plan.places[worker.name].node.number == 0
@@ -302,7 +283,6 @@ class RayEngine(Engine):
         self._replay.told = self._replay.call("metrics", timeout=self._limit)
 
     def _listen(self) -> list[EpisodeResult]:
-        """Pick up the answers that have come; the episodes among them."""
         episodes: list[EpisodeResult] = []
         for worker in self._everyone():
             answer = self._hear(worker)
@@ -312,7 +292,7 @@ class RayEngine(Engine):
                 episodes += worker.take(answer)
         if not self._real_ended and self._rollouts.spent:
             self._real_ended = True
-            self._replay.call("end_real", timeout=self._limit)
+            self._replay.call("change", real_ended=True, timeout=self._limit)
         return episodes
 
     def _hear(self, worker: WorkerSlot, timeout: float = 0.0) -> Any:
@@ -332,7 +312,7 @@ class RayEngine(Engine):
         waiting = self._rollouts.outstanding or (self._training and not self._done)
         # Where one worker is to blame, that is found a moment later.
         silent = max(worker.silent_s() for worker in self._everyone())
-        suspect = max(silent, self._rollouts.stuck_s) > self._limit / 2
+        suspect = max(silent, self._rollouts.busy_s) > self._limit / 2
         if state != self._last_state or not waiting:
             self._last_state, self._last_change = state, now
         elif now - self._last_change > self._limit and not suspect:

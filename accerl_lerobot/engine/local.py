@@ -1,12 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The engine in one process, without Ray: the same parts, called in turn, deterministic for a seed.
 
-    every poll:   all environments get a decision and step it → segments enter replay, as the pace allows
-                  → all imagined rollouts get a decision and a step, if the pace allows it
-                  → one update, if the pace allows it
-
-For tests and debugging. Weights reach the acting policy at once, so the lag comes from replay alone, unless
-`trainer.hold_back` asks for more.
+Every poll all environments and all imagined rollouts get a decision and step it, and there is one update, as
+the pace allows. For tests and debugging. Weights reach the acting policy at once, so the lag comes from
+replay alone, unless `trainer.hold_back` asks for more.
 """
 
 from __future__ import annotations
@@ -37,8 +34,7 @@ from accerl_lerobot.world_model.config import IMAGINATION
 
 logger = logging.getLogger(__name__)
 
-LOCAL = "local"
-"""Name of this engine's own state."""
+LOCAL = "local"  # name of this engine's own state
 
 
 class LocalEngine(Engine):
@@ -126,6 +122,8 @@ class LocalEngine(Engine):
         episodes = list(self._episodes)
         self._episodes.clear()
         self._outstanding -= {episode_key(e.plan) for e in episodes}
+        parts = (part for part in (self._imagination, self._world_learner) if part is not None)
+        imagined = {name: value for part in parts for name, value in part.metrics().items()}
         return Progress(
             version=self._update.version,
             done=self._training and not self._exploring,
@@ -133,7 +131,7 @@ class LocalEngine(Engine):
             episodes=episodes,
             rollout={k: float(v) for k, v in asdict(self._runner.counters).items()},
             replay=self._replay.metrics(),
-            imagination=self._imagined(),
+            imagination=imagined,
             inference={"version": float(self._acting_version)},
         )
 
@@ -272,7 +270,3 @@ class LocalEngine(Engine):
                 self._world_learner.add(segment)
         if self._plans.spent and not self._outbox and not self._runner.exploring:
             self._replay.real_ended = True
-
-    def _imagined(self) -> dict[str, float]:
-        learner = {} if self._world_learner is None else self._world_learner.metrics()
-        return {} if self._imagination is None else self._imagination.metrics() | learner

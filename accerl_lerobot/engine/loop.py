@@ -18,19 +18,15 @@ import numpy as np
 from accerl_lerobot.checkpoint import layout, snapshot
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import RunConfig
-from accerl_lerobot.engine.resuming import raise_if_stopped
 from accerl_lerobot.engine.stopping import Stopping
 from accerl_lerobot.evaluation import before_after, evaluation_plans, success_curve, summarise
 from accerl_lerobot.metrics import MetricsLog, plain
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.timeline import CHECKPOINT, EVALUATION, TRAINING, Clock, NoClock
 
-FILMED = ".before"
-"""Name of the filmed episodes of the first evaluation, kept until the video is made."""
-RECORD_EVERY = 10
-"""Updates between two records of the workers' counters when no episode ends."""
-RECENT = 100
-"""Exploring episodes over which the training success of the curve is averaged."""
+FILMED = ".before"  # name of the filmed episodes of the first evaluation, kept until the video is made
+RECORD_EVERY = 10  # updates between two records of the workers' counters when no episode ends
+RECENT = 100  # exploring episodes over which the training success of the curve is averaged
 _STATE = (
     "before", "evaluations", "curve", "recent", "explored", "won", "lags", "lag_max", "mismatch_max",
     "during", "base", "steps", "evaluated", "saved",
@@ -41,20 +37,16 @@ _STATE = (
 class Progress:
     """Events since the last poll."""
 
-    version: int
-    """Updates made so far."""
-    done: bool = False
-    """The trainer has made all its updates."""
-    updates: list[dict[str, float]] = field(default_factory=list)
-    """Metrics of each update."""
+    version: int  # updates made so far
+    done: bool = False  # the trainer has made all its updates
+    updates: list[dict[str, float]] = field(default_factory=list)  # metrics of each update
     episodes: list[EpisodeResult] = field(default_factory=list)
     """Finished episodes, both exploring and planned."""
     rollout: dict[str, float] = field(default_factory=dict)
     """Counters over all rollout workers since the run began."""
     replay: dict[str, float] = field(default_factory=dict)
     inference: dict[str, float] = field(default_factory=dict)
-    imagination: dict[str, float] = field(default_factory=dict)
-    """Empty where nothing is imagined."""
+    imagination: dict[str, float] = field(default_factory=dict)  # empty where nothing is imagined
 
 
 class Saved(NamedTuple):
@@ -104,7 +96,6 @@ class Engine(ABC):
 
 
 def episode_key(plan: EpisodePlan) -> tuple[str, int]:
-    """Key of a planned episode."""
     return plan.group, plan.index
 
 
@@ -139,55 +130,42 @@ class Times:
     """Seconds of a run; `started` is when this process began, on `time.monotonic`."""
 
     started: float
-    warm_s: float
-    """Warm start."""
-    rl_s: float = 0.0
-    """Training, in earlier processes."""
-    before_s: float | None = 0.0
-    """All, in earlier processes; None: the checkpoint has it."""
-    furthest: int = 0
-    """Latest update made in this process, lost or not."""
-    clock: Clock = field(default_factory=NoClock)
-    """The driver's row of the timeline."""
+    warm_s: float  # warm start
+    rl_s: float = 0.0  # training, in earlier processes
+    before_s: float | None = 0.0  # all, in earlier processes; None: the checkpoint has it
+    furthest: int = 0  # latest update made in this process, lost or not
+    clock: Clock = field(default_factory=NoClock)  # the driver's row of the timeline
 
     @property
     def wall_s(self) -> float:
-        """Seconds since the run began."""
         return (self.before_s or 0.0) + time.monotonic() - self.started
 
 
+@dataclass(eq=False)
 class Loop:
     """Evaluates, trains, saves checkpoints, and writes the results; `stop` tells when to save and end."""
 
-    def __init__(
-        self,
-        config: RunConfig,
-        directory: Path,
-        console: Console,
-        log: MetricsLog,
-        engine: Engine,
-        tasks: tuple[str, ...],
-        times: Times,
-        stop: Stopping,
-    ) -> None:
-        self.config, self.engine, self.tasks = config, engine, tasks
-        self.directory, self.console, self.log = directory, console, log
-        self.times, self.stop = times, stop
-        self.before: dict[str, Any] | None = None
-        """The evaluation before training, where there was one."""
+    config: RunConfig
+    directory: Path
+    console: Console
+    log: MetricsLog
+    engine: Engine
+    tasks: tuple[str, ...]
+    times: Times
+    stop: Stopping
+
+    def __post_init__(self) -> None:
+        self.before: dict[str, Any] | None = None  # the evaluation before training, where there was one
         self.evaluations: list[dict[str, Any]] = []
         self.curve: list[tuple[float, float]] = []
         self.recent: list[bool] = []
-        self.explored = self.won = 0
-        """Exploring episodes that have ended, and successes among them."""
+        self.explored = self.won = 0  # exploring episodes that have ended, and successes among them
         self.lags: list[float] = []
         self.lag_max = self.mismatch_max = 0.0
         self.during: dict[str, list[EpisodeResult]] = {}
         self.base: dict[str, float] = {}
-        self.steps = math.inf
-        """Env steps of the training, once it has ended."""
-        self.evaluated = self.saved = 0
-        """Evaluations and checkpoints that were due by the number of updates."""
+        self.steps = math.inf  # env steps of the training, once it has ended
+        self.evaluated = self.saved = 0  # evaluations and checkpoints that were due by the number of updates
         self._began_at: str | None = None
         self._training_since: float | None = None
         self._saved_at = time.monotonic()
@@ -206,7 +184,7 @@ class Loop:
                 self.before, filmed = self._evaluate("before", 0.0)
                 snapshot.save(self.directory / FILMED, [result for result in filmed if result.frames])
             self.base = self.engine.poll().rollout
-            if self.config.saves:
+            if self.config.save_every_updates or self.config.save_every_s:
                 self._save()
         last = self._train()
         self.steps = self._steps(last)
@@ -221,7 +199,7 @@ class Loop:
             film = self.directory / "before_after.mp4"
             before_after(film, (filmed, self.before), (results, after), fps=20)
         success_curve(self.directory / "success_curve.png", self.evaluations, self.curve)
-        summary = plain(self._summary(self.before, after, last))
+        summary = plain(self._summary(after, last))
         layout.write_atomically(self.directory / layout.SUMMARY, json.dumps(summary, indent=2) + "\n")
         for left in self.directory.glob(f"{FILMED}.*"):
             left.unlink()
@@ -246,10 +224,8 @@ class Loop:
         self.evaluated = min(self.evaluated, version // evaluate if evaluate else 0)
         self.saved = min(self.saved, version // save if save else 0)
 
-    def _summary(
-        self, before: dict[str, Any] | None, after: dict[str, Any], last: Progress
-    ) -> dict[str, Any]:
-        before = before or {}
+    def _summary(self, after: dict[str, Any], last: Progress) -> dict[str, Any]:
+        before = self.before or {}
         return {
             "success_before": before.get("success"),
             "success_after": after["success"],
@@ -303,7 +279,7 @@ class Loop:
                     self._plan(config.evaluation.episodes_during, group)
                 if self._is_due(progress.version) or self.stop.asked is not None:
                     self._save()
-                raise_if_stopped(self.stop, self.directory)
+                self.stop.check()
 
     @property
     def _rl_s(self) -> float:
@@ -312,8 +288,8 @@ class Loop:
 
     def _is_due(self, version: int) -> bool:
         updates, seconds = self.config.save_every_updates, self.config.save_every_s
-        by_time = bool(seconds) and time.monotonic() - self._saved_at > seconds
-        return by_time or bool(updates and version // updates > self.saved)
+        by_time = seconds and time.monotonic() - self._saved_at > seconds
+        return bool(by_time or (updates and version // updates > self.saved))
 
     def _record_updates(self, updates: list[dict[str, float]]) -> None:
         for metrics in updates:
@@ -341,11 +317,10 @@ class Loop:
                 values |= {f"{part}_{k}": v for k, v in getattr(progress, part).items()}
             self.log.write("rollout", progress.version, values)
         for episode in progress.episodes:
-            results = self.during.get(episode.plan.group)
-            if results is not None:
+            if (results := self.during.get(group := episode.plan.group)) is not None:
                 results.append(episode)
                 if len(results) == self.config.evaluation.episodes_during:
-                    self._report(episode.plan.group, results, self._steps(progress), progress.version)
+                    self._report(group, results, self._steps(progress), progress.version)
 
     def _plan(self, episodes: int, group: str, filmed: int = 0) -> None:
         seed = self.config.seed
@@ -361,7 +336,7 @@ class Loop:
 
     def _meanwhile(self, progress: Progress) -> None:
         self._record(progress)
-        raise_if_stopped(self.stop, self.directory)
+        self.stop.check()
 
     def _report(self, group: str, results: list[EpisodeResult], steps: float, version: int) -> dict[str, Any]:
         summary = summarise(results) | {"env_steps": steps, "group": group}

@@ -32,12 +32,9 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-BYTES = 4 * 1024**3
-"""Observations that are kept in memory at most."""
-LOG_EVERY = 25
-"""Updates between two records of metrics, which are means over them."""
-COMPARED = 256
-"""Decisions of successes, and of failures, whose imitation loss is measured before and after."""
+BYTES = 4 * 1024**3  # observations that are kept in memory at most
+LOG_EVERY = 25  # updates between two records of metrics, which are means over them
+COMPARED = 256  # decisions of successes, and of failures, whose imitation loss is measured before and after
 
 
 def learn_offline(config: OfflineRun, directory: Path, console: Console) -> dict[str, Any]:

@@ -1,10 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Placement: which worker runs on which node, and its share of a GPU there.
 
-    nodes   each with its CPUs and GPUs, and whether it sees the run's files
-    roles   the workers of a kind, and where they may be
-    plan    a node for every worker, by name
-
 By default everything is on the node where the run is started, and processes with a network share its GPUs.
 These read the policy's files and write into the run's folder, so they need a node that sees both under the
 same paths. Rollout workers need no files. Ray is told node by node: left to Ray, a worker that fits nowhere
@@ -13,6 +9,7 @@ is waited for without a word.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import importlib.metadata
 import logging
@@ -25,7 +22,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from accerl_lerobot.engine.ray_session import FIELD, start_ray
+from accerl_lerobot.engine.ray_session import FIELD, RaySession
 from accerl_lerobot.engine.stopping import WorkerError
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.metrics import numbered
@@ -37,27 +34,21 @@ logger = logging.getLogger(__name__)
 
 SECTION = "launch.placement"
 ALL = "all"
-TINY = 1e-6
-"""Rounding error of sums of GPU shares."""
-REPORT_S = 120.0
-"""Timeout for a node to start a process and report what it has."""
+TINY = 1e-6  # rounding error of sums of GPU shares
+REPORT_S = 120.0  # timeout for a node to start a process and report what it has
 
 
 @dataclass(frozen=True, kw_only=True)
 class Node:
     """A machine of the cluster."""
 
-    number: int
-    """0: where the run is started."""
-    key: str
-    """Ray's id."""
+    number: int  # 0: where the run is started
+    key: str  # Ray's id
     name: str
     cpus: float
     gpus: float
-    resources: frozenset[str] = frozenset()
-    """Names of its custom resources."""
-    unseen: str = ""
-    """A folder of the run that it does not see; empty: it sees all."""
+    resources: frozenset[str] = frozenset()  # names of its custom resources
+    unseen: str = ""  # A folder of the run that it does not see; empty: it sees all
 
     def __str__(self) -> str:
         return f"node {self.number} ({self.name})"
@@ -103,20 +94,6 @@ class Plan:
             ]
             yield f"{node}, {node.cpus:g} CPUs, {node.gpus:g} GPUs: {', '.join(parts) or 'nothing'}"
 
-    def moved(self, name: str, alive: frozenset[str]) -> Plan:
-        """The plan with a rollout worker, whose node has left, on node 0 or another that has some."""
-        load = Counter({0: 0})
-        load.update(place.node.number for other, place in self.places.items() if other.startswith("rollout "))
-        left = [node for node in self.nodes if node.number in load and node.key in alive]
-        if not left:
-            raise WorkerError(f"{name} worker is lost, and no node is left where another could be started")
-        return replace(self, places=self.places | {name: Place(_emptiest(left, load))})
-
-
-def _emptiest(nodes: Sequence[Node], load: Counter[int]) -> Node:
-    """The node with the fewest workers for its cores, one more counted."""
-    return min(nodes, key=lambda node: (load[node.number] + 1) / max(node.cpus, 1.0))
-
 
 def this_machine() -> Node:
     """The only node of a private Ray."""
@@ -155,22 +132,21 @@ def candidates(nodes: Sequence[Node], role: Role) -> list[Node]:
 
 
 def plan_workers(nodes: Sequence[Node], config: RunConfig) -> Plan:
-    """Place all workers of a run."""
     roles = roles_of(config)
     sites = {role.name: _sites(nodes, role) for role in roles}
     shares = _gpu_shares(roles, sites, config)
     free = {node.number: [1.0] * round(node.gpus) for node in nodes}
-    load: Counter[int] = Counter()
-    """Workers without a GPU."""
+    load: Counter[int] = Counter()  # workers without a GPU
     places: dict[str, Place] = {}
     for role in roles:
         share = shares.get(role.name, 0.0)
         for name in role.workers:
             if share:
                 places[name] = Place(_take_gpu(sites[role.name], free, share, role), share)
-            else:
-                places[name] = Place(_emptiest(sites[role.name], load))
-                load[places[name].node.number] += 1
+            else:  # where the fewest are for its cores, this one counted
+                node = min(sites[role.name], key=lambda node: (load[node.number] + 1) / max(node.cpus, 1.0))
+                places[name] = Place(node)
+                load[node.number] += 1
     return Plan(tuple(nodes), places | {"replay": Place(nodes[0])})
 
 
@@ -189,26 +165,26 @@ def _sites(nodes: Sequence[Node], role: Role) -> list[Node]:
 def _gpu_shares(roles: list[Role], sites: dict[str, list[Node]], config: RunConfig) -> dict[str, float]:
     """Share of a GPU for each process of a role; roles on the same nodes share what these have."""
     shares: dict[str, float] = {}
-    groups: dict[tuple[int, ...], list[Role]] = {}
+    groups: dict[tuple[Node, ...], list[Role]] = {}
     for role in roles:
         if role.network and config.policy.device != "cpu":
-            groups.setdefault(tuple(node.number for node in sites[role.name]), []).append(role)
-    for group in groups.values():
-        here = sites[group[0].name]
+            groups.setdefault(tuple(sites[role.name]), []).append(role)
+    for here, group in groups.items():
         gpus = sum(node.gpus for node in here)
         if not gpus and config.policy.device.startswith("cuda") and any(node.number for node in here):
             remedy = f"there is no GPU on {', '.join(map(str, here))}; use auto, cpu or other nodes"
             raise InputError("policy.device", config.policy.device, remedy)
         others = sum(len(role.workers) for role in group if role.name != "trainer")
         share = 1 / math.ceil(others / gpus) if gpus and others else 0.0
+        ranks = 0.0
         if group[0].name == "trainer":
-            shares["trainer"], share = config.trainer.gpu_shares(gpus, max(1, others))
-        shares |= {role.name: share for role in group if role.name != "trainer"}
+            ranks, share = config.trainer.gpu_shares(gpus, max(1, others))
+        shares |= {role.name: ranks if role.name == "trainer" else share for role in group}
     return shares
 
 
 def _take_gpu(sites: list[Node], free: dict[int, list[float]], share: float, role: Role) -> Node:
-    """Take a share of the fullest GPU of the first node that has room for it, as Ray does."""
+    """The first node that has room, whose fullest GPU that has it is taken from, as Ray does."""
     for node in sites:
         left = free[node.number]
         if fitting := [i for i, room in enumerate(left) if room >= share - TINY]:
@@ -231,16 +207,9 @@ def place_workers(config: RunConfig) -> Plan:
 
 def rehearse(config: RunConfig) -> list[str]:
     """The plan as lines, of a run that joins a cluster; leaves it as it was."""
-    import ray
-
-    joined = ray.is_initialized()
-    if not joined:
-        start_ray(config.launch)
-    try:
+    with contextlib.closing(RaySession(config.launch)) as session:
+        session.start()
         return list(place_workers(config).rows())
-    finally:
-        if not joined:
-            ray.shutdown()
 
 
 def actor_options(place: Place) -> dict[str, Any]:
@@ -251,11 +220,11 @@ def actor_options(place: Place) -> dict[str, Any]:
     return {"num_cpus": 0, "num_gpus": place.gpus, "scheduling_strategy": strategy}
 
 
-def alive_nodes() -> frozenset[str]:
-    """Keys of the nodes that are there."""
+def is_alive(node: Node) -> bool:
+    """True if the node is in the cluster still."""
     import ray
 
-    return frozenset(node["NodeID"] for node in ray.nodes() if node["Alive"])
+    return any(row["NodeID"] == node.key and row["Alive"] for row in ray.nodes())
 
 
 def _nodes(config: RunConfig) -> list[Node]:
@@ -303,27 +272,24 @@ def _report(node: Node, reference: Any, address: str) -> list[bool]:
 
     try:
         versions, seen = ray.get(reference, timeout=REPORT_S)
+        wrong = [
+            f"has {k} {versions[k]}, and this is {v}" for k, v in node_versions().items() if versions[k] != v
+        ]
     except RayTaskError as error:
-        last = str(error).strip().splitlines()[-1]
-        remedy = f"{node} cannot say its versions ({last}); install the same on all"
-        raise InputError(FIELD, address, remedy) from error
+        wrong = [f"cannot say its versions ({str(error).strip().splitlines()[-1]})"]
     except RayError as error:
         raise WorkerError(f"{node} did not report its versions:\n{error}") from error
-    for name, version in node_versions().items():
-        if versions[name] != version:
-            remedy = f"{node} has {name} {versions[name]}, and this is {version}; install the same on all"
-            raise InputError(FIELD, address, remedy)
+    if wrong:
+        raise InputError(FIELD, address, f"{node} {wrong[0]}; install the same on all")
     return list(seen)
 
 
 def node_versions() -> dict[str, str]:
     """Versions that must be equal on all nodes. Ray compares its own version, and Python's."""
-    names = ("lerobot", "torch", "accerl-lerobot")
-    versions = {name: importlib.metadata.version(name) for name in names}
-    code = hashlib.sha256()
-    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
-        code.update(path.read_bytes())
-    return {"python": platform.python_version(), **versions, "code": code.hexdigest()[:12]}
+    versions = {name: importlib.metadata.version(name) for name in ("lerobot", "torch", "accerl-lerobot")}
+    code = b"".join(path.read_bytes() for path in sorted(Path(__file__).parents[1].rglob("*.py")))
+    digest = hashlib.sha256(code).hexdigest()[:12]
+    return {"python": platform.python_version(), **versions, "code": digest}
 
 
 def report_node(folders: Sequence[Path]) -> tuple[dict[str, str], list[bool]]:

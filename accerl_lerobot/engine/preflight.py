@@ -97,7 +97,11 @@ def check_start(config: RunConfig, say: Callable[[str], object] = str) -> int:
     spec = check_world(config.env, config.rollout.reward_model)
     off_policy = isinstance(config.algorithm, OffPolicyConfig)
     if off_policy:
-        _check_off_policy(config, spec, policy)
+        check_imitates(config.algorithm, config.policy, policy)
+        decisions = math.ceil(spec.max_steps / getattr(policy, "n_action_steps", 1))
+        if config.rollout.segment_length < decisions:
+            why = f"algorithm.type={config.algorithm.type} looks at whole episodes; use at least {decisions}"
+            raise InputError("rollout.segment_length", config.rollout.segment_length, why)
     renames, offered = config.policy.rename_map, env_features(spec)
     if config.policy.path is not None:
         check_features(policy_features(policy), offered, renames, "policy.path", config.policy.path)
@@ -107,14 +111,13 @@ def check_start(config: RunConfig, say: Callable[[str], object] = str) -> int:
     else:
         meta = check_training_data(config.sft, config.dataset, policy, spec, renames)
     history = int(policy.n_obs_steps)
-    if off_policy and meta is not None:
+    if off_policy and meta is not None:  # one that cannot be remembered is left out
         _say_if_unlike(config, spec, meta, history)
     check_disk(config.output_dir)
     return history
 
 
 def _say_if_unlike(config: RunConfig, spec: WorldSpec, meta: Any, history: int) -> None:
-    """Warns of a dataset whose episodes off-policy learning cannot remember."""
     from accerl_lerobot.trainer.demonstrations import unlike
 
     wanted: dict[str, tuple[int, ...]] = {STATE: (spec.state_dim,), **spec.images}
@@ -154,10 +157,8 @@ def check_training_data(
 
 
 def _check_new_policy(policy: Any, source: Features, sft: SFTConfig) -> None:
-    """Give a new policy the features that LeRobot will give it, and has LeRobot check them.
-
-    SmolVLA and π0 pad states and actions to a size of their own, and LeRobot does not compare it with theirs.
-    """
+    """Have LeRobot check the features that it will give a new policy, and compare what it does not: the sizes
+    to which SmolVLA and π0 pad states and actions."""
     from lerobot.configs.types import FeatureType, PolicyFeature
 
     for name, most in ((STATE, "max_state_dim"), (ACTION, "max_action_dim")):
@@ -200,15 +201,6 @@ def check_imitates(algorithm: AlgorithmConfig, config: PolicyConfig, policy: Any
     if getattr(policy, "use_relative_actions", False):
         remedy = f"algorithm.type={algorithm.type} keeps actions without the state they refer to"
         raise InputError("policy.use_relative_actions", True, f"{remedy}; use another algorithm.type")
-
-
-def _check_off_policy(config: RunConfig, spec: WorldSpec, policy: Any) -> None:
-    """Refuse policies that cannot imitate a chunk, and segments that are not whole episodes."""
-    check_imitates(config.algorithm, config.policy, policy)
-    decisions = math.ceil(spec.max_steps / getattr(policy, "n_action_steps", 1))
-    if config.rollout.segment_length < decisions:
-        remedy = f"algorithm.type={config.algorithm.type} looks at whole episodes; use at least {decisions}"
-        raise InputError("rollout.segment_length", config.rollout.segment_length, remedy)
 
 
 def policy_to_be(config: RunConfig) -> Any:

@@ -38,14 +38,11 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 FIELD = "launch.address"
-STARTS = 4
-"""Attempts to start a private Ray, which gives up after 30 s; a busy machine may need more."""
+STARTS = 4  # attempts to start a private Ray, which gives up after 30 s; a busy machine may need more
 CONNECT_S, ANSWER_S = 5.0, 60.0
 """Timeouts for a TCP connection to a cluster, and for ``ray status``, most of which is importing Ray."""
-LOOK_S = 0.5
-"""Between two looks at Ray's processes."""
-HURRY_S = 2.0
-"""How long one of them may be stopped once the run has been asked to stop."""
+LOOK_S = 0.5  # between two looks at Ray's processes
+HURRY_S = 2.0  # how long one of them may be stopped once the run has been asked to stop
 GIVE_UP_S, GONE_S = 30.0, 3.0
 """How long the main thread may take to end a lost Ray, before this process is ended, and a killed process."""
 
@@ -278,8 +275,7 @@ class RaySession:
         self._lost = ""
         self._thread: threading.Thread | None = None
         self._closed, self._lock = threading.Event(), threading.Lock()
-        self._processes: dict[psutil.Process, str] = {}
-        """Required processes and their kind."""
+        self._processes: dict[psutil.Process, str] = {}  # required processes and their kind
         self._stopped: dict[psutil.Process, float] = {}
         """Since when they have been stopped, on `time.monotonic`."""
 
@@ -303,7 +299,6 @@ class RaySession:
             self.watch()
 
     def watch(self) -> None:
-        """Watch Ray's processes below this one."""
         self._processes, self._stopped, self._closed = {}, {}, threading.Event()
         self._look()
         self._thread = threading.Thread(target=self._watch, name="ray watch", daemon=True)

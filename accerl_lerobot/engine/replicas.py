@@ -1,18 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Supervision of the processes of an asynchronous run.
 
-    WorkerSlot           a place for one process after the other: a long call that must not end unasked,
-                         and one question at a time
-    RolloutWorkers       restarted alone: a process loses its unfinished segments; planned episodes are
-                         run again
-    InferenceReplicas    restarted alone: nothing is lost, as a request carries its noise and clients ask
-                         the successor again
-
 A process that ends is noticed by the call that waits for it (`launch.RayEngine._await_end`), one that hangs
-by `WorkerSlot.hung` after ``launch.stall_s``, a replica that takes no weights by `transport.weights`. Its
-successor gets the newest weights before clients are told its address (`_restart`, `_await_weights`).
-
-The engine waits for a restart, and the other workers go on meanwhile. Resuming a run works the same way.
+by `WorkerSlot.hung` after ``launch.stall_s``, a replica that takes no weights by `transport.weights`. The
+engine waits for a restart, and the other workers go on meanwhile. Resuming a run works the same way.
 """
 
 from __future__ import annotations
@@ -24,7 +15,6 @@ import time
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -36,11 +26,11 @@ from ray.exceptions import ActorUnavailableError, GetTimeoutError, RayActorError
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.loop import check_new, episode_key
-from accerl_lerobot.engine.placement import Plan, actor_options, alive_nodes
+from accerl_lerobot.engine.placement import Node, Place, Plan, actor_options, is_alive
 from accerl_lerobot.engine.ray_session import NO_HUB_TOKEN
 from accerl_lerobot.engine.stopping import WorkerError, pause_s
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.inference.batcher import BatcherStats, merge_metrics, merge_stats
+from accerl_lerobot.inference.batcher import merge_metrics
 from accerl_lerobot.metrics import numbered
 from accerl_lerobot.policies.config import Load
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, budgets, incarnation_after
@@ -50,19 +40,13 @@ from accerl_lerobot.transport.shared_memory import available
 
 logger = logging.getLogger(__name__)
 
-START_S = 600.0
-"""Timeout for the start of a worker; `LaunchConfig.stall_s` counts from its first answer."""
-STEADY_S = 30.0
-"""A worker that has run for so long starts counting restarts anew."""
-AWAY_S = 10.0
-"""How long a rollout worker may fail to connect to its inference replica."""
+START_S = 600.0  # timeout for the start of a worker; `LaunchConfig.stall_s` counts from its first answer
+STEADY_S = 30.0  # A worker that has run for so long starts counting restarts anew
 UNREACHABLE_S = 60.0
 """How long a process on another node may be out of reach before it is restarted, unless its node is found to
 have left, which Ray takes half of that to decide."""
-LOOK_S = 1.0
-"""Interval at which a node out of reach is looked at."""
-ROLLOUT = "rollout"
-"""Name of the rollout workers' part of a checkpoint."""
+LOOK_S = 1.0  # interval at which a node out of reach is looked at
+ROLLOUT = "rollout"  # name of the rollout workers' part of a checkpoint
 
 
 class WorkerSlot:
@@ -77,20 +61,16 @@ class WorkerSlot:
         self.name = name
         self.restart: Callable[[Exception], None] | None = None
         """Replaces the process after a failure; None: the run cannot go on without it."""
-        self.restarts = 0
-        """In a row."""
+        self.restarts = 0  # in a row
         self.occupy(actor)
 
     def occupy(self, actor: Any) -> None:
         """Take in a new process, an actor handle; None: there is none yet."""
         self.actor = actor
         self.work: Any = None
-        self.process: psutil.Process | None = None
-        """None: not known yet, or on another node."""
-        self.told: Any = None
-        """Last answer."""
-        self.since = math.inf
-        """When it was at work, on `time.monotonic`."""
+        self.process: psutil.Process | None = None  # None: not known yet, or on another node
+        self.told: Any = None  # last answer
+        self.since = math.inf  # when it was at work, on `time.monotonic`
         self._question: Any = None
         self._asked = 0.0
 
@@ -133,9 +113,8 @@ class WorkerSlot:
         silent = self.silent_s()
         return f"has not answered for {silent:.0f} s" if silent > limit else ""
 
-    def call(self, method: str, *arguments: Any, timeout: float) -> Any:
-        """Call a method and wait for its answer."""
-        return self.result(getattr(self.actor, method).remote(*arguments), method, timeout)
+    def call(self, method: str, *arguments: Any, timeout: float, **fields: Any) -> Any:
+        return self.result(getattr(self.actor, method).remote(*arguments, **fields), method, timeout)
 
     def result(self, reference: Any, method: str, timeout: float) -> Any:
         """See `call`, for a call that has been made."""
@@ -146,7 +125,7 @@ class WorkerSlot:
         except RayError as error:
             raise WorkerError(f"{self.name} worker failed in {method}:\n{error}") from error
 
-    def end(self, error: Exception, max_restarts: int | None) -> None:
+    def discard(self, error: Exception, max_restarts: int | None) -> None:
         """End a process that is to be replaced, unless that was so too often; None: it does not count."""
         if max_restarts is not None:
             if time.monotonic() - self.since > STEADY_S:
@@ -169,7 +148,6 @@ class Replicas[W: WorkerSlot](ABC):
             worker.restart = partial(self._restart, worker)
 
     def start(self, plan: Plan) -> None:
-        """Start all processes, where the plan says."""
         self._plan = plan
         for worker in self._all:
             worker.occupy(self._new(worker))
@@ -182,8 +160,7 @@ class Replicas[W: WorkerSlot](ABC):
         """Start a process; its actor handle."""
 
     @abstractmethod
-    def _restart(self, worker: W, error: Exception) -> None:
-        """Replace a process that has failed."""
+    def _restart(self, worker: W, error: Exception) -> None: ...
 
 
 class RolloutSlot(WorkerSlot):
@@ -192,24 +169,18 @@ class RolloutSlot(WorkerSlot):
     def __init__(self, index: int, budget: int | None) -> None:
         super().__init__(f"rollout {index}")
         self.index, self.budget = index, budget
-        self.incarnation = 0
-        """Grows with every process; part of its seeds and of its segments' keys."""
-        self.outstanding: dict[tuple[str, int], EpisodePlan] = {}
-        """Planned episodes without a result."""
+        self.incarnation = 0  # grows with every process; part of its seeds and of its segments' keys
+        self.outstanding: dict[tuple[str, int], EpisodePlan] = {}  # planned episodes without a result
         self.unsent: list[EpisodePlan] = []
-        self.moved: Endpoint | None = None
-        """New endpoint of its inference replica, until the process has been told."""
-        self.spent = budget == 0
-        """True if replay has all episodes of the budget."""
+        self.moved: Endpoint | None = None  # where its replica is now, until the process has been told
+        self.spent = budget == 0  # True if replay has all episodes of the budget
 
     @property
     def counters(self) -> dict[str, float]:
-        """Counters of the process."""
         return {} if self.told is None else dict(self.told.counters)
 
     @property
     def next_incarnation(self) -> int:
-        """Incarnation of another process in this place."""
         return incarnation_after(self.incarnation, 0 if self.told is None else self.told.starts)
 
     def take(self, report: Report) -> list[EpisodeResult]:
@@ -217,51 +188,40 @@ class RolloutSlot(WorkerSlot):
         self.spent, self.since = report.spent, min(self.since, time.monotonic())
         if self.budget is not None:
             self.budget -= sum(episode.plan.explore for episode in report.episodes)
-        return [
-            episode
-            for episode in report.episodes
-            if self.outstanding.pop(episode_key(episode.plan), None) is not None or episode.plan.explore
-        ]
+        known = self.outstanding
+        return [e for e in report.episodes if known.pop(episode_key(e.plan), None) or e.plan.explore]
 
     def assign(self, plans: list[EpisodePlan]) -> None:
         self.outstanding |= {episode_key(plan): plan for plan in plans}
         self.unsent += plans
 
     def hung(self, limit: float) -> str:
-        """Also a world that does not return, and inference that is not found."""
+        """Also a world that does not return."""
         report: Report | None = self.told
-        if report is None:
-            return super().hung(max(START_S, limit))
-        if why := super().hung(limit):
+        if (why := super().hung(limit if report else max(START_S, limit))) or report is None:
             return why
-        if report.in_world_s > limit:
-            return f"its world has not returned for {report.in_world_s:.0f} s"
-        if report.stuck_s > limit:
-            return f"it has done nothing for {report.stuck_s:.0f} s"
-        if report.away_s > AWAY_S and self.moved is None:
-            return f"without inference, which is up, for {report.away_s:.0f} s: {report.away_why}"
+        if report.busy_s > limit:
+            what = "its world has not returned" if report.in_world else "it has done nothing"
+            return f"{what} for {report.busy_s:.0f} s"
         return ""
 
 
 class RolloutWorkers(Replicas[RolloutSlot]):
-    """The rollout workers of a run."""
+    """The rollout workers of a run. A restart loses unfinished segments, and plays planned episodes again."""
 
     def __init__(
         self, config: RunConfig, tasks: tuple[str, ...], history: int, state: Path | None = None
     ) -> None:
         super().__init__(config, [RolloutSlot(i, left) for i, left in enumerate(budgets(config.rollout))])
         self._tasks, self._history = tasks, history
-        self._past: Counter[str] = Counter(restarts=0)
-        """Counters of processes that have ended."""
+        self._past: Counter[str] = Counter(restarts=0)  # counters of processes that have ended
         self._inference: list[Endpoint] = []
         self._replay: Endpoint | None = None
-        self.in_turn = False
-        """True if worlds wait for replay after each segment."""
+        self.in_turn = False  # True if worlds wait for replay after each segment
         if state is not None:
             self._restore(state)
 
     def run(self, inference: list[Endpoint], replay: Endpoint) -> None:
-        """Have all workers step their worlds."""
         self._inference, self._replay = inference, replay
         for worker in self._all:
             self._run(worker)
@@ -280,10 +240,7 @@ class RolloutWorkers(Replicas[RolloutSlot]):
         """Ask each worker for a report, unless one is outstanding."""
         for worker in self._all:
             if worker.ask("report", training, worker.unsent, self.in_turn, worker.moved):
-                worker.unsent = []
-                if worker.moved is not None and worker.told is not None:
-                    worker.told = replace(worker.told, away_s=0.0)  # that was about the old endpoint
-                worker.moved = None
+                worker.unsent, worker.moved = [], None
 
     def counters(self) -> dict[str, float]:
         """Sums over all processes since the run began."""
@@ -294,7 +251,6 @@ class RolloutWorkers(Replicas[RolloutSlot]):
 
     @property
     def outstanding(self) -> bool:
-        """True if a planned episode has no result yet."""
         return any(worker.outstanding for worker in self._all)
 
     @property
@@ -303,10 +259,9 @@ class RolloutWorkers(Replicas[RolloutSlot]):
         return all(worker.spent for worker in self._all)
 
     @property
-    def stuck_s(self) -> float:
-        """How long the slowest worker or world has been at what it does now."""
-        reports = [worker.told for worker in self._all if worker.told is not None]
-        return max((max(report.in_world_s, report.stuck_s) for report in reports), default=0.0)
+    def busy_s(self) -> float:
+        """How long the slowest worker has been at what it does now."""
+        return max((worker.told.busy_s for worker in self._all if worker.told is not None), default=0.0)
 
     def save(self, directory: Path) -> None:
         """Write the rollout workers' part of ``training_state``."""
@@ -341,8 +296,10 @@ class RolloutWorkers(Replicas[RolloutSlot]):
         return actor.remote(c.env, c.rollout, self._tasks, c.seed, *slot, self._history, timeline)
 
     def _restart(self, worker: RolloutSlot, error: Exception) -> None:
-        moved = self._relocate(worker, error)  # that its node has left is not the worker's fault
-        worker.end(error, None if moved else self._launch.max_restarts)
+        if lost := self._has_left(node := self._plan.places[worker.name].node, error):
+            logger.warning("%s has left; its %s worker goes to %s", node, worker.name, self._plan.nodes[0])
+            self._plan.places[worker.name] = Place(self._plan.nodes[0])
+        worker.discard(error, None if lost else self._launch.max_restarts)
         self._past["restarts"] += 1
         self._past.update(worker.counters)
         worker.incarnation, worker.moved = worker.next_incarnation, None
@@ -350,20 +307,13 @@ class RolloutWorkers(Replicas[RolloutSlot]):
         worker.occupy(self._new(worker))
         self._run(worker)
 
-    def _relocate(self, worker: RolloutSlot, error: Exception) -> bool:
-        """Plan another node for a worker whose own has left; False if that is still there."""
-        node, until = self._plan.places[worker.name].node, time.monotonic() + UNREACHABLE_S
-        while isinstance(error, ActorUnavailableError) and node.number and time.monotonic() < until:
-            if node.key not in alive_nodes():
-                break
+    def _has_left(self, node: Node, error: Exception) -> bool:
+        """True if it has left the cluster, which Ray takes a while to tell from being out of reach."""
+        unreachable = isinstance(error, ActorUnavailableError) and node.number > 0
+        until = time.monotonic() + (UNREACHABLE_S if unreachable else 0.0)
+        while (alive := is_alive(node)) and time.monotonic() < until:
             time.sleep(LOOK_S)
-        if node.key in (alive := alive_nodes()):
-            return False
-        self._plan = self._plan.moved(worker.name, alive)
-        self._past["moved"] += 1
-        target = self._plan.places[worker.name].node
-        logger.warning("%s has left; its %s worker goes to %s", node, worker.name, target)
-        return True
+        return not alive
 
     def _run(self, worker: RolloutSlot) -> None:
         inference = self._inference[worker.index % len(self._inference)]
@@ -373,10 +323,8 @@ class RolloutWorkers(Replicas[RolloutSlot]):
 class InferenceReplicas(Replicas[WorkerSlot]):
     """The inference replicas of a run; rollout worker i asks replica i modulo their number.
 
-    Args:
-        version: of the first weights.
-        state: the ``training_state`` that holds these; None: they are the policy's.
-        moved: called with the index and new endpoint of a replica that has been restarted.
+    A restart loses nothing, as a request carries its noise and clients ask the successor again. It gets the
+    newest weights before they are told its address: `moved` is called with its index and endpoint.
     """
 
     def __init__(
@@ -391,10 +339,8 @@ class InferenceReplicas(Replicas[WorkerSlot]):
         self._arguments = (config.policy, config.inference, version, state, load, config.timeline_folder)
         self._moved = moved
         self._in_turn = False
-        self.restarts = 0
-        """Restarts of all replicas since this engine began."""
-        self.trainer: Any = None
-        """Handle of the trainer, once it publishes weights."""
+        self.restarts = 0  # restarts of all replicas since this engine began
+        self.trainer: Any = None  # handle of the trainer, once it publishes weights
 
     def open(self) -> list[Endpoint]:
         """Have all replicas serve, once they are ready; their endpoints."""
@@ -411,10 +357,6 @@ class InferenceReplicas(Replicas[WorkerSlot]):
         merged = merge_metrics([worker.told for worker in self._all if worker.told])
         return merged | {"restarts": float(self.restarts)}
 
-    def batching(self) -> BatcherStats:
-        """Batches of all replicas so far."""
-        return merge_stats([worker.call("batching", timeout=self._launch.stall_s) for worker in self._all])
-
     def _new(self, worker: WorkerSlot) -> Any:
         from accerl_lerobot.inference.worker import InferenceWorker
 
@@ -425,8 +367,8 @@ class InferenceReplicas(Replicas[WorkerSlot]):
     def _restart(self, worker: WorkerSlot, error: Exception) -> None:
         here, limit = self._plan.places[worker.name].node, self._launch.stall_s
         while True:
-            worker.end(error, self._launch.max_restarts)
-            if here.key not in alive_nodes():
+            worker.discard(error, self._launch.max_restarts)
+            if not is_alive(here):
                 raise WorkerError(f"{worker.name} worker is lost: {here} has left:\n{error}") from error
             self.restarts += 1
             time.sleep(pause_s(worker.restarts - 1))
@@ -445,7 +387,7 @@ class InferenceReplicas(Replicas[WorkerSlot]):
         logger.info("%s worker is up again", worker.name)
 
     def _serve(self, worker: WorkerSlot) -> Endpoint:
-        endpoint = worker.endpoint("decide", self._launch.stall_s)
+        endpoint = worker.endpoint("receive", self._launch.stall_s)
         worker.work, worker.since = worker.actor.serve.remote(), time.monotonic()
         return endpoint
 

@@ -7,7 +7,6 @@ import fcntl
 import json
 import shlex
 import shutil
-import signal
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,7 +19,7 @@ from accerl_lerobot.checkpoint.safety import Origin, check_folder, check_number,
 from accerl_lerobot.config.parsing import read_recipe
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import RunConfig, decode, encode
-from accerl_lerobot.engine.stopping import StoppedError, Stopping, WorkerError, pause_s
+from accerl_lerobot.engine.stopping import WorkerError, pause_s
 from accerl_lerobot.errors import InputError, is_full, make_folder
 from accerl_lerobot.metrics import METRICS
 from accerl_lerobot.replay.journal import EPISODES
@@ -36,15 +35,7 @@ WARM_START = "warm_start.json"
 """File with the path of the policy that came of a run's own demonstrations and SFT."""
 
 
-def raise_if_stopped(stop: Stopping, directory: Path) -> None:
-    """End a run that was asked to stop."""
-    if (number := stop.asked) is not None:
-        how = resume_command(directory)
-        raise StoppedError(number, f"stopped by {signal.Signals(number).name}; to resume: {how}")
-
-
 def resume_command(directory: Path) -> str:
-    """The command that resumes a run."""
     return f"accerl train --resume=true --config_path={shlex.quote(str(directory / layout.CONFIG))}"
 
 
@@ -132,24 +123,19 @@ def _newest(checkpoints: Path, wanted: str, console: Console) -> Path:
 
 
 def continued(config: RunConfig, directory: Path, checkpoint: Path) -> RunConfig:
-    """The run from its checkpoint on."""
     if config.policy.tuning.mode != "lora":
         return improving(config, checkpoint / layout.PRETRAINED)
     # A checkpoint has low-rank adapters merged; apart from what they adapt they are in the training state.
     path, note = config.policy.path, directory / WARM_START
     if path is None and note.is_file():
         path = str(directory / json.loads(note.read_text())["policy"])
-    if path is None or not _is_here(path):
+    # A folder of this machine has to be there; a Hub id is taken at its word.
+    on_the_hub = path and not path.startswith((".", "/", "~", f"{layout.AWAY}/")) and path.count("/") <= 1
+    if path is None or not (on_the_hub or Path(path).expanduser().is_dir()):
         remedy = "the policy that this run began from is gone, and its low-rank adapters are of no other; "
         remedy += f"put it back, or begin a new run with --policy.path={checkpoint / layout.PRETRAINED}"
         raise InputError("policy.path", path, remedy)
     return improving(config, path)
-
-
-def _is_here(path: str) -> bool:
-    """True for a folder of this machine that exists, and for a Hub id."""
-    on_the_hub = not path.startswith((".", "/", "~", f"{layout.AWAY}/")) and path.count("/") <= 1
-    return on_the_hub or Path(path).expanduser().is_dir()
 
 
 def improving(config: RunConfig, path: Path | str) -> RunConfig:

@@ -77,7 +77,7 @@ def make_output_dir(config: Any) -> Path:
 
 
 def discard_unused(directory: Path) -> None:
-    """Remove the folder of a run that was refused before it did anything, so that its name is free again."""
+    """Free the name of a run that was refused before it did anything."""
     if {path.name for path in directory.iterdir()} <= {layout.CONFIG, resuming.LOCK}:
         shutil.rmtree(directory)
 
@@ -221,20 +221,22 @@ def execute(
     layout.write_atomically(directory / layout.CONFIG, text)
     spec = check_world(config.env)
     check_placement(replace(config, output_dir=str(directory)))
-    if checkpoint is None:
-        _check_imagination(config)
-        config = warm_start(config, directory, console)
-    else:
+    if checkpoint is not None:
         layout.go_back_to(checkpoint)
         config = resuming.continued(config, directory, checkpoint)
         if load is None:
             check_start(config)
-        _check_imagination(config)
         console.say(f"going on from {checkpoint}")
+    if config.imagination.share:
+        from accerl_lerobot.engine.imagination import check_imagination
+
+        check_imagination(config)
+    if checkpoint is None:
+        config = warm_start(config, directory, console)
     config, before_s = replace(config, output_dir=str(directory)), 0.0 if checkpoint is None else None
     times = Times(started=started, warm_s=time.monotonic() - started, before_s=before_s)
     with contextlib.ExitStack() as stack:  # flushes the log, whatever fails
-        stop = stack.enter_context(Stopping())
+        stop = stack.enter_context(Stopping(resuming.resume_command(directory)))
         times.clock = stack.enter_context(contextlib.closing(open_clock(config.timeline_folder, "driver")))
         log = stack.enter_context(contextlib.closing(MetricsLog(directory, config.wandb, encode(config))))
         session = None
@@ -242,17 +244,12 @@ def execute(
             ray_session.prepare(joins=config.launch.address is not None)
             session = stack.enter_context(contextlib.closing(ray_session.RaySession(config.launch)))
         recovery = resuming.Recovery(config.launch.max_restarts)
-        while True:
-            # A run, or what is left of it, by one set of workers.
+        while True:  # a run, or what is left of it, by one set of workers
             history = 1 if load is not None else check_policy(config, spec, own=True)
             state = None if checkpoint is None else checkpoint / layout.TRAINING_STATE
             try:
-                try:
-                    with console.stage("starting workers"), stop.at_once():
-                        engine = make_engine(config, spec.tasks, history, state, load, session)
-                except KeyboardInterrupt:
-                    resuming.raise_if_stopped(stop, directory)
-                    raise
+                with console.stage("starting workers"), stop.at_once():
+                    engine = make_engine(config, spec.tasks, history, state, load, session)
                 with contextlib.closing(engine):
                     loop = Loop(config, directory, console, log, engine, spec.tasks, times, stop)
                     return loop.run(state)
@@ -262,18 +259,11 @@ def execute(
                 if not isinstance(loss, WorkerError):
                     raise
                 times.clock.enter(RECOVERY)
-                resuming.raise_if_stopped(stop, directory)
+                stop.check()
                 checkpoint = recovery.next(directory / layout.CHECKPOINTS, console, loss, times.furthest)
-                resuming.raise_if_stopped(stop, directory)
+                stop.check()
                 layout.go_back_to(checkpoint)
                 config = resuming.continued(config, directory, checkpoint)
-
-
-def _check_imagination(config: RunConfig) -> None:
-    if config.imagination.share:
-        from accerl_lerobot.engine.imagination import check_imagination
-
-        check_imagination(config)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,17 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Memory, disk space and lag of a run: rough estimates, and refusals of what this machine cannot hold."""
+"""Memory and disk space of a run: rough estimates, and refusals of what this machine cannot hold."""
 
 from __future__ import annotations
 
 import contextlib
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from accerl_lerobot.algorithms import RatioConfig
 from accerl_lerobot.errors import InputError, expanded
-from accerl_lerobot.replay.pacing import lag_bound
 
 if TYPE_CHECKING:
     from accerl_lerobot.engine.config import RunConfig
@@ -22,10 +20,8 @@ SIMULATOR_GIB = {"metaworld": 0.17, "libero": 0.17}
 """Resident memory without a policy's weights, see `policy_gib`: a process with torch and LeRobot, a
 rollout process without its worlds, Ray's own processes, and, by type of environment, the simulator of one
 task with its renderers."""
-ABSURD = 2
-"""Times this machine's memory that a rough estimate may be; ``accerl doctor`` warns long before."""
-DISK_BYTES = 2**29
-"""Disk space that demonstrations, checkpoints and videos take at least."""
+ABSURD = 2  # times this machine's memory that a rough estimate may be; ``accerl doctor`` warns long before
+DISK_BYTES = 2**29  # disk space that demonstrations, checkpoints and videos take at least
 
 
 def check_memory(config: RunConfig) -> None:
@@ -60,7 +56,7 @@ def memory_parts_gib(config: RunConfig, history: int = 1) -> dict[str, float]:
         "inference.workers": 0.0 if local else (config.inference.workers - 1) * POLICY_PROCESS_GIB,
         "rollout.workers": 0.0 if local else rollout.workers * ROLLOUT_PROCESS_GIB,
         "rollout.worlds": rollout.workers * rollout.worlds * simulator,
-        "rollout.segment_length": under_way(config) * pictures,
+        "rollout.segment_length": rollout.in_flight * pictures,
         "replay.capacity": config.replay.capacity * pictures,
         "algorithm.memory": config.remembered * pictures,
         "evaluation.videos": frames * 3 * FILM[0] ** 2 / GIB,
@@ -117,24 +113,3 @@ def check_disk(folder: str | None, field: str = "output_dir") -> None:
     if (free := shutil.disk_usage(path).free) < DISK_BYTES:
         remedy = f"{free / GIB:.2f} GiB are free on this disk, and {DISK_BYTES / GIB:.1f} are needed at least"
         raise InputError(field, folder, f"{remedy}; make room or choose another")
-
-
-def lag_limits(config: RunConfig) -> tuple[int, int]:
-    """The largest lag under this recipe, and what its pace alone would allow; in updates."""
-    ahead = 1 if config.launch.engine == "ray" else 0  # of publications under way, and of batches drawn early
-    bound, of_pace = (
-        lag_bound(
-            replay,
-            batch_decisions=config.trainer.batch_decisions,
-            in_flight=under_way(config),
-            pickup=ahead + config.trainer.hold_back,
-            prefetch=ahead,
-        )
-        for replay in (config.replay, replace(config.replay, max_lag=10**9))
-    )
-    return bound, of_pace
-
-
-def under_way(config: RunConfig) -> int:
-    """Decisions that environments of equal speed make while a segment is on its way to replay."""
-    return config.rollout.workers * config.rollout.worlds * config.rollout.segment_length

@@ -112,7 +112,6 @@ def deferred() -> Iterator[None]:
 
 
 def _cancel_alarms(left: threading.Event) -> None:
-    """Cancel the alarm that follows a signal, until and when the context is left."""
     ended = False
     while not ended:
         ended = left.wait(1.0)
@@ -121,12 +120,11 @@ def _cancel_alarms(left: threading.Event) -> None:
 
 
 class Stopping:
-    """Notes the first signal; a second one interrupts at once."""
+    """Notes the first signal; a second one interrupts at once. `how`: the command that resumes the run."""
 
-    def __init__(self) -> None:
-        self.asked: int | None = None
-        """The signal's number."""
-        self._waits = True
+    def __init__(self, how: str = "") -> None:
+        self.asked: int | None = None  # the signal's number
+        self._how, self._waits = how, True
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> Stopping:
@@ -139,14 +137,22 @@ class Stopping:
         for number, handler in self._before.items():
             signal.signal(number, handler)
 
+    def check(self) -> None:
+        """End the run if a signal has come."""
+        if self.asked is not None:
+            name = signal.Signals(self.asked).name
+            raise StoppedError(self.asked, f"stopped by {name}; to resume: {self._how}")
+
     @contextmanager
     def at_once(self) -> Iterator[None]:
-        """Have the first signal interrupt this context, in which there is nothing new to be saved."""
+        """Have the first signal end the run in this context, in which there is nothing new to be saved."""
         self._waits = False
         try:
-            if self.asked is not None:
-                raise KeyboardInterrupt
+            self.check()
             yield
+        except KeyboardInterrupt:
+            self.check()
+            raise
         finally:
             self._waits = True
 

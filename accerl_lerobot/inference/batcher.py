@@ -7,51 +7,13 @@ neither split nor reordered nor forgotten. In lock step, requests wait until the
 environment, however long that takes, and are then served in as many batches as they need.
 
 Of several inference replicas rollout worker i asks replica i modulo their number, so the requests of a worker
-are batched together; their statistics are merged as of one.
+are batched together; their metrics are merged as of one.
 """
 
 from __future__ import annotations
 
-import math
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Sequence, Sized
-from dataclasses import dataclass, field
-
-GRAIN = 1.1
-"""Ratio of neighbouring bins of waits."""
-SHORTEST_S = 1e-6
-
-
-@dataclass(kw_only=True)
-class BatcherStats:
-    """Counters of the batcher so far."""
-
-    batch_sizes: Counter[int] = field(default_factory=Counter)
-    """Observations in a batch → batches."""
-    waits: Counter[int] = field(default_factory=Counter)
-    """k → requests that waited about `GRAIN` to the k-th, in seconds."""
-    wait_sum_s: float = 0.0
-    wait_max_s: float = 0.0
-
-    def metrics(self) -> dict[str, float]:
-        """Means for the log; 0 before the first batch."""
-        batches, sizes = self.batch_sizes.total(), self.batch_sizes.items()
-        return {
-            "batches": float(batches),
-            "batch_size_mean": sum(size * count for size, count in sizes) / max(batches, 1),
-            "wait_mean_s": self.wait_sum_s / max(self.waits.total(), 1),
-            "wait_max_s": self.wait_max_s,
-        }
-
-
-def quantile(waits: Counter[int], share: float) -> float:
-    """The wait that `share` of the requests do not exceed, in seconds, to `GRAIN`; NaN if there are none."""
-    left = share * waits.total()
-    for k in sorted(waits):
-        left -= waits[k]
-        if left <= 0:
-            return float(GRAIN**k)
-    return math.nan
 
 
 class Batcher[R: Sized]:
@@ -62,10 +24,20 @@ class Batcher[R: Sized]:
 
     def __init__(self, max_batch: int, max_wait_s: float) -> None:
         self.max_batch, self.max_wait_s = max_batch, max_wait_s
-        self.stats = BatcherStats()
         self._waiting: deque[tuple[R, float]] = deque()
         self._observations = 0
         self._together = self._left = 0
+        self._batches = self._batched = self._served = 0  # batches; observations and requests in them
+        self._wait_sum_s = self._wait_max_s = 0.0
+
+    def metrics(self) -> dict[str, float]:
+        """Means for the log; 0 before the first batch."""
+        return {
+            "batches": float(self._batches),
+            "batch_size_mean": self._batched / max(self._batches, 1),
+            "wait_mean_s": self._wait_sum_s / max(self._served, 1),
+            "wait_max_s": self._wait_max_s,
+        }
 
     def lock_step(self, observations: int) -> None:
         """From now on so many observations wait for each other; 0: none do."""
@@ -82,7 +54,6 @@ class Batcher[R: Sized]:
         self._observations += len(request)
 
     def due(self, now: float) -> bool:
-        """True if the next batch should be served."""
         deadline = self.next_deadline()
         return deadline is not None and now >= deadline
 
@@ -107,14 +78,13 @@ class Batcher[R: Sized]:
             request, since = self._waiting.popleft()
             batch.append(request)
             size += len(request)
-            wait_s, stats = now - since, self.stats
-            stats.wait_sum_s += wait_s
-            stats.wait_max_s = max(stats.wait_max_s, wait_s)
-            stats.waits[round(math.log(max(wait_s, SHORTEST_S), GRAIN))] += 1
+            self._wait_sum_s += now - since
+            self._wait_max_s = max(self._wait_max_s, now - since)
         self._observations -= size
         self._left = max(0, self._left - size)
-        if batch:
-            self.stats.batch_sizes[size] += 1
+        self._batches += bool(batch)
+        self._batched += size
+        self._served += len(batch)
         return batch
 
 
@@ -133,13 +103,3 @@ def merge_metrics(metrics: Sequence[dict[str, float]]) -> dict[str, float]:
         "busy_share": sum(m["busy_share"] for m in metrics) / len(metrics),
         **{name: max(m[name] for m in metrics) for name in ("wait_max_s", "swap_s", "publish_to_served_s")},
     }
-
-
-def merge_stats(stats: Sequence[BatcherStats]) -> BatcherStats:
-    """Batches as of one replica."""
-    return BatcherStats(
-        batch_sizes=sum((s.batch_sizes for s in stats), Counter()),
-        waits=sum((s.waits for s in stats), Counter()),
-        wait_sum_s=sum(s.wait_sum_s for s in stats),
-        wait_max_s=max(s.wait_max_s for s in stats),
-    )

@@ -1,12 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The inference process: one device answers many environments.
 
-    consumes    requests from rollout workers; published weights
-    produces    decisions, each stamped with the version of the weights that made it
-    waits for   a full batch, or for the oldest request to have waited `max_wait_s`
-    weights     are swapped between batches: no batch ever sees two versions
-    ends        with the process; an exception fails all requests, and the engine restarts the process, which
-                has no state but weights
+A batch is decided when it is full or its oldest request has waited `max_wait_s`. Published weights are taken
+in between batches, so none sees two versions, and each decision is stamped with its own. An exception fails
+all requests and ends the process, which has no state but weights; the engine starts another one.
 
 One thread waits for clients and for the batcher's clock at once, runs the forward pass and replies. Ray's
 calls come in on the event loop beside it, which only hands them over.
@@ -17,8 +14,8 @@ from __future__ import annotations
 import asyncio
 import os
 import time
-from collections import Counter, deque
-from dataclasses import dataclass, replace
+from collections import deque
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -29,15 +26,14 @@ from accerl_lerobot.checkpoint.layout import WEIGHTS
 from accerl_lerobot.config.ranges import Range, Section, Threads
 from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.fault_points import fault_point
-from accerl_lerobot.inference.batcher import Batcher, BatcherStats
+from accerl_lerobot.inference.batcher import Batcher
 from accerl_lerobot.policies.config import Load, PolicyConfig, loader
 from accerl_lerobot.timeline import COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
 from accerl_lerobot.transport.contract import PendingRequest, Server, stopped
 from accerl_lerobot.transport.shared_memory import Address, SharedMemoryServer
 from accerl_lerobot.transport.weights import WeightUpdate
 
-LOOK_S = 1.0
-"""Longest wait of the serving thread before it checks whether it should end."""
+LOOK_S = 1.0  # longest wait of the serving thread before it checks whether it should end
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,7 +94,7 @@ class InferenceWorker:
         self._server = server = SharedMemoryServer(self._take, copy=False)
         return server.address
 
-    async def decide(self, message: list[Request] | WeightUpdate) -> list[Decision] | None:
+    async def receive(self, message: list[Request] | WeightUpdate) -> list[Decision] | None:
         """Answer a client's requests, in order, as part of some batch; or use weights from the next batch on.
 
         Raises:
@@ -111,7 +107,6 @@ class InferenceWorker:
         return decisions
 
     async def lock_step(self, observations: int) -> None:
-        """See `Batcher.lock_step`."""
         self._lock_step.append(observations)
         self._server.wake()
 
@@ -132,17 +127,12 @@ class InferenceWorker:
         share = (busy_s - self._busy_told_s) / max(1e-9, now - self._since)
         self._since, self._busy_told_s = now, busy_s
         return {
-            **self._batcher.stats.metrics(),
+            **self._batcher.metrics(),
             "version": float(self._version),
             "busy_share": share,
             "swap_s": self._swap_s,
             "publish_to_served_s": self._publish_to_served_s,
         }
-
-    async def batching(self) -> BatcherStats:
-        stats = self._batcher.stats
-        # Copied in one go each: the other thread adds to them.
-        return replace(stats, batch_sizes=Counter(stats.batch_sizes), waits=Counter(stats.waits))
 
     def _serve(self) -> None:
         batch: list[PendingRequest] = []

@@ -25,10 +25,8 @@ from accerl_lerobot.replay.pacing import ReplayConfig, entitle
 DRAWS = 1024
 """Last draws that are remembered, to be taken back in `Replay.state`: a trainer draws one batch ahead, and
 goes on while it is saved."""
-BATCH_SHARE = 0.5
-"""Share of a batch that is one, when no more will come."""
-FILL_SHARE = 0.9
-"""Share of the real store up to which it is filled without anything being drawn."""
+BATCH_SHARE = 0.5  # share of a batch that is one, when no more will come
+FILL_SHARE = 0.9  # share of the real store up to which it is filled without anything being drawn
 
 
 @kind
@@ -44,12 +42,9 @@ class ReplayCounters:
     retired_segments: int = 0
     retired_decisions: int = 0
     retired_unused: int = 0
-    dropped_nonfinite: int = 0
-    """Segments refused because they hold a NaN or an infinity."""
-    trained_decisions: int = 0
-    """Drawn by the trainer, repetitions counted."""
-    unique_decisions: int = 0
-    """Drawn at least once."""
+    dropped_nonfinite: int = 0  # segments refused because they hold a NaN or an infinity
+    trained_decisions: int = 0  # drawn by the trainer, repetitions counted
+    unique_decisions: int = 0  # drawn at least once
 
 
 @dataclass(eq=False)
@@ -75,8 +70,7 @@ class Replay:
     def __init__(self, config: ReplayConfig) -> None:
         self.config, self.counters = config, ReplayCounters()
         self.stored_decisions = 0
-        self.available_decisions = 0
-        """Decisions of the segments with draws left."""
+        self.available_decisions = 0  # decisions of the segments with draws left
         self._entries: deque[_Entry] = deque()  # oldest first
         self._carry = 0.0
         self._drawn: deque[tuple[int, list[_Entry]]] = deque(maxlen=DRAWS)
@@ -84,7 +78,6 @@ class Replay:
 
     @property
     def segments(self) -> list[Segment]:
-        """All that is stored, the oldest first."""
         return [entry.segment for entry in self._entries]
 
     def may_insert(self) -> bool:
@@ -140,7 +133,6 @@ class Replay:
         return [entry.segment for entry in drawn]
 
     def metrics(self) -> dict[str, float]:
-        """Everything worth logging, by name."""
         counts = asdict(self.counters) | {"stored_segments": len(self._entries)}
         counts |= {name: getattr(self, name) for name in ("stored_decisions", "available_decisions")}
         return {name: float(count) for name, count in counts.items()}
@@ -161,7 +153,7 @@ class Replay:
             if count == entry.uses:
                 counters.unique_decisions -= entry.size
                 if entry.left:
-                    _count(counters, f"{entry.left}_unused", 1)
+                    vars(counters)[f"{entry.left}_unused"] += 1
         entries = [{"segment": e.segment, "draws": e.draws, "uses": e.uses - back[e]} for e in self._entries]
         return {"counters": counters, "entries": entries, "carry": self._carry}
 
@@ -187,12 +179,9 @@ class Replay:
         entry.segment, entry.left = None, how
         self.stored_decisions -= entry.size
         self.available_decisions -= entry.size if entry.available else 0
+        counts = vars(self.counters)
         for name, amount in (("segments", 1), ("decisions", entry.size), ("unused", entry.uses == 0)):
-            _count(self.counters, f"{how}_{name}", int(amount))
-
-
-def _count(counters: ReplayCounters, name: str, amount: int) -> None:
-    setattr(counters, name, getattr(counters, name) + amount)
+            counts[f"{how}_{name}"] += int(amount)
 
 
 def is_finite(segment: Segment) -> bool:
@@ -227,21 +216,17 @@ class MixedReplay:
     ) -> None:
         self._patient, self._journal = patient, journal
         self.real, self.imagined, self.share = Replay(real), Replay(imagined), share
-        self.real_ended = False
-        """True if no real segment will come any more."""
-        self.awaited = share > 0
-        """True if anything may be imagined later on, although nothing is now."""
+        self.real_ended = False  # True if no real segment will come any more
+        self.awaited = share > 0  # True if anything may be imagined later on, although nothing is now
         self.held = False
         """True if real episodes, if they are counted, wait: what is here is to be learnt from first."""
 
     def may_insert(self, source: str = REAL) -> bool:
-        """True if another segment of this source should be brought now."""
         if source != REAL:
             return self.imagined.may_insert()
         return not (self.held and self._patient) and (self.real.may_insert() or self._waits)
 
     def insert(self, segment: Segment) -> bool:
-        """See `Replay.insert`."""
         if segment.source != REAL:
             return self.imagined.insert(segment)
         stored = self.real.insert(segment)
@@ -250,7 +235,6 @@ class MixedReplay:
         return stored
 
     def may_sample(self, batch_decisions: int) -> bool:
-        """True if a batch should be drawn now."""
         return self._parts(batch_decisions) is not None
 
     def exhausted(self, batch_decisions: int) -> bool:
@@ -262,15 +246,11 @@ class MixedReplay:
         """See `Replay.sample`: empty, with nothing counted as used, if a part cannot be had."""
         self.real.retire(trainer_version)
         self.imagined.retire(trainer_version)
-        drawn: list[Segment] = []
-        for replay, count in zip(
-            (self.real, self.imagined), self._parts(num_decisions) or (0, 0), strict=True
-        ):
-            drawn += replay.sample(count, trainer_version, rng) if count else []
-        return drawn
+        real, imagined = self._parts(num_decisions) or (0, 0)
+        drawn = self.real.sample(real, trainer_version, rng) if real else []
+        return drawn + (self.imagined.sample(imagined, trainer_version, rng) if imagined else [])
 
     def state(self, version: int | None = None) -> dict[str, Any]:
-        """See `Replay.state`."""
         return {
             "real": self.real.state(version),
             "imagined": self.imagined.state(version),
@@ -279,7 +259,6 @@ class MixedReplay:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """See `Replay.restore`."""
         self.real.restore(state["real"])
         self.imagined.restore(state["imagined"])
         for name in _STATE:
@@ -303,19 +282,16 @@ class MixedReplay:
         """Decisions to draw from either store; None if one of them cannot give its part."""
         if self._waits:
             return None
-        real = batch - round(self.share * batch)
+        real, left = batch - round(self.share * batch), self.real.available_decisions
+        if self.real_ended and not self.share:
+            # Few episodes may be less than a batch: then they are one.
+            return (min(batch, left), 0) if left >= BATCH_SHARE * batch else None
         if self.real_ended:
-            left = self.real.available_decisions
-            if not self.share:
-                # Few episodes may be less than a batch: then they are one.
-                return (min(batch, left), 0) if left >= BATCH_SHARE * batch else None
             real = min(real, left)
         elif real and not self.real.may_sample(real):
             return None
         imagined = batch - real
-        if imagined and not self.imagined.may_sample(imagined):
-            return None
-        return real, imagined
+        return None if imagined and not self.imagined.may_sample(imagined) else (real, imagined)
 
 
 _STATE = ("share", "real_ended", "awaited", "held")

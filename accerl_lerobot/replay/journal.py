@@ -22,8 +22,7 @@ from accerl_lerobot.experience import Origin, Segment
 from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.metrics import cut_back
 
-EPISODES = "episodes.jsonl"
-"""Name of the file in a run's folder."""
+EPISODES = "episodes.jsonl"  # name of the file in a run's folder
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,14 +31,11 @@ class Done:
 
     key: str
     origin: Origin
-    actions: np.ndarray
-    """float32 (env steps, A), as they were executed, one after the other."""
-    steps: tuple[int, ...]
-    """Env steps of each decision; `rewards` have its cost taken off."""
+    actions: np.ndarray  # float32 (env steps, A), as they were executed, one after the other
+    steps: tuple[int, ...]  # env steps of each decision; `rewards` have its cost taken off
     versions: tuple[int, ...]
     rewards: tuple[float, ...]
-    ended: bool
-    """True if the episode ended with it."""
+    ended: bool  # True if the episode ended with it
     success: bool
 
 
@@ -55,7 +51,6 @@ class Journal:
         return self._path.stat().st_size
 
     def write(self, segment: Segment) -> None:
-        """Notes a real segment."""
         chunks = zip(segment.actions, segment.steps, strict=True)
         actions = np.concatenate([chunk[:steps] for chunk, steps in chunks])
         line = {

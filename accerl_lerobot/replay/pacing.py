@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """How far rollouts and trainer may run apart: two predicates, and the staleness they imply; whose turn it is.
 
-Everything is counted in decisions. On entering the store each segment gets a whole number of draws, ⌊r⌋ or
-⌈r⌉ with r = samples_per_insert, such that the average is r (`entitle`). A segment with draws left is
-*available*. With batch ≤ ahead, one of `may_sample` and `may_insert` holds at any time. Rollouts wait on
-insert instead of having their segments thrown away later, because what is thrown away first is what took
-longest, and those are the failures.
+Everything is counted in decisions. On entering the store each segment gets a number of draws (`entitle`); one
+with draws left is *available*. With batch ≤ ahead, one of `may_sample` and `may_insert` holds at any time.
+Rollouts wait on insert instead of having their segments thrown away later, because what is thrown away first
+is what took longest, and those are the failures.
 
     asynchronous   nobody waits for anybody, within the pace
     overlap        the next batch is collected while one is learned from, and then both wait for each other
@@ -18,11 +17,14 @@ together in them, as by a vectorised environment, so a step takes as long as its
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Annotated, Literal
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from accerl_lerobot.config.ranges import Range, Section, Steps
 from accerl_lerobot.errors import InputError
+
+if TYPE_CHECKING:
+    from accerl_lerobot.engine.config import RunConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,11 +73,9 @@ class ReplayConfig(Section, section="replay"):
             raise InputError("replay.capacity", self.capacity, remedy)
 
     def may_sample(self, stored: int, available: int, batch_decisions: int) -> bool:
-        """True if the trainer may draw a batch now."""
         return stored >= self.min_decisions and available >= batch_decisions
 
     def may_insert(self, stored: int, available: int) -> bool:
-        """True if rollouts may bring another segment now."""
         return stored < self.min_decisions or available < self.ahead
 
 
@@ -92,11 +92,7 @@ def entitle(samples_per_insert: float, n: int, carry: float) -> tuple[int, float
 def lag_bound(
     config: ReplayConfig, *, batch_decisions: int, in_flight: int, pickup: int = 0, prefetch: int = 0
 ) -> int:
-    """The largest lag of a decision that is drawn from replay, in updates.
-
-    `engine.sizes.lag_limits` computes it, for people to read. `Replay.retire` enforces ``max_lag``, and
-    `may_insert` and `may_sample` the pace. Off-policy algorithms learn from a memory of their own,
-    `trainer.off_policy.Memory`, which nothing of this bounds.
+    """The largest lag of a decision that is drawn from replay, in updates, for people to read.
 
         lag ≤ min(max_lag, pickup + drawn) + prefetch
         drawn = ⌊⌈samples_per_insert⌉ · (max(ahead, min_decisions) + 2·in_flight + capacity) / batch⌋ − 1
@@ -117,6 +113,18 @@ def lag_bound(
     return min(config.max_lag, pickup + drawn) + prefetch
 
 
+def lag_limits(config: RunConfig) -> tuple[int, int]:
+    """The largest lag under this recipe, and what its pace alone would allow; in updates."""
+    ahead = 1 if config.launch.engine == "ray" else 0  # of publications under way, and of batches drawn early
+    batch, in_flight = config.trainer.batch_decisions, config.rollout.in_flight
+    counts = {"batch_decisions": batch, "in_flight": in_flight, "prefetch": ahead}
+    bound, of_pace = (
+        lag_bound(replay, pickup=ahead + config.trainer.hold_back, **counts)
+        for replay in (config.replay, replace(config.replay, max_lag=10**9))
+    )
+    return bound, of_pace
+
+
 Schedule = Literal["asynchronous", "overlap", "synchronous"]
 ASYNCHRONOUS: Schedule = "asynchronous"
 OVERLAP: Schedule = "overlap"
@@ -132,8 +140,7 @@ class Turns:
 
     def __init__(self, schedule: Schedule = ASYNCHRONOUS) -> None:
         self.schedule: Schedule = schedule
-        self._under_way = 0
-        """Batches that the trainer has drawn and not learned from."""
+        self._under_way = 0  # batches that the trainer has drawn and not learned from
 
     def may_collect(self, ready: bool) -> bool:
         """True if who has brought a segment may go on; `ready`: the pace would let a batch be drawn now."""
@@ -143,7 +150,6 @@ class Turns:
         return self.schedule == ASYNCHRONOUS or not (ready and learning)
 
     def may_draw(self) -> bool:
-        """True if the trainer may have its next batch."""
         return self.schedule == ASYNCHRONOUS or self._under_way <= 0
 
     def drawn(self) -> None:

@@ -1,11 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The replay process.
+"""The replay process, between rollout workers, imagination and the trainer.
 
-consumes    segments from rollout workers and from imagination
-produces    batches of segments for the trainer
-waits for   the pace: `insert` until rollouts are not too far ahead, `sample` for enough that is new;
-            and, where they take turns, each for the other
-unblocked   by the other side, or by `close`
+`insert` waits until rollouts are not too far ahead, and `sample` for enough that is new; where they take
+turns, each waits for the other too. `close` ends all waits.
 """
 
 from __future__ import annotations
@@ -18,7 +15,7 @@ from collections import deque
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -41,10 +38,8 @@ class News(NamedTuple):
 
     segments: list[Segment]
     cursor: int
-    ended: bool
-    """No more will come."""
-    closed: bool
-    """The run is over."""
+    ended: bool  # no more will come
+    closed: bool  # the run is over
 
 
 class ReplayWorker:
@@ -114,16 +109,13 @@ class ReplayWorker:
                 self._insert_wait_s += time.monotonic() - started
             if self._closed:
                 return False
-            self._clock.enter(COMPUTE)
-            with self._failing():
+            with self._working():
                 for segment in segments:
                     fault_point("replay.insert")
                     if self._replay.insert(segment) and source == REAL:
                         self._real.append(segment)
                         self._real_count += 1
                         self._episodes += [segment.episode] if segment.episode else []
-            self._clock.enter(WAIT_IN)
-            self._changed.notify_all()
             kept = time.monotonic()
             await self._changed.wait_for(lambda: self._closed or self._turns.may_collect(self._ready))
             if source == REAL:
@@ -143,12 +135,9 @@ class ReplayWorker:
                 await self._changed.wait_for(lambda: ended() or (self._turns.may_draw() and self._ready))
                 if ended():
                     return []
-                self._clock.enter(COMPUTE)
-                with self._failing():
+                with self._working():
                     fault_point("replay.sample")
                     segments = self._replay.sample(num_decisions, trainer_version, self._rng)
-                self._clock.enter(WAIT_IN)
-                self._changed.notify_all()
                 if segments:
                     self._turns.drawn()
                     self._sample_wait_s += time.monotonic() - started
@@ -156,7 +145,6 @@ class ReplayWorker:
 
     @asynccontextmanager
     async def _changing(self) -> AsyncIterator[None]:
-        """Has everybody who waits look again."""
         async with self._changed:
             yield
             self._changed.notify_all()
@@ -175,40 +163,37 @@ class ReplayWorker:
         segments = list(self._real)[len(self._real) - new :]
         return News(segments, self._real_count, self._replay.real_ended, self._closed)
 
-    async def mix(self, share: float, awaited: bool) -> None:
-        """From now on, so much of a batch is imagined; `awaited`: or may be later on."""
+    async def change(self, **state: Any) -> None:
+        """Set ``share``, ``awaited``, ``held`` or ``real_ended`` of `MixedReplay`."""
         async with self._changing():
-            self._replay.share, self._replay.awaited = share, awaited
-
-    async def hold(self, held: bool) -> None:
-        """See `MixedReplay.held`."""
-        async with self._changing():
-            self._replay.held = held
-
-    async def end_real(self) -> None:
-        async with self._changing():
-            self._replay.real_ended = True
+            vars(self._replay).update(state)
 
     async def save(self, directory: Path, version: int) -> None:
         """Writes its part of ``training_state``, as it was when the trainer had made `version` updates."""
         self._clock.enter(CHECKPOINT)
         fault_point("replay.save")
-        replay, rng = self._replay.state(version), copy.deepcopy(self._rng)
-        state = {"replay": replay, "rng": rng, "real_count": self._real_count}
+        state = {
+            "replay": self._replay.state(version),
+            "rng": copy.deepcopy(self._rng),
+            "real_count": self._real_count,
+        }
         self._clock.enter(WAIT_IN)
         await asyncio.to_thread(snapshot.save, directory / "replay", state)
 
     @contextmanager
-    def _failing(self) -> Iterator[None]:
-        """Turns an exception inside into this worker's failure, and not that of the caller."""
+    def _working(self) -> Iterator[None]:
+        """An exception inside is this worker's failure, and not that of the caller."""
         if self._failure is not None:
             raise stopped(self._failure)
+        self._clock.enter(COMPUTE)
         try:
             yield
         except Exception as error:
             self._failure = error
-            self._changed.notify_all()
             raise stopped(error) from error
+        finally:
+            self._clock.enter(WAIT_IN)
+            self._changed.notify_all()
 
     @property
     def _ready(self) -> bool:
@@ -219,7 +204,7 @@ class ReplayWorker:
             self._closed = True
 
     async def metrics(self) -> dict[str, float]:
-        """Counters and seconds waited at either door; episodes since the last call as means."""
+        """Counters and seconds that either side has waited; episodes since the last call as means."""
         self._clock.beat()
         episodes, self._episodes = self._episodes, []
         names = episodes[0] if episodes else ()

@@ -16,8 +16,8 @@ from accerl_lerobot.checkpoint.layout import SUMMARY
 from accerl_lerobot.config.parsing import decode
 from accerl_lerobot.console import count, duration, number, percent, rate
 from accerl_lerobot.engine.config import RunConfig
-from accerl_lerobot.engine.sizes import lag_limits
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.replay.pacing import lag_limits
 from accerl_lerobot.report.charts import COLOURS, Chart, Series, line, rates
 from accerl_lerobot.report.read import Record, Run, apart, column, differences, newest
 from accerl_lerobot.timeline import STATES

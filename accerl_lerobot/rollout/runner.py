@@ -66,6 +66,11 @@ class RolloutConfig(Section, section="rollout"):
     reward_model: RewardModelConfig = field(default_factory=RewardModelConfig)
     """The model that tells success, where the environment does not."""
 
+    @property
+    def in_flight(self) -> int:
+        """Decisions that environments of equal speed make while a segment is on its way to replay."""
+        return self.workers * self.worlds * self.segment_length
+
 
 @kind
 @dataclass(frozen=True, kw_only=True)
@@ -76,10 +81,8 @@ class EpisodePlan:
     seed: int
     explore: bool
     """True: sample and learn from it. False: LeRobot's stock sampler, for evaluation; no segment is made."""
-    index: int = 0
-    """Position in the evaluation it belongs to."""
-    group: str = "train"
-    """Which evaluation it belongs to."""
+    index: int = 0  # position in the evaluation it belongs to
+    group: str = "train"  # which evaluation it belongs to
     film: tuple[int, int] | None = None
     """Side in pixels and env steps per frame of a video for people; None: none. It executes a chunk in parts,
     which changes nothing else."""
@@ -107,13 +110,11 @@ class EpisodePlans:
         self, tasks: tuple[str, ...], seed: int, budget: int | None, worker: int = 0, incarnation: int = 0
     ) -> None:
         self._tasks, self._seed, self._worker, self._budget = tasks, seed, worker, budget
-        self.starts = incarnation * STARTS_PER_INCARNATION
-        """Where it is in the worker's seeds."""
+        self.starts = incarnation * STARTS_PER_INCARNATION  # where it is in the worker's seeds
         # Filled and emptied on different threads: appending to and popping from a deque is atomic.
         self._queued: deque[EpisodePlan] = deque()
 
     def queue(self, plans: Iterable[EpisodePlan]) -> None:
-        """Plans evaluation episodes."""
         self._queued.extend(plans)
 
     def next(self, exploring: bool) -> EpisodePlan | None:
@@ -151,8 +152,7 @@ class EpisodeResult:
     episode_return: float
     steps: int
     decisions: int
-    versions: tuple[int, int]
-    """Oldest and newest weights that decided in it."""
+    versions: tuple[int, int]  # oldest and newest weights that decided in it
     frames: list[np.ndarray] = field(default_factory=list)
     """uint8 (H, W, 3) each, when the plan asked for a film."""
 
@@ -165,10 +165,10 @@ class Counters:
     env_steps: int = 0
     decisions: int = 0
     episodes: int = 0
-    dropped_nonfinite: int = 0
-    """Decisions thrown away because the world returned NaN or infinity."""
+    dropped_nonfinite: int = 0  # decisions thrown away because the world returned NaN or infinity
 
 
+@dataclass(eq=False)
 class RolloutRunner:
     """Drives a set of worlds, one per slot, through planned episodes.
 
@@ -177,37 +177,32 @@ class RolloutRunner:
     finished segments of exploring episodes, `on_episode` every finished episode.
     """
 
-    def __init__(
-        self,
-        worlds: Sequence[World],
-        next_plan: Callable[[], EpisodePlan | None],
-        config: RolloutConfig,
-        name: str,
-        on_segment: Callable[[Segment], object],
-        on_episode: Callable[[EpisodeResult], object],
-    ) -> None:
-        self.config, self.name = config, name
+    worlds: Sequence[World]
+    next_plan: Callable[[], EpisodePlan | None]
+    config: RolloutConfig
+    name: str
+    on_segment: Callable[[Segment], object]
+    on_episode: Callable[[EpisodeResult], object]
+
+    def __post_init__(self) -> None:
         self.counters = Counters()
-        self._worlds = list(worlds)
-        self._episodes: list[ActiveEpisode | None] = [None] * len(worlds)
-        self._next_plan, self._on_segment, self._on_episode = next_plan, on_segment, on_episode
+        self._episodes: list[ActiveEpisode | None] = [None] * len(self.worlds)
         self._sequence = 0
 
     def __len__(self) -> int:
-        return len(self._worlds)
+        return len(self.worlds)
 
     @property
     def exploring(self) -> bool:
-        """True if an exploring episode is under way."""
         return any(episode is not None and episode.plan.explore for episode in self._episodes)
 
     def start(self, slot: int) -> Request | None:
         """Begins the next planned episode in `slot`; None when nothing is planned."""
-        plan = self._next_plan()
+        plan = self.next_plan()
         if plan is None:
             self._episodes[slot] = None
             return None
-        observation = self._worlds[slot].reset(plan.seed, plan.task)
+        observation = self.worlds[slot].reset(plan.seed, plan.task)
         if not _finite(observation):
             raise RuntimeError(f"{plan.task} with seed {plan.seed}: the first observation is not finite")
         self._episodes[slot] = ActiveEpisode(plan, self._builder(plan, observation))
@@ -215,7 +210,7 @@ class RolloutRunner:
 
     def advance(self, slot: int, decision: Decision) -> Request | None:
         """Executes `decision`; the request is about the same episode, or the first of the next one."""
-        world, episode = self._worlds[slot], self._episodes[slot]
+        world, episode = self.worlds[slot], self._episodes[slot]
         assert episode is not None
         result = _execute(world, episode, decision.chunk)
         episode.chunks.append(decision.chunk)
@@ -255,7 +250,7 @@ class RolloutRunner:
     def restore(self, state: dict[str, Any]) -> None:
         """Resumes from `state`: worlds are brought back by doing again what was done in them."""
         self.counters, self._sequence = state["counters"], state["sequence"]
-        for slot, (world, saved) in enumerate(zip(self._worlds, state["episodes"], strict=True)):
+        for slot, (world, saved) in enumerate(zip(self.worlds, state["episodes"], strict=True)):
             if saved is None:
                 continue
             plan: EpisodePlan = saved["plan"]
@@ -264,7 +259,8 @@ class RolloutRunner:
                 observation = world.step_chunk(chunk).observation
             builder = self._builder(plan, observation)
             builder.restore(saved["builder"])
-            if not _equal(observation, builder.latest):
+            latest = builder.latest
+            if not all(np.array_equal(observation[key], latest[key]) for key in latest):
                 raise RuntimeError(
                     f"{plan.task} with seed {plan.seed} does not show again what it had shown after "
                     f"{len(saved['chunks'])} decisions, so its episodes cannot be resumed in the middle; "
@@ -273,7 +269,7 @@ class RolloutRunner:
             self._episodes[slot] = ActiveEpisode(**saved | {"builder": builder})
 
     def close(self) -> None:
-        for world in self._worlds:
+        for world in self.worlds:
             world.close()
 
     def _builder(self, plan: EpisodePlan, observation: Observation) -> SegmentBuilder:
@@ -287,7 +283,7 @@ class RolloutRunner:
         key = f"{self.name}.{self._sequence}"
         segment = episode.builder.cut(key, result.done, result.success, totals if result.done else None)
         if episode.plan.explore:
-            self._on_segment(segment)
+            self.on_segment(segment)
 
     def _finish(self, episode: ActiveEpisode, success: bool) -> None:
         self.counters.episodes += 1
@@ -301,7 +297,7 @@ class RolloutRunner:
             versions=(min(versions), max(versions)),
             frames=episode.frames,
         )
-        self._on_episode(result)
+        self.on_episode(result)
 
 
 def _execute(world: World, episode: ActiveEpisode, actions: np.ndarray) -> ChunkResult:
@@ -317,10 +313,6 @@ def _execute(world: World, episode: ActiveEpisode, actions: np.ndarray) -> Chunk
         if result.done:
             break
     return replace(result, rewards=np.concatenate(rewards))
-
-
-def _equal(one: Observation, other: Observation) -> bool:
-    return one.keys() == other.keys() and all(np.array_equal(one[key], other[key]) for key in one)
 
 
 def _finite(observation: Observation) -> bool:

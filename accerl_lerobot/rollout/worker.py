@@ -1,14 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The rollout process: steps its worlds while other observations wait for a decision.
 
-    consumes    decisions from inference
-    produces    segments for replay, results of episodes for the driver
-    waits for   a decision, only when every world has an observation under way
-    pauses      exploring worlds while replay keeps segments at the door; evaluation goes on
-    ends        never unasked: a world that raises ends the process's `run`, and `launch` starts another
-    outlives    inference: its successor is asked again what has not been answered
-
-Imports neither torch nor LeRobot (unless its world does).
+It waits only when every world has an observation under way, and pauses exploring while replay does not take
+segments. It outlives inference, whose successor is asked again what has not been answered. A world that
+raises ends `run`, and the engine starts another process. Imports neither torch nor LeRobot, unless its world
+does.
 """
 
 from __future__ import annotations
@@ -17,8 +13,6 @@ import os
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -39,31 +33,21 @@ from accerl_lerobot.transport.endpoint import Endpoint, ReconnectingClient
 
 PARTS = 2
 """A worker's worlds are asked for in so many parts: one is stepped while the other's decisions are made."""
-AT_THE_DOOR = 2
-"""Messages to replay that may be waiting before exploring worlds pause."""
-PAUSE_S = 0.005
-"""Between two looks at whether there is something to do."""
+MAX_PENDING = 2  # messages to replay that may be pending before exploring worlds pause
+PAUSE_S = 0.005  # between two looks at whether there is something to do
 
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
     """A rollout worker's answer when it is asked how it is."""
 
-    episodes: list[EpisodeResult]
-    """Finished since the last report."""
-    counters: dict[str, float]
-    """Since this process began."""
-    in_world_s: float
-    """Seconds for which the world has been at what it does now; 0 while none is stepped."""
-    stuck_s: float = 0.0
-    """Seconds since the thread that steps worlds last did anything; 0 while one is stepped."""
-    spent: bool = False
-    """Every exploring episode that was paid for has been played, and replay has it."""
-    starts: int = 0
-    """See `EpisodePlans.starts`."""
-    away_s: float = 0.0
-    """Seconds for which inference has not been where it was last said to be."""
-    away_why: str = ""
+    episodes: list[EpisodeResult]  # finished since the last report
+    counters: dict[str, float]  # since this process began
+    busy_s: float = 0.0
+    """Seconds for which its thread has been at what it does now; 0 before `RolloutWorker.run`."""
+    in_world: bool = False  # True if that is to step or reset a world
+    spent: bool = False  # every exploring episode that was paid for has been played, and replay has it
+    starts: int = 0  # see `EpisodePlans.starts`
 
 
 class RolloutWorker:
@@ -88,12 +72,11 @@ class RolloutWorker:
         self._clock = open_clock(timeline, f"rollout {index}")
         self._plans = EpisodePlans(tasks, seed, budget, index, incarnation)
         self._spent = False
-        self._at_the_door = AT_THE_DOOR
+        self._max_pending = MAX_PENDING
         # Shared by the two threads: appending to and popping from a deque is atomic.
         self._results: deque[EpisodeResult] = deque()
         self._training = threading.Event()
-        self._entered: float | None = None
-        self._moved: float | None = None
+        self._active: tuple[float, bool] | None = None  # since when the thread does what, see `Report`
         self._outbox: list[Segment] = []
         self._deciding = ReconnectingClient("inference")
         worlds = [make_world(env, history, config.reward_model) for _ in range(config.worlds)]
@@ -123,56 +106,57 @@ class RolloutWorker:
         if inference is not None:
             self._deciding.move(inference)
         self._plans.queue(plans)
-        self._at_the_door = 1 if in_turn else AT_THE_DOOR
+        self._max_pending = 1 if in_turn else MAX_PENDING
         (self._training.set if training else self._training.clear)()
-        episodes = [self._results.popleft() for _ in range(len(self._results))]
-        entered, moved, now = self._entered, self._moved, time.monotonic()
+        now = time.monotonic()
+        since, in_world = self._active or (now, False)
         return Report(
-            episodes=episodes,
+            episodes=[self._results.popleft() for _ in range(len(self._results))],
             counters={k: float(v) for k, v in vars(self._runner.counters).items()},
-            in_world_s=0.0 if entered is None else now - entered,
-            stuck_s=0.0 if moved is None or entered is not None else now - moved,
+            busy_s=now - since,
+            in_world=in_world,
             spent=self._spent,
             starts=self._plans.starts,
-            away_s=self._deciding.away_s,
-            away_why=self._deciding.why,
         )
 
     def run(self, inference: Endpoint, replay: Endpoint) -> None:
         """Steps worlds until the process ends."""
-        deciding, door = self._deciding, replay.connect()
+        deciding, storing = self._deciding, replay.connect()
         deciding.move(inference)
         idle = list(range(len(self._runner)))
         due: dict[int, Request] = {}
         under_way: dict[int, list[int]] = {}
-        at_the_door: set[int] = set()
+        pending: set[int] = set()  # tickets of messages to replay
         size = max(1, len(self._runner) // PARTS)
         patience = 0.0
         while True:
-            self._moved = time.monotonic()
-            at_the_door -= {ticket for ticket, _ in door.done(patience)}
+            self._active = time.monotonic(), False
+            pending -= {ticket for ticket, _ in storing.done(patience)}
             while self._outbox:
                 self._clock.enter(TRANSPORT)
                 if fault_point("rollout.send"):
                     self._outbox[0].reward = self._outbox[0].reward * np.float32(np.nan)
-                at_the_door.add(door.send(self._outbox[:size]))
+                pending.add(storing.send(self._outbox[:size]))
                 del self._outbox[:size]
-            self._spent = self._plans.spent and not self._runner.exploring and not at_the_door
+            self._spent = self._plans.spent and not self._runner.exploring and not pending
             if not self._training.is_set():  # so that planned episodes need not wait for exploring ones
                 idle += [slot for slot, request in due.items() if request.explore]
                 due = {slot: request for slot, request in due.items() if not request.explore}
-            idle = [slot for slot in idle if not self._begin(slot, due)]
-            sendable = [slot for slot in due if len(at_the_door) < self._at_the_door or not due[slot].explore]
+            idle = [slot for slot in idle if not self._step(slot, None, due)]
+            sendable = [slot for slot in due if len(pending) < self._max_pending or not due[slot].explore]
             for start in range(0, len(sendable), size):
                 self._clock.enter(TRANSPORT)
                 slots = sendable[start : start + size]
                 under_way[deciding.send([due.pop(slot) for slot in slots])] = slots
-            # Where no decision is awaited, there is nothing to wait for but the door, and orders.
+            # Where no decision is awaited, there is nothing to wait for but replay, and orders.
             patience = 0.0 if under_way else PAUSE_S
             self._clock.enter(WAIT_IN if under_way or not due else WAIT_OUT)
             for ticket, decisions in deciding.done(0.5) if under_way else ():
                 for slot, decision in zip(under_way.pop(ticket), decisions, strict=True):
-                    self._advance(slot, decision, due, idle)
+                    self._clock.enter(COMPUTE)
+                    fault_point("rollout.decided")
+                    if not self._step(slot, decision, due):
+                        idle.append(slot)
 
     def _next(self) -> EpisodePlan | None:
         plan = self._plans.next(exploring=self._training.is_set())
@@ -180,27 +164,15 @@ class RolloutWorker:
             self._clock.enter(COMPUTE)
         return plan
 
-    def _begin(self, slot: int, due: dict[int, Request]) -> bool:
-        with self._in_world():
+    def _step(self, slot: int, decision: Decision | None, due: dict[int, Request]) -> bool:
+        """Begin an episode, or execute a decision; False if nothing is due in this slot then."""
+        self._active = time.monotonic(), True
+        if decision is None:
             request = self._runner.start(slot)
+        else:
+            fault_point("rollout.step")
+            request = self._runner.advance(slot, decision)
+        self._active = time.monotonic(), False
         if request is not None:
             due[slot] = request
         return request is not None
-
-    def _advance(self, slot: int, decision: Decision, due: dict[int, Request], idle: list[int]) -> None:
-        self._clock.enter(COMPUTE)
-        fault_point("rollout.decided")
-        with self._in_world():
-            fault_point("rollout.step")
-            request = self._runner.advance(slot, decision)
-        if request is None:
-            idle.append(slot)
-        else:
-            due[slot] = request
-
-    @contextmanager
-    def _in_world(self) -> Iterator[None]:
-        """Lets `report` tell a world that hangs from a worker that waits."""
-        self._entered = time.monotonic()
-        yield
-        self._moved, self._entered = time.monotonic(), None

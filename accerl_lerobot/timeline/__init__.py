@@ -16,7 +16,6 @@ import json
 import os
 import threading
 import time
-from array import array
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -48,7 +47,6 @@ def bubble(shares: Mapping[str, float]) -> float:
 
 FORMAT = 1
 BITS = 4
-BATCH = 512
 FLUSH_NS = 1_000_000_000
 """An entry is on its way to the disk after so long, if another follows or `Clock.beat` is called."""
 PART_BYTES = 4_000_000
@@ -87,7 +85,6 @@ class Clock:
         self._now, self._lock = now, threading.Lock()
         self._state, self._origin = RECOVERY, begins.clock_ns
         self._since, self._due = self._origin, self._origin + FLUSH_NS
-        self._entries = array("Q")
         self._head = {"timeline": FORMAT, "worker": worker, "pid": os.getpid(), **begins._asdict()}
         self._point = f"{role_of(worker).split()[-1]}.timeline"
         folder.mkdir(parents=True, exist_ok=True)
@@ -102,12 +99,11 @@ class Clock:
         if state != self._state:
             with self._lock:
                 self._note(state)
-                if len(self._entries) >= BATCH or self._since >= self._due:
-                    self._write()
+                if self._since >= self._due:
+                    self._flush()
 
     @contextmanager
     def during(self, state: int) -> Iterator[None]:
-        """Is in a state for a while, and then in the one before again."""
         before = self._state
         self.enter(state)
         try:
@@ -119,38 +115,33 @@ class Clock:
         """Notes that the worker is still in its state, and writes all entries."""
         with self._lock:
             self._note(self._state)
-            self._write()
+            self._flush()
 
     def close(self) -> None:
-        """Ends the timeline of this worker; safe to call twice."""
         if not self._file.closed:
             self.beat()
             self._file.close()
 
     def _note(self, state: int) -> None:
         now = self._now()
-        self._entries.append((now - self._origin) << BITS | state)
+        self._file.write(((now - self._origin) << BITS | state).to_bytes(8, "little"))
         self._state, self._since = state, now
 
-    def _write(self) -> None:
-        """Appends to the file; the entries survive this process when this returns."""
-        entries, self._entries = self._entries, array("Q")
+    def _flush(self) -> None:
         fault_point(self._point)
-        self._file.write(entries.tobytes())
-        self._file.flush()
+        self._file.flush()  # from here on the entries survive this process
         self._due = self._since + FLUSH_NS
         if self._file.tell() >= self._part_bytes:
             self._file.close()
             self._file = self._next_part()
 
     def _next_part(self) -> BinaryIO:
-        """Opens a new file and removes the one before the last."""
         self._part += 1
         head = {**self._head, "at_ns": self._since - self._origin, "state": STATES[self._state]}
         file = self._path(self._part).open("xb")
         file.write((json.dumps(head) + "\n").encode())
         file.flush()
-        self._path(self._part - 2).unlink(missing_ok=True)
+        self._path(self._part - 2).unlink(missing_ok=True)  # the newest two are kept
         return file
 
     def _path(self, part: int) -> Path:

@@ -35,10 +35,8 @@ from accerl_lerobot.timeline import (
     role_of,
 )
 
-ABSENT = len(STATES)
-"""State of a worker of which there is no process, or whose older entries are not kept."""
-Window = tuple[float, float]
-"""First and last second, since the timeline began."""
+ABSENT = len(STATES)  # state of a worker of which there is no process, or whose older entries are not kept
+Window = tuple[float, float]  # first and last second, since the timeline began
 Shares = dict[str, dict[str, float]]
 """Role → state → share of the time of its workers; states with no time are left out."""
 
@@ -48,14 +46,11 @@ class Row:
     """One worker, all processes that it has been."""
 
     worker: str
-    times: np.ndarray
-    """int64 (n + 1,), nanoseconds since the timeline began; n intervals lie between them."""
-    states: np.ndarray
-    """uint8 (n,), of each interval."""
+    times: np.ndarray  # int64 (n + 1,), nanoseconds since the timeline began; n intervals lie between them
+    states: np.ndarray  # uint8 (n,), of each interval
 
     @property
     def role(self) -> str:
-        """Part of its name before the number."""
         return role_of(self.worker)
 
     def until(self, at: np.ndarray) -> np.ndarray:
@@ -112,14 +107,10 @@ class Part(NamedTuple):
     """One file of a process; the intervals between `times` are spent in `states`."""
 
     worker: str
-    number: tuple[int, int]
-    """Numbers of the process and of the part."""
-    begins: Moment
-    """When the process did."""
-    times: np.ndarray
-    """int64 (n + 1,), nanoseconds since the process began."""
-    states: np.ndarray
-    """uint8 (n,)."""
+    number: tuple[int, int]  # numbers of the process and of the part
+    begins: Moment  # when the process did
+    times: np.ndarray  # int64 (n + 1,), nanoseconds since the process began
+    states: np.ndarray  # uint8 (n,)
 
 
 def read_timeline(run_directory: Path) -> Timeline:
@@ -146,7 +137,6 @@ def read_timeline(run_directory: Path) -> Timeline:
 
 
 def read_parts(folder: Path) -> list[Part]:
-    """All that is kept, by process and number."""
     parts = []
     for path in folder.glob(f"*{SUFFIX}"):
         with contextlib.suppress(FileNotFoundError):  # its worker has begun another part meanwhile
@@ -200,8 +190,7 @@ COLOURS = {
     "weights": "#9b5de5", "checkpoint": "#8d6e63", "recovery": "#d64545", "training": "#a8c8a0",
     "evaluation": "#7fb8c9",
 }  # fmt: skip
-COLUMNS = 1600
-"""Columns of the picture; an interval that is shorter than one colours it in proportion."""
+COLUMNS = 1600  # columns of the picture; an interval that is shorter than one colours it in proportion
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -228,11 +217,7 @@ class TimelineConfig(Section):
 
 
 def show_timelines(config: TimelineConfig) -> dict[str, Any]:
-    """Reads the runs, writes the picture.
-
-    Returns:
-        ``picture`` and ``runs``: of each, what is drawn, when it trained, and how its roles spent that time.
-    """
+    """Writes the ``picture``; of the ``runs``, what is drawn, when each trained and its roles' shares."""
     picture = None if config.output is None else expanded(config.output, "output")
     timelines = [read_timeline(Path(name).expanduser()) for name in config.runs]
     if picture is None:
@@ -246,8 +231,9 @@ def show_timelines(config: TimelineConfig) -> dict[str, Any]:
     for timeline, window in zip(timelines, windows, strict=True):
         training = timeline.training()
         spent = timeline.shares(training)
-        run = {"run": str(timeline.run), "window_s": window, "training_s": training}
-        runs.append(run | {"shares": spent, "bubble": {role: bubble(own) for role, own in spent.items()}})
+        bubbles = {role: bubble(own) for role, own in spent.items()}
+        found = {"window_s": window, "training_s": training, "shares": spent, "bubble": bubbles}
+        runs.append({"run": str(timeline.run), **found})
     return {"picture": str(picture), "runs": runs}
 
 
@@ -294,7 +280,9 @@ def draw(path: Path, parts: Sequence[tuple[Timeline, Window]]) -> None:
     axes = figure.subplots(len(parts), squeeze=False, sharex=True, height_ratios=heights)[:, 0]
     seen = np.zeros(len(STATES))
     for ax, (timeline, (start, end)) in zip(axes, parts, strict=True):
-        shares = np.stack([columns(row, start, end) for row in timeline.rows])
+        edges = np.linspace(1e9 * start, 1e9 * end, COLUMNS + 1)
+        # (rows, columns, states), of each column's time; 0 where the worker is absent
+        shares = np.stack([np.diff(row.until(edges), axis=0) for row in timeline.rows]) / np.diff(edges)[0]
         seen += shares.sum(axis=(0, 1))
         image = np.clip(shares @ colours + 1 - shares.sum(axis=2, keepdims=True), 0, 1)
         extent = (0, end - start, len(shares), 0)
@@ -311,10 +299,3 @@ def draw(path: Path, parts: Sequence[tuple[Timeline, Window]]) -> None:
     handles = [Patch(color=COLOURS[STATES[i]], label=STATES[i]) for i in np.flatnonzero(seen)]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles) or 1, frameon=False)
     figure.savefig(path)
-
-
-def columns(row: Row, start: float, end: float) -> np.ndarray:
-    """Share of each state in each column of the picture, (columns, states); 0 where the worker is absent."""
-    edges = np.linspace(1e9 * start, 1e9 * end, COLUMNS + 1)
-    shares: np.ndarray = np.diff(row.until(edges), axis=0) / np.diff(edges)[:, None]
-    return shares

@@ -19,8 +19,7 @@ import numpy as np
 from accerl_lerobot.checkpoint.snapshot import from_json, to_json
 
 SIZE = struct.Struct("<I")
-ALIGNMENT = 64
-"""Alignment of arrays in shared memory, in bytes: a cache line."""
+ALIGNMENT = 64  # alignment of arrays in shared memory, in bytes: a cache line
 _dumps = json.JSONEncoder(separators=(",", ":"), check_circular=False).encode
 
 
@@ -47,11 +46,7 @@ class Encoded(NamedTuple):
 
 
 def encode(message: Any) -> Encoded:
-    """Encode what `snapshot` can save.
-
-    Raises:
-        TypeError: the message holds something else; names its place.
-    """
+    """Encode what `snapshot` can save; a `TypeError` names the place of anything else."""
     named: dict[str, np.ndarray] = {}
     tree = to_json(message, "message", named)
     arrays = list(named.values())
@@ -63,11 +58,7 @@ def encode(message: Any) -> Encoded:
 
 
 def decode(buffer: Any, start: int = 0, *, copy: bool = True) -> Any:
-    """Decode the message that begins at `start`.
-
-    Args:
-        copy: False: its arrays are views of the buffer.
-    """
+    """Decode the message that begins at `start`; unless `copy`, its arrays are views of the buffer."""
     (length,) = SIZE.unpack_from(buffer, start)
     end = start + SIZE.size + length
     tree, kinds = json.loads(bytes(buffer[start + SIZE.size : end]))

@@ -19,10 +19,10 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
+from dataclasses import dataclass
 from typing import Any
 
-MAX_IN_FLIGHT = 32
-"""Messages that `Client.ask` has under way at most; a transport carries at least so many."""
+MAX_IN_FLIGHT = 32  # messages that `Client.ask` has under way at most; a transport carries at least so many
 
 
 class ServiceStoppedError(RuntimeError):
@@ -73,6 +73,7 @@ class Client(ABC):
         return [replies[index] for index in range(len(messages))]
 
 
+@dataclass(eq=False)
 class PendingRequest:
     """A message at the service; answered or failed once, on the thread that polls.
 
@@ -80,24 +81,20 @@ class PendingRequest:
     awaited any more; `reply` sends a reply, or the error in its place.
     """
 
-    def __init__(
-        self,
-        message: Any,
-        sent: float,
-        gone: Callable[[], bool],
-        reply: Callable[[Any, BaseException | None], None],
-    ) -> None:
-        self.message, self.sent, self.gone, self._reply = message, sent, gone, reply
+    message: Any
+    sent: float
+    gone: Callable[[], bool]
+    reply: Callable[[Any, BaseException | None], None]
 
     def answer(self, reply: Any) -> None:
         """Send the reply. In shared memory, the message's arrays are valid until then; see `decode`."""
         if not self.gone():
-            self._reply(reply, None)
+            self.reply(reply, None)
 
     def fail(self, error: BaseException) -> None:
         """Raise a `ServiceStoppedError` that names this error at the client."""
         if not self.gone():
-            self._reply(None, error)
+            self.reply(None, error)
 
     def __len__(self) -> int:
         return len(self.message)

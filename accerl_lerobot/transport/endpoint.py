@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections import deque
@@ -12,18 +13,19 @@ from typing import Any
 from accerl_lerobot.transport.contract import Client, ServiceStoppedError
 from accerl_lerobot.transport.shared_memory import Address, SharedMemoryClient, available, this_node
 
+logger = logging.getLogger(__name__)
+
+RETRY_S = 1.0  # between two attempts to connect to a service that was lost
+
 
 @dataclass(frozen=True, kw_only=True)
 class Endpoint:
     """Address of a service, which a worker needs in order to call it."""
 
     name: str
-    method: Any
-    """Method of its Ray actor handle."""
-    address: Address | None = None
-    """Address of its shared memory; None: it can only be reached through Ray."""
-    actor: Any = None
-    """Ray's handle of its process."""
+    method: Any  # method of its Ray actor handle
+    address: Address | None = None  # address of its shared memory; None: it can only be reached through Ray
+    actor: Any = None  # Ray's handle of its process
 
     def kill(self) -> None:
         import ray
@@ -31,7 +33,6 @@ class Endpoint:
         ray.kill(self.actor)
 
     def connect(self) -> Client:
-        """Open a connection for this process."""
         if self.address is not None and available() and self.address.node == this_node():
             return SharedMemoryClient(self.name, self.address)
         return RayClient(self.name, self.method)
@@ -74,7 +75,7 @@ class RayClient(Client):
 
 
 class ReconnectingClient(Client):
-    """Asks a restarted service again what its predecessor has not answered.
+    """Connects again to a service that was lost, or to its successor, and asks what has not been answered.
 
     For services without a state of their own: a request for a decision carries its noise, and the decision
     the version of its weights. While the service is away no replies come and nothing fails; the engine
@@ -85,38 +86,29 @@ class ReconnectingClient(Client):
         super().__init__(name)
         self._next: deque[Endpoint] = deque(maxlen=1)
         self._moved = threading.Event()
+        self._endpoint: Endpoint | None = None
+        self._retry_at = 0.0
         self._client: Client | None = None
         self._messages: dict[int, Any] = {}  # not answered yet, by ticket
         self._tickets: dict[int, int] = {}  # ticket of the connection → ticket here
         self._sent = 0
-        self._away_since: float | None = None
-        self.why = ""
-        """Reason of the last loss of the connection."""
 
     def move(self, endpoint: Endpoint) -> None:
         self._next.append(endpoint)
-        self._away_since = None
         self._moved.set()
-
-    @property
-    def away_s(self) -> float:
-        """Seconds since the service was lost; 0 before the first attempt to connect."""
-        since = self._away_since
-        return 0.0 if since is None else time.monotonic() - since
 
     def send(self, message: Any) -> int:
         self._follow()
         self._sent += 1
         self._messages[self._sent] = message
-        if self._client is not None:
-            self._pass_on(self._sent)
+        self._pass_on(self._sent)
         return self._sent
 
     def done(self, timeout: float) -> list[tuple[int, Any]]:
         self._follow()
         if self._client is None:
-            if self._moved.wait(timeout):
-                self._moved.clear()
+            self._moved.wait(min(timeout, RETRY_S))
+            self._moved.clear()
             return []
         try:
             replies = self._client.done(timeout)
@@ -133,31 +125,29 @@ class ReconnectingClient(Client):
         self._drop()
 
     def _follow(self) -> None:
-        """Connect to where the service is now, if that has changed, and ask again."""
-        if not self._next:
+        """Connect to where the service is now, or once more to where it was, and ask again."""
+        if self._next:
+            self._drop()
+            self._endpoint = self._next.popleft()
+        elif self._client is not None or self._endpoint is None or time.monotonic() < self._retry_at:
             return
-        self._drop()
         try:
-            self._client = self._next.popleft().connect()
+            self._client = self._endpoint.connect()
         except ServiceStoppedError as error:
             self._lose(error)
-            return
-        self._away_since = None  # what was lost meanwhile was the predecessor
         for ticket in list(self._messages):
-            if self._client is not None:
-                self._pass_on(ticket)
+            self._pass_on(ticket)
 
     def _pass_on(self, ticket: int) -> None:
-        assert self._client is not None
-        try:
-            self._tickets[self._client.send(self._messages[ticket])] = ticket
-        except ServiceStoppedError as error:
-            self._lose(error)
+        if self._client is not None:
+            try:
+                self._tickets[self._client.send(self._messages[ticket])] = ticket
+            except ServiceStoppedError as error:
+                self._lose(error)
 
     def _lose(self, error: ServiceStoppedError) -> None:
-        self.why = str(error)
-        if self._away_since is None:
-            self._away_since = time.monotonic()
+        logger.info("%s", error)
+        self._retry_at = time.monotonic() + RETRY_S
         self._drop()
 
     def _drop(self) -> None:

@@ -24,6 +24,7 @@ import secrets
 import select
 import socket
 import struct
+import sys
 import time
 from collections.abc import Awaitable, Callable
 from pathlib import Path
@@ -34,33 +35,18 @@ from accerl_lerobot.transport.contract import Client, PendingRequest, Server, Se
 
 logger = logging.getLogger(__name__)
 
-CONNECT_S = 30.0
-"""Timeout for connecting to a service."""
-LEAST = 2**16
-"""Bytes of a slot at least; the reply is written behind the message."""
+CONNECT_S = 30.0  # timeout for connecting to a service
+LEAST = 2**16  # bytes of a slot at least; the reply is written behind the message
 SLOTS = 64
 """Slots of one client at most, and so messages that it may have under way. Their tokens fit into the buffers
 of the two sockets, so no end ever waits for the other one to read."""
 _TOKEN = struct.Struct("<BIQQQd")
-ASK, ANSWER, FAIL = range(3)
-"""Purpose of a token."""
+ASK, ANSWER, FAIL = range(3)  # purpose of a token
 
 
-@functools.cache
 def available() -> bool:
-    """True if this system has memfd, epoll and eventfd."""
-    try:
-        os.close(os.memfd_create("accerl"))
-        select.epoll().close()
-        os.close(os.eventfd(0))
-    except (AttributeError, OSError):
-        return False
-    return True
-
-
-def new_name() -> str:
-    """A socket name that nobody can guess."""
-    return f"accerl-{secrets.token_hex(16)}"
+    """True on Linux, which has memfd, epoll, eventfd and sockets that only have a name."""
+    return sys.platform == "linux"
 
 
 def new_socket() -> socket.socket:
@@ -68,16 +54,7 @@ def new_socket() -> socket.socket:
     return socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
 
 
-def listening(name: str, backlog: int) -> socket.socket:
-    """A socket that others connect to by this name."""
-    listener = new_socket()
-    listener.bind(f"\0{name}")
-    listener.listen(backlog)
-    return listener
-
-
 def same_user(connection: socket.socket) -> bool:
-    """True if the process at the other end belongs to this user."""
     size = struct.calcsize("3i")
     _, user, _ = struct.unpack("3i", connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, size))
     return bool(user == os.getuid())
@@ -89,26 +66,20 @@ class Token(NamedTuple):
     purpose: int
     slot: int
     ticket: int
-    start: int
-    """First byte of the message in the slot."""
+    start: int  # first byte of the message in the slot
     size: int
-    sent: float
-    """On `time.monotonic`."""
+    sent: float  # on `time.monotonic`
 
 
-class Slot:
-    """Mapped shared memory, which lasts as long as something refers to it or a view of it."""
-
-    def __init__(self, file: int) -> None:
-        self.size = os.fstat(file).st_size
-        self.memory = mmap.mmap(file, self.size)
+Slot = mmap.mmap
+"""Mapped shared memory, which lasts as long as something refers to it or a view of it."""
 
 
 def new_slot(size: int) -> tuple[Slot, int]:
     """A slot of at least `size` bytes, and its file descriptor; what is not written to takes no memory."""
     file = os.memfd_create("accerl", os.MFD_CLOEXEC)
     os.ftruncate(file, max(LEAST, 1 << (size - 1).bit_length()))
-    return Slot(file), file
+    return Slot(file, 0), file
 
 
 def send_token(connection: socket.socket, token: Token, file: int | None = None) -> None:
@@ -129,7 +100,7 @@ def receive_token(connection: socket.socket) -> tuple[Token, Slot | None] | None
         return None
     slot = None
     if files:
-        slot = Slot(files[0])
+        slot = Slot(files[0], 0)
         os.close(files[0])
     return Token._make(_TOKEN.unpack(packet)), slot
 
@@ -166,10 +137,10 @@ class SharedMemoryClient(Client):
         if not self._free and len(self._slots) == SLOTS:
             raise TimeoutError(f"{self.name}: none of {SLOTS} messages under way has been answered")
         index = self._free.pop() if self._free else len(self._slots)
-        if index == len(self._slots) or self._slots[index].size < encoded.size:
+        if index == len(self._slots) or len(self._slots[index]) < encoded.size:
             slot, file = new_slot(encoded.size + LEAST)
             self._slots[index : index + 1] = [slot]
-        encoded.write(self._slots[index].memory, 0)
+        encoded.write(self._slots[index], 0)
         self._sent += 1
         self._under_way[self._sent] = index
         try:
@@ -203,7 +174,7 @@ class SharedMemoryClient(Client):
         if slot is not None:
             self._slots[index] = slot
         self._free.append(index)
-        reply = decode(self._slots[index].memory, token.start)
+        reply = decode(self._slots[index], token.start)
         if token.purpose == FAIL:
             raise ServiceStoppedError(f"{self.name}: {reply}")
         return token.ticket, reply
@@ -243,8 +214,10 @@ class SharedMemoryServer(Server):
     def __init__(self, take: Callable[[PendingRequest], None], *, copy: bool) -> None:
         super().__init__(take)
         self._copy = copy
-        self.address = Address(this_node(), new_name())
-        self._listener = listening(self.address.name, SLOTS)
+        self.address = Address(this_node(), f"accerl-{secrets.token_hex(16)}")  # which nobody can guess
+        self._listener = new_socket()
+        self._listener.bind(f"\0{self.address.name}")
+        self._listener.listen(SLOTS)
         self._listener.setblocking(False)
         self._event = open(os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK), "rb+", buffering=0)  # noqa: SIM115
         self._epoll = select.epoll()
@@ -309,7 +282,7 @@ class SharedMemoryServer(Server):
         token, slot = packet
         if slot is not None:
             connection.slots[token.slot] = slot
-        message = decode(connection.slots[token.slot].memory, token.start, copy=self._copy)
+        message = decode(connection.slots[token.slot], token.start, copy=self._copy)
         reply = functools.partial(self._reply, connection, token)
         sent = min(token.sent, time.monotonic())
         received.append(PendingRequest(message, sent, lambda: connection.closed, reply))
@@ -319,10 +292,10 @@ class SharedMemoryServer(Server):
         purpose = ANSWER if error is None else FAIL
         encoded = encode(reply if error is None else str(stopped(error)))
         start, file = aligned(asked.start + asked.size), None
-        if start + encoded.size > to.slots[asked.slot].size:
+        if start + encoded.size > len(to.slots[asked.slot]):
             to.slots[asked.slot], file = new_slot(start + encoded.size)
             start = 0
-        encoded.write(to.slots[asked.slot].memory, start)
+        encoded.write(to.slots[asked.slot], start)
         token = Token(purpose, asked.slot, asked.ticket, start, encoded.size, asked.sent)
         try:
             send_token(to.socket, token, file)

@@ -22,13 +22,10 @@ from accerl_lerobot.transport.endpoint import Endpoint
 
 logger = logging.getLogger(__name__)
 
-FLUSH_S = 300.0
-"""Timeout for all replicas together: a forward pass and a copy of the weights."""
-UNDER_WAY = 2
-"""Sets on their way to a replica at most: one that it applies, and the next."""
+FLUSH_S = 300.0  # timeout for all replicas together: a forward pass and a copy of the weights
+UNDER_WAY = 2  # sets on their way to a replica at most: one that it applies, and the next
 
-Tensors = dict[str, np.ndarray]
-"""Parameter name → array; dtype and shape arrive as they were sent."""
+Tensors = dict[str, np.ndarray]  # parameter name → array; dtype and shape arrive as they were sent
 
 
 @kind
@@ -51,10 +48,7 @@ class _Reader:
 class WeightPublisher:
     """Sends the newest weights to all replicas. One that fails is ended, and the engine replaces it.
 
-    Example:
-        >>> publisher = WeightPublisher([inference])
-        >>> publisher.publish(1, tensors)   # copies them
-        >>> publisher.flush()               # before `tensors` change; so are `resend` and `add`
+    Published tensors must not change before `flush` has returned, as `resend` and `add` send them too.
     """
 
     def __init__(self, readers: Iterable[Endpoint] = ()) -> None:
@@ -143,9 +137,7 @@ class PublishDelay:
         return due[-1:] if last else due
 
     def state(self) -> list[tuple[int, Tensors]]:
-        """Everything that `restore` needs; see `snapshot`."""
         return list(self._waiting)
 
     def restore(self, state: list[tuple[int, Tensors]]) -> None:
-        """Resume from `state`."""
         self._waiting.extend(state)

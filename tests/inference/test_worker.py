@@ -115,7 +115,7 @@ def play(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
 
 def test_a_lonely_request_is_served_when_it_has_waited(play):
     async def scene(worker, adapter):
-        await worker.decide(requests(5))
+        await worker.receive(requests(5))
         assert adapter.batches == [[5]]
         metrics = await worker.metrics()
         assert metrics["wait_max_s"] >= 0.05 and metrics["batches"] == 1
@@ -126,7 +126,7 @@ def test_a_lonely_request_is_served_when_it_has_waited(play):
 def test_answers_go_to_those_who_asked_in_their_order(play):
     async def scene(worker, adapter):
         seeds = [[1, 2, 3], [4], [5, 6], [7, 8], [9]]
-        answers = await asyncio.gather(*(worker.decide(requests(*some)) for some in seeds))
+        answers = await asyncio.gather(*(worker.receive(requests(*some)) for some in seeds))
         assert [[int(d.latent["seed"]) for d in some] for some in answers] == seeds
 
     play(scene, max_batch=4, max_wait_s=0.01)
@@ -141,12 +141,12 @@ def test_no_batch_sees_two_versions(play):
             for version in range(1, last + 1):
                 while len(adapter.batches) < version:
                     await asyncio.sleep(0.0002)
-                await worker.decide(update(version))
+                await worker.receive(update(version))
 
         async def ask(first: int) -> list[Decision]:
             answers = []
             while worker._version < last:
-                answers += await worker.decide(requests(first, first + 1))
+                answers += await worker.receive(requests(first, first + 1))
             return answers
 
         _, *answers = await asyncio.gather(publish(), *(ask(10 * i) for i in range(4)))
@@ -162,11 +162,11 @@ def test_no_batch_sees_two_versions(play):
 
 def test_older_weights_are_ignored_even_while_newer_ones_are_loaded(play):
     async def scene(worker, adapter):
-        newer = asyncio.create_task(worker.decide(update(4)))
+        newer = asyncio.create_task(worker.receive(update(4)))
         while not adapter.entered.is_set():
             await asyncio.sleep(0.0005)
-        await asyncio.gather(newer, worker.decide(update(3)))  # version 4 is being written just now
-        versions = [(await worker.decide(requests(i)))[0].version for i in range(3)]
+        await asyncio.gather(newer, worker.receive(update(3)))  # version 4 is being written just now
+        versions = [(await worker.receive(requests(i)))[0].version for i in range(3)]
         assert versions == [4, 4, 4] and adapter.loaded == [4]
 
     play(scene, CountingAdapter(delay=0.01), max_batch=1, max_wait_s=0.0)
@@ -179,13 +179,13 @@ def test_a_failure_reaches_everyone_who_waits_and_everyone_after(play, weights_t
     async def scene(worker, adapter):
         # A batch holds one request, so that of those who wait only one is in the batch that fails.
         adapter.broken = ValueError("no such weights")
-        calls = [worker.decide(update(1))] if weights_too else []
-        calls += [worker.decide(requests(i)) for i in range(5)]
+        calls = [worker.receive(update(1))] if weights_too else []
+        calls += [worker.receive(requests(i)) for i in range(5)]
         answers = await asyncio.gather(*calls, return_exceptions=True)
         assert all(isinstance(a, ServiceStoppedError) for a in answers), answers
         assert "no such weights" in str(answers[-1])
         with pytest.raises(ServiceStoppedError, match="no such weights"):
-            await worker.decide(requests(9))
+            await worker.receive(requests(9))
 
     play(scene, adapter, max_batch=1, max_wait_s=0.0)
 
@@ -193,11 +193,11 @@ def test_a_failure_reaches_everyone_who_waits_and_everyone_after(play, weights_t
 def test_weights_that_cannot_be_loaded_are_heard_of_by_those_who_wait_for_a_batch(play):
     async def scene(worker, adapter):
         worker._batcher.max_wait_s = 1e9
-        waiting = [asyncio.create_task(worker.decide(requests(i))) for i in range(2)]
+        waiting = [asyncio.create_task(worker.receive(requests(i))) for i in range(2)]
         while len(worker._batcher) < 2:
             await asyncio.sleep(0.001)
         adapter.broken = ValueError("no such weights")
-        waiting.append(worker.decide(update(1)))
+        waiting.append(worker.receive(update(1)))
         answers = await asyncio.gather(*waiting, return_exceptions=True)
         assert all(isinstance(a, ServiceStoppedError) and "no such weights" in str(a) for a in answers)
 
@@ -209,15 +209,15 @@ def test_a_caller_who_gave_up_does_not_disturb_the_others(play):
     adapter.gate = threading.Event()
 
     async def scene(worker, adapter):
-        quitter = asyncio.create_task(worker.decide(requests(0)))
-        patient = asyncio.create_task(worker.decide(requests(1)))
+        quitter = asyncio.create_task(worker.receive(requests(0)))
+        patient = asyncio.create_task(worker.receive(requests(1)))
         while not adapter.entered.is_set():
             await asyncio.sleep(0.001)
         quitter.cancel()
         await asyncio.gather(quitter, return_exceptions=True)
         adapter.gate.set()
         assert (await patient)[0].latent["seed"] == 1
-        assert (await worker.decide(requests(2)))[0].latent["seed"] == 2
+        assert (await worker.receive(requests(2)))[0].latent["seed"] == 2
 
     play(scene, adapter, max_batch=2, max_wait_s=1.0)
 
@@ -241,7 +241,7 @@ def test_weights_through_shared_memory_are_swapped_in_and_let_go_of(play):
         for version in range(30):
             publisher.publish(version, weights(version))
             await asyncio.to_thread(publisher.flush, HANGS_S)  # applied, though nobody has asked
-            (decision,) = await worker.decide(requests(0))
+            (decision,) = await worker.receive(requests(0))
             assert decision.version == version and set(decision.chunk.ravel()) == {version}
         metrics = await worker.metrics()
         assert metrics["publish_to_served_s"] >= metrics["swap_s"] > 0
@@ -259,7 +259,7 @@ def test_a_service_that_fails_is_let_go_of_by_the_trainer(play):
         await asyncio.to_thread(publisher.flush, HANGS_S)
         assert endpoint.ended
         with pytest.raises(ServiceStoppedError, match="no such weights"):
-            await worker.decide(requests(0))
+            await worker.receive(requests(0))
 
     play(scene, max_batch=1)
 
@@ -271,7 +271,7 @@ def test_a_service_that_hangs_is_silent(play, monkeypatch: pytest.MonkeyPatch):
     async def scene(worker, adapter):
         await worker.metrics()
         adapter.gate = threading.Event()
-        asked = asyncio.create_task(worker.decide(requests(1)))
+        asked = asyncio.create_task(worker.receive(requests(1)))
         await asyncio.to_thread(adapter.entered.wait, HANGS_S)
         await asyncio.sleep(0.2)
         answer = asyncio.create_task(worker.metrics())

@@ -156,7 +156,7 @@ def test_news_is_real_experience_alone():
         await worker.insert([make_imagined("d")])
         news = await worker.news(0)
         assert [s.key for s in news.segments] == ["a"] and news.cursor == 1 and not news.ended
-        await worker.end_real()
+        await worker.change(real_ended=True)
         assert (await worker.news(1)).ended
 
     play(scene)

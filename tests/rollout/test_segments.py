@@ -39,13 +39,9 @@ def states(segment: Segment) -> list[float]:
     return segment.observations["observation.state"][:, 0].tolist()
 
 
-def test_a_segment_has_one_observation_more_than_decisions():
-    segment = collected(3).cut("k")
-    assert len(segment) == 3 and states(segment) == [0, 1, 2, 3]
-
-
 def test_everything_about_a_decision_stays_together():
     segment = collected(3).cut("k")
+    assert len(segment) == 3 and states(segment) == [0, 1, 2, 3]
     assert segment.latent["x"].tolist() == [[0, 0], [1, -1], [2, -2]]
     np.testing.assert_allclose(segment.log_prob[:, 0], [0, 0.1, 0.2], rtol=1e-6)
     np.testing.assert_allclose(segment.actions[:, 0, 0], [0, 0.1, 0.2], rtol=1e-6)
@@ -64,17 +60,12 @@ def test_the_next_segment_begins_where_this_one_was_cut():
     assert states(segment) == [3, 4] and segment.origin == ("push-v3", 7, 3)
 
 
-def test_what_was_seen_when_the_episode_ended_is_the_last_row():
-    segment = collected(2).cut("k", terminated=True, success=True)
-    assert states(segment) == [0, 1, 2] and segment.terminated and segment.success
-
-
 def test_full_at_its_length():
     assert not collected(3).full and collected(4).full
 
 
 @pytest.mark.parametrize("terminated", [False, True])
 def test_how_it_ended_is_kept(terminated: bool):
-    segment = collected(2).cut("k", terminated, episode={"return": 3.0})
-    assert segment.terminated == terminated
+    segment = collected(2).cut("k", terminated, success=terminated, episode={"return": 3.0})
+    assert segment.terminated == segment.success == terminated and states(segment) == [0, 1, 2]
     assert segment.episode == {"return": 3.0} and segment.source == "real" and segment.key == "k"

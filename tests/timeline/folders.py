@@ -9,8 +9,7 @@ from pathlib import Path
 from accerl_lerobot.timeline import TIMELINE, Clock, Moment
 
 SECOND = 10**9
-UP = 10**15
-"""The monotonic clock's time when a test begins; the calendar shows twice that."""
+UP = 10**15  # the monotonic clock's time when a test begins; the calendar shows twice that
 
 
 class Hands:
@@ -35,15 +34,7 @@ def a_clock(
 def write_worker(
     run: Path, worker: str, spans: Iterable[tuple[int, float]], *, at_s: float = 0.0, part_bytes: int = 10**6
 ) -> None:
-    """One process of a worker, to its end.
-
-    Args:
-        run: folder.
-        worker: its name.
-        spans: states, and how many seconds it was in each.
-        at_s: when it began.
-        part_bytes: see `Clock`.
-    """
+    """One process of a worker, to its end; `spans`: states, and how many seconds it was in each."""
     at = round(at_s * SECOND)
     begins = Moment("here", UP + at, 2 * UP + at)
     clock, hands = a_clock(run, worker, begins=begins, part_bytes=part_bytes)

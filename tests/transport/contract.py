@@ -28,8 +28,7 @@ from tests.replay.segments import make_segment
 
 Factory = Callable[[], Client]
 Check = Callable[[Factory], None]
-LONG_S = 240.0
-"""Seconds after which an end counts as hung."""
+LONG_S = 240.0  # seconds after which an end counts as hung
 
 
 class Service:
