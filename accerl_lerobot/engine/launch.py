@@ -1,5 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The asynchronous engine: places the workers, connects them as docs/architecture.md shows, and watches them.
+"""The asynchronous engine: places the workers, connects them and watches them.
+
+    rollout ×W ──requests──► inference ──decisions──► rollout   micro-asynchrony: others step meanwhile
+        │                        ▲
+        └──segments──► replay    │ weights, published without waiting
+                          │      │
+                          └──► trainer                          macro-asynchrony: no barrier, a measured lag
 
 The trainer is the clock: when it has made its updates the run is over. A rollout worker or inference replica
 that ends is restarted alone, see `replicas`; the end of any other worker ends this engine with its traceback,
