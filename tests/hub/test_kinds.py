@@ -17,15 +17,10 @@ TINY = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
 
 def test_kinds(tmp_path: Path):
     assert recognise(write_policy_folder(tmp_path / "policy")) == "policy"
-    assert recognise(write_run_folder(tmp_path / "run")) == "run"
     assert recognise(TINY) == "dataset" and repo_type("dataset") == "dataset"
-    for name, config in (
-        ("world model", {"spec": {}, "model": {}}),
-        ("success model", {"type": "success_pairs"}),
-    ):
-        write_json(tmp_path / name / "config.json", config)
-        (tmp_path / name / "model.safetensors").write_bytes(b"x")
-        assert recognise(tmp_path / name) == name and repo_type(name) == "model"
+    write_json(tmp_path / "world" / "config.json", {"spec": {}, "model": {}})
+    (tmp_path / "world" / "model.safetensors").write_bytes(b"x")
+    assert recognise(tmp_path / "world") == "world model" and repo_type("world model") == "model"
 
 
 @pytest.mark.parametrize(
@@ -34,12 +29,11 @@ def test_kinds(tmp_path: Path):
         ("policy", "model.safetensors"),
         ("policy", "policy_preprocessor.json"),
         ("policy", "policy_postprocessor.json"),
-        ("run", "summary.json"),
         ("dataset", "meta/tasks.parquet"),
     ],
 )
 def test_an_incomplete_folder_says_what_it_lacks(tmp_path: Path, artifact: str, missing: str):
-    write = {"policy": write_policy_folder, "run": write_run_folder, "dataset": copy_dataset}[artifact]
+    write = {"policy": write_policy_folder, "dataset": copy_dataset}[artifact]
     (write(tmp_path / "folder") / missing).unlink()
     with pytest.raises(InputError, match=f"looks like a {artifact} but lacks {missing}"):
         recognise(tmp_path / "folder")
@@ -51,11 +45,16 @@ def copy_dataset(folder: Path) -> Path:
 
 def test_folders_one_above_say_which_below(tmp_path: Path):
     run = write_run_folder(tmp_path / "run")
+    with pytest.raises(InputError, match="name the folder checkpoints/last/pretrained_model in it"):
+        recognise(run)
     with pytest.raises(InputError, match="name the folder pretrained_model in it"):
         recognise(run / "checkpoints" / "000012")
     (tmp_path / "learnt" / "world_model").mkdir(parents=True)
     with pytest.raises(InputError, match="name the folder world_model in it"):
         recognise(tmp_path / "learnt")
+    write_json(tmp_path / "success_model" / "config.json", {"type": "success_pairs"})
+    with pytest.raises(InputError, match="no known artifact"):
+        recognise(tmp_path / "success_model")
     with pytest.raises(InputError, match="a policy has config.json, model.safetensors"):
         recognise(tmp_path)
     with pytest.raises(InputError, match="no such folder"):
