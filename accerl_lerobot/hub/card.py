@@ -130,10 +130,6 @@ KEPT = {
 }
 """Artifact type → files of its run that go with it."""
 MARK = "<!-- Written by accerl push, and anew each time. Delete this line to keep what you change. -->"
-TITLES = {
-    POLICY: "A LeRobot policy improved by online reinforcement learning",
-    WORLD_MODEL: "A world model for LeRobot policies",
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -219,7 +215,7 @@ def model_card(repo_id: str, artifact: str, folder: Path, files: Files, provenan
         datasets=datasets or None,
         base_model=_base_model(recipe),
     )
-    own_recipe = files.get(place, b"")
+    own_recipe = files.get(place, b"")  # scrubbed
     card = ModelCard.from_template(
         data,
         template_str=Path(__file__).with_name("card.md.jinja").read_text(),
@@ -227,7 +223,6 @@ def model_card(repo_id: str, artifact: str, folder: Path, files: Files, provenan
         repo_id=repo_id,
         local=local,
         artifact=artifact,
-        title=TITLES[artifact],
         config=config,
         measurements=_measurements(provenance),
         summary=summary,

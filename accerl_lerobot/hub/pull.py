@@ -88,12 +88,12 @@ def _resolve(api: HfApi, config: card.PullConfig) -> tuple[str, str]:
 def _checked(listed: Iterable[Any], repo_id: str) -> dict[str, RepoFile]:
     """Files that a server lists, by name; one with which it could write elsewhere is refused."""
     files = [item for item in listed if isinstance(item, RepoFile)]
-    for name in (file.path for file in files):
+    for file in files:
+        name = file.path
         parts = PurePosixPath(name).parts if not unsafe_name(name) else ()
         if not parts or name != "/".join(parts) or parts[0] in (CACHE, ".git") or "." in parts:
             why = f"it has a file named {ascii(name)[:200]}, which is not safe to write"
             raise InputError("repo_id", repo_id, why)
-    for file in files:
         if type(file.size) is not int or file.size < 0:
             why = f"{ascii(file.path)[:99]} is listed with size {str(file.size)[:40]}; use another server"
             raise InputError("repo_id", repo_id, why)

@@ -77,7 +77,6 @@ def stage(config: card.PushConfig, folder: Path, artifact: str) -> tuple[card.Fi
 
 
 def _upload(config: card.PushConfig, artifact: str, files: card.Files, own_card: bool) -> dict[str, Any]:
-    """Creates the repository if need be, and the commit."""
     api, repo_id = HfApi(), config.repo_id
     where: dict[str, Any] = {"repo_id": repo_id, "repo_type": card.repo_type(artifact)}
     parent = _parent(api, config, artifact)
