@@ -249,7 +249,6 @@ class _Loader(yaml.SafeLoader):
 
 
 def _load_yaml(text: str) -> Any:
-    """The value in a YAML text."""
     try:
         return yaml.load(text, _Loader)
     except yaml.YAMLError:
