@@ -205,6 +205,7 @@ class TestConsent:
             ("env: {type: lerobot, trust_remote_code: true}", "--env.trust_remote_code=true"),
             (f"env: {{type: lerobot, kwargs: {{hub_path: {ARENA}}}}}", f"--env.kwargs.hub_path={ARENA}"),
             ("imagination: {discover_packages_path: os}", "--imagination.discover_packages_path=os"),
+            ("env: {type: gym, id: a/B, discover_packages_path: os}", "--env.discover_packages_path=os"),
             ("imagination: {success: {hub_path: a}}", "--imagination.success.hub_path=a"),
             ("launch: {address: 'them:6379'}", "--launch.address=them:6379"),
             ('sft: {extra_args: ["\\e[2J"]}', "\\u001b"),

@@ -137,24 +137,17 @@ def write_atomically(path: Path, text: str) -> None:
     _sync(path.parent)
 
 
-def entry(content: Path | bytes) -> dict[str, int | str]:
-    """Size and SHA-256 of a file, or of bytes, as a manifest lists them."""
-    if isinstance(content, bytes):
-        return {"size": len(content), "sha256": hashlib.sha256(content).hexdigest()}
-    return {"size": content.stat().st_size, "sha256": digest(content)}
-
-
-def manifest_text(files: dict[str, dict[str, int | str]]) -> str:
-    """A manifest of files, by name."""
-    return json.dumps({"format": FORMAT, "files": dict(sorted(files.items()))}, indent=2) + "\n"
-
-
 def write_manifest(directory: Path) -> None:
     """Writes the size and SHA-256 of every file in a checkpoint."""
     files = {path.relative_to(directory): path for path in directory.rglob("*") if path.is_file()}
     own = (MANIFEST, f".{MANIFEST}.new")
-    entries = {str(name): entry(path) for name, path in files.items() if name.parts[0] not in own}
-    write_atomically(directory / MANIFEST, manifest_text(entries))
+    entries = {
+        str(name): {"size": path.stat().st_size, "sha256": digest(path)}
+        for name, path in files.items()
+        if name.parts[0] not in own
+    }
+    manifest = {"format": FORMAT, "files": dict(sorted(entries.items()))}
+    write_atomically(directory / MANIFEST, json.dumps(manifest, indent=2) + "\n")
 
 
 def read_manifest(directory: Path) -> dict[str, Any]:

@@ -24,7 +24,7 @@ VERBS = {
     "eval": "measure the success of a checkpoint, with its confidence interval",
     "world-model": "train a world model on LeRobotDatasets and validate it on held-out episodes",
     "world-model-eval": "validate a world model on episodes of one or several datasets",
-    "push": "push a policy, world model, dataset or run to the Hub, as one commit",
+    "push": "push a policy, world model or dataset to the Hub, as one commit",
     "pull": "pull from the Hub into a new folder, pinned and checked",
     "report": "write one HTML page about a run, or several side by side",
     "timeline": "show when every worker of a run did what: a picture and shares",

@@ -69,9 +69,12 @@ def main(arguments: list[str]) -> int:
     config, history, checks = _resolve(arguments) if arguments else (None, 1, [])
     checks += machine(config, history)
     if config is not None:
-        more = {"imagination": imagination_checks, "placement": placement, "policy": policy_fits}
         checks += pace(config)
-        for name, check in more.items():
+        for name, check in {
+            "imagination": imagination,
+            "placement": placement,
+            "policy": policy_fits,
+        }.items():
             try:
                 checks += check(config)
             except InputError as error:
@@ -127,40 +130,40 @@ def libraries(config: RunConfig | None) -> Iterator[Check]:
             yield Check(name, FAIL, f"cannot be imported ({brief(error)}); run make setup")
             continue
         if name == "torch":
-            text += f", {gpus}" if (gpus := gpu_names()) else ", no CUDA device; policies run on the CPU"
+            text += f", {_gpus()}"
         yield Check(name, OK, text)
 
 
-def gpu_names() -> str:
-    """The GPUs that torch sees, as ``2 × NVIDIA H100``; empty: none."""
+def _gpus() -> str:
     import torch
 
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
-    return f"{count} × {torch.cuda.get_device_name(0)}" if count else ""
+    none = "no CUDA device; policies run on the CPU"
+    return f"{count} × {torch.cuda.get_device_name(0)}" if count else none
 
 
 def rendering(*, needed: bool, script: str = DRAW) -> Check:
     """Draws a frame in a process of its own; if it is not `needed`, a failure is only a warning."""
     from accerl_lerobot.envs.metaworld import choose_backend
 
-    bad = FAIL if needed else WARN
+    command, remedy = [sys.executable, "-c", script], "set MUJOCO_GL to osmesa or egl"
     if importlib.util.find_spec("mujoco") is None:
         text = "MuJoCo is not installed; install the extra: accerl-lerobot[metaworld] or [libero]"
-        return Check("rendering", bad, text)
-    command = [sys.executable, "-c", script]
+        return Check("rendering", FAIL if needed else WARN, text)
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=RENDER_TIMEOUT_S, check=False)
     except subprocess.TimeoutExpired:
-        text = f"no frame within {RENDER_TIMEOUT_S} s; set MUJOCO_GL to osmesa or egl"
-        return Check("rendering", bad, text)
-    words = done.stdout.split()
-    if done.returncode == 0 and words[:2] == ["drawn", "True"]:
-        backend = os.environ.get("MUJOCO_GL") or choose_backend() or "the display"
-        return Check("rendering", OK, f"MuJoCo draws 64 × 64 pixels in {words[2]} ms ({backend})")
-    if done.returncode == 0:
-        return Check("rendering", bad, "MuJoCo draws an empty picture; set MUJOCO_GL to osmesa or egl")
-    last = (done.stderr.strip().splitlines() or [f"ended with code {done.returncode}"])[-1]
-    return Check("rendering", bad, last.removeprefix("accerl_lerobot.errors.InputError: "))
+        text = f"no frame within {RENDER_TIMEOUT_S} s; {remedy}"
+    else:
+        words = done.stdout.split()
+        if done.returncode == 0 and words[:2] == ["drawn", "True"]:
+            backend = os.environ.get("MUJOCO_GL") or choose_backend() or "the display"
+            return Check("rendering", OK, f"MuJoCo draws 64 × 64 pixels in {words[2]} ms ({backend})")
+        text = (done.stderr.strip().splitlines() or [f"ended with code {done.returncode}"])[-1]
+        text = text.removeprefix("accerl_lerobot.errors.InputError: ")
+        if done.returncode == 0:
+            text = f"MuJoCo draws an empty picture; {remedy}"
+    return Check("rendering", FAIL if needed else WARN, text)
 
 
 def resources(config: RunConfig | None, history: int = 1) -> Iterator[Check]:
@@ -191,16 +194,13 @@ def resources(config: RunConfig | None, history: int = 1) -> Iterator[Check]:
     yield Check("disk", WARN if short else OK, text)
 
 
-def imagination_checks(config: RunConfig) -> Iterator[Check]:
+def imagination(config: RunConfig) -> Iterator[Check]:
     """Imagination settings against the environment and the policy."""
-    imagination = config.imagination
-    if not imagination.share:
-        return
     from accerl_lerobot.engine.imagination import check_imagination
 
-    check_imagination(config)
-    text = f"{imagination.share:.0%} of every batch; world model: {imagination.model}"
-    yield Check("imagination", OK, text)
+    if share := config.imagination.share:
+        check_imagination(config)
+        yield Check("imagination", OK, f"{share:.0%} of every batch; world model: {config.imagination.model}")
 
 
 def placement(config: RunConfig) -> Iterator[Check]:

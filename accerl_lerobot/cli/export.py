@@ -21,8 +21,8 @@ import numpy as np
 
 from accerl_lerobot.checkpoint.layout import CONFIG
 from accerl_lerobot.checkpoint.safety import Origin, check_folder
-from accerl_lerobot.config.parsing import parse, read_arguments
-from accerl_lerobot.config.ranges import DatasetName, NewFolder, Section, Seed
+from accerl_lerobot.config.parsing import decode, parse, read_arguments, read_recipe
+from accerl_lerobot.config.ranges import DatasetName, NewFolder, Section
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos import record
 from accerl_lerobot.engine.config import RunConfig
@@ -41,7 +41,7 @@ TOLERANCE = 1e-4
 
 @dataclass(frozen=True, kw_only=True)
 class ExportConfig(Section):
-    """Fields of ``accerl export``; `env`, `rollout` and `seed` are the run's own."""
+    """Fields of ``accerl export``; `env` is the run's own."""
 
     path: str | None = None
     """Folder of an ``accerl train`` run."""
@@ -51,10 +51,7 @@ class ExportConfig(Section):
     """Name of the dataset, ``owner/name``."""
     pick: Literal["all", "successes", "failures"] = "all"
     """Episodes by their outcome."""
-    seed: Seed = 0
-    """Noted in the dataset."""
     env: EnvConfig = field(default_factory=MetaWorldConfig)
-    rollout: RolloutConfig = field(default_factory=RolloutConfig)
 
 
 def export_config(arguments: list[str]) -> ExportConfig:
@@ -89,7 +86,7 @@ def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
         if not tally["episodes"]:
             remedy = "none of its episodes could be repeated: this environment is not deterministic"
             raise InputError("path", str(run), remedy)
-        about = {"export": {"path": run.name, "pick": config.pick}, "seed": config.seed, **tally}
+        about = {"export": {"path": run.name, "pick": config.pick}, **tally}
         (partial / SIDECAR).write_text(json.dumps(about, indent=2) + "\n")
     return tally
 
@@ -99,7 +96,9 @@ def _write(config: ExportConfig, chosen: list[list[Done]], root: Path, console: 
         spec = world.spec
     tally = {"episodes": 0, "frames": 0, "successes": 0, "unlike": 0}
     version = {VERSION: {"dtype": "int64", "shape": (1,), "names": None}}
-    replay = partial(_replay, config.rollout.decision_cost)
+    stored = read_recipe(Path(str(config.path)).expanduser() / CONFIG).get("rollout")
+    given = {k: v for k, v in stored.items() if k == "decision_cost"} if isinstance(stored, dict) else {}
+    replay = partial(_replay, decode(RolloutConfig, given).decision_cost)
     with (
         console.stage("replaying episodes", total=len(chosen)) as stage,
         record.simulated(config.env, replay, chosen) as repeated,

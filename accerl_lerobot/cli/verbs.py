@@ -39,10 +39,12 @@ from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.metrics import WandBConfig
 from accerl_lerobot.policies.config import Load, PolicyConfig
 from accerl_lerobot.report import ReportConfig, write_report
-from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
+from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.timeline.read import TimelineConfig, show_timelines, timeline_table
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.world_model.config import ValidationConfig, WorldModelConfig
+
+NO_DATASET = "name a LeRobotDataset, on the Hub or with dataset.root"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,9 +106,7 @@ class OfflineRun(NewFolderRun):
         if self.policy.path is None:
             raise InputError("policy.path", None, "give a LeRobot checkpoint; accerl sft makes one")
         if self.dataset.repo_id is None:
-            raise InputError(
-                "dataset.repo_id", None, "name a LeRobotDataset, on the Hub or with dataset.root"
-            )
+            raise InputError("dataset.repo_id", None, NO_DATASET)
         if self.trainer.ranks != 1:
             raise InputError("trainer.ranks", self.trainer.ranks, "offline learning is one process; use 1")
 
@@ -165,9 +165,6 @@ class WorldModelEvalRun(NewFolderRun):
         super().__post_init__()
         if self.path is None:
             raise InputError("path", None, "name the folder world_model of an accerl world-model run")
-
-
-NO_DATASET = "name a LeRobotDataset, on the Hub or with dataset.root"
 
 
 def train(arguments: list[str], load: Load | None = None) -> int:
@@ -250,6 +247,7 @@ def _in_new_folder[Result](
 
     directory, console = make_output_dir(config), Console()
     console.say(f"run {directory}")
+    (directory / CONFIG).write_text(yaml.safe_dump(encode(config), sort_keys=False))
     try:
         with redirect_stdout(sys.stderr), kept_traceback(directory):
             return work(directory, console), directory, console
@@ -265,7 +263,7 @@ def evaluate(arguments: list[str]) -> int:
     if out is not None:
         check_absent(out)
     from accerl_lerobot.engine import run
-    from accerl_lerobot.evaluation import summarise, table
+    from accerl_lerobot.evaluation import summarise, table, write_video
 
     sections = ("seed", "env", "policy", "rollout", "inference", "evaluation", "launch")
     whole = RunConfig(**{name: getattr(config, name) for name in sections})
@@ -277,7 +275,12 @@ def evaluate(arguments: list[str]) -> int:
     console.rich.print(table(summary, "evaluation"))
     sys.stdout.write(json.dumps(summary) + "\n")
     if out is not None:
-        _write_evaluation(out, summary, results)
+        make_folder(out, "output_dir")
+        (out / "evaluation.json").write_text(json.dumps(summary, indent=2) + "\n")
+        for result in (result for result in results if result.frames):
+            outcome = "success" if result.success else "failure"
+            name = f"{result.plan.task.replace('/', '-')}_{result.plan.seed}_{outcome}.mp4"
+            write_video(out / name, [[result.frames]], fps=20)
     return 0
 
 
@@ -305,11 +308,7 @@ def _validated(
         raise InputError("dataset.repo_id", None, NO_DATASET)
     from accerl_lerobot.world_model.validation import checks_table
 
-    def noted(directory: Path, console: Console) -> dict[str, Any]:
-        (directory / CONFIG).write_text(yaml.safe_dump(encode(config), sort_keys=False))
-        return work(directory, console)
-
-    found, directory, console = _in_new_folder(config, noted)
+    found, directory, console = _in_new_folder(config, work)
     (directory / "validation.json").write_text(json.dumps(found, indent=2) + "\n")
     console.rich.print(checks_table(found))
     console.say(f"{'passed' if found['passed'] else 'FAILED'}; see {directory / 'preview.mp4'}")
@@ -406,15 +405,3 @@ CONFIGS: dict[str, type[Any]] = {
     "bench latency": BenchLatencyConfig,
 }
 """Verb → what its command line is parsed into."""
-
-
-def _write_evaluation(out: Path, summary: dict[str, Any], results: list[EpisodeResult]) -> None:
-    from accerl_lerobot.evaluation import write_video
-
-    make_folder(out, "output_dir")
-    (out / "evaluation.json").write_text(json.dumps(summary, indent=2) + "\n")
-    for result in results:
-        if result.frames:
-            outcome = "success" if result.success else "failure"
-            name = f"{result.plan.task.replace('/', '-')}_{result.plan.seed}_{outcome}.mp4"
-            write_video(out / name, [[result.frames]], fps=20)

@@ -84,7 +84,6 @@ def brief(config_class: type[Any]) -> str:
 
 
 def _bare(config_class: type[Any]) -> str:
-    """Positional arguments of the command line."""
     name: str | None = getattr(config_class, "BARE", None)
     if name is None:
         return "[recipe.yaml | --config_path=recipe.yaml]"
@@ -170,7 +169,6 @@ def _default(field: Any, usual: Any = None) -> Any:
 
 
 def _shown(value: Any) -> str:
-    """A value as one would type it."""
     if isinstance(value, str):
         return value
     if isinstance(value, tuple):

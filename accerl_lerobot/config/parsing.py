@@ -71,8 +71,8 @@ LEROBOT = {
     "policy.pretrained_path": "use policy.path",
     "policy.use_amp": "use policy.precision=bf16",
     "policy.use_peft": "use policy.tuning.mode=lora",
-    "policy.push_to_hub": "leave it out, and use accerl push --path=RUN --repo_id=USER/NAME afterwards",
-    "policy.repo_id": "leave it out, and use accerl push --path=RUN --repo_id=USER/NAME afterwards",
+    "policy.push_to_hub": "leave it out, and use accerl push --path=POLICY --repo_id=USER/NAME afterwards",
+    "policy.repo_id": "leave it out, and use accerl push --path=POLICY --repo_id=USER/NAME afterwards",
 }
 """LeRobot's names of what has another name here → what to do."""
 REGISTERS = "registers"
@@ -249,7 +249,6 @@ class _Loader(yaml.SafeLoader):
 
 
 def _load_yaml(text: str) -> Any:
-    """The value in a YAML text."""
     try:
         return yaml.load(text, _Loader)
     except yaml.YAMLError:

@@ -300,35 +300,26 @@ def record_demos(env_config: EnvConfig, config: DemosConfig, root: str, seed: in
     for task in spec.tasks:
         make_expert(env_config, world, task)  # refuses a task without an expert before any work
     world.close()
-    with appearing(folder) as partial:
-        tally = _write(env_config, config, spec, partial, seed)
+    tally = {"episodes": 0, "frames": 0, "successes": 0, "discarded": 0}
+    record = partial(_record_one, env_config, config, seed)
+    with appearing(folder) as unfinished:
+        with (
+            simulated(env_config, record, range(config.episodes)) as episodes,
+            Progress(transient=True) as progress,
+            new_dataset(unfinished, REPO_ID, spec, env_config) as dataset,
+        ):
+            for episode, discarded in progress.track(episodes, config.episodes, description="recording"):
+                save_episode(dataset, episode, tally)
+                tally["discarded"] += discarded
         sidecar = {
             "env": draccus.encode(env_config, EnvConfig),
             "demos": asdict(config) | {"seed": seed},
             **tally,
             "versions": {k: importlib.metadata.version(v) for k, v in _VERSIONS.items() if find_spec(k)},
         }
-        (partial / SIDECAR).write_text(json.dumps(sidecar, indent=2) + "\n")
+        (unfinished / SIDECAR).write_text(json.dumps(sidecar, indent=2) + "\n")
     _logger.info("%s: %s", folder, tally)
     return folder
-
-
-def _write(
-    env_config: EnvConfig, config: DemosConfig, spec: WorldSpec, root: Path, seed: int
-) -> dict[str, int]:
-    tally = {"episodes": 0, "frames": 0, "successes": 0, "discarded": 0}
-    record = partial(_record_one, env_config, config, seed)
-    with (
-        simulated(env_config, record, range(config.episodes)) as episodes,
-        Progress(transient=True) as progress,
-        new_dataset(root, REPO_ID, spec, env_config) as dataset,
-    ):
-        bar = progress.add_task("recording", total=config.episodes)
-        for episode, discarded in episodes:
-            save_episode(dataset, episode, tally)
-            tally["discarded"] += discarded
-            progress.advance(bar)
-    return tally
 
 
 def save_episode(

@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-import yaml
 
 from accerl_lerobot.algorithms import OffPolicyConfig
 from accerl_lerobot.checkpoint import layout
@@ -52,7 +51,6 @@ def learn_offline(config: OfflineRun, directory: Path, console: Console) -> dict
     torch.set_num_threads(config.trainer.num_threads)
     policy, meta = rehearsed_config(config.policy), open_metadata(config.dataset)
     wanted = _check(config, policy, meta)
-    layout.write_atomically(directory / layout.CONFIG, yaml.safe_dump(encode(config), sort_keys=False))
     adapter = load_adapter(config.policy)
     # One step for each update, instead of so many for each new decision.
     assert isinstance(config.algorithm, OffPolicyConfig)

@@ -314,7 +314,23 @@ def lerobot_eval_arguments(env: Mapping[str, Any]) -> list[str]:
     return [*(f"--env.{name}={shlex.quote(str(value))}" for name, value in fields.items()), seed]
 
 
-class HistoryWorld(World):
+class WrappedWorld(World):
+    """Base of worlds that change what another one shows."""
+
+    def __init__(self, world: World) -> None:
+        self._world, self.spec = world, world.spec
+
+    def reset(self, seed: int, task: str) -> Observation:
+        return self._world.reset(seed, task)
+
+    def render(self, height: int, width: int) -> np.ndarray:
+        return self._world.render(height, width)
+
+    def close(self) -> None:
+        self._world.close()
+
+
+class HistoryWorld(WrappedWorld):
     """A world whose observations hold its last states, in a dimension of `length` in front of each array.
 
     LeRobot's ``n_obs_steps`` counts env steps, not decisions, so the last states of a chunk are looked at one
@@ -323,7 +339,7 @@ class HistoryWorld(World):
     """
 
     def __init__(self, world: World, length: int) -> None:
-        self._world, self.spec = world, world.spec
+        super().__init__(world)
         self._seen: deque[Observation] = deque(maxlen=length)
         self._length, self._left = length, 0
 
@@ -348,12 +364,6 @@ class HistoryWorld(World):
         rewards = np.concatenate([r.rewards for r in results])
         self._left -= len(rewards)
         return replace(results[-1], observation=self._observation(), rewards=rewards)
-
-    def render(self, height: int, width: int) -> np.ndarray:
-        return self._world.render(height, width)
-
-    def close(self) -> None:
-        self._world.close()
 
     def _observation(self) -> Observation:
         observation = dict(self._seen[-1])

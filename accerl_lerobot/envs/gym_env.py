@@ -153,7 +153,6 @@ class GymWorld(EpisodeWorld):
         return observation
 
     def _vector(self, name: str, raw: dict[str, np.ndarray], keys: tuple[str, ...]) -> np.ndarray:
-        """Numbers of the observation, float32 (N,)."""
         parts = [_part(raw, key, name) for key in keys]
         if any(part.dtype.kind not in "fiub" for part in parts):
             raise InputError(f"env.{name}", list(keys), "name keys with numbers")

@@ -158,7 +158,6 @@ class Simulator:
         self._grip, self._fresh = robot.gripper.current_action, False
 
     def _control(self, action: np.ndarray, decided: bool) -> None:
-        """Sets the motors for the current state."""
         if decided:
             self._goal = self._new_goal(action)
         self._mujoco.mj_jacSite(self.model, self.data, *self._jacobian, self._site)

@@ -19,7 +19,7 @@ import numpy as np
 
 from accerl_lerobot.checkpoint.safety import Origin, brief, read_json, tensor_shapes
 from accerl_lerobot.config.ranges import Commit, Range, Section
-from accerl_lerobot.envs.base import ChunkResult, World
+from accerl_lerobot.envs.base import ChunkResult, World, WrappedWorld
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK, Observation
 
@@ -109,17 +109,15 @@ def load_judge(config: RewardModelConfig) -> Callable[[Observation], bool]:
     return succeeded
 
 
-class JudgedWorld(World):
+class JudgedWorld(WrappedWorld):
     """A world whose successes, and rewards, are what a reward model says.
 
     An episode also ends where the world itself ends it, successfully or not.
     """
 
     def __init__(self, world: World, succeeded: Callable[[Observation], bool]) -> None:
-        self._world, self.succeeded, self.spec = world, succeeded, world.spec
-
-    def reset(self, seed: int, task: str) -> Observation:
-        return self._world.reset(seed, task)
+        super().__init__(world)
+        self.succeeded = succeeded
 
     def step_chunk(self, actions: np.ndarray) -> ChunkResult:
         result = self._world.step_chunk(actions)
@@ -133,9 +131,3 @@ class JudgedWorld(World):
             terminated=result.terminated or success,
             truncated=result.truncated and not success,
         )
-
-    def render(self, height: int, width: int) -> np.ndarray:
-        return self._world.render(height, width)
-
-    def close(self) -> None:
-        self._world.close()

@@ -27,20 +27,16 @@ from accerl_lerobot.envs.base import lerobot_eval_arguments
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import discovery
 
-POLICY, WORLD_MODEL, SUCCESS_MODEL = "policy", "world model", "success model"
-DATASET, RUN = "dataset", "run"
+POLICY, WORLD_MODEL, DATASET = "policy", "world model", "dataset"
 
 CONFIG, WEIGHTS, POSTPROCESSOR = "config.json", "model.safetensors", "policy_postprocessor.json"
 INFO, CARD = "meta/info.json", "README.md"
 RECORD = "accerl_pulled.json"
 """File that a pull adds: the commit that the others are from."""
-LAST = f"checkpoints/last/{PRETRAINED}"
 NEEDED = {
     POLICY: (CONFIG, WEIGHTS, PREPROCESSOR, POSTPROCESSOR),
     WORLD_MODEL: (CONFIG, WEIGHTS),
-    SUCCESS_MODEL: (CONFIG, WEIGHTS),
     DATASET: (INFO, "meta/tasks.parquet", "meta/episodes", "data"),
-    RUN: (RECIPE, SUMMARY, LAST),
 }
 CODEBASE_VERSION = "v3.0"
 """Version of LeRobotDatasets, and the tag under which LeRobot looks for them on the Hub."""
@@ -52,7 +48,7 @@ REPO_TYPES: tuple[RepoType, ...] = ("model", "dataset")
 
 @dataclass(frozen=True, kw_only=True)
 class PushConfig(Section):
-    """``accerl push``: a policy, world model, success model, dataset or whole run, as one commit."""
+    """``accerl push``: a policy, a world model with its success model, or a dataset, as one commit."""
 
     path: Annotated[str, Pattern(r"(?s).+", "the name of the folder to push")] = ""
     """Folder to push; its type is told by its files."""
@@ -61,8 +57,6 @@ class PushConfig(Section):
     private: bool = True
     """Keep the repository private. A public repository is written to only when this is false, and a private
     one stays private."""
-    include: list[str] = field(default_factory=list)
-    """Folders of a run that are not pushed otherwise, such as ``[demos, sft, tensorboard]``."""
     evaluation: str | None = None
     """Folder or file that ``accerl eval`` wrote about this policy; its numbers go into the card. None: those
     of the policy's run."""
@@ -89,7 +83,7 @@ def recognise(folder: Path, field: str = "path") -> str:
     """The artifact type of a complete folder; an unknown or incomplete one is refused, blaming `field`."""
     if not folder.is_dir():
         raise InputError(field, str(folder), "no such folder")
-    artifact = _likely(folder)
+    artifact = likely([INFO] if (folder / INFO).exists() else [], read_json(folder / CONFIG))
     if artifact is None:
         raise InputError(field, str(folder), _hint(folder))
     missing = [name for name in NEEDED[artifact] if not (folder / name).exists()]
@@ -107,27 +101,18 @@ def read_json(path: Path) -> dict[str, Any]:
         return {}
 
 
-def _likely(folder: Path) -> str | None:
-    names = {name for name in (INFO, RECIPE, CHECKPOINTS) if (folder / name).exists()}
-    return likely(names, read_json(folder / CONFIG))
-
-
 def likely(names: Collection[str], config: dict[str, Any]) -> str | None:
-    """The artifact type, by names of files and folders at hand and the content of ``config.json``."""
+    """The artifact type, by names of files at hand and the content of ``config.json``."""
     if INFO in names:
         return DATASET
     if {"spec", "model"} <= config.keys():
         return WORLD_MODEL
-    if "type" in config:
-        # LeRobot stores n_obs_steps in a policy's config, and nothing like it in a reward model's.
-        return POLICY if "n_obs_steps" in config else SUCCESS_MODEL
-    if {CHECKPOINTS, RECIPE} <= set(names):
-        return RUN
-    return None
+    # LeRobot stores n_obs_steps in a policy's config, and nothing like it in a reward model's.
+    return POLICY if {"type", "n_obs_steps"} <= config.keys() else None
 
 
 def _hint(folder: Path) -> str:
-    for below in (PRETRAINED, "world_model"):
+    for below in (f"{CHECKPOINTS}/last/{PRETRAINED}", PRETRAINED, "world_model"):
         if (folder / below).is_dir():
             return f"name the folder {below} in it"
     shapes = [f"a {artifact} has {', '.join(NEEDED[artifact])}" for artifact in NEEDED]
@@ -142,16 +127,9 @@ EVALUATION, VALIDATION = "evaluation.json", "validation.json"
 KEPT = {
     POLICY: (RECIPE, SUMMARY, EVALUATION, "success_curve.png", "before_after.mp4"),
     WORLD_MODEL: (RECIPE, VALIDATION, "preview.mp4", "preview_online.mp4"),
-    SUCCESS_MODEL: (RECIPE, VALIDATION),
 }
 """Artifact type → files of its run that go with it."""
 MARK = "<!-- Written by accerl push, and anew each time. Delete this line to keep what you change. -->"
-TITLES = {
-    POLICY: "A LeRobot policy improved by online reinforcement learning",
-    RUN: "A run of accerl train",
-    WORLD_MODEL: "A world model for LeRobot policies",
-    SUCCESS_MODEL: "A success model, which is a LeRobot reward model",
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,9 +152,9 @@ def find_provenance(folder: Path, artifact: str, evaluation: str | None) -> Prov
 
     `evaluation` is a folder or file of ``accerl eval``; one of another policy is refused.
     """
-    if evaluation is not None and artifact not in (POLICY, RUN):
+    if evaluation is not None and artifact != POLICY:
         raise InputError("evaluation", evaluation, f"only a policy is evaluated, this is a {artifact}")
-    carried = folder if artifact == RUN else folder / FOLDER
+    carried = folder / FOLDER
     home = carried if carried.is_dir() else _run_of(folder.resolve(), artifact)
     known: dict[str, Any] = {}
     files: dict[str, Path] = {}
@@ -189,13 +167,13 @@ def find_provenance(folder: Path, artifact: str, evaluation: str | None) -> Prov
         known["validation"] = read_json(home / VALIDATION)
         with contextlib.suppress(InputError):
             known["recipe"] = read_recipe(home / RECIPE)
-        if measured and artifact in (POLICY, RUN):
+        if measured and artifact == POLICY:
             known |= {"summary": summary, "evaluation": read_json(home / EVALUATION)}
     if evaluation is not None:
         path = Path(evaluation).expanduser()
         path = path / EVALUATION if path.is_dir() else path
-        known["evaluation"] = _read_evaluation(path, folder / LAST if artifact == RUN else folder)
-        files[EVALUATION if artifact == RUN else f"{FOLDER}/{EVALUATION}"] = path
+        known["evaluation"] = _read_evaluation(path, folder)
+        files[f"{FOLDER}/{EVALUATION}"] = path
     return Provenance(**known, files=files)
 
 
@@ -203,8 +181,8 @@ def _run_of(folder: Path, artifact: str) -> Path | None:
     """The folder of the run, or of the training of a world model, in which a folder lies."""
     if artifact == POLICY and folder.name == PRETRAINED and folder.parents[1].name == CHECKPOINTS:
         home, sign = folder.parents[2], RECIPE
-    elif artifact in (WORLD_MODEL, SUCCESS_MODEL):
-        home, sign = folder.parents[0 if artifact == WORLD_MODEL else 1], VALIDATION
+    elif artifact == WORLD_MODEL:
+        home, sign = folder.parent, VALIDATION
     else:
         return None
     return home if (home / sign).is_file() else None
@@ -222,8 +200,7 @@ def _read_evaluation(path: Path, policy: Path) -> dict[str, Any]:
 def model_card(repo_id: str, artifact: str, folder: Path, files: Files, provenance: Provenance) -> str:
     """README.md of a model repository; pictures and videos among `files` are shown."""
     recipe, summary, local = provenance.recipe, provenance.summary, repo_id.split("/")[1]
-    home, place = (LAST, RECIPE) if artifact == RUN else ("", f"{FOLDER}/{RECIPE}")
-    config, env = read_json(folder / home / CONFIG), recipe.get("env") or {}
+    place, config, env = f"{FOLDER}/{RECIPE}", read_json(folder / CONFIG), recipe.get("env") or {}
     tags = ["accerl-lerobot", artifact.replace(" ", "-"), config.get("type"), env.get("type")]
     if summary:
         tags += ["reinforcement-learning", (recipe.get("algorithm") or {}).get("type")]
@@ -238,7 +215,7 @@ def model_card(repo_id: str, artifact: str, folder: Path, files: Files, provenan
         datasets=datasets or None,
         base_model=_base_model(recipe),
     )
-    own_recipe = files.get(place, b"")
+    own_recipe = files.get(place, b"")  # scrubbed
     card = ModelCard.from_template(
         data,
         template_str=Path(__file__).with_name("card.md.jinja").read_text(),
@@ -246,14 +223,12 @@ def model_card(repo_id: str, artifact: str, folder: Path, files: Files, provenan
         repo_id=repo_id,
         local=local,
         artifact=artifact,
-        title=TITLES[artifact],
         config=config,
         measurements=_measurements(provenance),
         summary=summary,
         validation=provenance.validation,
         number=number,
         shown=sorted(name for name in files if name.startswith(f"{FOLDER}/") or "/" not in name),
-        policy=f"{local}/{home}".rstrip("/"),
         recipe_path=f"{local}/{place}" if recipe else None,
         stock=[*discovery(config.get("type")), *stock] if stock else None,
         # With one of its own, LeRobot finds the backbone only once a pull has set its place.

@@ -98,7 +98,6 @@ def _explain(error: BaseException, repo_id: str, revision: str | None, writing: 
 
 
 def _status(error: HfHubHTTPError, role: str) -> str:
-    """Meaning of an HTTP status, and the remedy."""
     code = error.response.status_code
     if code in (401, 404):
         if get_token() is None:

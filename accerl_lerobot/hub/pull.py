@@ -20,10 +20,8 @@ from huggingface_hub import HfApi, hf_hub_download
 from huggingface_hub.errors import RepositoryNotFoundError
 from huggingface_hub.hf_api import RepoFile
 
-from accerl_lerobot.checkpoint import layout
-from accerl_lerobot.checkpoint.layout import CHECKPOINTS, PRETRAINED, relocate
+from accerl_lerobot.checkpoint.layout import digest, relocate
 from accerl_lerobot.checkpoint.safety import brief, unsafe_name
-from accerl_lerobot.engine.resuming import LOCK
 from accerl_lerobot.errors import InputError, check_absent, expanded, make_folder
 from accerl_lerobot.hub import card
 from accerl_lerobot.hub.errors import check_commit, hub_errors
@@ -90,12 +88,12 @@ def _resolve(api: HfApi, config: card.PullConfig) -> tuple[str, str]:
 def _checked(listed: Iterable[Any], repo_id: str) -> dict[str, RepoFile]:
     """Files that a server lists, by name; one with which it could write elsewhere is refused."""
     files = [item for item in listed if isinstance(item, RepoFile)]
-    for name in (file.path for file in files):
+    for file in files:
+        name = file.path
         parts = PurePosixPath(name).parts if not unsafe_name(name) else ()
         if not parts or name != "/".join(parts) or parts[0] in (CACHE, ".git") or "." in parts:
             why = f"it has a file named {ascii(name)[:200]}, which is not safe to write"
             raise InputError("repo_id", repo_id, why)
-    for file in files:
         if type(file.size) is not int or file.size < 0:
             why = f"{ascii(file.path)[:99]} is listed with size {str(file.size)[:40]}; use another server"
             raise InputError("repo_id", repo_id, why)
@@ -126,33 +124,20 @@ def _receive(folder: Path, home: Path, files: dict[str, RepoFile], repo_id: str)
         if not _is_listed(folder / name, file):
             raise refuse(f"{name} is not what the server lists: its hash is another")
     (folder / ATTRIBUTES).unlink(missing_ok=True)
-    numbers = sorted(p.name for p in folder.glob(f"{CHECKPOINTS}/*") if p.is_dir())
-    if numbers and layout.LAST not in numbers:  # a repository has no links
-        (folder / CHECKPOINTS / layout.LAST).symlink_to(numbers[-1])
     artifact = card.recognise(folder, "repo_id")
-    checkpoints = [folder / CHECKPOINTS / number for number in numbers if artifact == card.RUN]
-    own = [checkpoint for checkpoint in checkpoints if (checkpoint / layout.MANIFEST).is_file()]
-    for checkpoint in own:
-        if (why := layout.defect(checkpoint)) is not None:
-            raise refuse(f"its checkpoint {checkpoint.name} is broken: {why}")
-    policies = [folder] if artifact == card.POLICY else [each / PRETRAINED for each in checkpoints]
-    for policy in policies:
-        relocate(policy, home / policy.relative_to(folder))
-    if artifact == card.RUN:
-        (folder / LOCK).touch()  # marks a run that can be resumed
+    if artifact == card.POLICY:
+        relocate(folder, home)
     code = sorted(path for path in folder.rglob("*") if path.name.endswith(CODE) and path.is_file())
     left_out = [path.relative_to(folder).as_posix() for path in code]
     for path in code:
         path.unlink()
-    for checkpoint in own:
-        layout.write_manifest(checkpoint)
     return {"kind": artifact, "files": len(files)} | ({"left_out": left_out} if left_out else {})
 
 
 def _is_listed(path: Path, file: RepoFile) -> bool:
     """True if a file has the hash by which the Hub knows it: SHA-256 if it is large, git's otherwise."""
     if file.lfs:
-        return layout.digest(path) == file.lfs.sha256
+        return digest(path) == file.lfs.sha256
     git = hashlib.sha1(b"blob %d\0" % file.size, usedforsecurity=False)
     with path.open("rb") as opened:
         return hashlib.file_digest(opened, lambda: git).hexdigest() == file.blob_id

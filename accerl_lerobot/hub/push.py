@@ -12,7 +12,7 @@ import json
 import logging
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -31,8 +31,7 @@ BRANCH = "main"
 NOT_CONTENTS = (card.CARD, card.RECORD, ".gitattributes")
 PICTURES = (".png", ".jpg", ".gif", ".svg", ".mp4")
 """Endings of files that a card may show, which somebody may have added on the Hub."""
-RESULTS = (".yaml", ".json", ".jsonl", ".html", *PICTURES)
-FOLDERS = (card.FOLDER, layout.BACKBONE, layout.CHECKPOINTS, "meta", "data", "videos", "images")
+FOLDERS = (card.FOLDER, layout.BACKBONE, "success_model", "meta", "data", "videos", "images")
 """Top folders of what is pushed."""
 WEIGHTS = (".safetensors", ".bin", ".pt", ".pth")
 RECORDS = (".json", ".jsonl", ".yaml", ".yml", ".md", ".txt", ".log", ".csv", ".html")
@@ -62,7 +61,7 @@ def push(config: card.PushConfig) -> dict[str, Any]:
 def stage(config: card.PushConfig, folder: Path, artifact: str) -> tuple[card.Files, bool]:
     """All files to upload, and True if the card among them is the user's own."""
     provenance = card.find_provenance(folder, artifact, config.evaluation)
-    files = contents(folder, artifact, config.include)
+    files = contents(folder, artifact)
     for name, path in provenance.files.items():
         files[name] = scrubbed(name, path.read_bytes(), folder) if is_record(name) else path
     readme, repo_id = folder / card.CARD, config.repo_id
@@ -78,7 +77,6 @@ def stage(config: card.PushConfig, folder: Path, artifact: str) -> tuple[card.Fi
 
 
 def _upload(config: card.PushConfig, artifact: str, files: card.Files, own_card: bool) -> dict[str, Any]:
-    """Creates the repository if need be, and the commit."""
     api, repo_id = HfApi(), config.repo_id
     where: dict[str, Any] = {"repo_id": repo_id, "repo_type": card.repo_type(artifact)}
     parent = _parent(api, config, artifact)
@@ -94,7 +92,7 @@ def _upload(config: card.PushConfig, artifact: str, files: card.Files, own_card:
             files[card.CARD] = readme
     theirs = {name for name in listed if "/" in name or not name.endswith((*PICTURES, *NOT_CONTENTS))}
     there = card.read_json(fetched(card.CONFIG)) if card.CONFIG in listed else {}
-    if theirs and (kind := card.likely(theirs | {name.split("/")[0] for name in theirs}, there)) != artifact:
+    if theirs and (kind := card.likely(theirs, there)) != artifact:
         held = f"a {kind}" if kind else "other files"
         raise InputError(
             "repo_id", repo_id, f"it holds {held}, and this is a {artifact}; choose another name"
@@ -156,33 +154,20 @@ def _tag(api: HfApi, where: dict[str, Any], commit: str) -> None:
         api.create_tag(tag=card.CODEBASE_VERSION, revision=commit, **where)
 
 
-def contents(folder: Path, artifact: str, include: Sequence[str] = ()) -> card.Files:
+def contents(folder: Path, artifact: str) -> card.Files:
     """Files of a folder that are pushed, without paths of this machine.
 
-    It refuses an `include` that is no folder of the run, a broken checkpoint, and a policy without backbone.
+    A policy without its backbone is refused.
     """
-    if include and artifact != card.RUN:
-        raise InputError("include", list(include), f"for a run; a {artifact} is pushed completely")
-    policies: list[str] = [""] if artifact == card.POLICY else []
-    last = (folder / layout.CHECKPOINTS / layout.LAST).resolve()
-    if artifact == card.RUN:
-        files = _of_a_run(folder, last, include)
-        policies = [f"{layout.CHECKPOINTS}/{last.name}/{layout.PRETRAINED}/"]
-    else:
-        files = {name: path for name, path in _walk(folder) if name not in NOT_CONTENTS}
+    files: card.Files = {name: path for name, path in _walk(folder) if name not in NOT_CONTENTS}
     if artifact == card.DATASET:  # LeRobot leaves images behind that are in the tables or videos now
         files = {name: path for name, path in files.items() if not name.startswith("images/")}
-    for prefix in policies:
-        _bring_backbone(files, folder / prefix, prefix)
+    if artifact == card.POLICY:
+        _bring_backbone(files, folder)
     for name, content in files.items():
         if is_record(name):
             data = content if isinstance(content, bytes) else content.read_bytes()
             files[name] = scrubbed(name, data, folder)
-    prefix = f"{layout.CHECKPOINTS}/{last.name}/"
-    if artifact == card.RUN and (manifest := f"{prefix}{layout.MANIFEST}") in files:
-        inside = {name: content for name, content in files.items() if name.startswith(prefix)}
-        entries = {n.removeprefix(prefix): layout.entry(c) for n, c in inside.items() if n != manifest}
-        files[manifest] = layout.manifest_text(entries).encode()
     return files
 
 
@@ -196,22 +181,7 @@ def _walk(folder: Path) -> Iterator[tuple[str, Path]]:
                 yield path.relative_to(folder).as_posix(), path
 
 
-def _of_a_run(run: Path, last: Path, include: Sequence[str]) -> card.Files:
-    if (last / layout.MANIFEST).is_file() and (why := layout.defect(last)) is not None:
-        raise InputError("path", str(last), f"the checkpoint is broken: {why}")
-    top = [path for path in sorted(run.iterdir()) if path.is_file() and path.suffix in RESULTS]
-    files: card.Files = {path.name: path for path in top if path.name not in NOT_CONTENTS}
-    folders = {f"{layout.CHECKPOINTS}/{last.name}": last}
-    for name in (name.strip("/") for name in include):
-        folders[name] = run / name
-        if not (run / name).is_dir() or (run / name).name != name or name.startswith("."):
-            raise InputError("include", name, f"no such folder in {run}")
-    for name, folder in folders.items():
-        files |= {f"{name}/{below}": path for below, path in _walk(folder)}
-    return files
-
-
-def _bring_backbone(files: card.Files, home: Path, prefix: str) -> None:
+def _bring_backbone(files: card.Files, home: Path) -> None:
     """Points a policy at the backbone beside it, which is copied there if it is elsewhere on this machine."""
     config, processor = card.read_json(home / card.CONFIG), card.read_json(home / layout.PREPROCESSOR)
     before = json.dumps([config, processor])
@@ -220,9 +190,9 @@ def _bring_backbone(files: card.Files, home: Path, prefix: str) -> None:
         for name, path in _walk(elsewhere):
             # The policy's own file holds its weights, unless LeRobot builds it from the backbone's.
             if config.get("load_vlm_weights") or path.suffix not in WEIGHTS:
-                files[f"{prefix}{layout.BACKBONE}/{name}"] = path
+                files[f"{layout.BACKBONE}/{name}"] = path
     ours = layout.CONFIG_FOLDERS.values()
-    has = {own for own in ours if any(name.startswith(f"{prefix}{own}/") for name in files)}
+    has = {own for own in ours if any(name.startswith(f"{own}/") for name in files)}
     for fields, key, own in layout.places_of_names(config, processor):
         if not Path(named := fields.get(key) or "").is_absolute():
             continue
@@ -231,8 +201,8 @@ def _bring_backbone(files: card.Files, home: Path, prefix: str) -> None:
             raise InputError("path", str(home), f"it needs {named}, which is not in it; {remedy}")
         fields[key] = own
     if json.dumps([config, processor]) != before:
-        files[f"{prefix}{card.CONFIG}"] = (json.dumps(config, indent=4) + "\n").encode()
-        files[f"{prefix}{layout.PREPROCESSOR}"] = (json.dumps(processor, indent=4) + "\n").encode()
+        files[card.CONFIG] = (json.dumps(config, indent=4) + "\n").encode()
+        files[layout.PREPROCESSOR] = (json.dumps(processor, indent=4) + "\n").encode()
 
 
 def is_record(name: str) -> bool:

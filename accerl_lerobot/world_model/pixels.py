@@ -191,7 +191,6 @@ def _to_floats(frames: Tensor) -> Tensor:
 
 
 def _to_bytes(image: Tensor, cameras: int) -> Tensor:
-    """Inverse of `_to_floats`, rounded."""
     return ((image + 1) * 127.5).round().clamp(0, 255).byte().unflatten(1, (cameras, 3)).movedim(2, -1)
 
 

@@ -78,18 +78,17 @@ class OracleModel(WorldModel):
             chunk=executed,
             fps=world.fps,
             context=1,
+            tasks=world.tasks,
         )
         self._make, self._longest = make, world.max_steps + executed
         self._simulators: list[World] = []
         self._where: list[bytes] = []
-        self.tasks: list[str] = []
 
     def begin(self, context: Context, tasks: Sequence[str], resets: Sequence[Reset] | None = None) -> State:
         if resets is None:
             raise ValueError("an oracle needs the reset of every start")
-        self.tasks += sorted({reset.task for reset in resets} - set(self.tasks))
         return {
-            "task": torch.tensor([self.tasks.index(reset.task) for reset in resets]),
+            "task": torch.tensor([self.spec.tasks.index(reset.task) for reset in resets]),
             "seed": torch.tensor([reset.seed for reset in resets]),
             "count": torch.zeros(len(resets), dtype=torch.long),
             "played": torch.zeros(len(resets), self._longest, self.spec.action_dim),
@@ -124,12 +123,11 @@ class OracleModel(WorldModel):
             self._simulators.append(self._make())
         world = self._simulators[row]
         if row >= len(self._where) or self._where[row] != _key(state, row):
-            world.reset(int(state["seed"][row]), self.tasks[int(state["task"][row])])
+            world.reset(int(state["seed"][row]), self.spec.tasks[int(state["task"][row])])
             if n := int(state["count"][row]):
                 world.step_chunk(state["played"][row, :n].numpy())
         return world.step_chunk(actions)
 
 
 def _key(state: State, row: int) -> bytes:
-    """Where a row is."""
     return b"".join(state[name][row].numpy().tobytes() for name in ("task", "seed", "count", "played"))

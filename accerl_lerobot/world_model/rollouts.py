@@ -196,7 +196,6 @@ class Imagination:
             "model_state": self._state,
             "sequence": (self._sequence, self._uncertain_in_a_row),
             "promoted": promoted,
-            "tasks": self._model.tasks if isinstance(self._model, OracleModel) else [],
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -209,8 +208,6 @@ class Imagination:
             model, success, self._success.config.threshold, self._roles = state["promoted"]
             learned_part(self._model).load_state_dict(model)
             self._success.load_state_dict(success)
-        if isinstance(self._model, OracleModel):
-            self._model.tasks = state["tasks"]
         if state["model_state"] is not None:
             device = "cpu" if self._success is None else self._success.out.weight.device
             self._state = {name: tensor.to(device) for name, tensor in state["model_state"].items()}

@@ -233,14 +233,6 @@ def test_a_picture_does_not_start_a_program(copied: Path, tmp_path: Path, monkey
     assert not mark.exists()
 
 
-def test_images_of_another_size(copied: Path):
-    packed = io.BytesIO()
-    Image.new("RGB", (32, 32)).save(packed, "PNG")
-    data_with(copied, [{"bytes": packed.getvalue(), "path": None}])
-    with pytest.raises(InputError, match="an image of 32 x 32 pixels, and its shape is"):
-        check_data(copied, info(), ORIGIN)
-
-
 def test_links_out_of_the_folder(copied: Path, tmp_path: Path):
     for part in ("meta/info.json", "meta/tasks.parquet", EPISODES):
         (copied / part).rename(tmp_path / "outside")

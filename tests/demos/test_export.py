@@ -82,6 +82,7 @@ def test_a_run_with_types_of_other_packages(run: Path, tmp_path: Path, capsys: p
     config = yaml.safe_load((run / "config.yaml").read_text())
     config |= {"algorithm": {"type": "theirs", "discover_packages_path": "a_package"}}
     config["env"]["discover_packages_path"] = "accerl_lerobot.envs"
+    config["rollout"]["reward_model"]["trust_remote_code"] = "0" * 40  # not needed to repeat episodes
     (other / "config.yaml").write_text(yaml.safe_dump(config))
     capsys.readouterr()
     assert exported(other, tmp_path / "set") == 2

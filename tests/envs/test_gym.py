@@ -92,13 +92,6 @@ def test_bad_values_name_field_and_remedy(changed: str, message: str):
         make_world(config(changed))
 
 
-def test_a_file_alone_imports_no_package(tmp_path: Path):
-    recipe = tmp_path / "recipe.yaml"
-    recipe.write_text("env: {type: gym, id: reach/Reach-v0, discover_packages_path: lerobot_env_reach}\n")
-    with pytest.raises(InputError, match=r"^env\.discover_packages_path"):
-        parse(RunConfig, [f"--config_path={recipe}"])
-
-
 def test_it_trains(tiny_checkpoint: Path):
     run = replace(tiny_run(tiny_checkpoint, env=config()), launch=LaunchConfig(engine="local"))
     made = trained(run, ("reach/Reach-v0",))

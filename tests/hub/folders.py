@@ -39,11 +39,10 @@ def write_policy_folder(folder: Path, *, size: int = 3000, seed: int = 0, **conf
 
 
 def write_run_folder(run: Path, **policy: Any) -> Path:
-    """A run that made 12 updates, with all that a run leaves behind; names its own places, as runs do."""
+    """A run that made 12 updates; names its own places, as runs do."""
     home = run / "checkpoints" / "000012" / "pretrained_model"
     write_policy_folder(home, **policy)
     write_policy_folder(run / "checkpoints" / "000006" / "pretrained_model", seed=6)
-    write_json(run / "checkpoints" / "000012" / "training_state" / "training_step.json", {"step": 12})
     os.symlink("000012", run / "checkpoints" / "last")
     recipe = {
         "output_dir": str(run),
@@ -55,10 +54,6 @@ def write_run_folder(run: Path, **policy: Any) -> Path:
     }
     (run / "config.yaml").write_text(yaml.safe_dump(recipe, sort_keys=False))
     write_json(run / "summary.json", SUMMARY)
-    (run / "metrics.jsonl").write_text(json.dumps({"kind": "train", "note": f"saved {home}/model"}) + "\n")
     (run / "success_curve.png").write_bytes(b"\x89PNG curve")
     (run / "before_after.mp4").write_bytes(b"\0\0 film")
-    for name in ("tensorboard/events", "demos/meta/info.json", "sft/log.txt", "sft.log", ".hidden"):
-        (run / name).parent.mkdir(parents=True, exist_ok=True)
-        (run / name).write_text("left at home")
     return run

@@ -1,37 +1,80 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of a folder that go to the Hub, and the facts about the run provenance it."""
+"""A folder's type by its files, the files that go to the Hub without paths of this machine, and their run."""
 
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
+import yaml
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.hub.card import find_provenance
-from accerl_lerobot.hub.push import contents
+from accerl_lerobot.hub.card import PullConfig, PushConfig, find_provenance, recognise, repo_type
+from accerl_lerobot.hub.push import contents, is_record, scrubbed
 from tests.hub.folders import SUMMARY, write_json, write_policy_folder, write_run_folder
 
+TINY = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
 TOKENIZER = {"registry_name": "tokenizer_processor", "config": {"tokenizer_name": "x"}}
 
 
-def test_of_a_run_go_its_results_and_the_last_checkpoint(tmp_path: Path):
+def test_kinds(tmp_path: Path):
+    assert recognise(write_policy_folder(tmp_path / "policy")) == "policy"
+    assert recognise(TINY) == "dataset" and repo_type("dataset") == "dataset"
+    write_json(tmp_path / "world" / "config.json", {"spec": {}, "model": {}})
+    (tmp_path / "world" / "model.safetensors").write_bytes(b"x")
+    assert recognise(tmp_path / "world") == "world model" and repo_type("world model") == "model"
+
+
+@pytest.mark.parametrize(
+    ("artifact", "missing"),
+    [
+        ("policy", "model.safetensors"),
+        ("policy", "policy_preprocessor.json"),
+        ("policy", "policy_postprocessor.json"),
+        ("dataset", "meta/tasks.parquet"),
+    ],
+)
+def test_an_incomplete_folder_says_what_it_lacks(tmp_path: Path, artifact: str, missing: str):
+    write = {"policy": write_policy_folder, "dataset": copy_dataset}[artifact]
+    (write(tmp_path / "folder") / missing).unlink()
+    with pytest.raises(InputError, match=f"looks like a {artifact} but lacks {missing}"):
+        recognise(tmp_path / "folder")
+
+
+def copy_dataset(folder: Path) -> Path:
+    return Path(shutil.copytree(TINY, folder))
+
+
+def test_folders_one_above_say_which_below(tmp_path: Path):
     run = write_run_folder(tmp_path / "run")
-    names = set(contents(run, "run"))
-    last = "checkpoints/000012"
-    assert names == {
-        "config.yaml", "summary.json", "metrics.jsonl", "success_curve.png", "before_after.mp4",
-        f"{last}/training_state/training_step.json",
-        *(f"{last}/pretrained_model/{p.name}" for p in (run / last / "pretrained_model").iterdir()),
-    }  # fmt: skip
-    more = set(contents(run, "run", ["demos", "sft/"]))
-    assert more - names == {"demos/meta/info.json", "sft/log.txt"}
-    for name in ("nowhere", "..", "../run"):
-        with pytest.raises(InputError, match="include"):
-            contents(run, "run", [name])
-    with pytest.raises(InputError, match="a policy is pushed completely"):
-        contents(run / last / "pretrained_model", "policy", ["demos"])
+    with pytest.raises(InputError, match="name the folder checkpoints/last/pretrained_model in it"):
+        recognise(run)
+    with pytest.raises(InputError, match="name the folder pretrained_model in it"):
+        recognise(run / "checkpoints" / "000012")
+    (tmp_path / "learnt" / "world_model").mkdir(parents=True)
+    with pytest.raises(InputError, match="name the folder world_model in it"):
+        recognise(tmp_path / "learnt")
+    write_json(tmp_path / "success_model" / "config.json", {"type": "success_pairs"})
+    with pytest.raises(InputError, match="no known artifact"):
+        recognise(tmp_path / "success_model")
+    with pytest.raises(InputError, match="a policy has config.json, model.safetensors"):
+        recognise(tmp_path)
+    with pytest.raises(InputError, match="no such folder"):
+        recognise(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize(
+    "name", [None, "", "door", "a/b/c", "../x/y", "a/..", "a/b c", "https://x/y", "/a/b"]
+)
+def test_what_is_no_name_of_a_repository(name: str | None):
+    for make in (
+        lambda: PushConfig(path="x", repo_id=name),
+        lambda: PullConfig(repo_id=name, output_dir="x"),
+    ):
+        with pytest.raises(InputError, match="user/name"):
+            make()
 
 
 def test_hidden_files_and_what_a_pull_left_stay_here(tmp_path: Path):
@@ -97,3 +140,57 @@ def test_an_evaluation_is_of_this_policy_or_refused(tmp_path: Path):
         find_provenance(policy, "policy", str(tmp_path))
     with pytest.raises(InputError, match="only a policy is evaluated"):
         find_provenance(tmp_path, "dataset", str(tmp_path / "eval"))
+
+
+def test_paths_in_json_and_yaml(tmp_path: Path):
+    tree = {
+        "own": str(tmp_path / "backbone" / "fast"),
+        "other": str(tmp_path.parent / "with blanks" / "demos"),
+        "output_dir": str(tmp_path),
+        "nested": [{"argument": f"--root={tmp_path.parent}/data/x.json,y"}],
+        "home": "~/runs/one",
+        "mac": "/Users/somebody/model",
+        "kept": ["lerobot/smolvla_base", "observation.front", 0.5, None, True, "m/s", "1/2/3", "/", "/tmp"],
+        "url": "https://example.org/tmp/a/b",
+        "pattern": "data/*/*.parquet",
+    }
+    wanted = tree | {
+        "own": "backbone/fast",
+        "other": "LOCAL/demos",
+        "output_dir": None,
+        "nested": [{"argument": "--root=LOCAL/x.json,y"}],
+        "home": "LOCAL/one",
+        "mac": "LOCAL/model",
+    }
+    assert json.loads(scrubbed("a.json", json.dumps(tree).encode(), tmp_path)) == wanted
+    assert yaml.safe_load(scrubbed("a.yaml", yaml.safe_dump(tree).encode(), tmp_path)) == wanted
+
+
+def test_paths_in_lines(tmp_path: Path):
+    text = f'{{"a": "{tmp_path}/x/y.png"}}\nsaved to {tmp_path.parent}/z/w at 3/4 of https://a.b/tmp/c/d\n'
+    new = scrubbed("log.jsonl", text.encode(), tmp_path).decode()
+    assert new == '{"a": "x/y.png"}\nsaved to LOCAL/w at 3/4 of https://a.b/tmp/c/d\n'
+
+
+@pytest.mark.parametrize("indent", [None, 1, 4])
+def test_what_has_no_paths_keeps_every_byte(tmp_path: Path, indent: int | None):
+    data = json.dumps(
+        {"b": 1e-5, "a": "é", "url": "http://a/b/c"}, indent=indent, ensure_ascii=False
+    ).encode()
+    assert scrubbed("config.json", data, tmp_path) is data
+    assert scrubbed("config.json", b"\xff\xfe/tmp/a/b", tmp_path) == b"\xff\xfe/tmp/a/b"
+    assert scrubbed("a.json", f"no json: {tmp_path}/b".encode(), tmp_path) == b"no json: b"
+
+
+def test_vocabularies_and_weights_are_no_records():
+    records = ["config.json", "a/config.yaml", "metrics.jsonl", "README.md", "backbone/tokenizer_config.json"]
+    assert all(map(is_record, records))
+    others = [
+        "backbone/tokenizer.json",
+        "vocab.json",
+        "model.safetensors",
+        "a.png",
+        "x.parquet",
+        "merges.txt",
+    ]
+    assert not any(map(is_record, others))

@@ -11,8 +11,7 @@ from typing import Any
 import pytest
 
 from accerl_lerobot import cli
-from accerl_lerobot.checkpoint.layout import defect, write_manifest
-from tests.hub.folders import write_policy_folder, write_run_folder
+from tests.hub.folders import write_policy_folder
 from tests.hub_server import STRANGER, Answer, Fault, HubServer
 
 NAME = "alice/door"
@@ -131,16 +130,6 @@ def test_code_that_a_recipe_could_name_does_not_come(hub, policy, pulled, tmp_pa
     assert pulled()["left_out"] == ["deep/er/x.so", "evil.py"]
     came = {path.name for path in (tmp_path / "pulled").rglob("*")}
     assert "notes.txt" in came and not {"evil.py", "x.so"} & came
-    run = write_run_folder(tmp_path / "run")
-    last = (run / "checkpoints" / "last").resolve()
-    (last / "pretrained_model" / "convert.py").write_text("raise SystemExit")
-    write_manifest(last)
-    hub.repos.clear()
-    assert cli.main(["push", f"--path={run}", f"--repo_id={NAME}"]) == 0
-    name = f"checkpoints/{last.name}"
-    assert pulled(to="second")["left_out"] == [f"{name}/pretrained_model/convert.py"]
-    assert not list((tmp_path / "second").rglob("*.py"))
-    assert defect(tmp_path / "second" / name) is None, "its own manifest is of what is there"
 
 
 @pytest.mark.parametrize("name", ["model.safetensors", "accerl.json"])
@@ -251,21 +240,21 @@ def test_what_a_server_may_list(
 ARENA = f"them/arena@{'0123456789' * 4}"
 
 
-def test_no_run_that_was_pulled_lets_code_run(hub, pulled, tmp_path, capsys):
-    run = write_run_folder(tmp_path / "run")
+def test_no_recipe_that_was_pulled_lets_code_run(hub, policy, pulled, tmp_path, capsys):
     recipe = (
         "env: {type: lerobot, name: isaaclab_arena, trust_remote_code: true,\n"
         f"  kwargs: {{hub_path: '{ARENA}'}}}}\npolicy: {{path: a/b}}\nsft: {{steps: 0}}\n"
         "launch: {address: 'them:6379', placement: {rollout: all}}\n"
     )
-    (run / "config.yaml").write_text(recipe)
-    assert cli.main(["push", f"--path={run}", f"--repo_id={NAME}"]) == 0
+    hub.plant(NAME, {"accerl_run/config.yaml": recipe.encode()})
     pulled()
     capsys.readouterr()
-    for verb in (["train", "--resume=true"], ["eval"], ["doctor"]):
-        assert cli.main([*verb, f"--config_path={tmp_path / 'pulled' / 'config.yaml'}"]) in (1, 2)
+    run = tmp_path / "pulled" / "accerl_run"
+    (run / ".lock").touch()
+    for verb in (["train"], ["train", "--resume=true"], ["eval"], ["doctor"]):
+        assert cli.main([*verb, f"--config_path={run / 'config.yaml'}"]) in (1, 2)
         assert "a file cannot allow this, only the command line can" in "".join(capsys.readouterr())
-    assert cli.main(["export", f"--path={tmp_path / 'pulled'}", f"--root={tmp_path / 'set'}"]) == 2
+    assert cli.main(["export", f"--path={run}", f"--root={tmp_path / 'set'}"]) == 2
     assert f"add --env.trust_remote_code=true --env.kwargs.hub_path={ARENA}" in capsys.readouterr().err
 
 

@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 
 from accerl_lerobot import cli
-from accerl_lerobot.checkpoint.layout import entry
+from accerl_lerobot.checkpoint.layout import digest
 from accerl_lerobot.hub import errors
 from accerl_lerobot.hub.card import MARK
-from tests.hub.folders import write_json, write_policy_folder, write_run_folder
+from tests.hub.folders import write_json, write_policy_folder
 from tests.hub_server import READER, WRITER, Fault, HubServer
 
 TINY = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
@@ -78,13 +78,13 @@ def test_a_cut_upload_leaves_the_repository_as_it_was_and_goes_on(hub, policy, p
     pushed(policy)
     before, uploaded = dict(hub.repo(NAME).branches), len(hub.uploaded)
     write_policy_folder(policy, size=400_000, seed=1)
-    large = str(entry(policy / "model.safetensors")["sha256"])
+    large = digest(policy / "model.safetensors")
     hub.faults.append(Fault("PUT", large, cut_after=1000, times=6))  # the client tries six times
     line = refused(policy)
     assert "cannot be reached" in line and "run the same command again" in line
     assert hub.faults[0].times == 0, "the connection was cut"
     assert hub.repo(NAME).branches == before and len(hub.repo(NAME).commits) == 2
-    small = str(entry(policy / "value_head.safetensors")["sha256"])
+    small = digest(policy / "value_head.safetensors")
     assert hub.uploaded[uploaded:] == [small]
     found = pushed(policy)
     assert hub.uploaded[uploaded:] == [small, large], "the small one is there already"
@@ -137,9 +137,9 @@ def test_a_name_that_holds_something_else(hub, policy, tmp_path, pushed, refused
     assert "it is a dataset repository, and this is a policy" in refused(policy)
     hub.repos.clear()
     pushed(policy)
-    assert "it holds a policy, and this is a run; choose another name" in refused(
-        write_run_folder(tmp_path / "run")
-    )
+    write_json(tmp_path / "world" / "config.json", {"spec": {}, "model": {}})
+    (tmp_path / "world" / "model.safetensors").write_bytes(b"x")
+    assert "it holds a policy, and this is a world model; choose another name" in refused(tmp_path / "world")
     assert "it is a model repository, and this is a dataset" in refused(TINY)
     assert len(hub.repos) == 1 and len(hub.repo(NAME).commits) == 2
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -14,20 +13,15 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-import yaml
 
 from accerl_lerobot import cli
-from accerl_lerobot.checkpoint.layout import defect, save_checkpoint
-from accerl_lerobot.engine.config import LaunchConfig, encode
-from accerl_lerobot.evaluation import EvaluationConfig
+from accerl_lerobot.checkpoint.layout import save_checkpoint
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.loading import load_adapter
 from accerl_lerobot.policies.saving import save_pretrained
 from accerl_lerobot.testing import perturb
-from accerl_lerobot.trainer.config import TrainerConfig
 from tests.hub.folders import SUMMARY, write_json
 from tests.hub_server import HubServer, environment
-from tests.runs import tiny_run
 from tests.world_model.test_pixels import model
 
 ROOT = Path(__file__).parents[2]
@@ -95,57 +89,23 @@ def run(tiny_checkpoint: Path, tmp_path: Path) -> Path:
     return tmp_path / "run"
 
 
-def test_policies_and_runs_load_wherever_they_are(hub: HubServer, run: Path, tmp_path: Path):
-    for name, path in (("alice/policy", run / LAST), ("alice/run", run)):
-        accerl("push", f"--path={path}", f"--repo_id={name}")
+def test_policies_load_wherever_they_are(hub: HubServer, run: Path, tmp_path: Path):
+    accerl("push", f"--path={run / LAST}", "--repo_id=alice/policy")
     commit = hub.repo("alice/policy").branches["main"]
     original = run.rename(tmp_path / "moved") / LAST  # whatever still names the old place is found out
     accerl("pull", "--repo_id=alice/policy", f"--output_dir={tmp_path / 'policy'}")
-    accerl("pull", "--repo_id=alice/run", f"--output_dir={tmp_path / 'again'}")
     hub.plant("alice/policy", {"model.safetensors": b"what came later"})
-    pulled, again = str(tmp_path / "policy"), str(tmp_path / "again" / LAST)
-    places = [(str(original), None), (pulled, None), (again, None), ("alice/policy", commit)]
+    pulled = str(tmp_path / "policy")
+    places = [(str(original), None), (pulled, None), ("alice/policy", commit)]
     found = fresh(hub, tmp_path / "home", LOAD, json.dumps(places), pulled)
     assert {path: found[path] for path, _ in places} == dict.fromkeys(found.keys() - {"stock"}, found[pulled])
     assert found["stock"] == found[pulled][0]
-    assert os.readlink(tmp_path / "again" / "checkpoints" / "last") == "000012"
-    assert json.loads((tmp_path / "again" / "summary.json").read_text()) == SUMMARY
-    assert (tmp_path / "again" / "config.yaml").read_text() == "output_dir: null\njob_name: tiny\n"
-    before = hub.files("alice/run")
-    accerl("push", f"--path={tmp_path / 'again'}", "--repo_id=alice/run")
-    assert hub.files("alice/run") == before, "there and back changes nothing"
-
-
-@pytest.mark.parametrize("start", ["hub", pytest.param("folder", marks=pytest.mark.slow)])
-def test_a_run_that_was_pulled_can_be_gone_on_with(hub, tiny_checkpoint, tmp_path, start):
-    """With and without the checkpoint that it began from."""
-    trainer = TrainerConfig(updates=3, batch_decisions=16, lr=1e-2, warmup_updates=0, value_warmup_updates=0)
-    launch, evaluation = LaunchConfig(engine="local"), EvaluationConfig(episodes=2, videos=0)
-    accerl("push", f"--path={tiny_checkpoint}", "--repo_id=alice/start")
-    began = shutil.copytree(tiny_checkpoint, tmp_path / "began" / "pretrained_model")
-    policy = PolicyConfig(path="alice/start" if start == "hub" else str(began), device="cpu")
-    config = tiny_run(tiny_checkpoint, policy=policy, trainer=trainer, launch=launch, evaluation=evaluation)
-    (tmp_path / "recipe.yaml").write_text(yaml.safe_dump(encode(config)))
-    accerl("train", f"--config_path={tmp_path / 'recipe.yaml'}", f"--output_dir={tmp_path / 'run'}")
-    accerl("push", f"--path={tmp_path / 'run'}", "--repo_id=alice/run")
-    uploaded = hub.files("alice/run")
-    assert [n for n, data in uploaded.items() if str(tmp_path).encode() in data] == []
-    shutil.rmtree(tmp_path / "run")
-    shutil.rmtree(tmp_path / "began")
-    accerl("pull", "--repo_id=alice/run", f"--output_dir={tmp_path / 'pulled'}")
-    assert defect(tmp_path / "pulled" / "checkpoints" / "000003") is None
-    accerl(
-        "train",
-        "--resume=true",
-        f"--config_path={tmp_path / 'pulled' / 'config.yaml'}",
-        "--trainer.updates=5",
-    )
-    assert os.readlink(tmp_path / "pulled" / "checkpoints" / "last") == "000005"
-    assert json.loads((tmp_path / "pulled" / "summary.json").read_text())["updates"] == 5
-    weights = tmp_path / "pulled" / LAST / "model.safetensors"
-    weights.write_bytes(weights.read_bytes()[:-1] + b"x")
-    assert cli.main(["push", f"--path={tmp_path / 'pulled'}", "--repo_id=alice/run"]) == 2
-    assert hub.files("alice/run") == uploaded, "what is broken is not pushed"
+    carried = tmp_path / "policy" / "accerl_run"
+    assert json.loads((carried / "summary.json").read_text()) == SUMMARY
+    assert (carried / "config.yaml").read_text() == "output_dir: null\njob_name: tiny\n"
+    before = hub.files("alice/policy", revision=commit)
+    accerl("push", f"--path={pulled}", "--repo_id=alice/policy")
+    assert hub.files("alice/policy") == before, "there and back changes nothing"
 
 
 def test_a_dataset_is_one_that_lerobot_finds(hub: HubServer, tmp_path: Path):
@@ -157,7 +117,7 @@ def test_a_dataset_is_one_that_lerobot_finds(hub: HubServer, tmp_path: Path):
     assert {p.relative_to(TINY): p.read_bytes() for p in TINY.rglob("*.*")}.items() <= pulled.items()
 
 
-def test_world_models_and_success_models(hub: HubServer, tmp_path: Path):
+def test_a_world_model_brings_its_success_model(hub: HubServer, tmp_path: Path):
     from accerl_lerobot.world_model.learners import new_success_model
     from accerl_lerobot.world_model.store import load_roles, load_world_model, save_world_model
     from accerl_lerobot.world_model.success_model import SuccessPairsRewardModel
@@ -165,13 +125,12 @@ def test_world_models_and_success_models(hub: HubServer, tmp_path: Path):
     world, success, roles = model(), new_success_model(5), {"a": "learnt", "b": "held out"}
     save_world_model(tmp_path / "world_model", world, success, roles)
     accerl("push", f"--path={tmp_path / 'world_model'}", "--repo_id=alice/world")
-    accerl("push", f"--path={tmp_path / 'world_model' / 'success_model'}", "--repo_id=alice/success")
     accerl("pull", "--repo_id=alice/world", f"--output_dir={tmp_path / 'pulled'}")
     came, judge = load_world_model(tmp_path / "pulled")
     assert load_roles(tmp_path / "pulled") == roles and came.spec == world.spec
     for first, second in ((world, came), (success, judge)):
         assert all(torch.equal(value, second.state_dict()[key]) for key, value in first.state_dict().items())
-    alone = SuccessPairsRewardModel.from_pretrained("alice/success", strict=True)
+    alone = SuccessPairsRewardModel.from_pretrained(str(tmp_path / "pulled" / "success_model"), strict=True)
     frames = torch.from_numpy(np.random.default_rng(0).random((2, 1, 3, 16, 16), dtype=np.float32))
     with torch.no_grad():
         assert torch.equal(alone.logits(frames, frames)[0], judge.logits(frames, frames)[0])
