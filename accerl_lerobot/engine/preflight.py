@@ -275,7 +275,7 @@ def sft_policy(config: SFTConfig) -> Any:
 
     from accerl_lerobot.checkpoint.safety import Origin, brief, read_json
     from accerl_lerobot.policies.config import register_policies
-    from accerl_lerobot.policies.guard import CONFIG, fetched_checkpoint
+    from accerl_lerobot.policies.untrusted import CONFIG, fetched_checkpoint
 
     folder = fetched_checkpoint(config.init_path, None, "sft.init_path")
     kind = read_json(folder / CONFIG, Origin("sft.init_path", config.init_path)).get("type")

@@ -137,6 +137,7 @@ class OffPolicyUpdate(BaseUpdate):
         metrics["reward_mean"] = float(rewards.mean())
         if len(self.memory):
             metrics |= self.learn(len(rewards))
+        # Lag is that of the new decisions only: those that the steps draw from the memory may be much older.
         versions = torch.from_numpy(np.concatenate([segment.version for segment in segments]))
         metrics |= lag_metrics(versions, self.version)
         self.version += 1

@@ -39,7 +39,7 @@ from accerl_lerobot.trainer.sharding import arrange, synchronise
 def make_update(
     adapter: Any, algorithm: AlgorithmConfig, config: TrainerConfig, ranks: Ranks = ALONE
 ) -> BaseUpdate:
-    """The updates that belong to an algorithm; see `Update` for the arguments."""
+    """The updates that belong to an algorithm; see `RatioUpdate` for the arguments."""
     shared = [ranks] if isinstance(algorithm, RatioConfig) else []
     return imported(algorithm.update)(adapter, algorithm, config, *shared)
 
@@ -96,7 +96,7 @@ class BaseUpdate(ABC):
             )
 
 
-class Update(BaseUpdate):
+class RatioUpdate(BaseUpdate):
     """Updates by a likelihood ratio; of several ranks, each has one, and all make the same steps.
 
     Parameters of the adapter are others afterwards where `ranks` keep parts of them.

@@ -22,7 +22,7 @@ from accerl_lerobot.trainer.batch import turns
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.ranks import Ranks
 from accerl_lerobot.trainer.sharding import Watch, arrange
-from accerl_lerobot.trainer.update import Update
+from accerl_lerobot.trainer.update import RatioUpdate
 from tests.rounding import assert_close
 from tests.trainer import sharded
 from tests.trainer.linear import LinearAdapter
@@ -191,7 +191,7 @@ def test_blocks_that_forget_compute_again_and_learn_the_same():
     for forget in (False, True):
         adapter = sharded.LayeredAdapter()
         config = TrainerConfig(warmup_updates=0, value_warmup_updates=0, activation_checkpointing=forget)
-        update = Update(adapter, GIPOConfig(), config)
+        update = RatioUpdate(adapter, GIPOConfig(), config)
         calls: list[None] = []
         adapter.layers[0].up.register_forward_hook(lambda *_, calls=calls: calls.append(None))
         update.step(sharded.cases()["forgetful"].batches[0])

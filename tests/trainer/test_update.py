@@ -16,7 +16,7 @@ from accerl_lerobot.algorithms import GIPOConfig
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.trainer.batch import MAX_NONFINITE, NonFiniteError, collate
 from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.trainer.update import Update
+from accerl_lerobot.trainer.update import RatioUpdate
 from tests.rounding import assert_close
 from tests.trainer.linear import STATE, LinearAdapter, make_segments
 
@@ -26,8 +26,8 @@ PLAIN = TrainerConfig(
 LENGTHS = (3, 5, 1, 4)
 
 
-def make_update(config: TrainerConfig = PLAIN, seed: int = 0, **algorithm: Any) -> Update:
-    return Update(LinearAdapter(seed), GIPOConfig(**algorithm), config)
+def make_update(config: TrainerConfig = PLAIN, seed: int = 0, **algorithm: Any) -> RatioUpdate:
+    return RatioUpdate(LinearAdapter(seed), GIPOConfig(**algorithm), config)
 
 
 def with_counts(segments: list[Segment]) -> list[Segment]:
@@ -55,7 +55,7 @@ def returns_by_hand(
     return np.asarray(found)
 
 
-def critic_values(update: Update, segments: Sequence[Segment]) -> list[np.ndarray]:
+def critic_values(update: RatioUpdate, segments: Sequence[Segment]) -> list[np.ndarray]:
     return [update.adapter.values(s.observations, [s.task] * (len(s) + 1)).numpy() for s in segments]
 
 
