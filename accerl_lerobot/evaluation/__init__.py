@@ -45,7 +45,6 @@ class Rate:
         return self.successes / self.n if self.n else math.nan
 
     def interval(self) -> Interval:
-        """`wilson_interval` of this rate."""
         return wilson_interval(self.successes, self.n)
 
     def __str__(self) -> str:
@@ -193,12 +192,9 @@ def success_curve(
 
 
 def write_video(path: Path, rows: Sequence[Sequence[Sequence[np.ndarray]]], fps: int) -> None:
-    """Writes a grid of clips as MP4; one that ends early holds its last frame.
+    """Writes rows of clips, of equal width, as MP4; a clip that ends early holds its last frame.
 
-    Args:
-        path: file to write.
-        rows: rows of clips, of equal width; frames of a clip are uint8 (H, W, 3), all of one height in a row.
-        fps: frames per second.
+    Frames are uint8 (H, W, 3), all of one height in a row.
     """
     import imageio.v2 as imageio
 
@@ -272,7 +268,6 @@ def _with_outcome(frames: Sequence[np.ndarray], success: bool) -> list[np.ndarra
 
 def _joined(pictures: Sequence[np.ndarray], axis: int) -> np.ndarray:
     """Pictures beside (axis 1) or below (axis 0) each other, white between them."""
-    shape = list(pictures[0].shape)
-    shape[axis] = GAP
+    shape = [GAP if i == axis else size for i, size in enumerate(pictures[0].shape)]
     gap = np.full(shape, 255, np.uint8)
     return np.concatenate([part for picture in pictures for part in (picture, gap)][:-1], axis=axis)

@@ -241,7 +241,6 @@ class LeRobotAdapter(PolicyAdapter):
 
     @torch.no_grad()
     def decide(self, requests: Sequence[Request], version: int) -> list[Decision]:
-        """Acts; each decision's noise comes from its own request's seed, whatever its batch."""
         arrays, tasks = stack_observations(requests)
         with self.autocast():
             encoded = self.encode(arrays, tasks)

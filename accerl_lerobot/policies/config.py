@@ -68,7 +68,6 @@ class GaussianSamplerConfig(SamplerConfig):
 
     @property
     def bounds(self) -> tuple[float, float]:
-        """Bounds of the learned std."""
         return self.std / 4, 2.5 * self.std
 
 
@@ -220,18 +219,14 @@ def sampler_config(config: PolicyConfig, policy_type: str) -> SamplerConfig:
     return config.sampler
 
 
-def steps_field(policy_config: Any) -> str | None:
-    """Field of a LeRobot policy config that holds its denoising steps; None if it does not denoise."""
-    return next((n for n in ("num_steps", "num_inference_steps") if hasattr(policy_config, n)), None)
-
-
 def override(policy_config: Any, config: PolicyConfig) -> None:
     """Puts a run's choices of denoising steps, executed rows and precision into LeRobot's policy config."""
     if hasattr(policy_config, "pretrained_backbone_weights"):
         # The checkpoint has them; LeRobot would download torchvision's first, even when told to stay offline.
         policy_config.pretrained_backbone_weights = None
     if config.num_steps is not None:
-        if (name := steps_field(policy_config)) is None:
+        names = (name for name in ("num_steps", "num_inference_steps") if hasattr(policy_config, name))
+        if (name := next(names, None)) is None:
             remedy = f"a {policy_config.type} policy does not denoise; leave the field out"
             raise InputError("policy.num_steps", config.num_steps, remedy)
         setattr(policy_config, name, config.num_steps)

@@ -128,7 +128,6 @@ def rehearsed[T](config: PolicyConfig, task: Callable[[LeRobotAdapter], T]) -> T
 
 
 def sizes_of(adapter: LeRobotAdapter) -> Sizes:
-    """Numbers of an adapter's parameters."""
     of = (adapter.policy.parameters(), adapter.trainable().values())
     return Sizes(*(sum(parameter.numel() for parameter in parameters) for parameters in of))
 
@@ -203,7 +202,6 @@ def _refusing(config: PolicyConfig, what: str) -> Iterator[None]:
 
 
 def _checkpoint_folder(config: PolicyConfig) -> Path:
-    """Where the checkpoint's files are, once checked; those of a Hub repository are fetched."""
     if config.path is None:
         remedy = "give a LeRobot checkpoint directory or Hub id, or an sft section"
         raise InputError("policy.path", None, remedy)

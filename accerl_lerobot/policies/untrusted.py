@@ -94,7 +94,6 @@ def check_checkpoint(folder: Path, origin: Origin, *, fetched: bool = False) -> 
 
 
 def check_ours(ours: dict[str, Any], origin: Origin) -> None:
-    """Checks the content of ``accerl.json``."""
     for key in ("sampler", "rename_map"):
         if not isinstance(ours.get(key, {}), dict):
             raise origin.refuse(f"{OURS}: {key}", "a mapping is wanted; remove the file to start without it")

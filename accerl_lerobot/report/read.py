@@ -45,7 +45,6 @@ class Run:
 
     @property
     def name(self) -> str:
-        """Name of its folder."""
         return self.path.resolve().name
 
     @property
@@ -82,7 +81,6 @@ class Run:
 
 
 def read_run(path: Path) -> Run:
-    """Reads a folder."""
     check_folder(path, Origin("runs", str(path)))
     config_path = path / CONFIG
     if not config_path.is_file():
@@ -122,7 +120,6 @@ def newest(records: Sequence[Record], name: str) -> float | None:
 
 
 def _mapping(path: Path) -> Record:
-    """The content of a JSON file."""
     try:
         return dict(json.loads(path.read_text()))
     except (TypeError, ValueError, RecursionError) as error:

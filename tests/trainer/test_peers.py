@@ -115,7 +115,7 @@ def test_what_all_do_wrong_is_told_as_the_first_one_s(peers: Callable[[str, str]
 
 
 def test_a_lone_rank_waits_for_nobody():
-    with Peers([], TrainerConfig()).joining("step", ""):
+    with Peers([], TrainerConfig(), WAIT_S).joining("step", ""):
         pass
 
 

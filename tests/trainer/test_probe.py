@@ -169,6 +169,6 @@ def test_the_live_weights_are_back_in_their_own_memory(broken: str, monkeypatch:
     if broken == "copy":
         probe._copy.pop()  # the first parameter is swapped, then it fails
     with pytest.raises((MemoryError, ValueError)) if broken != "nothing" else nullcontext():
-        assert not probe.log_prob(batch.part(np.arange(len(batch)))).requires_grad
+        assert not probe.apart(batch, np.arange(len(batch))).requires_grad
     assert all(torch.equal(p, before[k]) for k, p in adapter.trainable().items())
     assert adapter.weight.data_ptr() == place and adapter.weight.grad is None
