@@ -213,7 +213,7 @@ def _check_off_policy(config: RunConfig, spec: WorldSpec, policy: Any) -> None:
 
 def policy_to_be(config: RunConfig) -> Any:
     """LeRobot's config of the policy that a run will act with, as far as it is known before an SFT."""
-    from accerl_lerobot.policies.config import check_observations, check_type, override, sampler_config
+    from accerl_lerobot.policies.config import check_observations, override, sampler_config
     from accerl_lerobot.policies.loading import rehearsed_config
 
     if config.policy.path is not None:
@@ -228,8 +228,7 @@ def policy_to_be(config: RunConfig) -> Any:
             what = "" if error.field == "policy.path" else f"{error.field.partition('.')[2]}={error.value}: "
             raise InputError("sft.init_path", start.path, what + error.remedy) from error
     policy_config = check_sft_policy(config.sft)
-    kind = check_type(config.sft.policy["type"], "sft.policy.type", "RL needs a likelihood: ")
-    sampler_config(config.policy, kind)
+    sampler_config(config.policy, config.sft.policy["type"], "sft.policy.type", "RL needs a likelihood: ")
     override(policy_config, config.policy)
     check_observations(policy_config, "sft.policy.n_obs_steps")
     return policy_config

@@ -45,32 +45,29 @@ class Rate:
         return self.successes / self.n if self.n else math.nan
 
     def interval(self) -> Interval:
-        return wilson_interval(self.successes, self.n)
+        """Wilson's score interval of 95 % (Wilson 1927; Brown, Cai and DasGupta 2001, section 3.1.1).
+
+            (p + z²/2n ± z √(p(1 − p)/n + z²/4n²)) / (1 + z²/n),  p = successes / n
+
+        Unlike p ± z√(p(1 − p)/n) it has width at 0 and at n successes and stays inside [0, 1]. For n = 0 it
+        is [0, 1], as nothing is known.
+        """
+        successes, n = self.successes, self.n
+        if not 0 <= successes <= n:
+            raise ValueError(f"{successes} successes in {n} episodes")
+        if n == 0:
+            return Interval(0.0, 1.0)
+        z = NormalDist().inv_cdf(0.975)
+        p, share = successes / n, z * z / n
+        centre = (p + share / 2) / (1 + share)
+        half = z * math.sqrt(p * (1 - p) / n + share / (4 * n)) / (1 + share)
+        return Interval(0.0 if successes == 0 else centre - half, 1.0 if successes == n else centre + half)
 
     def __str__(self) -> str:
         if self.n == 0:
             return "no episodes"
         low, high = self.interval()
         return f"{100 * self.value:.1f} % [{100 * low:.1f}, {100 * high:.1f}] n={self.n}"
-
-
-def wilson_interval(successes: int, n: int) -> Interval:
-    """Wilson's score interval of 95 % (Wilson 1927; Brown, Cai and DasGupta 2001, section 3.1.1).
-
-        (p + z²/2n ± z √(p(1 − p)/n + z²/4n²)) / (1 + z²/n),  p = successes / n
-
-    Unlike p ± z√(p(1 − p)/n) it has width at 0 and at n successes and stays inside [0, 1]. For n = 0 it is
-    [0, 1], as nothing is known.
-    """
-    if not 0 <= successes <= n:
-        raise ValueError(f"{successes} successes in {n} episodes")
-    if n == 0:
-        return Interval(0.0, 1.0)
-    z = NormalDist().inv_cdf(0.975)
-    p, share = successes / n, z * z / n
-    centre = (p + share / 2) / (1 + share)
-    half = z * math.sqrt(p * (1 - p) / n + share / (4 * n)) / (1 + share)
-    return Interval(0.0 if successes == 0 else centre - half, 1.0 if successes == n else centre + half)
 
 
 def summarise(results: Sequence[EpisodeResult]) -> dict[str, Any]:

@@ -193,14 +193,6 @@ def discovery(policy_type: str | None) -> list[str]:
     return [f"--policy.discover_packages_path={PLUGINS[policy_type]}"] if policy_type in PLUGINS else []
 
 
-def check_type(policy_type: Any, field: str, prefix: str = "") -> str:
-    """Refuses a LeRobot policy type that has no likelihood here; `prefix` begins the remedy."""
-    if policy_type not in POLICIES:
-        known = f"use one of {', '.join(POLICIES)}, or name its package: policy.discover_packages_path"
-        raise InputError(field, policy_type, f"{prefix}no likelihood for it here; {known}")
-    return str(policy_type)
-
-
 def check_observations(policy_config: Any, field: str) -> None:
     """Refuses an observation history that LeRobot's policy of this type does not read."""
     if policy_config.n_obs_steps != 1 and policy_config.type not in USES_HISTORY:
@@ -208,8 +200,17 @@ def check_observations(policy_config: Any, field: str) -> None:
         raise InputError(field, policy_config.n_obs_steps, remedy)
 
 
-def sampler_config(config: PolicyConfig, policy_type: str) -> SamplerConfig:
-    """How a policy of this type explores in this run; a sampler of another family is refused."""
+def sampler_config(
+    config: PolicyConfig, policy_type: Any, field: str = "policy.type", prefix: str = ""
+) -> SamplerConfig:
+    """How a policy of this type explores in this run.
+
+    Refuses a type without a likelihood here, naming `field`, in a remedy that begins with `prefix`; and a
+    sampler of another family.
+    """
+    if policy_type not in POLICIES:
+        known = f"use one of {', '.join(POLICIES)}, or name its package: policy.discover_packages_path"
+        raise InputError(field, policy_type, f"{prefix}no likelihood for it here; {known}")
     families = POLICIES[policy_type][1]
     if config.sampler is None:
         return SamplerConfig.get_choice_class(families[0])()

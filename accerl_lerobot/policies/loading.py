@@ -31,7 +31,6 @@ from accerl_lerobot.policies.adapter import (
     LeRobotAdapter,
     Processing,
     ValueHead,
-    example_requests,
     stack_observations,
 )  # fmt: skip
 from accerl_lerobot.policies.config import (
@@ -39,7 +38,6 @@ from accerl_lerobot.policies.config import (
     PolicyConfig,
     SamplerConfig,
     check_observations,
-    check_type,
     override,
     register_policies,
     sampler_config,
@@ -88,7 +86,7 @@ def load_lerobot_config(config: PolicyConfig) -> Any:
     folder = _checkpoint_folder(config)
     kind = _registered_type(config, folder)
     with _refusing(config, "its config.json is not one of this LeRobot's policies"):
-        sampler_config(config, check_type(kind, "policy.type", f"{config.path} is of this type: "))
+        sampler_config(config, kind, prefix=f"{config.path} is of this type: ")
         lerobot_config = PreTrainedConfig.from_pretrained(folder)
     lerobot_config.device = str(resolve_device(config.device))
     override(lerobot_config, config)
@@ -178,7 +176,7 @@ def load_adapter(config: PolicyConfig, *, rehearsal: bool = False) -> LeRobotAda
         adapter = LeRobotAdapter(policy, processing, model, family, critic, config.precision)
         if (folder / untrusted.OURS).is_file():
             _load_ours(adapter, folder, origin)
-        requests = example_requests(lerobot_config, config.rename_map)
+        requests = adapter.example_requests()
         if not rehearsal:
             adapter.self_check(*stack_observations(requests))
         elif sum(parameter.numel() for parameter in policy.parameters()) <= ACTS_MOST:

@@ -53,11 +53,6 @@ def refused(path: Path, why: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_good_ones_pass(good: Path, tiny_checkpoint: Path):
-    for path in (good, tiny_checkpoint):
-        assert check_checkpoint(path, ORIGIN)["type"]
-
-
 def call(marker: Path) -> dict[str, Any]:
     """LeRobot 0.6.1's way to a processor step: it imports the class and calls it."""
     return {"class": "subprocess.Popen", "config": {"args": ["touch", str(marker)]}}

@@ -153,12 +153,6 @@ def test_every_row_is_somebodys_and_all_run_equally_often(count: int, size: int,
     assert len(shares[0]) == math.ceil(math.ceil(count / ranks) / size), "no turn more than it takes"
 
 
-def test_a_trainer_alone_gets_what_it_gives():
-    rows = np.arange(5)
-    said = Ranks().each(lambda some: torch.from_numpy(some * 2.0), rows, size=2)
-    assert said.tolist() == [0.0, 2.0, 4.0, 6.0, 8.0]
-
-
 def watch(adapter: LinearAdapter) -> Watch:
     return Watch(adapter, lambda: adapter.evaluate(*adapter.example()))
 

@@ -119,19 +119,6 @@ def test_values_are_recomputed_bootstraps_included(micro_batch: int):
     assert found["value_loss"] == pytest.approx(error, rel=1e-4)
 
 
-def test_a_cut_is_bootstrapped_and_a_termination_is_not():
-    (segment,) = make_segments((2,))
-    means = {}
-    for name in ("terminated", "cut"):
-        update = make_update(gamma=0.9, lam=1.0)
-        ended = replace(segment, terminated=name == "terminated")
-        last = critic_values(update, [segment])[0][-1]
-        means[name] = update.step([ended])["return_mean"]
-    # λ = 1: the bootstrap enters the last return with γ and the first with γ².
-    assert means["cut"] - means["terminated"] == pytest.approx((0.9 + 0.81) / 2 * last, abs=1e-4)
-    assert abs(last) > 0.1
-
-
 def test_advantages_are_normalised_over_the_batch():
     """Neither the size of rewards nor a constant in all of them changes what the policy learns."""
     gradients = []
