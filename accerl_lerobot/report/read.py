@@ -9,6 +9,7 @@ Also the differences of a run's recipe from the defaults and from other runs.
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -133,20 +134,15 @@ def _lines(path: Path) -> tuple[list[Record], bool]:
     records: list[Record] = []
     lines = path.read_bytes().splitlines()
     for number, line in enumerate(lines, 1):
-        if (record := _record(line)) is not None:
+        record = None
+        with contextlib.suppress(ValueError, RecursionError):
+            record = json.loads(line)
+        if isinstance(record, dict) and isinstance(record.get("kind"), str):
             records.append(record)
         elif number < len(lines):
             remedy = f"{line[:60].decode(errors='replace')!r} is not a whole record; mend or remove this line"
             raise InputError("runs", f"{path}:{number}", remedy)
     return records, len(records) < len(lines)
-
-
-def _record(line: bytes) -> Record | None:
-    try:
-        record = json.loads(line)
-    except (ValueError, RecursionError):
-        return None
-    return record if isinstance(record, dict) and isinstance(record.get("kind"), str) else None
 
 
 PLACES = ("output_dir", "job_name")
