@@ -117,4 +117,4 @@ def _episode(
 
 
 def _numbers(value: Any, shape: tuple[int, ...]) -> np.ndarray:
-    return pixels_of(value) if len(shape) == 3 else np.asarray(value.numpy(), np.float32).reshape(shape)
+    return pixels_of(value) if len(shape) > 2 else np.asarray(value.numpy(), np.float32).reshape(shape)
