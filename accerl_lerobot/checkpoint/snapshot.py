@@ -78,7 +78,7 @@ def to_json(value: Any, place: str, arrays: dict[str, np.ndarray]) -> Any:
             return parts
         keys = [to_json(key, f"{place}.key", arrays) for key in parts]
         return {MARK: "map", "items": [list(item) for item in zip(keys, parts.values(), strict=True)]}
-    if _KINDS.get(cls.__name__) == cls:
+    if cls in _KINDS.values():
         fields = {f: to_json(getattr(value, f), f"{place}.{f}", arrays) for f in field_names(cls)}
         return {MARK: cls.__name__, "fields": fields}
     if isinstance(value, np.generic):
