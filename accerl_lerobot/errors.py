@@ -20,16 +20,12 @@ given where a number belongs, and some remedies repeat a part of it."""
 
 
 class InputError(ValueError):
-    """Bad input, refused before any long work.
+    """Bad input, refused before any long work: a field as it is written on the command line, and a sentence.
 
     Example:
         >>> raise InputError("env.task", "push-v2", "use one of: push-v3, reach-v3")
         Traceback (most recent call last):
         accerl_lerobot.errors.InputError: env.task='push-v2': use one of: push-v3, reach-v3
-
-    Args:
-        field: dotted name, as it is written on the command line.
-        remedy: what to do instead, one sentence without a full stop.
     """
 
     def __init__(self, field: str, value: object, remedy: str) -> None:

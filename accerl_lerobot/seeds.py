@@ -51,7 +51,6 @@ def noise_seed(episode_seed: int, decision: int) -> int:
 
 
 def episode_of(noise_seed: int) -> int:
-    """Seed of the episode that a decision with this `noise_seed` is of."""
     return noise_seed // _DECISIONS_PER_EPISODE
 
 
@@ -78,7 +77,6 @@ def global_generators() -> dict[str, Any]:
 
 
 def restore_global_generators(states: dict[str, Any]) -> None:
-    """Sets them to what `global_generators` gave."""
     random.setstate(states["python"])
     np.random.set_state(states["numpy"])
     if "torch" in states:

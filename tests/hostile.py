@@ -239,7 +239,7 @@ def checks(trial: Trial, at: dict[str, Path], times: int) -> None:
     from accerl_lerobot.checkpoint.isolation import rehearse
     from accerl_lerobot.checkpoint.safety import Origin, read_json, tensor_shapes
     from accerl_lerobot.demos.dataset_files import check_data, check_info, check_metadata, check_stats
-    from accerl_lerobot.policies import guard
+    from accerl_lerobot.policies import untrusted
 
     origin = Origin("path", "hostile")
     policy, dataset = at["policy"], at["dataset"]
@@ -254,13 +254,15 @@ def checks(trial: Trial, at: dict[str, Path], times: int) -> None:
     weights.write_bytes((policy / "value_head.safetensors").read_bytes())
     trial.files("safetensors", weights, lambda: tensor_shapes(weights, origin), 300 * times)
     ours = json.loads((policy / "accerl.json").read_text())
-    trial.trees("accerl.json", ours, lambda t: guard.check_ours(t, origin), 40 * times)
+    trial.trees("accerl.json", ours, lambda t: untrusted.check_ours(t, origin), 40 * times)
     file = policy / "accerl.json"
     trial.files("JSON", file, lambda: read_json(file, origin), 130 * times)
     name = "policy_preprocessor.json"
-    trial.files("processor", policy / name, lambda: guard.check_processor(policy, name, origin), 60 * times)
     trial.files(
-        "checkpoint", policy / "config.json", lambda: guard.check_checkpoint(policy, origin), 5 * times
+        "processor", policy / name, lambda: untrusted.check_processor(policy, name, origin), 60 * times
+    )
+    trial.files(
+        "checkpoint", policy / "config.json", lambda: untrusted.check_checkpoint(policy, origin), 5 * times
     )
     info = json.loads((dataset / "meta/info.json").read_text())
     trial.trees("info.json", info, lambda t: check_info(t, origin), 150 * times)

@@ -44,7 +44,7 @@ class AlgorithmConfig(Section, draccus.ChoiceRegistry, section="algorithm"):
 class RatioConfig(AlgorithmConfig):
     """Base of the objectives that weight decisions by their likelihood under new and old weights."""
 
-    update = "accerl_lerobot.trainer.update:Update"
+    update = "accerl_lerobot.trainer.update:RatioUpdate"
 
     lam: Share = 0.95
     """λ of GAE per decision: 0 trusts the critic, 1 the observed rewards."""

@@ -71,8 +71,8 @@ def bench_policy(config: BenchPolicyConfig) -> dict[str, Any]:
 
     from accerl_lerobot.experience import TASK, Request
     from accerl_lerobot.policies.adapter import stack_observations
-    from accerl_lerobot.policies.guard import Unfilled
     from accerl_lerobot.policies.loading import resolve_device, sizes_of
+    from accerl_lerobot.policies.untrusted import Unfilled
     from accerl_lerobot.testing import stored
     from accerl_lerobot.trainer.footprint import policy_memory
 

@@ -87,7 +87,6 @@ def rehearse[T](task: Callable[[], T], folder: Path, origin: Origin, pattern: st
 
 
 def _cause(status: int | None, cpu_s: int) -> str:
-    """Why a child sent no message."""
     if status is None:
         return f"takes more than {PATIENCE * cpu_s:.0f} s"
     code = os.waitstatus_to_exitcode(status)

@@ -208,7 +208,6 @@ def newest_whole(checkpoints: Path, wanted: str = LAST) -> tuple[Path, list[str]
 
 
 def saved_version(state: Path) -> int:
-    """Number of updates behind a ``training_state``."""
     return int(json.loads((state / STEP).read_text())["step"])
 
 
@@ -261,8 +260,8 @@ def relocate(directory: Path, home: Path) -> None:
     """
     if not (directory / BACKBONE).is_dir():
         return
-    config, processor = _read_configs(directory)
-    for fields, key, folder in _local_names(config, processor):
+    config, processor, places = _local_names(directory)
+    for fields, key, folder in places:
         fields[key] = str((home / folder).absolute())
     (directory / "config.json").write_text(json.dumps(config, indent=4) + "\n")
     (directory / PREPROCESSOR).write_text(json.dumps(processor, indent=4) + "\n")
@@ -272,24 +271,22 @@ def displaced(directory: Path) -> bool:
     """True if a checkpoint has a backbone folder of its own and its files name one that does not exist."""
     if not (directory / BACKBONE).is_dir():
         return False
-    return any(not Path(fields[key]).is_dir() for fields, key, _ in _local_names(*_read_configs(directory)))
+    return any(not Path(fields[key]).is_dir() for fields, key, _ in _local_names(directory)[2])
 
 
-def _read_configs(directory: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    config = json.loads((directory / "config.json").read_text())
-    return config, json.loads((directory / PREPROCESSOR).read_text())
+Place = tuple[dict[str, Any], str, str]
+"""Mapping, its key that may name a folder, and our folder for that."""
 
 
-def _local_names(config: dict[str, Any], processor: dict[str, Any]) -> list[tuple[dict[str, Any], str, str]]:
-    """Places of `places_of_names` that name a folder of this machine, or by its bare name one beside them."""
+def _local_names(directory: Path) -> tuple[dict[str, Any], dict[str, Any], list[Place]]:
+    """Config, preprocessor, and their places that name a folder here, or by its bare name one beside them."""
+    config, processor = (json.loads((directory / name).read_text()) for name in ("config.json", PREPROCESSOR))
     named = [(place, place[0].get(place[1]) or "") for place in places_of_names(config, processor)]
-    return [place for place, name in named if Path(name).is_absolute() or name == place[2]]
+    return config, processor, [at for at, name in named if Path(name).is_absolute() or name == at[2]]
 
 
-def places_of_names(
-    config: dict[str, Any], processor: dict[str, Any]
-) -> list[tuple[dict[str, Any], str, str]]:
-    """Places where a policy's files may name a folder: (mapping, key, our folder for it)."""
+def places_of_names(config: dict[str, Any], processor: dict[str, Any]) -> list[Place]:
+    """Places where a policy's files may name a folder."""
     places = [(config, key, folder) for key, folder in CONFIG_FOLDERS.items()]
     for step in processor.get("steps", []):
         if (option := STEP_FOLDERS.get(step.get("registry_name"))) is not None:

@@ -14,7 +14,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,6 @@ from accerl_lerobot.errors import InputError
 
 MARK = "$"
 """Key of a JSON object that stands for something JSON does not know."""
-_PLAIN = (bool, int, float, str)
 _KINDS: dict[str, type[Any]] = {}
 
 
@@ -35,11 +33,6 @@ def kind[T](cls: type[T]) -> type[T]:
     if _KINDS.setdefault(cls.__name__, cls) is not cls:
         raise TypeError(f"two kinds are called {cls.__name__}")
     return cls
-
-
-def kind_named(name: str) -> type[Any] | None:
-    """Type that was registered under this name; None: nothing."""
-    return _KINDS.get(name)
 
 
 def save(path: Path, tree: Any) -> None:
@@ -68,13 +61,9 @@ def load(path: Path) -> Any:
 
 
 def to_json(value: Any, place: str, arrays: dict[str, np.ndarray]) -> Any:
-    """A tree as JSON can hold it; its arrays go into `arrays`, by number.
-
-    Raises:
-        TypeError: the tree holds something of a kind that is not known; names its place.
-    """
+    """A tree as JSON can hold it; its arrays go into `arrays`, by number. Raises as `save` does."""
     cls: Any = type(value)
-    if value is None or cls in _PLAIN:
+    if value is None or cls in (bool, int, float, str):
         return value
     if cls is np.ndarray:
         return _stored(value, "array", place, arrays)
@@ -89,7 +78,7 @@ def to_json(value: Any, place: str, arrays: dict[str, np.ndarray]) -> Any:
             return parts
         keys = [to_json(key, f"{place}.key", arrays) for key in parts]
         return {MARK: "map", "items": [list(item) for item in zip(keys, parts.values(), strict=True)]}
-    if kind_named(cls.__name__) == cls:
+    if cls in _KINDS.values():
         fields = {f: to_json(getattr(value, f), f"{place}.{f}", arrays) for f in field_names(cls)}
         return {MARK: cls.__name__, "fields": fields}
     if isinstance(value, np.generic):
@@ -119,35 +108,24 @@ def from_json(value: Any, arrays: dict[str, np.ndarray]) -> Any:
         return value
     if MARK not in value:
         return {key: from_json(part, arrays) for key, part in value.items()}
-    if (name := value[MARK]) in _READERS:
-        return _READERS[name](value, arrays)
-    cls = kind_named(name)
-    if cls is None:
-        raise ValueError(f"no kind of thing is called {name!r}")
-    return cls(**{key: from_json(part, arrays) for key, part in value["fields"].items()})
+    match value[MARK]:
+        case "array":
+            return arrays[value["name"]]
+        case "tensor":
+            import torch
 
-
-def _tensor(value: dict[str, Any], arrays: dict[str, np.ndarray]) -> Any:
-    import torch
-
-    return torch.from_numpy(arrays[value["name"]])
-
-
-def _generator(value: dict[str, Any], arrays: dict[str, np.ndarray]) -> np.random.Generator:
-    generator = np.random.default_rng()
-    generator.bit_generator.state = value["state"]
-    return generator
-
-
-_READERS: dict[str, Callable[[dict[str, Any], dict[str, np.ndarray]], Any]] = {
-    "array": lambda value, arrays: arrays[value["name"]],
-    "tensor": _tensor,
-    "generator": _generator,
-    "tuple": lambda value, arrays: tuple(from_json(part, arrays) for part in value["items"]),
-    "map": lambda value, arrays: {
-        from_json(key, arrays): from_json(part, arrays) for key, part in value["items"]
-    },
-}
+            return torch.from_numpy(arrays[value["name"]])
+        case "tuple":
+            return tuple(from_json(part, arrays) for part in value["items"])
+        case "map":
+            return {from_json(key, arrays): from_json(part, arrays) for key, part in value["items"]}
+        case "generator":
+            generator = np.random.default_rng()
+            generator.bit_generator.state = value["state"]
+            return generator
+        case name:
+            fields = {key: from_json(part, arrays) for key, part in value["fields"].items()}
+            return _KINDS[name](**fields)
 
 
 @functools.cache

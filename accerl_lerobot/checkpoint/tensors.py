@@ -61,5 +61,4 @@ def restore_optimizer(optimizer: torch.optim.Optimizer, state: dict[int, dict[st
 
 
 def copied(module: torch.nn.Module) -> dict[str, torch.Tensor]:
-    """A copy of its weights and buffers."""
     return {name: tensor.detach().clone() for name, tensor in module.state_dict().items()}

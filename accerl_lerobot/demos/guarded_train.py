@@ -23,7 +23,7 @@ from accerl_lerobot.config.parsing import DISCOVER, discover
 from accerl_lerobot.demos.dataset_files import checked
 from accerl_lerobot.demos.sft import REFUSED, TRUST
 from accerl_lerobot.experience import ENVIRONMENT_STATE
-from accerl_lerobot.policies.guard import guarded, input_error
+from accerl_lerobot.policies.untrusted import guarded, input_error
 
 PACKAGE = f"--policy.{DISCOVER}="
 MAX_BYTES = 4 * 1024**3

@@ -154,7 +154,7 @@ def run_sft(
     """
     check_absent(output_dir)
     if config.init_path is not None:
-        from accerl_lerobot.policies.guard import fetched_checkpoint  # imports torch
+        from accerl_lerobot.policies.untrusted import fetched_checkpoint  # imports torch
 
         config = replace(config, init_path=str(fetched_checkpoint(config.init_path, None, "sft.init_path")))
     output_dir.parent.mkdir(parents=True, exist_ok=True)

@@ -205,7 +205,7 @@ def check_imitates(algorithm: AlgorithmConfig, config: PolicyConfig, policy: Any
 
 def policy_to_be(config: RunConfig) -> Any:
     """LeRobot's config of the policy that a run will act with, as far as it is known before an SFT."""
-    from accerl_lerobot.policies.config import check_observations, check_type, override, sampler_config
+    from accerl_lerobot.policies.config import check_observations, override, sampler_config
     from accerl_lerobot.policies.loading import rehearsed_config
 
     if config.policy.path is not None:
@@ -220,8 +220,7 @@ def policy_to_be(config: RunConfig) -> Any:
             what = "" if error.field == "policy.path" else f"{error.field.partition('.')[2]}={error.value}: "
             raise InputError("sft.init_path", start.path, what + error.remedy) from error
     policy_config = check_sft_policy(config.sft)
-    kind = check_type(config.sft.policy["type"], "sft.policy.type", "RL needs a likelihood: ")
-    sampler_config(config.policy, kind)
+    sampler_config(config.policy, config.sft.policy["type"], "sft.policy.type", "RL needs a likelihood: ")
     override(policy_config, config.policy)
     check_observations(policy_config, "sft.policy.n_obs_steps")
     return policy_config
@@ -267,7 +266,7 @@ def sft_policy(config: SFTConfig) -> Any:
 
     from accerl_lerobot.checkpoint.safety import Origin, brief, read_json
     from accerl_lerobot.policies.config import register_policies
-    from accerl_lerobot.policies.guard import CONFIG, fetched_checkpoint
+    from accerl_lerobot.policies.untrusted import CONFIG, fetched_checkpoint
 
     folder = fetched_checkpoint(config.init_path, None, "sft.init_path")
     kind = read_json(folder / CONFIG, Origin("sft.init_path", config.init_path)).get("type")

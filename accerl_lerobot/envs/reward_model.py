@@ -53,23 +53,24 @@ def load_judge(config: RewardModelConfig) -> Callable[[Observation], bool]:
     from lerobot.utils.import_utils import register_third_party_plugins
 
     from accerl_lerobot.checkpoint.layout import BACKBONE
-    from accerl_lerobot.policies import guard
+    from accerl_lerobot.policies import untrusted
 
     assert config.path is not None
     origin = Origin(f"{REWARD_MODEL}.path", config.path)
-    folder = guard.fetched_checkpoint(config.path, config.revision, origin.field)
+    folder = untrusted.fetched_checkpoint(config.path, config.revision, origin.field)
     fetched = not Path(config.path).expanduser().exists()
     stored = read_json(folder / "config.json", origin)
-    guard.check_origin(
+    untrusted.check_origin(
         stored.get("model_name"), folder / BACKBONE, "config.json: model_name", origin, fetched
     )
     names = [path.name for path in folder.glob("*_preprocessor.json")]
     if len(names) != 1:
         raise origin.refuse("*_preprocessor.json", f"{len(names)} of them; lerobot-train writes one")
-    guard.check_processor(folder, names[0], origin, fetched=fetched)
+    untrusted.check_processor(folder, names[0], origin, fetched=fetched)
     register_third_party_plugins()
     try:
-        with guard.guarded(REWARD_MODEL, config.trust_remote_code), contextlib.redirect_stdout(sys.stderr):
+        trusted = config.trust_remote_code
+        with untrusted.guarded(REWARD_MODEL, trusted), contextlib.redirect_stdout(sys.stderr):
             theirs = LeRobotConfig.from_pretrained(folder)
             if theirs.observation_delta_indices is not None:
                 remedy = "looks at several observations at once; use one that judges each alone"
@@ -83,11 +84,11 @@ def load_judge(config: RewardModelConfig) -> Callable[[Observation], bool]:
     except Exception as error:  # LeRobot takes the files at their word, and may fail over any of them
         remedy = f"it cannot be loaded as one of LeRobot's reward models ({brief(error)})"
         raise InputError(origin.field, config.path, remedy) from error
-    mine, there = model.state_dict(), tensor_shapes(folder / guard.WEIGHTS, origin)
+    mine, there = model.state_dict(), tensor_shapes(folder / untrusted.WEIGHTS, origin)
     held = {mine[name].data_ptr() for name in there if name in mine}  # some have several names
     if missing := [name for name, tensor in mine.items() if tensor.data_ptr() not in held]:
         remedy = f"{len(missing)} tensors are missing, such as {missing[0]}; save it again"
-        raise origin.refuse(guard.WEIGHTS, remedy)
+        raise origin.refuse(untrusted.WEIGHTS, remedy)
     wanted = {name: tuple(feature.shape) for name, feature in theirs.input_features.items()}
 
     @torch.no_grad()

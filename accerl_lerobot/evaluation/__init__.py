@@ -45,33 +45,29 @@ class Rate:
         return self.successes / self.n if self.n else math.nan
 
     def interval(self) -> Interval:
-        """`wilson_interval` of this rate."""
-        return wilson_interval(self.successes, self.n)
+        """Wilson's score interval of 95 % (Wilson 1927; Brown, Cai and DasGupta 2001, section 3.1.1).
+
+            (p + z²/2n ± z √(p(1 − p)/n + z²/4n²)) / (1 + z²/n),  p = successes / n
+
+        Unlike p ± z√(p(1 − p)/n) it has width at 0 and at n successes and stays inside [0, 1]. For n = 0 it
+        is [0, 1], as nothing is known.
+        """
+        successes, n = self.successes, self.n
+        if not 0 <= successes <= n:
+            raise ValueError(f"{successes} successes in {n} episodes")
+        if n == 0:
+            return Interval(0.0, 1.0)
+        z = NormalDist().inv_cdf(0.975)
+        p, share = successes / n, z * z / n
+        centre = (p + share / 2) / (1 + share)
+        half = z * math.sqrt(p * (1 - p) / n + share / (4 * n)) / (1 + share)
+        return Interval(0.0 if successes == 0 else centre - half, 1.0 if successes == n else centre + half)
 
     def __str__(self) -> str:
         if self.n == 0:
             return "no episodes"
         low, high = self.interval()
         return f"{100 * self.value:.1f} % [{100 * low:.1f}, {100 * high:.1f}] n={self.n}"
-
-
-def wilson_interval(successes: int, n: int) -> Interval:
-    """Wilson's score interval of 95 % (Wilson 1927; Brown, Cai and DasGupta 2001, section 3.1.1).
-
-        (p + z²/2n ± z √(p(1 − p)/n + z²/4n²)) / (1 + z²/n),  p = successes / n
-
-    Unlike p ± z√(p(1 − p)/n) it has width at 0 and at n successes and stays inside [0, 1]. For n = 0 it is
-    [0, 1], as nothing is known.
-    """
-    if not 0 <= successes <= n:
-        raise ValueError(f"{successes} successes in {n} episodes")
-    if n == 0:
-        return Interval(0.0, 1.0)
-    z = NormalDist().inv_cdf(0.975)
-    p, share = successes / n, z * z / n
-    centre = (p + share / 2) / (1 + share)
-    half = z * math.sqrt(p * (1 - p) / n + share / (4 * n)) / (1 + share)
-    return Interval(0.0 if successes == 0 else centre - half, 1.0 if successes == n else centre + half)
 
 
 def summarise(results: Sequence[EpisodeResult]) -> dict[str, Any]:
@@ -193,12 +189,9 @@ def success_curve(
 
 
 def write_video(path: Path, rows: Sequence[Sequence[Sequence[np.ndarray]]], fps: int) -> None:
-    """Writes a grid of clips as MP4; one that ends early holds its last frame.
+    """Writes rows of clips, of equal width, as MP4; a clip that ends early holds its last frame.
 
-    Args:
-        path: file to write.
-        rows: rows of clips, of equal width; frames of a clip are uint8 (H, W, 3), all of one height in a row.
-        fps: frames per second.
+    Frames are uint8 (H, W, 3), all of one height in a row.
     """
     import imageio.v2 as imageio
 
@@ -272,7 +265,6 @@ def _with_outcome(frames: Sequence[np.ndarray], success: bool) -> list[np.ndarra
 
 def _joined(pictures: Sequence[np.ndarray], axis: int) -> np.ndarray:
     """Pictures beside (axis 1) or below (axis 0) each other, white between them."""
-    shape = list(pictures[0].shape)
-    shape[axis] = GAP
+    shape = [GAP if i == axis else size for i, size in enumerate(pictures[0].shape)]
     gap = np.full(shape, 255, np.uint8)
     return np.concatenate([part for picture in pictures for part in (picture, gap)][:-1], axis=axis)

@@ -182,24 +182,6 @@ class Processing:
         return torch.where(varies, (chunk - zero) / torch.where(varies, scale, 1), 0)
 
 
-def example_requests(policy_config: Any, rename_map: dict[str, str]) -> list[Request]:
-    """Two requests with random observations for this policy, and instructions of unequal length."""
-    rng, steps = np.random.default_rng(0), policy_config.n_obs_steps
-    env_name = {policy: env for env, policy in rename_map.items()}
-    batch = (2,) if steps == 1 else (2, steps)
-    observations: dict[str, np.ndarray] = {}
-    for key, feature in policy_config.input_features.items():
-        name, shape = env_name.get(key, key), tuple(feature.shape)
-        if key.startswith(IMAGES) and ".empty_camera_" not in key:
-            observations[name] = rng.integers(0, 256, (*batch, *shape[1:], shape[0]), dtype=np.uint8)
-        elif key == OBS_STATE:
-            observations[name] = rng.standard_normal((*batch, *shape), dtype=np.float32)
-    return [
-        Request(observation={k: v[i] for k, v in observations.items()} | {TASK: task}, noise_seed=i)
-        for i, task in enumerate(("Go", "Put the red cube on the plate"))
-    ]
-
-
 class LeRobotAdapter(PolicyAdapter):
     """A LeRobot policy with its processors, a model that runs it, a likelihood and a critic.
 
@@ -241,7 +223,6 @@ class LeRobotAdapter(PolicyAdapter):
 
     @torch.no_grad()
     def decide(self, requests: Sequence[Request], version: int) -> list[Decision]:
-        """Acts; each decision's noise comes from its own request's seed, whatever its batch."""
         arrays, tasks = stack_observations(requests)
         with self.autocast():
             encoded = self.encode(arrays, tasks)
@@ -268,13 +249,13 @@ class LeRobotAdapter(PolicyAdapter):
         with self.autocast():
             encoded = self.encode(observations, tasks)
             log_prob, entropy = self.family.score(encoded, {k: v.to(self.device) for k, v in latent.items()})
-        return Evaluation(log_prob, entropy, self._value(encoded))
+        return Evaluation(log_prob, entropy, self.value_head(encoded.features, encoded.mask))
 
     @torch.no_grad()
     def values(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Tensor:
         with self.autocast():
             encoded = self.encode(observations, tasks)
-        return self._value(encoded)
+        return self.value_head(encoded.features, encoded.mask)
 
     def trainable(self) -> dict[str, nn.Parameter]:
         parts = {"policy": self.policy, "family": self.family, "value_head": self.value_head}
@@ -287,8 +268,25 @@ class LeRobotAdapter(PolicyAdapter):
         teacher = {} if self.teacher is None else dict(self.teacher.named_parameters())
         return named | {PREFIX + name: parameter for name, parameter in teacher.items()}
 
+    def example_requests(self) -> list[Request]:
+        """Two requests with random observations for this policy, and instructions of unequal length."""
+        config, rng = self.policy.config, np.random.default_rng(0)
+        env_names = {policy: env for env, policy in self.processing.rename_map.items()}
+        batch = (2,) if config.n_obs_steps == 1 else (2, config.n_obs_steps)
+        arrays: dict[str, np.ndarray] = {}
+        for key, feature in config.input_features.items():
+            name, shape = env_names.get(key, key), tuple(feature.shape)
+            if key.startswith(IMAGES) and ".empty_camera_" not in key:
+                arrays[name] = rng.integers(0, 256, (*batch, *shape[1:], shape[0]), dtype=np.uint8)
+            elif key == OBS_STATE:
+                arrays[name] = rng.standard_normal((*batch, *shape), dtype=np.float32)
+        return [
+            Request(observation={k: v[i] for k, v in arrays.items()} | {TASK: task}, noise_seed=i)
+            for i, task in enumerate(("Go", "Put the red cube on the plate"))
+        ]
+
     def example(self) -> tuple[dict[str, np.ndarray], Sequence[str], dict[str, Tensor]]:
-        requests = example_requests(self.policy.config, self.processing.rename_map)
+        requests = self.example_requests()
         latents = [decision.latent for decision in self.decide(requests, 0)]
         stacked = {k: torch.from_numpy(np.stack([latent[k] for latent in latents])) for k in latents[0]}
         return *stack_observations(requests), stacked
@@ -316,6 +314,3 @@ class LeRobotAdapter(PolicyAdapter):
         fits = f"the adapter of {self.policy.name} does not fit LeRobot {lerobot.__version__}"
         remedy = f"{fits}: it differs from its sampler by {difference:.2e}; install the pinned version"
         raise InputError("lerobot", lerobot.__version__, remedy)
-
-    def _value(self, encoded: Encoded) -> Tensor:
-        return self.value_head(encoded.features, encoded.mask)

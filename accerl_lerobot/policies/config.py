@@ -69,7 +69,6 @@ class GaussianSamplerConfig(SamplerConfig):
 
     @property
     def bounds(self) -> tuple[float, float]:
-        """Bounds of the learned std."""
         return self.std / 4, 2.5 * self.std
 
 
@@ -199,14 +198,6 @@ def discovery(policy_type: str | None) -> list[str]:
     return [f"--policy.discover_packages_path={PLUGINS[policy_type]}"] if policy_type in PLUGINS else []
 
 
-def check_type(policy_type: Any, field: str, prefix: str = "") -> str:
-    """Refuses a LeRobot policy type that has no likelihood here; `prefix` begins the remedy."""
-    if policy_type not in POLICIES:
-        known = f"use one of {', '.join(POLICIES)}, or name its package: policy.discover_packages_path"
-        raise InputError(field, policy_type, f"{prefix}no likelihood for it here; {known}")
-    return str(policy_type)
-
-
 def check_observations(policy_config: Any, field: str) -> None:
     """Refuses an observation history that LeRobot's policy of this type does not read."""
     if policy_config.n_obs_steps != 1 and policy_config.type not in USES_HISTORY:
@@ -214,8 +205,17 @@ def check_observations(policy_config: Any, field: str) -> None:
         raise InputError(field, policy_config.n_obs_steps, remedy)
 
 
-def sampler_config(config: PolicyConfig, policy_type: str) -> SamplerConfig:
-    """How a policy of this type explores in this run; a sampler of another family is refused."""
+def sampler_config(
+    config: PolicyConfig, policy_type: Any, field: str = "policy.type", prefix: str = ""
+) -> SamplerConfig:
+    """How a policy of this type explores in this run.
+
+    Refuses a type without a likelihood here, naming `field`, in a remedy that begins with `prefix`; and a
+    sampler of another family.
+    """
+    if policy_type not in POLICIES:
+        known = f"use one of {', '.join(POLICIES)}, or name its package: policy.discover_packages_path"
+        raise InputError(field, policy_type, f"{prefix}no likelihood for it here; {known}")
     families = POLICIES[policy_type][1]
     if config.sampler is None:
         return SamplerConfig.get_choice_class(families[0])()
@@ -225,18 +225,14 @@ def sampler_config(config: PolicyConfig, policy_type: str) -> SamplerConfig:
     return config.sampler
 
 
-def steps_field(policy_config: Any) -> str | None:
-    """Field of a LeRobot policy config that holds its denoising steps; None if it does not denoise."""
-    return next((n for n in ("num_steps", "num_inference_steps") if hasattr(policy_config, n)), None)
-
-
 def override(policy_config: Any, config: PolicyConfig) -> None:
     """Puts a run's choices of denoising steps, executed rows and precision into LeRobot's policy config."""
     if hasattr(policy_config, "pretrained_backbone_weights"):
         # The checkpoint has them; LeRobot would download torchvision's first, even when told to stay offline.
         policy_config.pretrained_backbone_weights = None
     if config.num_steps is not None:
-        if (name := steps_field(policy_config)) is None:
+        names = (name for name in ("num_steps", "num_inference_steps") if hasattr(policy_config, name))
+        if (name := next(names, None)) is None:
             remedy = f"a {policy_config.type} policy does not denoise; leave the field out"
             raise InputError("policy.num_steps", config.num_steps, remedy)
         setattr(policy_config, name, config.num_steps)

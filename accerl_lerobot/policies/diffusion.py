@@ -13,9 +13,8 @@ the operations of LeRobot's scheduler, in its order. While exploring, a step's s
 log-density counts; the chain is what is stored, and re-scoring takes a network pass per step. x_N's
 density does not depend on the weights and is left out. In every step but the last all rows feed back through
 the network, so all count; after the last nothing feeds back, and rows that are not executed are left out.
-
-DPPO's other liberties are not taken: it may explore in the last steps alone, score with a wider std than it
-sampled with, clips its noise, and gives each denoising step a ratio of its own with a discount.
+Deviations from DPPO: all steps explore, with the std that is scored; their noise is not clipped; and no ratio
+is of a single step.
 
 Shapes: B batch, H horizon, A action dims, N steps, L factors: one per row.
 """

@@ -6,9 +6,7 @@ x ← x − δ·v(x, t). That map has no usable density, so exploration adds N(0
 initial noise x₀, whose density does not depend on the weights, the executed action is exactly N(G_θ(x₀), s²),
 and its mean is the stock action. Padded action dims and rows that are not executed are never fed back, so
 leaving them out marginalises them exactly. Re-scoring replays the ODE from x₀: N velocity passes.
-
-Flow-GRPO (arXiv 2505.05470) and πRL (arXiv 2510.25889) make every step Gaussian instead, which is exact too;
-padded dims then feed back into real ones and belong to the density.
+Flow-GRPO (arXiv 2505.05470) and πRL (arXiv 2510.25889) make every step Gaussian instead.
 
 Shapes: B batch, K actions per chunk, D = max_action_dim (real dims first, then padding), A real dims,
 N steps, L log-prob factors, one per executed row.

@@ -26,12 +26,11 @@ from accerl_lerobot.checkpoint.safety import Origin, brief, read_json, read_tens
 from accerl_lerobot.config.parsing import discover, imported
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK
-from accerl_lerobot.policies import guard
+from accerl_lerobot.policies import untrusted
 from accerl_lerobot.policies.adapter import (
     LeRobotAdapter,
     Processing,
     ValueHead,
-    example_requests,
     stack_observations,
 )  # fmt: skip
 from accerl_lerobot.policies.config import (
@@ -39,7 +38,6 @@ from accerl_lerobot.policies.config import (
     PolicyConfig,
     SamplerConfig,
     check_observations,
-    check_type,
     override,
     register_policies,
     sampler_config,
@@ -88,7 +86,7 @@ def load_lerobot_config(config: PolicyConfig) -> Any:
     folder = _checkpoint_folder(config)
     kind = _registered_type(config, folder)
     with _refusing(config, "its config.json is not one of this LeRobot's policies"):
-        sampler_config(config, check_type(kind, "policy.type", f"{config.path} is of this type: "))
+        sampler_config(config, kind, prefix=f"{config.path} is of this type: ")
         lerobot_config = PreTrainedConfig.from_pretrained(folder)
     lerobot_config.device = str(resolve_device(config.device))
     override(lerobot_config, config)
@@ -128,7 +126,6 @@ def rehearsed[T](config: PolicyConfig, task: Callable[[LeRobotAdapter], T]) -> T
 
 
 def sizes_of(adapter: LeRobotAdapter) -> Sizes:
-    """Numbers of an adapter's parameters."""
     of = (adapter.policy.parameters(), adapter.trainable().values())
     return Sizes(*(sum(parameter.numel() for parameter in parameters) for parameters in of))
 
@@ -148,12 +145,12 @@ def load_adapter(config: PolicyConfig, *, rehearsal: bool = False) -> LeRobotAda
     model_class: type[Model] = imported(POLICIES[lerobot_config.type][0])
     with (
         _refusing(config, "its network cannot be built as its config.json says"),
-        guard.guarded("policy", config.trust_remote_code),
+        untrusted.guarded("policy", config.trust_remote_code),
         model_class.loading(),
-        guard.Unfilled(),
+        untrusted.Unfilled(),
     ):
         policy = get_policy_class(lerobot_config.type)(lerobot_config)
-    load_weights(policy, model_class, folder / guard.WEIGHTS, config.path, read=not rehearsal)
+    load_weights(policy, model_class, folder / untrusted.WEIGHTS, config.path, read=not rehearsal)
     device = torch.device(lerobot_config.device)
     policy.to(device).eval()
     model = model_class(policy)  # type: ignore[call-arg]
@@ -162,11 +159,11 @@ def load_adapter(config: PolicyConfig, *, rehearsal: bool = False) -> LeRobotAda
         # algorithms; what they round differently is divided by the std of the noise in every log-prob.
         torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = False
     overrides = {"device_processor": {"device": str(device)}}
-    guard.check_statistics(folder, origin)
-    hint = f"a tokeniser that cannot be had from the Hub goes into {BACKBONE}/ beside {guard.CONFIG}"
+    untrusted.check_statistics(folder, origin)
+    hint = f"a tokeniser that cannot be had from the Hub goes into {BACKBONE}/ beside {untrusted.CONFIG}"
     with _refusing(config, f"its LeRobot processors did not load; {hint}"):
         overrides |= _tokenizer_overrides(lerobot_config, folder)
-        with guard.guarded("policy", config.trust_remote_code), model.loading():
+        with untrusted.guarded("policy", config.trust_remote_code), model.loading():
             pre, post = make_pre_post_processors(
                 lerobot_config, pretrained_path=str(folder), preprocessor_overrides=overrides
             )
@@ -177,9 +174,9 @@ def load_adapter(config: PolicyConfig, *, rehearsal: bool = False) -> LeRobotAda
         family = imported(sampler.family)(model, sampler)
         critic = ValueHead(model.width)
         adapter = LeRobotAdapter(policy, processing, model, family, critic, config.precision)
-        if (folder / guard.OURS).is_file():
+        if (folder / untrusted.OURS).is_file():
             _load_ours(adapter, folder, origin)
-        requests = example_requests(lerobot_config, config.rename_map)
+        requests = adapter.example_requests()
         if not rehearsal:
             adapter.self_check(*stack_observations(requests))
         elif sum(parameter.numel() for parameter in policy.parameters()) <= ACTS_MOST:
@@ -197,49 +194,49 @@ def _refusing(config: PolicyConfig, what: str) -> Iterator[None]:
     except InputError:
         raise
     except Exception as error:
-        if (ours := guard.input_error(error)) is not None:
+        if (ours := untrusted.input_error(error)) is not None:
             raise ours from error
         raise InputError("policy.path", config.path, f"{what} ({brief(error)})") from error
 
 
 def _checkpoint_folder(config: PolicyConfig) -> Path:
-    """Where the checkpoint's files are, once checked; those of a Hub repository are fetched."""
     if config.path is None:
         remedy = "give a LeRobot checkpoint directory or Hub id, or an sft section"
         raise InputError("policy.path", None, remedy)
-    return guard.fetched_checkpoint(config.path, config.revision, "policy.path")
+    return untrusted.fetched_checkpoint(config.path, config.revision, "policy.path")
 
 
 def _registered_type(config: PolicyConfig, folder: Path) -> Any:
     """The checkpoint's policy type; packages that may have it are imported."""
     discover(config.discover_packages_path, "policy")
-    kind = read_json(folder / guard.CONFIG, Origin("policy.path", config.path)).get("type")
+    kind = read_json(folder / untrusted.CONFIG, Origin("policy.path", config.path)).get("type")
     register_policies(str(kind))
     return kind
 
 
 def _load_ours(adapter: LeRobotAdapter, folder: Path, origin: Origin) -> None:
     """Loads critic and family, and says where this run's options differ from those they were made with."""
-    there = json.loads((folder / guard.OURS).read_text()).get("sampler", {})
+    there = json.loads((folder / untrusted.OURS).read_text()).get("sampler", {})
     here = draccus.encode(adapter.family.sampler, SamplerConfig)
     if differing := [k for k in here if k in there and there[k] != here[k]]:
         logger.warning(
             "this run explores unlike the one that made the checkpoint (evaluation is not affected): %s",
             ", ".join(f"policy.sampler.{k}={here[k]}, there {there[k]}" for k in differing),
         )
-    state = dict(read_tensors(folder / guard.FAMILY, origin)) if (folder / guard.FAMILY).is_file() else {}
+    file = folder / untrusted.FAMILY
+    state = dict(read_tensors(file, origin)) if file.is_file() else {}
     mine = adapter.family.state_dict()
     if {k: v.shape for k, v in state.items()} == {k: v.shape for k, v in mine.items()}:
         adapter.family.load_state_dict(state)
     elif state and mine:
         logger.warning("the checkpoint's weights of the sampler are not loaded: they are of another shape")
-    if (folder / guard.VALUE_HEAD).is_file():
-        state = dict(read_tensors(folder / guard.VALUE_HEAD, origin))
+    if (folder / untrusted.VALUE_HEAD).is_file():
+        state = dict(read_tensors(folder / untrusted.VALUE_HEAD, origin))
         try:
             adapter.value_head.load_state_dict(state)
         except RuntimeError as error:
             remedy = f"it is no critic of this policy; remove it to start anew ({brief(error)})"
-            raise origin.refuse(guard.VALUE_HEAD, remedy) from error
+            raise origin.refuse(untrusted.VALUE_HEAD, remedy) from error
 
 
 def _use_backbone(lerobot_config: Any, folder: Path, path: str | None) -> None:
@@ -272,7 +269,7 @@ def _tokenizer_overrides(lerobot_config: Any, folder: Path) -> dict[str, dict[st
 
 def _keep_names(lerobot_config: Any, preprocessor: Any, folder: Path) -> None:
     """Undoes the two functions above in what will be saved, once tokenisers are loaded."""
-    stored = json.loads((folder / guard.CONFIG).read_text())
+    stored = json.loads((folder / untrusted.CONFIG).read_text())
     for field in CONFIG_FOLDERS.keys() - {"vlm_model_name"}:
         if hasattr(lerobot_config, field) and field in stored:
             setattr(lerobot_config, field, stored[field])

@@ -25,7 +25,7 @@ from accerl_lerobot.checkpoint.tensors import place, whole
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import PolicyConfig, SamplerConfig, TuningConfig
 from accerl_lerobot.policies.family import Model
-from accerl_lerobot.policies.guard import FAMILY, OURS, VALUE_HEAD
+from accerl_lerobot.policies.untrusted import FAMILY, OURS, VALUE_HEAD
 
 if TYPE_CHECKING:
     from accerl_lerobot.policies.adapter import LeRobotAdapter

@@ -113,7 +113,6 @@ class Section:
 
     @property
     def empty(self) -> bool:
-        """True if there is nothing under the heading."""
         rest = (self.text, self.bars, self.tables, self.videos, self.details)
         return not any(rest) and not any(chart.drawable for chart in self.charts)
 
@@ -168,7 +167,6 @@ def comparison_page(runs: Sequence[Run], now: float) -> dict[str, Any]:
 
 
 def status(run: Run, now: float) -> str:
-    """How a run stands."""
     if run.result is None:
         return "still going" if now - run.written < RECENT_S else "not finished"
     return "finished"
@@ -226,7 +224,6 @@ def shown(value: Any) -> str:
 
 
 def _charts(records: Sequence[Record], specs: Sequence[Spec]) -> list[Chart]:
-    """Charts of metrics over updates."""
     update = column(records, "update")
     charts = []
     for title, note, names, options in specs:
@@ -276,7 +273,6 @@ def exploring(run: Run) -> tuple[np.ndarray, np.ndarray]:
 
 
 def evaluated(run: Run, name: str, colour: int) -> Series:
-    """The evaluations of a run with their intervals."""
     ends = np.array([e["ci95"] for e in run.evaluations], dtype=np.float64).reshape(-1, 2)
     x, y = column(run.evaluations, "env_steps"), column(run.evaluations, "success")
     return Series(name, x, y, colour, ends[:, 0], ends[:, 1], points=True)
@@ -322,7 +318,6 @@ def _mean(records: Sequence[Record], name: str) -> float | None:
 
 
 def _speed(run: Run) -> Section:
-    """How fast a run went, and what its workers did with their time."""
     x_label, counters = "minutes since the workers began to start", ("env_steps", "decisions")
     curves = {name: (column(run.rollout, "wall_s"), column(run.rollout, name)) for name in counters}
     curves["updates"] = (column(run.train, "wall_s"), column(run.train, "update"))
@@ -336,7 +331,6 @@ def _speed(run: Run) -> Section:
 
 
 def _headline(run: Run) -> str:
-    """The result in one sentence."""
     last, env = run.evaluations[-1:], run.section("env")
     names = (run.result or {}).get("tasks") or sorted((last[0].get("tasks") if last else None) or ())
     names = names or [env.get("task") or env.get("name") or env.get("type")]

@@ -9,6 +9,7 @@ Also the differences of a run's recipe from the defaults and from other runs.
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -45,7 +46,6 @@ class Run:
 
     @property
     def name(self) -> str:
-        """Name of its folder."""
         return self.path.resolve().name
 
     @property
@@ -82,7 +82,6 @@ class Run:
 
 
 def read_run(path: Path) -> Run:
-    """Reads a folder."""
     check_folder(path, Origin("runs", str(path)))
     config_path = path / CONFIG
     if not config_path.is_file():
@@ -122,7 +121,6 @@ def newest(records: Sequence[Record], name: str) -> float | None:
 
 
 def _mapping(path: Path) -> Record:
-    """The content of a JSON file."""
     try:
         return dict(json.loads(path.read_text()))
     except (TypeError, ValueError, RecursionError) as error:
@@ -136,20 +134,15 @@ def _lines(path: Path) -> tuple[list[Record], bool]:
     records: list[Record] = []
     lines = path.read_bytes().splitlines()
     for number, line in enumerate(lines, 1):
-        if (record := _record(line)) is not None:
+        record = None
+        with contextlib.suppress(ValueError, RecursionError):
+            record = json.loads(line)
+        if isinstance(record, dict) and isinstance(record.get("kind"), str):
             records.append(record)
         elif number < len(lines):
             remedy = f"{line[:60].decode(errors='replace')!r} is not a whole record; mend or remove this line"
             raise InputError("runs", f"{path}:{number}", remedy)
     return records, len(records) < len(lines)
-
-
-def _record(line: bytes) -> Record | None:
-    try:
-        record = json.loads(line)
-    except (ValueError, RecursionError):
-        return None
-    return record if isinstance(record, dict) and isinstance(record.get("kind"), str) else None
 
 
 PLACES = ("output_dir", "job_name")

@@ -156,15 +156,10 @@ def check_gradient(
     step: float = 0.01,
     slack: float = 0.05,
 ) -> None:
-    """Σ log-prob's gradient against finite differences, for the parameters of each part.
+    """Σ log-prob's gradient against finite differences, for the parameters whose names have a part.
 
-    In fp32: along the gradient itself, where the change is large against rounding.
-
-    Args:
-        adapter: of weights other than those that made the decisions.
-        parts: parts of parameter names.
-        step: how far to go, over the norm of the part's gradient where that is above 1.
-        slack: relative error.
+    In fp32: `step` along the gradient itself, over its norm where that is above 1, so that the change is
+    large against rounding; `slack` is the relative error. The weights must not be those that decided.
     """
     latent, _ = stored(decisions)
     adapter.evaluate(*stack_observations(asked), latent).log_prob.sum().backward()

@@ -23,9 +23,6 @@ from accerl_lerobot.experience import Segment
 if TYPE_CHECKING:
     from accerl_lerobot.trainer.update import BaseUpdate
 
-Part = tuple[dict[str, np.ndarray], list[str], dict[str, Tensor]]
-"""Observations, tasks and latents of some decisions, as `PolicyAdapter.evaluate` takes them."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class Batch:
@@ -45,14 +42,12 @@ class Batch:
     def __len__(self) -> int:
         return len(self.tasks)
 
-    def part(self, rows: np.ndarray) -> Part:
-        """Some of the rows."""
-        observations, tasks = pick(self.observations, self.tasks, rows)
-        return observations, tasks, {k: v[rows] for k, v in self.latent.items()}
+    def part(self, rows: np.ndarray) -> tuple[dict[str, np.ndarray], list[str], dict[str, Tensor]]:
+        """Some of the decisions, as `PolicyAdapter.evaluate` takes them."""
+        return *pick(self.observations, self.tasks, rows), {k: v[rows] for k, v in self.latent.items()}
 
 
 def collate(segments: Sequence[Segment]) -> Batch:
-    """Lays segments end to end."""
     keys, names = segments[0].observations.keys(), segments[0].latent.keys()
     return Batch(
         observations={k: np.concatenate([s.observations[k][:-1] for s in segments]) for k in keys},
@@ -71,7 +66,6 @@ def collate(segments: Sequence[Segment]) -> Batch:
 def pick(
     observations: dict[str, np.ndarray], tasks: Sequence[str], rows: np.ndarray
 ) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Some rows of observations and of the tasks beside them."""
     return {k: v[rows] for k, v in observations.items()}, [tasks[i] for i in rows]
 
 
@@ -98,10 +92,10 @@ class NonFiniteError(RuntimeError):
 
 @contextmanager
 def keeping(directory: Path | None, update: BaseUpdate, segments: Sequence[Segment]) -> Iterator[None]:
-    """Keeps the segments of an update, made inside, that raises `NonFiniteError`, for people to look at.
+    """Saves the segments of an update, made inside, that raises `NonFiniteError`, for `snapshot.load`.
 
-    ``nonfinite-000123.json`` and ``.safetensors`` in the run's `directory`, if there is one, hold what would
-    have made update 123; `snapshot.load` reads it, and the error names it.
+    ``nonfinite-000123.json`` and ``.safetensors`` in the run's `directory` hold what would have made update
+    123; the error names them.
     """
     try:
         yield

@@ -58,15 +58,13 @@ SMALLEST_SCALE = 0.02
 
 
 class Critic(nn.Module):
-    """An ensemble of Q(state, chunk)."""
+    """An ensemble of Q: a scaled state (B, S) and a chunk (B, K, A) to (M, B)."""
 
     def __init__(self, teacher: Teacher) -> None:
         super().__init__()
-        inputs = len(teacher.mean) + math.prod(teacher.chunk)
-        self.network = Ensemble(inputs, 1, MEMBERS)
+        self.network = Ensemble(len(teacher.mean) + math.prod(teacher.chunk), 1, MEMBERS)
 
     def forward(self, state: Tensor, chunk: Tensor) -> Tensor:
-        """(B, S), scaled, and (B, K, A) to (M, B)."""
         return self.network(torch.cat([state, chunk.flatten(1)], -1))[..., 0]
 
 
@@ -90,8 +88,9 @@ class ChunkCriticUpdate(OffPolicyUpdate):
             "critic": torch.optim.AdamW(self.critic.parameters(), lr=config.value_lr, weight_decay=1e-3),
             "teacher": torch.optim.AdamW(self.teacher.network.parameters(), lr=TEACHER_LR, weight_decay=1e-4),
         }
-        names = ("policy_success", "teacher_success")
-        self._outcomes: dict[str, deque[bool]] = {name: deque(maxlen=LAST) for name in names}
+        self._outcomes: dict[str, deque[bool]] = {
+            name: deque(maxlen=LAST) for name in ("policy_success", "teacher_success")
+        }
         """Success of the last exploring episodes, by who acted in them."""
         self.optimizer.add_param_group({"params": list(self.reader.parameters()), "lr": READER_LR})
 
@@ -112,15 +111,12 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         bounds = float(returns.min()), float(returns.max())
         if not self.teacher.ready:
             self._begin(won, bounds)
-        metrics = mean(
-            self._critic_step(bounds) for _ in self.steps("critic", self.algorithm.critic_steps, new)
-        )
-        due = self.steps("teacher", self.algorithm.critic_steps / 2, new)
-        metrics |= mean(self._teacher_step(won) for _ in due)
-        return metrics | self.policy_learns(new)
+        each = self.algorithm.critic_steps
+        metrics = mean(self._critic_step(bounds) for _ in self.steps("critic", each, new))
+        metrics |= mean(self._teacher_step(won) for _ in self.steps("teacher", each / 2, new))
+        return metrics | super().learn(new)
 
-    def imitable(self) -> np.ndarray:
-        """See the base class: every observation has a label."""
+    def imitable(self) -> np.ndarray:  # the teacher labels every observation
         return np.arange(len(self.memory))
 
     @torch.no_grad()
@@ -223,10 +219,7 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         for parameter, gradient in zip(parameters, torch.autograd.grad(loss, parameters), strict=True):
             parameter.grad = gradient
         norm = float(torch.nn.utils.clip_grad_norm_(parameters, clip))
-        if math.isfinite(float(loss.detach()) + norm):
-            optimizer.step()
-        else:
-            self.skip(f"a step of the {name}", float(loss.detach()), norm)
+        self.apply(optimizer, f"a step of the {name}", float(loss.detach()), norm)
         return norm
 
 

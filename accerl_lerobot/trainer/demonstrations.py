@@ -105,7 +105,7 @@ def _episode(
     rows: list[dict[str, np.ndarray]] = []
     rewards: list[float] = []
     for frame in frames:
-        rows.append({name: _array(frame[name], shape) for name, shape in wanted.items()})
+        rows.append({name: _numbers(frame[name], shape) for name, shape in wanted.items()})
         rewards.append(float(frame.get(REWARD, 0.0)))
         task, success = str(frame["task"]), bool(frame.get(SUCCESS, True))
         if SUCCESS in frame and success:
@@ -116,8 +116,5 @@ def _episode(
     return columns, np.array(rewards, np.float32), success, task
 
 
-def _array(value: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """A frame's numbers, uint8 (H, W, C) of an image, as environments give them."""
-    if len(shape) < 3:
-        return np.asarray(value.numpy(), np.float32).reshape(shape)
-    return pixels_of(value)
+def _numbers(value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    return pixels_of(value) if len(shape) > 2 else np.asarray(value.numpy(), np.float32).reshape(shape)

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map_only
 
-from accerl_lerobot.policies.adapter import LeRobotAdapter, example_requests, stack_observations
+from accerl_lerobot.policies.adapter import LeRobotAdapter, stack_observations
 from accerl_lerobot.policies.family import Action
 from accerl_lerobot.policies.loading import sizes_of
 from accerl_lerobot.trainer.sharding import Watch, forget
@@ -93,7 +93,7 @@ def policy_memory(adapter: LeRobotAdapter, *, imitates: bool, checkpointing: boo
     from torch._subclasses.fake_tensor import FakeTensorMode
 
     sizes = sizes_of(adapter)
-    requests = example_requests(adapter.policy.config, adapter.processing.rename_map)
+    requests = adapter.example_requests()
     batch = adapter.processing.prepare(*stack_observations(requests))
     mode: Any = nullcontext()
     if sizes.policy > FAKED_FROM:

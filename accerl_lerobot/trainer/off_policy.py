@@ -105,12 +105,10 @@ class Memory:
         return seen, [self.tasks[i] for i in self._columns["task"][rows]]
 
     def state(self) -> dict[str, Any]:
-        """All that `restore` needs; see `snapshot`."""
         columns = {name: self[name].copy() for name in self._columns}
         return {"total": self.total, "tasks": list(self.tasks), "columns": columns}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Resume from `state`."""
         self.total, self.tasks, self._columns = state["total"], list(state["tasks"]), dict(state["columns"])
 
 
@@ -137,14 +135,21 @@ class OffPolicyUpdate(BaseUpdate):
         metrics["reward_mean"] = float(rewards.mean())
         if len(self.memory):
             metrics |= self.learn(len(rewards))
+        # Lag is that of the new decisions only: those that the steps draw from the memory may be much older.
         versions = torch.from_numpy(np.concatenate([segment.version for segment in segments]))
         metrics |= lag_metrics(versions, self.version)
         self.version += 1
         return metrics | {"skipped": float(self.skipped)}
 
     def learn(self, new: int) -> dict[str, float]:
-        """Makes all steps that so many new decisions allow."""
-        return self.policy_learns(new)
+        """Makes the steps that so many new decisions allow; none before ``value_warmup_updates``."""
+        start = self.config.value_warmup_updates
+        lr = self.config.lr * self.lr_share(start)
+        self.optimizer.param_groups[0]["lr"] = lr
+        metrics = {"lr": lr}
+        if self.version >= start and len(rows := self.imitable()):
+            metrics |= mean(self._policy_step(rows) for _ in self.steps("policy", self.policy_steps, new))
+        return metrics
 
     def imitable(self) -> np.ndarray:
         """Rows of the memory that the policy imitates."""
@@ -176,18 +181,7 @@ class OffPolicyUpdate(BaseUpdate):
         self._owed[name] = owed - due
         return range(due)
 
-    def policy_learns(self, new: int) -> dict[str, float]:
-        """The policy's steps of this update; none before ``value_warmup_updates``."""
-        start = self.config.value_warmup_updates
-        lr = self.config.lr * self.lr_share(start)
-        self.optimizer.param_groups[0]["lr"] = lr
-        metrics = {"lr": lr}
-        if self.version >= start and len(rows := self.imitable()):
-            metrics |= mean(self._policy_step(rows) for _ in self.steps("policy", self.policy_steps, new))
-        return metrics
-
     def remember(self, segment: Segment) -> None:
-        """Adds a whole episode to the memory."""
         executed = self.adapter.processing.normalise(torch.from_numpy(segment.actions))
         self.memory.add(segment, executed.numpy())
 
@@ -196,7 +190,6 @@ class OffPolicyUpdate(BaseUpdate):
         return torch.from_numpy(self.memory[name][rows]).to(self.adapter.device)
 
     def _policy_step(self, imitable: np.ndarray) -> dict[str, float]:
-        """One gradient step on rows drawn from `imitable`."""
         rows = drawn(imitable, POLICY_BATCH)
         metrics: dict[str, float] = {}
         self.optimizer.zero_grad(set_to_none=True)
@@ -211,11 +204,7 @@ class OffPolicyUpdate(BaseUpdate):
                 metrics[name] = metrics.get(name, 0.0) + float(value.detach())
         loss = sum(metrics.values())
         norm = float(torch.nn.utils.clip_grad_norm_(self._policy, self.config.grad_clip))
-        if math.isfinite(loss + norm):
-            self.optimizer.step()
-            self._skipped_in_a_row = 0
-        else:
-            self.skip("a step of the policy", loss, norm)
+        self.apply(self.optimizer, "a step of the policy", loss, norm)
         return metrics | {"policy_loss": loss, "grad_norm": norm}
 
 
@@ -233,8 +222,7 @@ class AWRUpdate(OffPolicyUpdate):
         self.optimizer.param_groups[1]["lr"] = self.config.value_lr * self.lr_share()
         return super().learn(new)
 
-    def imitable(self) -> np.ndarray:
-        """See the base class: of failures too, what went better than expected."""
+    def imitable(self) -> np.ndarray:  # of failures too, what went better than expected
         return np.arange(len(self.memory))
 
     def losses(self, rows: np.ndarray, encoded: Encoded, imitation: Tensor) -> dict[str, Tensor]:

@@ -63,7 +63,6 @@ class LearnerSettings(NamedTuple):
     """How long a rank waits for the others within an update."""
 
     def adapter(self) -> Any:
-        """Loads the policy."""
         import torch
 
         torch.set_num_threads(self.trainer.num_threads)
@@ -92,7 +91,6 @@ class TrainerRank:
         return os.getpid()
 
     def node(self) -> str:
-        """Id of the machine that it is on."""
         return str(ray.get_runtime_context().get_node_id())
 
     def metrics(self) -> dict[str, float]:
@@ -100,7 +98,6 @@ class TrainerRank:
         return {}
 
     def join(self, rendezvous: Rendezvous) -> None:
-        """Meets the others."""
         from accerl_lerobot.trainer import ranks
 
         size, timeout_s = self._settings.trainer.ranks, self._settings.timeout_s
@@ -111,7 +108,6 @@ class TrainerRank:
         self._update = self._settings.begin(self._adapter, group)
 
     def step(self, segments: Sequence[Segment]) -> None:
-        """Its part of an update."""
         fault_point("rank.step")
         self._update.step(segments)
 
@@ -129,7 +125,7 @@ class TrainerRank:
 class Peers:
     """The others, as the first rank sees them: `actors` are handles of `TrainerRank`, of rank 1, 2 …."""
 
-    def __init__(self, actors: Sequence[Any], config: TrainerConfig, timeout_s: float = 120.0) -> None:
+    def __init__(self, actors: Sequence[Any], config: TrainerConfig, timeout_s: float) -> None:
         self._actors, self._config, self._timeout_s = list(actors), config, timeout_s
 
     def begin(self, settings: LearnerSettings) -> BaseUpdate:

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from accerl_lerobot.checkpoint.tensors import part_of, whole
 from accerl_lerobot.policies.adapter import PolicyAdapter
-from accerl_lerobot.trainer.batch import Batch, Part
+from accerl_lerobot.trainer.batch import Batch
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.ranks import ALONE, Ranks
 from accerl_lerobot.trainer.sharding import swapped_in
@@ -42,18 +42,15 @@ class Probe:
         self.renew(0)
 
     def state(self) -> dict[str, Any]:
-        """All that `restore` needs; see `snapshot`."""
         weights = [whole(tensor.detach()).clone() for tensor in self._copy]
         return {"version": self._version, "next": self._next, "weights": weights}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Resume from `state`."""
         self._version, self._next = state["version"], state["next"]
         # There are no weights in the state where there was no copy.
         self._copy = [part_of(t, live) for t, live in zip(state["weights"], self._live, strict=False)]
 
     def renew(self, version: int) -> None:
-        """Takes a copy if it is time for one."""
         config = self._config
         due = config.probe_every and self._version is None and version >= self._next
         if due and version < config.updates:
@@ -66,7 +63,12 @@ class Probe:
             return {}
         rows = np.flatnonzero(batch.version == self._version)
         if len(rows):
-            metrics = self._measure(batch, rows)
+            apart = self._ranks.each(partial(self.apart, batch), rows, self._config.micro_batch)
+            metrics = {
+                "logprob/mismatch_mean": float(apart.abs().mean()),
+                "logprob/mismatch_max": float(apart.abs().max()),
+                "logprob/mismatch_clip": float((apart.expm1().abs() > CLIP).double().mean()),
+            }
         elif np.median(batch.version) > self._version:
             metrics, self._next = {}, 0
         else:
@@ -74,24 +76,12 @@ class Probe:
         self._copy, self._version = [], None
         return metrics
 
-    def _measure(self, batch: Batch, rows: np.ndarray) -> dict[str, float]:
-        apart = self._ranks.each(partial(self._apart, batch), rows, self._config.micro_batch)
-        return {
-            "logprob/mismatch_mean": float(apart.abs().mean()),
-            "logprob/mismatch_max": float(apart.abs().max()),
-            "logprob/mismatch_clip": float((apart.expm1().abs() > CLIP).double().mean()),
-        }
-
     @torch.no_grad()
-    def log_prob(self, part: Part) -> Tensor:
-        """log-probs (B, L) of stored latents under the copy."""
-        with swapped_in(self.adapter, self._live, self._copy):
-            return self.adapter.evaluate(*part).log_prob
-
-    def _apart(self, batch: Batch, rows: np.ndarray) -> Tensor:
-        """Σ log π − Σ log μ of each row, float64."""
+    def apart(self, batch: Batch, rows: np.ndarray) -> Tensor:
+        """Σ log π − Σ log μ of each row, float64, with π of the copy."""
         part = batch.part(rows)
-        difference = self.log_prob(part).cpu() - batch.log_prob[rows]
+        with swapped_in(self.adapter, self._live, self._copy):
+            difference = self.adapter.evaluate(*part).log_prob.cpu() - batch.log_prob[rows]
         factors = self.adapter.factors(part[2])
         if factors is not None:
             difference = difference.masked_fill(~factors.cpu(), 0.0)

@@ -104,7 +104,6 @@ def create(address: str, size: int, timeout_s: float) -> tuple[dist.Store, Rende
 
 
 def join(rendezvous: Rendezvous, size: int, timeout_s: float, **options: bool | int) -> dist.Store:
-    """Connects to a store that another process has opened."""
     timeout = timedelta(seconds=timeout_s)
     return dist.TCPStore(*rendezvous, world_size=size, timeout=timeout, wait_for_workers=False, **options)
 

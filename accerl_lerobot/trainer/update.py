@@ -39,7 +39,7 @@ from accerl_lerobot.trainer.sharding import arrange, synchronise
 def make_update(
     adapter: Any, algorithm: AlgorithmConfig, config: TrainerConfig, ranks: Ranks = ALONE
 ) -> BaseUpdate:
-    """The updates that belong to an algorithm; see `Update` for the arguments."""
+    """The updates that belong to an algorithm; see `RatioUpdate` for the arguments."""
     shared = [ranks] if isinstance(algorithm, RatioConfig) else []
     return imported(algorithm.update)(adapter, algorithm, config, *shared)
 
@@ -81,12 +81,17 @@ class BaseUpdate(ABC):
         # A resumed run with more updates keeps the schedule that it began with, so that rates do not jump.
         return self.config.lr_share(self.version, start=start, updates=self._schedule_updates)
 
-    def skip(self, step: str, loss: float, norm: float) -> None:
-        """Counts a step that was left out because its loss or gradient is not finite.
+    def apply(self, optimizer: torch.optim.Optimizer, step: str, loss: float, norm: float) -> None:
+        """Makes a step, unless its loss or its gradient's norm is not finite; those are counted.
 
         Raises:
             NonFiniteError: `MAX_NONFINITE` of them since the policy's last step.
         """
+        if math.isfinite(loss + norm):
+            optimizer.step()
+            if optimizer is self.optimizer:
+                self._skipped_in_a_row = 0
+            return
         self.skipped += 1
         self._skipped_in_a_row += 1
         if self._skipped_in_a_row >= MAX_NONFINITE:
@@ -96,7 +101,7 @@ class BaseUpdate(ABC):
             )
 
 
-class Update(BaseUpdate):
+class RatioUpdate(BaseUpdate):
     """Updates by a likelihood ratio; of several ranks, each has one, and all make the same steps.
 
     Parameters of the adapter are others afterwards where `ranks` keep parts of them.
@@ -131,11 +136,7 @@ class Update(BaseUpdate):
             float(whole(torch.nn.utils.clip_grad_norm_(parameters, self.config.grad_clip)))
             for parameters in (self._policy, self._value)
         )
-        if math.isfinite(metrics["loss"] + norm + value_norm):
-            self.optimizer.step()
-            self._skipped_in_a_row = 0
-        else:
-            self.skip("an update", metrics["loss"], norm + value_norm)
+        self.apply(self.optimizer, "an update", metrics["loss"], norm + value_norm)
         metrics |= mismatch | lag_metrics(torch.from_numpy(batch.version), self.version)
         self.version += 1
         self._probe.renew(self.version)

@@ -98,7 +98,6 @@ class TrainerWorker:
             return self._handed_over
 
     def _train(self, replay: Any, publisher: WeightPublisher) -> None:
-        """Makes the updates."""
         held = PublishDelay(self._config.hold_back)
         n, config = self._config.batch_decisions, self._config
         upcoming = replay.sample.remote(n, self._update.version)

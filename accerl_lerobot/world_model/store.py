@@ -31,7 +31,7 @@ from accerl_lerobot.checkpoint.safety import (
 )
 from accerl_lerobot.config.parsing import DISCOVER, discover
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.policies.guard import Unfilled, input_error
+from accerl_lerobot.policies.untrusted import Unfilled, input_error
 from accerl_lerobot.world_model.config import LearnableModelConfig
 from accerl_lerobot.world_model.contract import Context, LearnableWorldModel, WorldModelSpec, new_model
 from accerl_lerobot.world_model.success_model import SuccessPairsRewardModel

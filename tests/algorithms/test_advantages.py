@@ -95,12 +95,6 @@ def test_parts_of_different_size_equal_the_whole() -> None:
     assert (got[~mask] == 0).all() and got.dtype == x.dtype
 
 
-def test_normalisation_by_hand() -> None:
-    x, mask = torch.tensor([1.0, 3.0]), torch.ones(2, dtype=torch.bool)
-    assert moments(x, mask).tolist() == [4.0, 10.0, 2.0]
-    torch.testing.assert_close(normalise(x, moments(x, mask), mask), torch.tensor([-1.0, 1.0]))
-
-
 def test_padding_that_is_normalised_may_be_nan() -> None:
     x, mask = torch.tensor([1.0, torch.nan, 3.0]), torch.tensor([True, False, True])
     assert normalise(x, moments(x, mask), mask).tolist()[1] == 0.0

@@ -15,10 +15,8 @@ from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 
 
 def evaluated(env_steps: float, successes: int, n: int) -> dict[str, Any]:
-    from accerl_lerobot.evaluation import wilson_interval
-
-    interval = wilson_interval(successes, n)
-    return {"env_steps": env_steps, "success": successes / n, "n": n, "ci95": [interval.low, interval.high]}
+    ci95 = list(evaluation.Rate(successes=successes, n=n).interval())
+    return {"env_steps": env_steps, "success": successes / n, "n": n, "ci95": ci95}
 
 
 def clip(frames: int, colour: tuple[int, int, int], side: int = 32) -> list[np.ndarray]:

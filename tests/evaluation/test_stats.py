@@ -9,7 +9,7 @@ import math
 import pytest
 from rich.console import Console
 
-from accerl_lerobot.evaluation import FILM, Rate, evaluation_plans, summarise, table, wilson_interval
+from accerl_lerobot.evaluation import FILM, Rate, evaluation_plans, summarise, table
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.seeds import DEMO_SEEDS, EVAL_SEEDS, TRAIN_SEEDS
 
@@ -26,15 +26,15 @@ from accerl_lerobot.seeds import DEMO_SEEDS, EVAL_SEEDS, TRAIN_SEEDS
     ],
 )
 def test_wilson_by_hand(successes: int, n: int, low: float, high: float) -> None:
-    interval = wilson_interval(successes, n)
+    interval = Rate(successes=successes, n=n).interval()
     assert interval.low == pytest.approx(low, abs=2e-6)
     assert interval.high == pytest.approx(high, abs=2e-6)
 
 
 def test_knowing_nothing() -> None:
-    interval = wilson_interval(0, 0)
-    assert (interval.low, interval.high) == (0.0, 1.0)
-    assert math.isnan(Rate(successes=0, n=0).value) and str(Rate(successes=0, n=0)) == "no episodes"
+    nothing = Rate(successes=0, n=0)
+    assert nothing.interval() == (0.0, 1.0)
+    assert math.isnan(nothing.value) and str(nothing) == "no episodes"
 
 
 def result(task: str, seed: int, success: bool, versions: tuple[int, int] = (3, 3)) -> EpisodeResult:

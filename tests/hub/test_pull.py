@@ -209,7 +209,7 @@ def test_huggingface_hub_alone_writes_where_a_header_says(hub: HubServer, policy
     from huggingface_hub.utils._http import default_client_factory
 
     from accerl_lerobot.errors import InputError
-    from accerl_lerobot.policies.guard import fetched_checkpoint
+    from accerl_lerobot.policies.untrusted import fetched_checkpoint
 
     hub.change = changed("/resolve/", lambda answer: answer.headers.update({"ETag": "../../../escaped"}))
     set_client_factory(default_client_factory)

@@ -14,7 +14,6 @@ from torch import Tensor
 
 from accerl_lerobot.policies.config import FlowSamplerConfig
 from accerl_lerobot.policies.flow import FlowFamily, FlowShape
-from accerl_lerobot.testing import stored
 from tests.policies import oracle
 from tests.policies.tiny import adapter_at, requests
 
@@ -100,21 +99,6 @@ def test_not_exploring_is_the_stock_sampler_bit_for_bit(num_steps: int):
     assert not torch.isclose(exploring[:, :2, :2], stock[:, :2, :2]).any()
 
 
-def test_gradient_against_finite_differences():
-    shape = sizes(3)
-    x0, eps = draws(shape, count=3)
-    latent = family(shape).sample(velocity, x0, eps, explore_all(x0)).latent
-
-    def score(rows: Tensor, dims: Tensor, shift: Tensor) -> Tensor:
-        def parametrised(x: Tensor, t: Tensor) -> Tensor:
-            return torch.tanh(rows @ x @ dims + t[:, None, None] * shift) + 0.2 * x
-
-        return family(shape).log_prob(parametrised, latent)
-
-    parameters = [torch.from_numpy(ROW_MIX), torch.from_numpy(DIM_MIX), torch.ones(4, dtype=torch.float64)]
-    assert torch.autograd.gradcheck(score, [p.clone().requires_grad_() for p in parameters], atol=1e-6)
-
-
 @pytest.fixture
 def path(written: Callable[[str], Path]) -> Path:
     return written("smolvla")
@@ -128,14 +112,6 @@ def test_the_executed_noise_has_the_configured_size(path: Path):
     stock = np.stack([d.chunk for d in adapter.decide(requests(200, explore=False), 0)])
     added = (noisy - stock) / 0.5
     assert abs(added.mean()) < 0.02 and added.std() == pytest.approx(0.2, rel=0.06)
-
-
-def test_the_latent_is_as_small_as_re_scoring_allows(path: Path):
-    adapter = adapter_at(path)
-    decision = adapter.decide(requests(1), 0)[0]
-    assert decision.latent["path"].shape == (2, 5, 4)
-    assert decision.log_prob.shape == (3,), "each is one row"
-    assert adapter.factors(stored([decision])[0]) is None, "all of them exist"
 
 
 def test_published_weights_that_do_not_fit_change_nothing(path: Path):

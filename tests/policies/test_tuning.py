@@ -15,12 +15,9 @@ from accerl_lerobot.policies.adapter import LeRobotAdapter, stack_observations
 from accerl_lerobot.policies.config import PolicyConfig, TuningConfig
 from accerl_lerobot.policies.saving import save_pretrained
 from accerl_lerobot.testing import check_ratio_one, log_ratio, perturb, stored
-from accerl_lerobot.transport.codec import encode
-from accerl_lerobot.transport.weights import WeightPublisher, WeightUpdate
 from tests.policies.cases import CASES
 from tests.policies.tiny import adapter_at, requests
 from tests.rounding import assert_close
-from tests.transport.played import played
 
 BACKBONES = {
     "smolvla": "model.vlm_with_expert.vlm.",
@@ -115,21 +112,12 @@ def test_targets_that_do_not_suit_the_policy(
         tuned(written(name), mode="lora", targets=targets)
 
 
-def test_only_what_is_trained_travels_and_is_copied_once(path: Path):
+def test_only_what_is_trained_travels(path: Path):
     trainer, reader, asked = tuned(path, mode="lora", rank=2), tuned(path, mode="lora", rank=2), requests(4)
     views, parameters = trainer.view_trainable(), trainer.trainable()
     trained = {f"policy.{k}" for k, p in trainer.policy.named_parameters() if p.requires_grad}
-    assert {k for k in views if k.startswith("policy.")} == trained
+    assert {k for k in views if k.startswith("policy.")} == trained and views.keys() == parameters.keys()
     assert all(views[k].ctypes.data == p.data_ptr() for k, p in parameters.items()), "their own memory"
-    arrived: list[int] = []
-
-    def apply(update: WeightUpdate) -> None:
-        assert update.tensors.keys() == parameters.keys()
-        arrived.append(encode(update).size)
-        reader.load_trainable(update.tensors)
-
     perturb(trainer, 0.3)
-    WeightPublisher([played(apply)]).publish(1, trainer.view_trainable())
-    assert len(arrived) == 1
-    assert arrived[0] < 256 * len(views) + sum(p.numel() * 4 for p in parameters.values())
+    reader.load_trainable(trainer.view_trainable())
     assert pickle.dumps(reader.decide(asked, 0)) == pickle.dumps(trainer.decide(asked, 0))

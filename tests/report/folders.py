@@ -14,7 +14,7 @@ import yaml
 from accerl_lerobot.algorithms import PPOConfig
 from accerl_lerobot.engine.config import RunConfig, encode
 from accerl_lerobot.envs import MetaWorldConfig, SimulatedConfig
-from accerl_lerobot.evaluation import wilson_interval
+from accerl_lerobot.evaluation import Rate
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.world_model.config import ImaginationConfig
 
@@ -85,8 +85,7 @@ def write_run(
 
 
 def evaluation(group: str, steps: float, successes: int, n: int, tasks: Sequence[str]) -> dict[str, Any]:
-    ends = wilson_interval(successes, n)
-    rate = {"success": successes / n, "n": n, "ci95": [ends.low, ends.high]}
+    rate = {"success": successes / n, "n": n, "ci95": [*Rate(successes=successes, n=n).interval()]}
     return {
         **rate,
         "steps_mean": 10.0,

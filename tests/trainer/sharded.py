@@ -24,7 +24,7 @@ from accerl_lerobot.policies.adapter import Evaluation, PolicyAdapter
 from accerl_lerobot.trainer import ranks
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.ranks import LOOPBACK, Rendezvous, create, join, use_only
-from accerl_lerobot.trainer.update import Update
+from accerl_lerobot.trainer.update import RatioUpdate
 from tests.trainer.linear import STATE, STD, LinearAdapter, make_segments
 
 TIMEOUT_S = 60.0
@@ -109,7 +109,7 @@ def run(case: Case, config: TrainerConfig, group: ranks.Ranks, state: Any = None
         with torch.no_grad():
             for parameter in adapter.trainable().values():
                 parameter.add_(1.0)
-    update = Update(adapter, case.algorithm, config, group)
+    update = RatioUpdate(adapter, case.algorithm, config, group)
     if state is not None:
         adapter.load_trainable(state["weights"])
         update.restore(state["update"])

@@ -3,14 +3,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot.algorithms import ChunkCriticConfig, SelfImitationConfig
+from accerl_lerobot.algorithms import AWRConfig, ChunkCriticConfig, SelfImitationConfig
 from accerl_lerobot.engine.preflight import check_start
 from accerl_lerobot.envs import SimulatedConfig, make_world
 from accerl_lerobot.errors import InputError
@@ -28,7 +30,7 @@ from accerl_lerobot.trainer import chunk_critic
 from accerl_lerobot.trainer.batch import NonFiniteError
 from accerl_lerobot.trainer.chunk_critic import ChunkCriticUpdate
 from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.trainer.off_policy import Memory, OffPolicyUpdate
+from accerl_lerobot.trainer.off_policy import AWRUpdate, Memory, OffPolicyUpdate
 from tests.replay.segments import make_segment
 from tests.runs import tiny_run
 
@@ -222,17 +224,24 @@ def test_imitation_is_flow_matching():
     target = torch.zeros(64, 4, 5)
     target[:, :3, :2] = torch.randn(64, 3, 2)
 
-    class Fake:
-        pass
-
-    model: Any = Fake()
-    model.shape = shape
-    family = FlowFamily(model, FlowSamplerConfig())
+    family = FlowFamily(SimpleNamespace(shape=shape), FlowSamplerConfig())
     for off in (0.0, 1.0):
         velocity = lambda x, t, off=off: (x - target) / t[:, None, None] + off  # noqa: E731
         encoded = Encoded(features=torch.zeros(64, 1, 1), mask=torch.ones(64, 1), context=velocity)
         loss = family.imitation_loss(encoded, target[:, :3, :2])
         torch.testing.assert_close(loss, torch.full((64,), off), atol=1e-3, rtol=1e-3)
+
+
+def imitator(checkpoint: Path, policy_steps: float, **trainer: Any) -> OffPolicyUpdate:
+    adapter = load_adapter(PolicyConfig(path=str(checkpoint), device="cpu"))
+    config = TrainerConfig(warmup_updates=0, value_warmup_updates=0, **trainer)
+    return OffPolicyUpdate(adapter, SelfImitationConfig(policy_steps=policy_steps), config)
+
+
+def tried(rng: np.random.Generator, reward: Callable[[float], float]) -> list[Segment]:
+    """32 episodes of one random chunk; the reward is of its first action."""
+    actions = rng.uniform(-1, 1, (32, 1, 4, 2)).astype(np.float32)
+    return [episode([reward(float(each[0, 0, 0]))], actions=each) for each in actions]
 
 
 def first_action(update: OffPolicyUpdate) -> float:
@@ -254,11 +263,7 @@ def test_teacher_and_policy_go_where_the_critic_leads(tiny_checkpoint: Path, mon
     rng, metrics = np.random.default_rng(0), {}
     before = first_action(update)
     for _ in range(10):
-        segments = []
-        for _ in range(32):
-            actions = rng.uniform(-1, 1, (1, 4, 2)).astype(np.float32)
-            segments.append(episode([(1 + float(actions[0, 0, 0])) / 2], actions=actions))
-        metrics = update.step(segments)
+        metrics = update.step(tried(rng, lambda up: (1 + up) / 2))
         assert bool(update.teacher.ready) == (update.version > 2)
     state = update.tensor("state", np.arange(1))
     taught_action = update.adapter.processing.unnormalise(update.teacher(state).detach())[0, 0, 0]
@@ -267,15 +272,24 @@ def test_teacher_and_policy_go_where_the_critic_leads(tiny_checkpoint: Path, mon
     assert metrics["explained_variance"] > 0.5 and metrics["memory_decisions"] == 10 * 32
 
 
-def test_what_was_learnt_is_restored_to_the_last_bit(tiny_checkpoint: Path):
-    def steps(update: ChunkCriticUpdate, seed: int) -> dict[str, float]:
+def awr(checkpoint: Path) -> OffPolicyUpdate:
+    torch.manual_seed(0)  # of the critic
+    adapter = load_adapter(PolicyConfig(path=str(checkpoint), device="cpu"))
+    config = TrainerConfig(warmup_updates=0, value_warmup_updates=0, lr=1e-3)
+    return AWRUpdate(adapter, AWRConfig(), config)
+
+
+@pytest.mark.parametrize("make", [learner, awr])
+def test_what_was_learnt_is_restored_to_the_last_bit(
+    make: Callable[[Path], OffPolicyUpdate], tiny_checkpoint: Path
+):
+    def steps(update: OffPolicyUpdate, seed: int) -> dict[str, float]:
         torch.manual_seed(seed)
         actions = np.random.default_rng(seed).uniform(-1, 1, (8, 3, 4, 2)).astype(np.float32)
         return update.step([episode([0.0, 0.0, float(a[0, 0, 0] > 0)], actions=a) for a in actions])
 
-    one = learner(tiny_checkpoint)
+    one, other = make(tiny_checkpoint), make(tiny_checkpoint)
     steps(one, 0)
-    other = learner(tiny_checkpoint)
     other.adapter.load_trainable(one.adapter.export_trainable())
     other.restore(one.state())
     assert steps(one, 1) == steps(other, 1)
@@ -287,17 +301,12 @@ def test_what_was_learnt_is_restored_to_the_last_bit(tiny_checkpoint: Path):
 def test_self_imitation_goes_where_successes_are(tiny_checkpoint: Path):
     """Success is a chunk whose first action goes up; half of the chunks do, by chance."""
     torch.manual_seed(0)
-    adapter = load_adapter(PolicyConfig(path=str(tiny_checkpoint), device="cpu"))
-    config = TrainerConfig(warmup_updates=0, value_warmup_updates=0, lr=1e-3)
-    update = OffPolicyUpdate(adapter, SelfImitationConfig(policy_steps=0.5), config)
+    update = imitator(tiny_checkpoint, policy_steps=0.5, lr=1e-3)
     rng = np.random.default_rng(0)
-
     for _ in range(6):
-        segments = []
-        for _ in range(32):
-            actions = rng.uniform(-1, 1, (1, 4, 2)).astype(np.float32)
-            segments.append(episode([float(actions[0, 0, 0] > 0)], actions=actions))
-            del segments[-1].observations[ENVIRONMENT_STATE]
+        segments = tried(rng, lambda up: float(up > 0))
+        for segment in segments:
+            del segment.observations[ENVIRONMENT_STATE]
         metrics = update.step(segments)
         if update.version == 1:
             first, before = metrics["imitation_loss"], first_action(update)
@@ -309,11 +318,9 @@ def test_self_imitation_goes_where_successes_are(tiny_checkpoint: Path):
 
 def test_a_step_imitates_successes_only(tiny_checkpoint: Path):
     """The loss of a step equals the family's, averaged over those rows of its batch that succeeded."""
-    adapter = load_adapter(PolicyConfig(path=str(tiny_checkpoint), device="cpu"))
-    config = TrainerConfig(warmup_updates=0, value_warmup_updates=0, lr=0.0)
-    update = OffPolicyUpdate(adapter, SelfImitationConfig(policy_steps=0.25), config)
-    family = adapter.family
-    family.imitation_loss = lambda encoded, chunk: chunk[:, 0, 0] + 0 * encoded.features.sum((1, 2))
+    update = imitator(tiny_checkpoint, policy_steps=0.25, lr=0.0)
+    adapter = update.adapter
+    adapter.family.imitation_loss = lambda encoded, chunk: chunk[:, 0, 0] + 0 * encoded.features.sum((1, 2))
     segments = []
     for value, reward in ((1.0, 1.0), (3.0, 1.0), (100.0, 0.0), (200.0, 0.0)):
         actions = np.full((1, 4, 2), value, np.float32)
@@ -326,13 +333,11 @@ def test_a_step_imitates_successes_only(tiny_checkpoint: Path):
 def test_less_memory_gives_the_same_step(tiny_checkpoint: Path):
     def step(**options: Any) -> tuple[dict[str, float], dict[str, np.ndarray]]:
         torch.manual_seed(0)
-        adapter = load_adapter(PolicyConfig(path=str(tiny_checkpoint), device="cpu"))
-        adapter.family.imitation_loss = lambda encoded, chunk: encoded.features.square().mean((1, 2))
-        config = TrainerConfig(warmup_updates=0, value_warmup_updates=0, lr=1e-3, **options)
-        update = OffPolicyUpdate(adapter, SelfImitationConfig(policy_steps=0.25), config)
-        segments = [episode([0.0, 0.0, 0.0, 1.0])]
-        segments[0].observations["observation.state"][:, 0] = np.arange(5)
-        return update.step(segments), adapter.export_trainable()
+        update = imitator(tiny_checkpoint, policy_steps=0.25, lr=1e-3, **options)
+        update.adapter.family.imitation_loss = lambda encoded, _: encoded.features.square().mean((1, 2))
+        segment = episode([0.0, 0.0, 0.0, 1.0])
+        segment.observations["observation.state"][:, 0] = np.arange(5)
+        return update.step([segment]), update.adapter.export_trainable()
 
     (metrics, weights), (other, others) = step(), step(micro_batch=50)
     assert other == pytest.approx(metrics, rel=1e-5)

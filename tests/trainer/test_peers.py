@@ -114,11 +114,6 @@ def test_what_all_do_wrong_is_told_as_the_first_one_s(peers: Callable[[str, str]
         raise ArithmeticError("not finite")
 
 
-def test_a_lone_rank_waits_for_nobody():
-    with Peers([], TrainerConfig()).joining("step", ""):
-        pass
-
-
 def test_ranks_talk_over_the_interface_that_has_the_address(monkeypatch: pytest.MonkeyPatch):
     from accerl_lerobot.trainer import ranks as rendezvous
 

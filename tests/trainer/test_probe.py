@@ -18,7 +18,7 @@ from accerl_lerobot.policies.adapter import Evaluation
 from accerl_lerobot.trainer.batch import collate
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.probe import Probe
-from accerl_lerobot.trainer.update import Update
+from accerl_lerobot.trainer.update import RatioUpdate
 from tests.trainer.linear import LinearAdapter, decided_by, make_segments
 
 CONFIG = TrainerConfig(
@@ -28,11 +28,11 @@ NAMES = ["logprob/mismatch_mean", "logprob/mismatch_max", "logprob/mismatch_clip
 LENGTHS = (3, 5, 1, 4)
 
 
-def make_update(config: TrainerConfig = CONFIG) -> Update:
-    return Update(LinearAdapter(), GIPOConfig(), config)
+def make_update(config: TrainerConfig = CONFIG) -> RatioUpdate:
+    return RatioUpdate(LinearAdapter(), GIPOConfig(), config)
 
 
-def fresh(update: Update, seed: int = 0) -> list[Segment]:
+def fresh(update: RatioUpdate, seed: int = 0) -> list[Segment]:
     """Decisions of the weights of now."""
     return decided_by(update.adapter, make_segments(LENGTHS, seed=seed), update.version)
 
@@ -44,7 +44,7 @@ def read(metrics: dict[str, float]) -> list[float] | None:
     return found or None
 
 
-def readings(update: Update, updates: int) -> list[int]:
+def readings(update: RatioUpdate, updates: int) -> list[int]:
     """Updates, counted from 1, at which fresh decisions gave a reading, all of them 0."""
     found = []
     for i in range(updates):
@@ -169,6 +169,6 @@ def test_the_live_weights_are_back_in_their_own_memory(broken: str, monkeypatch:
     if broken == "copy":
         probe._copy.pop()  # the first parameter is swapped, then it fails
     with pytest.raises((MemoryError, ValueError)) if broken != "nothing" else nullcontext():
-        assert not probe.log_prob(batch.part(np.arange(len(batch)))).requires_grad
+        assert not probe.apart(batch, np.arange(len(batch))).requires_grad
     assert all(torch.equal(p, before[k]) for k, p in adapter.trainable().items())
     assert adapter.weight.data_ptr() == place and adapter.weight.grad is None

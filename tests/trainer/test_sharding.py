@@ -22,7 +22,7 @@ from accerl_lerobot.trainer.batch import turns
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.ranks import Ranks
 from accerl_lerobot.trainer.sharding import Watch, arrange
-from accerl_lerobot.trainer.update import Update
+from accerl_lerobot.trainer.update import RatioUpdate
 from tests.rounding import assert_close
 from tests.trainer import sharded
 from tests.trainer.linear import LinearAdapter
@@ -153,12 +153,6 @@ def test_every_row_is_somebodys_and_all_run_equally_often(count: int, size: int,
     assert len(shares[0]) == math.ceil(math.ceil(count / ranks) / size), "no turn more than it takes"
 
 
-def test_a_trainer_alone_gets_what_it_gives():
-    rows = np.arange(5)
-    said = Ranks().each(lambda some: torch.from_numpy(some * 2.0), rows, size=2)
-    assert said.tolist() == [0.0, 2.0, 4.0, 6.0, 8.0]
-
-
 def watch(adapter: LinearAdapter) -> Watch:
     return Watch(adapter, lambda: adapter.evaluate(*adapter.example()))
 
@@ -191,7 +185,7 @@ def test_blocks_that_forget_compute_again_and_learn_the_same():
     for forget in (False, True):
         adapter = sharded.LayeredAdapter()
         config = TrainerConfig(warmup_updates=0, value_warmup_updates=0, activation_checkpointing=forget)
-        update = Update(adapter, GIPOConfig(), config)
+        update = RatioUpdate(adapter, GIPOConfig(), config)
         calls: list[None] = []
         adapter.layers[0].up.register_forward_hook(lambda *_, calls=calls: calls.append(None))
         update.step(sharded.cases()["forgetful"].batches[0])

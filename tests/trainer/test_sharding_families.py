@@ -25,7 +25,7 @@ from accerl_lerobot.policies.saving import copy_weights
 from accerl_lerobot.testing import perturb
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.ranks import Ranks
-from accerl_lerobot.trainer.update import Update
+from accerl_lerobot.trainer.update import RatioUpdate
 from tests.policies.cases import CASES as POLICIES
 from tests.policies.tiny import adapter_at, as_segment
 from tests.rounding import assert_close
@@ -60,7 +60,7 @@ def learn(case: Case, folder: Path, config: TrainerConfig, group: Ranks) -> dict
         torch.manual_seed(0)
         adapter = adapter_at(folder / case.kind / "pretrained_model", **case.options)
         perturb(adapter, 0.02)
-        update = Update(adapter, GIPOConfig(level=case.level), config, group)
+        update = RatioUpdate(adapter, GIPOConfig(level=case.level), config, group)
         metrics = [update.step(batch)]
         gradients = {
             name: torch.zeros(p.shape) if p.grad is None else whole(p.grad).clone()

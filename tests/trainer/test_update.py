@@ -16,7 +16,7 @@ from accerl_lerobot.algorithms import GIPOConfig
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.trainer.batch import MAX_NONFINITE, NonFiniteError, collate
 from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.trainer.update import Update
+from accerl_lerobot.trainer.update import RatioUpdate
 from tests.rounding import assert_close
 from tests.trainer.linear import STATE, LinearAdapter, make_segments
 
@@ -26,8 +26,8 @@ PLAIN = TrainerConfig(
 LENGTHS = (3, 5, 1, 4)
 
 
-def make_update(config: TrainerConfig = PLAIN, seed: int = 0, **algorithm: Any) -> Update:
-    return Update(LinearAdapter(seed), GIPOConfig(**algorithm), config)
+def make_update(config: TrainerConfig = PLAIN, seed: int = 0, **algorithm: Any) -> RatioUpdate:
+    return RatioUpdate(LinearAdapter(seed), GIPOConfig(**algorithm), config)
 
 
 def with_counts(segments: list[Segment]) -> list[Segment]:
@@ -55,7 +55,7 @@ def returns_by_hand(
     return np.asarray(found)
 
 
-def critic_values(update: Update, segments: Sequence[Segment]) -> list[np.ndarray]:
+def critic_values(update: RatioUpdate, segments: Sequence[Segment]) -> list[np.ndarray]:
     return [update.adapter.values(s.observations, [s.task] * (len(s) + 1)).numpy() for s in segments]
 
 
@@ -117,19 +117,6 @@ def test_values_are_recomputed_bootstraps_included(micro_batch: int):
     mine = np.concatenate([v[:-1] for v in now])
     error = np.square(mine - returns_by_hand(segments, now, 0.9, 0.8)).mean()
     assert found["value_loss"] == pytest.approx(error, rel=1e-4)
-
-
-def test_a_cut_is_bootstrapped_and_a_termination_is_not():
-    (segment,) = make_segments((2,))
-    means = {}
-    for name in ("terminated", "cut"):
-        update = make_update(gamma=0.9, lam=1.0)
-        ended = replace(segment, terminated=name == "terminated")
-        last = critic_values(update, [segment])[0][-1]
-        means[name] = update.step([ended])["return_mean"]
-    # λ = 1: the bootstrap enters the last return with γ and the first with γ².
-    assert means["cut"] - means["terminated"] == pytest.approx((0.9 + 0.81) / 2 * last, abs=1e-4)
-    assert abs(last) > 0.1
 
 
 def test_advantages_are_normalised_over_the_batch():

@@ -3,15 +3,8 @@
 
 The action head of OpenVLA-OFT's discrete variant (Kim et al., arXiv 2502.19645) and of AcceRL
 (arXiv 2603.18464) on SmolVLA's backbone: the bins of all action dimensions of a chunk in one parallel pass,
-with a vocabulary of nothing but bins.
-
-Example:
-    ::
-
-        lerobot-train --policy.discover_packages_path=accerl_lerobot.policies.bins_plugin \\
-          --policy.type=smolvla_bins --policy.push_to_hub=false --dataset.repo_id=...
-
-Importing this registers the type.
+with a vocabulary of nothing but bins. Importing this registers the type, in `lerobot-train` by
+``--policy.discover_packages_path=accerl_lerobot.policies.bins_plugin``.
 """
 
 from accerl_lerobot.policies.bins_plugin.configuration_smolvla_bins import SmolVLABinsConfig

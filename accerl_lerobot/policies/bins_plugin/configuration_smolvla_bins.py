@@ -74,7 +74,6 @@ class SmolVLABinsConfig(PreTrainedConfig):
             raise ValueError(f"normalization_mapping.ACTION={mode}: bins need MIN_MAX or QUANTILES")
 
     def validate_features(self) -> None:
-        """Refuses features it cannot read."""
         if not self.image_features:
             raise ValueError("smolvla_bins needs at least one image among its input features")
         if self.action_feature is None:

@@ -28,8 +28,6 @@ from accerl_lerobot.policies.bins_plugin.configuration_smolvla_bins import SmolV
 
 
 class ParallelDecoder(nn.Module):
-    """The network."""
-
     def __init__(self, config: SmolVLABinsConfig) -> None:
         super().__init__()
         # SDPA: the one implementation that takes our mask as it is, on every device.
@@ -99,7 +97,6 @@ class SmolVLABinsPolicy(PreTrainedPolicy):
         self.reset()
 
     def reset(self) -> None:
-        """Forgets the chunk that is being executed."""
         self._queue: deque[Tensor] = deque(maxlen=self.config.n_action_steps)
 
     def get_optim_params(self) -> list[nn.Parameter]:

@@ -71,8 +71,8 @@ def fetched_checkpoint(path: str, revision: str | None, field: str) -> Path:
     return folder
 
 
-def check_checkpoint(folder: Path, origin: Origin, *, fetched: bool = False) -> dict[str, Any]:
-    """Checks all files of a LeRobot checkpoint that are read, before they are; returns its ``config.json``.
+def check_checkpoint(folder: Path, origin: Origin, *, fetched: bool = False) -> None:
+    """Checks all files of a LeRobot checkpoint that are read, before they are.
 
     One that was `fetched` from the Hub must not name folders of this machine.
     """
@@ -90,11 +90,9 @@ def check_checkpoint(folder: Path, origin: Origin, *, fetched: bool = False) -> 
     if safe_join(folder, OURS, origin).exists():
         check_ours(read_json(folder / OURS, origin), origin)
     _check_beside(folder, origin)
-    return config
 
 
 def check_ours(ours: dict[str, Any], origin: Origin) -> None:
-    """Checks the content of ``accerl.json``."""
     for key in ("sampler", "rename_map"):
         if not isinstance(ours.get(key, {}), dict):
             raise origin.refuse(f"{OURS}: {key}", "a mapping is wanted; remove the file to start without it")

@@ -19,9 +19,9 @@ from accerl_lerobot.checkpoint.layout import BACKBONE
 from accerl_lerobot.checkpoint.safety import Origin
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import PolicyConfig
-from accerl_lerobot.policies.guard import Unfilled, check_checkpoint, guarded
 from accerl_lerobot.policies.loading import load_adapter
 from accerl_lerobot.policies.saving import save_pretrained
+from accerl_lerobot.policies.untrusted import Unfilled, check_checkpoint, guarded
 from tests.policies.checkpoints import edit_config, write_act, write_smolvla
 
 PRE = "policy_preprocessor.json"
@@ -51,11 +51,6 @@ def refused(path: Path, why: str) -> None:
     with pytest.raises(InputError, match=f"^policy.path='.*': .*{why}") as caught:
         load_adapter(PolicyConfig(path=str(path), device="cpu"))
     assert "\n" not in str(caught.value)
-
-
-def test_good_ones_pass(good: Path, tiny_checkpoint: Path):
-    for path in (good, tiny_checkpoint):
-        assert check_checkpoint(path, ORIGIN)["type"]
 
 
 def call(marker: Path) -> dict[str, Any]:
@@ -259,9 +254,7 @@ def test_nothing_is_unpickled(tmp_path: Path):
         torch.load(tmp_path / "pytorch_model.bin", weights_only=False)
     assert not marker.exists()
     torch.save({"a": torch.zeros(2)}, tmp_path / "a.pt")
-    assert torch.load(tmp_path / "a.pt", weights_only=True)["a"].shape == (2,), (
-        "the guard is gone with its block"
-    )
+    assert torch.load(tmp_path / "a.pt", weights_only=True)["a"].shape == (2,), "the patch is undone"
 
 
 def test_weights_from_pytorch_itself_are_read_as_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
