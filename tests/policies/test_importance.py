@@ -2,7 +2,7 @@
 """E_μ[ρ f(a)] = E_π[f(a)] for what is executed, on networks small enough to be sampled often.
 
 "ρ = 1 at equal weights" and "E_μ[ρ] = 1" also hold for log-probs that leave out padded dims; this does not.
-`test_tokens` compares probabilities and frequencies of all that a token policy can say.
+`test_tokens` has the same for tokens, by enumeration.
 """
 
 from __future__ import annotations

@@ -29,11 +29,13 @@ class Recurrent(TokenModel):
 
     terminator, length, width = END, LENGTH, WIDTH
 
-    def __init__(self, late: bool = False) -> None:
+    def __init__(self, perturbation: float = 0.0, late: bool = False) -> None:
         draw = torch.Generator().manual_seed(1)
         self.embedding = torch.randn(VOCABULARY, WIDTH, generator=draw)
         self.out = torch.randn(VOCABULARY, WIDTH, generator=draw)
         self.decoder = torch.randn(LENGTH, VOCABULARY, 2, generator=draw)
+        self.out += perturbation * torch.randn(VOCABULARY, WIDTH, generator=draw)
+        self.embedding += perturbation * torch.randn(VOCABULARY, WIDTH, generator=draw)
         self.late, self.calls = late, 0
 
     def encode(self, batch: dict[str, Tensor]) -> Encoded:
@@ -79,9 +81,10 @@ class Parallel(TokenModel):
 
     terminator, length, width = None, LENGTH, WIDTH
 
-    def __init__(self) -> None:
+    def __init__(self, perturbation: float = 0.0) -> None:
         draw = torch.Generator().manual_seed(2)
         self.out = torch.randn(LENGTH, VOCABULARY, WIDTH, generator=draw)
+        self.out += perturbation * torch.randn(LENGTH, VOCABULARY, WIDTH, generator=draw)
 
     def encode(self, batch: dict[str, Tensor]) -> Encoded:
         start = batch["observation"]
@@ -247,6 +250,30 @@ def test_generation_ends_when_all_have_ended():
     action = family(model).act(encoded(model, starts), requests(3))
     assert model.calls == 1 and action.latent["tokens"].tolist() == [[END] * LENGTH] * 3
     assert (action.log_prob[:, 0] > -1e-5).all() and not action.log_prob[:, 1:].any()
+
+
+@pytest.mark.parametrize("kind", MODELS)
+def test_weighted_samples_of_mu_are_samples_of_pi(kind: Any):
+    old, new, start, count = kind(), kind(0.3), observations(1, seed=1), 20_000
+    starts = start.expand(count, -1)
+    action = family(old).act(encoded(old, starts), requests(count))
+    log_prob = family(new).score(encoded(new, starts), action.latent)[0]
+    ratio = (log_prob - action.log_prob).sum(1).exp().double()
+
+    def payoff(chunk: Tensor) -> Tensor:
+        x = chunk.flatten(1).double()
+        return torch.tanh(2 * (x[:, 0] - x[:, -1])) + x[:, 0] ** 2
+
+    def exact(model: Any) -> float:
+        said = sequences(model)
+        each = [math.exp(sum(oracle(model, start[0].double().numpy(), s, 1.0)[0])) for s in said]
+        return float(np.dot(each, payoff(old.chunk(torch.tensor(said)))))
+
+    product = ratio * payoff(action.chunk)
+    error = float(product.std()) / math.sqrt(count)
+    assert abs(exact(old) - exact(new)) > 10 * error, "the weights must matter, or the test shows nothing"
+    assert abs(float(product.mean()) - exact(new)) < 4 * error
+    assert abs(float(ratio.mean()) - 1) < 4 * float(ratio.std()) / math.sqrt(count)
 
 
 def test_impossible_tokens_are_never_drawn_and_spoil_nothing():

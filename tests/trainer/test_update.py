@@ -231,3 +231,16 @@ def test_the_memory_of_advantages_by_hand():
     one, two = (np.asarray(b[0].reward, np.float64) - bias for b in batches)
     expected = [0.5 * one.sum() + two.sum(), 0.5 * (one**2).sum() + (two**2).sum(), 0.5 * 3 + 3]
     assert_close(update._moments, expected)
+
+
+def test_a_cut_is_bootstrapped_and_a_termination_is_not():
+    (segment,) = make_segments((2,))
+    means = {}
+    for name in ("terminated", "cut"):
+        update = make_update(gamma=0.9, lam=1.0)
+        ended = replace(segment, terminated=name == "terminated")
+        last = critic_values(update, [segment])[0][-1]
+        means[name] = update.step([ended])["return_mean"]
+    # λ = 1: the bootstrap enters the last return with γ and the first with γ².
+    assert means["cut"] - means["terminated"] == pytest.approx((0.9 + 0.81) / 2 * last, abs=1e-4)
+    assert abs(last) > 0.1
