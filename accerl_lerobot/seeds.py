@@ -17,8 +17,7 @@ TRAIN_SEEDS = range(1_000_000_000, 2_000_000_000)
 EVAL_SEEDS = range(2_000_000_000, 3_000_000_000)
 
 _WORKERS_PER_RUN = 1_000
-_PRIME = 999_999_937
-"""The largest below 10**9, the size of a range."""
+_PRIME = 999_999_937  # the largest below 10**9, the size of a range
 _EVALUATIONS_PER_RUN = 10_000
 _DECISIONS_PER_EPISODE = 1_000_003
 

@@ -32,10 +32,8 @@ float32, because SmolVLA builds layers that it then drops."""
 CPU_S, CPU_S_PER_BYTE = 15, 1e-7
 """Seconds of processor time, and those for each byte of the files: a decision computes with all weights.
 Processor time, because a busy machine must not refuse a good file."""
-PATIENCE = 20
-"""Times its processor time after which a child is given up, whatever it waits for."""
-LONGEST = 1000
-"""Characters of a child's message."""
+PATIENCE = 20  # times its processor time after which a child is given up, whatever it waits for
+LONGEST = 1000  # characters of a child's message
 NO_MEMORY = (
     "MemoryError",
     "can't allocate",

@@ -32,21 +32,16 @@ PRETRAINED, TRAINING_STATE, WORLD_MODEL = "pretrained_model", "training_state", 
 CHECKPOINTS, DEMOS = "checkpoints", "demos"
 CONFIG, SUMMARY = "config.yaml", "summary.json"
 MANIFEST, LAST = "manifest.json", "last"
-KEEP = 2
-"""Newest checkpoints that can be resumed from; the others keep their policies only."""
+KEEP = 2  # newest checkpoints that can be resumed from; the others keep their policies only
 WRITING, REPLACED = ".writing-", ".replaced-"
 RUN_STATE, WEIGHTS = "run", "weights"
 """Names of states in `TRAINING_STATE`: the progress of the run, and the exact trained weights."""
 STEP = "training_step.json"
-FORMAT = 2
-"""Format of the manifest and the training state; another one is refused."""
+FORMAT = 2  # format of the manifest and the training state; another one is refused
 MANIFEST_MOST = 64 * MIB
-AWAY = "LOCAL"
-"""Replaces the folders above a file of the machine that pushed it."""
-BACKBONE = "backbone"
-"""Folder beside the weights with the vision-language backbone's config and tokenisers."""
-FAST = f"{BACKBONE}/fast"
-"""Folder with the tokeniser of actions, where a policy has one."""
+AWAY = "LOCAL"  # replaces the folders above a file of the machine that pushed it
+BACKBONE = "backbone"  # folder beside the weights with the vision-language backbone's config and tokenisers
+FAST = f"{BACKBONE}/fast"  # folder with the tokeniser of actions, where a policy has one
 CONFIG_FOLDERS = {"vlm_model_name": BACKBONE, "text_tokenizer_name": BACKBONE, "action_tokenizer_name": FAST}
 """Field of a LeRobot policy config that names files → our folder for them."""
 STEP_FOLDERS = {
@@ -274,8 +269,7 @@ def displaced(directory: Path) -> bool:
     return any(not Path(fields[key]).is_dir() for fields, key, _ in _local_names(directory)[2])
 
 
-Place = tuple[dict[str, Any], str, str]
-"""Mapping, its key that may name a folder, and our folder for that."""
+Place = tuple[dict[str, Any], str, str]  # mapping, its key that may name a folder, and our folder for that
 
 
 def _local_names(directory: Path) -> tuple[dict[str, Any], dict[str, Any], list[Place]]:

@@ -23,12 +23,9 @@ from safetensors import SafetensorError, safe_open
 from accerl_lerobot.errors import InputError
 
 MIB = 1024**2
-JSON_MOST = 4 * MIB
-"""Bytes of a JSON file, unless it is one that is known to be larger."""
-READ_MOST = 64 * MIB
-"""Bytes that are read of a safetensors file before it is opened again."""
-PART_MOST, PATH_MOST = 255, 1024
-"""Bytes of one part of a file's name, and of all of it."""
+JSON_MOST = 4 * MIB  # bytes of a JSON file, unless it is one that is known to be larger
+READ_MOST = 64 * MIB  # bytes that are read of a safetensors file before it is opened again
+PART_MOST, PATH_MOST = 255, 1024  # bytes of one part of a file's name, and of all of it
 PICKLES = (".bin", ".pt", ".pth", ".pkl", ".pickle", ".ckpt")
 """Endings of files that PyTorch unpickles, which may run whatever their author wished."""
 REVISION = re.compile(r"[0-9a-f]{40}")

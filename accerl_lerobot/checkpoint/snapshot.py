@@ -23,8 +23,7 @@ from safetensors.numpy import load_file, save_file
 
 from accerl_lerobot.errors import InputError
 
-MARK = "$"
-"""Key of a JSON object that stands for something JSON does not know."""
+MARK = "$"  # key of a JSON object that stands for something JSON does not know
 _KINDS: dict[str, type[Any]] = {}
 
 

@@ -28,8 +28,7 @@ if TYPE_CHECKING:
     from accerl_lerobot.engine.config import RunConfig
 
 OK, WARN, FAIL = "ok", "warn", "FAIL"
-DISK_GIB = 2.0
-"""Space that demonstrations, checkpoints and videos of a run may need."""
+DISK_GIB = 2.0  # space that demonstrations, checkpoints and videos of a run may need
 RENDER_TIMEOUT_S = 120
 USABLE = 0.8
 """Share of a device's memory that an estimate may fill. SmolVLA's backward pass took 1.19 times its estimate
@@ -58,10 +57,8 @@ class Check(NamedTuple):
     """One result."""
 
     name: str
-    status: str
-    """ok, warn or FAIL; only the last makes the exit code 1."""
-    text: str
-    """The finding and, unless it is fine, the remedy."""
+    status: str  # ok, warn or FAIL; only the last makes the exit code 1
+    text: str  # the finding and, unless it is fine, the remedy
 
 
 def main(arguments: list[str]) -> int:

@@ -33,10 +33,8 @@ from accerl_lerobot.rollout.runner import RolloutConfig
 
 SIDECAR = Path("meta") / "accerl_rollouts.json"
 """File of the dataset: its origin, and how many episodes it has."""
-VERSION = "policy_version"
-"""Feature: updates behind the weights that chose the action."""
-TOLERANCE = 1e-4
-"""By how much rewards of a decision may differ, as they are summed in another order."""
+VERSION = "policy_version"  # feature: updates behind the weights that chose the action
+TOLERANCE = 1e-4  # by how much rewards of a decision may differ, as they are summed in another order
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,10 +18,8 @@ from accerl_lerobot.config.ranges import hints_of, range_in_words
 from accerl_lerobot.errors import InputError
 
 WIDTH = 110
-COLUMN = 44
-"""Where explanations begin."""
-PAGE = 60
-"""Lines that are shown at once; what is longer is shown by section."""
+COLUMN = 44  # where explanations begin
+PAGE = 60  # lines that are shown at once; what is longer is shown by section
 COMMON = (
     "output_dir", "job_name", "seed", "resume", "path", "repo_id", "env.type", "env.task", "env.image_size",
     "env.max_steps", "dataset.repo_id", "dataset.root", "demos.episodes", "root", "sft.steps",
@@ -37,13 +35,10 @@ COMMON = (
 class Line(NamedTuple):
     """A field of a config, or the heading of a section."""
 
-    name: str
-    """Dotted."""
-    default: str | None
-    """As one would type it; None: a heading."""
+    name: str  # dotted
+    default: str | None  # as one would type it; None: a heading
     text: str
-    choices: str = ""
-    """Its range."""
+    choices: str = ""  # its range
 
 
 def help_text(command: str, config_class: type[Any], what: str, section: str = "") -> str:

@@ -51,11 +51,9 @@ def discover(package: str | None, section: str = "") -> None:
         raise InputError(field, package, f"cannot be imported ({why})") from error
 
 
-LARGEST_RECIPE = 2**18
-"""Bytes of a recipe at most."""
+LARGEST_RECIPE = 2**18  # bytes of a recipe at most
 RECIPES = "recipes"
-TYPE = "type"
-"""The key that picks one config of several, as in ``env.type``."""
+TYPE = "type"  # the key that picks one config of several, as in ``env.type``
 LONGEST_KEY = 80
 LEROBOT = {
     "steps": "use trainer.updates or sft.steps",

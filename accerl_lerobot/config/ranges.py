@@ -66,10 +66,8 @@ Share = Annotated[float, Range("[0, 1]")]
 Positive = Annotated[float, Range("(0, inf)")]
 NonNegative = Annotated[float, Range("[0, inf)")]
 LearningRate = Annotated[float, Range("(0, 1)")]
-Seed = Annotated[int, Range("[0, 4294967295]")]
-"""A seed that Python, NumPy, torch and all simulators accept."""
-Steps = Annotated[int, Range("[0, 1000000000]")]
-"""A number of steps, updates or episodes that may be 0."""
+Seed = Annotated[int, Range("[0, 4294967295]")]  # a seed that Python, NumPy, torch and all simulators accept
+Steps = Annotated[int, Range("[0, 1000000000]")]  # a number of steps, updates or episodes that may be 0
 Device = Annotated[str, Pattern(r"auto|cpu|cuda(:\d{1,2})?", "auto, cpu, cuda or cuda:0")]
 Threads = Annotated[int, Range("[1, 1024]")]
 NewFolder = Annotated[str, Pattern(r"(?s).+", "the name of a folder to create")]
@@ -78,8 +76,7 @@ Repeats = Annotated[int, Range("[1, 100000]")]
 Commit = Annotated[str, Pattern(r"[0-9a-f]{40}", "the 40 hexadecimal digits of a commit")]
 
 
-LONGEST_TEXT = 4096
-"""Characters of a text; no path is longer."""
+LONGEST_TEXT = 4096  # characters of a text; no path is longer
 
 
 class Section:
@@ -88,8 +85,7 @@ class Section:
     A subclass with a ``__post_init__`` of its own, for what concerns several fields, calls this one first.
     """
 
-    SECTION: ClassVar[str] = ""
-    """Name on the command line, dotted; empty for the config of a whole command."""
+    SECTION: ClassVar[str] = ""  # name on the command line, dotted; empty for the config of a whole command
 
     def __init_subclass__(cls, section: str | None = None, **rest: Any) -> None:
         super().__init_subclass__(**rest)

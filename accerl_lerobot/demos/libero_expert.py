@@ -23,12 +23,9 @@ Script = Generator[np.ndarray, None, bool]
 """Yields actions, float64 (7,); returns True if the movement was completed."""
 
 SUITES = ("libero_object", "libero_spatial", "libero_goal")
-UNSOLVED = "libero_goal/3"
-"""The task without an expert: open the top drawer and put the bowl inside."""
-REACH, TURN = 0.05, 0.5
-"""Movement in m and rad for an action of 1."""
-GRIP_STEPS = 10
-"""Env steps in which the fingers open or close."""
+UNSOLVED = "libero_goal/3"  # the task without an expert: open the top drawer and put the bowl inside
+REACH, TURN = 0.05, 0.5  # movement in m and rad for an action of 1
+GRIP_STEPS = 10  # env steps in which the fingers open or close
 OFFSETS = {
     "basket": (0, 0, -0.055),
     "cook_region": (0, 0, 0.035),
@@ -38,10 +35,8 @@ OFFSETS = {
 """Target of an object's lowest point, relative to the position of the object or region it is placed on."""
 HANDLE = np.array([-0.002, -0.1015, 0.1105])
 """Centre of the handle of the cabinet's middle drawer, in the cabinet's frame."""
-KNOB = 0.038
-"""Height of the grasp above the origin of the stove's knob."""
-PRESS = 0.008
-"""Height of the fingers above a plate's origin while they push it."""
+KNOB = 0.038  # height of the grasp above the origin of the stove's knob
+PRESS = 0.008  # height of the fingers above a plate's origin while they push it
 
 
 class Hand:
@@ -51,8 +46,7 @@ class Hand:
         self.scene, self.simulator, self.rng = scene, scene.simulator, rng
         self.speed = rng.uniform(0.85, 1)
         self.grip = -1.0
-        self.held = np.zeros(3)
-        """Offset of the grasped object from the hand."""
+        self.held = np.zeros(3)  # offset of the grasped object from the hand
         self.turn: Callable[[np.ndarray], np.ndarray] = lambda at: DOWN
         """Maps the hand's position to its wanted orientation (3, 3)."""
 

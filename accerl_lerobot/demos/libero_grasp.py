@@ -14,12 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from accerl_lerobot.envs.libero_simulator import Simulator
 
-WIDEST = 0.068
-"""Widest object that fits between the open fingers with some room, in m."""
-DEPTH = 0.015
-"""Distance of the grip site below an object's top; the palm is 2.4 cm above the grip site."""
-EASY_REACH = 0.72
-"""Distance from the robot's base that a hand pointing straight down reaches easily, in m."""
+WIDEST = 0.068  # widest object that fits between the open fingers with some room, in m
+DEPTH = 0.015  # distance of the grip site below an object's top; the palm is 2.4 cm above the grip site
+EASY_REACH = 0.72  # distance from the robot's base that a hand pointing straight down reaches easily, in m
 DOWN = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
 """Rotation of a hand that points down; its fingers close along the world's y axis."""
 _CORNERS = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
@@ -34,12 +31,9 @@ HAND = np.array([*_FINGERS, *_PALM])
 class Grasp(NamedTuple):
     """Pose of the hand that takes an object."""
 
-    offset: np.ndarray
-    """(3,) of the grip site from the object's position."""
-    yaw: float
-    """Turn of the hand about the vertical."""
-    lean: float
-    """Tilt of the hand toward the robot, which extends its reach."""
+    offset: np.ndarray  # (3,) of the grip site from the object's position
+    yaw: float  # turn of the hand about the vertical
+    lean: float  # tilt of the hand toward the robot, which extends its reach
 
 
 class Scene:

@@ -42,22 +42,19 @@ from accerl_lerobot.errors import InputError, check_absent, expanded
 from accerl_lerobot.experience import ENVIRONMENT_STATE, REWARD, SUCCESS
 from accerl_lerobot.seeds import demo_seed
 
-REPO_ID = "accerl/demos"
-"""Name of a recorded dataset, which is where its folder is."""
+REPO_ID = "accerl/demos"  # name of a recorded dataset, which is where its folder is
 SIDECAR = Path("meta") / "accerl_demos.json"
 """Inside the dataset: the two configs, what came of them, and the versions that decide on the physics."""
 
 _logger = logging.getLogger(__name__)
 _MAX_EPISODES = 10_000
 _MAX_TRIES = 50
-MOST_PROCESSES = 8
-"""Simulators at once, each of some 100 MB; a container may see more cores than it has."""
+MOST_PROCESSES = 8  # simulators at once, each of some 100 MB; a container may see more cores than it has
 _VERSIONS = {name: name for name in ("lerobot", "metaworld", "robosuite", "mujoco", "numpy")}
 _VERSIONS |= {"libero": "hf-libero"}
 """Module → distribution."""
 
-Expert = Callable[[], np.ndarray]
-"""Gives the next action for the state its world is in."""
+Expert = Callable[[], np.ndarray]  # gives the next action for the state its world is in
 
 _DRIFT_MEMORY = 0.9
 _DRIFT_SCALE = 0.5
@@ -68,15 +65,12 @@ _DRIFT_FROM = 60
 class Episode:
     """One recorded episode; every array has one row per env step."""
 
-    observations: dict[str, np.ndarray]
-    """Before each step, under LeRobot's names."""
-    actions: np.ndarray
-    """float32 (T, A), as executed: noise included, clipped to the world's bounds."""
+    observations: dict[str, np.ndarray]  # before each step, under LeRobot's names
+    actions: np.ndarray  # float32 (T, A), as executed: noise included, clipped to the world's bounds
     rewards: np.ndarray
     task: str
     done: bool
-    success_at: int
-    """Index of the first step after which the task was achieved; -1 for never."""
+    success_at: int  # index of the first step after which the task was achieved; -1 for never
     seed: int
 
     @property

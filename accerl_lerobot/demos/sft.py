@@ -32,11 +32,9 @@ from accerl_lerobot.policies.config import discovery, register_policies
 logger = logging.getLogger(__name__)
 
 TRUST = "--trust_remote_code="
-HELD_OUT = re.compile(r"\bstep (\d+): eval_loss=(\S+)")
-"""LeRobot's report of a loss on held-out episodes."""
+HELD_OUT = re.compile(r"\bstep (\d+): eval_loss=(\S+)")  # LeRobot's report of a loss on held-out episodes
 PROGRESS = re.compile(r"\bstep:(\d+\.?\d*)([KM]?) .*\bloss:(nan|inf|\d+\.?\d*)\b")
-CANDIDATES = 10
-"""Checkpoints of which the best on held-out episodes is used."""
+CANDIDATES = 10  # checkpoints of which the best on held-out episodes is used
 REFUSED = "accerl refuses: "
 """Begins the last line of a trainer that met something it must not use; JSON follows."""
 LOG_EVERY, WARMUP_STEPS = 25, 20

@@ -19,10 +19,8 @@ from accerl_lerobot.envs.base import EnvConfig, EpisodeWorld, Step, WorldSpec
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Observation
 
-FPS = 20
-"""Control rate of environments that name none."""
-RENDER = "render"
-"""In `GymConfig.images`: the picture that the environment renders."""
+FPS = 20  # control rate of environments that name none
+RENDER = "render"  # in `GymConfig.images`: the picture that the environment renders
 
 
 @EnvConfig.register_subclass("gym")
@@ -81,8 +79,7 @@ class GymWorld(EpisodeWorld):
         import gymnasium
 
         self.config = config
-        self._pictures: dict[str, np.ndarray] = {}
-        """Images of the last observation, by camera."""
+        self._pictures: dict[str, np.ndarray] = {}  # images of the last observation, by camera
         kwargs = {"render_mode": "rgb_array"} if RENDER in config.images.values() else {}
         try:
             # `unwrapped` leaves out Gymnasium's time limit: ours counts, and it truncates.

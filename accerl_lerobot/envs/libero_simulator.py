@@ -22,13 +22,10 @@ from accerl_lerobot.envs.metaworld import draw_fast, import_mujoco, new_renderer
 from accerl_lerobot.seeds import EVAL_SEEDS
 
 FPS = 20
-SETTLING = 10
-"""Env steps without motion before the first observation, as in LeRobot's own environment."""
-MAX_OBJECTS = 4
-"""Most objects that a task names as those it is about."""
+SETTLING = 10  # env steps without motion before the first observation, as in LeRobot's own environment
+MAX_OBJECTS = 4  # most objects that a task names as those it is about
 MAX_FACES = 2000
-ARENA = "64M"
-"""Memory of a simulation's contacts and constraints; some 6 MB are used."""
+ARENA = "64M"  # memory of a simulation's contacts and constraints; some 6 MB are used
 ROBOT_NUMBERS, OBJECT_NUMBERS = 25, 8
 TIMESTEP = 0.002
 STILL = np.array([0, 0, 0, 0, 0, 0, -1], np.float32)
@@ -37,19 +34,15 @@ STILL = np.array([0, 0, 0, 0, 0, 0, -1], np.float32)
 class Arm(NamedTuple):
     """State that the controller reads, as views of MuJoCo's arrays."""
 
-    jacobian: np.ndarray
-    """(2, 3, V): of the hand's position and rotation."""
+    jacobian: np.ndarray  # (2, 3, V): of the hand's position and rotation
     packed_mass: np.ndarray
-    mass_entries: np.ndarray
-    """int (7, 7): where `packed_mass` has the arm's."""
+    mass_entries: np.ndarray  # int (7, 7): where `packed_mass` has the arm's
     bias: np.ndarray
     qpos: np.ndarray
     qvel: np.ndarray
-    dofs: np.ndarray
-    """int (7,): the arm's, equal for `qpos` and `qvel`, as it comes first."""
+    dofs: np.ndarray  # int (7,): the arm's, equal for `qpos` and `qvel`, as it comes first
     position: np.ndarray
-    rotation: np.ndarray
-    """(3, 3) of the hand."""
+    rotation: np.ndarray  # (3, 3) of the hand
 
 
 class Aim(NamedTuple):
@@ -57,10 +50,8 @@ class Aim(NamedTuple):
 
     position: np.ndarray
     rotation: np.ndarray
-    rest: np.ndarray
-    """(7,) joint positions that are kept where the hand leaves a choice."""
-    gains: np.ndarray
-    """(2, 6): stiffness and damping."""
+    rest: np.ndarray  # (7,) joint positions that are kept where the hand leaves a choice
+    gains: np.ndarray  # (2, 6): stiffness and damping
 
 
 class Simulator:

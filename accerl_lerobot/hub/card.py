@@ -31,8 +31,7 @@ POLICY, WORLD_MODEL, DATASET = "policy", "world model", "dataset"
 
 CONFIG, WEIGHTS, POSTPROCESSOR = "config.json", "model.safetensors", "policy_postprocessor.json"
 INFO, CARD = "meta/info.json", "README.md"
-RECORD = "accerl_pulled.json"
-"""File that a pull adds: the commit that the others are from."""
+RECORD = "accerl_pulled.json"  # file that a pull adds: the commit that the others are from
 NEEDED = {
     POLICY: (CONFIG, WEIGHTS, PREPROCESSOR, POSTPROCESSOR),
     WORLD_MODEL: (CONFIG, WEIGHTS),
@@ -119,10 +118,8 @@ def _hint(folder: Path) -> str:
     return f"no known artifact: {'; '.join(shapes)}"
 
 
-Files = dict[str, Path | bytes]
-"""Name in the repository → a file, or its content."""
-FOLDER = "accerl_run"
-"""Folder in which a policy or world model carries files of its run."""
+Files = dict[str, Path | bytes]  # name in the repository → a file, or its content
+FOLDER = "accerl_run"  # folder in which a policy or world model carries files of its run
 EVALUATION, VALIDATION = "evaluation.json", "validation.json"
 KEPT = {
     POLICY: (RECIPE, SUMMARY, EVALUATION, "success_curve.png", "before_after.mp4"),
@@ -137,12 +134,9 @@ class Provenance:
     """Facts about a folder's run."""
 
     recipe: dict[str, Any] = field(default_factory=dict)
-    summary: dict[str, Any] = field(default_factory=dict)
-    """Summary of a run that ended with this very policy."""
-    evaluation: dict[str, Any] = field(default_factory=dict)
-    """By ``accerl eval``, of this very policy."""
-    validation: dict[str, Any] = field(default_factory=dict)
-    """Validation of the world model."""
+    summary: dict[str, Any] = field(default_factory=dict)  # summary of a run that ended with this very policy
+    evaluation: dict[str, Any] = field(default_factory=dict)  # by ``accerl eval``, of this very policy
+    validation: dict[str, Any] = field(default_factory=dict)  # validation of the world model
     files: Mapping[str, Path] = field(default_factory=dict)
     """Name in the repository → file that goes with the folder."""
 

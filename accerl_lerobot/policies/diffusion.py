@@ -42,18 +42,12 @@ Network = Callable[[Tensor, int], Tensor]
 class Schedule:
     """The steps of LeRobot's scheduler, in the order in which they are taken."""
 
-    timesteps: tuple[int, ...]
-    """N, falling to 0."""
-    alphas: Tensor
-    """(N,) ᾱ at each step, fp32 on the CPU."""
-    following: Tensor
-    """(N,) ᾱ at the step after it; 1 after the last."""
-    scheduler: str
-    """DDPM or DDIM."""
-    prediction: str
-    """Target that the network predicts: epsilon (the noise) or sample (the actions)."""
-    clip: float | None
-    """Bound of x̂, if it is clipped."""
+    timesteps: tuple[int, ...]  # N, falling to 0
+    alphas: Tensor  # (N,) ᾱ at each step, fp32 on the CPU
+    following: Tensor  # (N,) ᾱ at the step after it; 1 after the last
+    scheduler: str  # DDPM or DDIM
+    prediction: str  # target that the network predicts: epsilon (the noise) or sample (the actions)
+    clip: float | None  # bound of x̂, if it is clipped
 
     def __len__(self) -> int:
         return len(self.timesteps)
@@ -90,10 +84,8 @@ class Diffusion(Model):
     `predict_action_chunk` wants a time dimension that its preprocessor does not add; `stock` adds it.
     """
 
-    size: tuple[int, int]
-    """(H, A)."""
-    rows: slice
-    """The executed ones among the H."""
+    size: tuple[int, int]  # (H, A)
+    rows: slice  # the executed ones among the H
     schedule: Schedule
 
     def __init__(self, policy: Any) -> None:

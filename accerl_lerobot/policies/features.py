@@ -24,14 +24,10 @@ RESIZERS = ("resize_imgs_with_padding", "image_resolution", "resize_shape")
 class Features:
     """Inputs and outputs of an environment, a dataset or a policy, by LeRobot's names."""
 
-    shapes: dict[str, tuple[int, ...]]
-    """Name → shape; images are (channels, height, width)."""
-    any_size: bool = False
-    """Images of any height and width fit."""
-    fps: float | None = None
-    """Control rate in Hz; None: not known."""
-    tasks: tuple[str, ...] = ()
-    """Instructions; empty: not known."""
+    shapes: dict[str, tuple[int, ...]]  # name → shape; images are (channels, height, width)
+    any_size: bool = False  # images of any height and width fit
+    fps: float | None = None  # control rate in Hz; None: not known
+    tasks: tuple[str, ...] = ()  # instructions; empty: not known
 
 
 def env_features(spec: WorldSpec) -> Features:

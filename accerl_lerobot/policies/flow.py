@@ -33,16 +33,11 @@ Velocity = Callable[[Tensor, Tensor], Tensor]
 class FlowShape:
     """The sizes a chunk is sampled in."""
 
-    num_steps: int
-    """N denoising steps."""
-    chunk_size: int
-    """K rows the network denoises."""
-    executed: int
-    """Rows that are executed in the environment, ≤ K (LeRobot's n_action_steps)."""
-    padded_dim: int
-    """D, LeRobot's max_action_dim."""
-    action_dim: int
-    """A real dims."""
+    num_steps: int  # N denoising steps
+    chunk_size: int  # K rows the network denoises
+    executed: int  # rows that are executed in the environment, ≤ K (LeRobot's n_action_steps)
+    padded_dim: int  # D, LeRobot's max_action_dim
+    action_dim: int  # A real dims
 
     def executed_part(self, x: Tensor) -> Tensor:
         """The executed entries (B, L, A) of (B, K, D)."""

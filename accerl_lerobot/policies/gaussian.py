@@ -32,11 +32,9 @@ class GaussianModel(Model):
     `Encoded.context` is its chunk, fp32 (B, K, A), and the rows (B, K, W) that the std is computed from.
     """
 
-    executed: int
-    """Rows that are executed in the environment."""
+    executed: int  # rows that are executed in the environment
     action_dim: int
-    row_width: int
-    """W."""
+    row_width: int  # w
 
 
 class StdHead(nn.Module):

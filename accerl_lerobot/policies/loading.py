@@ -60,8 +60,7 @@ class Sizes(NamedTuple):
     trained: int
 
 
-_rehearsed: dict[str, Sizes] = {}
-"""Checkpoints and configs that need no other rehearsal in this process."""
+_rehearsed: dict[str, Sizes] = {}  # checkpoints and configs that need no other rehearsal in this process
 
 
 def resolve_device(name: str, field: str = "policy.device") -> torch.device:

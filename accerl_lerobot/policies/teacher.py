@@ -23,12 +23,9 @@ from accerl_lerobot.policies.config import Load, PolicyConfig
 from accerl_lerobot.seeds import episode_of
 
 WIDTH = 256
-NOISE = 0.25
-"""Standard deviation of its exploration, in normalised action units."""
-TASK_BITS = 16
-"""Numbers of a state that stand for the task."""
-PREFIX = "teacher."
-"""How names of its weights begin among those that are published."""
+NOISE = 0.25  # standard deviation of its exploration, in normalised action units
+TASK_BITS = 16  # numbers of a state that stand for the task
+PREFIX = "teacher."  # how names of its weights begin among those that are published
 
 
 class Ensemble(nn.Module):
@@ -68,8 +65,7 @@ class Teacher(nn.Module):
         """(A,), smallest action that it gives, in normalised units; with `high`, the range that was explored:
         beyond it the critic knows nothing."""
         self.high = nn.Parameter(torch.ones(chunk[1]), requires_grad=False)
-        self.ready = nn.Parameter(torch.zeros(()), requires_grad=False)
-        """1 once it may act."""
+        self.ready = nn.Parameter(torch.zeros(()), requires_grad=False)  # 1 once it may act
 
     def scaled(self, state: Tensor) -> Tensor:
         """States (B, S) in units of what has been seen."""

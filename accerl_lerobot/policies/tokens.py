@@ -29,8 +29,7 @@ from accerl_lerobot.experience import Request
 from accerl_lerobot.policies.config import TokenSamplerConfig
 from accerl_lerobot.policies.family import Action, Encoded, Family, Model
 
-Choose = Callable[[Tensor, int], Tensor]
-"""(logits (B, V), position) → tokens (B,), int64."""
+Choose = Callable[[Tensor, int], Tensor]  # (logits (B, V), position) → tokens (B,), int64
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,10 +51,8 @@ class TokenContext:
 class TokenModel(Model):
     """A LeRobot policy that chooses tokens; `Encoded.context` is a `TokenContext`."""
 
-    terminator: int | None
-    """The token after which the others mean nothing; None: all L always count."""
-    length: int
-    """L, most tokens of a decision. Tokens that reach no executed action have no place among them."""
+    terminator: int | None  # the token after which the others mean nothing; None: all L always count
+    length: int  # L, most tokens of a decision. Tokens that reach no executed action have no place among them
 
     @abstractmethod
     def chunk(self, tokens: Tensor) -> Tensor:

@@ -42,8 +42,7 @@ OURS, VALUE_HEAD, FAMILY = "accerl.json", "value_head.safetensors", "family.safe
 FILES = ("*.json", WEIGHTS, "*processor_step_*.safetensors", VALUE_HEAD, FAMILY, f"{BACKBONE}/*")
 """Files that are fetched of a checkpoint on the Hub."""
 PROCESSORS = (PREPROCESSOR, "policy_postprocessor.json")
-LARGE = 2**16
-"""Numbers of a tensor that is not filled, see `Unfilled`."""
+LARGE = 2**16  # numbers of a tensor that is not filled, see `Unfilled`
 FILLS = frozenset((
     "normal_", "uniform_", "zero_", "fill_", "erfinv_", "trunc_normal_", "constant_", "ones_", "zeros_",
     "kaiming_uniform_", "kaiming_normal_", "xavier_uniform_", "xavier_normal_", "orthogonal_",

@@ -190,12 +190,9 @@ class FastTokenizer:
     JSON is enough, so `data_only` has LeRobot use this class instead.
     """
 
-    bpe_tokenizer: Any
-    """Merges characters into tokens, a `PreTrainedTokenizerFast`."""
-    scale: float
-    """Factor on coefficients before they are rounded."""
-    min_token: int
-    """The coefficient that character 0 stands for."""
+    bpe_tokenizer: Any  # merges characters into tokens, a `PreTrainedTokenizerFast`
+    scale: float  # factor on coefficients before they are rounded
+    min_token: int  # the coefficient that character 0 stands for
     folder: Path
 
     @classmethod

@@ -32,10 +32,8 @@ class Series(NamedTuple):
     name: str
     x: np.ndarray
     y: np.ndarray
-    colour: int = 0
-    """Index into `COLOURS`; from its length on, lines are dashed."""
-    low: np.ndarray | None = None
-    """Lower ends of the band around a line, or of the intervals of points."""
+    colour: int = 0  # index into `COLOURS`; from its length on, lines are dashed
+    low: np.ndarray | None = None  # lower ends of the band around a line, or of the intervals of points
     high: np.ndarray | None = None
     points: bool = False
 

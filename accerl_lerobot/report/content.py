@@ -24,11 +24,9 @@ from accerl_lerobot.timeline import STATES
 from accerl_lerobot.timeline.read import read_timeline
 
 RECENT_S = 120.0
-FEW = 25
-"""Exploring episodes below which their success says nothing; the first to end are the short ones."""
+FEW = 25  # exploring episodes below which their success says nothing; the first to end are the short ones
 STATE_COLOURS = dict(zip(STATES, (0, 7, 1, 3, 2, 6, 5, 4, 4), strict=True))
-MISMATCH = 1e-4
-"""Nats between acting and learning at equal weights that rounding in float32 does not explain."""
+MISMATCH = 1e-4  # nats between acting and learning at equal weights that rounding in float32 does not explain
 STEPS = "env steps of online experience"
 SHARE: dict[str, Any] = {"share": True, "bottom": -0.03, "top": 1.04}
 """Options of a chart of shares, such that points at both ends are whole."""
@@ -46,8 +44,7 @@ WARNINGS = {
 }
 """Counter → what is counted, and what happened; a run in which it is 0 needs no warning."""
 
-LATE = 20
-"""Updates at the end over which `WORRIES` are looked at."""
+LATE = 20  # updates at the end over which `WORRIES` are looked at
 WORRIES: dict[str, tuple[Callable[[float], bool], str]] = {
     "low_weight": (lambda x: x > 0.3, "Many samples hardly counted: too stale, or trainer.lr too high"),
     "explained_variance": (
@@ -57,8 +54,7 @@ WORRIES: dict[str, tuple[Callable[[float], bool], str]] = {
 }
 """Metric → when it points to a problem, and to which."""
 
-Spec = tuple[str, str, dict[str, str], dict[str, Any]]
-"""Title, note, metric → label, and options of a chart."""
+Spec = tuple[str, str, dict[str, str], dict[str, Any]]  # title, note, metric → label, and options of a chart
 LEARNING: tuple[Spec, ...] = (
     ("Policy loss", "The algorithm's own term.", {"policy_loss": "policy loss"}, {}),
     ("Value loss", "Squared error of the critic against the returns.", {"value_loss": "value loss"}, {}),

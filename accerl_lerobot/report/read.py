@@ -145,8 +145,7 @@ def _lines(path: Path) -> tuple[list[Record], bool]:
     return records, len(records) < len(lines)
 
 
-PLACES = ("output_dir", "job_name")
-"""Fields that say where results go, which are never shown as differences."""
+PLACES = ("output_dir", "job_name")  # fields that say where results go, which are never shown as differences
 
 
 def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -31,30 +31,20 @@ from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.off_policy import OffPolicyUpdate, drawn, mean
 
 MEMBERS = 6
-MONTE_CARLO = 0.25
-"""Share of the observed return in the critic's target."""
-BATCH = 256
-"""Rows of one step of critic or teacher."""
-TAU = 0.01
-"""Share of the critic's weights that its slow copy takes over in a step."""
-SMOOTHING = 0.1
-"""Std of the noise on the teacher's chunks within the critic's target, as in TD3."""
+MONTE_CARLO = 0.25  # share of the observed return in the critic's target
+BATCH = 256  # rows of one step of critic or teacher
+TAU = 0.01  # share of the critic's weights that its slow copy takes over in a step
+SMOOTHING = 0.1  # std of the noise on the teacher's chunks within the critic's target, as in TD3
 DISTANCE, IMITATION = 0.3, 0.5
 """Normalised action units in which the teacher's distance from successes is measured, and its weight."""
-PERCEPTION = 0.5
-"""Weight of reading the simulator's state off the policy's features."""
+PERCEPTION = 0.5  # weight of reading the simulator's state off the policy's features
 TEACHER_LR = 3e-4
 READER_LR = 1e-3
-LAST = 50
-"""Exploring episodes that ``teacher_success`` and ``policy_success`` are of."""
-FIRST_STEPS = 2000
-"""Steps in which the teacher learns what was done before it may act."""
-MOST_FIRST = 5000
-"""Most steps of the critic before the teacher's first along it."""
-MARGIN = 0.05
-"""Share of the explored range of actions that the teacher may go beyond it."""
-SMALLEST_SCALE = 0.02
-"""Smallest mean |Q| that Q is divided by."""
+LAST = 50  # exploring episodes that ``teacher_success`` and ``policy_success`` are of
+FIRST_STEPS = 2000  # steps in which the teacher learns what was done before it may act
+MOST_FIRST = 5000  # most steps of the critic before the teacher's first along it
+MARGIN = 0.05  # share of the explored range of actions that the teacher may go beyond it
+SMALLEST_SCALE = 0.02  # smallest mean |Q| that Q is divided by
 
 
 class Critic(nn.Module):

@@ -33,15 +33,11 @@ FLOAT32 = 4
 class PolicyMemory(NamedTuple):
     """Bytes: of a batch whatever its size, and of each decision in it."""
 
-    weights: int
-    """All parameters, in float32 whatever ``policy.precision``."""
-    trained: int
-    """Parameters that are trained, the critic's included."""
-    acting_batch: int
-    """Most at a time while a batch is decided; copies of weights in bf16."""
+    weights: int  # all parameters, in float32 whatever ``policy.precision``
+    trained: int  # parameters that are trained, the critic's included
+    acting_batch: int  # most at a time while a batch is decided; copies of weights in bf16
     acting: int
-    learning_batch: int
-    """A batch that waits for its gradient."""
+    learning_batch: int  # a batch that waits for its gradient
     learning: int
 
     def trainer(self, decisions: int, copies: int = 3) -> int:

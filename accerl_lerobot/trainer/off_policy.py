@@ -27,14 +27,10 @@ from accerl_lerobot.policies.teacher import TASK_BITS, task_code
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.update import BaseUpdate
 
-POLICY_BATCH = 64
-"""Rows of one step of the policy."""
-CAP = 20.0
-"""Largest weight of a decision in AWR, the paper's."""
-FORGET = 0.99
-"""Share of the mean square of R − V that a step keeps."""
-FIRST = 1024
-"""Rows that a column has space for at first; doubled when they are full."""
+POLICY_BATCH = 64  # rows of one step of the policy
+CAP = 20.0  # largest weight of a decision in AWR, the paper's
+FORGET = 0.99  # share of the mean square of R − V that a step keeps
+FIRST = 1024  # rows that a column has space for at first; doubled when they are full
 
 
 class Memory:
@@ -42,8 +38,7 @@ class Memory:
 
     def __init__(self, capacity: int, gamma: float, n_step: int) -> None:
         self.capacity, self.gamma, self.n_step = capacity, gamma, n_step
-        self.total = 0
-        """Rows ever added."""
+        self.total = 0  # rows ever added
         self._columns: dict[str, np.ndarray] = {}
         self.tasks: list[str] = []
 
@@ -115,8 +110,7 @@ class Memory:
 class OffPolicyUpdate(BaseUpdate):
     """Updates for each ``batch_decisions`` of new experience; as it is, imitates successful episodes."""
 
-    n_step = 1
-    """Decisions after which a target bootstraps."""
+    n_step = 1  # decisions after which a target bootstraps
 
     def __init__(self, adapter: LeRobotAdapter, algorithm: OffPolicyConfig, config: TrainerConfig) -> None:
         super().__init__(adapter, config)
@@ -214,8 +208,7 @@ class AWRUpdate(OffPolicyUpdate):
     def __init__(self, adapter: LeRobotAdapter, algorithm: AWRConfig, config: TrainerConfig) -> None:
         super().__init__(adapter, algorithm, config)
         self.algorithm = algorithm
-        self._variance = 0.0
-        """Mean square of R − V, over some hundred steps."""
+        self._variance = 0.0  # mean square of R − V, over some hundred steps
         self.optimizer.add_param_group({"params": self._value, "lr": config.value_lr})
 
     def learn(self, new: int) -> dict[str, float]:

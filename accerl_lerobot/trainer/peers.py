@@ -32,14 +32,11 @@ if TYPE_CHECKING:
     from accerl_lerobot.trainer.ranks import Ranks, Rendezvous
     from accerl_lerobot.trainer.update import BaseUpdate
 
-LOAD_S = 600.0
-"""How long a rank may take to load its policy."""
+LOAD_S = 600.0  # how long a rank may take to load its policy
 SHARE = 0.4
 """Share of ``launch.stall_s`` for which a rank waits for the others, so that the lost one is named first."""
-PATIENCE = 0.9
-"""Share of that after which the first rank has waited for another."""
-BLAME_S = 10.0
-"""How long to wait for the failure that the first rank's own is the consequence of."""
+PATIENCE = 0.9  # share of that after which the first rank has waited for another
+BLAME_S = 10.0  # how long to wait for the failure that the first rank's own is the consequence of
 
 
 class RankError(RuntimeError):
@@ -49,18 +46,13 @@ class RankError(RuntimeError):
 class LearnerSettings(NamedTuple):
     """How each rank makes its policy, and the updates of it."""
 
-    policy: PolicyConfig
-    """The checkpoint to start from."""
+    policy: PolicyConfig  # the checkpoint to start from
     algorithm: AlgorithmConfig
     trainer: TrainerConfig
-    seed: int
-    """Seed of torch's global generator."""
-    state: Path | None = None
-    """The ``training_state`` to resume from; None: begin."""
-    load: Load | None = None
-    """Makes the adapter; None: of LeRobot's checkpoint."""
-    timeout_s: float = 120.0
-    """How long a rank waits for the others within an update."""
+    seed: int  # seed of torch's global generator
+    state: Path | None = None  # the ``training_state`` to resume from; None: begin
+    load: Load | None = None  # makes the adapter; None: of LeRobot's checkpoint
+    timeout_s: float = 120.0  # how long a rank waits for the others within an update
 
     def adapter(self) -> Any:
         import torch

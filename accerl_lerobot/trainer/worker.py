@@ -30,8 +30,7 @@ from accerl_lerobot.trainer.peers import LearnerSettings, Peers
 from accerl_lerobot.transport.endpoint import Endpoint
 from accerl_lerobot.transport.weights import PublishDelay, WeightPublisher
 
-FIRST_S = 120.0
-"""Timeout for the first weights to be published."""
+FIRST_S = 120.0  # timeout for the first weights to be published
 RESEND_S = 0.2
 """Interval at which replicas that were busy get the newest weights while the trainer waits for a batch."""
 
@@ -57,10 +56,8 @@ class TrainerWorker:
         self._kept: Any = None
         self._in_turn = False
         self._publisher: WeightPublisher | None = None
-        self._publishing = threading.Event()
-        """Set once the first weights have been published."""
-        self._handed_over = -1
-        """Version of the weights that were published last."""
+        self._publishing = threading.Event()  # set once the first weights have been published
+        self._handed_over = -1  # version of the weights that were published last
         self._history: deque[dict[str, float]] = deque()  # filled on one thread, emptied on another
         self._clock.enter(WAIT_IN)
 

@@ -77,8 +77,7 @@ class Token(NamedTuple):
     sent: float  # on `time.monotonic`
 
 
-Slot = mmap.mmap
-"""Mapped shared memory, which lasts as long as something refers to it or a view of it."""
+Slot = mmap.mmap  # mapped shared memory, which lasts as long as something refers to it or a view of it
 
 
 def new_slot(size: int) -> tuple[Slot, int]:

@@ -13,14 +13,10 @@ from accerl_lerobot.config.ranges import DatasetConfig, LearningRate, NonNegativ
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.replay.pacing import ReplayConfig
 
-PIXELS = "pixels"
-"""The type of our own class of learned world models."""
-SPACE_TO_DEPTH = 4
-"""Side of the pixel blocks that become channels in its network."""
-IMAGINATION = "imagination"
-"""Name of the worker that imagines, and of its state."""
-WORLD_LEARNING = "world learning"
-"""Name of the worker that trains the world model."""
+PIXELS = "pixels"  # the type of our own class of learned world models
+SPACE_TO_DEPTH = 4  # side of the pixel blocks that become channels in its network
+IMAGINATION = "imagination"  # name of the worker that imagines, and of its state
+WORLD_LEARNING = "world learning"  # name of the worker that trains the world model
 
 
 @dataclass(frozen=True, kw_only=True)

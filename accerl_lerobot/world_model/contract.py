@@ -32,8 +32,7 @@ if TYPE_CHECKING:
     from accerl_lerobot.world_model.config import LearnableModelConfig
     from accerl_lerobot.world_model.data import Windows
 
-State = dict[str, Tensor]
-"""Each (B, ...)."""
+State = dict[str, Tensor]  # each (B, ...)
 
 
 def select_rows(state: State, chosen: Sequence[int] | np.ndarray) -> State:

@@ -37,16 +37,12 @@ from accerl_lerobot.world_model.rollout_eval import replay
 from accerl_lerobot.world_model.success_model import SuccessPairsConfig, SuccessPairsRewardModel
 
 WEIGHT_DECAY, GRAD_CLIP = 1e-2, 1.0
-WARMUP = 50
-"""Steps in which the learning rate of a world model rises."""
-AVERAGE = 0.99
-"""Decay of the moving average of its weights."""
-STATISTICS_WINDOWS = 2048
-"""Windows from which normalisation statistics are taken."""
+WARMUP = 50  # steps in which the learning rate of a world model rises
+AVERAGE = 0.99  # decay of the moving average of its weights
+STATISTICS_WINDOWS = 2048  # windows from which normalisation statistics are taken
 REPLAYED, REFRESH_EVERY = 48, 50
 """Episodes that are replayed at a time for a success model; gradient steps until others are."""
-EASY = 0.1
-"""How often a failure of P(success) = 0 is drawn, beside one of P(success) = 1."""
+EASY = 0.1  # how often a failure of P(success) = 0 is drawn, beside one of P(success) = 1
 
 
 class _Trainer:

@@ -35,21 +35,16 @@ from accerl_lerobot.world_model.store import HELD_OUT, LEARNT
 from accerl_lerobot.world_model.success_model import SuccessPairsRewardModel
 from accerl_lerobot.world_model.validation import fit_uncertainty_scale, validate
 
-BATCH, LEARNING_RATE = 16, 3e-4
-"""Windows per gradient step, and the learning rate after the first steps."""
+BATCH, LEARNING_RATE = 16, 3e-4  # windows per gradient step, and the learning rate after the first steps
 OFFLINE, RECENT, FAILURES = 0.5, 0.7, 0.6
 """Share of windows from the pre-training data; of the others, from the newest quarter of episodes; and of
 those, from failures."""
-MEMORY = 400
-"""Real episodes kept for training."""
+MEMORY = 400  # real episodes kept for training
 MOST_UNFINISHED = 1024
 """Incomplete episodes; of more the oldest are dropped, such as those of a worker that died."""
-FINAL_VALIDATIONS = 5
-"""Validations after the last real episode, at most."""
-MAX_VALIDATION_S = 3600.0
-"""A validation in progress counts as progress of the run for so long, see `launch`."""
-ENDLESS = 10**9
-"""Steps of a learning rate that never falls."""
+FINAL_VALIDATIONS = 5  # validations after the last real episode, at most
+MAX_VALIDATION_S = 3600.0  # a validation in progress counts as progress of the run for so long, see `launch`
+ENDLESS = 10**9  # steps of a learning rate that never falls
 _COUNTS = ("pending_steps", "promoted", "rejected", "result", "_ended", "_since", "_final_validations")
 
 

@@ -33,10 +33,8 @@ from accerl_lerobot.world_model.contract import (
 )
 from accerl_lerobot.world_model.data import Windows
 
-COARSE = 8
-"""Side of the coarse view that the state heads get."""
-HEADS = 3
-"""Size of the ensemble that predicts the robot's state; its disagreement is the uncertainty."""
+COARSE = 8  # side of the coarse view that the state heads get
+HEADS = 3  # size of the ensemble that predicts the robot's state; its disagreement is the uncertainty
 CONDITION, PLANES = 128, 8
 """Width of the conditioning vector that the adaptive norms read; channels of the action planes."""
 

@@ -34,8 +34,7 @@ from accerl_lerobot.world_model.data import Episode
 if TYPE_CHECKING:
     from accerl_lerobot.cli.verbs import WorldModelRun
 
-LOG_EVERY = 20
-"""Steps between two lines of training losses."""
+LOG_EVERY = 20  # steps between two lines of training losses
 METRICS = "metrics.jsonl"
 
 

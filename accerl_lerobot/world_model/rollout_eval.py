@@ -21,12 +21,9 @@ from accerl_lerobot.world_model.contract import WorldModel, context_of, select_r
 from accerl_lerobot.world_model.data import Episode, Windows, WindowStart, cut_windows, hold_last_action
 from accerl_lerobot.world_model.success_model import SuccessPairsRewardModel
 
-BATCH = 64
-"""Rollouts at once."""
-FOLDS = 4
-"""Folds of the episodes, see `outcome_metrics`."""
-DRAWS = 1000
-"""Resamples of an interval."""
+BATCH = 64  # rollouts at once
+FOLDS = 4  # folds of the episodes, see `outcome_metrics`
+DRAWS = 1000  # resamples of an interval
 
 
 class Predictions(NamedTuple):

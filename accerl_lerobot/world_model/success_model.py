@@ -24,10 +24,8 @@ from torch.nn import functional
 from accerl_lerobot.errors import InputError
 
 IMAGES = "observation.image"
-GRID, HIDDEN = 4, 128
-"""Side of the feature map that is flattened, and width of the layer behind it."""
-BATCH = 64
-"""Pairs that are classified at once."""
+GRID, HIDDEN = 4, 128  # side of the feature map that is flattened, and width of the layer behind it
+BATCH = 64  # pairs that are classified at once
 ALONE = 0.25
 """Share of pairs whose first frame is replaced by the second in training, so that the second frame is judged
 and not their distance."""
