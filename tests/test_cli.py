@@ -53,6 +53,7 @@ def test_verb_help_lists_fields_with_their_docstrings(verb: str, capsys: pytest.
         assert "  --trainer.lr=" in out and "--algorithm.clip_low" not in out
         assert "--algorithm.type=gipo" in out and "| ppo" in out
         assert "--help=SECTION" in out and "\n  trainer     How the policy is updated." in out
+        assert "recipes: act_pusht, deploy, few_shot" in out
     assert cli.main([verb, "--help=all"]) == 0
     out = capsys.readouterr().out
     assert out.startswith(f"usage: accerl {verb}") and max(map(len, out.splitlines())) <= 140

@@ -19,7 +19,7 @@ import pytest
 import torch
 from lerobot.configs.policies import PreTrainedConfig
 
-from accerl_lerobot import load_policy
+from accerl_lerobot import cli, load_policy
 from accerl_lerobot.algorithms import AlgorithmConfig
 from accerl_lerobot.config.parsing import parse
 from accerl_lerobot.config.ranges import DatasetConfig
@@ -169,6 +169,13 @@ def test_lerobot_s_trainer_is_told_of_it(checkpoint: Path, tmp_path: Path):
     importlib.import_module(PACKAGE)
     for sft in (SFTConfig(steps=1, policy={"type": POLICY}), SFTConfig(steps=1, init_path=str(checkpoint))):
         assert FLAG in sft_command(sft, DatasetConfig(repo_id="a/b"), tmp_path / "sft", 0, "cpu")
+
+
+def test_help_knows_types_of_a_package_that_is_named(capsys: pytest.CaptureFixture[str]):
+    assert cli.main(["train", "--help=algorithm"]) == 0
+    assert "cispo" not in capsys.readouterr().out
+    assert cli.main(["train", NAMED[0], "--help=algorithm"]) == 0
+    assert "algorithm.type=cispo: Settings of CISPO." in capsys.readouterr().out
 
 
 def test_it_trains_with_its_own_algorithm(checkpoint: Path):

@@ -9,6 +9,7 @@ import logging
 import os
 import signal
 import sys
+import textwrap
 from collections.abc import Callable, Iterator
 
 from accerl_lerobot import __version__
@@ -61,11 +62,17 @@ def show_help(verb: str, rest: list[str], section: str) -> int:
     """``accerl VERB --help``; for bench, of the measurement that is named, or a list of them."""
     from accerl_lerobot.cli.verbs import CONFIGS
     from accerl_lerobot.config.help import brief, help_text
+    from accerl_lerobot.config.parsing import DISCOVER, read_arguments, register_types, shipped_recipes
 
     names = [name for name in CONFIGS if name.split()[0] == verb]
     named = [name for name in names if len(names) == 1 or name.split()[-1] in rest]
     if named:
+        given = read_arguments([argument for argument in rest if f"{DISCOVER}=" in argument])[1]
+        register_types(CONFIGS[named[0]], given)
         text = help_text(f"accerl {named[0]}", CONFIGS[named[0]], VERBS[verb], section)
+        if verb in ("train", "doctor") and not section:
+            recipes = f"recipes: {', '.join(shipped_recipes())}, or a YAML file of your own"
+            text = "\n".join([text, "", *textwrap.wrap(recipes, 100)])
     else:
         lines = [f"  {name.split()[-1]:16} {brief(CONFIGS[name])[:90]}" for name in names]
         usage = [f"usage: accerl {verb} NAME [--field=value …]", "", *lines]

@@ -98,7 +98,7 @@ def parse(config_class: type[Any], arguments: list[str], *, recipe_class: type[A
         # A run's own config is a recipe too, and its folder is taken.
         other = _names(recipe_class) - _names(config_class) | {"output_dir"}
         tree = {key: value for key, value in tree.items() if key not in other}
-    _discover(config_class, given, ())
+    register_types(config_class, given)
     merged = _overridden(config_class, tree, given)
     if from_file := consents(merged, given):
         flags = " ".join(shlex.quote(f"--{name}={_as_text(value)}") for name, value in from_file.items())
@@ -305,14 +305,14 @@ def _overridden(config_class: type[Any], tree: dict[str, Any], given: dict[str, 
     return merged
 
 
-def _discover(cls: type[Any], tree: dict[str, Any], path: tuple[str, ...]) -> None:
+def register_types(cls: type[Any], tree: dict[str, Any], path: tuple[str, ...] = ()) -> None:
     """Imports the packages that register types of what is to be decoded, as LeRobot's parser does."""
     for field in dataclasses.fields(cls):
         value, section = tree.get(field.name), section_of(hints_of(cls)[field.name])
         if field.metadata.get(REGISTERS) and value is not None:
             discover(str(value), ".".join(path))
         elif section is not None and isinstance(value, dict):
-            _discover(section, value, (*path, field.name))
+            register_types(section, value, (*path, field.name))
 
 
 def _merged(tree: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
