@@ -83,7 +83,9 @@ def show_help(verb: str, rest: list[str], section: str) -> int:
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs a verb; returns the exit code."""
-    arguments = sys.argv[1:] if arguments is None else arguments
+    if arguments is None:  # this process is all ours
+        arguments = sys.argv[1:]
+        os.environ.setdefault("ACCERL_ONE_POLICY", "1")  # see `policies.deferred`
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         sys.stdout.write(usage() + "\n")
         return 0

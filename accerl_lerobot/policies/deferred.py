@@ -4,6 +4,9 @@
 ``lerobot.policies`` imports the config of each policy type, and with it that type's whole package: models and
 processors that pull in diffusers and much of transformers, a third of the time in which a process starts.
 Here such a package runs its own code when somebody asks it for something.
+
+Only in processes that are all ours, the command line's and its workers: LeRobot's processors are found by
+names that such code registers, and a user's own code may look for any of them.
 """
 
 from __future__ import annotations
@@ -11,6 +14,7 @@ from __future__ import annotations
 import functools
 import importlib
 import importlib.metadata
+import os
 import sys
 import threading
 from collections.abc import Sequence
@@ -19,6 +23,7 @@ from types import ModuleType
 from typing import Any
 
 PARENT = "lerobot.policies"
+OURS = "ACCERL_ONE_POLICY"  # environment variable of processes that are all ours
 _lock = threading.RLock()
 
 
@@ -65,6 +70,8 @@ class _Finder:
 
 def import_policies(wanted: str | None) -> None:
     """Imports ``lerobot.policies``, and runs the package of one policy type, or of all."""
+    if not os.environ.get(OURS):
+        importlib.import_module(PARENT)
     if PARENT not in sys.modules:
         # transformers and diffusers each ask for all installed distributions, 0.7 s here.
         metadata: Any = importlib.metadata

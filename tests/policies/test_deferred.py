@@ -1,8 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Only the code of the policy type that is wanted is imported, and any other as soon as it is asked for."""
 
+import os
 import subprocess
 import sys
+
+import pytest
+
+from accerl_lerobot.policies.deferred import OURS
 
 CODE = """
 import sys
@@ -22,4 +27,10 @@ assert "lerobot.policies.groot.processor_groot" in sys.modules
 
 
 def test_one_policy_is_imported_without_the_others():
-    subprocess.run([sys.executable, "-c", CODE], check=True, timeout=300)
+    subprocess.run([sys.executable, "-c", CODE], check=True, timeout=300, env=os.environ | {OURS: "1"})
+
+
+def test_whoever_calls_us_has_all_of_lerobot(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.delenv(OURS, raising=False)
+    code = CODE.replace('["smolvla"]', '["smolvla", "act", "groot"]')
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=300)
