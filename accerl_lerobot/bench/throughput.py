@@ -79,7 +79,8 @@ class Measured:
         steps = polls[-1].rollout["env_steps"] - first.rollout["env_steps"]
         total = sum(_seconds(u) for u in updates)
         batches = after["batches"] - before["batches"]
-        requests = after["batches"] * after["batch_size_mean"] - before["batches"] * before["batch_size_mean"]
+        # Rounded, as a mean times its divisor need not be whole.
+        then, now = (round(each["batches"] * each["batch_size_mean"]) for each in (before, after))
         return Block(
             schedule=schedule,
             seconds=total,
@@ -88,7 +89,7 @@ class Measured:
             env_steps_per_s=steps / wall,
             lag_mean=sum(u["lag_mean"] for u in updates) / len(updates),
             trainer_waits=sum(u["wait_s"] for u in updates) / total,
-            batch_size=requests / max(batches, 1.0),
+            batch_size=(now - then) / max(batches, 1.0),
             inference_busy=sum(p.inference["busy_share"] for p in polls) / len(polls),
             processors=psutil.cpu_percent() / 100,
         )
