@@ -77,8 +77,10 @@ def import_policies(wanted: str | None) -> None:
         metadata: Any = importlib.metadata
         metadata.packages_distributions = functools.cache(metadata.packages_distributions)
         sys.meta_path.insert(0, _Finder)
-        importlib.import_module(PARENT)
-        sys.meta_path.remove(_Finder)
+        try:
+            importlib.import_module(PARENT)
+        finally:
+            sys.meta_path.remove(_Finder)
     for name in [name for name in sys.modules if name.rpartition(".")[0] == PARENT]:
         if wanted is None or name == f"{PARENT}.{wanted}":
             run(sys.modules[name])
