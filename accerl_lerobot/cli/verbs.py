@@ -23,7 +23,7 @@ from accerl_lerobot.bench.latency import BenchLatencyConfig
 from accerl_lerobot.bench.policy import BenchPolicyConfig
 from accerl_lerobot.bench.throughput import BenchThroughputConfig
 from accerl_lerobot.bench.world import BenchWorldConfig
-from accerl_lerobot.checkpoint.layout import CONFIG
+from accerl_lerobot.checkpoint.layout import CONFIG, write_atomically
 from accerl_lerobot.cli.export import ExportConfig, export_config, export_episodes
 from accerl_lerobot.config.parsing import read_arguments
 from accerl_lerobot.config.ranges import Device, NewFolder, Section, Seed
@@ -247,7 +247,7 @@ def _in_new_folder[Result](
 
     directory, console = make_output_dir(config), Console()
     console.say(f"run {directory}")
-    (directory / CONFIG).write_text(yaml.safe_dump(encode(config), sort_keys=False))
+    write_atomically(directory / CONFIG, yaml.safe_dump(encode(config), sort_keys=False))
     try:
         with redirect_stdout(sys.stderr), kept_traceback(directory):
             return work(directory, console), directory, console

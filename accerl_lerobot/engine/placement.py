@@ -48,7 +48,7 @@ class Node:
     cpus: float
     gpus: float
     resources: frozenset[str] = frozenset()  # names of its custom resources
-    unseen: str = ""  # A folder of the run that it does not see; empty: it sees all
+    unseen: str = ""  # a folder of the run that it does not see; empty: it sees all
 
     def __str__(self) -> str:
         return f"node {self.number} ({self.name})"
@@ -184,10 +184,10 @@ def _gpu_shares(roles: list[Role], sites: dict[str, list[Node]], config: RunConf
 
 
 def _take_gpu(sites: list[Node], free: dict[int, list[float]], share: float, role: Role) -> Node:
-    """The first node that has room, whose fullest GPU that has it is taken from, as Ray does."""
+    """The first node with enough left, which is taken from its fullest GPU that has it, as Ray does."""
     for node in sites:
         left = free[node.number]
-        if fitting := [i for i, room in enumerate(left) if room >= share - TINY]:
+        if fitting := [i for i, rest in enumerate(left) if rest >= share - TINY]:
             left[min(fitting, key=lambda i: left[i])] -= share
             return node
     remedy = (

@@ -41,7 +41,7 @@ from accerl_lerobot.transport.shared_memory import available
 logger = logging.getLogger(__name__)
 
 START_S = 600.0  # timeout for the start of a worker; `LaunchConfig.stall_s` counts from its first answer
-STEADY_S = 30.0  # A worker that has run for so long starts counting restarts anew
+STEADY_S = 30.0  # a worker that has run for so long starts counting restarts anew
 UNREACHABLE_S = 60.0
 """How long a process on another node may be out of reach before it is restarted, unless its node is found to
 have left, which Ray takes half of that to decide."""

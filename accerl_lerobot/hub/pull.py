@@ -47,7 +47,7 @@ def pull(config: card.PullConfig) -> dict[str, Any]:
         # Named after the commit, so that an interrupted pull resumes and no other one's files are in it.
         temporary = home.parent / f".pulling-{commit[:16]}-{home.name}"
         make_folder(temporary, "output_dir", again=True)
-        _check_room(temporary, sum(file.size for file in files.values()))
+        _check_space(temporary, sum(file.size for file in files.values()))
         # `snapshot_download` would ask for the names again, and these have been checked.
         pool = ThreadPoolExecutor(THREADS)
         options = {"repo_type": repo_type, "revision": commit, "local_dir": temporary}
@@ -100,7 +100,7 @@ def _checked(listed: Iterable[Any], repo_id: str) -> dict[str, RepoFile]:
     return {file.path: file for file in files}
 
 
-def _check_room(temporary: Path, size: int) -> None:
+def _check_space(temporary: Path, size: int) -> None:
     """Refuses what the disk cannot hold, beside what an interrupted pull has fetched of it."""
     fetched = sum(path.stat().st_size for path in temporary.rglob("*") if path.is_file())
     free = shutil.disk_usage(temporary).free + fetched

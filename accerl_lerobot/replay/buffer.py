@@ -275,8 +275,8 @@ class MixedReplay:
 
     @property
     def _waits(self) -> bool:
-        room = self.real.stored_decisions < FILL_SHARE * self.real.config.capacity
-        return self._patient and self.awaited and not self.share and room
+        has_space = self.real.stored_decisions < FILL_SHARE * self.real.config.capacity
+        return self._patient and self.awaited and not self.share and has_space
 
     def _parts(self, batch: int) -> tuple[int, int] | None:
         """Decisions to draw from either store; None if one of them cannot give its part."""
