@@ -64,12 +64,17 @@ def bench_gpu(config: BenchGpuConfig) -> dict[str, Any]:
     resolve_device(config.device, "device")
     console, root = Console(), output_folder(config.output_dir).resolve()
     result: dict[str, Any] = {"config": asdict(config), "host": host(), "policies": {}, "runs": {}}
+
+    def save() -> None:
+        write(root, "gpu", result, as_markdown(COLUMNS, _rows(result)))
+
     measured = BenchPolicyConfig(
         batch=config.batch, repeats=config.repeats, device=config.device, tuning=TuningConfig(mode="expert")
     )
     for precision in ("fp32", "bf16"):
         console.say(f"SmolVLA of its published size, {precision} …")
         result["policies"][precision] = bench_policy(replace(measured, precision=precision))
+        save()
     gpus = torch.cuda.device_count()
     for sharding, ranks in (("ddp", 1), ("zero2", 2)):
         if config.device != "cpu" and ranks > gpus:
@@ -78,7 +83,7 @@ def bench_gpu(config: BenchGpuConfig) -> dict[str, Any]:
         console.say(f"{config.updates} updates of {ranks} rank(s) …")
         ranked = (f"--trainer.ranks={ranks}", f"--trainer.sharding={sharding}")
         result["runs"][sharding] = _run(config, root / sharding, ranked)
-    write(root, "gpu", result, as_markdown(COLUMNS, _rows(result)))
+    save()
     console.say(f"wrote gpu.json and gpu.md into {root}")
     return result
 

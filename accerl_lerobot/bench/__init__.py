@@ -12,7 +12,9 @@ from typing import Any
 
 from rich.table import Table
 
-PACKAGES = ("accerl-lerobot", "lerobot", "torch", "ray", "numpy")
+from accerl_lerobot import __version__
+
+PACKAGES = ("lerobot", "torch", "ray", "numpy")
 
 
 def host() -> dict[str, Any]:
@@ -21,7 +23,7 @@ def host() -> dict[str, Any]:
         "cores": os.cpu_count(),
         "machine": platform.machine(),
         "python": platform.python_version(),
-        "versions": {name: version(name) for name in PACKAGES},
+        "versions": {"accerl-lerobot": __version__} | {name: version(name) for name in PACKAGES},
         "load_1min": os.getloadavg()[0],
     }
 
