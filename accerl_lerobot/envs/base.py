@@ -8,7 +8,9 @@ itself, `terminated` means the task is over (bootstrap 0), `truncated` that only
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
+import json
 import shlex
 from abc import ABC, abstractmethod
 from collections import deque
@@ -302,12 +304,20 @@ def task_code(tasks: Sequence[str], task: str) -> np.ndarray:
 
 def lerobot_eval_arguments(env: Mapping[str, Any]) -> list[str]:
     """``--env.…`` and seed of stock ``lerobot-eval`` for an environment; none if LeRobot cannot have it."""
-    if (kind := env.get("type")) in ("metaworld", "libero"):
-        plugin = {"discover_packages_path": "accerl_lerobot.envs.lerobot_plugin", "type": f"accerl_{kind}"}
-        shared = ("task", "camera", "image_size", "max_steps", "rendering")
-        fields: dict[str, Any] = plugin | {name: env[name] for name in shared if name in env}
-    elif kind == "lerobot":
-        fields = {"type": env.get("name"), **(env.get("kwargs") or {})}
+    kind = env.get("type")
+    if kind == "lerobot":
+        fields: dict[str, Any] = {"type": env.get("name"), **(env.get("kwargs") or {})}
+    elif kind in EnvConfig.get_known_choices():
+        # Only what differs from the defaults, as the run wrote them.
+        owned = dataclasses.fields(EnvConfig.get_choice_class(str(kind)))
+        usual = {own.name: own.default for own in owned if own.default is not dataclasses.MISSING}
+        usual |= {own.name: own.default_factory() for own in owned if callable(own.default_factory)}
+        given = {name: value for name, value in env.items() if value != draccus.encode(usual.get(name))}
+        given.pop("assets", None)  # a folder of this machine
+        plugin = {"discover_packages_path": "accerl_lerobot.envs.lerobot_plugin", "type": "accerl"}
+        fields = plugin | {"world": json.dumps(given)}
+        if package := given.get("discover_packages_path"):
+            fields["world.discover_packages_path"] = package
     else:
         return []
     seed = f"--seed={EVAL_SEEDS.start}"  # the starts of our evaluation of a run with seed 0

@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Both directions: LeRobot's environments as our worlds, our MetaWorld as LeRobot's environment."""
+"""Both directions: LeRobot's environments as our worlds, ours as LeRobot's."""
 
 from __future__ import annotations
+
+import importlib
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from accerl_lerobot.envs import LeRobotEnvConfig, LeRobotWorld, MetaWorldConfig, make_world
+from accerl_lerobot.envs import GymConfig, LeRobotEnvConfig, LeRobotWorld, MetaWorldConfig, make_world
 from accerl_lerobot.errors import InputError
 
 pytest.importorskip("lerobot")
@@ -74,7 +77,7 @@ def plugin():
     load_plugin("accerl_lerobot.envs.lerobot_plugin")
     from lerobot.envs.factory import make_env_config
 
-    return lambda **values: make_env_config("accerl_metaworld", **values)
+    return lambda **values: make_env_config("accerl", world={"type": "metaworld"} | values)
 
 
 def test_stock_lerobot_loads_and_describes_the_plugin(plugin):
@@ -116,6 +119,31 @@ def test_stock_lerobot_sees_our_world(plugin):
     assert vector.envs[0].render().shape == (256, 256, 3)
     vector.close()
     world.close()
+
+
+@pytest.mark.usefixtures("plugin")
+@pytest.mark.parametrize("asynchronous", [False, True])
+def test_stock_lerobot_runs_a_gymnasium_environment(monkeypatch: pytest.MonkeyPatch, asynchronous: bool):
+    from lerobot.envs.factory import make_env, make_env_config
+    from lerobot.envs.utils import NEW_ROLLOUT_OPTION
+
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "packages" / "lerobot_env_reach"))
+    world = {"type": "gym", "id": "reach/Reach-v0", "discover_packages_path": "lerobot_env_reach"}
+    world |= {"images": {"front": "pixels"}, "state": ["agent_pos", "goal"], "max_steps": 5, "fps": 10}
+    with pytest.raises(InputError, match="only the command line .* add --env.world.discover_packages_path="):
+        make_env_config("accerl", world=world | {"discover_packages_path": "somebodys"})
+    importlib.import_module("lerobot_env_reach")
+    settings = make_env_config("accerl", world=world)
+    assert settings.fps == 10 and settings.features["agent_pos"].shape == (4,)
+    vector = make_env(settings, n_envs=2, use_async_envs=asynchronous)["reach/Reach-v0"][0]
+    try:
+        seen, _ = vector.reset(seed=[3, 4], options={NEW_ROLLOUT_OPTION: True})
+        ours = make_world(GymConfig(**{k: v for k, v in world.items() if k != "type"}))
+        assert np.array_equal(seen["agent_pos"][1], ours.reset(4, "reach/Reach-v0")["observation.state"])
+        ends = [vector.step(np.zeros((2, 2), np.float32))[3].all() for _ in range(5)]
+        assert ends == [False] * 4 + [True]
+    finally:
+        vector.close()
 
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"

@@ -76,7 +76,7 @@ def test_commands_in_the_card_are_commands(tmp_path: Path, kind: str):
 def test_stock_lerobot_and_a_plugin_policy(tmp_path: Path):
     run = write_run_folder(tmp_path / "run", type="smolvla_bins", vlm_model_name="org/vlm")
     text = card_of(run / "checkpoints/last/pretrained_model", "policy")
-    assert "lerobot-eval --policy.path=door" in text and "--env.task=door-open-v3" in text
+    assert "lerobot-eval --policy.path=door" in text and '"task": "door-open-v3"' in text
     assert "--policy.discover_packages_path=accerl_lerobot.policies.bins_plugin" in text
     assert "loads it from the Hub as well: `--policy.path=alice/door`" in text
 

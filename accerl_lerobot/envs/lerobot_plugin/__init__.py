@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Our MetaWorld and LIBERO in stock LeRobot: ``lerobot-eval`` and ``lerobot-train`` on the world we train in.
+"""Our environments in stock LeRobot: ``lerobot-eval`` and ``lerobot-train`` on the world we train in.
 
-``--env.discover_packages_path=accerl_lerobot.envs.lerobot_plugin --env.type=accerl_metaworld``. A package and
-not a module, because LeRobot's plugin loader looks for submodules.
+``--env.discover_packages_path=accerl_lerobot.envs.lerobot_plugin --env.type=accerl --env.world='{type: …}'``.
+A package and not a module, because LeRobot's plugin loader looks for submodules.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import functools
+import sys
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -18,10 +18,10 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import freeze_after_episode_end
 
+from accerl_lerobot.config.parsing import DISCOVER, decode, discover
 from accerl_lerobot.envs import EnvConfig as WorldConfig
-from accerl_lerobot.envs import LiberoConfig, MetaWorldConfig, make_world
-from accerl_lerobot.envs.libero_simulator import FPS as LIBERO_FPS
-from accerl_lerobot.envs.metaworld import FPS, ShiftConfig
+from accerl_lerobot.envs import make_world
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Observation
 
 VIDEO_SIZE = 256
@@ -35,9 +35,11 @@ class AccerlEnv(gym.Env):
 
     def __init__(self, config: WorldConfig, task: str) -> None:
         # Builds its simulator at the first reset, in whatever process that is.
+        discover(config.discover_packages_path, "env")
         self._world = make_world(config)
         spec = self._world.spec
-        self.task, self.task_description = task, spec.instructions[spec.tasks.index(task)]
+        self.task = task
+        self.task_description = dict(zip(spec.tasks, spec.instructions, strict=False)).get(task, "")
         self.metadata = self.metadata | {"render_fps": spec.fps}
         self._max_episode_steps = config.max_steps  # LeRobot's rollout asks for it under this name
         images = {_camera(key): gym.spaces.Box(0, 255, size, np.uint8) for key, size in spec.images.items()}
@@ -70,17 +72,24 @@ class AccerlEnv(gym.Env):
         return {"pixels": pixels, "agent_pos": observation["observation.state"]}
 
 
+@dataclass(frozen=True)
+class _Recipe:
+    env: WorldConfig
+
+
+@EnvConfig.register_subclass("accerl")
 @dataclass
 class AccerlEnvConfig(EnvConfig):
-    """The fields that LeRobot needs of any world of ours."""
+    """Any environment of ours, plugins included."""
 
-    world: ClassVar[type[WorldConfig]]
-
+    # The fields of a recipe's `env`; LeRobot's parser could not tell which ones a type has.
+    world: dict[str, Any] = field(default_factory=dict)
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         spec = make_world(self.world_config).spec  # refuses bad values now
+        self.fps = spec.fps
         self.features = {
             "action": PolicyFeature(type=FeatureType.ACTION, shape=(spec.action_dim,)),
             "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(spec.state_dim,)),
@@ -91,14 +100,14 @@ class AccerlEnvConfig(EnvConfig):
             self.features[name] = PolicyFeature(type=FeatureType.VISUAL, shape=size)
             self.features_map[name] = key
 
-    @property
+    @functools.cached_property
     def world_config(self) -> WorldConfig:
-        """The world behind every environment made from this config: its fields that this one has too."""
-        names = {own.name for own in dataclasses.fields(self.world)}
-        given = {name: value for name, value in vars(self).items() if name in names}
-        if "shift" in given:
-            given["shift"] = ShiftConfig(**given["shift"])
-        return self.world(**given)
+        package = self.world.get(DISCOVER)
+        if package and package not in sys.modules:  # LeRobot imports what its command line names
+            remedy = f"only the command line can have code imported: add --env.world.{DISCOVER}={package}"
+            raise InputError(f"env.world.{DISCOVER}", package, remedy)
+        recipe: _Recipe = decode(_Recipe, {"env": self.world})
+        return recipe.env
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
@@ -116,38 +125,6 @@ class AccerlEnvConfig(EnvConfig):
             make = freeze_after_episode_end(functools.partial(AccerlEnv, config, task))
             vectors[task] = {0: kind([make] * n_envs)}
         return vectors
-
-
-@EnvConfig.register_subclass("accerl_metaworld")
-@dataclass
-class AccerlMetaWorldEnvConfig(AccerlEnvConfig):
-    """`MetaWorldConfig` as LeRobot spells configs; see there for the meaning and range of each field."""
-
-    world = MetaWorldConfig
-
-    task: str | None = "drawer-open-v3"
-    fps: int = FPS
-    camera: str = "corner2"
-    image_size: int = 64
-    max_steps: int = 500
-    rendering: Literal["stock", "fast"] = "fast"
-    shift: dict[str, Any] = field(default_factory=dict)
-
-
-@EnvConfig.register_subclass("accerl_libero")
-@dataclass
-class AccerlLiberoEnvConfig(AccerlEnvConfig):
-    """`LiberoConfig` as LeRobot spells configs; see there for the meaning and range of each field."""
-
-    world = LiberoConfig
-
-    task: str | None = "libero_object"
-    fps: int = LIBERO_FPS
-    camera: str = "agentview,robot0_eye_in_hand"
-    image_size: int = 256
-    max_steps: int = 280
-    rendering: Literal["stock", "fast"] = "stock"
-    assets: str = ""
 
 
 def _camera(key: str) -> str:
