@@ -34,9 +34,8 @@ class AccerlEnv(gym.Env):
     render_mode = "rgb_array"
 
     def __init__(self, config: WorldConfig, task: str) -> None:
-        # Builds its simulator at the first reset, in whatever process that is.
         discover(config.discover_packages_path, "env")
-        self._world = make_world(config)
+        self._world = make_world(config)  # its simulator is built at the first reset
         spec = self._world.spec
         self.task = task
         self.task_description = dict(zip(spec.tasks, spec.instructions, strict=False)).get(task, "")
