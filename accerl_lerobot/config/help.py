@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import yaml
 
 from accerl_lerobot.config.parsing import TYPE, choices_of, section_of
-from accerl_lerobot.config.ranges import hints_of, range_in_words
+from accerl_lerobot.config.ranges import default_of, hints_of, range_in_words
 from accerl_lerobot.errors import InputError
 
 WIDTH = 110
@@ -156,11 +156,7 @@ def _in_brief(line: Line) -> str:
 
 
 def _default(field: Any, usual: Any = None) -> Any:
-    if usual is not None:
-        return getattr(usual, field.name)
-    if field.default is not dataclasses.MISSING:
-        return field.default
-    return None if field.default_factory is dataclasses.MISSING else field.default_factory()
+    return default_of(field) if usual is None else getattr(usual, field.name)
 
 
 def _shown(value: Any) -> str:

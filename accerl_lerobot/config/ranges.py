@@ -131,6 +131,13 @@ def _hints_of(cls: Any) -> dict[str, Any]:
     return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
 
 
+def default_of(field: Any) -> Any:
+    """Default of a field of a dataclass; None if it has none."""
+    if field.default is not dataclasses.MISSING:
+        return field.default
+    return None if field.default_factory is dataclasses.MISSING else field.default_factory()
+
+
 def check(hint: Any, value: Any, field: str) -> None:
     """Refuses a value that does not fit an annotation."""
     for text in value if isinstance(value, (list, tuple)) else (value,):

@@ -21,7 +21,7 @@ from typing import Annotated, Any, ClassVar, NamedTuple, Self
 import draccus
 import numpy as np
 
-from accerl_lerobot.config.ranges import Range, Section
+from accerl_lerobot.config.ranges import Range, Section, default_of
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Observation
 from accerl_lerobot.seeds import EVAL_SEEDS
@@ -310,9 +310,8 @@ def lerobot_eval_arguments(env: Mapping[str, Any]) -> list[str]:
     elif kind in EnvConfig.get_known_choices():
         # Only what differs from the defaults, as the run wrote them.
         owned = dataclasses.fields(EnvConfig.get_choice_class(str(kind)))
-        usual = {own.name: own.default for own in owned if own.default is not dataclasses.MISSING}
-        usual |= {own.name: own.default_factory() for own in owned if callable(own.default_factory)}
-        given = {name: value for name, value in env.items() if value != draccus.encode(usual.get(name))}
+        usual = {own.name: draccus.encode(default_of(own)) for own in owned}
+        given = {name: value for name, value in env.items() if value != usual.get(name)}
         given.pop("assets", None)  # a folder of this machine
         plugin = {"discover_packages_path": "accerl_lerobot.envs.lerobot_plugin", "type": "accerl"}
         fields = plugin | {"world": json.dumps(given)}
