@@ -53,7 +53,7 @@ WORKERS = {
     "TOKENIZERS_PARALLELISM": "false",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
 }
-FORWARDED = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE")
+FORWARDED = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE", "ACCERL_ONE_POLICY")
 """Environment variables that workers on other nodes get besides `WORKERS`, where they are set here."""
 PRIVATE = {
     # Ray 2.60 moves a node at 127.0.0.1 to the machine's address and then listens on every interface, unless

@@ -80,10 +80,10 @@ def load_lerobot_config(config: PolicyConfig) -> Any:
     Raises:
         InputError: no checkpoint there, or a policy type without a likelihood here.
     """
-    from lerobot.configs.policies import PreTrainedConfig
-
     folder = _checkpoint_folder(config)
     kind = _registered_type(config, folder)
+    from lerobot.configs.policies import PreTrainedConfig
+
     with _refusing(config, "its config.json is not one of this LeRobot's policies"):
         sampler_config(config, kind, prefix=f"{config.path} is of this type: ")
         lerobot_config = PreTrainedConfig.from_pretrained(folder)
@@ -137,9 +137,10 @@ def load_adapter(config: PolicyConfig, *, rehearsal: bool = False) -> LeRobotAda
     Raises:
         InputError: see `load_lerobot_config` and `LeRobotAdapter.self_check`; or a file did not load.
     """
+    lerobot_config = load_lerobot_config(config)
+    # After the line above, which keeps it from importing the code of all policy types.
     from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 
-    lerobot_config = load_lerobot_config(config)
     folder, origin = _checkpoint_folder(config), Origin("policy.path", config.path)
     model_class: type[Model] = imported(POLICIES[lerobot_config.type][0])
     with (

@@ -4,6 +4,7 @@
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -11,9 +12,10 @@ from accerl_lerobot.policies.deferred import OURS
 
 CODE = """
 import sys
-from accerl_lerobot.policies.config import register_policies
+from accerl_lerobot.policies.config import PolicyConfig, register_policies
+from accerl_lerobot.policies.loading import load_adapter
 
-register_policies("smolvla")
+load_adapter(PolicyConfig(path=sys.argv[1], device="cpu"))  # as trainer and inference begin
 loaded = [n for n in ("smolvla", "act", "groot") if f"lerobot.policies.{n}.processor_{n}" in sys.modules]
 assert loaded == ["smolvla"], loaded
 from lerobot.configs.policies import PreTrainedConfig
@@ -26,11 +28,12 @@ assert "lerobot.policies.groot.processor_groot" in sys.modules
 """
 
 
-def test_one_policy_is_imported_without_the_others():
-    subprocess.run([sys.executable, "-c", CODE], check=True, timeout=300, env=os.environ | {OURS: "1"})
+def test_one_policy_is_imported_without_the_others(tiny_checkpoint: Path):
+    command = [sys.executable, "-c", CODE, str(tiny_checkpoint)]
+    subprocess.run(command, check=True, timeout=300, env=os.environ | {OURS: "1"})
 
 
-def test_whoever_calls_us_has_all_of_lerobot(monkeypatch: pytest.MonkeyPatch):
+def test_whoever_calls_us_has_all_of_lerobot(tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.delenv(OURS, raising=False)
     code = CODE.replace('["smolvla"]', '["smolvla", "act", "groot"]')
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=300)
+    subprocess.run([sys.executable, "-c", code, str(tiny_checkpoint)], check=True, timeout=300)
