@@ -21,7 +21,7 @@ Masks, of ratios that exist, are applied by filling and not by indexing, so noth
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from accerl_lerobot.algorithms.contract import Level, LossInputs, RatioConfig
@@ -99,58 +99,27 @@ def advantage_column(inputs: LossInputs) -> Tensor:
     return inputs.advantage.detach()[:, None]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Samples:
-    """Inputs of the metrics that are no means over micro-batches, such as quantiles, without gradient."""
-
-    log_ratio: Tensor
-    """(N, F), 0 where a ratio does not exist."""
-    weight: Tensor
-    """(N, F), ω."""
-    keep: Tensor
-    """bool (N, F), the ratios that exist."""
-    value: Tensor
-    """(N,), V."""
-    returns: Tensor
-    """(N,), R."""
-    clip: tuple[float, float]
-    """(low, high) of the clip range."""
-
-    def rows(self) -> Tensor:
-        """All of it on the CPU, float64 (N, 3F + 2), for `joined`."""
-        import torch
-
-        narrow = (self.value[:, None], self.returns[:, None])
-        return torch.cat([x.double().cpu() for x in (self.log_ratio, self.weight, self.keep, *narrow)], 1)
-
-    def joined(self, rows: Tensor) -> Samples:
-        """The samples of a whole batch, from the `rows` of its parts in any order, laid end to end."""
-        f = self.log_ratio.shape[1]
-        log_ratio, weight, keep, *narrow = rows.split([f, f, f, 1, 1], dim=1)
-        value, returns = (column[:, 0] for column in narrow)
-        return replace(
-            self, log_ratio=log_ratio, weight=weight, keep=keep.bool(), value=value, returns=returns
-        )
-
-    def metrics(self) -> dict[str, Tensor]:
-        """Scalars, see ``docs/metrics.md``."""
-        keep, rho, (low, high) = self.keep, ratio(self.log_ratio), self.clip
-        weighted = self.weight * rho
-        squares = masked_mean(weighted.square(), keep).clamp(min=TINY)
-        logs = self.log_ratio.masked_fill(~keep, math.nan).flatten()
-        spread = self.returns.var(correction=0)
-        left = (self.returns - self.value).var(correction=0) / spread.clamp(min=VARIANCE_FLOOR)
-        return {
-            "approx_kl": masked_mean(rho - 1.0 - self.log_ratio, keep),
-            "ess": masked_mean(weighted, keep).square() / squares,  # Kish's
-            "low_weight": masked_mean((self.weight < LOW_WEIGHT).float(), keep),
-            "clip_fraction": masked_mean(((rho < 1.0 - low) | (rho > 1.0 + high)).float(), keep),
-            "ratio_max_dev": (rho - 1.0).abs().max(),
-            "log_ratio_p05": logs.nanquantile(0.05),
-            "log_ratio_p50": logs.nanquantile(0.5),
-            "log_ratio_p95": logs.nanquantile(0.95),
-            "explained_variance": (1.0 - left).masked_fill(spread <= VARIANCE_FLOOR, 0.0),
-        }
+def sample_metrics(samples: Tensor, clip: tuple[float, float]) -> dict[str, Tensor]:
+    """Scalars, see ``docs/metrics.md``, of the `LossOutput.samples` of a batch's parts, in any order."""
+    f, (low, high) = (samples.shape[1] - 2) // 3, clip
+    log_ratio, weight, exists, value, returns = samples.split([f, f, f, 1, 1], dim=1)
+    keep, rho = exists.bool(), ratio(log_ratio)
+    weighted = weight * rho
+    squares = masked_mean(weighted.square(), keep).clamp(min=TINY)
+    logs = log_ratio.masked_fill(~keep, math.nan).flatten()
+    spread = returns.var(correction=0)
+    left = (returns - value).var(correction=0) / spread.clamp(min=VARIANCE_FLOOR)
+    return {
+        "approx_kl": masked_mean(rho - 1.0 - log_ratio, keep),
+        "ess": masked_mean(weighted, keep).square() / squares,  # Kish's
+        "low_weight": masked_mean((weight < LOW_WEIGHT).float(), keep),
+        "clip_fraction": masked_mean(((rho < 1.0 - low) | (rho > 1.0 + high)).float(), keep),
+        "ratio_max_dev": (rho - 1.0).abs().max(),
+        "log_ratio_p05": logs.nanquantile(0.05),
+        "log_ratio_p50": logs.nanquantile(0.5),
+        "log_ratio_p95": logs.nanquantile(0.95),
+        "explained_variance": (1.0 - left).masked_fill(spread <= VARIANCE_FLOOR, 0.0),
+    }
 
 
 def lag_metrics(version: Tensor, trainer_version: int) -> dict[str, float]:
@@ -167,13 +136,16 @@ class LossOutput:
     """(), call ``backward`` on it."""
     means: dict[str, Tensor]
     """Means over decisions, scalars without gradient; ``decisions`` is a count."""
-    samples: Samples
-    """Per-decision values behind the metrics that are no means over decisions."""
+    samples: Tensor
+    """float64 (N, 3F + 2) without gradient, for metrics that are no means over decisions, such as quantiles:
+    of each ratio log ρ, ω and 1 if it exists, else 0; V; R."""
+    clip: tuple[float, float]
+    """(low, high) of the clip range."""
 
     @property
     def metrics(self) -> dict[str, Tensor]:
         """Scalars of this batch, still on the device."""
-        return self.means | self.samples.metrics()
+        return self.means | sample_metrics(self.samples, self.clip)
 
 
 def assemble(
@@ -185,11 +157,13 @@ def assemble(
     weight: Tensor,
     clip: tuple[float, float] = USUAL_CLIP,
 ) -> LossOutput:
-    """Adds the shared terms to a policy loss and measures the batch.
+    """Adds the shared terms to a policy loss and measures the batch, with `clip` (low, high).
 
     `log_ratio` (N, F), log π/μ with gradient, is from `at_level`; `weight` (N, F) is how much of each
     sample's gradient the algorithm keeps, ω.
     """
+    import torch
+
     value_loss = (inputs.value - inputs.returns).square().mean()
     mean_entropy = inputs.entropy.mean()
     kl = mean_over_ratios(kl_from_behaviour(log_ratio), inputs, config.level)
@@ -200,13 +174,8 @@ def assemble(
         loss = loss - config.entropy_coef * mean_entropy
     means = {"policy_loss": policy_loss, "value_loss": value_loss, "kl": kl, "entropy": mean_entropy}
     means |= {"loss": loss, "decisions": loss.new_tensor(float(len(inputs.value)))}
-    everything = log_ratio.new_ones(log_ratio.shape).bool()
-    samples = Samples(
-        log_ratio=log_ratio.detach(),
-        weight=weight.detach(),
-        keep=everything if inputs.factors is None else present(inputs.factors, config.level),
-        value=inputs.value.detach(),
-        returns=inputs.returns,
-        clip=clip,
-    )
-    return LossOutput(loss=loss, means={k: v.detach() for k, v in means.items()}, samples=samples)
+    exists = torch.ones_like(log_ratio) if inputs.factors is None else present(inputs.factors, config.level)
+    columns = (log_ratio, weight, exists, inputs.value[:, None], inputs.returns[:, None])
+    samples = torch.cat([column.detach().double() for column in columns], 1)
+    means = {name: mean.detach() for name, mean in means.items()}
+    return LossOutput(loss=loss, means=means, samples=samples, clip=clip)
