@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from lerobot.configs import NormalizationMode, PreTrainedConfig
-from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
+from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
 
 PACKAGE = "accerl_lerobot.policies.bins_plugin"
 
@@ -79,31 +79,11 @@ class SmolVLABinsConfig(PreTrainedConfig):
         if self.action_feature is None:
             raise ValueError("smolvla_bins needs an action among its output features")
 
-    def get_optimizer_preset(self) -> AdamWConfig:
-        return AdamWConfig(
-            lr=self.optimizer_lr,
-            betas=self.optimizer_betas,
-            eps=self.optimizer_eps,
-            weight_decay=self.optimizer_weight_decay,
-            grad_clip_norm=self.optimizer_grad_clip_norm,
-        )
-
-    def get_scheduler_preset(self) -> CosineDecayWithWarmupSchedulerConfig:
-        return CosineDecayWithWarmupSchedulerConfig(
-            peak_lr=self.optimizer_lr,
-            decay_lr=self.scheduler_decay_lr,
-            num_warmup_steps=self.scheduler_warmup_steps,
-            num_decay_steps=self.scheduler_decay_steps,
-        )
+    get_optimizer_preset = SmolVLAConfig.get_optimizer_preset
+    get_scheduler_preset = SmolVLAConfig.get_scheduler_preset
+    action_delta_indices = SmolVLAConfig.action_delta_indices
+    reward_delta_indices = SmolVLAConfig.reward_delta_indices
 
     @property
     def observation_delta_indices(self) -> None:
-        return None
-
-    @property
-    def action_delta_indices(self) -> list[int]:
-        return list(range(self.chunk_size))
-
-    @property
-    def reward_delta_indices(self) -> None:
         return None
