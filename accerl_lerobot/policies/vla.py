@@ -262,6 +262,7 @@ class Pi0Fast(TokenModel):
             remedy = f"LeRobot decodes so many rows from the coefficients of {rows}; use all of them"
             raise InputError("policy.n_action_steps", config.n_action_steps, remedy)
         config.validate_action_token_prefix = False
+        logging.root.addFilter(_decodable)
         self.policy = policy
         self.length = config.max_decoding_steps
         self.terminator = tokenizer.convert_tokens_to_ids(END)
@@ -311,12 +312,7 @@ class Pi0Fast(TokenModel):
 
     def chunk(self, tokens: Tensor) -> Tensor:
         rows, dims = self.policy.config.n_action_steps, self.policy.config.action_feature.shape[0]
-        with _undecodable_quietly():
-            return self.policy.detokenize_actions(tokens, action_horizon=rows, action_dim=dims)
-
-    def stock(self, batch: dict[str, Tensor], **noise: Tensor) -> Tensor:
-        with _undecodable_quietly():
-            return super().stock(batch, **noise)
+        return self.policy.detokenize_actions(tokens, action_horizon=rows, action_dim=dims)
 
     def stock_tokens(self, batch: dict[str, Tensor]) -> Tensor:
         return self.policy.model.sample_actions_fast_kv_cache(
@@ -327,15 +323,6 @@ class Pi0Fast(TokenModel):
         )
 
 
-def _passes(record: logging.LogRecord) -> bool:
+def _decodable(record: logging.LogRecord) -> bool:
+    """False for both lines that LeRobot logs of a sequence that it cannot decode: exploring draws many."""
     return not str(record.msg).startswith(("Error decoding tokens", "Tokens: "))
-
-
-@contextlib.contextmanager
-def _undecodable_quietly() -> Iterator[None]:
-    """LeRobot logs two lines for each sequence that it cannot decode, and exploring draws many."""
-    logging.root.addFilter(_passes)
-    try:
-        yield
-    finally:
-        logging.root.removeFilter(_passes)
