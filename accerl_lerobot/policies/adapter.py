@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -147,14 +148,14 @@ def stack_observations(requests: Sequence[Request]) -> tuple[dict[str, np.ndarra
     return arrays, [str(r.observation[TASK]) for r in requests]
 
 
+@dataclass
 class Processing:
     """LeRobot's pre- and post-processor, which tokenise and normalise, fed with raw observations."""
 
-    def __init__(
-        self, preprocessor: Any, postprocessor: Any, device: torch.device, rename_map: dict[str, str]
-    ) -> None:
-        self.preprocessor, self.postprocessor = preprocessor, postprocessor
-        self.device, self.rename_map = device, rename_map
+    preprocessor: Any
+    postprocessor: Any
+    device: torch.device
+    rename_map: dict[str, str]
 
     def prepare(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> dict[str, Tensor]:
         """Normalises and tokenises. Images go from uint8 (..., H, W, 3) to float (..., 3, H, W) in [0, 1]."""
