@@ -31,6 +31,7 @@ from accerl_lerobot.trainer.batch import NonFiniteError
 from accerl_lerobot.trainer.chunk_critic import ChunkCriticUpdate
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.off_policy import AWRUpdate, Memory, OffPolicyUpdate
+from accerl_lerobot.trainer.update import make_update
 from tests.replay.segments import make_segment
 from tests.runs import tiny_run
 
@@ -272,11 +273,13 @@ def test_teacher_and_policy_go_where_the_critic_leads(tiny_checkpoint: Path, mon
     assert metrics["explained_variance"] > 0.5 and metrics["memory_decisions"] == 10 * 32
 
 
-def awr(checkpoint: Path) -> OffPolicyUpdate:
+def awr(checkpoint: Path, algorithm: AWRConfig | None = None, **trainer: Any) -> AWRUpdate:
     torch.manual_seed(0)  # of the critic
     adapter = load_adapter(PolicyConfig(path=str(checkpoint), device="cpu"))
-    config = TrainerConfig(warmup_updates=0, value_warmup_updates=0, lr=1e-3)
-    return AWRUpdate(adapter, AWRConfig(), config)
+    config = TrainerConfig(**{"warmup_updates": 0, "value_warmup_updates": 0, "lr": 1e-3} | trainer)
+    update = make_update(adapter, algorithm or AWRConfig(), config)
+    assert isinstance(update, AWRUpdate)
+    return update
 
 
 @pytest.mark.parametrize("make", [learner, awr])
