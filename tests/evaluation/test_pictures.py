@@ -27,15 +27,12 @@ def read(path: Path) -> np.ndarray:
     return np.stack([np.asarray(frame) for frame in imageio.get_reader(path)])
 
 
-class TestSuccessCurve:
-    """PNG."""
-
-    def test_draws(self, tmp_path: Path) -> None:
-        path = tmp_path / "curve.png"
-        success_curve(path, [evaluated(0, 30, 100), evaluated(5000, 95, 100)], [(100, 0.3), (4000, 0.9)])
-        image = np.asarray(imageio.imread(path))
-        assert image.shape[:2] == (480, 840)
-        assert len(np.unique(image[..., :3].reshape(-1, 3), axis=0)) > 20
+def test_the_curve_is_drawn(tmp_path: Path) -> None:
+    path = tmp_path / "curve.png"
+    success_curve(path, [evaluated(0, 30, 100), evaluated(5000, 95, 100)], [(100, 0.3), (4000, 0.9)])
+    image = np.asarray(imageio.imread(path))
+    assert image.shape[:2] == (480, 840)
+    assert len(np.unique(image[..., :3].reshape(-1, 3), axis=0)) > 20
 
 
 class TestVideo:
