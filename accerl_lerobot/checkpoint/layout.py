@@ -118,8 +118,7 @@ def go_back_to(checkpoint: Path) -> None:
 
 def has_checkpoint(checkpoints: Path) -> bool:
     """True if there is a checkpoint, broken or not."""
-    if checkpoints.is_dir():
-        _tidy(checkpoints)
+    _tidy(checkpoints)
     return bool(_numbered(checkpoints))
 
 

@@ -29,12 +29,9 @@ from accerl_lerobot.policies.teacher import PREFIX, Teacher
 
 HIDDEN = 128
 OBS_STATE = "observation.state"
-IMAGES = "observation.image"
-"""How images' names begin: ``observation.images.<camera>``, or LeRobot's name for a lone camera."""
-CONSTANT = 1e-6
-"""Environment units in one normalised unit, below which an action counts as constant."""
-SELF_CHECK_TOLERANCE = 1e-5
-"""Largest difference, in normalised action units, between our sampler and LeRobot's; fp32 noise is 1e-6."""
+IMAGES = "observation.image"  # begins ``observation.images.<camera>``; LeRobot's name for a lone camera
+CONSTANT = 1e-6  # environment units in one normalised unit, below which an action counts as constant
+SELF_CHECK_TOLERANCE = 1e-5  # between our sampler and LeRobot's, in normalised actions; fp32 noise is 1e-6
 
 
 class ValueHead(nn.Module):
@@ -67,12 +64,9 @@ class ValueHead(nn.Module):
 class Evaluation(NamedTuple):
     """A batch of stored decisions under the current weights."""
 
-    log_prob: Tensor
-    """(B, L), same factors as `Decision.log_prob`."""
-    entropy: Tensor
-    """(B,)."""
-    value: Tensor
-    """(B,), V of the observations."""
+    log_prob: Tensor  # (B, L), same factors as `Decision.log_prob`
+    entropy: Tensor  # (B,)
+    value: Tensor  # (B,), V of the observations
 
 
 class PolicyAdapter(nn.Module, ABC):

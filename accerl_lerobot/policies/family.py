@@ -29,23 +29,18 @@ from accerl_lerobot.experience import Request
 class Encoded:
     """A batch of B observations, read once by the network."""
 
-    features: Tensor
-    """(B, P, width), what the critic reads."""
-    mask: Tensor
-    """bool (B, P), True where a feature is of something real."""
-    context: Any
-    """Input that the family samples from; each family's model defines it."""
+    features: Tensor  # (B, P, width), what the critic reads
+    mask: Tensor  # bool (B, P), True where a feature is of something real
+    context: Any  # input that the family samples from; each family's model defines it
 
 
 class Action(NamedTuple):
     """A family's decisions for a batch."""
 
-    chunk: Tensor
-    """(B, K, A), K executed actions in the policy's normalised units."""
+    chunk: Tensor  # (B, K, A), K executed actions in the policy's normalised units
     latent: dict[str, Tensor]
     """Each (B, ...): what was sampled, all that `Family.score` needs beside the observations."""
-    log_prob: Tensor
-    """(B, L); zero where not exploring."""
+    log_prob: Tensor  # (B, L); zero where not exploring
 
 
 class Model(ABC):
@@ -63,8 +58,7 @@ class Model(ABC):
     policy: Any
     idle: tuple[str, ...] = ()
     """Prefixes of the parameters that no action depends on; never trained, nor published."""
-    width: int
-    """Width of the features."""
+    width: int  # width of the features
 
     @staticmethod
     def loading() -> AbstractContextManager[None]:

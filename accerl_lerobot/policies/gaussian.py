@@ -113,18 +113,12 @@ class ACT(GaussianModel):
             inputs[OBS_IMAGES] = [batch[key] for key in self.policy.config.image_features]
         seen: dict[str, Tensor] = {}
 
-        def encoder_done(module: nn.Module, arguments: Any, output: Tensor) -> None:
-            seen["features"] = output.transpose(0, 1)
-
-        def head_starts(module: nn.Module, arguments: tuple[Tensor]) -> None:
-            seen["rows"] = arguments[0]
-
         with (
-            model.encoder.register_forward_hook(encoder_done),
-            model.action_head.register_forward_pre_hook(head_starts),
+            model.encoder.register_forward_hook(lambda module, given, made: seen.update(features=made)),
+            model.action_head.register_forward_pre_hook(lambda module, given: seen.update(rows=given[0])),
         ):
             mean, _ = model(inputs)
-        features = seen["features"]
+        features = seen["features"].transpose(0, 1)
         return Encoded(
             features=features,
             mask=features.new_ones(features.shape[:2]).bool(),

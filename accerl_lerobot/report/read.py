@@ -36,10 +36,8 @@ class Run:
     path: Path
     config: Record
     config_text: str
-    records: dict[str, list[Record]]
-    """Lines of metrics.jsonl by their kind, in order."""
-    result: Record | None
-    """summary.json; None: not finished."""
+    records: dict[str, list[Record]]  # lines of metrics.jsonl by their kind, in order
+    result: Record | None  # summary.json; None: not finished
     truncated: bool
     written: float
     videos: tuple[Path, ...]

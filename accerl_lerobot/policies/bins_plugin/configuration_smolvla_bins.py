@@ -16,10 +16,8 @@ PACKAGE = "accerl_lerobot.policies.bins_plugin"
 class SmolVLABinsConfig(PreTrainedConfig):
     """A vision-language model, a query token per action dimension of a chunk, and a head onto bins."""
 
-    chunk_size: int = 8
-    """Actions of a chunk."""
-    n_action_steps: int = 8
-    """Executed actions among these."""
+    chunk_size: int = 8  # actions of a chunk
+    n_action_steps: int = 8  # executed actions among these
     num_bins: int = 256
     """Bins per action dimension, of equal width over [-1, 1] in normalised units; an action beyond is taken
     as the outermost bin."""
@@ -35,18 +33,15 @@ class SmolVLABinsConfig(PreTrainedConfig):
     reproduce them. MIN_MAX, because LeRobot takes a dataset's quantile to be the mean of its episodes'
     quantiles: a movement that few episodes need would be cut off in all of them."""
 
-    vlm_model_name: str = "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"
-    """Hub id or folder of a SmolVLM."""
+    vlm_model_name: str = "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"  # Hub id or folder of a SmolVLM
     load_vlm_weights: bool = True
     """Start a new policy from that model's weights instead of random ones; unlike in smolvla, where
     random ones are the default. False in every checkpoint, whose own file holds the weights."""
-    num_vlm_layers: int = 16
-    """How many of its language-model layers are kept, the first ones; 0 keeps all."""
+    num_vlm_layers: int = 16  # how many of its language-model layers are kept, the first ones; 0 keeps all
     freeze_vision_encoder: bool = True
     freeze_language_model: bool = False
     """True trains only queries, state projection, head and the images' connector."""
-    resize_imgs_with_padding: tuple[int, int] | None = (512, 512)
-    """Width and height."""
+    resize_imgs_with_padding: tuple[int, int] | None = (512, 512)  # width and height
     tokenizer_max_length: int = 48
     pad_language_to: str = "longest"
 
