@@ -89,12 +89,11 @@ class Diffusion(Model):
     schedule: Schedule
 
     def __init__(self, policy: Any) -> None:
+        super().__init__(policy)
         config = policy.config
-        self.refuse_options(config)
         steps, most = policy.diffusion.num_inference_steps, config.num_train_timesteps
         if steps > most:
             raise InputError("policy.num_steps", steps, f"use at most {most}, as many as it was trained with")
-        self.policy = policy
         self.size = (config.horizon, config.action_feature.shape[0])
         first = config.n_obs_steps - 1  # rows before it stand for the past
         self.rows = slice(first, min(first + config.n_action_steps, config.horizon))
@@ -164,8 +163,7 @@ class DiffusionFamily(Family):
     counted: Tensor  # bool (N, H, 1), rows of each step's outcome that belong to the density
 
     def __init__(self, model: Diffusion, sampler: DiffusionSamplerConfig) -> None:
-        super().__init__()
-        self.model, self.sampler = model, sampler
+        super().__init__(model, sampler)
         self.size, self.rows, self.schedule = model.size, model.rows, model.schedule
         self._factors = self.rows if len(self.schedule) == 1 else slice(None)
         """L rows. Those without a density are left out: as constant factors they would dilute means."""

@@ -55,25 +55,24 @@ class Model(ABC):
     unread: ClassVar[tuple[str, ...]] = ()
     """Names of tensors that nothing is computed with; savers drop them where they are tied."""
 
-    policy: Any
     idle: tuple[str, ...] = ()
     """Prefixes of the parameters that no action depends on; never trained, nor published."""
     width: int  # width of the features
+
+    def __init__(self, policy: Any) -> None:
+        """Refuses options that several of LeRobot's policies have."""
+        if (rtc := getattr(policy.config, "rtc_config", None)) is not None and rtc.enabled:
+            remedy = "real-time chunking changes the sampler's density; turn it off"
+            raise InputError("policy.rtc_config.enabled", True, remedy)
+        if getattr(policy.config, "compile_model", False):
+            remedy = "a compiled sampler rounds unlike the re-scoring pass; set it to false in config.json"
+            raise InputError("policy.compile_model", True, remedy)
+        self.policy = policy
 
     @staticmethod
     def loading() -> AbstractContextManager[None]:
         """Holds while LeRobot builds policy and processors."""
         return nullcontext()
-
-    @staticmethod
-    def refuse_options(config: Any) -> None:
-        """Refuses options of LeRobot's policies under which the density would be another."""
-        if (rtc := getattr(config, "rtc_config", None)) is not None and rtc.enabled:
-            remedy = "real-time chunking changes the sampler's density; turn it off"
-            raise InputError("policy.rtc_config.enabled", True, remedy)
-        if config.compile_model:
-            remedy = "a compiled sampler rounds unlike the re-scoring pass; set it to false in config.json"
-            raise InputError("policy.compile_model", True, remedy)
 
     @abstractmethod
     def encode(self, batch: dict[str, Tensor]) -> Encoded:
@@ -86,6 +85,10 @@ class Model(ABC):
 
 class Family(nn.Module, ABC):
     """One way of acting at random with a known density; may own parameters, which are trained."""
+
+    def __init__(self, model: Any, sampler: Any) -> None:
+        super().__init__()
+        self.model, self.sampler = model, sampler
 
     @abstractmethod
     def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:

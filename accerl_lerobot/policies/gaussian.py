@@ -61,8 +61,7 @@ class GaussianFamily(Family):
     """Policies explored by noise around the chunk they predict."""
 
     def __init__(self, model: GaussianModel, sampler: GaussianSamplerConfig) -> None:
-        super().__init__()
-        self.model, self.sampler = model, sampler
+        super().__init__(model, sampler)
         self.std = StdHead(model.row_width, model.action_dim, sampler)
 
     def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
@@ -98,11 +97,11 @@ class ACT(GaussianModel):
     idle = ("model.vae_encoder", "model.encoder_latent_input_proj.weight")
 
     def __init__(self, policy: Any) -> None:
+        super().__init__(policy)
         config = policy.config
         if (coefficient := config.temporal_ensemble_coeff) is not None:
             remedy = "averaging over earlier chunks makes actions depend on more than the observation"
             raise InputError("policy.temporal_ensemble_coeff", coefficient, f"{remedy}; set it to null")
-        self.policy = policy
         self.executed, self.action_dim = config.n_action_steps, config.action_feature.shape[0]
         self.width = self.row_width = config.dim_model
 

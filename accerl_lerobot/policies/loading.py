@@ -152,7 +152,7 @@ def load_adapter(config: PolicyConfig, *, rehearsal: bool = False) -> LeRobotAda
     load_weights(policy, model_class, folder / untrusted.WEIGHTS, config.path, read=not rehearsal)
     device = torch.device(lerobot_config.device)
     policy.to(device).eval()
-    model = model_class(policy)  # type: ignore[call-arg]
+    model = model_class(policy)
     if config.precision == "fp32" and device.type == "cuda":
         # torch convolves with 10 bits of mantissa there. For batches of different sizes cuDNN chooses other
         # algorithms; what they round differently is divided by the std of the noise in every log-prob.

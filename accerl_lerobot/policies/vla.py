@@ -75,12 +75,10 @@ class SmolVLA(FlowModel):
     unread = ("model.vlm_with_expert.vlm.lm_head.weight",)
 
     def __init__(self, policy: Any) -> None:
-        config = policy.config
-        self.refuse_options(config)
-        if config.adapt_to_pi_aloha:
+        super().__init__(policy)
+        if policy.config.adapt_to_pi_aloha:
             raise InputError("policy.adapt_to_pi_aloha", True, "not supported in RL; train one without it")
-        self.policy = policy
-        self.shape = flow_shape(config, config.num_steps)
+        self.shape = flow_shape(policy.config, policy.config.num_steps)
         self.width = policy.model.vlm_with_expert.config.text_config.hidden_size
 
     def encode(self, batch: dict[str, Tensor]) -> Encoded:
@@ -103,7 +101,7 @@ class SmolVLABins(TokenModel):
     terminator = None
 
     def __init__(self, policy: Any) -> None:
-        self.policy = policy
+        super().__init__(policy)
         self.rows = int(policy.config.n_action_steps)
         self.length = self.rows * policy.config.action_feature.shape[0]
         self.width = policy.model.head.in_features
@@ -133,10 +131,8 @@ class Pi05(FlowModel):
     unread = (f"{VLM}lm_head.weight", "model.paligemma_with_expert.gemma_expert.lm_head.weight")
 
     def __init__(self, policy: Any) -> None:
-        config = policy.config
-        self.refuse_options(config)
-        self.policy = policy
-        self.shape = flow_shape(config, config.num_inference_steps)
+        super().__init__(policy)
+        self.shape = flow_shape(policy.config, policy.config.num_inference_steps)
         language_model = policy.model.paligemma_with_expert.paligemma.model.language_model
         # As LeRobot's own sampler has it, which switches it on at its first call.
         language_model.config._attn_implementation = "eager"
@@ -252,8 +248,8 @@ class Pi0Fast(TokenModel):
     loading = staticmethod(data_only)
 
     def __init__(self, policy: Any) -> None:
+        super().__init__(policy)
         config, tokenizer = policy.config, policy._paligemma_tokenizer
-        self.refuse_options(config)
         if config.temperature != 0:
             remedy = "LeRobot's sampler has to be greedy here: set it to 0 in config.json; exploration has a "
             raise InputError("policy.temperature", config.temperature, f"{remedy}policy.sampler.temperature")
@@ -263,7 +259,6 @@ class Pi0Fast(TokenModel):
             raise InputError("policy.n_action_steps", config.n_action_steps, remedy)
         config.validate_action_token_prefix = False
         logging.root.addFilter(_decodable)
-        self.policy = policy
         self.length = config.max_decoding_steps
         self.terminator = tokenizer.convert_tokens_to_ids(END)
         paligemma = policy.model.paligemma_with_expert.paligemma
