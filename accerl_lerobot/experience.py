@@ -91,7 +91,7 @@ class Segment:
     origin: Origin  # where it begins; of an imagined one, the real observation that it was imagined from
     world_version: int | None = None  # version of the world model that imagined it, in gradient steps
     episode: dict[str, float] = field(default_factory=dict)
-    """Of the last segment of an episode: ``return``, ``steps``, ``decisions``, ``success``."""
+    """Set on the last segment of an episode: ``return``, ``steps``, ``decisions``, ``success``."""
 
     def __len__(self) -> int:
         return len(self.reward)
