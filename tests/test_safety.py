@@ -18,13 +18,7 @@ from safetensors.numpy import save_file
 
 from accerl_lerobot import cli
 from accerl_lerobot.checkpoint import safety
-from accerl_lerobot.checkpoint.safety import (
-    Origin,
-    read_json,
-    read_tensors,
-    safe_join,
-    tensor_shapes,
-)
+from accerl_lerobot.checkpoint.safety import Origin, read_json, read_tensors, safe_join, tensor_shapes
 from accerl_lerobot.errors import InputError
 from tests.hostile import hostile_names
 

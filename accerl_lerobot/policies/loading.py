@@ -27,12 +27,7 @@ from accerl_lerobot.config.parsing import discover, imported
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK
 from accerl_lerobot.policies import untrusted
-from accerl_lerobot.policies.adapter import (
-    LeRobotAdapter,
-    Processing,
-    ValueHead,
-    stack_observations,
-)  # fmt: skip
+from accerl_lerobot.policies.adapter import LeRobotAdapter, Processing, ValueHead, stack_observations
 from accerl_lerobot.policies.config import (
     POLICIES,
     PolicyConfig,
