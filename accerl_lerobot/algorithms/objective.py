@@ -37,12 +37,9 @@ KL_LINEAR_ABOVE = 3.0
 so that one stale sample could decide a whole update."""
 USUAL_CLIP = (0.2, 0.2)
 """Range (low, high) of the reported clip fraction of algorithms that clip nothing, so that runs compare."""
-LOW_WEIGHT = 0.1
-"""A sample below this share of its gradient is as good as lost."""
-TINY = 1e-30
-"""Makes the effective sample size 0, and not NaN, when every weight is 0."""
-VARIANCE_FLOOR = 1e-12
-"""Returns that vary less (a standard deviation of 1e-6) are constant up to rounding."""
+LOW_WEIGHT = 0.1  # share of its gradient below which a sample is as good as lost
+TINY = 1e-30  # makes the effective sample size 0, and not NaN, when every weight is 0
+VARIANCE_FLOOR = 1e-12  # returns that vary less (a standard deviation of 1e-6) are constant up to rounding
 
 
 def at_level(x: Tensor, inputs: LossInputs, level: Level) -> Tensor:

@@ -50,13 +50,13 @@ class Model(ABC):
         InputError: an option of this checkpoint would make its density wrong.
     """
 
-    backbone: ClassVar[str | None] = None
-    """Prefix of the parameters that ``policy.tuning.mode=expert`` freezes; None: it has no expert."""
-    unread: ClassVar[tuple[str, ...]] = ()
-    """Names of tensors that nothing is computed with; savers drop them where they are tied."""
-
-    idle: tuple[str, ...] = ()
-    """Prefixes of the parameters that no action depends on; never trained, nor published."""
+    backbone: ClassVar[str | None] = None  # prefix of what tuning mode ``expert`` freezes; None: no expert
+    unread: ClassVar[
+        tuple[str, ...]
+    ] = ()  # tensors nothing is computed with; savers drop tied ones
+    idle: tuple[
+        str, ...
+    ] = ()  # prefixes of parameters that no action depends on; never trained or published
     width: int  # width of the features
 
     def __init__(self, policy: Any) -> None:

@@ -42,10 +42,8 @@ from accerl_lerobot.policies.saving import tune
 
 logger = logging.getLogger(__name__)
 
-ACTS_MOST = 10**9
-"""Parameters of a policy that acts when its load is rehearsed; π0's four billion would take minutes."""
-TEXT = f"Put the red cube on the plate {string.printable}"
-"""Instruction of that decision: a tokeniser can be slow on some characters only."""
+ACTS_MOST = 10**9  # parameters of a policy that acts in a rehearsal; π0's four billion would take minutes
+TEXT = f"Put the red cube on the plate {string.printable}"  # a tokeniser can be slow on some characters only
 
 
 class Sizes(NamedTuple):

@@ -37,8 +37,7 @@ other numbers, relative to the largest of their kind."""
 BATCH = 12  # decisions that are compared in batches of several sizes
 MOVED = 0.5  # std of log ρ between the two policies of `check_importance`
 STEPS_MOST = 100  # small steps of the weights until log ρ varies by that much
-DEVIATIONS = 5.0
-"""Largest difference of two estimates in standard errors; one in two million is above it by chance."""
+DEVIATIONS = 5.0  # standard errors between two estimates; one in two million is further off by chance
 
 
 def check_policy(policy: PolicyConfig | Path | str, observations: Sequence[Observation]) -> None:
