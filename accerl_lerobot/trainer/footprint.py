@@ -96,8 +96,8 @@ def policy_memory(adapter: LeRobotAdapter, *, imitates: bool, checkpointing: boo
     if sizes.policy > FAKED_FROM:
         mode = FakeTensorMode(allow_non_fake_inputs=True)
         batch = tree_map_only(Tensor, mode.from_tensor, batch)
-        with FakeCopyMode(mode):
-            adapter = copy.deepcopy(adapter)
+        with FakeCopyMode(mode):  # tokenisers stay as they are
+            adapter = copy.deepcopy(adapter, {id(adapter.processing): adapter.processing})
     one = tree_map_only(Tensor, lambda tensor: tensor[:1], batch)
     peaks, kept = [], []
     with mode:

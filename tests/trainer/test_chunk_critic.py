@@ -158,17 +158,12 @@ def test_a_teacher_keeps_to_its_range_and_scales_what_it_sees():
     assert chunk[..., 1].max() > 3.9 and chunk[..., 0].min() < -0.9
 
 
-def requests(adapter: LeRobotAdapter, count: int) -> list[Request]:
-    world = make_world(ENV)
-    return [Request(observation=world.reset(i, "match"), noise_seed=i) for i in range(count)]
-
-
 class TestActing:
     def test_whole_episodes_are_the_teachers_once_it_is_ready(self, tiny_checkpoint: Path):
         config = PolicyConfig(path=str(tiny_checkpoint), device="cpu")
         adapter = with_teacher(load_adapter, ENV.state_size, share=0.5, config=config, noise=0.0)
         assert adapter.teacher is not None
-        observation = requests(adapter, 1)[0].observation
+        observation = make_world(ENV).reset(0, "match")
         asked = [
             Request(observation=observation, noise_seed=noise_seed(episode, decision), explore=explore)
             for episode in range(200)
