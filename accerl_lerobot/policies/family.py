@@ -51,12 +51,8 @@ class Model(ABC):
     """
 
     backbone: ClassVar[str | None] = None  # prefix of what tuning mode ``expert`` freezes; None: no expert
-    unread: ClassVar[
-        tuple[str, ...]
-    ] = ()  # tensors nothing is computed with; savers drop tied ones
-    idle: tuple[
-        str, ...
-    ] = ()  # prefixes of parameters that no action depends on; never trained or published
+    unread: ClassVar[tuple[str, ...]] = ()  # tensors nothing is computed with; savers drop tied ones
+    idle: tuple[str, ...] = ()  # prefixes of parameters that no action depends on; never trained or published
     width: int  # width of the features
 
     def __init__(self, policy: Any) -> None:

@@ -28,6 +28,7 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
@@ -228,18 +229,15 @@ def data_only() -> Iterator[None]:
     """While it lasts, LeRobot reads the tokenisers of π0-FAST and runs no code that comes with them."""
     from lerobot.policies.pi0_fast import modeling_pi0_fast
     from lerobot.processor import tokenizer_processor
+    from transformers import AutoTokenizer
 
-    ours: dict[str, Any] = {"AutoProcessor": FastTokenizer, "AutoTokenizer": _TextTokenizer}
+    def text_tokenizer(name: str, **options: Any) -> Any:
+        return AutoTokenizer.from_pretrained(name, **options | {"trust_remote_code": False})
+
+    text = SimpleNamespace(from_pretrained=text_tokenizer)
+    ours: dict[str, Any] = {"AutoProcessor": FastTokenizer, "AutoTokenizer": text}
     with patch.multiple(modeling_pi0_fast, **ours), patch.multiple(tokenizer_processor, **ours):
         yield
-
-
-class _TextTokenizer:
-    @staticmethod
-    def from_pretrained(name: str, **options: Any) -> Any:
-        from transformers import AutoTokenizer
-
-        return AutoTokenizer.from_pretrained(name, **options | {"trust_remote_code": False})
 
 
 class Pi0Fast(TokenModel):
