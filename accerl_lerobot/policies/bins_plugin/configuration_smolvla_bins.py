@@ -8,8 +8,6 @@ from dataclasses import dataclass, field
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
 
-PACKAGE = "accerl_lerobot.policies.bins_plugin"
-
 
 @PreTrainedConfig.register_subclass("smolvla_bins")
 @dataclass
@@ -54,7 +52,7 @@ class SmolVLABinsConfig(PreTrainedConfig):
     scheduler_decay_steps: int = 30_000
     scheduler_decay_lr: float = 2.5e-6
 
-    discover_packages_path: str = PACKAGE
+    discover_packages_path: str = "accerl_lerobot.policies.bins_plugin"
     """Where this type comes from. A field, because LeRobot 0.6.1 takes the flag
     ``--policy.discover_packages_path`` for an override of the config when ``--policy.path`` is given too."""
 
@@ -77,8 +75,4 @@ class SmolVLABinsConfig(PreTrainedConfig):
     get_optimizer_preset = SmolVLAConfig.get_optimizer_preset
     get_scheduler_preset = SmolVLAConfig.get_scheduler_preset
     action_delta_indices = SmolVLAConfig.action_delta_indices
-    reward_delta_indices = SmolVLAConfig.reward_delta_indices
-
-    @property
-    def observation_delta_indices(self) -> None:
-        return None
+    observation_delta_indices = reward_delta_indices = None
