@@ -51,7 +51,7 @@ class Decision:
     """One policy call, as the inference service answers it."""
 
     chunk: np.ndarray  # float32 (K, A), in the environment's action units (un-normalised); not clipped
-    latent: dict[str, np.ndarray]  # the policy's actual sample, whose density in normalised units follows
+    latent: dict[str, np.ndarray]  # what the policy sampled; `log_prob` is its density in normalised units
     log_prob: np.ndarray  # float32 (L,), an entry per factor, such as a row; the chunk's is their sum
     version: int  # number of optimiser steps behind the weights that decided
 
