@@ -12,8 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-TOKEN = re.compile(r"\bhf_\w{6,}")
-"""A token of the Hub, which somebody may have typed where it does not belong; it is not repeated."""
+TOKEN = re.compile(r"\bhf_\w{6,}")  # of the Hub, which somebody may have typed where it does not belong
 LONGEST, LONGEST_REMEDY, MOST_SHOWN = 200, 1200, 600
 """Characters that are shown of a value, of a remedy and of an unexpected error; a whole section may have been
 given where a number belongs, and some remedies repeat a part of it."""

@@ -42,8 +42,7 @@ class Request:
 
     observation: Observation
     noise_seed: int
-    explore: bool = True
-    """False asks for LeRobot's stock sampler, the one evaluation uses."""
+    explore: bool = True  # False asks for LeRobot's stock sampler, the one evaluation uses
 
 
 @kind
@@ -51,27 +50,19 @@ class Request:
 class Decision:
     """One policy call, as the inference service answers it."""
 
-    chunk: np.ndarray
-    """float32 (K, A), in the environment's action units (un-normalised); not clipped."""
-    latent: dict[str, np.ndarray]
-    """The policy's actual sample; `log_prob` is the density of this, in normalised action space."""
-    log_prob: np.ndarray
-    """float32 (L,), one entry per factor (for a flow policy one per row of the chunk that has a density); the
-    chunk's is their sum."""
-    version: int
-    """Number of optimiser steps behind the weights that decided."""
+    chunk: np.ndarray  # float32 (K, A), in the environment's action units (un-normalised); not clipped
+    latent: dict[str, np.ndarray]  # what the policy sampled; `log_prob` is its density in normalised units
+    log_prob: np.ndarray  # float32 (L,), an entry per factor, such as a row; the chunk's is their sum
+    version: int  # number of optimiser steps behind the weights that decided
 
 
 @kind
 class Origin(NamedTuple):
     """Where in which episode something begins."""
 
-    task: str
-    """Task of `World.reset`, which is not the instruction."""
-    seed: int
-    """Seed of `World.reset`."""
-    decision: int
-    """Decisions made before."""
+    task: str  # task of `World.reset`, which is not the instruction
+    seed: int  # seed of `World.reset`
+    decision: int  # decisions made before
 
 
 @kind
@@ -87,29 +78,18 @@ class Segment:
     """Each (T + 1, ...) under LeRobot's names, without the task; the last row is the bootstrap observation,
     or what was seen when the episode terminated, which nothing is bootstrapped from."""
     task: str
-    latent: dict[str, np.ndarray]
-    """Each (T, ...)."""
-    log_prob: np.ndarray
-    """float32 (T, L), of the behaviour policy."""
-    actions: np.ndarray
-    """float32 (T, K, A), the chunks within the world's bounds; the first `steps` of each were executed."""
-    reward: np.ndarray
-    """float32 (T,), summed over the steps of each chunk."""
-    version: np.ndarray
-    """int64 (T,), the weights behind each decision."""
-    steps: np.ndarray
-    """int64 (T,), env steps each decision executed."""
+    latent: dict[str, np.ndarray]  # each (T, ...)
+    log_prob: np.ndarray  # float32 (T, L), of the behaviour policy
+    actions: np.ndarray  # float32 (T, K, A), within bounds; the first `steps` rows of each were executed
+    reward: np.ndarray  # float32 (T,), summed over the steps of each chunk
+    version: np.ndarray  # int64 (T,), the weights behind each decision
+    steps: np.ndarray  # int64 (T,), env steps each decision executed
     terminated: bool
-    success: bool
-    """True if the episode had succeeded when the segment ended."""
-    key: str
-    """Worker, incarnation, sequence number."""
-    source: str = REAL
-    """``real`` or ``imagined``."""
-    origin: Origin
-    """Where it begins; of an imagined one, the real observation that it was imagined from."""
-    world_version: int | None = None
-    """Version of the world model that imagined it, in gradient steps."""
+    success: bool  # True if the episode had succeeded when the segment ended
+    key: str  # worker, incarnation, sequence number
+    source: str = REAL  # ``real`` or ``imagined``
+    origin: Origin  # where it begins; of an imagined one, the real observation that it was imagined from
+    world_version: int | None = None  # version of the world model that imagined it, in gradient steps
     episode: dict[str, float] = field(default_factory=dict)
     """Set on the last segment of an episode: ``return``, ``steps``, ``decisions``, ``success``."""
 

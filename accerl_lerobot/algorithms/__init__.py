@@ -2,7 +2,7 @@
 """The objectives as the papers state them: typed tensors in, loss and diagnostics out.
 
 To add one, register a config under `AlgorithmConfig`: a `RatioConfig` with a `loss` that ends in
-`objective.assemble`, as in `losses`, or an `OffPolicyConfig` whose `update` names a subclass of
+`objective.assemble`, as GIPO's does, or an `OffPolicyConfig` whose `update` names a subclass of
 `trainer.off_policy.OffPolicyUpdate`. In this package, import it below; in a package of your own, name that by
 ``--algorithm.discover_packages_path``. No file that this package imports pulls in torch, so a run can be
 parsed before torch is loaded.
@@ -20,8 +20,7 @@ from accerl_lerobot.algorithms.contract import (
     RatioConfig,
     SelfImitationConfig,
 )
-from accerl_lerobot.algorithms.losses import GIPOConfig, PPOConfig
-from accerl_lerobot.algorithms.objective import LossOutput
+from accerl_lerobot.algorithms.objective import GIPOConfig, LossOutput, PPOConfig
 
 __all__ = [
     "AWRConfig",

@@ -20,8 +20,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-STD_EPSILON = 1e-6
-"""Added to the standard deviation: advantages that are all equal become 0, and not noise of unit size."""
+STD_EPSILON = 1e-6  # added to the standard deviation: advantages that are all equal become 0, not noise
 
 
 def decision_mask(lengths: Tensor, t: int) -> Tensor:

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Importance ratios, the terms that all objectives share, and the metrics that are logged about every update.
+"""The objectives with a likelihood ratio, GIPO and PPO: ratios, the terms that they share, and metrics.
 
 L = L_policy + ½ · E(V − R)² + kl_coef · KL(μ‖π) − entropy_coef · H
 
 ρ = π(a|o) / μ(a|o). μ is the behaviour policy, the one that acted; its log-prob is stored with the sample.
-All ratios are handled as logs of shape (N, F), F ratios per decision:
+E is the mean over all ratios of all decisions, which are handled as logs of shape (N, F), F per decision:
 
     level       one ratio covers                      F
     token       one log-prob factor                   L
@@ -21,10 +21,11 @@ Masks, of ratios that exist, are applied by filling and not by indexing, so noth
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated
 
-from accerl_lerobot.algorithms.contract import Level, LossInputs, RatioConfig
+from accerl_lerobot.algorithms.contract import AlgorithmConfig, Level, LossInputs, RatioConfig
+from accerl_lerobot.config.ranges import NonNegative, Range
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -37,12 +38,9 @@ KL_LINEAR_ABOVE = 3.0
 so that one stale sample could decide a whole update."""
 USUAL_CLIP = (0.2, 0.2)
 """Range (low, high) of the reported clip fraction of algorithms that clip nothing, so that runs compare."""
-LOW_WEIGHT = 0.1
-"""A sample below this share of its gradient is as good as lost."""
-TINY = 1e-30
-"""Makes the effective sample size 0, and not NaN, when every weight is 0."""
-VARIANCE_FLOOR = 1e-12
-"""Returns that vary less (a standard deviation of 1e-6) are constant up to rounding."""
+LOW_WEIGHT = 0.1  # share of its gradient below which a sample is as good as lost
+TINY = 1e-30  # makes the effective sample size 0, and not NaN, when every weight is 0
+VARIANCE_FLOOR = 1e-12  # returns that vary less (a standard deviation of 1e-6) are constant up to rounding
 
 
 def at_level(x: Tensor, inputs: LossInputs, level: Level) -> Tensor:
@@ -99,58 +97,27 @@ def advantage_column(inputs: LossInputs) -> Tensor:
     return inputs.advantage.detach()[:, None]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Samples:
-    """Inputs of the metrics that are no means over micro-batches, such as quantiles, without gradient."""
-
-    log_ratio: Tensor
-    """(N, F), 0 where a ratio does not exist."""
-    weight: Tensor
-    """(N, F), ω."""
-    keep: Tensor
-    """bool (N, F), the ratios that exist."""
-    value: Tensor
-    """(N,), V."""
-    returns: Tensor
-    """(N,), R."""
-    clip: tuple[float, float]
-    """(low, high) of the clip range."""
-
-    def rows(self) -> Tensor:
-        """All of it on the CPU, float64 (N, 3F + 2), for `joined`."""
-        import torch
-
-        narrow = (self.value[:, None], self.returns[:, None])
-        return torch.cat([x.double().cpu() for x in (self.log_ratio, self.weight, self.keep, *narrow)], 1)
-
-    def joined(self, rows: Tensor) -> Samples:
-        """The samples of a whole batch, from the `rows` of its parts in any order, laid end to end."""
-        f = self.log_ratio.shape[1]
-        log_ratio, weight, keep, *narrow = rows.split([f, f, f, 1, 1], dim=1)
-        value, returns = (column[:, 0] for column in narrow)
-        return replace(
-            self, log_ratio=log_ratio, weight=weight, keep=keep.bool(), value=value, returns=returns
-        )
-
-    def metrics(self) -> dict[str, Tensor]:
-        """Scalars, see ``docs/metrics.md``."""
-        keep, rho, (low, high) = self.keep, ratio(self.log_ratio), self.clip
-        weighted = self.weight * rho
-        squares = masked_mean(weighted.square(), keep).clamp(min=TINY)
-        logs = self.log_ratio.masked_fill(~keep, math.nan).flatten()
-        spread = self.returns.var(correction=0)
-        left = (self.returns - self.value).var(correction=0) / spread.clamp(min=VARIANCE_FLOOR)
-        return {
-            "approx_kl": masked_mean(rho - 1.0 - self.log_ratio, keep),
-            "ess": masked_mean(weighted, keep).square() / squares,  # Kish's
-            "low_weight": masked_mean((self.weight < LOW_WEIGHT).float(), keep),
-            "clip_fraction": masked_mean(((rho < 1.0 - low) | (rho > 1.0 + high)).float(), keep),
-            "ratio_max_dev": (rho - 1.0).abs().max(),
-            "log_ratio_p05": logs.nanquantile(0.05),
-            "log_ratio_p50": logs.nanquantile(0.5),
-            "log_ratio_p95": logs.nanquantile(0.95),
-            "explained_variance": (1.0 - left).masked_fill(spread <= VARIANCE_FLOOR, 0.0),
-        }
+def sample_metrics(samples: Tensor, clip: tuple[float, float]) -> dict[str, Tensor]:
+    """Scalars, see ``docs/metrics.md``, of the `LossOutput.samples` of a batch's parts, in any order."""
+    f, (low, high) = (samples.shape[1] - 2) // 3, clip
+    log_ratio, weight, exists, value, returns = samples.split([f, f, f, 1, 1], dim=1)
+    keep, rho = exists.bool(), ratio(log_ratio)
+    weighted = weight * rho
+    squares = masked_mean(weighted.square(), keep).clamp(min=TINY)
+    logs = log_ratio.masked_fill(~keep, math.nan).flatten()
+    spread = returns.var(correction=0)
+    left = (returns - value).var(correction=0) / spread.clamp(min=VARIANCE_FLOOR)
+    return {
+        "approx_kl": masked_mean(rho - 1.0 - log_ratio, keep),
+        "ess": masked_mean(weighted, keep).square() / squares,  # Kish's
+        "low_weight": masked_mean((weight < LOW_WEIGHT).float(), keep),
+        "clip_fraction": masked_mean(((rho < 1.0 - low) | (rho > 1.0 + high)).float(), keep),
+        "ratio_max_dev": (rho - 1.0).abs().max(),
+        "log_ratio_p05": logs.nanquantile(0.05),
+        "log_ratio_p50": logs.nanquantile(0.5),
+        "log_ratio_p95": logs.nanquantile(0.95),
+        "explained_variance": (1.0 - left).masked_fill(spread <= VARIANCE_FLOOR, 0.0),
+    }
 
 
 def lag_metrics(version: Tensor, trainer_version: int) -> dict[str, float]:
@@ -167,13 +134,16 @@ class LossOutput:
     """(), call ``backward`` on it."""
     means: dict[str, Tensor]
     """Means over decisions, scalars without gradient; ``decisions`` is a count."""
-    samples: Samples
-    """Per-decision values behind the metrics that are no means over decisions."""
+    samples: Tensor
+    """float64 (N, 3F + 2) without gradient, for metrics that are no means over decisions, such as quantiles:
+    of each ratio log ρ, ω and 1 if it exists, else 0; V; R."""
+    clip: tuple[float, float]
+    """(low, high) of the clip range."""
 
     @property
     def metrics(self) -> dict[str, Tensor]:
         """Scalars of this batch, still on the device."""
-        return self.means | self.samples.metrics()
+        return self.means | sample_metrics(self.samples, self.clip)
 
 
 def assemble(
@@ -185,11 +155,13 @@ def assemble(
     weight: Tensor,
     clip: tuple[float, float] = USUAL_CLIP,
 ) -> LossOutput:
-    """Adds the shared terms to a policy loss and measures the batch.
+    """Adds the shared terms to a policy loss and measures the batch, with `clip` (low, high).
 
     `log_ratio` (N, F), log π/μ with gradient, is from `at_level`; `weight` (N, F) is how much of each
     sample's gradient the algorithm keeps, ω.
     """
+    import torch
+
     value_loss = (inputs.value - inputs.returns).square().mean()
     mean_entropy = inputs.entropy.mean()
     kl = mean_over_ratios(kl_from_behaviour(log_ratio), inputs, config.level)
@@ -200,13 +172,67 @@ def assemble(
         loss = loss - config.entropy_coef * mean_entropy
     means = {"policy_loss": policy_loss, "value_loss": value_loss, "kl": kl, "entropy": mean_entropy}
     means |= {"loss": loss, "decisions": loss.new_tensor(float(len(inputs.value)))}
-    everything = log_ratio.new_ones(log_ratio.shape).bool()
-    samples = Samples(
-        log_ratio=log_ratio.detach(),
-        weight=weight.detach(),
-        keep=everything if inputs.factors is None else present(inputs.factors, config.level),
-        value=inputs.value.detach(),
-        returns=inputs.returns,
-        clip=clip,
-    )
-    return LossOutput(loss=loss, means={k: v.detach() for k, v in means.items()}, samples=samples)
+    exists = torch.ones_like(log_ratio) if inputs.factors is None else present(inputs.factors, config.level)
+    columns = (log_ratio, weight, exists, inputs.value[:, None], inputs.returns[:, None])
+    samples = torch.cat([column.detach().double() for column in columns], 1)
+    means = {name: mean.detach() for name, mean in means.items()}
+    return LossOutput(loss=loss, means=means, samples=samples, clip=clip)
+
+
+@AlgorithmConfig.register_subclass("gipo")
+@dataclass(frozen=True, kw_only=True)
+class GIPOConfig(RatioConfig):
+    """Settings of GIPO (arXiv 2603.03955, used by AcceRL, 2603.18464); the defaults are the paper's.
+
+        ω = exp(−½ (log ρ̄ / σ)²)          ρ̄ = ρ without gradient
+        L = −E[ω · ρ · Â]  +  the shared terms
+
+    A Gaussian trust weight on the log-ratio instead of a clip. The gradient is −E[ω ρ Â ∇log π]. At ρ = 1 it
+    is the plain policy gradient; ω·ρ never exceeds exp(σ²/2) and fades to 0 the further the current policy
+    has moved from the one that acted, in both directions. Deviations from the paper: the KL is estimated from
+    samples, because a flow policy has no token bins to sum over, and log ρ is clamped.
+    """
+
+    sigma: Annotated[float, Range("(0, inf]")] = 1.0
+    """Width of the trust weight in nats of log ρ; ``inf`` is importance sampling without any clip."""
+    kl_coef: NonNegative = 0.1
+    """Weight of KL(μ‖π), the distance from the behaviour policy."""
+
+    def loss(self, inputs: LossInputs) -> LossOutput:
+        logs = at_level(inputs.log_prob_new - inputs.log_prob_old, inputs, self.level)
+        weight = (-0.5 * (logs.detach() / self.sigma).square()).exp()
+        weighted = weight * ratio(logs) * advantage_column(inputs)
+        policy_loss = -mean_over_ratios(weighted, inputs, self.level)
+        return assemble(inputs, self, policy_loss=policy_loss, log_ratio=logs, weight=weight)
+
+
+@AlgorithmConfig.register_subclass("ppo")
+@dataclass(frozen=True, kw_only=True)
+class PPOConfig(RatioConfig):
+    """Settings of PPO with a clip (arXiv 1707.06347), asymmetric as in DAPO (arXiv 2503.14476, section 3.1).
+
+        L = −E[min(ρ Â, clip(ρ, 1 − low, 1 + high) Â)]  +  the shared terms
+
+    The ratio is taken against the behaviour policy, so under asynchrony the clip range is also the staleness
+    budget: at a large lag most samples are outside and their gradient is gone. That is what GIPO is for.
+    """
+
+    clip_low: Annotated[float, Range("(0, 1)")] = 0.2
+    """How far ρ may fall below 1 before a sample with Â < 0 stops counting."""
+    clip_high: Annotated[float, Range("(0, inf]")] = 0.28
+    """How far ρ may rise above 1 before a sample with Â > 0 stops counting."""
+
+    def loss(self, inputs: LossInputs) -> LossOutput:
+        logs = at_level(inputs.log_prob_new - inputs.log_prob_old, inputs, self.level)
+        rho, advantage = ratio(logs), advantage_column(inputs)
+        low, high = 1.0 - self.clip_low, 1.0 + self.clip_high
+        surrogate = (rho * advantage).minimum(rho.clamp(low, high) * advantage)
+        dropped = ((advantage > 0.0) & (rho > high)) | ((advantage < 0.0) & (rho < low))
+        return assemble(
+            inputs,
+            self,
+            policy_loss=-mean_over_ratios(surrogate, inputs, self.level),
+            log_ratio=logs,
+            weight=(~dropped).to(logs.dtype),
+            clip=(self.clip_low, self.clip_high),
+        )

@@ -73,15 +73,16 @@ def rehearse[T](task: Callable[[], T], folder: Path, origin: Origin, pattern: st
         if status is None:  # it may still run
             os.kill(child, signal.SIGKILL)
             os.waitpid(child, 0)
-    result, field, value, why = json.loads(message) if message else (None, None, None, _cause(status, cpu_s))
+    answer = json.loads(message) if message else {"why": _cause(status, cpu_s)}
+    if "result" in answer:
+        return cast(T, answer["result"])
+    why = answer["why"]
     if any(words in why for words in NO_MEMORY):
-        field, why = None, f"takes more than {memory // MIB} MiB beside the libraries"
-    if field is not None:
-        raise InputError(field, value, why)
-    if why:
-        remedy = "the size of its files does not account for that; get it again, or another one"
-        raise InputError(origin.field, origin.value, f"loading it, tried in a process apart, {why}; {remedy}")
-    return cast(T, result)
+        why = f"takes more than {memory // MIB} MiB beside the libraries"
+    elif "field" in answer:
+        raise InputError(answer["field"], answer["value"], why)
+    remedy = "the size of its files does not account for that; get it again, or another one"
+    raise InputError(origin.field, origin.value, f"loading it, tried in a process apart, {why}; {remedy}")
 
 
 def _cause(status: int | None, cpu_s: int) -> str:
@@ -95,25 +96,21 @@ def _cause(status: int | None, cpu_s: int) -> str:
 
 def _run(task: Callable[[], object], writer: int, parent: int, memory: int, cpu_s: int) -> None:
     """Runs in the child, and ends it."""
-    message = b""
+    answer: dict[str, object] = {}
     try:
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
         if os.getppid() != parent:
             os._exit(1)
         _confine(memory, cpu_s)
-        message = _report(task())
+        answer = {"result": task()}
     except InputError as error:
         value = None if error.value is None else str(error.value)[:LONGEST]
-        message = _report(None, error.field, value, error.remedy[:LONGEST])
+        answer = {"field": error.field, "value": value, "why": error.remedy[:LONGEST]}
     except BaseException as error:  # Rust's panics are no `Exception`
-        message = _report(None, why=f"fails with {type(error).__name__}: {brief(error)}")
+        answer = {"why": f"fails with {type(error).__name__}: {brief(error)}"}
     with contextlib.suppress(BaseException):
-        os.write(writer, message)
+        os.write(writer, json.dumps(answer).encode())
     os._exit(0)
-
-
-def _report(result: object, field: str | None = None, value: str | None = None, why: str = "") -> bytes:
-    return json.dumps((result, field, value, why)).encode()
 
 
 def _confine(memory: int, cpu_s: int) -> None:

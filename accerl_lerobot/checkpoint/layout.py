@@ -118,8 +118,7 @@ def go_back_to(checkpoint: Path) -> None:
 
 def has_checkpoint(checkpoints: Path) -> bool:
     """True if there is a checkpoint, broken or not."""
-    if checkpoints.is_dir():
-        _tidy(checkpoints)
+    _tidy(checkpoints)
     return bool(_numbered(checkpoints))
 
 
@@ -133,16 +132,13 @@ def write_atomically(path: Path, text: str) -> None:
 
 
 def write_manifest(directory: Path) -> None:
-    """Writes the size and SHA-256 of every file in a checkpoint."""
-    files = {path.relative_to(directory): path for path in directory.rglob("*") if path.is_file()}
-    own = (MANIFEST, f".{MANIFEST}.new")
-    entries = {
-        str(name): {"size": path.stat().st_size, "sha256": digest(path)}
-        for name, path in files.items()
-        if name.parts[0] not in own
+    """Writes the size and SHA-256 of every file in a new checkpoint."""
+    files = {
+        str(path.relative_to(directory)): {"size": path.stat().st_size, "sha256": digest(path)}
+        for path in sorted(directory.rglob("*"))
+        if path.is_file()
     }
-    manifest = {"format": FORMAT, "files": dict(sorted(entries.items()))}
-    write_atomically(directory / MANIFEST, json.dumps(manifest, indent=2) + "\n")
+    (directory / MANIFEST).write_text(json.dumps({"format": FORMAT, "files": files}, indent=2) + "\n")
 
 
 def read_manifest(directory: Path) -> dict[str, Any]:

@@ -31,7 +31,7 @@ PICKLES = (".bin", ".pt", ".pth", ".pkl", ".pickle", ".ckpt")
 REVISION = re.compile(r"[0-9a-f]{40}")
 HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]{0,95}(/[A-Za-z0-9][\w.-]{0,95})?", re.ASCII)
 _DRIVE = re.compile(r"[A-Za-z]:")
-_CONTROL = re.compile(r"[\x00-\x1f\x7f]")
+_CONTROL = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
 
 
 @dataclass(frozen=True)
@@ -118,10 +118,9 @@ def read_json(path: Path, origin: Origin, most: int = JSON_MOST) -> dict[str, An
             content = json.loads(file.read(most + 1).decode())
     except OSError as error:
         raise origin.refuse(path.name, f"cannot be read ({error.strerror})") from error
-    except RecursionError as error:
-        raise origin.refuse(path.name, "nested too deeply; it is not what it says") from error
-    except ValueError as error:
-        raise origin.refuse(path.name, f"not good JSON ({error})") from error
+    except (RecursionError, ValueError) as error:
+        why = "it is nested too deeply" if isinstance(error, RecursionError) else error
+        raise origin.refuse(path.name, f"not good JSON ({why})") from error
     if not isinstance(content, dict):
         raise origin.refuse(path.name, f"a mapping is wanted, not {type(content).__name__}")
     return content
@@ -200,14 +199,10 @@ def unsafe_name(name: object) -> str:
     """The reason why a name must not be joined to a folder; empty if it may."""
     if not isinstance(name, str) or not name:
         return "not a name"
-    try:
-        size = len(name.encode())
-    except UnicodeEncodeError:
-        return "not good Unicode"
-    if size > PATH_MOST or any(len(part.encode()) > PART_MOST for part in name.split("/")):
-        return "too long"
     if _CONTROL.search(name):
-        return "it has control characters"
+        return "it has control characters, or is not good Unicode"
+    if len(name.encode()) > PATH_MOST or any(len(part.encode()) > PART_MOST for part in name.split("/")):
+        return "too long"
     if "\\" in name or _DRIVE.match(name):
         return "a Windows path"
     if name.startswith(("/", "~")):

@@ -11,8 +11,6 @@ were registered with `kind`.
 
 from __future__ import annotations
 
-import dataclasses
-import functools
 import json
 from pathlib import Path
 from typing import Any
@@ -28,7 +26,7 @@ _KINDS: dict[str, type[Any]] = {}
 
 
 def kind[T](cls: type[T]) -> type[T]:
-    """Class decorator: instances of this dataclass or named tuple may be in a tree."""
+    """Class decorator: instances of this dataclass or named tuple, which has no base, may be in a tree."""
     if _KINDS.setdefault(cls.__name__, cls) is not cls:
         raise TypeError(f"two kinds are called {cls.__name__}")
     return cls
@@ -78,7 +76,7 @@ def to_json(value: Any, place: str, arrays: dict[str, np.ndarray]) -> Any:
         keys = [to_json(key, f"{place}.key", arrays) for key in parts]
         return {MARK: "map", "items": [list(item) for item in zip(keys, parts.values(), strict=True)]}
     if cls in _KINDS.values():
-        fields = {f: to_json(getattr(value, f), f"{place}.{f}", arrays) for f in field_names(cls)}
+        fields = {f: to_json(getattr(value, f), f"{place}.{f}", arrays) for f in cls.__annotations__}
         return {MARK: cls.__name__, "fields": fields}
     if isinstance(value, np.generic):
         return value.item()
@@ -125,11 +123,3 @@ def from_json(value: Any, arrays: dict[str, np.ndarray]) -> Any:
         case name:
             fields = {key: from_json(part, arrays) for key, part in value["fields"].items()}
             return _KINDS[name](**fields)
-
-
-@functools.cache
-def field_names(cls: type[Any]) -> tuple[str, ...]:
-    """Fields of a dataclass or named tuple, in order."""
-    if dataclasses.is_dataclass(cls):
-        return tuple(field.name for field in dataclasses.fields(cls))
-    return tuple(cls._fields)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,12 +29,9 @@ from accerl_lerobot.policies.teacher import PREFIX, Teacher
 
 HIDDEN = 128
 OBS_STATE = "observation.state"
-IMAGES = "observation.image"
-"""How images' names begin: ``observation.images.<camera>``, or LeRobot's name for a lone camera."""
-CONSTANT = 1e-6
-"""Environment units in one normalised unit, below which an action counts as constant."""
-SELF_CHECK_TOLERANCE = 1e-5
-"""Largest difference, in normalised action units, between our sampler and LeRobot's; fp32 noise is 1e-6."""
+IMAGES = "observation.image"  # begins ``observation.images.<camera>``; LeRobot's name for a lone camera
+CONSTANT = 1e-6  # environment units in one normalised unit, below which an action counts as constant
+SELF_CHECK_TOLERANCE = 1e-5  # between our sampler and LeRobot's, in normalised actions; fp32 noise is 1e-6
 
 
 class ValueHead(nn.Module):
@@ -66,12 +64,9 @@ class ValueHead(nn.Module):
 class Evaluation(NamedTuple):
     """A batch of stored decisions under the current weights."""
 
-    log_prob: Tensor
-    """(B, L), same factors as `Decision.log_prob`."""
-    entropy: Tensor
-    """(B,)."""
-    value: Tensor
-    """(B,), V of the observations."""
+    log_prob: Tensor  # (B, L), same factors as `Decision.log_prob`
+    entropy: Tensor  # (B,)
+    value: Tensor  # (B,), V of the observations
 
 
 class PolicyAdapter(nn.Module, ABC):
@@ -147,14 +142,14 @@ def stack_observations(requests: Sequence[Request]) -> tuple[dict[str, np.ndarra
     return arrays, [str(r.observation[TASK]) for r in requests]
 
 
+@dataclass
 class Processing:
     """LeRobot's pre- and post-processor, which tokenise and normalise, fed with raw observations."""
 
-    def __init__(
-        self, preprocessor: Any, postprocessor: Any, device: torch.device, rename_map: dict[str, str]
-    ) -> None:
-        self.preprocessor, self.postprocessor = preprocessor, postprocessor
-        self.device, self.rename_map = device, rename_map
+    preprocessor: Any
+    postprocessor: Any
+    device: torch.device
+    rename_map: dict[str, str]
 
     def prepare(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> dict[str, Tensor]:
         """Normalises and tokenises. Images go from uint8 (..., H, W, 3) to float (..., 3, H, W) in [0, 1]."""

@@ -162,8 +162,7 @@ POLICIES: dict[str, tuple[str, tuple[str, ...]]] = {
 """LeRobot policy type → its model, and the families that suit it, the default one first."""
 PLUGINS = {"smolvla_bins": "accerl_lerobot.policies.bins_plugin"}
 """LeRobot policy type that is not LeRobot's own → the package that registers it with LeRobot."""
-USES_HISTORY = ("diffusion",)
-"""Types that read the observations of ``n_obs_steps`` env steps; the others read one."""
+USES_HISTORY = ("diffusion",)  # types that read observations of ``n_obs_steps`` env steps; others read one
 
 
 def register_policy(policy_type: str, model: str, *families: str) -> None:

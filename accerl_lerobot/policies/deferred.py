@@ -18,7 +18,7 @@ import os
 import sys
 import threading
 from collections.abc import Sequence
-from importlib.machinery import ModuleSpec, PathFinder
+from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from types import ModuleType
 from typing import Any
 
@@ -42,17 +42,11 @@ def run(package: ModuleType) -> None:
     with _lock:
         if isinstance(package, _Package):
             package.__class__ = ModuleType  # type: ignore[assignment]
-            loader: Any = package.__spec__ and package.__spec__.loader
-            loader.run(package)
+            loader: Any = package.__loader__
+            SourceFileLoader.exec_module(loader, package)
 
 
-class _Loader:
-    def __init__(self, loader: Any) -> None:
-        self.run = loader.exec_module
-
-    def create_module(self, spec: ModuleSpec) -> None:
-        """Python's own way."""
-
+class _Loader(SourceFileLoader):
     def exec_module(self, module: ModuleType) -> None:
         module.__class__ = _Package
 
@@ -63,8 +57,8 @@ class _Finder:
         if name.rpartition(".")[0] != PARENT:
             return None
         spec = PathFinder.find_spec(name, path)
-        if spec is not None and spec.submodule_search_locations is not None:
-            spec.loader = _Loader(spec.loader)  # type: ignore[assignment]
+        if spec and spec.submodule_search_locations and spec.origin:
+            spec.loader = _Loader(name, spec.origin)
         return spec
 
 

@@ -89,12 +89,11 @@ class Diffusion(Model):
     schedule: Schedule
 
     def __init__(self, policy: Any) -> None:
+        super().__init__(policy)
         config = policy.config
-        self.refuse_options(config)
         steps, most = policy.diffusion.num_inference_steps, config.num_train_timesteps
         if steps > most:
             raise InputError("policy.num_steps", steps, f"use at most {most}, as many as it was trained with")
-        self.policy = policy
         self.size = (config.horizon, config.action_feature.shape[0])
         first = config.n_obs_steps - 1  # rows before it stand for the past
         self.rows = slice(first, min(first + config.n_action_steps, config.horizon))
@@ -161,15 +160,20 @@ class Diffusion(Model):
 class DiffusionFamily(Family):
     """Diffusion policies explored by the noise of their steps. The latent is ``path``, (N + 1, H, A)."""
 
+    counted: Tensor  # bool (N, H, 1), rows of each step's outcome that belong to the density
+
     def __init__(self, model: Diffusion, sampler: DiffusionSamplerConfig) -> None:
-        super().__init__()
-        self.model, self.sampler = model, sampler
+        super().__init__(model, sampler)
         self.size, self.rows, self.schedule = model.size, model.rows, model.schedule
         self._factors = self.rows if len(self.schedule) == 1 else slice(None)
         """L rows. Those without a density are left out: as constant factors they would dilute means."""
         zero = torch.zeros(1, 1, 1)
         stds = [self._exploring_step(k, zero, zero)[1] for k in range(len(self.schedule))]
-        entries = [int(self._mask(k, zero.device).sum()) * self.size[1] for k in range(len(stds))]
+        counted = torch.ones(len(stds), self.size[0], 1, dtype=torch.bool)
+        counted[-1] = False
+        counted[-1, self.rows] = True
+        self.register_buffer("counted", counted, persistent=False)
+        entries = (counted.sum((1, 2)) * self.size[1]).tolist()
         self.entropy = sum(n * float(normal_entropy(std)) for n, std in zip(entries, stds, strict=True))
         """Differential entropy of the steps; no weight changes it."""
 
@@ -219,11 +223,4 @@ class DiffusionFamily(Family):
 
     def _rows(self, k: int, x: Tensor, mean: Tensor, std: Tensor) -> Tensor:
         """Log-density of each row (B, H) of step k's outcome x."""
-        return torch.where(self._mask(k, x.device), normal_log_prob(x, mean, std), 0.0).sum(-1)
-
-    def _mask(self, k: int, device: torch.device) -> Tensor:
-        """bool (H, 1): rows of step k's outcome that belong to the density."""
-        last = k == len(self.schedule) - 1
-        mask = torch.full((self.size[0], 1), not last, dtype=torch.bool, device=device)
-        mask[self.rows] = True
-        return mask
+        return torch.where(self.counted[k], normal_log_prob(x, mean, std), 0.0).sum(-1)

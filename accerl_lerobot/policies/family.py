@@ -29,23 +29,18 @@ from accerl_lerobot.experience import Request
 class Encoded:
     """A batch of B observations, read once by the network."""
 
-    features: Tensor
-    """(B, P, width), what the critic reads."""
-    mask: Tensor
-    """bool (B, P), True where a feature is of something real."""
-    context: Any
-    """Input that the family samples from; each family's model defines it."""
+    features: Tensor  # (B, P, width), what the critic reads
+    mask: Tensor  # bool (B, P), True where a feature is of something real
+    context: Any  # input that the family samples from; each family's model defines it
 
 
 class Action(NamedTuple):
     """A family's decisions for a batch."""
 
-    chunk: Tensor
-    """(B, K, A), K executed actions in the policy's normalised units."""
+    chunk: Tensor  # (B, K, A), K executed actions in the policy's normalised units
     latent: dict[str, Tensor]
     """Each (B, ...): what was sampled, all that `Family.score` needs beside the observations."""
-    log_prob: Tensor
-    """(B, L); zero where not exploring."""
+    log_prob: Tensor  # (B, L); zero where not exploring
 
 
 class Model(ABC):
@@ -55,31 +50,25 @@ class Model(ABC):
         InputError: an option of this checkpoint would make its density wrong.
     """
 
-    backbone: ClassVar[str | None] = None
-    """Prefix of the parameters that ``policy.tuning.mode=expert`` freezes; None: it has no expert."""
-    unread: ClassVar[tuple[str, ...]] = ()
-    """Names of tensors that nothing is computed with; savers drop them where they are tied."""
+    backbone: ClassVar[str | None] = None  # prefix of what tuning mode ``expert`` freezes; None: no expert
+    unread: ClassVar[tuple[str, ...]] = ()  # tensors nothing is computed with; savers drop tied ones
+    idle: tuple[str, ...] = ()  # prefixes of parameters that no action depends on; never trained or published
+    width: int  # width of the features
 
-    policy: Any
-    idle: tuple[str, ...] = ()
-    """Prefixes of the parameters that no action depends on; never trained, nor published."""
-    width: int
-    """Width of the features."""
+    def __init__(self, policy: Any) -> None:
+        """Refuses options that several of LeRobot's policies have."""
+        if (rtc := getattr(policy.config, "rtc_config", None)) is not None and rtc.enabled:
+            remedy = "real-time chunking changes the sampler's density; turn it off"
+            raise InputError("policy.rtc_config.enabled", True, remedy)
+        if getattr(policy.config, "compile_model", False):
+            remedy = "a compiled sampler rounds unlike the re-scoring pass; set it to false in config.json"
+            raise InputError("policy.compile_model", True, remedy)
+        self.policy = policy
 
     @staticmethod
     def loading() -> AbstractContextManager[None]:
         """Holds while LeRobot builds policy and processors."""
         return nullcontext()
-
-    @staticmethod
-    def refuse_options(config: Any) -> None:
-        """Refuses options of LeRobot's policies under which the density would be another."""
-        if (rtc := getattr(config, "rtc_config", None)) is not None and rtc.enabled:
-            remedy = "real-time chunking changes the sampler's density; turn it off"
-            raise InputError("policy.rtc_config.enabled", True, remedy)
-        if config.compile_model:
-            remedy = "a compiled sampler rounds unlike the re-scoring pass; set it to false in config.json"
-            raise InputError("policy.compile_model", True, remedy)
 
     @abstractmethod
     def encode(self, batch: dict[str, Tensor]) -> Encoded:
@@ -92,6 +81,10 @@ class Model(ABC):
 
 class Family(nn.Module, ABC):
     """One way of acting at random with a known density; may own parameters, which are trained."""
+
+    def __init__(self, model: Any, sampler: Any) -> None:
+        super().__init__()
+        self.model, self.sampler = model, sampler
 
     @abstractmethod
     def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:

@@ -73,8 +73,8 @@ class FlowFamily(Family):
     """Flow policies explored by noise in their last denoising step. The latent is ``path``, (2, K, D)."""
 
     def __init__(self, model: FlowModel, sampler: FlowSamplerConfig) -> None:
-        super().__init__()
-        self.model, self.sampler, self.shape = model, sampler, model.shape
+        super().__init__(model, sampler)
+        self.shape = model.shape
         entries = self.shape.executed * self.shape.action_dim
         self.entropy = entries * float(normal_entropy(torch.tensor(sampler.noise_level)))
         """Differential entropy of the executed entries; no weight changes it."""

@@ -61,8 +61,7 @@ class GaussianFamily(Family):
     """Policies explored by noise around the chunk they predict."""
 
     def __init__(self, model: GaussianModel, sampler: GaussianSamplerConfig) -> None:
-        super().__init__()
-        self.model, self.sampler = model, sampler
+        super().__init__(model, sampler)
         self.std = StdHead(model.row_width, model.action_dim, sampler)
 
     def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
@@ -98,11 +97,11 @@ class ACT(GaussianModel):
     idle = ("model.vae_encoder", "model.encoder_latent_input_proj.weight")
 
     def __init__(self, policy: Any) -> None:
+        super().__init__(policy)
         config = policy.config
         if (coefficient := config.temporal_ensemble_coeff) is not None:
             remedy = "averaging over earlier chunks makes actions depend on more than the observation"
             raise InputError("policy.temporal_ensemble_coeff", coefficient, f"{remedy}; set it to null")
-        self.policy = policy
         self.executed, self.action_dim = config.n_action_steps, config.action_feature.shape[0]
         self.width = self.row_width = config.dim_model
 
@@ -113,18 +112,12 @@ class ACT(GaussianModel):
             inputs[OBS_IMAGES] = [batch[key] for key in self.policy.config.image_features]
         seen: dict[str, Tensor] = {}
 
-        def encoder_done(module: nn.Module, arguments: Any, output: Tensor) -> None:
-            seen["features"] = output.transpose(0, 1)
-
-        def head_starts(module: nn.Module, arguments: tuple[Tensor]) -> None:
-            seen["rows"] = arguments[0]
-
         with (
-            model.encoder.register_forward_hook(encoder_done),
-            model.action_head.register_forward_pre_hook(head_starts),
+            model.encoder.register_forward_hook(lambda module, given, made: seen.update(features=made)),
+            model.action_head.register_forward_pre_hook(lambda module, given: seen.update(rows=given[0])),
         ):
             mean, _ = model(inputs)
-        features = seen["features"]
+        features = seen["features"].transpose(0, 1)
         return Encoded(
             features=features,
             mask=features.new_ones(features.shape[:2]).bool(),

@@ -27,12 +27,7 @@ from accerl_lerobot.config.parsing import discover, imported
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK
 from accerl_lerobot.policies import untrusted
-from accerl_lerobot.policies.adapter import (
-    LeRobotAdapter,
-    Processing,
-    ValueHead,
-    stack_observations,
-)  # fmt: skip
+from accerl_lerobot.policies.adapter import LeRobotAdapter, Processing, ValueHead, stack_observations
 from accerl_lerobot.policies.config import (
     POLICIES,
     PolicyConfig,
@@ -47,10 +42,8 @@ from accerl_lerobot.policies.saving import tune
 
 logger = logging.getLogger(__name__)
 
-ACTS_MOST = 10**9
-"""Parameters of a policy that acts when its load is rehearsed; π0's four billion would take minutes."""
-TEXT = f"Put the red cube on the plate {string.printable}"
-"""Instruction of that decision: a tokeniser can be slow on some characters only."""
+ACTS_MOST = 10**9  # parameters of a policy that acts in a rehearsal; π0's four billion would take minutes
+TEXT = f"Put the red cube on the plate {string.printable}"  # a tokeniser can be slow on some characters only
 
 
 class Sizes(NamedTuple):
@@ -153,7 +146,7 @@ def load_adapter(config: PolicyConfig, *, rehearsal: bool = False) -> LeRobotAda
     load_weights(policy, model_class, folder / untrusted.WEIGHTS, config.path, read=not rehearsal)
     device = torch.device(lerobot_config.device)
     policy.to(device).eval()
-    model = model_class(policy)  # type: ignore[call-arg]
+    model = model_class(policy)
     if config.precision == "fp32" and device.type == "cuda":
         # torch convolves with 10 bits of mantissa there. For batches of different sizes cuDNN chooses other
         # algorithms; what they round differently is divided by the std of the noise in every log-prob.

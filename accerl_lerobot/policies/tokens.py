@@ -98,9 +98,8 @@ class TokenFamily(Family):
 
     The latent is ``tokens``, int64 (L,), the terminator from the first one on."""
 
-    def __init__(self, model: TokenModel, sampler: TokenSamplerConfig) -> None:
-        super().__init__()
-        self.model, self.sampler = model, sampler
+    model: TokenModel
+    sampler: TokenSamplerConfig
 
     def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
         """Samples; where a request does not explore, the most likely token."""

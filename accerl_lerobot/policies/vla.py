@@ -28,6 +28,7 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
@@ -75,12 +76,10 @@ class SmolVLA(FlowModel):
     unread = ("model.vlm_with_expert.vlm.lm_head.weight",)
 
     def __init__(self, policy: Any) -> None:
-        config = policy.config
-        self.refuse_options(config)
-        if config.adapt_to_pi_aloha:
+        super().__init__(policy)
+        if policy.config.adapt_to_pi_aloha:
             raise InputError("policy.adapt_to_pi_aloha", True, "not supported in RL; train one without it")
-        self.policy = policy
-        self.shape = flow_shape(config, config.num_steps)
+        self.shape = flow_shape(policy.config, policy.config.num_steps)
         self.width = policy.model.vlm_with_expert.config.text_config.hidden_size
 
     def encode(self, batch: dict[str, Tensor]) -> Encoded:
@@ -103,7 +102,7 @@ class SmolVLABins(TokenModel):
     terminator = None
 
     def __init__(self, policy: Any) -> None:
-        self.policy = policy
+        super().__init__(policy)
         self.rows = int(policy.config.n_action_steps)
         self.length = self.rows * policy.config.action_feature.shape[0]
         self.width = policy.model.head.in_features
@@ -133,10 +132,8 @@ class Pi05(FlowModel):
     unread = (f"{VLM}lm_head.weight", "model.paligemma_with_expert.gemma_expert.lm_head.weight")
 
     def __init__(self, policy: Any) -> None:
-        config = policy.config
-        self.refuse_options(config)
-        self.policy = policy
-        self.shape = flow_shape(config, config.num_inference_steps)
+        super().__init__(policy)
+        self.shape = flow_shape(policy.config, policy.config.num_inference_steps)
         language_model = policy.model.paligemma_with_expert.paligemma.model.language_model
         # As LeRobot's own sampler has it, which switches it on at its first call.
         language_model.config._attn_implementation = "eager"
@@ -232,18 +229,15 @@ def data_only() -> Iterator[None]:
     """While it lasts, LeRobot reads the tokenisers of π0-FAST and runs no code that comes with them."""
     from lerobot.policies.pi0_fast import modeling_pi0_fast
     from lerobot.processor import tokenizer_processor
+    from transformers import AutoTokenizer
 
-    ours: dict[str, Any] = {"AutoProcessor": FastTokenizer, "AutoTokenizer": _TextTokenizer}
+    def text_tokenizer(name: str, **options: Any) -> Any:
+        return AutoTokenizer.from_pretrained(name, **options | {"trust_remote_code": False})
+
+    text = SimpleNamespace(from_pretrained=text_tokenizer)
+    ours: dict[str, Any] = {"AutoProcessor": FastTokenizer, "AutoTokenizer": text}
     with patch.multiple(modeling_pi0_fast, **ours), patch.multiple(tokenizer_processor, **ours):
         yield
-
-
-class _TextTokenizer:
-    @staticmethod
-    def from_pretrained(name: str, **options: Any) -> Any:
-        from transformers import AutoTokenizer
-
-        return AutoTokenizer.from_pretrained(name, **options | {"trust_remote_code": False})
 
 
 class Pi0Fast(TokenModel):
@@ -252,8 +246,8 @@ class Pi0Fast(TokenModel):
     loading = staticmethod(data_only)
 
     def __init__(self, policy: Any) -> None:
+        super().__init__(policy)
         config, tokenizer = policy.config, policy._paligemma_tokenizer
-        self.refuse_options(config)
         if config.temperature != 0:
             remedy = "LeRobot's sampler has to be greedy here: set it to 0 in config.json; exploration has a "
             raise InputError("policy.temperature", config.temperature, f"{remedy}policy.sampler.temperature")
@@ -262,7 +256,7 @@ class Pi0Fast(TokenModel):
             remedy = f"LeRobot decodes so many rows from the coefficients of {rows}; use all of them"
             raise InputError("policy.n_action_steps", config.n_action_steps, remedy)
         config.validate_action_token_prefix = False
-        self.policy = policy
+        logging.root.addFilter(_decodable)
         self.length = config.max_decoding_steps
         self.terminator = tokenizer.convert_tokens_to_ids(END)
         paligemma = policy.model.paligemma_with_expert.paligemma
@@ -311,12 +305,7 @@ class Pi0Fast(TokenModel):
 
     def chunk(self, tokens: Tensor) -> Tensor:
         rows, dims = self.policy.config.n_action_steps, self.policy.config.action_feature.shape[0]
-        with _undecodable_quietly():
-            return self.policy.detokenize_actions(tokens, action_horizon=rows, action_dim=dims)
-
-    def stock(self, batch: dict[str, Tensor], **noise: Tensor) -> Tensor:
-        with _undecodable_quietly():
-            return super().stock(batch, **noise)
+        return self.policy.detokenize_actions(tokens, action_horizon=rows, action_dim=dims)
 
     def stock_tokens(self, batch: dict[str, Tensor]) -> Tensor:
         return self.policy.model.sample_actions_fast_kv_cache(
@@ -327,15 +316,6 @@ class Pi0Fast(TokenModel):
         )
 
 
-def _passes(record: logging.LogRecord) -> bool:
+def _decodable(record: logging.LogRecord) -> bool:
+    """False for both lines that LeRobot logs of a sequence that it cannot decode: exploring draws many."""
     return not str(record.msg).startswith(("Error decoding tokens", "Tokens: "))
-
-
-@contextlib.contextmanager
-def _undecodable_quietly() -> Iterator[None]:
-    """LeRobot logs two lines for each sequence that it cannot decode, and exploring draws many."""
-    logging.root.addFilter(_passes)
-    try:
-        yield
-    finally:
-        logging.root.removeFilter(_passes)

@@ -51,8 +51,7 @@ class Chart:
     bottom: float | None = None
     top: float | None = None
     share: bool = False
-    bands: bool = True
-    """False draws no bands and intervals, which hide each other where there are many series."""
+    bands: bool = True  # False: no bands nor intervals, which hide each other where there are many series
     wide: bool = False
 
     @property

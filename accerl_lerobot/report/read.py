@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from accerl_lerobot.checkpoint.layout import CONFIG, SUMMARY
-from accerl_lerobot.checkpoint.safety import Origin, brief, check_folder
+from accerl_lerobot.checkpoint.safety import Origin, check_folder, read_json
 from accerl_lerobot.config.parsing import encode, read_recipe
 from accerl_lerobot.console import ABSENT
 from accerl_lerobot.engine.config import RunConfig
@@ -36,10 +36,8 @@ class Run:
     path: Path
     config: Record
     config_text: str
-    records: dict[str, list[Record]]
-    """Lines of metrics.jsonl by their kind, in order."""
-    result: Record | None
-    """summary.json; None: not finished."""
+    records: dict[str, list[Record]]  # lines of metrics.jsonl by their kind, in order
+    result: Record | None  # summary.json; None: not finished
     truncated: bool
     written: float
     videos: tuple[Path, ...]
@@ -82,7 +80,8 @@ class Run:
 
 
 def read_run(path: Path) -> Run:
-    check_folder(path, Origin("runs", str(path)))
+    origin = Origin("runs", str(path))
+    check_folder(path, origin)
     config_path = path / CONFIG
     if not config_path.is_file():
         remedy = f"no run in it: there is no {CONFIG}, which every run writes first"
@@ -100,7 +99,7 @@ def read_run(path: Path) -> Run:
         config=config,
         config_text=config_path.read_text(),
         records=records,
-        result=_mapping(result) if result.is_file() else None,
+        result=read_json(result, origin) if result.is_file() else None,
         truncated=truncated,
         written=max(file.stat().st_mtime for file in path.iterdir() if file.suffix != ".html"),
         videos=tuple(sorted(path.glob("*.mp4"))),
@@ -118,13 +117,6 @@ def newest(records: Sequence[Record], name: str) -> float | None:
     values = column(records, name)
     finite = values[np.isfinite(values)]
     return float(finite[-1]) if len(finite) else None
-
-
-def _mapping(path: Path) -> Record:
-    try:
-        return dict(json.loads(path.read_text()))
-    except (TypeError, ValueError, RecursionError) as error:
-        raise InputError("runs", str(path), f"damaged ({brief(error)}); restore it, or remove it") from error
 
 
 def _lines(path: Path) -> tuple[list[Record], bool]:

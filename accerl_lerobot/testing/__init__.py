@@ -34,14 +34,10 @@ from accerl_lerobot.policies.saving import save_pretrained
 TOLERANCE = 1e-4
 """|ρ − 1| of a whole chunk at equal weights, in fp32 on any CPU; found are 1e-7 to 2e-5. Also the error of
 other numbers, relative to the largest of their kind."""
-BATCH = 12
-"""Decisions that are compared in batches of several sizes."""
-MOVED = 0.5
-"""Std of log ρ between the two policies of `check_importance`."""
-STEPS_MOST = 100
-"""Small steps of the weights until log ρ varies by that much."""
-DEVIATIONS = 5.0
-"""Largest difference of two estimates in standard errors; one in two million is above it by chance."""
+BATCH = 12  # decisions that are compared in batches of several sizes
+MOVED = 0.5  # std of log ρ between the two policies of `check_importance`
+STEPS_MOST = 100  # small steps of the weights until log ρ varies by that much
+DEVIATIONS = 5.0  # standard errors between two estimates; one in two million is further off by chance
 
 
 def check_policy(policy: PolicyConfig | Path | str, observations: Sequence[Observation]) -> None:

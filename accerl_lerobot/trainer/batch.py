@@ -82,8 +82,7 @@ def turns(rows: np.ndarray, size: int, rank: int, ranks: int) -> list[tuple[np.n
     return own + [(rows[:1], False)] * (most - len(own))
 
 
-MAX_NONFINITE = 5
-"""Steps with a non-finite loss or gradient are skipped and counted; so many in a row are an error."""
+MAX_NONFINITE = 5  # steps in a row with a non-finite loss or gradient that are an error; fewer are skipped
 
 
 class NonFiniteError(RuntimeError):

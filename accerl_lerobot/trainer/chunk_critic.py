@@ -70,18 +70,16 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         device = adapter.device
         self.critic = Critic(self.teacher).to(device)
         self.slow = copy.deepcopy(self.critic).requires_grad_(False)
+        # Reads the scaled state off the policy's features.
         self.reader = nn.Linear(adapter.model.width, len(self.teacher.mean)).to(device)
-        """Reads the scaled state off the policy's features."""
         # The teacher lies beside the policy's weights.
         self.networks = {"critic": self.critic, "slow": self.slow, "reader": self.reader}
         self.optimizers = {
             "critic": torch.optim.AdamW(self.critic.parameters(), lr=config.value_lr, weight_decay=1e-3),
             "teacher": torch.optim.AdamW(self.teacher.network.parameters(), lr=TEACHER_LR, weight_decay=1e-4),
         }
-        self._outcomes: dict[str, deque[bool]] = {
-            name: deque(maxlen=LAST) for name in ("policy_success", "teacher_success")
-        }
-        """Success of the last exploring episodes, by who acted in them."""
+        # Success of the last exploring episodes, by who acted in them.
+        self._outcomes = {name: deque[bool](maxlen=LAST) for name in ("policy_success", "teacher_success")}
         self.optimizer.add_param_group({"params": list(self.reader.parameters()), "lr": READER_LR})
 
     def step(self, segments: Sequence[Segment]) -> dict[str, float]:

@@ -9,13 +9,14 @@ PyTorch's fake tensors, which have shapes and no data: π0 needs no 14 GiB to be
 
 from __future__ import annotations
 
+import copy
 import weakref
 from contextlib import nullcontext
 from functools import partial
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map_only
 
@@ -86,7 +87,7 @@ def policy_memory(adapter: LeRobotAdapter, *, imitates: bool, checkpointing: boo
 
     `imitates` is true of off-policy algorithms, `checkpointing` is ``trainer.activation_checkpointing``.
     """
-    from torch._subclasses.fake_tensor import FakeTensorMode
+    from torch._subclasses.fake_tensor import FakeCopyMode, FakeTensorMode
 
     sizes = sizes_of(adapter)
     requests = adapter.example_requests()
@@ -95,7 +96,8 @@ def policy_memory(adapter: LeRobotAdapter, *, imitates: bool, checkpointing: boo
     if sizes.policy > FAKED_FROM:
         mode = FakeTensorMode(allow_non_fake_inputs=True)
         batch = tree_map_only(Tensor, mode.from_tensor, batch)
-        _fake(adapter, mode)
+        with FakeCopyMode(mode):  # tokenisers stay as they are
+            adapter = copy.deepcopy(adapter, {id(adapter.processing): adapter.processing})
     one = tree_map_only(Tensor, lambda tensor: tensor[:1], batch)
     peaks, kept = [], []
     with mode:
@@ -131,21 +133,3 @@ def _prepare_gradient(adapter: LeRobotAdapter, action: Action, imitates: bool, b
         latent = {name: tensor.expand(rows, *tensor.shape[1:]) for name, tensor in action.latent.items()}
         log_prob, _ = adapter.family.score(encoded, latent)
     return log_prob, adapter.value_head(encoded.features, encoded.mask)
-
-
-def _fake(adapter: LeRobotAdapter, mode: Any) -> None:
-    """Replaces all weights by fake ones of the same shapes; what is tied stays tied."""
-    fakes: dict[int, Any] = {}
-
-    def fake(tensor: Tensor) -> Tensor:
-        if id(tensor) not in fakes:
-            made = mode.from_tensor(tensor.detach())
-            trained = tensor.requires_grad
-            fakes[id(tensor)] = nn.Parameter(made, trained) if isinstance(tensor, nn.Parameter) else made
-        return fakes[id(tensor)]
-
-    modules = (m for root in (adapter.policy, adapter.family, adapter.value_head) for m in root.modules())
-    with mode:
-        for module in modules:
-            for named in (module._parameters, module._buffers):
-                named.update({name: fake(tensor) for name, tensor in named.items() if tensor is not None})

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from accerl_lerobot.algorithms import AlgorithmConfig, LossInputs, RatioConfig
 from accerl_lerobot.algorithms.advantages import decision_mask, gae, moments, normalise
-from accerl_lerobot.algorithms.objective import lag_metrics, present
+from accerl_lerobot.algorithms.objective import lag_metrics, present, sample_metrics
 from accerl_lerobot.checkpoint.tensors import optimizer_state, restore_optimizer, whole
 from accerl_lerobot.config.parsing import imported
 from accerl_lerobot.experience import Segment
@@ -189,16 +189,16 @@ class RatioUpdate(BaseUpdate):
             for name, mean in output.means.items():
                 weight = float(own) if name == "decisions" else share
                 means[name] = means.get(name, 0.0) + (weight * float(mean) if own else 0.0)
-            samples.append(output.samples.rows()[counted])
+            samples.append(output.samples[counted].cpu())
         if not self.config.zero:
             self.ranks.average(self._policy + self._value)
         assert targets is not None
         share_of_means = torch.tensor([list(means.values())], dtype=torch.float64)
         total = self.ranks.gather(share_of_means, self.ranks.size).sum(0).tolist()
-        joined = output.samples.joined(self.ranks.gather(torch.cat(samples), len(batch)))
+        gathered = sample_metrics(self.ranks.gather(torch.cat(samples), len(batch)), output.clip)
         return {
             **dict(zip(means, total, strict=True)),
-            **{name: float(value) for name, value in joined.metrics().items()},
+            **{name: float(value) for name, value in gathered.items()},
             "return_mean": float(targets[1].mean()),
             "reward_mean": float(batch.reward.mean()),
         }

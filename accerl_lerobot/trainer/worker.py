@@ -31,8 +31,7 @@ from accerl_lerobot.transport.endpoint import Endpoint
 from accerl_lerobot.transport.weights import PublishDelay, WeightPublisher
 
 FIRST_S = 120.0  # timeout for the first weights to be published
-RESEND_S = 0.2
-"""Interval at which replicas that were busy get the newest weights while the trainer waits for a batch."""
+RESEND_S = 0.2  # interval at which busy replicas get the newest weights while the trainer waits for a batch
 
 
 class TrainerWorker:

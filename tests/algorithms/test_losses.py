@@ -3,6 +3,7 @@
 
 import math
 from dataclasses import replace
+from statistics import fmean
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,6 @@ import torch
 
 from accerl_lerobot.algorithms import GIPOConfig, LossInputs, PPOConfig, RatioConfig
 from accerl_lerobot.algorithms.objective import LOG_RATIO_CLAMP
-from tests.algorithms import oracle
 from tests.algorithms.inputs import gradient, make_inputs, one
 
 CONFIGS: list[RatioConfig] = [
@@ -26,27 +26,46 @@ each_algorithm = pytest.mark.parametrize(
 )
 
 
-def logs_of(inputs: LossInputs, level: str) -> oracle.Ragged:
+Ragged = list[list[float]]
+"""One list per decision, with an entry for each of its ratios."""
+
+
+def grouped(x: np.ndarray, level: str, factors: np.ndarray | None = None) -> Ragged:
+    """Sums of (N, L) log-probs over what one ratio covers, without factors that do not exist."""
+    found: Ragged = []
+    for i in range(len(x)):
+        row = [float(x[i, j]) for j in range(x.shape[1]) if factors is None or factors[i, j]]
+        found.append([sum(row)] if level == "chunk" else row)
+    return found
+
+
+def logs_of(inputs: LossInputs, level: str) -> Ragged:
     """log of π over μ."""
     factors = None if inputs.factors is None else inputs.factors.numpy()
-    difference = (inputs.log_prob_new.detach() - inputs.log_prob_old).numpy()
-    return oracle.grouped(difference, level, factors)
+    return grouped((inputs.log_prob_new.detach() - inputs.log_prob_old).numpy(), level, factors)
 
 
 def policy_loss_of(inputs: LossInputs, config: RatioConfig) -> float:
-    """The algorithm's own term by its oracle."""
-    logs, advantage = logs_of(inputs, config.level), inputs.advantage.numpy()
-    if isinstance(config, GIPOConfig):
-        return oracle.gipo(logs, advantage, config.sigma)
-    assert isinstance(config, PPOConfig)
-    return oracle.ppo(logs, advantage, config.clip_low, config.clip_high)
+    """The papers' formulas, one ratio at a time: −E[ω ρ Â], or −E[min(ρ Â, clip(ρ, 1 − low, 1 + high) Â)]."""
+    terms = []
+    for row, advantage in zip(logs_of(inputs, config.level), inputs.advantage.tolist(), strict=True):
+        for x in row:
+            rho = math.exp(x)
+            if isinstance(config, GIPOConfig):
+                terms.append(math.exp(-0.5 * (x / config.sigma) ** 2) * rho * advantage)
+            else:
+                assert isinstance(config, PPOConfig)
+                clipped = min(max(rho, 1 - config.clip_low), 1 + config.clip_high)
+                terms.append(min(rho * advantage, clipped * advantage))
+    return -fmean(terms)
 
 
 def loss_of(inputs: LossInputs, config: RatioConfig) -> float:
-    """All of it."""
-    error = (inputs.value.detach() - inputs.returns).square().numpy()
-    entropy = inputs.entropy.detach().numpy()
-    shared = oracle.shared(error, logs_of(inputs, config.level), entropy, config)
+    """With ½ E(V − R)² + kl_coef · KL(μ‖π) − entropy_coef · H."""
+    error = (inputs.value.detach() - inputs.returns).square().tolist()
+    kl = fmean(math.exp(x) - 1 - x for row in logs_of(inputs, config.level) for x in row)
+    entropy = fmean(inputs.entropy.detach().tolist())
+    shared = 0.5 * fmean(error) + config.kl_coef * kl - config.entropy_coef * entropy
     return policy_loss_of(inputs, config) + shared
 
 
@@ -108,11 +127,11 @@ def test_gipo_gradient_is_that_of_importance_sampling_with_the_weight_held_still
     advantage = inputs.advantage.numpy()[:, None]
 
     def surrogate(new: np.ndarray, weight: np.ndarray) -> float:
-        logs = np.array(oracle.grouped(new - inputs.log_prob_old.numpy(), level))
+        logs = np.array(grouped(new - inputs.log_prob_old.numpy(), level))
         return float(-np.mean(weight * np.exp(logs) * advantage))
 
     new = inputs.log_prob_new.detach().numpy()
-    logs = np.array(oracle.grouped(new - inputs.log_prob_old.numpy(), level))
+    logs = np.array(grouped(new - inputs.log_prob_old.numpy(), level))
     weight = np.exp(-0.5 * (logs / 0.7) ** 2)
     formula = np.broadcast_to(-weight * np.exp(logs) * advantage / logs.size, new.shape)
     np.testing.assert_allclose(got.numpy(), formula, atol=1e-12)

@@ -14,11 +14,11 @@ import torch
 from accerl_lerobot.algorithms import AlgorithmConfig, GIPOConfig, PPOConfig, RatioConfig
 from accerl_lerobot.algorithms.objective import (
     KL_LINEAR_ABOVE,
-    Samples,
     kl_from_behaviour,
     lag_metrics,
     mean_over_ratios,
     present,
+    sample_metrics,
 )
 from tests.algorithms.inputs import gradient, make_inputs
 from tests.runs import ALGORITHMS
@@ -105,21 +105,18 @@ def test_kl_pulls_back_from_both_sides_with_a_bounded_slope() -> None:
 
 # ---- metrics
 
-YES = torch.ones(4, 1, dtype=torch.bool)
-
 
 def metrics_of(
     log_ratio: list[float] = [0.0] * 4,
     weight: list[float] = [1.0] * 4,
     value: list[float] = [0.0] * 4,
     returns: list[float] = [1.0] * 4,
-    keep: torch.Tensor = YES,
+    keep: list[bool] = [True] * 4,
     clip: tuple[float, float] = (0.2, 0.28),
 ) -> dict[str, float]:
     """Metrics of four decisions with a ratio each."""
-    columns = {"log_ratio": torch.tensor(log_ratio)[:, None], "weight": torch.tensor(weight)[:, None]}
-    rows = {"value": torch.tensor(value), "returns": torch.tensor(returns)}
-    return {k: v.item() for k, v in Samples(**columns, **rows, keep=keep, clip=clip).metrics().items()}
+    samples = torch.tensor([log_ratio, weight, keep, value, returns], dtype=torch.float64).T
+    return {name: metric.item() for name, metric in sample_metrics(samples, clip).items()}
 
 
 @pytest.mark.parametrize(
@@ -135,8 +132,7 @@ def test_shares_and_quantiles_are_of_the_ratios_that_exist() -> None:
     found = metrics_of(logs, weight=[0.0, 0.05, 1.0, 1.0])
     assert (found["clip_fraction"], found["low_weight"]) == (0.5, 0.5)
     assert found["log_ratio_p05"] == pytest.approx(np.quantile(logs, 0.05))
-    keep = torch.tensor([[True], [True], [True], [False]])
-    found = metrics_of(logs, weight=[0.0, 0.05, 1.0, 1.0], keep=keep)
+    found = metrics_of(logs, weight=[0.0, 0.05, 1.0, 1.0], keep=[True, True, True, False])
     assert (found["clip_fraction"], found["low_weight"]) == pytest.approx((1 / 3, 2 / 3))
     assert found["log_ratio_p95"] == pytest.approx(np.quantile(logs[:3], 0.95))
     assert found["approx_kl"] == pytest.approx(np.mean([math.exp(x) - 1 - x for x in logs[:3]]), abs=1e-6)

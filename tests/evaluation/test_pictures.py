@@ -27,68 +27,62 @@ def read(path: Path) -> np.ndarray:
     return np.stack([np.asarray(frame) for frame in imageio.get_reader(path)])
 
 
-class TestSuccessCurve:
-    """PNG."""
-
-    def test_draws(self, tmp_path: Path) -> None:
-        path = tmp_path / "curve.png"
-        success_curve(path, [evaluated(0, 30, 100), evaluated(5000, 95, 100)], [(100, 0.3), (4000, 0.9)])
-        image = np.asarray(imageio.imread(path))
-        assert image.shape[:2] == (480, 840)
-        assert len(np.unique(image[..., :3].reshape(-1, 3), axis=0)) > 20
+def test_the_curve_is_drawn(tmp_path: Path) -> None:
+    path = tmp_path / "curve.png"
+    success_curve(path, [evaluated(0, 30, 100), evaluated(5000, 95, 100)], [(100, 0.3), (4000, 0.9)])
+    image = np.asarray(imageio.imread(path))
+    assert image.shape[:2] == (480, 840)
+    assert len(np.unique(image[..., :3].reshape(-1, 3), axis=0)) > 20
 
 
-class TestVideo:
-    """MP4 in the pixel format that all players know."""
+def test_clips_stand_side_by_side_and_hold_their_last_frame(tmp_path: Path) -> None:
+    path = tmp_path / "film.mp4"
+    write_video(path, [[clip(3, (200, 0, 0)), clip(6, (0, 0, 200))]], fps=10)
+    film = read(path)
+    assert film.shape == (6 + 10, 32, 32 + GAP + 32, 3)
+    left, right = film[:, 8:24, 8:24].mean((1, 2)), film[:, 8:24, -24:-8].mean((1, 2))
+    assert (abs(left - (200, 0, 0)) < 25).all() and (abs(right - (0, 0, 200)) < 25).all()
+    assert (film[:, :, 33 : 32 + GAP - 1] > 150).all()
 
-    def test_clips_stand_side_by_side_and_hold_their_last_frame(self, tmp_path: Path) -> None:
-        path = tmp_path / "film.mp4"
-        write_video(path, [[clip(3, (200, 0, 0)), clip(6, (0, 0, 200))]], fps=10)
-        film = read(path)
-        assert film.shape == (6 + 10, 32, 32 + GAP + 32, 3)
-        left, right = film[:, 8:24, 8:24].mean((1, 2)), film[:, 8:24, -24:-8].mean((1, 2))
-        assert (abs(left - (200, 0, 0)) < 25).all() and (abs(right - (0, 0, 200)) < 25).all()
-        assert (film[:, :, 33 : 32 + GAP - 1] > 150).all()
 
-    def test_before_beside_after_with_outcomes_and_numbers(self, tmp_path, monkeypatch):
-        def result(index: int, success: bool, frames: list[np.ndarray]) -> EpisodeResult:
-            plan = EpisodePlan(task="t", seed=index, explore=False, index=index)
-            return EpisodeResult(
-                plan=plan, success=success, episode_return=0.0, steps=1, decisions=1, versions=(0, 0),
-                frames=frames,
-            )  # fmt: skip
+def test_before_beside_after_with_outcomes_and_numbers(tmp_path, monkeypatch):
+    def result(index: int, success: bool, frames: list[np.ndarray]) -> EpisodeResult:
+        plan = EpisodePlan(task="t", seed=index, explore=False, index=index)
+        return EpisodeResult(
+            plan=plan, success=success, episode_return=0.0, steps=1, decisions=1, versions=(0, 0),
+            frames=frames,
+        )  # fmt: skip
 
-        grey = clip(3, (120, 120, 120), side=64)
-        before = [result(i, i == 0, grey) for i in (1, 0, 2)] + [result(3, True, [])]
-        after = [result(i, i != 2, grey) for i in range(4)]
-        captions: list[Any] = []
-        caption = evaluation._caption
-        monkeypatch.setattr(
-            evaluation, "_caption", lambda text, width: captions.append(text) or caption(text, width)
-        )
-        numbers = evaluated(0, 46, 100), evaluated(1, 98, 100)
-        before_after(tmp_path / "film.mp4", (before, numbers[0]), (after, numbers[1]), fps=4)
-        film = read(tmp_path / "film.mp4").astype(int)
-        half = 2 * 64 + GAP
-        head = film.shape[1] - GAP - half
-        assert 15 < head < 60 and film.shape[2] == 2 * half + 4 * GAP
+    grey = clip(3, (120, 120, 120), side=64)
+    before = [result(i, i == 0, grey) for i in (1, 0, 2)] + [result(3, True, [])]
+    after = [result(i, i != 2, grey) for i in range(4)]
+    captions: list[Any] = []
+    caption = evaluation._caption
+    monkeypatch.setattr(
+        evaluation, "_caption", lambda text, width: captions.append(text) or caption(text, width)
+    )
+    numbers = evaluated(0, 46, 100), evaluated(1, 98, 100)
+    before_after(tmp_path / "film.mp4", (before, numbers[0]), (after, numbers[1]), fps=4)
+    film = read(tmp_path / "film.mp4").astype(int)
+    half = 2 * 64 + GAP
+    head = film.shape[1] - GAP - half
+    assert 15 < head < 60 and film.shape[2] == 2 * half + 4 * GAP
 
-        def edge(frame: int, row: int, column: int) -> str:
-            top, left = (
-                head + GAP + row * (64 + GAP),
-                column % 2 * (64 + GAP) + column // 2 * (half + 4 * GAP),
-            )
-            red, green, _ = film[frame, top + 61, left + 20 : left + 44].mean(0)
-            return "red" if red > green + 60 else "green" if green > red + 60 else "none"
+    def edge(frame: int, row: int, column: int) -> str:
+        top = head + GAP + row * (64 + GAP)
+        left = column % 2 * (64 + GAP) + column // 2 * (half + 4 * GAP)
+        red, green, _ = film[frame, top + 61, left + 20 : left + 44].mean(0)
+        return "red" if red > green + 60 else "green" if green > red + 60 else "none"
 
-        assert [edge(0, r, c) for r in (0, 1) for c in range(4)] == ["none"] * 8
-        ends = [edge(-1, r, c) for r in (0, 1) for c in range(4)]
-        assert ends == ["green", "red", "green", "green", "red", "none", "red", "none"]
-        assert (film[:, head + GAP + 80 :, 80:half] > 150).all(), "no fourth episode"
-        assert captions == [
-            "before RL: 46% success [37%, 56%], n = 100", "after RL: 98% success [93%, 99%], n = 100",
-        ]  # fmt: skip
+    assert [edge(0, r, c) for r in (0, 1) for c in range(4)] == ["none"] * 8
+    ends = [edge(-1, r, c) for r in (0, 1) for c in range(4)]
+    assert ends == ["green", "red", "green", "green", "red", "none", "red", "none"]
+    assert (film[:, head + GAP + 80 :, 80:half] > 150).all(), "no fourth episode"
+    assert captions == [
+        "before RL: 46% success [37%, 56%], n = 100", "after RL: 98% success [93%, 99%], n = 100",
+    ]  # fmt: skip
 
-    def test_without_frames_there_is_no_video(self, tmp_path: Path) -> None:
-        before_after(tmp_path / "film.mp4", ([], None), ([], None), fps=4)
-        assert list(tmp_path.iterdir()) == []
+
+def test_without_frames_there_is_no_video(tmp_path: Path) -> None:
+    before_after(tmp_path / "film.mp4", ([], None), ([], None), fps=4)
+    assert list(tmp_path.iterdir()) == []

@@ -55,27 +55,19 @@ RESULTS = [
 ]
 
 
-class TestSummarise:
-    """Plain numbers, by hand."""
-
-    def test_in_all(self) -> None:
-        summary = summarise(RESULTS)
-        assert (summary["success"], summary["n"]) == (0.45, 20)
-        # Wilson, 9 of 20: (p + z²/2n ± z √(p(1 − p)/n + z²/4n²)) / (1 + z²/n) with z = 1.959964
-        assert summary["ci95"] == pytest.approx([0.258199, 0.657906], abs=1e-5)
-        assert summary["return_mean"] == pytest.approx((9 - 11 * 0.5) / 20)
-        assert summary["steps_mean"] == pytest.approx((9 * 50 + 11 * 150) / 20)
-        assert (summary["version_min"], summary["version_max"]) == (2, 5)
-
-    def test_per_task(self) -> None:
-        tasks = summarise(RESULTS)["tasks"]
-        assert list(tasks) == ["door", "drawer"]
-        assert [(t["success"], t["n"]) for t in tasks.values()] == [(0.8, 10), (0.1, 10)]
-        assert all(t["ci95"][0] < t["success"] < t["ci95"][1] for t in tasks.values())
-
-    def test_says_which_starts_failed(self) -> None:
-        task = summarise(RESULTS)["tasks"]["door"]
-        assert task["seeds"] == [0, 9] and task["failed_seeds"] == [8, 9]
+def test_a_summary_in_all_and_per_task() -> None:
+    summary = summarise(RESULTS)
+    assert (summary["success"], summary["n"]) == (0.45, 20)
+    # Wilson, 9 of 20: (p + z²/2n ± z √(p(1 − p)/n + z²/4n²)) / (1 + z²/n) with z = 1.959964
+    assert summary["ci95"] == pytest.approx([0.258199, 0.657906], abs=1e-5)
+    assert summary["return_mean"] == pytest.approx((9 - 11 * 0.5) / 20)
+    assert summary["steps_mean"] == pytest.approx((9 * 50 + 11 * 150) / 20)
+    assert (summary["version_min"], summary["version_max"]) == (2, 5)
+    tasks = summary["tasks"]
+    assert list(tasks) == ["door", "drawer"]
+    assert [(t["success"], t["n"]) for t in tasks.values()] == [(0.8, 10), (0.1, 10)]
+    assert all(t["ci95"][0] < t["success"] < t["ci95"][1] for t in tasks.values())
+    assert tasks["door"]["seeds"] == [0, 9] and tasks["door"]["failed_seeds"] == [8, 9]
 
 
 def test_a_table_has_a_row_per_task_and_one_for_all() -> None:
@@ -89,26 +81,17 @@ def test_a_table_has_a_row_per_task_and_one_for_all() -> None:
     assert "all" not in printed(RESULTS[:10]), "one task needs no sum"
 
 
-class TestPlans:
-    """Which episodes are run."""
+def test_plans_are_paired_across_evaluations_and_runs_of_any_size() -> None:
+    before, after = (evaluation_plans(("a", "b"), 10, group) for group in ("before", "after"))
+    assert [(p.task, p.seed) for p in before] == [(p.task, p.seed) for p in after]
+    assert len({(p.task, p.seed) for p in before}) == 10
+    assert evaluation_plans(("a", "b"), 6, "before") == before[:6]
 
-    def test_are_paired_across_evaluations_and_runs(self) -> None:
-        before = evaluation_plans(("a", "b"), 10, "before")
-        after = evaluation_plans(("a", "b"), 10, "after")
-        assert [(p.task, p.seed) for p in before] == [(p.task, p.seed) for p in after]
-        assert len({(p.task, p.seed) for p in before}) == 10
 
-    def test_smaller_evaluations_are_the_beginning_of_larger_ones(self) -> None:
-        few, many = (evaluation_plans(("a", "b"), n, "x") for n in (6, 12))
-        assert few == many[:6]
-
-    def test_seeds_are_never_trained_on(self) -> None:
-        for plan in evaluation_plans(("a",), 50, "x"):
-            assert plan.seed in EVAL_SEEDS
-            assert plan.seed not in TRAIN_SEEDS and plan.seed not in DEMO_SEEDS
-
-    def test_do_not_explore_and_are_filmed_first(self) -> None:
-        plans = evaluation_plans(("a",), 4, "x", filmed=2)
-        assert not any(p.explore for p in plans)
-        assert [p.film for p in plans] == [FILM, FILM, None, None]
-        assert [p.index for p in plans] == [0, 1, 2, 3] and {p.group for p in plans} == {"x"}
+def test_plans_are_never_trained_on_do_not_explore_and_are_filmed_first() -> None:
+    plans = evaluation_plans(("a",), 50, "x", filmed=2)
+    for plan in plans:
+        assert plan.seed in EVAL_SEEDS and plan.group == "x" and not plan.explore
+        assert plan.seed not in TRAIN_SEEDS and plan.seed not in DEMO_SEEDS
+    assert [p.film for p in plans] == [FILM, FILM] + [None] * 48
+    assert [p.index for p in plans] == list(range(50))

@@ -30,22 +30,13 @@ from tests.rounding import assert_close
 DATASET = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
 CHUNK, DIMS, BINS = 3, 2, 8
 SFT = SFTConfig(
-    steps=60,
-    batch_size=16,
-    lr=5e-3,
-    num_threads=1,
+    steps=60, batch_size=16, lr=5e-3, num_threads=1, extra_args=["--log_freq=10"],
     policy={
-        "type": "smolvla_bins",
-        "num_vlm_layers": 2,
-        "chunk_size": 4,
-        "n_action_steps": 3,
-        "num_bins": 32,
-        "resize_imgs_with_padding": [32, 32],
-        "freeze_vision_encoder": False,
+        "type": "smolvla_bins", "num_vlm_layers": 2, "chunk_size": 4, "n_action_steps": 3, "num_bins": 32,
+        "resize_imgs_with_padding": [32, 32], "freeze_vision_encoder": False,
     },
     backbone=BackboneConfig(hidden=32, patch=8, image=32),
-    extra_args=["--log_freq=10"],
-)
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")

@@ -144,10 +144,8 @@ def write_pi(
 ) -> Path:  # fmt: skip
     """Saves a random policy with identity-like normalisation as LeRobot does; call it within `small`.
 
-    Args:
-        kind: of `KINDS`, or pi0_fast, whose `num_steps` are its most tokens.
-        prompt: tokens; the longest of `tiny.TEXTS` takes 20, and π0.5 adds 20 or so with the state.
-        whole: with the tokeniser beside it, as our checkpoints have it; LeRobot's need the Hub for that.
+    `num_steps` are pi0_fast's most tokens. The longest of `tiny.TEXTS` takes 20 tokens of a `prompt`, π0.5
+    adds 20 or so with the state. If `whole`, the tokeniser lies beside it, as in our checkpoints.
     """
     fast = {"max_decoding_steps": num_steps, "max_action_tokens": 32, "fast_skip_tokens": SKIP}
     cache = directory.parent / f"{directory.name}-hub"

@@ -54,17 +54,9 @@ def write_run(
     rollout: dict[str, Any] | None = None,
     train: dict[str, Any] | None = None,
 ) -> Path:
-    """A run of ``accerl train`` with an evaluation before, one after, and `n` episodes in each.
+    """A run of ``accerl train`` with an evaluation before and, if `finished`, after, of `n` episodes each.
 
-    Args:
-        folder: to make.
-        config: its recipe; None: `run_config`.
-        tasks: evaluated on.
-        successes: before and after.
-        n: episodes of each evaluation.
-        finished: whether there is a summary and an evaluation after.
-        rollout: further numbers of each record of the workers.
-        train: further numbers of each record of the trainer.
+    `rollout` and `train` are further numbers of each record of the workers and of the trainer.
     """
     folder.mkdir(parents=True)
     config = config or run_config()

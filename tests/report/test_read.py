@@ -72,7 +72,7 @@ def test_what_is_no_run(tmp_path: Path) -> None:
         ("config.yaml", b"a: [1,", "not good YAML"),
         ("config.yaml", b"- a\n", "a recipe is a mapping"),
         ("config.yaml", b"\xff\xff", "not good YAML"),
-        ("summary.json", b'{"success_before": null', "damaged"),
+        ("summary.json", b'{"success_before": null', "summary.json: not good JSON"),
     ],
 )
 def test_damaged_files_are_named(tmp_path: Path, name: str, content: bytes, said: str) -> None:

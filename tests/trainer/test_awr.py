@@ -5,28 +5,14 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 from accerl_lerobot.algorithms import AWRConfig
-from accerl_lerobot.policies.config import PolicyConfig
-from accerl_lerobot.policies.loading import load_adapter
-from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.trainer.off_policy import AWRUpdate, weights
-from accerl_lerobot.trainer.update import make_update
-from tests.trainer.test_chunk_critic import episode, first_action, tried
-
-
-def learner(checkpoint: Path, algorithm: AWRConfig, **trainer: Any) -> AWRUpdate:
-    torch.manual_seed(0)
-    adapter = load_adapter(PolicyConfig(path=str(checkpoint), device="cpu"))
-    config = TrainerConfig(**{"warmup_updates": 0, "value_warmup_updates": 0, "lr": 1e-3} | trainer)
-    update = make_update(adapter, algorithm, config)
-    assert isinstance(update, AWRUpdate)
-    return update
+from accerl_lerobot.trainer.off_policy import weights
+from tests.trainer.test_chunk_critic import awr, episode, first_action, tried
 
 
 def test_weights_by_hand():
@@ -38,7 +24,7 @@ def test_weights_by_hand():
 
 def test_a_step_weighs_each_row_by_its_advantage(tiny_checkpoint: Path):
     """Two decisions with known returns, a critic that says 0, and imitation losses of 1 and 3."""
-    update = learner(tiny_checkpoint, AWRConfig(policy_steps=1.0, beta=0.5), lr=0.0, value_lr=0.0)
+    update = awr(tiny_checkpoint, AWRConfig(policy_steps=1.0, beta=0.5), lr=0.0, value_lr=0.0)
     for value, reward in ((1.0, 0.0), (3.0, 1.0)):
         update.remember(episode([reward], actions=np.full((1, 4, 2), value, np.float32)))
     losses = update.adapter.processing.normalise(torch.tensor([1.0, 3.0])[:, None, None].expand(2, 4, 2))
@@ -59,7 +45,7 @@ def test_a_step_weighs_each_row_by_its_advantage(tiny_checkpoint: Path):
 
 
 def test_the_critic_learns_returns_and_leaves_the_policy_alone(tiny_checkpoint: Path):
-    update = learner(tiny_checkpoint, AWRConfig(policy_steps=1.0), lr=0.0, value_lr=3e-2)
+    update = awr(tiny_checkpoint, AWRConfig(policy_steps=1.0), lr=0.0, value_lr=3e-2)
     before = update.adapter.export_trainable()
     update.remember(episode([0.0, 0.0, 1.0]))
     for _ in range(60):
@@ -73,7 +59,7 @@ def test_the_critic_learns_returns_and_leaves_the_policy_alone(tiny_checkpoint: 
 @pytest.mark.slow
 def test_it_goes_where_returns_are_high(tiny_checkpoint: Path):
     """The return is how far the first action goes up; nothing counts as a success."""
-    update = learner(tiny_checkpoint, AWRConfig(policy_steps=0.5, beta=0.3), value_lr=1e-2)
+    update = awr(tiny_checkpoint, AWRConfig(policy_steps=0.5, beta=0.3), value_lr=1e-2)
     rng, before = np.random.default_rng(0), first_action(update)
     for _ in range(10):
         segments = tried(rng, lambda up: (1 + up) / 2)

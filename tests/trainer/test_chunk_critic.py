@@ -31,6 +31,7 @@ from accerl_lerobot.trainer.batch import NonFiniteError
 from accerl_lerobot.trainer.chunk_critic import ChunkCriticUpdate
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.off_policy import AWRUpdate, Memory, OffPolicyUpdate
+from accerl_lerobot.trainer.update import make_update
 from tests.replay.segments import make_segment
 from tests.runs import tiny_run
 
@@ -157,17 +158,12 @@ def test_a_teacher_keeps_to_its_range_and_scales_what_it_sees():
     assert chunk[..., 1].max() > 3.9 and chunk[..., 0].min() < -0.9
 
 
-def requests(adapter: LeRobotAdapter, count: int) -> list[Request]:
-    world = make_world(ENV)
-    return [Request(observation=world.reset(i, "match"), noise_seed=i) for i in range(count)]
-
-
 class TestActing:
     def test_whole_episodes_are_the_teachers_once_it_is_ready(self, tiny_checkpoint: Path):
         config = PolicyConfig(path=str(tiny_checkpoint), device="cpu")
         adapter = with_teacher(load_adapter, ENV.state_size, share=0.5, config=config, noise=0.0)
         assert adapter.teacher is not None
-        observation = requests(adapter, 1)[0].observation
+        observation = make_world(ENV).reset(0, "match")
         asked = [
             Request(observation=observation, noise_seed=noise_seed(episode, decision), explore=explore)
             for episode in range(200)
@@ -272,11 +268,13 @@ def test_teacher_and_policy_go_where_the_critic_leads(tiny_checkpoint: Path, mon
     assert metrics["explained_variance"] > 0.5 and metrics["memory_decisions"] == 10 * 32
 
 
-def awr(checkpoint: Path) -> OffPolicyUpdate:
+def awr(checkpoint: Path, algorithm: AWRConfig | None = None, **trainer: Any) -> AWRUpdate:
     torch.manual_seed(0)  # of the critic
     adapter = load_adapter(PolicyConfig(path=str(checkpoint), device="cpu"))
-    config = TrainerConfig(warmup_updates=0, value_warmup_updates=0, lr=1e-3)
-    return AWRUpdate(adapter, AWRConfig(), config)
+    config = TrainerConfig(**{"warmup_updates": 0, "value_warmup_updates": 0, "lr": 1e-3} | trainer)
+    update = make_update(adapter, algorithm or AWRConfig(), config)
+    assert isinstance(update, AWRUpdate)
+    return update
 
 
 @pytest.mark.parametrize("make", [learner, awr])

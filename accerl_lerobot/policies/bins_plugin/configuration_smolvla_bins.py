@@ -6,9 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from lerobot.configs import NormalizationMode, PreTrainedConfig
-from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
-
-PACKAGE = "accerl_lerobot.policies.bins_plugin"
+from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
 
 
 @PreTrainedConfig.register_subclass("smolvla_bins")
@@ -16,10 +14,8 @@ PACKAGE = "accerl_lerobot.policies.bins_plugin"
 class SmolVLABinsConfig(PreTrainedConfig):
     """A vision-language model, a query token per action dimension of a chunk, and a head onto bins."""
 
-    chunk_size: int = 8
-    """Actions of a chunk."""
-    n_action_steps: int = 8
-    """Executed actions among these."""
+    chunk_size: int = 8  # actions of a chunk
+    n_action_steps: int = 8  # executed actions among these
     num_bins: int = 256
     """Bins per action dimension, of equal width over [-1, 1] in normalised units; an action beyond is taken
     as the outermost bin."""
@@ -35,18 +31,15 @@ class SmolVLABinsConfig(PreTrainedConfig):
     reproduce them. MIN_MAX, because LeRobot takes a dataset's quantile to be the mean of its episodes'
     quantiles: a movement that few episodes need would be cut off in all of them."""
 
-    vlm_model_name: str = "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"
-    """Hub id or folder of a SmolVLM."""
+    vlm_model_name: str = "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"  # Hub id or folder of a SmolVLM
     load_vlm_weights: bool = True
     """Start a new policy from that model's weights instead of random ones; unlike in smolvla, where
     random ones are the default. False in every checkpoint, whose own file holds the weights."""
-    num_vlm_layers: int = 16
-    """How many of its language-model layers are kept, the first ones; 0 keeps all."""
+    num_vlm_layers: int = 16  # how many of its language-model layers are kept, the first ones; 0 keeps all
     freeze_vision_encoder: bool = True
     freeze_language_model: bool = False
     """True trains only queries, state projection, head and the images' connector."""
-    resize_imgs_with_padding: tuple[int, int] | None = (512, 512)
-    """Width and height."""
+    resize_imgs_with_padding: tuple[int, int] | None = (512, 512)  # width and height
     tokenizer_max_length: int = 48
     pad_language_to: str = "longest"
 
@@ -59,7 +52,7 @@ class SmolVLABinsConfig(PreTrainedConfig):
     scheduler_decay_steps: int = 30_000
     scheduler_decay_lr: float = 2.5e-6
 
-    discover_packages_path: str = PACKAGE
+    discover_packages_path: str = "accerl_lerobot.policies.bins_plugin"
     """Where this type comes from. A field, because LeRobot 0.6.1 takes the flag
     ``--policy.discover_packages_path`` for an override of the config when ``--policy.path`` is given too."""
 
@@ -79,31 +72,7 @@ class SmolVLABinsConfig(PreTrainedConfig):
         if self.action_feature is None:
             raise ValueError("smolvla_bins needs an action among its output features")
 
-    def get_optimizer_preset(self) -> AdamWConfig:
-        return AdamWConfig(
-            lr=self.optimizer_lr,
-            betas=self.optimizer_betas,
-            eps=self.optimizer_eps,
-            weight_decay=self.optimizer_weight_decay,
-            grad_clip_norm=self.optimizer_grad_clip_norm,
-        )
-
-    def get_scheduler_preset(self) -> CosineDecayWithWarmupSchedulerConfig:
-        return CosineDecayWithWarmupSchedulerConfig(
-            peak_lr=self.optimizer_lr,
-            decay_lr=self.scheduler_decay_lr,
-            num_warmup_steps=self.scheduler_warmup_steps,
-            num_decay_steps=self.scheduler_decay_steps,
-        )
-
-    @property
-    def observation_delta_indices(self) -> None:
-        return None
-
-    @property
-    def action_delta_indices(self) -> list[int]:
-        return list(range(self.chunk_size))
-
-    @property
-    def reward_delta_indices(self) -> None:
-        return None
+    get_optimizer_preset = SmolVLAConfig.get_optimizer_preset
+    get_scheduler_preset = SmolVLAConfig.get_scheduler_preset
+    action_delta_indices = SmolVLAConfig.action_delta_indices
+    observation_delta_indices = reward_delta_indices = None
