@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 import copy
 import os
-import time
 from collections import deque
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager
@@ -68,7 +67,6 @@ class ReplayWorker:
         self._batch = 0  # decisions the trainer asked for last
         self._closed = False
         self._failure: Exception | None = None
-        self._insert_wait_s = self._sample_wait_s = 0.0
         self._episodes: list[dict[str, float]] = []
         if state is not None:
             saved = snapshot.load(state / "replay")
@@ -102,11 +100,8 @@ class ReplayWorker:
             ServiceStoppedError: storing has failed, now or before; `run` says why.
         """
         source = segments[0].source
-        started = time.monotonic()
         async with self._changed:
             await self._changed.wait_for(lambda: self._closed or self._replay.may_insert(source))
-            if source == REAL:
-                self._insert_wait_s += time.monotonic() - started
             if self._closed:
                 return False
             with self._working():
@@ -116,10 +111,7 @@ class ReplayWorker:
                         self._real.append(segment)
                         self._real_count += 1
                         self._episodes += [segment.episode] if segment.episode else []
-            kept = time.monotonic()
             await self._changed.wait_for(lambda: self._closed or self._turns.may_collect(self._ready))
-            if source == REAL:
-                self._insert_wait_s += time.monotonic() - kept
         return True
 
     async def sample(self, num_decisions: int, trainer_version: int) -> list[Segment]:
@@ -128,7 +120,6 @@ class ReplayWorker:
         def ended() -> bool:
             return self._closed or self._replay.exhausted(num_decisions)
 
-        started = time.monotonic()
         self._batch = num_decisions
         async with self._changed:
             while True:
@@ -140,7 +131,6 @@ class ReplayWorker:
                     segments = self._replay.sample(num_decisions, trainer_version, self._rng)
                 if segments:
                     self._turns.drawn()
-                    self._sample_wait_s += time.monotonic() - started
                     return segments
 
     @asynccontextmanager
@@ -204,10 +194,9 @@ class ReplayWorker:
             self._closed = True
 
     async def metrics(self) -> dict[str, float]:
-        """Counters and seconds that either side has waited; episodes since the last call as means."""
+        """Counters, and means over the episodes that have ended since the last call."""
         self._clock.beat()
         episodes, self._episodes = self._episodes, []
         names = episodes[0] if episodes else ()
         means = {f"episode_{name}": float(np.mean([e[name] for e in episodes])) for name in names}
-        waits = {"insert_wait_s": self._insert_wait_s, "sample_wait_s": self._sample_wait_s}
-        return self._replay.metrics() | waits | means | {"episodes": float(len(episodes))}
+        return self._replay.metrics() | means | {"episodes": float(len(episodes))}
