@@ -8,7 +8,7 @@ import math
 import shutil
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -70,8 +70,7 @@ class Engine(ABC):
     def plan(self, plans: list[EpisodePlan]) -> None:
         """Queue episodes that are run before any exploring one; `poll` reports one result for each.
 
-        Raises:
-            ValueError: an episode of the same group and index has been planned and not been reported yet.
+        No two of them that are under way have the same group and index.
         """
 
     @abstractmethod
@@ -93,18 +92,6 @@ class Engine(ABC):
     @abstractmethod
     def close(self) -> None:
         """End all workers. Does not raise, so that it hides no other error. Safe to call twice."""
-
-
-def episode_key(plan: EpisodePlan) -> tuple[str, int]:
-    return plan.group, plan.index
-
-
-def check_new(plans: Sequence[EpisodePlan], outstanding: Container[tuple[str, int]]) -> None:
-    """Check the argument of `Engine.plan`."""
-    keys = [episode_key(plan) for plan in plans]
-    for group, index in keys:
-        if (group, index) in outstanding or keys.count((group, index)) > 1:
-            raise ValueError(f"episode {index} of {group!r} is planned twice")
 
 
 def run_plans(
