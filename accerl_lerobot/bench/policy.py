@@ -96,7 +96,14 @@ def bench_policy(config: BenchPolicyConfig) -> dict[str, Any]:
         return result | {"estimate": policy_memory(adapter, imitates=config.imitates)._asdict()}
 
     def measure(name: str, work: Callable[[], Any]) -> None:
-        seconds[name] = _timed(work, config.repeats, device)
+        times = []
+        for _ in range(config.repeats + 1):
+            began = time.perf_counter()
+            work()
+            if device.type == "cuda":
+                torch.cuda.synchronize()
+            times.append(time.perf_counter() - began)
+        seconds[name] = spread(times[1:])
 
     memory["built"] = _peak_gb(device)
     requests = [
@@ -141,20 +148,6 @@ def bench_policy(config: BenchPolicyConfig) -> dict[str, Any]:
         },
         "estimate": policy_memory(adapter, imitates=config.imitates)._asdict(),
     }
-
-
-def _timed(work: Callable[[], Any], repeats: int, device: Any) -> dict[str, Any]:
-    """Seconds that some work takes on a torch device, after a first time that does not count."""
-    import torch
-
-    seconds = []
-    for _ in range(repeats + 1):
-        started = time.perf_counter()
-        work()
-        if device.type == "cuda":
-            torch.cuda.synchronize()
-        seconds.append(time.perf_counter() - started)
-    return spread(seconds[1:])
 
 
 def _peak_gb(device: Any) -> float:

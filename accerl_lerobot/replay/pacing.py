@@ -100,13 +100,10 @@ def lag_bound(
     Between a segment's first decision and its being drawn, each update has drawn a batch out of what was
     available at first, at most max(ahead, min_decisions) + in_flight, and of what was inserted since:
     in_flight until the segment itself was in, and capacity after that, or it would have been evicted. The
-    weights that decided were `pickup` updates old at most.
+    weights that decided were `pickup` updates old at most, and `prefetch` batches are drawn early.
 
-    Args:
-        in_flight: most decisions inserted, by all workers, from the first decision of a segment until it is
-            inserted itself, its own included. With environments of about equal speed: one segment of each,
-            twice that to be safe. One worker that hangs breaks this; `max_lag` then retires its segment.
-        prefetch: batches drawn ahead of the update that uses them.
+    `in_flight` decisions are inserted by all workers while a segment is made and inserted, one segment of
+    each environment if these are about equally fast. One that hangs breaks this; `max_lag` then retires it.
     """
     decisions = max(config.ahead, config.min_decisions) + 2 * in_flight + config.capacity
     drawn = math.ceil(config.samples_per_insert) * decisions // batch_decisions - 1
