@@ -47,8 +47,6 @@ class Batcher[R: Sized]:
 
     def add(self, request: R, now: float) -> None:
         """Queues a request, which holds an observation at least."""
-        if len(request) == 0:
-            raise ValueError("a request without observations")
         self._waiting.append((request, now))
         self._observations += len(request)
 

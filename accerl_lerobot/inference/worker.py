@@ -95,8 +95,7 @@ class InferenceWorker:
     async def receive(self, message: list[Request] | WeightUpdate) -> list[Decision] | None:
         """Answer a client's requests, in order, as part of some batch; or use weights from the next batch on.
 
-        Raises:
-            ServiceStoppedError: `serve` has failed, before or after this call began.
+        A `ServiceStoppedError` if `serve` has failed, before or after this call began.
         """
         answer = self._server.call(message)
         if self._failure is not None:  # after the call, as `serve` hands over once more when it fails
@@ -159,11 +158,8 @@ class InferenceWorker:
     def _take(self, asked: PendingRequest) -> None:
         if isinstance(asked.message, WeightUpdate):
             self._published.append(asked)
-            return
-        try:
+        else:
             self._batcher.add(asked, asked.sent)
-        except (TypeError, ValueError) as error:  # no list of requests, or an empty one
-            asked.fail(error)
 
     def _swap(self) -> None:
         """Use the newest weights that have come, if they are newer than those of now."""
