@@ -264,7 +264,10 @@ class Loop:
                     group = f"during-{self.evaluated}"
                     self.during[group] = []
                     self._plan(config.evaluation.episodes_during, group)
-                if self._is_due(progress.version) or self.stop.asked is not None:
+                updates, seconds = config.save_every_updates, config.save_every_s
+                due = seconds and time.monotonic() - self._saved_at > seconds
+                due = due or (updates and progress.version // updates > self.saved)
+                if due or self.stop.asked is not None:
                     self._save()
                 self.stop.check()
 
@@ -272,11 +275,6 @@ class Loop:
     def _rl_s(self) -> float:
         since = self._training_since
         return self.times.rl_s + (0.0 if since is None else time.monotonic() - since)
-
-    def _is_due(self, version: int) -> bool:
-        updates, seconds = self.config.save_every_updates, self.config.save_every_s
-        by_time = seconds and time.monotonic() - self._saved_at > seconds
-        return bool(by_time or (updates and version // updates > self.saved))
 
     def _record_updates(self, updates: list[dict[str, float]]) -> None:
         for metrics in updates:

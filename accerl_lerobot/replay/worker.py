@@ -94,10 +94,8 @@ class ReplayWorker:
     async def insert(self, segments: list[Segment]) -> bool:
         """Stores segments of one source once the pace allows it; returns when more may be collected.
 
-        False when the run is over and they were not stored.
-
-        Raises:
-            ServiceStoppedError: storing has failed, now or before; `run` says why.
+        False when the run is over and they were not stored. A `ServiceStoppedError` if storing has failed,
+        now or before; `run` says why.
         """
         source = segments[0].source
         async with self._changed:
