@@ -133,9 +133,8 @@ def test_every_logged_number_is_explained(tiny_checkpoint: Path) -> None:
     assert explained("train") == (told - {"update"}) | with_ray
     rollout = progress.rollout.keys() | {f"replay_{k}" for k in progress.replay}
     rollout |= {f"inference_{k}" for k in (*Batcher(1, 0.0).metrics(), "busy_share", "version")}
-    ends = ("s", "_return", "_steps", "_decisions", "_success")
     rollout |= {"restarts", "inference_restarts", "success_exploring"}
-    assert explained("rollout") == rollout | {f"replay_episode{end}" for end in ends}
+    assert explained("rollout") == rollout | {f"episode_{name}" for name in ("return", "steps", "decisions")}
 
 
 def test_every_role_and_state_of_the_timeline_is_explained() -> None:

@@ -44,7 +44,7 @@ def test_who_may_collect(schedule: Any, allowed: list[bool]):
         for ready in (False, True):
             turns = Turns(schedule)
             if learning:
-                turns.drawn()
+                turns.under_way += 1
             found.append(turns.may_collect(ready))
             # Nobody is kept while nothing happens that would end it.
             assert found[-1] or (ready and turns.may_draw()) or learning
@@ -55,9 +55,9 @@ def test_a_batch_is_drawn_when_the_one_before_has_been_learned_from():
     for schedule, at_once in ((ASYNCHRONOUS, True), (OVERLAP, False), (SYNCHRONOUS, False)):
         turns = Turns(schedule)
         assert turns.may_draw()
-        turns.drawn()
+        turns.under_way += 1
         assert turns.may_draw() is at_once
-        turns.learnt()
+        turns.under_way -= 1
         assert turns.may_draw()
 
 

@@ -298,6 +298,10 @@ class Loop:
         # Imagination and learning go on once all real episodes have been played.
         if explored or any(metrics["update"] % RECORD_EVERY == 0 for metrics in progress.updates):
             values = progress.rollout | {"success_exploring": share}
+            if explored:
+                sums = np.sum([(e.episode_return, e.steps, e.decisions) for e in explored], axis=0)
+                names = ("episode_return", "episode_steps", "episode_decisions")
+                values |= dict(zip(names, sums / len(explored), strict=True))
             for part in ("replay", "inference", "imagination"):
                 values |= {f"{part}_{k}": v for k, v in getattr(progress, part).items()}
             self.log.write("rollout", progress.version, values)

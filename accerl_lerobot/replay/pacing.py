@@ -128,6 +128,7 @@ OVERLAP: Schedule = "overlap"
 SYNCHRONOUS: Schedule = "synchronous"
 
 
+@dataclass
 class Turns:
     """Order in which rollouts and the trainer may go on.
 
@@ -135,24 +136,15 @@ class Turns:
     learned from, and each is followed by an update; where no batch may be drawn, one is learned from.
     """
 
-    def __init__(self, schedule: Schedule = ASYNCHRONOUS) -> None:
-        self.schedule: Schedule = schedule
-        self._under_way = 0  # batches that the trainer has drawn and not learned from
+    schedule: Schedule = ASYNCHRONOUS
+    under_way: int = 0  # batches that the trainer has drawn, and that not every reader has the weights of
 
     def may_collect(self, ready: bool) -> bool:
         """True if who has brought a segment may go on; `ready`: the pace would let a batch be drawn now."""
-        learning = self._under_way > 0
+        learning = self.under_way > 0
         if self.schedule == SYNCHRONOUS:
             return not (ready or learning)
         return self.schedule == ASYNCHRONOUS or not (ready and learning)
 
     def may_draw(self) -> bool:
-        return self.schedule == ASYNCHRONOUS or self._under_way <= 0
-
-    def drawn(self) -> None:
-        """The trainer has another batch."""
-        self._under_way += 1
-
-    def learnt(self) -> None:
-        """It has learned from one, and in turn every reader has the weights."""
-        self._under_way -= 1
+        return self.schedule == ASYNCHRONOUS or self.under_way <= 0

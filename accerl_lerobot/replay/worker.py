@@ -67,7 +67,6 @@ class ReplayWorker:
         self._batch = 0  # decisions the trainer asked for last
         self._closed = False
         self._failure: Exception | None = None
-        self._episodes: list[dict[str, float]] = []
         if state is not None:
             saved = snapshot.load(state / "replay")
             self._replay.restore(saved["replay"])
@@ -108,7 +107,6 @@ class ReplayWorker:
                     if self._replay.insert(segment) and source == REAL:
                         self._real.append(segment)
                         self._real_count += 1
-                        self._episodes += [segment.episode] if segment.episode else []
             await self._changed.wait_for(lambda: self._closed or self._turns.may_collect(self._ready))
         return True
 
@@ -128,7 +126,7 @@ class ReplayWorker:
                     fault_point("replay.sample")
                     segments = self._replay.sample(num_decisions, trainer_version, self._rng)
                 if segments:
-                    self._turns.drawn()
+                    self._turns.under_way += 1
                     return segments
 
     @asynccontextmanager
@@ -139,7 +137,7 @@ class ReplayWorker:
 
     async def learnt(self) -> None:
         async with self._changing():
-            self._turns.learnt()
+            self._turns.under_way -= 1
 
     async def follow(self, schedule: Schedule) -> None:
         async with self._changing():
@@ -192,9 +190,5 @@ class ReplayWorker:
             self._closed = True
 
     async def metrics(self) -> dict[str, float]:
-        """Counters, and means over the episodes that have ended since the last call."""
         self._clock.beat()
-        episodes, self._episodes = self._episodes, []
-        names = episodes[0] if episodes else ()
-        means = {f"episode_{name}": float(np.mean([e[name] for e in episodes])) for name in names}
-        return self._replay.metrics() | means | {"episodes": float(len(episodes))}
+        return self._replay.metrics()

@@ -55,13 +55,7 @@ class SegmentBuilder:
         self.taken.append((decision, actions, reward, steps))
         self.observations.append(following)
 
-    def cut(
-        self,
-        key: str,
-        terminated: bool = False,
-        success: bool = False,
-        episode: dict[str, float] | None = None,
-    ) -> Segment:
+    def cut(self, key: str, terminated: bool = False, success: bool = False) -> Segment:
         """Hands out what was collected as one segment and goes on from its last observation."""
         keys = [k for k in self.observations[0] if k != TASK]
         decisions, actions, rewards, steps = zip(*self.taken, strict=True)
@@ -79,7 +73,6 @@ class SegmentBuilder:
             key=key,
             source=self.source,
             origin=self.origin,
-            episode=episode or {},
         )
         self.origin = self.origin._replace(decision=self.origin.decision + len(decisions))
         self.observations, self.taken = [self.latest], []
@@ -290,7 +283,10 @@ class RolloutRunner:
         actions = np.clip(decision.chunk, world.spec.action_low, world.spec.action_high)
         episode.builder.add(decision, actions, reward, result.steps, result.observation)
         if result.done or episode.builder.full:
-            self._emit(episode, result)
+            self._sequence += 1
+            segment = episode.builder.cut(f"{self.name}.{self._sequence}", result.done, result.success)
+            if episode.plan.explore:
+                self.on_segment(segment)
         if result.done:
             self._finish(episode, result.success)
             return self.start(slot)
@@ -326,15 +322,6 @@ class RolloutRunner:
     def close(self) -> None:
         for world in self.worlds:
             world.close()
-
-    def _emit(self, episode: ActiveEpisode, result: ChunkResult) -> None:
-        totals: dict[str, float] = {"return": episode.episode_return, "steps": episode.steps}
-        totals |= {"decisions": len(episode.versions), "success": float(result.success)}
-        self._sequence += 1
-        key = f"{self.name}.{self._sequence}"
-        segment = episode.builder.cut(key, result.done, result.success, totals if result.done else None)
-        if episode.plan.explore:
-            self.on_segment(segment)
 
     def _finish(self, episode: ActiveEpisode, success: bool) -> None:
         self.counters.episodes += 1

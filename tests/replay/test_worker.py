@@ -159,16 +159,3 @@ def test_news_is_real_experience_alone():
         assert (await worker.news(1)).ended
 
     play(scene)
-
-
-def test_episodes_are_averaged_since_the_last_question():
-    async def scene(worker: ReplayWorker) -> None:
-        totals = [{"return": 1.0, "success": 1.0}, {"return": 0.0, "success": 0.0}]
-        segments = [make_segment(f"{i}", 2, episode=total) for i, total in enumerate(totals)]
-        await worker.insert([*segments, make_segment("middle", 2)])
-        metrics = await worker.metrics()
-        assert (metrics["episodes"], metrics["episode_return"], metrics["episode_success"]) == (2, 0.5, 0.5)
-        metrics = await worker.metrics()
-        assert metrics["episodes"] == 0 and "episode_return" not in metrics
-
-    play(scene)

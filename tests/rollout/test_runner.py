@@ -47,7 +47,7 @@ def test_the_last_segment_says_how_the_episode_ended(end, success):
     assert (cut.terminated, cut.success) == (False, False)
     assert (last.terminated, last.success) == (True, success)
     assert steps_seen(last) == [6, 8]
-    assert last.episode["decisions"] == 4 and recorder.results[0].success is success
+    assert recorder.results[0].decisions == 4 and recorder.results[0].success is success
 
 
 def test_an_episode_that_ends_within_a_chunk_counts_the_steps_that_were_made():
@@ -69,11 +69,10 @@ def test_every_decision_costs():
     assert evaluation.results[0].episode_return == 8.0, "the environment's own"
 
 
-def test_episode_totals_come_with_the_last_segment_only():
+def test_a_result_has_the_totals_of_its_episode():
     recorder = Recorder([ScriptedWorld(steps=9)], [explore()], CONFIG)
     recorder.play(version=7)
-    assert [bool(s.episode) for s in recorder.segments] == [False, True]
-    assert recorder.segments[-1].episode == {"return": 9.0, "steps": 9, "decisions": 5, "success": 1.0}
+    assert [s.terminated for s in recorder.segments] == [False, True]
     (result,) = recorder.results
     assert (result.success, result.episode_return, result.steps, result.decisions) == (True, 9.0, 9, 5)
     assert result.versions == (7, 7) and recorder.runner.counters.episodes == 1
@@ -244,9 +243,9 @@ def test_full_at_its_length():
 
 @pytest.mark.parametrize("terminated", [False, True])
 def test_how_it_ended_is_kept(terminated: bool):
-    segment = collected(2).cut("k", terminated, success=terminated, episode={"return": 3.0})
+    segment = collected(2).cut("k", terminated, success=terminated)
     assert segment.terminated == segment.success == terminated and states(segment) == [0, 1, 2]
-    assert segment.episode == {"return": 3.0} and segment.source == "real" and segment.key == "k"
+    assert segment.source == "real" and segment.key == "k"
 
 
 TASKS = ("push", "pull", "lift")
