@@ -7,7 +7,7 @@ NumPy only: a rollout worker that imports this file stays free of torch and LeRo
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -90,8 +90,6 @@ class Segment:
     source: str = REAL  # ``real`` or ``imagined``
     origin: Origin  # where it begins; of an imagined one, the real observation that it was imagined from
     world_version: int | None = None  # version of the world model that imagined it, in gradient steps
-    episode: dict[str, float] = field(default_factory=dict)
-    """Set on the last segment of an episode: ``return``, ``steps``, ``decisions``, ``success``."""
 
     def __len__(self) -> int:
         return len(self.reward)

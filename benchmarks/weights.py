@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from time import perf_counter
+from time import monotonic, perf_counter
 from typing import Annotated, Any
 
 import numpy as np
@@ -122,9 +122,9 @@ def _block(arm: str, endpoints: list[Endpoint], tensors: Tensors, copy: Tensors)
                 np.copyto(copy[name], tensor)
             memcpy = perf_counter() - started
             _update(tensors, 1.0)
-            started = perf_counter()
+            published = monotonic()
             publisher.publish(version, tensors)
-            stall = perf_counter() - started
+            stall = monotonic() - published
             publisher.flush()
     finally:
         publisher.close()
@@ -133,8 +133,9 @@ def _block(arm: str, endpoints: list[Endpoint], tensors: Tensors, copy: Tensors)
     for handle in handles:
         if not np.array_equal(ask(handle, "some"), expected):
             raise RuntimeError(f"{arm}: a reader has other weights than were published")
-    worst = {key: max(note[key] for note in notes) for key in ("applied_s", "pause_s", "bytes")}
-    return {"stall_s": stall, "memcpy_s": memcpy, **worst}
+    worst = {key: max(note[key] for note in notes) for key in ("applied_at", "pause_s", "bytes")}
+    applied = worst.pop("applied_at") - published
+    return {"stall_s": stall, "applied_s": applied, "memcpy_s": memcpy, **worst}
 
 
 def _update(tensors: Tensors, step: float) -> None:

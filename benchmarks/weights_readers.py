@@ -40,7 +40,7 @@ class ReadingWorker:
         self._server.call(update).result()
 
     def note(self, version: int) -> dict[str, float]:
-        """When a set was applied, how long that took, and its bytes."""
+        """When a set was applied, on `time.monotonic`, how long that took, and its bytes."""
         return self._notes[version]
 
     def some(self) -> np.ndarray:
@@ -57,7 +57,7 @@ class ReadingWorker:
         for name, tensor in update.tensors.items():
             np.copyto(self._parameters[name], tensor)
         self._notes[update.version] = {
-            "applied_s": time.time() - update.published_s,
+            "applied_at": time.monotonic(),
             "pause_s": time.monotonic() - started,
             "bytes": float(sum(tensor.nbytes for tensor in update.tensors.values())),
         }

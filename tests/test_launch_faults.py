@@ -9,18 +9,22 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 import ray
 
-from accerl_lerobot.engine import replicas
+from accerl_lerobot.engine import launch, replicas
 from accerl_lerobot.engine.config import LaunchConfig
-from accerl_lerobot.engine.launch import RayEngine
+from accerl_lerobot.engine.launch import RayEngine, end_all
 from accerl_lerobot.engine.loop import Progress
+from accerl_lerobot.engine.replicas import WorkerSlot
 from accerl_lerobot.engine.stopping import WorkerError, pause_s
 from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.inference import worker as inference_worker
@@ -96,11 +100,9 @@ def test_a_run_ends_by_itself_and_closing_leaves_no_process(engine):
     assert [name for name, pid in pids.items() if not gone(pid)] == []
 
 
-def test_what_cannot_be_done_is_refused_and_an_exception_in_the_trainer_ends_the_run(engine, tmp_path: Path):
+def test_a_full_disk_is_survived_and_an_exception_in_the_trainer_ends_the_run(engine, tmp_path: Path):
     one = engine(trainer=ENDLESS)
     one.plan(evaluation_plans(("match",), 2, "a"))
-    with pytest.raises(ValueError, match="episode 0 of 'a' is planned twice"):
-        one.plan(evaluation_plans(("match",), 1, "a"))
     with pytest.raises(RuntimeError, match=r"trainer worker failed in write(.|\n)*no space left"):
         one.save(tmp_path / FULL)
     assert len(collect(one, "a", 2)) == 2
@@ -336,3 +338,27 @@ def test_a_run_in_which_nothing_moves_ends(engine):
     ray.get(one._trainer.actor.idle.remote())  # rollouts fill replay up, then wait at the door
     text = until_failure(one)
     assert text.startswith("nothing moved for 5 s") and "raise launch.stall_s" in text
+
+
+class Stand:
+    """Stands in for `ray`: every reference is its own answer, and nobody is killed."""
+
+    def get(self, reference: Any, timeout: float) -> Any:
+        return reference
+
+    def kill(self, actor: Any) -> None:
+        pass
+
+
+@pytest.mark.parametrize("here", [True, False])
+def test_only_a_process_of_this_node_is_ended_by_its_number(here: bool, monkeypatch: pytest.MonkeyPatch):
+    for module in (launch, replicas):
+        monkeypatch.setattr(module, "ray", Stand())
+    monkeypatch.setattr(launch, "GONE_S", 0.2)
+    with subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"]) as process:
+        worker = WorkerSlot("somebody")
+        worker.await_start(process.pid, 1.0, here)
+        assert (worker.process == psutil.Process(process.pid)) is here
+        end_all([worker])
+        assert (process.poll() is not None) is here
+        process.kill()

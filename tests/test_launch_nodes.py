@@ -18,14 +18,7 @@ def test_two_nodes():
     clean = {k: v for k, v in os.environ.items() if not k.startswith("RAY_")}
     root = str(Path(__file__).parents[1])
     command = [sys.executable, "-c", "from tests import two_nodes; two_nodes.main()"]
-    done = subprocess.run(
-        command,
-        env=clean | {"PYTHONPATH": root},
-        cwd=root,
-        capture_output=True,
-        text=True,
-        timeout=240,
-        check=False,
-    )
+    env = clean | {"PYTHONPATH": root}
+    done = subprocess.run(command, env=env, cwd=root, capture_output=True, text=True, timeout=240)
     assert done.returncode == 0, done.stderr[-6000:]
     assert json.loads(done.stdout.splitlines()[-1]).keys() == {"start", "refusals", "run", "node lost"}

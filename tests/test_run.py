@@ -95,6 +95,12 @@ def test_every_update_is_logged_once(finished: Finished):
     assert max(r["lag_max"] for r in train) == finished.summary["lag_max"]
 
 
+def test_exploring_episodes_are_averaged_as_they_end(finished: Finished):
+    rollout = records(finished.directory, "rollout")
+    found = [(r["episode_steps"], r["episode_decisions"]) for r in rollout if "episode_return" in r]
+    assert found and all(0 < decisions <= steps <= 12 for steps, decisions in found)
+
+
 def test_evaluations_are_logged_in_order_with_the_weights_they_used(finished: Finished):
     found = records(finished.directory, "evaluation")
     # Three were planned while training, after 4 and 8 updates; the one after 12 is the one after training.

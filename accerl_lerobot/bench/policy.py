@@ -6,7 +6,6 @@ Weights are random, sizes those of the published checkpoint, inputs generated: n
 
 from __future__ import annotations
 
-import platform
 import resource
 import tempfile
 import time
@@ -18,7 +17,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from rich.table import Table
 
-from accerl_lerobot.bench import as_table, ranged, spread
+from accerl_lerobot.bench import as_table, host, ranged, spread
 from accerl_lerobot.config.ranges import Device, Range, Repeats, Section
 from accerl_lerobot.demos.backbone import write_backbone
 from accerl_lerobot.policies.config import TuningConfig
@@ -77,6 +76,7 @@ def bench_policy(config: BenchPolicyConfig) -> dict[str, Any]:
     from accerl_lerobot.trainer.footprint import policy_memory
 
     device = resolve_device("cpu" if config.memory_only else config.device, "device")
+    on = torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu"
     seconds: dict[str, Any] = {}
     memory: dict[str, float] = {}
     started = time.perf_counter()
@@ -86,17 +86,20 @@ def bench_policy(config: BenchPolicyConfig) -> dict[str, Any]:
     result = {
         "config": asdict(config),
         "parameters": {"all": sizes.policy, "trained": sizes.trained},
-        "host": {
-            "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
-            "machine": platform.machine(),
-            "threads": torch.get_num_threads(),
-        },
+        "host": host() | {"device": on, "threads": torch.get_num_threads()},
     }
     if config.memory_only:
         return result | {"estimate": policy_memory(adapter, imitates=config.imitates)._asdict()}
 
     def measure(name: str, work: Callable[[], Any]) -> None:
-        seconds[name] = _timed(work, config.repeats, device)
+        times = []
+        for _ in range(config.repeats + 1):
+            began = time.perf_counter()
+            work()
+            if device.type == "cuda":
+                torch.cuda.synchronize()
+            times.append(time.perf_counter() - began)
+        seconds[name] = spread(times[1:])
 
     memory["built"] = _peak_gb(device)
     requests = [
@@ -141,20 +144,6 @@ def bench_policy(config: BenchPolicyConfig) -> dict[str, Any]:
         },
         "estimate": policy_memory(adapter, imitates=config.imitates)._asdict(),
     }
-
-
-def _timed(work: Callable[[], Any], repeats: int, device: Any) -> dict[str, Any]:
-    """Seconds that some work takes on a torch device, after a first time that does not count."""
-    import torch
-
-    seconds = []
-    for _ in range(repeats + 1):
-        started = time.perf_counter()
-        work()
-        if device.type == "cuda":
-            torch.cuda.synchronize()
-        seconds.append(time.perf_counter() - started)
-    return spread(seconds[1:])
 
 
 def _peak_gb(device: Any) -> float:
@@ -208,8 +197,7 @@ def _adapter(config: BenchPolicyConfig, device: Any, directory: Path) -> Any:
     model = imported(POLICIES[config.type][0])(policy)
     family = FlowFamily(model, FlowSamplerConfig(noise_level=0.2))
     inputs: Any = _RandomInputs(config, device)
-    critic = ValueHead(model.width)
-    adapter = LeRobotAdapter(policy, inputs, model, family, critic, config.precision)
+    adapter = LeRobotAdapter(policy, inputs, model, family, ValueHead(model.width), config.precision)
     tune(policy, model, config.tuning)
     return adapter
 

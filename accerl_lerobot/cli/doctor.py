@@ -202,7 +202,7 @@ def imagination(config: RunConfig) -> Iterator[Check]:
 
 def placement(config: RunConfig) -> Iterator[Check]:
     """Where each worker would run; the cluster is asked if one is to be joined."""
-    from accerl_lerobot.engine.preflight import check_placement
+    from accerl_lerobot.engine.placement import check_placement
 
     return (Check("placement", OK, row) for row in check_placement(config))
 

@@ -18,7 +18,7 @@ import numpy as np
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import PRETRAINED, TRAINING_STATE, WEIGHTS, WORLD_MODEL
 from accerl_lerobot.engine.config import RunConfig
-from accerl_lerobot.engine.loop import Engine, Progress, Saved, check_new, episode_key
+from accerl_lerobot.engine.loop import Engine, Progress, Saved
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, REAL, Request, Segment
@@ -75,7 +75,6 @@ class LocalEngine(Engine):
             if imagination.learns:
                 self._world_learner = make_learner(config)
         self._rng = np.random.default_rng(config.seed)
-        self._outstanding: set[tuple[str, int]] = set()
         self._episodes: list[EpisodeResult] = []
         self._training = False
         self._outbox: deque[Segment] = deque()
@@ -90,14 +89,11 @@ class LocalEngine(Engine):
             self._outbox.append,
             self._episodes.append,
         )
-        self._due: dict[int, Request] = {}
         if state is not None:
             self._restore(state)
         self._clock.enter(WAIT_IN)
 
     def plan(self, plans: list[EpisodePlan]) -> None:
-        check_new(plans, self._outstanding)
-        self._outstanding |= {episode_key(p) for p in plans}
         self._plans.queue(plans)
 
     def train(self) -> None:
@@ -119,9 +115,7 @@ class LocalEngine(Engine):
                     updates.append(self._update.step(segments) | {"update": float(self._update.version)})
                 self._publish()
         self._clock.enter(WAIT_IN)
-        episodes = list(self._episodes)
-        self._episodes.clear()
-        self._outstanding -= {episode_key(e.plan) for e in episodes}
+        episodes, self._episodes[:] = list(self._episodes), []
         parts = (part for part in (self._imagination, self._world_learner) if part is not None)
         imagined = {name: value for part in parts for name, value in part.metrics().items()}
         return Progress(
@@ -148,7 +142,6 @@ class LocalEngine(Engine):
             "rng": self._rng,
             "acting": (self._acting_version, acting),
             "held_back": self._delay.state(),
-            "outstanding": sorted(self._outstanding),
             "outbox": list(self._outbox),
             "plans": self._plans.state(),
             "runner": self._runner.state(),
@@ -174,12 +167,9 @@ class LocalEngine(Engine):
         if acting is not None:
             self._acting.load_trainable(acting)
         self._delay.restore(engine["held_back"])
-        self._outstanding = set(engine["outstanding"])
         self._outbox.extend(engine["outbox"])
         self._plans.restore(engine["plans"])
         self._runner.restore(engine["runner"])
-        slots = range(len(self._runner))
-        self._due = {slot: request for slot in slots if (request := self._runner.request(slot))}
         if self._imagination is not None:
             imagined = snapshot.load(directory / IMAGINATION)
             self._imagination.restore(imagined["imagination"])
@@ -204,22 +194,18 @@ class LocalEngine(Engine):
 
     def _act(self) -> None:
         """One decision in every environment that may continue."""
-        for slot in range(len(self._runner)):
-            request = self._due.get(slot)
+        runner, may_explore = self._runner, self._replay.may_insert()
+        due: dict[int, Request] = {}
+        for slot in range(len(runner)):
+            request = runner.request(slot)
             if request is None or (request.explore and not self._exploring):
-                self._due.pop(slot, None)
-                if (fresh := self._runner.start(slot)) is not None:
-                    self._due[slot] = fresh
-        may_explore = self._replay.may_insert()
-        slots = [s for s, r in self._due.items() if may_explore or not r.explore]
-        if not slots:
-            return
-        decisions = self._acting.decide([self._due[s] for s in slots], self._acting_version)
-        for slot, decision in zip(slots, decisions, strict=True):
-            if (request := self._runner.advance(slot, decision)) is None:
-                del self._due[slot]
-            else:
-                self._due[slot] = request
+                request = runner.start(slot)
+            if request is not None and (may_explore or not request.explore):
+                due[slot] = request
+        if due:
+            decisions = self._acting.decide(list(due.values()), self._acting_version)
+            for slot, decision in zip(due, decisions, strict=True):
+                runner.advance(slot, decision)
 
     def _imagine(self) -> None:
         """One decision in every imagined rollout, if any is wanted."""

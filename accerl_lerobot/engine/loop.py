@@ -8,7 +8,7 @@ import math
 import shutil
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -70,8 +70,7 @@ class Engine(ABC):
     def plan(self, plans: list[EpisodePlan]) -> None:
         """Queue episodes that are run before any exploring one; `poll` reports one result for each.
 
-        Raises:
-            ValueError: an episode of the same group and index has been planned and not been reported yet.
+        No two of them that are under way have the same group and index.
         """
 
     @abstractmethod
@@ -93,18 +92,6 @@ class Engine(ABC):
     @abstractmethod
     def close(self) -> None:
         """End all workers. Does not raise, so that it hides no other error. Safe to call twice."""
-
-
-def episode_key(plan: EpisodePlan) -> tuple[str, int]:
-    return plan.group, plan.index
-
-
-def check_new(plans: Sequence[EpisodePlan], outstanding: Container[tuple[str, int]]) -> None:
-    """Check the argument of `Engine.plan`."""
-    keys = [episode_key(plan) for plan in plans]
-    for group, index in keys:
-        if (group, index) in outstanding or keys.count((group, index)) > 1:
-            raise ValueError(f"episode {index} of {group!r} is planned twice")
 
 
 def run_plans(
@@ -277,7 +264,10 @@ class Loop:
                     group = f"during-{self.evaluated}"
                     self.during[group] = []
                     self._plan(config.evaluation.episodes_during, group)
-                if self._is_due(progress.version) or self.stop.asked is not None:
+                updates, seconds = config.save_every_updates, config.save_every_s
+                due = seconds and time.monotonic() - self._saved_at > seconds
+                due = due or (updates and progress.version // updates > self.saved)
+                if due or self.stop.asked is not None:
                     self._save()
                 self.stop.check()
 
@@ -285,11 +275,6 @@ class Loop:
     def _rl_s(self) -> float:
         since = self._training_since
         return self.times.rl_s + (0.0 if since is None else time.monotonic() - since)
-
-    def _is_due(self, version: int) -> bool:
-        updates, seconds = self.config.save_every_updates, self.config.save_every_s
-        by_time = seconds and time.monotonic() - self._saved_at > seconds
-        return bool(by_time or (updates and version // updates > self.saved))
 
     def _record_updates(self, updates: list[dict[str, float]]) -> None:
         for metrics in updates:
@@ -313,6 +298,10 @@ class Loop:
         # Imagination and learning go on once all real episodes have been played.
         if explored or any(metrics["update"] % RECORD_EVERY == 0 for metrics in progress.updates):
             values = progress.rollout | {"success_exploring": share}
+            if explored:
+                sums = np.sum([(e.episode_return, e.steps, e.decisions) for e in explored], axis=0)
+                names = ("episode_return", "episode_steps", "episode_decisions")
+                values |= dict(zip(names, sums / len(explored), strict=True))
             for part in ("replay", "inference", "imagination"):
                 values |= {f"{part}_{k}": v for k, v in getattr(progress, part).items()}
             self.log.write("rollout", progress.version, values)

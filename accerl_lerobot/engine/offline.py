@@ -37,11 +37,7 @@ COMPARED = 256  # decisions of successes, and of failures, whose imitation loss 
 
 
 def learn_offline(config: OfflineRun, directory: Path, console: Console) -> dict[str, Any]:
-    """Learns, writes ``checkpoints/NNNNNN`` and ``summary.json`` into `directory`; returns the summary.
-
-    Raises:
-        InputError: policy and dataset do not fit each other, or its episodes are not labelled.
-    """
+    """Learns, writes ``checkpoints/NNNNNN`` and ``summary.json`` into `directory`; returns the summary."""
     from accerl_lerobot.demos.dataset_files import open_metadata
     from accerl_lerobot.policies.loading import load_adapter, rehearsed_config
     from accerl_lerobot.trainer.update import make_update

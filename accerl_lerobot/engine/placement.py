@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from accerl_lerobot.engine.ray_session import FIELD, RaySession
+from accerl_lerobot.engine.ray_session import FIELD, RaySession, prepare
 from accerl_lerobot.engine.stopping import WorkerError
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.metrics import numbered
@@ -205,8 +205,13 @@ def place_workers(config: RunConfig) -> Plan:
     return plan
 
 
-def rehearse(config: RunConfig) -> list[str]:
-    """The plan as lines, of a run that joins a cluster; leaves it as it was."""
+def check_placement(config: RunConfig) -> list[str]:
+    """Plan where the workers will be, so that what does not fit is refused before anything long; as lines."""
+    if config.launch.engine == "local":
+        return []
+    if config.launch.address is None:
+        return list(plan_workers([this_machine()], config).rows())
+    prepare(joins=True)
     with contextlib.closing(RaySession(config.launch)) as session:
         session.start()
         return list(place_workers(config).rows())

@@ -19,7 +19,6 @@ import draccus
 
 from accerl_lerobot.algorithms import OffPolicyConfig
 from accerl_lerobot.config.ranges import Range, check
-from accerl_lerobot.engine import ray_session
 from accerl_lerobot.engine.sizes import check_disk, check_memory
 from accerl_lerobot.envs import EnvConfig, JudgedWorld, RewardModelConfig, WorldSpec, make_world
 from accerl_lerobot.errors import InputError, check_absent, expanded
@@ -276,17 +275,3 @@ def sft_policy(config: SFTConfig) -> Any:
     except Exception as error:  # LeRobot takes the file at its word, and may fail over any of it
         remedy = f"its config.json is not one of this LeRobot's policies ({brief(error)})"
         raise InputError("sft.init_path", config.init_path, remedy) from error
-
-
-def check_placement(config: RunConfig) -> list[str]:
-    """Plan where the workers will be, so that what does not fit is refused before anything long; as lines."""
-    if config.launch.engine == "local":
-        return []
-    if config.launch.address is None:
-        from accerl_lerobot.engine.placement import plan_workers, this_machine
-
-        return list(plan_workers([this_machine()], config).rows())
-    ray_session.prepare(joins=True)
-    from accerl_lerobot.engine.placement import rehearse
-
-    return rehearse(config)

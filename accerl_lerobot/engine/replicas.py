@@ -25,7 +25,6 @@ from ray.exceptions import ActorUnavailableError, GetTimeoutError, RayActorError
 
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.engine.config import RunConfig
-from accerl_lerobot.engine.loop import check_new, episode_key
 from accerl_lerobot.engine.placement import Node, Place, Plan, actor_options, is_alive
 from accerl_lerobot.engine.ray_session import NO_HUB_TOKEN
 from accerl_lerobot.engine.stopping import WorkerError, pause_s
@@ -189,10 +188,10 @@ class RolloutSlot(WorkerSlot):
         if self.budget is not None:
             self.budget -= sum(episode.plan.explore for episode in report.episodes)
         known = self.outstanding
-        return [e for e in report.episodes if known.pop(episode_key(e.plan), None) or e.plan.explore]
+        return [e for e in report.episodes if known.pop((e.plan.group, e.plan.index), None) or e.plan.explore]
 
     def assign(self, plans: list[EpisodePlan]) -> None:
-        self.outstanding |= {episode_key(plan): plan for plan in plans}
+        self.outstanding |= {(plan.group, plan.index): plan for plan in plans}
         self.unsent += plans
 
     def hung(self, limit: float) -> str:
@@ -232,7 +231,6 @@ class RolloutWorkers(Replicas[RolloutSlot]):
             worker.moved = inference
 
     def plan(self, plans: list[EpisodePlan]) -> None:
-        check_new(plans, {key for worker in self._all for key in worker.outstanding})
         for worker in self._all:
             worker.assign(plans[worker.index :: len(self._all)])
 

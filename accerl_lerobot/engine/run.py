@@ -45,7 +45,8 @@ from accerl_lerobot.demos.record import REPO_ID, record_demos
 from accerl_lerobot.engine import ray_session, resuming
 from accerl_lerobot.engine.config import RunConfig, encode, parse
 from accerl_lerobot.engine.loop import Engine, Loop, Times, run_plans
-from accerl_lerobot.engine.preflight import check_placement, check_policy, check_start, check_world
+from accerl_lerobot.engine.placement import check_placement
+from accerl_lerobot.engine.preflight import check_policy, check_start, check_world
 from accerl_lerobot.engine.sizes import check_memory
 from accerl_lerobot.engine.stopping import StoppedError, Stopping, WorkerError
 from accerl_lerobot.errors import InputError, check_absent, expanded, is_full, kept_traceback, make_folder

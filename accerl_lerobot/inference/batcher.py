@@ -28,7 +28,7 @@ class Batcher[R: Sized]:
         self._observations = 0
         self._together = self._left = 0
         self._batches = self._batched = self._served = 0  # batches; observations and requests in them
-        self._wait_sum_s = self._wait_max_s = 0.0
+        self._wait_sum_s = 0.0
 
     def metrics(self) -> dict[str, float]:
         """Means for the log; 0 before the first batch."""
@@ -36,7 +36,6 @@ class Batcher[R: Sized]:
             "batches": float(self._batches),
             "batch_size_mean": self._batched / max(self._batches, 1),
             "wait_mean_s": self._wait_sum_s / max(self._served, 1),
-            "wait_max_s": self._wait_max_s,
         }
 
     def lock_step(self, observations: int) -> None:
@@ -48,8 +47,6 @@ class Batcher[R: Sized]:
 
     def add(self, request: R, now: float) -> None:
         """Queues a request, which holds an observation at least."""
-        if len(request) == 0:
-            raise ValueError("a request without observations")
         self._waiting.append((request, now))
         self._observations += len(request)
 
@@ -79,7 +76,6 @@ class Batcher[R: Sized]:
             batch.append(request)
             size += len(request)
             self._wait_sum_s += now - since
-            self._wait_max_s = max(self._wait_max_s, now - since)
         self._observations -= size
         self._left = max(0, self._left - size)
         self._batches += bool(batch)
@@ -89,7 +85,7 @@ class Batcher[R: Sized]:
 
 
 def merge_metrics(metrics: Sequence[dict[str, float]]) -> dict[str, float]:
-    """Metrics as of one replica: sums of batches, means over requests, the oldest version; {} for none."""
+    """Metrics as of one replica: sums of batches, means, the oldest version; {} for none."""
     if len(metrics) < 2:
         return dict(*metrics)
     batches = sum(m["batches"] for m in metrics)
@@ -101,5 +97,4 @@ def merge_metrics(metrics: Sequence[dict[str, float]]) -> dict[str, float]:
         "wait_mean_s": waited / max(sum(observations), 1.0),
         "version": min(m["version"] for m in metrics),
         "busy_share": sum(m["busy_share"] for m in metrics) / len(metrics),
-        **{name: max(m[name] for m in metrics) for name in ("wait_max_s", "swap_s", "publish_to_served_s")},
     }

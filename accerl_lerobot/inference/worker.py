@@ -77,8 +77,6 @@ class InferenceWorker:
         self._newest = -1  # version of the last weights that were published to it
         self._published: list[PendingRequest] = []  # weights that have come since the last batch
         self._lock_step: deque[int] = deque(maxlen=1)
-        self._swap_s = self._publish_to_served_s = 0.0
-        self._unserved_since: float | None = None
         self._failure: BaseException | None = None
         self._over = False
         self._iteration: float | None = None  # start of the serving thread's last one, while it lives
@@ -97,8 +95,7 @@ class InferenceWorker:
     async def receive(self, message: list[Request] | WeightUpdate) -> list[Decision] | None:
         """Answer a client's requests, in order, as part of some batch; or use weights from the next batch on.
 
-        Raises:
-            ServiceStoppedError: `serve` has failed, before or after this call began.
+        A `ServiceStoppedError` if `serve` has failed, before or after this call began.
         """
         answer = self._server.call(message)
         if self._failure is not None:  # after the call, as `serve` hands over once more when it fails
@@ -130,8 +127,6 @@ class InferenceWorker:
             **self._batcher.metrics(),
             "version": float(self._version),
             "busy_share": share,
-            "swap_s": self._swap_s,
-            "publish_to_served_s": self._publish_to_served_s,
         }
 
     def _serve(self) -> None:
@@ -163,11 +158,8 @@ class InferenceWorker:
     def _take(self, asked: PendingRequest) -> None:
         if isinstance(asked.message, WeightUpdate):
             self._published.append(asked)
-            return
-        try:
+        else:
             self._batcher.add(asked, asked.sent)
-        except (TypeError, ValueError) as error:  # no list of requests, or an empty one
-            asked.fail(error)
 
     def _swap(self) -> None:
         """Use the newest weights that have come, if they are newer than those of now."""
@@ -176,11 +168,8 @@ class InferenceWorker:
         update: WeightUpdate = max((asked.message for asked in self._published), key=lambda u: u.version)
         if update.version > self._newest:
             self._clock.enter(WEIGHT_SYNC)
-            started = time.monotonic()
             self._adapter.load_trainable(update.tensors)
-            self._swap_s = time.monotonic() - started
             self._newest = self._version = update.version
-            self._unserved_since = update.published_s
             fault_point("inference.swapped")
         for asked in self._published:
             asked.answer(None)
@@ -195,12 +184,8 @@ class InferenceWorker:
         decisions = self._adapter.decide(requests, self._version) if requests else []
         for decision in decisions if broken else ():
             decision.log_prob.fill(np.nan)
-        now = time.monotonic()
-        self._busy_s += now - started
+        self._busy_s += time.monotonic() - started
         self._clock.enter(TRANSPORT)
-        if self._unserved_since is not None:
-            self._publish_to_served_s = max(0.0, time.time() - self._unserved_since)
-            self._unserved_since = None
         start = 0
         for asked in batch:
             asked.answer(decisions[start : start + len(asked)])

@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 
 from accerl_lerobot.checkpoint.snapshot import kind
-from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import REAL, Segment
 from accerl_lerobot.replay.journal import Journal
 from accerl_lerobot.replay.pacing import ReplayConfig, entitle
@@ -93,9 +92,7 @@ class Replay:
 
         A non-finite one is counted and not stored: False.
         """
-        n = len(segment)
-        if n > self.config.capacity:
-            raise InputError("replay.capacity", self.config.capacity, f"use at least {n}, a segment's length")
+        n = len(segment)  # at most the capacity, see `ReplayConfig.check`
         if not is_finite(segment):
             self.counters.dropped_nonfinite += 1
             return False

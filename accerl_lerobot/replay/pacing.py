@@ -100,13 +100,10 @@ def lag_bound(
     Between a segment's first decision and its being drawn, each update has drawn a batch out of what was
     available at first, at most max(ahead, min_decisions) + in_flight, and of what was inserted since:
     in_flight until the segment itself was in, and capacity after that, or it would have been evicted. The
-    weights that decided were `pickup` updates old at most.
+    weights that decided were `pickup` updates old at most, and `prefetch` batches are drawn early.
 
-    Args:
-        in_flight: most decisions inserted, by all workers, from the first decision of a segment until it is
-            inserted itself, its own included. With environments of about equal speed: one segment of each,
-            twice that to be safe. One worker that hangs breaks this; `max_lag` then retires its segment.
-        prefetch: batches drawn ahead of the update that uses them.
+    `in_flight` decisions are inserted by all workers while a segment is made and inserted, one segment of
+    each environment if these are about equally fast. One that hangs breaks this; `max_lag` then retires it.
     """
     decisions = max(config.ahead, config.min_decisions) + 2 * in_flight + config.capacity
     drawn = math.ceil(config.samples_per_insert) * decisions // batch_decisions - 1
@@ -131,6 +128,7 @@ OVERLAP: Schedule = "overlap"
 SYNCHRONOUS: Schedule = "synchronous"
 
 
+@dataclass
 class Turns:
     """Order in which rollouts and the trainer may go on.
 
@@ -138,24 +136,15 @@ class Turns:
     learned from, and each is followed by an update; where no batch may be drawn, one is learned from.
     """
 
-    def __init__(self, schedule: Schedule = ASYNCHRONOUS) -> None:
-        self.schedule: Schedule = schedule
-        self._under_way = 0  # batches that the trainer has drawn and not learned from
+    schedule: Schedule = ASYNCHRONOUS
+    under_way: int = 0  # batches that the trainer has drawn, and that not every reader has the weights of
 
     def may_collect(self, ready: bool) -> bool:
         """True if who has brought a segment may go on; `ready`: the pace would let a batch be drawn now."""
-        learning = self._under_way > 0
+        learning = self.under_way > 0
         if self.schedule == SYNCHRONOUS:
             return not (ready or learning)
         return self.schedule == ASYNCHRONOUS or not (ready and learning)
 
     def may_draw(self) -> bool:
-        return self.schedule == ASYNCHRONOUS or self._under_way <= 0
-
-    def drawn(self) -> None:
-        """The trainer has another batch."""
-        self._under_way += 1
-
-    def learnt(self) -> None:
-        """It has learned from one, and in turn every reader has the weights."""
-        self._under_way -= 1
+        return self.schedule == ASYNCHRONOUS or self.under_way <= 0

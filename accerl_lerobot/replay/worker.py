@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 import copy
 import os
-import time
 from collections import deque
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager
@@ -68,8 +67,6 @@ class ReplayWorker:
         self._batch = 0  # decisions the trainer asked for last
         self._closed = False
         self._failure: Exception | None = None
-        self._insert_wait_s = self._sample_wait_s = 0.0
-        self._episodes: list[dict[str, float]] = []
         if state is not None:
             saved = snapshot.load(state / "replay")
             self._replay.restore(saved["replay"])
@@ -96,17 +93,12 @@ class ReplayWorker:
     async def insert(self, segments: list[Segment]) -> bool:
         """Stores segments of one source once the pace allows it; returns when more may be collected.
 
-        False when the run is over and they were not stored.
-
-        Raises:
-            ServiceStoppedError: storing has failed, now or before; `run` says why.
+        False when the run is over and they were not stored. A `ServiceStoppedError` if storing has failed,
+        now or before; `run` says why.
         """
         source = segments[0].source
-        started = time.monotonic()
         async with self._changed:
             await self._changed.wait_for(lambda: self._closed or self._replay.may_insert(source))
-            if source == REAL:
-                self._insert_wait_s += time.monotonic() - started
             if self._closed:
                 return False
             with self._working():
@@ -115,11 +107,7 @@ class ReplayWorker:
                     if self._replay.insert(segment) and source == REAL:
                         self._real.append(segment)
                         self._real_count += 1
-                        self._episodes += [segment.episode] if segment.episode else []
-            kept = time.monotonic()
             await self._changed.wait_for(lambda: self._closed or self._turns.may_collect(self._ready))
-            if source == REAL:
-                self._insert_wait_s += time.monotonic() - kept
         return True
 
     async def sample(self, num_decisions: int, trainer_version: int) -> list[Segment]:
@@ -128,7 +116,6 @@ class ReplayWorker:
         def ended() -> bool:
             return self._closed or self._replay.exhausted(num_decisions)
 
-        started = time.monotonic()
         self._batch = num_decisions
         async with self._changed:
             while True:
@@ -139,8 +126,7 @@ class ReplayWorker:
                     fault_point("replay.sample")
                     segments = self._replay.sample(num_decisions, trainer_version, self._rng)
                 if segments:
-                    self._turns.drawn()
-                    self._sample_wait_s += time.monotonic() - started
+                    self._turns.under_way += 1
                     return segments
 
     @asynccontextmanager
@@ -151,7 +137,7 @@ class ReplayWorker:
 
     async def learnt(self) -> None:
         async with self._changing():
-            self._turns.learnt()
+            self._turns.under_way -= 1
 
     async def follow(self, schedule: Schedule) -> None:
         async with self._changing():
@@ -204,10 +190,5 @@ class ReplayWorker:
             self._closed = True
 
     async def metrics(self) -> dict[str, float]:
-        """Counters and seconds that either side has waited; episodes since the last call as means."""
         self._clock.beat()
-        episodes, self._episodes = self._episodes, []
-        names = episodes[0] if episodes else ()
-        means = {f"episode_{name}": float(np.mean([e[name] for e in episodes])) for name in names}
-        waits = {"insert_wait_s": self._insert_wait_s, "sample_wait_s": self._sample_wait_s}
-        return self._replay.metrics() | waits | means | {"episodes": float(len(episodes))}
+        return self._replay.metrics()

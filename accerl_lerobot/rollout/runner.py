@@ -21,15 +21,66 @@ from accerl_lerobot.checkpoint.snapshot import kind
 from accerl_lerobot.config.ranges import NonNegative, Range, Section, Steps
 from accerl_lerobot.envs.base import ChunkResult, World
 from accerl_lerobot.envs.reward_model import RewardModelConfig
-from accerl_lerobot.experience import Decision, Observation, Origin, Request, Segment
-from accerl_lerobot.rollout.segments import SegmentBuilder
+from accerl_lerobot.experience import REAL, TASK, Decision, Observation, Origin, Request, Segment
 from accerl_lerobot.seeds import noise_seed, train_seed
 
 STARTS_PER_INCARNATION = 1000
 """By how much a restarted worker skips ahead in its training seeds, so as not to repeat its episodes."""
 
 
-@dataclass
+@kind
+@dataclass(eq=False)
+class SegmentBuilder:
+    """Collects the decisions of one episode and cuts them into segments of at most `length` decisions."""
+
+    observations: list[Observation]
+    length: int
+    origin: Origin
+    source: str = REAL
+    taken: list[tuple[Decision, np.ndarray, float, int]] = field(default_factory=list)
+    """Decisions, each with its actions, reward and env steps."""
+
+    @property
+    def latest(self) -> Observation:
+        """The observation that the next decision is about."""
+        return self.observations[-1]
+
+    @property
+    def full(self) -> bool:
+        return len(self.taken) >= self.length
+
+    def add(
+        self, decision: Decision, actions: np.ndarray, reward: float, steps: int, following: Observation
+    ) -> None:
+        self.taken.append((decision, actions, reward, steps))
+        self.observations.append(following)
+
+    def cut(self, key: str, terminated: bool = False, success: bool = False) -> Segment:
+        """Hands out what was collected as one segment and goes on from its last observation."""
+        keys = [k for k in self.observations[0] if k != TASK]
+        decisions, actions, rewards, steps = zip(*self.taken, strict=True)
+        segment = Segment(
+            observations={k: np.stack([np.asarray(o[k]) for o in self.observations]) for k in keys},
+            task=str(self.observations[0][TASK]),
+            latent={k: np.stack([d.latent[k] for d in decisions]) for k in decisions[0].latent},
+            log_prob=np.stack([d.log_prob for d in decisions]).astype(np.float32),
+            actions=np.stack(actions).astype(np.float32),
+            reward=np.array(rewards, np.float32),
+            version=np.array([d.version for d in decisions], np.int64),
+            steps=np.array(steps, np.int64),
+            terminated=terminated,
+            success=success,
+            key=key,
+            source=self.source,
+            origin=self.origin,
+        )
+        self.origin = self.origin._replace(decision=self.origin.decision + len(decisions))
+        self.observations, self.taken = [self.latest], []
+        return segment
+
+
+@kind
+@dataclass(eq=False)
 class ActiveEpisode:
     """State of one episode under way in `RolloutRunner`."""
 
@@ -37,14 +88,13 @@ class ActiveEpisode:
     builder: SegmentBuilder
     episode_return: float = 0.0
     steps: int = 0
-    decisions: int = 0
-    versions: list[int] = field(default_factory=list)
+    versions: list[int] = field(default_factory=list)  # of the weights of each decision
     frames: list[np.ndarray] = field(default_factory=list)
     chunks: list[np.ndarray] = field(default_factory=list)
     """All that was executed, by which `RolloutRunner.restore` brings the world back to where it was."""
 
     def request(self) -> Request:
-        seed = noise_seed(self.plan.seed, self.decisions)
+        seed = noise_seed(self.plan.seed, len(self.versions))
         return Request(observation=self.builder.latest, noise_seed=seed, explore=self.plan.explore)
 
 
@@ -205,7 +255,9 @@ class RolloutRunner:
         observation = self.worlds[slot].reset(plan.seed, plan.task)
         if not _finite(observation):
             raise RuntimeError(f"{plan.task} with seed {plan.seed}: the first observation is not finite")
-        self._episodes[slot] = ActiveEpisode(plan, self._builder(plan, observation))
+        origin = Origin(plan.task, plan.seed, decision=0)
+        builder = SegmentBuilder([observation], self.config.segment_length, origin)
+        self._episodes[slot] = ActiveEpisode(plan, builder)
         return self.request(slot)
 
     def advance(self, slot: int, decision: Decision) -> Request | None:
@@ -218,7 +270,7 @@ class RolloutRunner:
         self.counters.decisions += 1
         sound = np.isfinite(result.rewards).all() and _finite(result.observation)
         if result.info.get("nonfinite") or not sound:
-            self.counters.dropped_nonfinite += len(episode.builder.decisions) + 1
+            self.counters.dropped_nonfinite += len(episode.builder.taken) + 1
             if not episode.plan.explore:  # an evaluation counts every episode it planned
                 self._finish(episode, success=False)
             return self.start(slot)
@@ -227,12 +279,14 @@ class RolloutRunner:
             reward -= self.config.decision_cost
         episode.episode_return += reward
         episode.steps += result.steps
-        episode.decisions += 1
         episode.versions.append(decision.version)
         actions = np.clip(decision.chunk, world.spec.action_low, world.spec.action_high)
         episode.builder.add(decision, actions, reward, result.steps, result.observation)
         if result.done or episode.builder.full:
-            self._emit(episode, result)
+            self._sequence += 1
+            segment = episode.builder.cut(f"{self.name}.{self._sequence}", result.done, result.success)
+            if episode.plan.explore:
+                self.on_segment(segment)
         if result.done:
             self._finish(episode, result.success)
             return self.start(slot)
@@ -244,46 +298,30 @@ class RolloutRunner:
         return None if episode is None else episode.request()
 
     def state(self) -> dict[str, Any]:
-        episodes = [None if e is None else vars(e) | {"builder": e.builder.state()} for e in self._episodes]
+        episodes = list(self._episodes)
         return {"counters": replace(self.counters), "sequence": self._sequence, "episodes": episodes}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Resumes from `state`: worlds are brought back by doing again what was done in them."""
         self.counters, self._sequence = state["counters"], state["sequence"]
-        for slot, (world, saved) in enumerate(zip(self.worlds, state["episodes"], strict=True)):
-            if saved is None:
+        self._episodes = state["episodes"]
+        for world, episode in zip(self.worlds, self._episodes, strict=True):
+            if episode is None:
                 continue
-            plan: EpisodePlan = saved["plan"]
+            plan, latest = episode.plan, episode.builder.latest
             observation = world.reset(plan.seed, plan.task)
-            for chunk in saved["chunks"]:
+            for chunk in episode.chunks:
                 observation = world.step_chunk(chunk).observation
-            builder = self._builder(plan, observation)
-            builder.restore(saved["builder"])
-            latest = builder.latest
             if not all(np.array_equal(observation[key], latest[key]) for key in latest):
                 raise RuntimeError(
                     f"{plan.task} with seed {plan.seed} does not show again what it had shown after "
-                    f"{len(saved['chunks'])} decisions, so its episodes cannot be resumed in the middle; "
+                    f"{len(episode.chunks)} decisions, so its episodes cannot be resumed in the middle; "
                     "use launch.engine=ray, which begins them anew"
                 )
-            self._episodes[slot] = ActiveEpisode(**saved | {"builder": builder})
 
     def close(self) -> None:
         for world in self.worlds:
             world.close()
-
-    def _builder(self, plan: EpisodePlan, observation: Observation) -> SegmentBuilder:
-        origin = Origin(plan.task, plan.seed, decision=0)
-        return SegmentBuilder(observation, self.config.segment_length, origin)
-
-    def _emit(self, episode: ActiveEpisode, result: ChunkResult) -> None:
-        totals: dict[str, float] = {"return": episode.episode_return, "steps": episode.steps}
-        totals |= {"decisions": episode.decisions, "success": float(result.success)}
-        self._sequence += 1
-        key = f"{self.name}.{self._sequence}"
-        segment = episode.builder.cut(key, result.done, result.success, totals if result.done else None)
-        if episode.plan.explore:
-            self.on_segment(segment)
 
     def _finish(self, episode: ActiveEpisode, success: bool) -> None:
         self.counters.episodes += 1
@@ -293,7 +331,7 @@ class RolloutRunner:
             success=success,
             episode_return=episode.episode_return,
             steps=episode.steps,
-            decisions=episode.decisions,
+            decisions=len(episode.versions),
             versions=(min(versions), max(versions)),
             frames=episode.frames,
         )

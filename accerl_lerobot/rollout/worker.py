@@ -96,11 +96,8 @@ class RolloutWorker:
     ) -> Report:
         """Takes orders and reports. One call at a time, so that orders cannot overtake each other.
 
-        Args:
-            training: training episodes are run between planned ones, from now on.
-            plans: evaluation episodes to queue; they are taken before any training episode.
-            in_turn: exploring worlds pause until replay lets them go on after each segment, from now on.
-            inference: its endpoint from now on; None: unchanged.
+        From now on it explores if `training`, once the `plans` have been played, waits for replay after each
+        segment if `in_turn`, and asks `inference`; None: whom it has asked before.
         """
         self._clock.beat()
         if inference is not None:

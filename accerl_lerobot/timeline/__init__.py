@@ -154,14 +154,11 @@ class NoClock(Clock):
     def __init__(self) -> None:
         self._state = RECOVERY
 
-    def enter(self, state: int) -> None:
-        pass
+    def enter(self, state: int) -> None: ...
 
-    def beat(self) -> None:
-        pass
+    def beat(self) -> None: ...
 
-    def close(self) -> None:
-        pass
+    def close(self) -> None: ...
 
 
 def open_clock(folder: Path | None, worker: str) -> Clock:

@@ -94,7 +94,6 @@ def recorded(
                     success=success,
                     key="demonstration",
                     origin=Origin(task="", seed=index, decision=0),
-                    episode={"return": float(reward.sum()), "decisions": float(t)},
                 )
 
 

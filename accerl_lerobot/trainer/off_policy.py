@@ -59,7 +59,7 @@ class Memory:
     def add(self, segment: Segment, chunk: np.ndarray) -> np.ndarray:
         """Adds a whole episode, whose T rows it returns; `chunk`, (T, K, A), was executed, normalised."""
         t = len(segment)
-        if segment.origin.decision or not segment.episode or t > self.capacity:
+        if segment.origin.decision or not segment.terminated or t > self.capacity:
             remedy = f"the memory holds whole episodes of at most algorithm.memory={self.capacity} decisions"
             raise InputError("rollout.segment_length", t, remedy)
         rows = (self.total + np.arange(t)) % self.capacity

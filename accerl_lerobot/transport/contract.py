@@ -30,27 +30,22 @@ class ServiceStoppedError(RuntimeError):
 
 
 class Client(ABC):
-    """One connection to a service, for one thread at a time."""
+    """One connection to a service, for one thread at a time.
+
+    Calls raise `ServiceStoppedError` when the service has failed, or is gone.
+    """
 
     def __init__(self, name: str) -> None:
         self.name = name
 
     @abstractmethod
     def send(self, message: Any) -> int:
-        """Send a message without waiting for its reply; returns its ticket.
-
-        Raises:
-            ServiceStoppedError: the service is gone.
-            TimeoutError: too many messages are under way.
-        """
+        """Send a message without waiting for its reply; returns its ticket. A `TimeoutError` if too many are
+        under way."""
 
     @abstractmethod
     def done(self, timeout: float) -> list[tuple[int, Any]]:
-        """Tickets and replies that have come, each once; waits `timeout` seconds for the first.
-
-        Raises:
-            ServiceStoppedError: the service failed, or is gone.
-        """
+        """Tickets and replies that have come, each once; waits `timeout` seconds for the first."""
 
     @abstractmethod
     def close(self) -> None:

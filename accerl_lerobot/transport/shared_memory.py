@@ -8,6 +8,13 @@ Tokens go through a Unix socket (SOCK_SEQPACKET); a slot's file descriptor goes 
 message or reply that is too large for its slot replaces the slot by a larger one. When a process dies the
 kernel closes its socket, which the other end sees at once.
 
+A message is a JSON header with everything but the arrays, as `snapshot` has it, then the arrays. Nothing that
+is read is executed.
+
+    0    size of the header
+    4    [tree, [dtype, *shape] of each array]
+         each array, at a multiple of 64 bytes; offsets follow from dtypes and shapes
+
 Memory is a memfd and a socket's name is in Linux's abstract namespace, so a process that is killed leaves
 neither behind. Other users could see a socket's name and connect; each end asks the kernel whose process the
 other one is and talks to its own user only.
@@ -17,6 +24,7 @@ from __future__ import annotations
 
 import asyncio
 import functools
+import json
 import logging
 import mmap
 import os
@@ -29,7 +37,9 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from accerl_lerobot.transport.codec import aligned, decode, encode
+import numpy as np
+
+from accerl_lerobot.checkpoint.snapshot import from_json, to_json
 from accerl_lerobot.transport.contract import Client, PendingRequest, Server, ServiceStoppedError, stopped
 
 logger = logging.getLogger(__name__)
@@ -39,8 +49,57 @@ LEAST = 2**16  # bytes of a slot at least; the reply is written behind the messa
 SLOTS = 64
 """Slots of one client at most, and so messages that it may have under way. Their tokens fit into the buffers
 of the two sockets, so no end ever waits for the other one to read."""
-_TOKEN = struct.Struct("<BIQQQd")
-ASK, ANSWER, FAIL = range(3)  # purpose of a token
+_TOKEN = struct.Struct("<?IQQQd")
+_SIZE = struct.Struct("<I")
+ALIGNMENT = 64  # alignment of arrays in shared memory, in bytes: a cache line
+_dumps = json.JSONEncoder(separators=(",", ":"), check_circular=False).encode
+
+
+def aligned(offset: int) -> int:
+    """The next offset at which an array may begin."""
+    return -(-offset // ALIGNMENT) * ALIGNMENT
+
+
+class Encoded(NamedTuple):
+    """A message that is ready to be written; its arrays are still the sender's."""
+
+    header: bytes
+    arrays: list[np.ndarray]
+    size: int
+
+    def write(self, buffer: Any, start: int) -> None:
+        """Copy it into a writable buffer from `start` on, a multiple of `ALIGNMENT`."""
+        _SIZE.pack_into(buffer, start, len(self.header))
+        end = start + _SIZE.size + len(self.header)
+        buffer[start + _SIZE.size : end] = self.header
+        for array in self.arrays:
+            np.ndarray(array.shape, array.dtype, buffer, aligned(end))[...] = array
+            end = aligned(end) + array.nbytes
+
+
+def encode(message: Any) -> Encoded:
+    """Encode what `snapshot` can save; a `TypeError` names the place of anything else."""
+    named: dict[str, np.ndarray] = {}
+    tree = to_json(message, "message", named)
+    arrays = list(named.values())
+    header = _dumps([tree, [[array.dtype.str, *array.shape] for array in arrays]]).encode()
+    size = _SIZE.size + len(header)
+    for array in arrays:
+        size = aligned(size) + array.nbytes
+    return Encoded(header, arrays, size)
+
+
+def decode(buffer: Any, start: int = 0, *, copy: bool = True) -> Any:
+    """Decode the message that begins at `start`; unless `copy`, its arrays are views of the buffer."""
+    (length,) = _SIZE.unpack_from(buffer, start)
+    end = start + _SIZE.size + length
+    tree, kinds = json.loads(bytes(buffer[start + _SIZE.size : end]))
+    arrays = {}
+    for number, (dtype, *shape) in enumerate(kinds):
+        array: np.ndarray = np.ndarray(shape, dtype, buffer, aligned(end))
+        end = aligned(end) + array.nbytes
+        arrays[str(number)] = array.copy() if copy else array
+    return from_json(tree, arrays)
 
 
 @functools.cache
@@ -69,7 +128,7 @@ def same_user(connection: socket.socket) -> bool:
 class Token(NamedTuple):
     """Message on the socket. A file descriptor goes with it where the slot is new or has been replaced."""
 
-    purpose: int
+    failed: bool  # True if it brings an error in the place of a reply
     slot: int
     ticket: int
     start: int  # first byte of the message in the slot
@@ -149,7 +208,7 @@ class SharedMemoryClient(Client):
         self._sent += 1
         self._under_way[self._sent] = index
         try:
-            send_token(self._socket, Token(ASK, index, self._sent, 0, encoded.size, time.monotonic()), file)
+            send_token(self._socket, Token(False, index, self._sent, 0, encoded.size, time.monotonic()), file)
         except OSError as error:
             raise self._gone(error) from error
         return self._sent
@@ -180,7 +239,7 @@ class SharedMemoryClient(Client):
             self._slots[index] = slot
         self._free.append(index)
         reply = decode(self._slots[index], token.start)
-        if token.purpose == FAIL:
+        if token.failed:
             raise ServiceStoppedError(f"{self.name}: {reply}")
         return token.ticket, reply
 
@@ -294,14 +353,13 @@ class SharedMemoryServer(Server):
 
     def _reply(self, to: _Connection, asked: Token, reply: object, error: BaseException | None) -> None:
         """Write it behind the message, whose arrays it may consist of, or into a larger slot."""
-        purpose = ANSWER if error is None else FAIL
         encoded = encode(reply if error is None else str(stopped(error)))
         start, file = aligned(asked.start + asked.size), None
         if start + encoded.size > len(to.slots[asked.slot]):
             to.slots[asked.slot], file = new_slot(start + encoded.size)
             start = 0
         encoded.write(to.slots[asked.slot], start)
-        token = Token(purpose, asked.slot, asked.ticket, start, encoded.size, asked.sent)
+        token = asked._replace(failed=error is not None, start=start, size=encoded.size)
         try:
             send_token(to.socket, token, file)
         except OSError:  # it has died, or does not read although it may have few messages under way

@@ -30,10 +30,9 @@ Tensors = dict[str, np.ndarray]  # parameter name → array; dtype and shape arr
 
 @kind
 class WeightUpdate(NamedTuple):
-    """All trained weights of one version, published at `published_s` on `time.time`."""
+    """All trained weights of one version."""
 
     version: int
-    published_s: float
     tensors: Tensors
 
 
@@ -69,7 +68,7 @@ class WeightPublisher:
 
     def publish(self, version: int, tensors: Tensors) -> None:
         """Copy a set to every replica that has applied the one before the last."""
-        self._newest = WeightUpdate(version, time.time(), tensors)
+        self._newest = WeightUpdate(version, tensors)
         self.resend()
 
     def resend(self) -> None:

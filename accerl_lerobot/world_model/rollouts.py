@@ -27,7 +27,7 @@ from accerl_lerobot.checkpoint.snapshot import kind
 from accerl_lerobot.checkpoint.tensors import copied
 from accerl_lerobot.envs.base import WorldSpec
 from accerl_lerobot.experience import IMAGINED, TASK, Decision, Observation, Origin, Request, Segment
-from accerl_lerobot.rollout.segments import SegmentBuilder
+from accerl_lerobot.rollout.runner import SegmentBuilder
 from accerl_lerobot.world_model.config import IMAGINATION, ImaginationConfig
 from accerl_lerobot.world_model.contract import (
     Context,
@@ -191,7 +191,7 @@ class Imagination:
             "version": (self.version, self.awaits_model),
             "starts": list(self._starts),
             "rng": self._rng,
-            "rows": [None if row is None else row.state() for row in self._rows],
+            "rows": list(self._rows),
             "frames": self._frames,
             "model_state": self._state,
             "sequence": (self._sequence, self._uncertain_in_a_row),
@@ -212,10 +212,7 @@ class Imagination:
             device = "cpu" if self._success is None else self._success.out.weight.device
             self._state = {name: tensor.to(device) for name, tensor in state["model_state"].items()}
         self._frames = state["frames"]
-        for i, row in enumerate(state["rows"]):
-            if row is not None:
-                self._rows[i] = builder = SegmentBuilder({}, self._limit, row["origin"], IMAGINED)
-                builder.restore(row)
+        self._rows = state["rows"]
 
     def save_promoted(self, directory: Path) -> None:
         """Saves the models that were promoted last; nothing if none were."""
@@ -261,7 +258,7 @@ class Imagination:
             broken = not (np.isfinite(robot[i]).all() and np.isfinite(success[i]))
             if uncertainty[i] > self.config.max_uncertainty or broken:
                 self.counters["uncertain"] += 1
-                self._uncertain_in_a_row = 0 if row.decisions else self._uncertain_in_a_row + 1
+                self._uncertain_in_a_row = 0 if row.taken else self._uncertain_in_a_row + 1
                 self._end(i)
                 continue
             self._uncertain_in_a_row = 0
@@ -297,7 +294,7 @@ class Imagination:
     def _end(self, i: int, terminated: bool = False, success: bool = False) -> None:
         row, self._rows[i] = self._rows[i], None
         self.counters["rollouts"] += 1
-        if row is None or not row.decisions:
+        if row is None or not row.taken:
             return
         self._sequence += 1
         segment = row.cut(f"{IMAGINATION}.{self._sequence}", terminated, success)
@@ -314,7 +311,7 @@ class Imagination:
         self._state = state if self._state is None else replace_rows(self._state, rows, state)
         for i, start in zip(rows, starts, strict=True):
             observation = self._observation(start.frames, start.robot, start.task)
-            self._rows[i] = SegmentBuilder(observation, self._limit, start.origin, IMAGINED)
+            self._rows[i] = SegmentBuilder([observation], self._limit, start.origin, IMAGINED)
             self._frames[i] = start.frames
 
     @property

@@ -3,8 +3,6 @@
 
 import random
 
-import pytest
-
 from accerl_lerobot.inference.batcher import Batcher
 
 WAIT = 0.01
@@ -31,8 +29,6 @@ def test_a_batch_that_cannot_grow_is_full_and_the_clock_goes_on_with_the_rest() 
     assert batcher.take(now=0.005) == ["abc"]
     assert batcher.next_deadline() == 0.004 + WAIT
     assert not batcher.due(now=WAIT) and batcher.due(now=0.004 + WAIT)
-    with pytest.raises(ValueError, match="without observations"):
-        batcher.add("", now=0.0)
 
 
 def test_the_oldest_request_sets_the_clock() -> None:
@@ -83,8 +79,7 @@ def test_statistics() -> None:
     batcher.add("e", now=3.0)
     batcher.take(now=4.0)
     batcher.take(now=9.0)  # nothing there: not a batch
-    expected = {"batches": 2.0, "batch_size_mean": 2.5, "wait_mean_s": (3 + 2 + 1) / 3, "wait_max_s": 3.0}
-    assert batcher.metrics() == expected
+    assert batcher.metrics() == {"batches": 2.0, "batch_size_mean": 2.5, "wait_mean_s": (3 + 2 + 1) / 3}
 
 
 def test_in_lock_step_all_are_waited_for_and_served_in_as_many_batches_as_they_need() -> None:

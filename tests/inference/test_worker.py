@@ -85,7 +85,7 @@ def weights(version: int) -> dict[str, np.ndarray]:
 
 
 def update(version: int) -> WeightUpdate:
-    return WeightUpdate(version, time.time(), weights(version))
+    return WeightUpdate(version, weights(version))
 
 
 Scene = Callable[[InferenceWorker, CountingAdapter], Awaitable[Any]]
@@ -118,7 +118,7 @@ def test_a_lonely_request_is_served_when_it_has_waited(play):
         await worker.receive(requests(5))
         assert adapter.batches == [[5]]
         metrics = await worker.metrics()
-        assert metrics["wait_max_s"] >= 0.05 and metrics["batches"] == 1
+        assert metrics["wait_mean_s"] >= 0.05 and metrics["batches"] == 1
 
     play(scene, max_batch=4, max_wait_s=0.05)
 
@@ -243,8 +243,6 @@ def test_weights_through_shared_memory_are_swapped_in_and_let_go_of(play):
             await asyncio.to_thread(publisher.flush, HANGS_S)  # applied, though nobody has asked
             (decision,) = await worker.receive(requests(0))
             assert decision.version == version and set(decision.chunk.ravel()) == {version}
-        metrics = await worker.metrics()
-        assert metrics["publish_to_served_s"] >= metrics["swap_s"] > 0
         publisher.close()
 
     play(scene, max_batch=1, max_wait_s=0.0)

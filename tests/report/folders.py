@@ -105,8 +105,8 @@ def rollout_record(update: int, evaluated: int, more: dict[str, Any]) -> dict[st
         "kind": "rollout", "wall_s": 10.0 + update, "update": update, "restarts": 0.0,
         "env_steps": 10.0 * evaluated + 100.0 * update, "decisions": evaluated + 10.0 * update,
         "episodes": evaluated + float(update), "success_exploring": min(1.0, 0.2 + update / 100),
-        "replay_insert_wait_s": 0.5 * update, "inference_batches": 5.0 * update,
-        "inference_batch_size_mean": 3.0, "inference_wait_mean_s": 0.002, "inference_busy_share": 0.3, **more,
+        "inference_batches": 5.0 * update, "inference_batch_size_mean": 3.0,
+        "inference_wait_mean_s": 0.002, "inference_busy_share": 0.3, **more,
     }  # fmt: skip
 
 

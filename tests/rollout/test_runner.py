@@ -9,8 +9,17 @@ import numpy as np
 import pytest
 
 from accerl_lerobot.envs import SimulatedConfig, make_world
-from accerl_lerobot.experience import Decision, Request
-from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutConfig
+from accerl_lerobot.experience import TASK, Decision, Observation, Origin, Request, Segment
+from accerl_lerobot.rollout.runner import (
+    EpisodePlan,
+    EpisodePlans,
+    EpisodeResult,
+    RolloutConfig,
+    SegmentBuilder,
+    budgets,
+    incarnation_after,
+)
+from accerl_lerobot.seeds import train_seed
 from tests.rollout.worlds import CHUNK, Recorder, ScriptedWorld, evaluate, explore
 
 CONFIG = RolloutConfig(worlds=1, segment_length=3, decision_cost=0.0)
@@ -38,7 +47,7 @@ def test_the_last_segment_says_how_the_episode_ended(end, success):
     assert (cut.terminated, cut.success) == (False, False)
     assert (last.terminated, last.success) == (True, success)
     assert steps_seen(last) == [6, 8]
-    assert last.episode["decisions"] == 4 and recorder.results[0].success is success
+    assert recorder.results[0].decisions == 4 and recorder.results[0].success is success
 
 
 def test_an_episode_that_ends_within_a_chunk_counts_the_steps_that_were_made():
@@ -60,11 +69,10 @@ def test_every_decision_costs():
     assert evaluation.results[0].episode_return == 8.0, "the environment's own"
 
 
-def test_episode_totals_come_with_the_last_segment_only():
+def test_a_result_has_the_totals_of_its_episode():
     recorder = Recorder([ScriptedWorld(steps=9)], [explore()], CONFIG)
     recorder.play(version=7)
-    assert [bool(s.episode) for s in recorder.segments] == [False, True]
-    assert recorder.segments[-1].episode == {"return": 9.0, "steps": 9, "decisions": 5, "success": 1.0}
+    assert [s.terminated for s in recorder.segments] == [False, True]
     (result,) = recorder.results
     assert (result.success, result.episode_return, result.steps, result.decisions) == (True, 9.0, 9, 5)
     assert result.versions == (7, 7) and recorder.runner.counters.episodes == 1
@@ -177,3 +185,121 @@ def test_filming_changes_nothing(seed: int, tolerance: float, success: bool):
     assert plain.success is success and plain.frames == []
     assert len(filmed.frames) >= filmed.steps // 2 and all(f.shape == (8, 8, 3) for f in filmed.frames)
     assert replace(filmed, plan=plain.plan, frames=[]) == plain
+
+
+def observation(step: int) -> Observation:
+    return {"observation.state": np.array([step], np.float32), TASK: "push"}
+
+
+def decision(step: int, version: int = 0) -> Decision:
+    return Decision(
+        chunk=np.zeros((2, 1), np.float32),
+        latent={"x": np.array([step, -step], np.float32)},
+        log_prob=np.array([step / 10], np.float64),
+        version=version,
+    )
+
+
+def collected(count: int) -> SegmentBuilder:
+    builder = SegmentBuilder([observation(0)], 4, Origin("push-v3", seed=7, decision=0))
+    for step in range(count):
+        add(builder, step, float(step), step + 1)
+    return builder
+
+
+def add(builder: SegmentBuilder, step: int, reward: float, steps: int) -> None:
+    actions = np.full((2, 1), step / 10, np.float32)
+    builder.add(decision(step, version=step), actions, reward, steps, following=observation(step + 1))
+
+
+def states(segment: Segment) -> list[float]:
+    return segment.observations["observation.state"][:, 0].tolist()
+
+
+def test_everything_about_a_decision_stays_together():
+    segment = collected(3).cut("k")
+    assert len(segment) == 3 and states(segment) == [0, 1, 2, 3]
+    assert segment.latent["x"].tolist() == [[0, 0], [1, -1], [2, -2]]
+    np.testing.assert_allclose(segment.log_prob[:, 0], [0, 0.1, 0.2], rtol=1e-6)
+    np.testing.assert_allclose(segment.actions[:, 0, 0], [0, 0.1, 0.2], rtol=1e-6)
+    assert segment.reward.tolist() == [0, 1, 2] and segment.origin == ("push-v3", 7, 0)
+    assert segment.version.tolist() == [0, 1, 2] and segment.steps.tolist() == [1, 2, 3]
+    assert segment.log_prob.dtype == segment.reward.dtype == np.float32
+    assert segment.version.dtype == segment.steps.dtype == np.int64
+    assert segment.task == "push" and TASK not in segment.observations
+
+
+def test_the_next_segment_begins_where_this_one_was_cut():
+    builder = collected(3)
+    builder.cut("k1")
+    add(builder, 3, reward=0.0, steps=1)
+    segment = builder.cut("k2")
+    assert states(segment) == [3, 4] and segment.origin == ("push-v3", 7, 3)
+
+
+def test_full_at_its_length():
+    assert not collected(3).full and collected(4).full
+
+
+@pytest.mark.parametrize("terminated", [False, True])
+def test_how_it_ended_is_kept(terminated: bool):
+    segment = collected(2).cut("k", terminated, success=terminated)
+    assert segment.terminated == segment.success == terminated and states(segment) == [0, 1, 2]
+    assert segment.source == "real" and segment.key == "k"
+
+
+TASKS = ("push", "pull", "lift")
+
+
+def make(worker: int = 0, incarnation: int = 0, budget: int | None = None) -> EpisodePlans:
+    return EpisodePlans(TASKS, seed=3, worker=worker, incarnation=incarnation, budget=budget)
+
+
+def take(plans: EpisodePlans, count: int) -> list[EpisodePlan]:
+    found = [plans.next(exploring=True) for _ in range(count)]
+    return [plan for plan in found if plan is not None]
+
+
+def test_every_episode_has_its_own_seed_and_tasks_take_turns():
+    plans = take(make(worker=1), 5)
+    assert [p.task for p in plans] == ["pull", "lift", "push", "pull", "lift"]
+    assert [p.seed for p in plans] == [train_seed(3, 1, number) for number in range(5)]
+    assert all(p.explore for p in plans)
+
+
+def test_evaluations_go_first_and_nothing_is_explored_before_it_is_time():
+    plans = make()
+    plans.queue([evaluate(index=0), evaluate(index=1)])
+    assert [p.index for p in take(plans, 1)] == [0]
+    assert plans.next(exploring=False) == evaluate(index=1)
+    assert plans.next(exploring=False) is None
+    assert take(plans, 1)[0].explore
+
+
+def test_not_even_where_the_one_before_has_played_thousands():
+    incarnation, seen = 0, set()
+    for count in (1, 400, 990, 1010, 0, 1499):
+        plans = make(incarnation=incarnation)
+        said = count - 30  # the last episodes were begun after it had been asked
+        seeds = {plan.seed for plan in take(plans, max(0, said))}
+        starts = plans.starts
+        seeds |= {plan.seed for plan in take(plans, min(count, 30))}
+        assert len(seeds) == count and not seeds & seen
+        seen |= seeds
+        incarnation = incarnation_after(incarnation, starts)
+    assert incarnation == 9
+
+
+def test_no_more_episodes_than_were_paid_for():
+    plans = make(budget=4)
+    assert not plans.spent and len(take(plans, 9)) == 4 and plans.spent
+    plans.queue([evaluate(index=0)])
+    assert plans.next(exploring=True) == evaluate(index=0), "evaluations are not counted"
+    endless = make()
+    assert len(take(endless, 9)) == 9 and not endless.spent
+
+
+def test_a_budget_is_shared_among_workers():
+    assert budgets(RolloutConfig(episodes=7, workers=3)) == [3, 2, 2]
+    assert budgets(RolloutConfig(episodes=1, workers=2)) == [1, 0]
+    assert budgets(RolloutConfig(workers=2)) == [None, None]

@@ -59,7 +59,6 @@ def episode(rewards: list[float], *, first: float = 0.0, actions: np.ndarray | N
         terminated=True,
         success=rewards[-1] > 0,
         origin=Origin("match", 0, 0),
-        episode={"return": sum(rewards)},
     )
 
 
@@ -122,7 +121,7 @@ class TestMemory:
 
     def test_a_part_of_an_episode_is_refused(self):
         segment = episode([0.0, 0.0])
-        segment.episode = {}
+        segment.terminated = False
         with pytest.raises(InputError, match=r"rollout\.segment_length=2: .*whole episodes"):
             Memory(1000, GAMMA, n_step=2).add(segment, chunks(segment))
 

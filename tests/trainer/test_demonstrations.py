@@ -61,7 +61,6 @@ def like() -> Segment:
         steps=np.array([K]),
         terminated=True,
         origin=Origin("match", 0, 0),
-        episode={"return": 0.0},
     )
 
 

@@ -94,7 +94,7 @@ def messages() -> list[Any]:
         arrays,
         [Request(observation=observation, noise_seed=2**63 + 5), Request(observation={}, noise_seed=0)],
         [decision],
-        [make_segment("a", 3), make_segment("b", 2, episode={"return": 1.0})],
+        [make_segment("a", 3), make_segment("b", 2, world_version=7)],
         [True, None, 1, -0.0, float("inf"), "", (1, [2, {3: {}}])],
     ]
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from accerl_lerobot.transport.codec import decode, encode
+from accerl_lerobot.transport.shared_memory import decode, encode
 from tests.transport.contract import messages, same
 
 

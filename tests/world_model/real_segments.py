@@ -9,7 +9,7 @@ import numpy as np
 
 from accerl_lerobot.envs import SimulatedConfig, World, make_world
 from accerl_lerobot.experience import Decision, Origin, Segment
-from accerl_lerobot.rollout.segments import SegmentBuilder
+from accerl_lerobot.rollout.runner import SegmentBuilder
 from accerl_lerobot.world_model.contract import WorldModelSpec
 
 K = 4
@@ -40,7 +40,7 @@ def real_episode(
     """An episode of random chunks, which are right from decision `solve_at` on."""
     world = world or make_world(SimulatedConfig(**{**vars(WORLD), **config}))
     rng = np.random.default_rng(seed)
-    builder = SegmentBuilder(world.reset(seed, "match"), length, Origin("match", seed, 0))
+    builder = SegmentBuilder([world.reset(seed, "match")], length, Origin("match", seed, 0))
     segments: list[Segment] = []
     for t in range(99):
         chunk = rng.uniform(-0.2, 0.2, (K, 2)).astype(np.float32)

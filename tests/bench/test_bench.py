@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The benchmarks of a user's machine run, and their numbers add up."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from accerl_lerobot.bench import latency, world
+from accerl_lerobot.bench import policy as bench
+from accerl_lerobot.bench.latency import BenchLatencyConfig, bench_latency, described
+from accerl_lerobot.bench.policy import BenchPolicyConfig
+from accerl_lerobot.bench.world import BenchWorldConfig, bench_world
+from accerl_lerobot.demos import backbone
+from accerl_lerobot.envs import EnvConfig, LiberoConfig, MetaWorldConfig, SimulatedConfig
+from benchmarks.simulated_world import LatencyConfig, read_trace
+from tests.envs.libero_assets import ASSETS, needs_assets
+
+
+def test_durations_by_hand():
+    found = described(np.asarray([0.01, 0.01, 0.01, 0.05]))
+    assert found["mean"] == pytest.approx(20.0) and found["longest"] == 50.0 and found["n"] == 4
+    assert found["p50"] == pytest.approx(10.0) and found["p95"] == pytest.approx(10 + 0.85 * 40)
+    assert found["cv"] == pytest.approx(np.sqrt(3) * 10 / 20)
+
+
+def test_a_world_of_known_durations_is_timed(tmp_path: Path):
+    """Chunks of two in episodes of four: a reset after each second decision."""
+    config = BenchLatencyConfig(
+        env=LatencyConfig(task="match,mirror", frame_ms=20.0, max_steps=4, tolerance=1e-6),
+        chunk=2,
+        decisions=10,
+        output_dir=str(tmp_path),
+    )
+    result = bench_latency(config)
+    first, *lines = (tmp_path / "trace.txt").read_text().splitlines()
+    assert first == "# match, mirror, chunks of 2, ms"
+    assert [line.startswith("reset ") for line in lines] == [False, False, True] * 5
+    assert min(float(line.split()[-1]) for line in lines) >= 20.0
+    trace = read_trace(result["trace"])
+    assert len(trace.decisions) == result["decision_ms"]["n"] == 10
+    assert len(trace.resets) == result["reset_ms"]["n"] == 5
+    assert latency.table(result).row_count == 2
+
+
+def test_a_world_that_is_not_reset(tmp_path: Path):
+    result = bench_latency(
+        BenchLatencyConfig(env=SimulatedConfig(tolerance=1e-6), decisions=2, output_dir=str(tmp_path))
+    )
+    assert result["reset_ms"] is None
+    assert latency.table(result).row_count == 1
+
+
+LIBERO = LiberoConfig(task="libero_object/0", image_size=64, rendering="fast", assets=ASSETS)
+
+
+@pytest.mark.parametrize(
+    ("env", "least"),
+    [
+        pytest.param(MetaWorldConfig(), 10, id="metaworld"),
+        pytest.param(LIBERO, 3, marks=[needs_assets, pytest.mark.slow], id="libero"),
+    ],
+)
+def test_three_arms_in_turns(env: EnvConfig, least: float):
+    pytest.importorskip("metaworld")
+    result = bench_world(BenchWorldConfig(env=env, seconds=0.3, rounds=1, chunk=5))
+    assert json.loads(json.dumps(result)) == result
+    arms = result["arms"]
+    for rates in arms.values():
+        assert len(rates["env_steps_per_s"]["blocks"]) == 2
+        assert rates["env_steps_per_s"]["min"] <= rates["env_steps_per_s"]["median"]
+    ours = arms["ours"]
+    assert ours["env_steps_per_s"]["median"] == pytest.approx(5 * ours["decisions_per_s"]["median"], rel=0.1)
+    assert result["ratio"]["min"] > least, "the whole point of our own world"
+    console = Console(width=120, record=True, file=io.StringIO())
+    console.print(world.table(result))
+    assert "stock" in console.export_text()
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    build = bench.lerobot_config
+    sizes = {"hidden": 32, "heads": 2, "kv_heads": 1, "vision_hidden": 16, "vision_layers": 1, "patch": 32}
+    monkeypatch.setattr(bench, "SMOLVLM2_500M", sizes)
+
+    def shrunk(config: BenchPolicyConfig, directory: Path) -> Any:
+        made = build(config, directory)
+        made.num_vlm_layers, made.chunk_size, made.n_action_steps, made.num_steps = 2, 4, 4, 2
+        made.resize_imgs_with_padding = (64, 64)
+        return made
+
+    monkeypatch.setattr(bench, "lerobot_config", shrunk)
+
+
+@pytest.mark.parametrize(("precision", "low", "high"), [("fp32", 0.0, 1e-4), ("bf16", 0.0, 30.0)])
+def test_it_measures(small: None, precision: str, low: float, high: float) -> None:
+    result = bench.bench_policy(
+        BenchPolicyConfig(batch=3, precision=precision, device="cpu", repeats=1, cameras=1)
+    )
+    assert 0 < result["parameters"]["trained"] < result["parameters"]["all"]
+    assert list(result["memory_gb"]) == ["built", "decided", "updated"]
+    assert all(result["seconds"][k]["median"] > 0 for k in ("decide_one", "decide", "score", "update"))
+    assert low <= result["mismatch"]["mean"] <= result["mismatch"]["max"] <= high
+    assert "memory, updated" in list(bench.table(result).columns[0].cells)
+
+
+def test_the_published_backbone_has_the_published_size(tmp_path: Path) -> None:
+    backbone.write_backbone(tmp_path / "b", **bench.SMOLVLM2_500M)
+    text = json.loads((tmp_path / "b" / "config.json").read_text())["text_config"]
+    assert (text["hidden_size"], text["intermediate_size"], text["vocab_size"]) == (960, 2560, 49280)
