@@ -112,22 +112,23 @@ def consents(tree: Any, given: Any = None) -> dict[str, Any]:
 
     Fields that the command line sets as well, in `given`, are left out.
     """
-    asked = {name for name, *_ in _leaves(given)}
+    asked = {name for name, _ in _leaves(given)}
     return {
         name: value
-        for name, key, value in _leaves(tree)
-        if str(key).rpartition(".")[2] in CONSENT and value not in UNSET and name not in asked
+        for name, value in _leaves(tree)
+        if name.rpartition(".")[2] in CONSENT and value not in UNSET and name not in asked
     }
 
 
-def _leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Dotted name, key and value of everything in a tree that is not looked into."""
+def _leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted name and value of everything in a tree that is not looked into."""
     entries = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
     for key, value in entries:
-        if isinstance(value, (dict, list)) and str(key).rpartition(".")[2] not in CONSENT:
-            yield from _leaves(value, f"{path}{key}.")
+        name = f"{path}{key}"
+        if isinstance(value, (dict, list)) and name.rpartition(".")[2] not in CONSENT:
+            yield from _leaves(value, f"{name}.")
         else:
-            yield f"{path}{key}", key, value
+            yield name, value
 
 
 def decode(config_class: type[Any], tree: dict[str, Any]) -> Any:

@@ -20,7 +20,6 @@ import numbers
 import re
 import types
 import typing
-from collections.abc import Hashable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -41,9 +40,6 @@ class Range:
         self.text, self._low_open, self._high_open = text, match[1] == "(", match[4] == ")"
         self.low, self.high = float(match[2]), float(match[3])
 
-    def __repr__(self) -> str:
-        return f"Range({self.text!r})"
-
     def __contains__(self, value: Any) -> bool:
         above = value > self.low if self._low_open else value >= self.low
         return bool(above and (value < self.high if self._high_open else value <= self.high))
@@ -54,9 +50,6 @@ class Pattern:
 
     def __init__(self, pattern: str, words: str) -> None:
         self.pattern, self.words = re.compile(pattern), words
-
-    def __repr__(self) -> str:
-        return f"Pattern({self.pattern.pattern!r})"
 
     def __contains__(self, value: Any) -> bool:
         return self.pattern.fullmatch(value) is not None
@@ -115,13 +108,9 @@ class DatasetConfig(Section, section="dataset"):
             raise InputError("dataset.repo_id", None, remedy)
 
 
-def hints_of(cls: type[Any]) -> dict[str, Any]:
-    """Field name → annotation, with its range."""
-    return _hints_of(typing.cast(Hashable, cls))
-
-
 @functools.cache
-def _hints_of(cls: Any) -> dict[str, Any]:
+def hints_of(cls: Any) -> dict[str, Any]:
+    """Field name → annotation, with its range."""
     hints: dict[str, Any] = {}
     for base in reversed([base for base in cls.__mro__ if dataclasses.is_dataclass(base)]):
         for name, hint in typing.get_type_hints(base, include_extras=True).items():
