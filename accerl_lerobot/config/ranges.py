@@ -20,6 +20,7 @@ import numbers
 import re
 import types
 import typing
+from collections.abc import Hashable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -108,9 +109,13 @@ class DatasetConfig(Section, section="dataset"):
             raise InputError("dataset.repo_id", None, remedy)
 
 
-@functools.cache
-def hints_of(cls: Any) -> dict[str, Any]:
+def hints_of(cls: type[Any]) -> dict[str, Any]:
     """Field name → annotation, with its range."""
+    return _hints_of(typing.cast(Hashable, cls))
+
+
+@functools.cache
+def _hints_of(cls: Any) -> dict[str, Any]:
     hints: dict[str, Any] = {}
     for base in reversed([base for base in cls.__mro__ if dataclasses.is_dataclass(base)]):
         for name, hint in typing.get_type_hints(base, include_extras=True).items():
