@@ -39,7 +39,6 @@ ARMS = {
     "none": ("--imagination.share=0",),
     "learned": ("--imagination.model=learned", "--imagination.learn.steps_per_episode=5"),
     "frozen": ("--imagination.model=learned", "--imagination.learn.steps_per_episode=0"),
-    "copy": ("--imagination.model=copy",),
     "shuffled": ("--imagination.model=shuffled",),
     "oracle": ("--imagination.model=oracle",),
 }
@@ -61,7 +60,7 @@ class BenchEfficiencyConfig(StudyConfig):
     """Each a warm start of its own."""
     arms: tuple[Annotated[str, Pattern("|".join(ARMS), " or ".join(ARMS))], ...] = tuple(ARMS)
     """Compared world models: none, learned (is trained on), frozen (is not), oracle (a simulator), and
-    the placebos copy (nothing moves) and shuffled (gets other actions)."""
+    the placebo shuffled (gets other actions)."""
     budgets: tuple[Annotated[int, Range("[1, 1000000]")], ...] = (16, 64, 256)
     """Real episodes of a cell, ``rollout.episodes``."""
     decisions: Annotated[int, Range("[1, 100000]")] = 15

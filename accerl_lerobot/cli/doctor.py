@@ -67,11 +67,7 @@ def main(arguments: list[str]) -> int:
     checks += machine(config, history)
     if config is not None:
         checks += pace(config)
-        for name, check in {
-            "imagination": imagination,
-            "placement": placement,
-            "policy": policy_fits,
-        }.items():
+        for name, check in (("imagination", imagination), ("placement", placement), ("policy", policy_fits)):
             try:
                 checks += check(config)
             except InputError as error:
@@ -122,21 +118,15 @@ def libraries(config: RunConfig | None) -> Iterator[Check]:
     ray_session.prepare(joins=config is not None and config.launch.address is not None)
     for name in ("ray", "torch"):
         try:
-            text = importlib.import_module(name).__version__
+            module = importlib.import_module(name)
         except Exception as error:
             yield Check(name, FAIL, f"cannot be imported ({brief(error)}); run make setup")
             continue
+        text = str(module.__version__)
         if name == "torch":
-            text += f", {_gpus()}"
+            count = module.cuda.device_count() if module.cuda.is_available() else 0
+            text += f", {count} × {module.cuda.get_device_name(0)}" if count else ", no CUDA device"
         yield Check(name, OK, text)
-
-
-def _gpus() -> str:
-    import torch
-
-    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
-    none = "no CUDA device; policies run on the CPU"
-    return f"{count} × {torch.cuda.get_device_name(0)}" if count else none
 
 
 def rendering(*, needed: bool, script: str = DRAW) -> Check:

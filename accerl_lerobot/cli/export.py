@@ -118,12 +118,9 @@ def _replay(cost: float, parts: list[Done]) -> record.Episode | None:
     """An episode with an observation at every step; None if it differs from the journal."""
     actions, origin = np.concatenate([part.actions for part in parts]), parts[0].origin
     episode = record.played(record.this_world(), origin.task, origin.seed, actions)
-    same = len(episode) == len(actions) and episode.success == parts[-1].success
-    return episode if same and _rewards_match(parts, episode.rewards, cost) else None
-
-
-def _rewards_match(parts: list[Done], rewards: np.ndarray, cost: float) -> bool:
+    if len(episode) != len(actions) or episode.success != parts[-1].success:
+        return None
     steps = np.concatenate([part.steps for part in parts])
-    brought = np.add.reduceat(rewards, np.concatenate([[0], np.cumsum(steps)[:-1]])) - cost
+    rewards = np.add.reduceat(episode.rewards, np.concatenate([[0], np.cumsum(steps)[:-1]])) - cost
     expected = np.concatenate([part.rewards for part in parts])
-    return bool(np.allclose(brought, expected, rtol=0, atol=TOLERANCE))
+    return episode if np.allclose(rewards, expected, rtol=0, atol=TOLERANCE) else None

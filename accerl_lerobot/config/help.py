@@ -8,7 +8,7 @@ import dataclasses
 import inspect
 import sys
 import textwrap
-import typing
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import yaml
@@ -94,12 +94,12 @@ def docstrings(cls: type[Any]) -> dict[str, str]:
             continue
         node = ast.parse(textwrap.dedent(inspect.getsource(base))).body[0]
         assert isinstance(node, ast.ClassDef)
-        for statement, below in zip(node.body, [*node.body[1:], None], strict=True):
-            if not (isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name)):
-                continue
-            text = below.value.value if _is_text(below) else ""
-            if text or statement.target.id not in found:
-                found[statement.target.id] = " ".join(text.split())
+        for pair in pairwise([*node.body, ast.Pass()]):
+            match pair:
+                case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(text))):
+                    found[name] = " ".join(text.split())
+                case ast.AnnAssign(target=ast.Name(id=name)), _:
+                    found.setdefault(name, "")
     return found
 
 
@@ -111,7 +111,7 @@ def _listed(cls: type[Any], prefix: str = "", usual: Any = None, all_types: bool
     hints, texts, fields, sections = hints_of(cls), docstrings(cls), list[Line](), list[Line]()
     for field in dataclasses.fields(cls):
         hint, name = hints[field.name], f"{prefix}{field.name}"
-        section, default = section_of(hint), _default(field, usual)
+        section, default = section_of(hint), getattr(usual, field.name, default_of(field))
         if section is None:
             fields.append(Line(name, _shown(default), texts[field.name], range_in_words(hint)))
         elif not (choices := choices_of(section)):
@@ -155,10 +155,6 @@ def _in_brief(line: Line) -> str:
     return f"{start} {textwrap.shorten(text, WIDTH - COLUMN, placeholder=' …')}"
 
 
-def _default(field: Any, usual: Any = None) -> Any:
-    return default_of(field) if usual is None else getattr(usual, field.name)
-
-
 def _shown(value: Any) -> str:
     if isinstance(value, str):
         return value
@@ -169,11 +165,3 @@ def _shown(value: Any) -> str:
 
 def _summary(cls: type[Any]) -> str:
     return (inspect.getdoc(cls) or "").split("\n\n")[0].replace("\n", " ")
-
-
-def _is_text(node: ast.stmt | None) -> typing.TypeGuard[Any]:
-    return (
-        isinstance(node, ast.Expr)
-        and isinstance(node.value, ast.Constant)
-        and isinstance(node.value.value, str)
-    )

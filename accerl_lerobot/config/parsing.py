@@ -112,22 +112,23 @@ def consents(tree: Any, given: Any = None) -> dict[str, Any]:
 
     Fields that the command line sets as well, in `given`, are left out.
     """
-    asked = {name for name, *_ in _leaves(given)}
+    asked = {name for name, _ in _leaves(given)}
     return {
         name: value
-        for name, key, value in _leaves(tree)
-        if str(key).rpartition(".")[2] in CONSENT and value not in UNSET and name not in asked
+        for name, value in _leaves(tree)
+        if name.rpartition(".")[2] in CONSENT and value not in UNSET and name not in asked
     }
 
 
-def _leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Dotted name, key and value of everything in a tree that is not looked into."""
+def _leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted name and value of everything in a tree that is not looked into."""
     entries = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
     for key, value in entries:
-        if isinstance(value, (dict, list)) and str(key).rpartition(".")[2] not in CONSENT:
-            yield from _leaves(value, f"{path}{key}.")
+        name = f"{path}{key}"
+        if isinstance(value, (dict, list)) and name.rpartition(".")[2] not in CONSENT:
+            yield from _leaves(value, f"{name}.")
         else:
-            yield f"{path}{key}", key, value
+            yield name, value
 
 
 def decode(config_class: type[Any], tree: dict[str, Any]) -> Any:
@@ -377,18 +378,26 @@ def _section(
 
 
 def _leaf(hint: Any, value: Any, field: str) -> Any:
-    """A plain value, decoded by draccus unless draccus would quietly turn it into something else."""
-    plain, value = unmarked(hint), _as_list(unmarked(hint), value)
-    kinds = _kinds(plain)
+    """A plain value, decoded by draccus unless draccus would quietly turn it into something else.
+
+    ``a,b`` and a lone value are the list that the field holds.
+    """
+    plain = unmarked(hint)
+    kinds = set(typing.get_args(plain)) if is_union(plain) else {plain}
+    entries = [typing.get_args(kind)[0] for kind in kinds if typing.get_origin(kind) in (list, tuple)]
+    entry = entries[0] if len(entries) == 1 else None
+    if entry is not None and isinstance(value, str):  # draccus would take text letter by letter
+        parts = [part.strip() for part in value.split(",")]
+        value = parts if entry is str else [_value(part) for part in parts]
+    elif entry is not None and isinstance(value, (bool, int, float)):
+        value = [value]
     wrong = (
         (value is None and plain is not Any and not is_optional(plain))
         or (isinstance(value, bool) and not kinds & {bool, Any})
         or (isinstance(value, (list, dict)) and kinds <= {str, int, float, bool, type(None)})
     )
-    lists = [kind for kind in kinds if typing.get_origin(kind) in (list, tuple)]
-    if isinstance(value, list) and len(lists) == 1:
-        entry = typing.get_args(lists[0])[0]
-        wrong |= entry not in (bool, Any) and any(isinstance(v, bool) for v in value)
+    if isinstance(value, list) and entry not in (None, bool, Any):
+        wrong |= any(isinstance(v, bool) for v in value)
     try:
         decoded = None if wrong else draccus.decode(plain, value)
     except Exception:  # whatever draccus raises, the value does not fit
@@ -406,21 +415,6 @@ def _apart(field: Any, section: type[Any]) -> dict[str, Any]:
     """
     default = None if field.default_factory is dataclasses.MISSING else field.default_factory()
     return {} if default is None or default == section() else encode(default)
-
-
-def _as_list(hint: Any, value: Any) -> Any:
-    """``a,b`` and a lone value as the list that the field holds; draccus would take text letter by letter."""
-    lists = [kind for kind in _kinds(hint) if typing.get_origin(kind) in (list, tuple)]
-    if len(lists) != 1:
-        return value
-    if isinstance(value, str):
-        entries = [entry.strip() for entry in value.split(",")]
-        return entries if typing.get_args(lists[0])[0] is str else [_value(entry) for entry in entries]
-    return [value] if isinstance(value, (bool, int, float)) else value
-
-
-def _kinds(hint: Any) -> set[Any]:
-    return set(typing.get_args(hint)) if is_union(hint) else {hint}
 
 
 def dotted_fields(cls: type[Any], path: tuple[str, ...] = ()) -> Iterator[str]:

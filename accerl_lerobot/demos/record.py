@@ -144,7 +144,7 @@ def metaworld_expert(world: World, task: str) -> Expert:
 
     assert isinstance(world, MetaWorld)
     policy = getattr(policies, expert_name(task))()
-    return lambda: policy.get_action(world.raw_observation)
+    return lambda: policy.get_action(world.simulator.everything())
 
 
 def simulated_expert(world: World, task: str) -> Expert:

@@ -36,7 +36,7 @@ from accerl_lerobot.world_model.config import IMAGINATION, WORLD_LEARNING
 from accerl_lerobot.world_model.contract import WorldModel, WorldModelSpec
 from accerl_lerobot.world_model.data import load_datasets, open_datasets
 from accerl_lerobot.world_model.online import OnlineLearner, Promotion
-from accerl_lerobot.world_model.reference import CopyModel, OracleModel, ShuffledModel, learned_part
+from accerl_lerobot.world_model.reference import OracleModel, ShuffledModel, learned_part
 from accerl_lerobot.world_model.rollouts import Imagination
 from accerl_lerobot.world_model.store import LEARNT, load_roles, load_world_model, rehearse_world_model
 from accerl_lerobot.world_model.success_model import SuccessPairsRewardModel
@@ -101,8 +101,6 @@ def _load(
     check_fit(learned.spec, world, executed, policy.n_obs_steps)
     success.config.device = str(device)
     success.to(device)
-    if imagination.model == "copy":
-        return world, CopyModel(learned.spec), success
     model = learned.to(device)
     return world, ShuffledModel(model) if imagination.model == "shuffled" else model, success
 

@@ -23,7 +23,7 @@ import numpy as np
 
 from accerl_lerobot.config.ranges import Range, Section, default_of
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import Observation
+from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Observation
 from accerl_lerobot.seeds import EVAL_SEEDS
 
 
@@ -140,11 +140,6 @@ class EpisodeWorld(World):
     def late(self) -> float:
         """Share of the time limit gone."""
         return self._steps / self.spec.max_steps
-
-    def _privileged(self, *numbers: np.ndarray) -> np.ndarray:
-        """``observation.environment_state`` of a simulator's numbers, the time gone, and the task."""
-        task = task_code(self.spec.tasks, self._task)
-        return np.concatenate([*numbers, [self.late], task]).astype(np.float32)
 
     def reset(self, seed: int, task: str) -> Observation:
         if task not in self.spec.tasks:
@@ -300,6 +295,56 @@ def unit_spec(
 def task_code(tasks: Sequence[str], task: str) -> np.ndarray:
     """Part of ``observation.environment_state`` that tells tasks apart: one-hot, or empty for one task."""
     return np.eye(len(tasks))[tasks.index(task)] if len(tasks) > 1 else np.zeros(0)
+
+
+class SuiteWorld(EpisodeWorld):
+    """A world of many tasks; the simulator of each is built when the task is first played, then kept."""
+
+    def __init__(self, config: SuiteConfig, spec: WorldSpec) -> None:
+        self.config, self.spec = config, spec
+        self._simulators: dict[str, Any] = {}
+
+    @abstractmethod
+    def _build(self, task: str) -> Any:
+        """Builds a simulator: it has `reset`, `step`, which tells success and if all numbers are finite,
+        `state`, `everything` (numbers of ``observation.environment_state``), `render` and `close`."""
+
+    @property
+    def simulator(self) -> Any:
+        """The simulator of the current task; for experts, not for policies."""
+        return self._simulators[self._task]
+
+    def _begin(self, seed: int, task: str) -> None:
+        if task not in self._simulators:
+            self._simulators[task] = self._build(task)
+        self._simulators[task].reset(seed)
+
+    def _step(self, action: np.ndarray) -> Step:
+        success, finite = self.simulator.step(action)
+        return Step(success=success, ended=success, finite=finite)
+
+    def render(self, height: int, width: int) -> np.ndarray:
+        if not self._task:
+            raise RuntimeError("nothing to render: call reset first")
+        return np.asarray(self.simulator.render(self.config.cameras[0], height, width))
+
+    def close(self) -> None:
+        for simulator in self._simulators.values():
+            simulator.close()
+        self._simulators, self._task, self._done = {}, "", True
+
+    def _observe(self) -> Observation:
+        simulator, spec = self.simulator, self.spec
+        observation: Observation = {
+            key: simulator.render(camera, *size[:2])
+            for camera, (key, size) in zip(self.config.cameras, spec.images.items(), strict=True)
+        }
+        observation["observation.state"] = simulator.state()
+        if self.config.environment_state:
+            numbers = simulator.everything(), [self.late], task_code(spec.tasks, self._task)
+            observation[ENVIRONMENT_STATE] = np.concatenate(numbers).astype(np.float32)
+        observation[TASK] = spec.instructions[spec.tasks.index(self._task)]
+        return observation
 
 
 def lerobot_eval_arguments(env: Mapping[str, Any]) -> list[str]:

@@ -10,15 +10,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-import numpy as np
-
 from accerl_lerobot.config.ranges import Range
-from accerl_lerobot.envs.base import EnvConfig, EpisodeWorld, Step, SuiteConfig, unit_spec
+from accerl_lerobot.envs.base import EnvConfig, SuiteConfig, SuiteWorld, unit_spec
 from accerl_lerobot.envs.libero_simulator import FPS, MAX_OBJECTS, OBJECT_NUMBERS, ROBOT_NUMBERS, Simulator
 from accerl_lerobot.envs.libero_tasks import instruction, suites
-from accerl_lerobot.envs.metaworld import diverged
 from accerl_lerobot.errors import InputError, expanded
-from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Observation
 
 CAMERAS = {"agentview": "image", "robot0_eye_in_hand": "image2"}
 """LeRobot's names of the two cameras that policies see."""
@@ -68,50 +64,14 @@ class LiberoConfig(SuiteConfig):
             raise InputError("env.assets", self.assets, "no folder of LIBERO's assets: it holds no scenes/")
 
 
-def image_key(camera: str) -> str:
-    """Name under which observations hold a camera's image."""
-    return f"observation.images.{CAMERAS.get(camera, camera)}"
+class LiberoWorld(SuiteWorld):
+    """One LIBERO instance."""
 
-
-class LiberoWorld(EpisodeWorld):
-    """One LIBERO instance; its simulators are built on first use of a task, then kept."""
+    config: LiberoConfig
 
     def __init__(self, config: LiberoConfig) -> None:
-        self.config = config
-        images = map(image_key, config.cameras)
-        self.spec = unit_spec(config, images, instruction, STATE_DIM, ACTION_DIM, FPS)
-        self._simulators: dict[str, Simulator] = {}
+        images = [f"observation.images.{CAMERAS.get(camera, camera)}" for camera in config.cameras]
+        super().__init__(config, unit_spec(config, images, instruction, STATE_DIM, ACTION_DIM, FPS))
 
-    @property
-    def simulator(self) -> Simulator:
-        """That of the current task; for experts, not for policies."""
-        return self._simulators[self._task]
-
-    def _begin(self, seed: int, task: str) -> None:
-        if task not in self._simulators:
-            self._simulators[task] = Simulator(task, self.config.rendering, self.config.assets)
-        self._simulators[task].reset(seed)
-
-    def _step(self, action: np.ndarray) -> Step:
-        success = self.simulator.step(action)
-        return Step(success=success, ended=success, finite=not diverged(self.simulator.data))
-
-    def render(self, height: int, width: int) -> np.ndarray:
-        if not self._task:
-            raise RuntimeError("nothing to render: call reset first")
-        return self.simulator.render(self.config.cameras[0], height, width)
-
-    def close(self) -> None:
-        for simulator in self._simulators.values():
-            simulator.close()
-        self._simulators, self._task, self._done = {}, "", True
-
-    def _observe(self) -> Observation:
-        simulator, size = self.simulator, self.config.image_size
-        cameras = self.config.cameras
-        observation: Observation = {image_key(name): simulator.render(name, size, size) for name in cameras}
-        observation["observation.state"] = simulator.state()
-        if self.config.environment_state:
-            observation[ENVIRONMENT_STATE] = self._privileged(simulator.everything())
-        observation[TASK] = instruction(self._task)
-        return observation
+    def _build(self, task: str) -> Simulator:
+        return Simulator(task, self.config.rendering, self.config.assets)

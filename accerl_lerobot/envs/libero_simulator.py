@@ -18,7 +18,7 @@ from unittest.mock import patch
 import numpy as np
 
 from accerl_lerobot.envs.libero_tasks import bddl_file, load_libero, recorded_states
-from accerl_lerobot.envs.metaworld import draw_fast, import_mujoco, new_renderer
+from accerl_lerobot.envs.metaworld import diverged, draw_fast, import_mujoco, new_renderer
 from accerl_lerobot.seeds import EVAL_SEEDS
 
 FPS = 20
@@ -113,8 +113,9 @@ class Simulator:
         for _ in range(SETTLING):
             self.step(STILL)
 
-    def step(self, action: np.ndarray) -> bool:
-        """One env step with an action, float32 (7,) in [−1, 1]; True if the goal holds after it."""
+    def step(self, action: np.ndarray) -> tuple[bool, bool]:
+        """One env step with an action, float32 (7,) in [−1, 1]; True if the goal holds after it, and True if
+        all numbers are finite."""
         model, data, mujoco = self.model, self.data, self._mujoco
         self._closing = np.array([-0.01, 0.01]) * np.sign(action[6])
         for i in range(round(1 / FPS / TIMESTEP)):
@@ -136,7 +137,7 @@ class Simulator:
                 self._fingers_seen[:] = data.qpos[self._fingers]
         success = bool(self.env._check_success())
         self.env._post_process()
-        return success
+        return success, not diverged(data)
 
     def _begin(self, action: np.ndarray) -> None:
         """The first simulation step is robosuite's own: its controller has the pose before the start."""
@@ -208,8 +209,7 @@ class Simulator:
     def render(self, camera: str, height: int, width: int) -> np.ndarray:
         """Frame of a camera, uint8 (height, width, 3), turned as LeRobot's datasets have it."""
         self._look()
-        renderer = self._renderers.get((height, width))
-        if renderer is None:
+        if (renderer := self._renderers.get((height, width))) is None:
             renderer = self._renderers[height, width] = new_renderer(self.model, height, width)
         renderer.update_scene(self._seen, camera, self._visible)
         return np.ascontiguousarray(renderer.render()[:, ::-1])

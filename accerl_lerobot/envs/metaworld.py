@@ -30,9 +30,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 
 from accerl_lerobot.config.ranges import Positive, Range, Section
-from accerl_lerobot.envs.base import EnvConfig, EpisodeWorld, Step, SuiteConfig, unit_spec
+from accerl_lerobot.envs.base import EnvConfig, SuiteConfig, SuiteWorld, unit_spec
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Observation
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -228,103 +227,86 @@ class MetaWorldConfig(SuiteConfig):
         return replace(self, shift=ShiftConfig())
 
 
-class MetaWorld(EpisodeWorld):
-    """One MetaWorld instance; its simulators are built on first use of a task, then kept.
+class MetaWorld(SuiteWorld):
+    """One MetaWorld instance.
 
     A simulator that diverges (non-finite state or reward, or MuJoCo had to reset it) ends the episode as
     truncated, with ``info["nonfinite"] == 1.0``: such a segment must not be trained on.
     """
 
+    config: MetaWorldConfig
+
     def __init__(self, config: MetaWorldConfig) -> None:
         for package in ("metaworld", "mujoco"):
             if find_spec(package) is None:
                 raise ModuleNotFoundError(f"No module named {package!r}", name=package)
-        self.config = config
         images = [f"observation.images.{camera}" for camera in config.cameras]
-        self.spec = unit_spec(config, images, description, STATE_DIM, ACTION_DIM, FPS)
-        self._sims: dict[str, Any] = {}
-        self._eyes: dict[str, Any] = {}
-        self._film: dict[str, Any] = {}
-        self._raw = np.zeros(0)
-        self._delayed: deque[np.ndarray] = deque()
+        super().__init__(config, unit_spec(config, images, description, STATE_DIM, ACTION_DIM, FPS))
 
-    @property
-    def raw_observation(self) -> np.ndarray:
-        """MetaWorld's own 39 numbers, float64, objects and goal included: for experts, not for policies."""
-        return self._raw
+    def _build(self, task: str) -> Simulator:
+        return Simulator(task, self.config)
 
-    def _begin(self, seed: int, task: str) -> None:
-        if task not in self._sims:
-            self._sims[task] = self._build(task)
-        sim = self._sims[task]
-        sim.seed(seed)
-        self._raw, _ = sim.reset()
-        # MetaWorld moves the goal marker after its last forward pass, so that the first frame would show an
-        # older goal. This places the markers and leaves the physics as it is.
-        import_mujoco().mj_kinematics(sim.model, sim.data)
-        self._delayed = deque([np.zeros(ACTION_DIM, np.float32)] * self.config.shift.action_delay)
 
-    def _step(self, action: np.ndarray) -> Step:
-        self._delayed.append(action)
-        sim = self._sims[self._task]
-        self._raw, reward, _, _, info = sim.step(self._delayed.popleft())
-        finite = math.isfinite(reward) and np.isfinite(self._raw).all() and not diverged(sim.data)
-        success = bool(info["success"])
-        return Step(success=success, ended=success, finite=bool(finite))
+class Simulator:
+    """One task in MuJoCo."""
 
-    def render(self, height: int, width: int) -> np.ndarray:
-        if not self._task:
-            raise RuntimeError("nothing to render: call reset first")
-        renderer = self._film.get(self._task)
-        if renderer is None or (renderer.height, renderer.width) != (height, width):
-            if renderer is not None:
-                renderer.close()
-            renderer = self._film[self._task] = new_renderer(self._sims[self._task].model, height, width)
-        return self._frame(renderer, self.config.cameras[0])
-
-    def close(self) -> None:
-        for renderer in (*self._eyes.values(), *self._film.values()):
-            renderer.close()
-        for sim in self._sims.values():
-            sim.close()
-        self._eyes, self._film, self._sims = {}, {}, {}
-        self._task, self._done = "", True
-
-    def _build(self, task: str) -> Any:
+    def __init__(self, task: str, config: MetaWorldConfig) -> None:
         import_mujoco()
         from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 
-        sim = ALL_V3_ENVIRONMENTS[task]()
+        self.env = env = ALL_V3_ENVIRONMENTS[task]()
         # What `set_task` with a task of the MT1 benchmark does, without first sampling its 50 goals: the goal
         # is visible in the raw observation, and `seed` decides where things are.
-        sim._partially_observable = False
-        del sim.sawyer_observation_space  # a cached property that depends on the line above
-        sim._set_task_called = True
-        sim._freeze_rand_vec = False
-        sim.seeded_rand_vec = True
-        model = sim.model
-        model.cam("corner2").pos[:] = (0.75, 0.075, 0.7)  # as LeRobot's wrapper does
-        if self.config.rendering == "fast":
-            draw_fast(model)
-        self.config.shift.apply(sim, self.config.cameras)
-        self._eyes[task] = new_renderer(model, self.config.image_size, self.config.image_size)
-        sim.touching_object = functools.partial(touching_object, sim)
-        return sim
+        env._partially_observable = False
+        del env.sawyer_observation_space  # a cached property that depends on the line above
+        env._set_task_called = True
+        env._freeze_rand_vec = False
+        env.seeded_rand_vec = True
+        env.model.cam("corner2").pos[:] = (0.75, 0.075, 0.7)  # as LeRobot's wrapper does
+        if config.rendering == "fast":
+            draw_fast(env.model)
+        config.shift.apply(env, config.cameras)
+        env.touching_object = functools.partial(touching_object, env)
+        self._delay = config.shift.action_delay
+        self._renderers: dict[tuple[int, int], Any] = {}
 
-    def _observe(self) -> Observation:
-        eyes, cameras = self._eyes[self._task], self.config.cameras
-        observation: Observation = {f"observation.images.{name}": self._frame(eyes, name) for name in cameras}
-        observation["observation.state"] = self._raw[:STATE_DIM].astype(np.float32)
-        if self.config.environment_state:
-            observation[ENVIRONMENT_STATE] = self._privileged(self._raw)
-        observation[TASK] = description(self._task)
-        return observation
+    def reset(self, seed: int) -> None:
+        """To the start that `seed` stands for."""
+        self.env.seed(seed)
+        self._raw, _ = self.env.reset()
+        # MetaWorld moves the goal marker after its last forward pass, so that the first frame would show an
+        # older goal. This places the markers and leaves the physics as it is.
+        import_mujoco().mj_kinematics(self.env.model, self.env.data)
+        self._delayed = deque([np.zeros(ACTION_DIM, np.float32)] * self._delay)
 
-    def _frame(self, renderer: Any, camera: str) -> np.ndarray:
-        renderer.update_scene(self._sims[self._task].data, camera=camera)
-        image = renderer.render()
+    def step(self, action: np.ndarray) -> tuple[bool, bool]:
+        """One env step; True if it succeeded, and True if all numbers are finite."""
+        self._delayed.append(action)
+        self._raw, reward, _, _, info = self.env.step(self._delayed.popleft())
+        finite = math.isfinite(reward) and np.isfinite(self._raw).all() and not diverged(self.env.data)
+        return bool(info["success"]), bool(finite)
+
+    def state(self) -> np.ndarray:
+        """``observation.state``, float32 (4,)."""
+        return self._raw[:STATE_DIM].astype(np.float32)
+
+    def everything(self) -> np.ndarray:
+        """MetaWorld's own 39 numbers, float64, objects and goal included."""
+        return self._raw
+
+    def render(self, camera: str, height: int, width: int) -> np.ndarray:
+        """Frame of a camera, uint8 (height, width, 3)."""
+        if (renderer := self._renderers.get((height, width))) is None:
+            renderer = self._renderers[height, width] = new_renderer(self.env.model, height, width)
+        renderer.update_scene(self.env.data, camera=camera)
+        image: np.ndarray = renderer.render()
         # corner2 hangs upside down in MetaWorld's scene; LeRobot turns it, and so do its datasets.
         return np.ascontiguousarray(image[::-1, ::-1]) if camera == "corner2" else image
+
+    def close(self) -> None:
+        for renderer in self._renderers.values():
+            renderer.close()
+        self.env.close()
 
 
 def touching_object(sim: Any, geom: int) -> bool:

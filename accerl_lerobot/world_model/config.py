@@ -183,13 +183,12 @@ class ImaginationConfig(Section, section="imagination"):
 
     share: Annotated[float, Range("[0, 1)")] = 0.0
     """Share of the decisions of a batch that are imagined; 0: none."""
-    model: Literal["learned", "shuffled", "copy", "oracle"] = "learned"
-    """World model. learned: the one in `path`. oracle: a simulator, the best there can be. copy (nothing ever
-    moves) and shuffled (the learned one, given another rollout's actions): placebos; a gain that they give
-    too is not the world model's."""
+    model: Literal["learned", "shuffled", "oracle"] = "learned"
+    """World model. learned: the one in `path`. oracle: a simulator, the best there can be. shuffled (the
+    learned one, given another rollout's actions): a placebo; a gain that it gives too is not the world
+    model's."""
     path: str | None = None
-    """The folder ``world_model`` that ``accerl world-model`` has written; oracle needs none, copy uses its
-    success model."""
+    """The folder ``world_model`` that ``accerl world-model`` has written; oracle needs none."""
     discover_packages_path: str | None = None
     """Package to import that registers the type of the world model in `path`, where that is not one of ours;
     every machine of the cluster needs it."""
@@ -230,5 +229,4 @@ class ImaginationConfig(Section, section="imagination"):
     @property
     def learns(self) -> bool:
         """True if the world model is trained on during the run."""
-        trainable = self.model in ("learned", "shuffled")
-        return self.share > 0 and trainable and self.learn.steps_per_episode > 0
+        return self.share > 0 and self.needs_path and self.learn.steps_per_episode > 0

@@ -96,9 +96,7 @@ class Windows:
     """A batch of windows. Chunks beyond an episode's end repeat its last frame and are not `valid`."""
 
     frames: np.ndarray  # uint8 (B, L + R, V, H, W, 3): context, the first frame last, one after each chunk
-    anchor: (
-        np.ndarray
-    )  # uint8 (B, V, H, W, 3), some chunks before the first, where a rollout would have begun
+    anchor: np.ndarray  # uint8 (B, V, H, W, 3), some chunks before the first, where a rollout began
     state: np.ndarray  # float32 (B, L + R, S), at each of the frames
     before: np.ndarray  # float32 (B, L − 1, K, A), actions within the context; zero where none was executed
     commanded_sum: np.ndarray  # float32 (B, A), the sum of the actions before the window's first frame

@@ -95,19 +95,21 @@ class PixelWorldModel(LearnableWorldModel):
             executed = torch.arange(self.spec.chunk, device=device) < steps[:, r, None]
             taken = actions[:, r] * executed[..., None]
             chunk = self._chunk(state, taken, executed)
-            target = _to_floats(frames[:, length + r])
-            images.append(self._image_loss(state, chunk, target, generator))
-            robots.append(self._robot_loss(state, chunk, robot[:, length + r]))
+            change = (_to_floats(frames[:, length + r]) - _to_floats(state["frames"][:, -1])) / self.change
+            images.append((self._change(state, chunk, generator) - change).square().mean((1, 2, 3)))
+            motion = (robot[:, length + r] - state["robot"][:, -1] - self.motion_mean) / self.motion_std
+            error = (self._motions(state, chunk) - motion).square()
+            robots.append(error.mean((0, 2)) if self.spec.state_dim else motion.new_zeros(len(motion)))
             if r + 1 < chunks:
                 state = self._predict(state, taken, executed).state
         weight = valid.T.float().contiguous()
         total = weight.sum().clamp(min=1)
-        image, motion = ((torch.stack(part) * weight).sum() / total for part in (images, robots))
-        metrics = {"image": image.item(), "state": motion.item()}
+        image, state_loss = ((torch.stack(part) * weight).sum() / total for part in (images, robots))
+        metrics = {"image": image.item(), "state": state_loss.item()}
         if chunks > 1:
             later = weight[1:].sum().clamp(min=1)
             metrics["image_imagined"] = ((torch.stack(images[1:]) * weight[1:]).sum() / later).item()
-        return image + motion, metrics
+        return image + state_loss, metrics
 
     @torch.no_grad()
     def _predict(self, state: State, actions: Tensor, executed: Tensor) -> Prediction:
@@ -126,17 +128,6 @@ class PixelWorldModel(LearnableWorldModel):
             robot=robot,
             uncertainty=torch.where(finite, uncertainty, torch.inf),
         )
-
-    def _image_loss(self, state: State, chunk: Tensor, target: Tensor, generator: torch.Generator) -> Tensor:
-        """Mean squared error of the change, (B,)."""
-        change = (target - _to_floats(state["frames"][:, -1])) / self.change
-        return (self._change(state, chunk, generator) - change).square().mean((1, 2, 3))
-
-    def _robot_loss(self, state: State, chunk: Tensor, target: Tensor) -> Tensor:
-        """Mean squared error of the motion, (B,)."""
-        motion = (target - state["robot"][:, -1] - self.motion_mean) / self.motion_std
-        error = (self._motions(state, chunk) - motion).square()
-        return error.mean((0, 2)) if self.spec.state_dim else motion.new_zeros(len(motion))
 
     def _change(self, state: State, chunk: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """The change in usual changes, (B, C, H, W); with a generator, the context is noisy."""

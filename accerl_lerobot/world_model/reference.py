@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reference models beside a learned one: an oracle, the best there can be, and two placebos.
+"""Reference models beside a learned one: an oracle, the best there can be, and a placebo.
 
-What a policy gains from a copy of the last frame, or from a model that gets other actions, it does not gain
-from the world model.
+What a policy gains from a model that gets other actions, it does not gain from the world model.
 """
 
 from __future__ import annotations
@@ -25,20 +24,6 @@ from accerl_lerobot.world_model.contract import (
     WorldModelSpec,
 )
 from accerl_lerobot.world_model.data import model_arrays
-
-
-class CopyModel(WorldModel):
-    """Predicts that nothing changes."""
-
-    def __init__(self, spec: WorldModelSpec) -> None:
-        self.spec = spec
-
-    def begin(self, context: Context, tasks: Sequence[str], resets: Sequence[Reset] | None = None) -> State:
-        return {"frames": context.frames[:, -1], "robot": context.robot[:, -1]}
-
-    def step(self, state: State, actions: Tensor, seeds: Sequence[int]) -> Prediction:
-        unknown = torch.full((len(actions),), torch.nan)
-        return Prediction(state=state, frames=state["frames"], robot=state["robot"], uncertainty=unknown)
 
 
 class ShuffledModel(WorldModel):

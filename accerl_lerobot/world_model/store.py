@@ -17,7 +17,6 @@ from pathlib import Path
 import draccus
 import torch
 from lerobot.configs.rewards import RewardModelConfig
-from safetensors import SafetensorError
 from safetensors.torch import save_file
 
 from accerl_lerobot.checkpoint.isolation import rehearse
@@ -36,10 +35,6 @@ from accerl_lerobot.world_model.config import LearnableModelConfig
 from accerl_lerobot.world_model.contract import Context, LearnableWorldModel, WorldModelSpec, new_model
 from accerl_lerobot.world_model.success_model import SuccessPairsRewardModel
 
-UNREADABLE = (
-    OSError, LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError,
-    SafetensorError, draccus.utils.DraccusException,
-)  # fmt: skip
 CONFIG, WEIGHTS, SUCCESS = "config.json", "model.safetensors", "success_model"
 LEARNT, HELD_OUT, THRESHOLD = "learnt", "held out", "threshold"
 """Roles of episodes: the model was trained on it; it was held out; the success threshold was chosen on it,
@@ -118,7 +113,9 @@ def _filled[M: torch.nn.Module](what: str, make: Callable[[], M], directory: Pat
         with Unfilled():
             model = make()
         model.load_state_dict(dict(read_tensors(weights, origin)))
-    except UNREADABLE as error:
+    except MemoryError:  # `isolation` has a line of its own for it
+        raise
+    except Exception as error:  # the files may hold anything
         ours = input_error(error)  # draccus wraps what a config refuses
         if ours is None:
             remedy = f"not a {what} of accerl world-model ({brief(error)})"

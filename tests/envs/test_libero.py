@@ -263,7 +263,7 @@ def test_physics_and_success_are_liberos(task: str, seed: int):
     actions = iter(some_actions(40))
     for i, (qpos, qvel, success) in enumerate(stock_physics(task, seed, 40)):
         if i:
-            assert simulator.step(next(actions)) == success
+            assert simulator.step(next(actions))[0] == success
         assert np.abs(qpos - simulator.data.qpos).max() < 1e-9, i
         assert np.abs(qvel - simulator.data.qvel).max() < 1e-6, i
     simulator.close()

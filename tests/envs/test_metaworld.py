@@ -33,8 +33,8 @@ def play(world: MetaWorld, seed: int = 0, chunk: int = 1) -> list:
 
 def test_success_terminates_with_one_reward_and_a_last_picture(monkeypatch: pytest.MonkeyPatch):
     world, frames = MetaWorld(MetaWorldConfig(task=TASK)), []
-    frame = MetaWorld._frame
-    monkeypatch.setattr(MetaWorld, "_frame", lambda *args: frames.append(1) or frame(*args))
+    frame = gl.Simulator.render
+    monkeypatch.setattr(gl.Simulator, "render", lambda *args: frames.append(1) or frame(*args))
     results = play(world, chunk=3)
     assert results[-1].terminated and results[-1].success and not results[-1].truncated
     assert sum(float(r.rewards.sum()) for r in results) == 1.0 and results[-1].rewards[-1] == 1.0
@@ -45,7 +45,7 @@ def test_touch_is_told_as_metaworld_tells_it(monkeypatch: pytest.MonkeyPatch):
     task, told = "push-v3", []
     world = MetaWorld(MetaWorldConfig(task=task))
     world.reset(0, task)
-    expert, sim = make_expert(world.config, world, task), world._sims[task]
+    expert, sim = make_expert(world.config, world, task), world.simulator.env
     ours, theirs = sim.touching_object, type(sim).touching_object
 
     def both(geom: int) -> bool:
@@ -114,7 +114,7 @@ def test_a_diverged_simulator_ends_the_episode_and_says_so(tmp_path, monkeypatch
     monkeypatch.chdir(tmp_path)  # MuJoCo writes its log into the working directory
     world = MetaWorld(MetaWorldConfig(task=TASK))
     world.reset(0, TASK)
-    world._sims[TASK].data.qpos[:] = np.nan
+    world.simulator.env.data.qpos[:] = np.nan
     result = world.step_chunk(np.zeros((5, 4), np.float32))
     assert result.info["nonfinite"] == 1.0 and result.truncated and result.steps == 1
     healthy = world.reset(0, TASK)

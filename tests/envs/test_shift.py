@@ -27,10 +27,10 @@ def world(**shift: Any) -> MetaWorld:
 def played(of: MetaWorld, actions: np.ndarray = ACTIONS, seed: int = 5) -> tuple[np.ndarray, np.ndarray]:
     """MetaWorld's 39 numbers after the reset and each action, and the last frame."""
     frame = of.reset(seed, TASK)[IMAGE]
-    states = [of.raw_observation]
+    states = [of.simulator.everything()]
     for action in actions:
         frame = of.step_chunk(action[None]).observation[IMAGE]
-        states.append(of.raw_observation)
+        states.append(of.simulator.everything())
     return np.stack(states), frame
 
 
@@ -47,7 +47,7 @@ def test_friction_scales_that_of_every_surface():
     nominal, slippery = world(), world(friction=0.25)
     for each in (nominal, slippery):
         each.reset(0, TASK)
-    a, b = (each._sims[TASK].model.geom_friction for each in (nominal, slippery))
+    a, b = (each.simulator.env.model.geom_friction for each in (nominal, slippery))
     np.testing.assert_allclose(b[:, 0], 0.25 * a[:, 0])
     np.testing.assert_array_equal(b[:, 1:], a[:, 1:])
 
@@ -66,8 +66,8 @@ def test_starts_come_from_wider_ranges():
     for seed in range(40):
         for name, each in (("nominal", nominal), ("wide", wide)):
             each.reset(seed, TASK)
-            seen[name].append(each._sims[TASK]._last_rand_vec)
-    space = nominal._sims[TASK]._random_reset_space
+            seen[name].append(each.simulator.env._last_rand_vec)
+    space = nominal.simulator.env._random_reset_space
     half = (space.high - space.low) / 2
     drawn = np.stack(seen["wide"]) - (space.high + space.low) / 2
     assert (np.abs(drawn) <= 2 * half + 1e-9).all() and (np.abs(drawn) > half + 1e-9).any(0)[:2].all()

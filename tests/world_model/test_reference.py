@@ -11,7 +11,7 @@ from accerl_lerobot.envs import SimulatedWorld, World, make_world
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.world_model.contract import Reset, State, WorldModel
 from accerl_lerobot.world_model.data import model_arrays
-from accerl_lerobot.world_model.reference import CopyModel, OracleModel, ShuffledModel
+from accerl_lerobot.world_model.reference import OracleModel, ShuffledModel
 from accerl_lerobot.world_model.rollouts import Start, context_at, start_of
 from tests.world_model.real_segments import SPEC, WORLD, K, real_episode
 
@@ -80,18 +80,6 @@ def test_a_simulator_that_is_there_goes_on(monkeypatch: pytest.MonkeyPatch):
     assert len(resets) == 1
     again = oracle.step(state, actions, [0])  # the state of before is still good
     assert len(resets) == 2 and torch.equal(again.frames, first.frames)
-
-
-def test_a_copy_never_changes():
-    starts, _ = starts_of(1, 2)
-    copy = CopyModel(SPEC)
-    state = begun(copy, starts)
-    for _ in range(2):
-        rollout = copy.step(state, torch.randn(12, 4, 2), [0] * 12)
-        assert np.array_equal(rollout.frames.numpy(), np.stack([s.frames for s in starts]))
-        assert np.array_equal(rollout.robot.numpy(), np.stack([s.robot for s in starts]))
-        assert rollout.uncertainty.isnan().all() and rollout.success is None
-        state = rollout.state
 
 
 def test_shuffled_actions_are_those_of_the_row_before():

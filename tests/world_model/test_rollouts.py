@@ -318,7 +318,7 @@ def test_what_does_not_go_together():
         ImaginationConfig(share=0.5)
     ImaginationConfig(share=0.5, model="oracle")
     assert ImaginationConfig(share=0.5, path="x").learns
-    assert not ImaginationConfig(share=0.5, path="x", model="copy").learns
+    assert not ImaginationConfig(share=0.5, path="x", learn=OnlineLearnConfig(steps_per_episode=0)).learns
     assert not ImaginationConfig(path="x").learns
 
 

@@ -28,7 +28,7 @@ from accerl_lerobot.world_model.learners import new_success_model
 from accerl_lerobot.world_model.online import Promotion
 from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.pretrain import world_spec
-from accerl_lerobot.world_model.reference import CopyModel, OracleModel, ShuffledModel
+from accerl_lerobot.world_model.reference import OracleModel, ShuffledModel
 from accerl_lerobot.world_model.store import HELD_OUT, LEARNT, THRESHOLD, load_roles, save_world_model
 from accerl_lerobot.world_model.success_model import SuccessPairsRewardModel
 from tests.runs import tiny_run
@@ -59,7 +59,7 @@ def run(checkpoint: Path, folder: Path, learn: OnlineLearnConfig, roles: dict[st
 
 @pytest.mark.parametrize(
     ("name", "made"),
-    [("learned", PixelWorldModel), ("shuffled", ShuffledModel), ("copy", CopyModel), ("oracle", OracleModel)],
+    [("learned", PixelWorldModel), ("shuffled", ShuffledModel), ("oracle", OracleModel)],
 )
 def test_what_a_run_can_imagine_with(name: Any, made: type, tiny_checkpoint: Path, tmp_path: Path):
     config = run(tiny_checkpoint, tmp_path / "model", OnlineLearnConfig(), {})

@@ -23,10 +23,7 @@ from accerl_lerobot.cli.verbs import WorldModelEvalRun, WorldModelRun
 from accerl_lerobot.engine.config import parse
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.world_model.config import (
-    LearnableModelConfig,
-    WorldModelConfig,
-)
+from accerl_lerobot.world_model.config import LearnableModelConfig, WorldModelConfig
 from accerl_lerobot.world_model.contract import LearnableWorldModel, new_model
 from accerl_lerobot.world_model.learners import Learner, new_success_model
 from accerl_lerobot.world_model.pretrain import world_spec

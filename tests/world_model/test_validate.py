@@ -75,16 +75,8 @@ def with_successes(episodes: list[Episode]) -> list[Episode]:
         if not len(there) or there[0] < 2:
             continue
         t = int(there[0]) + 1
-        made.append(
-            replace(
-                episode,
-                frames=episode.frames[:t],
-                times=episode.times[:t],
-                state=episode.state[:t],
-                actions=episode.actions[:t],
-                success_at=t - 1,
-            )  # fmt: skip
-        )
+        cut = {name: getattr(episode, name)[:t] for name in ("frames", "times", "state", "actions")}
+        made.append(replace(episode, success_at=t - 1, **cut))
     return made
 
 
