@@ -26,10 +26,8 @@ are raw: scaling and normalisation belong to the policy's own LeRobot processors
 TASK = "task"
 ENVIRONMENT_STATE = "observation.environment_state"
 """LeRobot's name for what a simulator says of itself. Ours end it with the share of the time limit gone."""
-REWARD, SUCCESS = "next.reward", "next.success"
-"""LeRobot's names for what an env step led to."""
-REAL, IMAGINED = "real", "imagined"
-"""Which worlds a segment can be from."""
+REWARD, SUCCESS = "next.reward", "next.success"  # LeRobot's names for what an env step led to
+REAL, IMAGINED = "real", "imagined"  # which worlds a segment can be from
 
 
 @kind

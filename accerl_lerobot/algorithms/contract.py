@@ -130,18 +130,12 @@ class ChunkCriticConfig(OffPolicyConfig):
 class LossInputs:
     """One batch of decisions, re-scored by the current policy."""
 
-    log_prob_new: Tensor
-    """(N, L), log π of the stored latents under the current weights; carries gradient."""
-    log_prob_old: Tensor
-    """(N, L), log μ as the behaviour policy stored it."""
-    advantage: Tensor
-    """(N,), normalised over the batch by the caller."""
-    value: Tensor
-    """(N,), V of the current critic; carries gradient."""
-    returns: Tensor
-    """(N,), what V is regressed to."""
-    entropy: Tensor
-    """(N,), entropy of π at each decision; carries gradient if it is to be used."""
+    log_prob_new: Tensor  # (N, L), log π of the stored latents under the current weights; carries gradient
+    log_prob_old: Tensor  # (N, L), log μ as the behaviour policy stored it
+    advantage: Tensor  # (N,), normalised over the batch by the caller
+    value: Tensor  # (N,), V of the current critic; carries gradient
+    returns: Tensor  # (N,), what V is regressed to
+    entropy: Tensor  # (N,), entropy of π at each decision; carries gradient if it is to be used
     factors: Tensor | None = None
     """bool (N, L), False for a factor that does not exist, such as a token after the terminator; its content
     is never looked at. None: all exist."""

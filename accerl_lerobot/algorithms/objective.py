@@ -130,15 +130,12 @@ def lag_metrics(version: Tensor, trainer_version: int) -> dict[str, float]:
 class LossOutput:
     """Loss and metrics of one batch."""
 
-    loss: Tensor
-    """(), call ``backward`` on it."""
-    means: dict[str, Tensor]
-    """Means over decisions, scalars without gradient; ``decisions`` is a count."""
+    loss: Tensor  # (), call ``backward`` on it
+    means: dict[str, Tensor]  # means over decisions, scalars without gradient; ``decisions`` is a count
     samples: Tensor
     """float64 (N, 3F + 2) without gradient, for metrics that are no means over decisions, such as quantiles:
     of each ratio log ρ, ω and 1 if it exists, else 0; V; R."""
-    clip: tuple[float, float]
-    """(low, high) of the clip range."""
+    clip: tuple[float, float]  # (low, high) of the clip range
 
     @property
     def metrics(self) -> dict[str, Tensor]:

@@ -31,20 +31,14 @@ from accerl_lerobot.seeds import EVAL_SEEDS
 class WorldSpec:
     """Sizes and features that a policy must fit to act in a world."""
 
-    images: dict[str, tuple[int, int, int]]
-    """``observation.images.<camera>`` → (H, W, 3)."""
-    state_dim: int
-    """Length of ``observation.state``."""
+    images: dict[str, tuple[int, int, int]]  # ``observation.images.<camera>`` → (H, W, 3)
+    state_dim: int  # length of ``observation.state``
     action_dim: int
-    action_low: np.ndarray
-    """float32 (A,). Actions outside are clipped by the world."""
+    action_low: np.ndarray  # float32 (A,). Actions outside are clipped by the world.
     action_high: np.ndarray
-    fps: int
-    """Control rate in Hz."""
-    max_steps: int
-    """Episode limit in env steps; reaching it truncates."""
-    tasks: tuple[str, ...]
-    """Names `World.reset` accepts."""
+    fps: int  # control rate in Hz
+    max_steps: int  # episode limit in env steps; reaching it truncates
+    tasks: tuple[str, ...]  # names `World.reset` accepts
     instructions: tuple[str, ...] = ()
     """Text of each task, in the order of `tasks`; empty where the environment has none."""
 
@@ -53,14 +47,11 @@ class WorldSpec:
 class ChunkResult:
     """Outcome of one executed chunk; `rewards` has one entry per executed step, at most K."""
 
-    observation: Observation
-    """After the last executed step."""
-    rewards: np.ndarray
-    """float32 (k,), 1 ≤ k ≤ K: the episode may end before the chunk does."""
+    observation: Observation  # after the last executed step
+    rewards: np.ndarray  # float32 (k,), 1 ≤ k ≤ K: the episode may end before the chunk does
     terminated: bool
     truncated: bool
-    success: bool
-    """True if the task has been achieved at any step of the episode so far."""
+    success: bool  # True if the task has been achieved at any step of the episode so far
     info: dict[str, float] = field(default_factory=dict)
 
     @property
@@ -106,12 +97,9 @@ class Step(NamedTuple):
     """Outcome of one env step."""
 
     success: bool
-    ended: bool
-    """True if the task is over, which `success` alone need not mean."""
-    reward: float | None = None
-    """None: 1.0 at the first success, else 0.0."""
-    cut: bool = False
-    """True if the simulator itself ends the episode early."""
+    ended: bool  # True if the task is over, which `success` alone need not mean
+    reward: float | None = None  # None: 1.0 at the first success, else 0.0
+    cut: bool = False  # True if the simulator itself ends the episode early
     finite: bool = True
     """False if the simulator diverged: the episode ends as truncated, and must not be trained on."""
 
