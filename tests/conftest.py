@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,10 @@ import pytest
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+# A policy type in a package of its own, as if it were installed; in LeRobot's commands too.
+EXAMPLE = str(Path(__file__).parents[1] / "docs" / "examples" / "lerobot_policy_smolvla_bins")
+sys.path.insert(0, EXAMPLE)
+os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (EXAMPLE, os.environ.get("PYTHONPATH"))))
 
 from accerl_lerobot.engine import ray_session  # noqa: E402
 

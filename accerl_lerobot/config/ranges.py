@@ -41,6 +41,9 @@ class Range:
         self.text, self._low_open, self._high_open = text, match[1] == "(", match[4] == ")"
         self.low, self.high = float(match[2]), float(match[3])
 
+    def __repr__(self) -> str:
+        return f"Range({self.text!r})"
+
     def __contains__(self, value: Any) -> bool:
         above = value > self.low if self._low_open else value >= self.low
         return bool(above and (value < self.high if self._high_open else value <= self.high))
@@ -51,6 +54,9 @@ class Pattern:
 
     def __init__(self, pattern: str, words: str) -> None:
         self.pattern, self.words = re.compile(pattern), words
+
+    def __repr__(self) -> str:
+        return f"Pattern({self.pattern.pattern!r})"
 
     def __contains__(self, value: Any) -> bool:
         return self.pattern.fullmatch(value) is not None

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import importlib
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -157,11 +156,9 @@ POLICIES: dict[str, tuple[str, tuple[str, ...]]] = {
     "pi0": ("accerl_lerobot.policies.vla:Pi0", ("flow",)),
     "pi05": ("accerl_lerobot.policies.vla:Pi05", ("flow",)),
     "pi0_fast": ("accerl_lerobot.policies.vla:Pi0Fast", ("tokens",)),
-    "smolvla_bins": ("accerl_lerobot.policies.vla:SmolVLABins", ("tokens",)),
 }
 """LeRobot policy type → its model, and the families that suit it, the default one first."""
-PLUGINS = {"smolvla_bins": "accerl_lerobot.policies.bins_plugin"}
-"""LeRobot policy type that is not LeRobot's own → the package that registers it with LeRobot."""
+PLUGINS: dict[str, str] = {}  # policy type that is not LeRobot's own → package that registers it with LeRobot
 USES_HISTORY = ("diffusion",)  # types that read observations of ``n_obs_steps`` env steps; others read one
 
 
@@ -181,10 +178,7 @@ def register_policies(wanted: str | None = None) -> None:
 
     Of LeRobot's own types, the code of `wanted` alone is imported; of all if it is None or another's.
     """
-    ours = wanted in POLICIES and PLUGINS.get(str(wanted), __name__).startswith("accerl_lerobot.")
-    import_policies(wanted if ours else None)
-    for package in PLUGINS.values():
-        importlib.import_module(package)
+    import_policies(wanted if wanted in POLICIES.keys() - PLUGINS.keys() else None)
     from lerobot.configs.policies import PreTrainedConfig
     from lerobot.utils.import_utils import register_third_party_plugins
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""LeRobot's vision-language-action policies: SmolVLA, smolvla_bins, π0, π0.5 and π0-FAST.
+"""LeRobot's vision-language-action policies: SmolVLA, π0, π0.5 and π0-FAST.
 
 LeRobot's samplers run without gradient, so their parts are driven here: `embed_prefix`, the language model,
 `denoise_step`. Each sampler is compared with the installed LeRobot's own whenever a policy is loaded.
@@ -93,32 +93,6 @@ class SmolVLA(FlowModel):
         mask, places = make_att_2d_masks(pad, att), torch.cumsum(pad, dim=1) - 1
         features, cache = _run(model.vlm_with_expert, embedded, mask, places)
         return Encoded(features=features, mask=pad, context=_velocity(model, pad, cache))
-
-
-class SmolVLABins(TokenModel):
-    """Drives `bins_plugin`'s policy; queries of rows that are not executed have no token."""
-
-    backbone = "model.vlm."
-    terminator = None
-
-    def __init__(self, policy: Any) -> None:
-        super().__init__(policy)
-        self.rows = int(policy.config.n_action_steps)
-        self.length = self.rows * policy.config.action_feature.shape[0]
-        self.width = policy.model.head.in_features
-
-    def encode(self, batch: dict[str, Tensor]) -> Encoded:
-        """The features are the queries' hidden states, as in AcceRL."""
-        hidden = self.policy.hidden(batch)
-        logits = self.policy.model.logits(hidden[:, : self.length])
-        mask = torch.ones(hidden.shape[:2], dtype=torch.bool, device=hidden.device)
-        return Encoded(features=hidden, mask=mask, context=TokenContext(logits=lambda tokens: logits))
-
-    def chunk(self, tokens: Tensor) -> Tensor:
-        return self.policy.decode_tokens(tokens).view(len(tokens), self.rows, -1)
-
-    def stock(self, batch: dict[str, Tensor], **noise: Tensor) -> Tensor:
-        return super().stock(batch, **noise)[:, : self.rows]
 
 
 VLM = "model.paligemma_with_expert.paligemma."

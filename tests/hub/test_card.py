@@ -13,6 +13,7 @@ from accerl_lerobot.cli.verbs import CONFIGS
 from accerl_lerobot.engine.config import RunConfig, parse
 from accerl_lerobot.hub.card import MARK, PushConfig
 from accerl_lerobot.hub.push import stage
+from accerl_lerobot.policies.config import PLUGINS
 from tests.hub.folders import write_json, write_policy_folder, write_run_folder
 
 TINY = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
@@ -73,11 +74,12 @@ def test_commands_in_the_card_are_commands(tmp_path: Path, kind: str):
         parse(CONFIGS[verb], [a for a in arguments if "config.yaml" not in a], recipe_class=RunConfig)
 
 
-def test_stock_lerobot_and_a_plugin_policy(tmp_path: Path):
+def test_stock_lerobot_and_a_plugin_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(PLUGINS, "smolvla_bins", "lerobot_policy_smolvla_bins")
     run = write_run_folder(tmp_path / "run", type="smolvla_bins", vlm_model_name="org/vlm")
     text = card_of(run / "checkpoints/last/pretrained_model", "policy")
     assert "lerobot-eval --policy.path=door" in text and '"task": "door-open-v3"' in text
-    assert "--policy.discover_packages_path=accerl_lerobot.policies.bins_plugin" in text
+    assert "--policy.discover_packages_path=lerobot_policy_smolvla_bins" in text
     assert "loads it from the Hub as well: `--policy.path=alice/door`" in text
 
 

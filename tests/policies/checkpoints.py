@@ -117,11 +117,9 @@ def write_bins(
     **options: Any,
 ) -> Path:
     """A smolvla_bins of some 30 k parameters that fits ``SimulatedConfig()``, its backbone beside it."""
+    import lerobot_policy_smolvla_bins  # noqa: F401
     import torch
 
-    from accerl_lerobot.policies.config import register_policies
-
-    register_policies()
     low, high = (torch.full((2,), bound) for bound in action_range)
     small = {
         "chunk_size": chunk,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The LeRobot plugin ``smolvla_bins``: its network, its loss, and its way through LeRobot's own commands."""
+"""The package ``lerobot_policy_smolvla_bins``: network, loss, and the way through LeRobot's own commands."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import lerobot_policy_smolvla_bins  # noqa: F401
 import numpy as np
 import pytest
 import torch
@@ -21,7 +22,7 @@ from accerl_lerobot.demos.backbone import BackboneConfig
 from accerl_lerobot.demos.sft import SFTConfig, run_sft, sft_command
 from accerl_lerobot.engine.preflight import check_sft_policy
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.policies.config import PLUGINS, PolicyConfig, discovery, register_policies
+from accerl_lerobot.policies.config import PLUGINS, PolicyConfig, discovery
 from accerl_lerobot.policies.saving import save_pretrained
 from tests.policies.checkpoints import write_bins
 from tests.policies.tiny import adapter_at, requests
@@ -240,8 +241,6 @@ def test_where_lerobot_finds_the_type(path: Path, tmp_path: Path):
     from lerobot.configs.parser import load_plugin
     from lerobot.configs.policies import PreTrainedConfig
 
-    register_policies()
-    assert set(PLUGINS) <= set(PreTrainedConfig.get_known_choices())
     load_plugin(PLUGINS["smolvla_bins"])  # every submodule, as LeRobot's commands do
     flag = f"--policy.discover_packages_path={PLUGINS['smolvla_bins']}"
     assert discovery("smolvla_bins") == [flag] and discovery("smolvla") == discovery(None) == []

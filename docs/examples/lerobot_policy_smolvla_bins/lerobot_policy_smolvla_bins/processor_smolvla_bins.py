@@ -8,7 +8,7 @@ from typing import Any
 from lerobot.policies.smolvla.processor_smolvla import make_smolvla_pre_post_processors
 from torch import Tensor
 
-from accerl_lerobot.policies.bins_plugin.configuration_smolvla_bins import SmolVLABinsConfig
+from lerobot_policy_smolvla_bins.configuration_smolvla_bins import SmolVLABinsConfig
 
 
 def make_smolvla_bins_pre_post_processors(

@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from transformers import AutoConfig, AutoModelForImageTextToText
 
-from accerl_lerobot.policies.bins_plugin.configuration_smolvla_bins import SmolVLABinsConfig
+from lerobot_policy_smolvla_bins.configuration_smolvla_bins import SmolVLABinsConfig
 
 
 class ParallelDecoder(nn.Module):

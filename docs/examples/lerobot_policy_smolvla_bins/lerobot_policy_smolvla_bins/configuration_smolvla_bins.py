@@ -52,7 +52,7 @@ class SmolVLABinsConfig(PreTrainedConfig):
     scheduler_decay_steps: int = 30_000
     scheduler_decay_lr: float = 2.5e-6
 
-    discover_packages_path: str = "accerl_lerobot.policies.bins_plugin"
+    discover_packages_path: str = "lerobot_policy_smolvla_bins"
     """Where this type comes from. A field, because LeRobot 0.6.1 takes the flag
     ``--policy.discover_packages_path`` for an override of the config when ``--policy.path`` is given too."""
 
