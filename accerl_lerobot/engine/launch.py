@@ -1,6 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The asynchronous engine: places the workers, connects them and watches them.
 
+    rollout ×W ──requests──► inference ──decisions──► rollout   micro-asynchrony: others step meanwhile
+        │                        ▲
+        └──segments──► replay    │ weights, published without waiting
+                          │      │
+                          └──► trainer                          macro-asynchrony: no barrier, a measured lag
+
 The trainer is the clock: when it has made its updates the run is over. A rollout worker or inference replica
 that ends is restarted alone, see `replicas`; the end of any other worker ends this engine with its traceback,
 and `run` makes another one from the last checkpoint. The same goes for a worker that hangs: every wait here
