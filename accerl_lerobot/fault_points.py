@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import importlib
 import os
-from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 HANDLER = "ACCERL_FAULT_HANDLER"
 """Environment variable that names a module; its ``handle(name, path)`` is called at every point."""
@@ -20,10 +20,8 @@ def fault_point(name: str, path: Path | None = None) -> bool:
 
     Returns True if the value computed there is to be made non-finite.
     """
-    return _handle is not None and _handle(name, path)
+    return _handle is not None and bool(_handle(name, path))
 
 
 _module = os.environ.get(HANDLER)
-_handle: Callable[[str, Path | None], bool] | None = (
-    importlib.import_module(_module).handle if _module else None
-)
+_handle: Any = importlib.import_module(_module).handle if _module else None

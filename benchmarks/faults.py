@@ -265,7 +265,7 @@ def _finish(victim: Victim, start: Start, updates: int) -> dict[str, Any]:
             if code := one.process.wait():
                 raise RuntimeError(f"{name}: it ended with code {code}:\n{last_words(one.log)}")
             summary = json.loads((one.folder / SUMMARY).read_text())
-            rate = Rate(successes=round(summary["success_after"] * summary["n"]), n=summary["n"])
+            rate = Rate(successes=round(summary["success_after"] * summary["n_after"]), n=summary["n_after"])
             found[name] = str(rate)
     finally:
         alone.kill()

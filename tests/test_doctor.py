@@ -8,6 +8,7 @@ import importlib.util
 import math
 import os
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -119,14 +120,10 @@ class TestRendering:
     ],
 )
 def test_packages_against_the_ranges(installed, status, text, monkeypatch):
-    def version(name: str) -> str:
-        if name not in installed:
-            raise importlib.metadata.PackageNotFoundError(name)
-        return installed[name]
-
+    here = [SimpleNamespace(name=k, version=v) for k, v in {"accerl_lerobot": "0.1", **installed}.items()]
     wanted = ["lerobot[dataset]>=0.6.1,<0.7", "torch>=2.7,<2.12", 'mujoco==3.3.2; extra == "metaworld"']
     monkeypatch.setattr(importlib.metadata, "requires", lambda name: wanted)
-    monkeypatch.setattr(importlib.metadata, "version", version)
+    monkeypatch.setattr(importlib.metadata, "distributions", lambda: here)
     check = doctor.packages()
     assert check.status == status and text in check.text
 

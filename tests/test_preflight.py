@@ -14,6 +14,8 @@ from typing import Any
 import pytest
 
 from accerl_lerobot import cli
+from accerl_lerobot.algorithms import GIPOConfig, LossInputs, LossOutput, PPOConfig, RatioConfig
+from accerl_lerobot.engine.preflight import check_loss
 from accerl_lerobot.envs import SimulatedConfig, make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.features import Features, check_features, env_features, policy_features
@@ -216,3 +218,16 @@ def test_a_simulator_that_is_not_installed(
     for verb, more in (("train", [*sft, f"--output_dir={out}"]), ("demos", [f"--root={out}"])):
         assert refused(capsys, verb, *env, *more) == line
         assert not out.exists()
+
+
+def detached(self: GIPOConfig, inputs: LossInputs) -> LossOutput:
+    return PPOConfig().loss(replace(inputs, log_prob_new=inputs.log_prob_new.detach()))
+
+
+@pytest.mark.parametrize(("loss", "why"), [(RatioConfig.loss, "has no loss"), (detached, "no finite grad")])
+def test_an_objective_that_cannot_be_learnt_from_is_refused(loss: Any, why: str, monkeypatch):
+    for algorithm in (GIPOConfig(), PPOConfig(), GIPOConfig(level="chunk", entropy_coef=0.1)):
+        check_loss(algorithm)
+    monkeypatch.setattr(GIPOConfig, "loss", loss)
+    with pytest.raises(InputError, match=f"^algorithm.type='gipo': its loss fails on a small batch .*{why}"):
+        check_loss(GIPOConfig())

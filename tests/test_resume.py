@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import shutil
 import signal
 import subprocess
@@ -17,8 +18,11 @@ import pytest
 import yaml
 
 from accerl_lerobot.cli import main
-from accerl_lerobot.engine.config import LaunchConfig, encode
+from accerl_lerobot.console import Console
+from accerl_lerobot.engine import run as run_module
+from accerl_lerobot.engine.config import LaunchConfig, RunConfig, decode, encode
 from accerl_lerobot.engine.local import LocalEngine
+from accerl_lerobot.engine.resuming import resume_command
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
@@ -123,7 +127,7 @@ def test_a_run_that_fell_over_goes_on_from_its_last_whole_checkpoint(
         context.setattr(LocalEngine, "poll", falls)
         assert main(["train", str(recipe(tmp_path, tiny_checkpoint)), f"--output_dir={run}"]) == 1
     said = " ".join(capsys.readouterr().err.split())
-    assert "failed; to resume from the last checkpoint: accerl train --resume=true" in said
+    assert "failed; to resume: accerl train --resume=true" in said
     assert f"accerl: ArithmeticError: it fell over; the traceback is in {run / 'error.log'}" in said
     assert "ArithmeticError: it fell over" in (run / "error.log").read_text()
     newest = run / "checkpoints" / "000010" / "training_state" / "replay.safetensors"
@@ -238,3 +242,17 @@ def test_an_asynchronous_run_that_was_killed_and_stopped_goes_on(tiny_checkpoint
     assert max(r["lag_max"] for r in train) == found["lag_max"] < 40
     steps = [r["env_steps"] for r in records(run) if r["kind"] == "rollout"]
     assert steps == sorted(steps)
+
+
+def test_a_run_says_what_the_command_line_has_to_allow_again(tmp_path: Path):
+    config = decode(RunConfig, {"algorithm": {"type": "ppo", "discover_packages_path": "mine.too"}})
+    said = [shlex.split(resume_command(tmp_path / "a run", one)) for one in (decode(RunConfig, {}), config)]
+    assert said[1] == [*said[0], "--algorithm.discover_packages_path=mine.too"] and len(said[0]) == 4
+
+
+def test_demonstrations_that_are_complete_are_not_recorded_again(tmp_path: Path, monkeypatch):
+    (tmp_path / "demos").mkdir()
+    monkeypatch.setattr(run_module, "record_demos", None)
+    monkeypatch.setattr(run_module, "fine_tune", lambda sft, dataset, *rest: Path(dataset.root) / "made")
+    config = run_module.warm_start(decode(RunConfig, {"env": {"type": "simulated"}}), tmp_path, Console())
+    assert config.policy.path == str(tmp_path / "demos" / "made")

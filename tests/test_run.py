@@ -62,9 +62,8 @@ def test_the_summary_has_what_is_promised(finished: Finished):
         assert 0.0 <= summary[f"success_{when}"] <= 1.0 and summary[f"n_{when}"] == 8
         low, high = summary[f"ci95_{when}"]
         assert 0.0 <= low <= summary[f"success_{when}"] <= high <= 1.0 and low < high
-        assert summary["ci95"][when] == [low, high]
-    assert summary["n"] == 8 and summary["updates"] == 12
-    assert summary["env_steps"] >= summary["decisions"] > 0 and summary["trained_decisions"] >= 12 * 16
+    assert summary["env_steps"] >= summary["decisions"] > 0 and summary["updates"] == 12
+    assert summary["trained_decisions"] >= 12 * 16
     assert 0 <= summary["lag_mean"] <= summary["lag_max"]
     assert summary["wall_s"] >= summary["rl_s"] > 0 and summary["restarts"] == 0
 
@@ -76,7 +75,7 @@ def test_the_evaluation_before_can_be_left_out(tiny_checkpoint: Path, tmp_path: 
     directory = run.make_output_dir(config)
     summary = run.execute(config, directory, Console())
     assert [r["group"] for r in records(directory, "evaluation")] == ["after"]
-    assert summary["success_before"] is summary["ci95"]["before"] is None and summary["n_after"] == 4
+    assert summary["success_before"] is summary["ci95_before"] is None and summary["n_after"] == 4
     assert (directory / "success_curve.png").is_file() and not (directory / "before_after.mp4").exists()
 
 

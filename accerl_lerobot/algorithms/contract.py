@@ -58,7 +58,7 @@ class RatioConfig(AlgorithmConfig):
 
     def loss(self, inputs: LossInputs) -> LossOutput:
         """The objective, with its diagnostics; `objective.assemble` adds the shared terms."""
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} has no loss(inputs)")
 
 
 @dataclass(frozen=True, kw_only=True)

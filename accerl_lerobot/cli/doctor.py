@@ -91,24 +91,20 @@ def machine(config: RunConfig | None, history: int = 1) -> Iterator[Check]:
 def packages() -> Check:
     """Installed versions against the ranges of this package's requirements."""
     from packaging.requirements import Requirement
+    from packaging.utils import canonicalize_name
 
-    try:
-        wanted = [Requirement(text) for text in importlib.metadata.requires("accerl-lerobot") or []]
-    except importlib.metadata.PackageNotFoundError:
+    here: dict[str, str] = {canonicalize_name(d.name): d.version for d in importlib.metadata.distributions()}
+    if "accerl-lerobot" not in here:
         return Check("packages", FAIL, "accerl-lerobot is not installed: run make setup")
-    status, wrong = OK, []
-    for requirement in (r for r in wanted if r.marker is None or r.marker.evaluate({"extra": ""})):
-        try:
-            installed = importlib.metadata.version(requirement.name)
-            if not requirement.specifier.contains(installed, prereleases=True):
-                wrong.append(f"{requirement.name} {installed}, not {requirement.specifier}")
-        except importlib.metadata.PackageNotFoundError:
-            status = FAIL
-            wrong.append(f"{requirement.name} missing")
+    wrong: dict[str, str | None] = {}
+    for requirement in map(Requirement, importlib.metadata.requires("accerl-lerobot") or ()):
+        installed = here.get(canonicalize_name(requirement.name))
+        needed = requirement.marker is None or requirement.marker.evaluate({"extra": ""})
+        if needed and not (installed and requirement.specifier.contains(installed, prereleases=True)):
+            wrong[f"{requirement.name} {installed or 'missing'}, not {requirement.specifier}"] = installed
     if wrong:
-        return Check("packages", status if status == FAIL else WARN, f"{'; '.join(wrong)}: run make setup")
-    text = f"all within their ranges, lerobot {importlib.metadata.version('lerobot')} among them"
-    return Check("packages", OK, text)
+        return Check("packages", WARN if all(wrong.values()) else FAIL, f"{'; '.join(wrong)}: run make setup")
+    return Check("packages", OK, f"all within their ranges, lerobot {here['lerobot']} among them")
 
 
 def libraries(config: RunConfig | None) -> Iterator[Check]:

@@ -194,7 +194,7 @@ def train(arguments: list[str], load: Load | None = None) -> int:
 def demos(arguments: list[str]) -> int:
     """``accerl demos``."""
     config: DemosRun = parse(DemosRun, arguments, recipe_class=RunConfig)
-    from accerl_lerobot.demos.record import record_demos
+    from accerl_lerobot.demos.record import SIDECAR, record_demos
     from accerl_lerobot.engine.preflight import check_world
     from accerl_lerobot.engine.sizes import check_disk
 
@@ -202,6 +202,8 @@ def demos(arguments: list[str]) -> int:
         check_disk(config.root, "root")
         check_world(config.env)
         path = record_demos(config.env, config.demos, config.root, config.seed)
+        tally = json.loads((path / SIDECAR).read_text())
+        sys.stderr.write("{episodes} episodes, {frames} frames, {successes} successes\n".format(**tally))
     sys.stdout.write(f"{path}\n")
     return 0
 
@@ -235,8 +237,7 @@ def offline(arguments: list[str]) -> int:
     config: OfflineRun = parse(OfflineRun, arguments, recipe_class=RunConfig)
     from accerl_lerobot.engine.offline import learn_offline
 
-    summary = _in_new_folder(config, lambda *place: learn_offline(config, *place))[0]
-    return _told(summary)
+    return _told(_in_new_folder(config, lambda *place: learn_offline(config, *place))[0])
 
 
 def _in_new_folder[Result](

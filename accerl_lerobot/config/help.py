@@ -164,4 +164,5 @@ def _shown(value: Any) -> str:
 
 
 def _summary(cls: type[Any]) -> str:
-    return (inspect.getdoc(cls) or "").split("\n\n")[0].replace("\n", " ")
+    text = inspect.getdoc(cls) or ""  # a dataclass without one shows its signature
+    return "" if text.startswith(f"{cls.__name__}(") else text.split("\n\n")[0].replace("\n", " ")

@@ -47,8 +47,10 @@ def discover(package: str | None, section: str = "") -> None:
     try:
         importlib.import_module(package)
     except (Exception, SystemExit) as error:  # it is somebody's code, which may do anything
-        why = f"{type(error).__name__}: {brief(error)}"
-        raise InputError(field, package, f"cannot be imported ({why})") from error
+        why = f"cannot be imported ({type(error).__name__}: {brief(error)})"
+        if isinstance(error, ModuleNotFoundError) and error.name == package.partition(".")[0]:
+            why += "; install it, or name the folder that it is in: PYTHONPATH=FOLDER accerl …"
+        raise InputError(field, package, why) from error
 
 
 LARGEST_RECIPE = 2**18  # bytes of a recipe at most
@@ -101,7 +103,7 @@ def parse(config_class: type[Any], arguments: list[str], *, recipe_class: type[A
     register_types(config_class, given)
     merged = _overridden(config_class, tree, given)
     if from_file := consents(merged, given):
-        flags = " ".join(shlex.quote(f"--{name}={_as_text(value)}") for name, value in from_file.items())
+        flags = consent_flags(from_file)
         remedy = f"a file cannot allow this, only the command line can: if you trust it, add {flags}"
         raise InputError(next(iter(from_file)), next(iter(from_file.values())), remedy)
     return decode(config_class, merged)
@@ -118,6 +120,11 @@ def consents(tree: Any, given: Any = None) -> dict[str, Any]:
         for name, value in _leaves(tree)
         if name.rpartition(".")[2] in CONSENT and value not in UNSET and name not in asked
     }
+
+
+def consent_flags(consented: dict[str, Any]) -> str:
+    """Arguments of the command line that give these `consents`."""
+    return " ".join(shlex.quote(f"--{name}={as_text(value)}") for name, value in consented.items())
 
 
 def _leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any]]:
@@ -256,7 +263,7 @@ def _load_yaml(text: str) -> Any:
         raise yaml.YAMLError(f"{type(error).__name__}: {error}") from error
 
 
-def _as_text(value: Any) -> str:
+def as_text(value: Any) -> str:
     """A value as it can be typed on a command line; control characters are escaped."""
     return value if isinstance(value, str) and value.isprintable() else json.dumps(value, default=str)
 

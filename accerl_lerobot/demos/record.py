@@ -51,8 +51,7 @@ _MAX_EPISODES = 10_000
 _MAX_TRIES = 50
 MOST_PROCESSES = 8  # simulators at once, each of some 100 MB; a container may see more cores than it has
 _VERSIONS = {name: name for name in ("lerobot", "metaworld", "robosuite", "mujoco", "numpy")}
-_VERSIONS |= {"libero": "hf-libero"}
-"""Module → distribution."""
+_VERSIONS |= {"libero": "hf-libero"}  # module → distribution
 
 Expert = Callable[[], np.ndarray]  # gives the next action for the state its world is in
 

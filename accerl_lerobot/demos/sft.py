@@ -23,6 +23,7 @@ from typing import Annotated, Any, Literal
 
 from accerl_lerobot.checkpoint.layout import CHECKPOINTS, LAST, PRETRAINED, displaced, relocate
 from accerl_lerobot.checkpoint.safety import Origin, read_json
+from accerl_lerobot.config.parsing import as_text
 from accerl_lerobot.config.ranges import Commit, DatasetConfig, LearningRate, Range, Section, Steps, Threads
 from accerl_lerobot.demos.backbone import BackboneConfig, write_backbone
 from accerl_lerobot.errors import InputError, check_absent
@@ -108,7 +109,7 @@ def sft_command(
         policy["pretrained_backbone_weights"] = None  # the checkpoint's replace them; spares their download
     command = [sys.executable, "-m", "accerl_lerobot.demos.guarded_train"]
     command += [f"{TRUST}{config.trust_remote_code}"] if config.trust_remote_code else []
-    command += [f"--policy.{key}={_as_argument(value)}" for key, value in policy.items()]
+    command += [f"--policy.{key}={as_text(value)}" for key, value in policy.items()]
     command += discovery(kind)
     named = {"repo_id": dataset.repo_id, "root": dataset.root, "revision": dataset.revision}
     command += [f"--dataset.{key}={value}" for key, value in named.items() if value]
@@ -255,10 +256,6 @@ def policy_fields(kind: str, field: str) -> set[str]:
     if kind in NO_SFT:
         raise InputError(field, kind, NO_SFT[kind])
     return {f.name for f in fields(choices[kind])}
-
-
-def _as_argument(value: Any) -> str:
-    return value if isinstance(value, str) else json.dumps(value)
 
 
 def _parse_progress(line: str) -> tuple[int, float] | None:

@@ -214,23 +214,12 @@ class Loop:
     def _summary(self, after: dict[str, Any], last: Progress) -> dict[str, Any]:
         before = self.before or {}
         return {
-            "success_before": before.get("success"),
-            "success_after": after["success"],
-            "n": after["n"],
-            "ci95": {"before": before.get("ci95"), "after": after["ci95"]},
-            "n_before": before.get("n"),
-            "n_after": after["n"],
-            "ci95_before": before.get("ci95"),
-            "ci95_after": after["ci95"],
-            "tasks_before": before.get("tasks"),
-            "tasks_after": after["tasks"],
+            **{f"{name}_before": before.get(name) for name in ("success", "n", "ci95", "tasks")},
+            **{f"{name}_after": after[name] for name in ("success", "n", "ci95", "tasks")},
             "env_steps": int(self.steps),
-            "decisions": int(self._since(last, "decisions")),
-            "episodes": int(self._since(last, "episodes")),
+            **{k: int(self._since(last, k)) for k in ("decisions", "episodes", "dropped_nonfinite")},
             "updates": last.version,
-            "trained_decisions": int(last.replay.get("trained_decisions", 0)),
-            "unique_decisions": int(last.replay.get("unique_decisions", 0)),
-            "dropped_nonfinite": int(self._since(last, "dropped_nonfinite")),
+            **{k: int(last.replay.get(k, 0)) for k in ("trained_decisions", "unique_decisions")},
             "restarts": int(last.rollout.get("restarts", 0)),
             "lag_mean": float(np.mean(self.lags)) if self.lags else 0.0,
             "lag_max": self.lag_max,
@@ -362,7 +351,7 @@ class Loop:
         return min(self.steps, self._since(progress, "env_steps"))
 
     def _status(self, progress: Progress) -> str:
-        success = f"{np.mean(self.recent):.0%}" if self.recent else "…"
+        success = f"{np.mean(self.recent):.0%} of {len(self.recent)}" if self.recent else "…"
         lag = f"{self.lags[-1]:.0f}" if self.lags else "…"
         decisions = f"{self._since(progress, 'decisions'):.0f} decisions"
         words = f"exploring success {success} · lag {lag} · {decisions}"

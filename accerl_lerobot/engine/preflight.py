@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import draccus
 
-from accerl_lerobot.algorithms import OffPolicyConfig
+from accerl_lerobot.algorithms import LossInputs, OffPolicyConfig, RatioConfig
+from accerl_lerobot.checkpoint.safety import brief
 from accerl_lerobot.config.ranges import Range, check
 from accerl_lerobot.engine.sizes import check_disk, check_memory
 from accerl_lerobot.envs import EnvConfig, JudgedWorld, RewardModelConfig, WorldSpec, make_world
@@ -72,6 +73,23 @@ def check_policy(config: RunConfig, spec: WorldSpec, *, own: bool = False) -> in
     return int(policy.n_obs_steps)
 
 
+def check_loss(algorithm: RatioConfig) -> None:
+    """Refuse an objective, which may be somebody's own, that gives no gradient on a small batch."""
+    import torch
+
+    new, old, ones = torch.zeros(3, 2, requires_grad=True), torch.zeros(3, 2), torch.ones(3)
+    rest = {"advantage": ones, "value": ones.clone().requires_grad_(), "returns": ones, "entropy": ones}
+    try:
+        output = algorithm.loss(LossInputs(log_prob_new=new, log_prob_old=old, **rest))
+        output.loss.backward()
+        sorted(output.metrics)
+        if new.grad is None or not new.grad.isfinite().all():
+            raise ValueError("no finite gradient reaches log_prob_new")
+    except Exception as error:
+        why = f"its loss fails on a small batch ({type(error).__name__}: {brief(error)})"
+        raise InputError("algorithm.type", algorithm.type, why) from error
+
+
 def check_start(config: RunConfig, say: Callable[[str], object] = str) -> int:
     """Refuse a run that could not begin or whose outcome could not be used; what can be is checked here."""
     from accerl_lerobot.demos.dataset_files import open_metadata
@@ -83,6 +101,8 @@ def check_start(config: RunConfig, say: Callable[[str], object] = str) -> int:
         remedy = "give a LeRobot checkpoint, or sft.steps > 0 to make one; the recipe quickstart does"
         raise InputError("policy.path", None, remedy)
     resolve_device(config.policy.device)  # refuses one that is not there
+    if isinstance(config.algorithm, RatioConfig):
+        check_loss(config.algorithm)
     if 0 < config.trainer.updates <= config.trainer.value_warmup_updates:
         logger.warning(
             "the policy will not change: the first trainer.value_warmup_updates=%d are the critic's alone, "
@@ -263,7 +283,7 @@ def sft_policy(config: SFTConfig) -> Any:
         return check_sft_policy(config)
     from lerobot.configs.policies import PreTrainedConfig
 
-    from accerl_lerobot.checkpoint.safety import Origin, brief, read_json
+    from accerl_lerobot.checkpoint.safety import Origin, read_json
     from accerl_lerobot.policies.config import register_policies
     from accerl_lerobot.policies.untrusted import CONFIG, fetched_checkpoint
 

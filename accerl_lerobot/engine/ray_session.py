@@ -58,7 +58,8 @@ FORWARDED = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "HF_HUB_OFFLINE", "TRANSFORMERS_O
 PRIVATE = {
     # Ray 2.60 moves a node at 127.0.0.1 to the machine's address and then listens on every interface, unless
     # it is told that there is no cluster to be part of. The name is historical: it is read on all systems.
-    "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0"
+    "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
+    "RAY_worker_niceness": "0",  # Ray's own 15 starves workers on a machine with other work
 }
 _AUTH = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
 _NO_TOKEN = {"HF_TOKEN": "", "HUGGING_FACE_HUB_TOKEN": "", "HF_TOKEN_PATH": os.devnull}

@@ -16,7 +16,7 @@ from typing import Any
 
 from accerl_lerobot.checkpoint import layout
 from accerl_lerobot.checkpoint.safety import Origin, check_folder, check_number, read_json
-from accerl_lerobot.config.parsing import read_recipe
+from accerl_lerobot.config.parsing import consent_flags, consents, read_recipe
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import RunConfig, decode, encode
 from accerl_lerobot.engine.stopping import WorkerError, pause_s
@@ -35,8 +35,9 @@ WARM_START = "warm_start.json"
 """File with the path of the policy that came of a run's own demonstrations and SFT."""
 
 
-def resume_command(directory: Path) -> str:
-    return f"accerl train --resume=true --config_path={shlex.quote(str(directory / layout.CONFIG))}"
+def resume_command(directory: Path, config: RunConfig) -> str:
+    command = f"accerl train --resume=true --config_path={shlex.quote(str(directory / layout.CONFIG))}"
+    return " ".join(filter(None, (command, consent_flags(consents(encode(config))))))
 
 
 def resumed_run(path: Path | None, config: RunConfig) -> tuple[Path, str]:
@@ -107,7 +108,7 @@ class Recovery:
 def checkpoint_of(directory: Path, wanted: str, console: Console) -> Path | None:
     """The checkpoint to resume from; None if there is none yet."""
     if not layout.has_checkpoint(directory / layout.CHECKPOINTS):
-        console.say("there is no checkpoint yet: the run begins again after its warm start")
+        console.say("there is no checkpoint yet: what is kept are demonstrations and SFT, if complete")
         for name in (METRICS, EPISODES):
             (directory / name).unlink(missing_ok=True)
         shutil.rmtree(directory / "tensorboard", ignore_errors=True)

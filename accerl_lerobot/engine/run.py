@@ -95,7 +95,7 @@ def start(
             check_start(config, console.say)  # before there is a folder
         directory = make_output_dir(config)
     console.say(f"run {directory}")
-    how = resuming.resume_command(directory)
+    how = resuming.resume_command(directory, config)
     guardian.explain(remedy=f"to resume: {how}")
     try:
         with (
@@ -115,7 +115,7 @@ def start(
             console.say(f"{error}; to resume: {how}")
         elif not isinstance(error, StoppedError):
             verb = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
-            console.say(f"{verb}; to resume from the last checkpoint: {how}")
+            console.say(f"{verb}; to resume: {how}")
         raise
 
 
@@ -195,14 +195,15 @@ def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfi
         return config
     if note.is_file():
         return resuming.improving(config, directory / json.loads(note.read_text())["policy"])
-    for name in (layout.DEMOS, f"{layout.DEMOS}.partial", "sft"):
+    for name in (f"{layout.DEMOS}.partial", "sft"):
         shutil.rmtree(directory / name, ignore_errors=True)
     dataset = config.dataset
     if dataset.repo_id is None:
-        root = str(directory / layout.DEMOS)
-        with console.stage("demonstrations"):
-            record_demos(config.env, config.demos, root, config.seed)
-        dataset = replace(dataset, repo_id=REPO_ID, root=root)
+        root = directory / layout.DEMOS  # there once it is complete
+        if not root.exists():
+            with console.stage("demonstrations"):
+                record_demos(config.env, config.demos, str(root), config.seed)
+        dataset = replace(dataset, repo_id=REPO_ID, root=str(root))
     device = str(resolve_device(config.policy.device))
     path = fine_tune(config.sft, dataset, directory, config.seed, device, console)
     relative = Path(path).absolute().relative_to(directory.absolute())
@@ -237,7 +238,7 @@ def execute(
     config, before_s = replace(config, output_dir=str(directory)), 0.0 if checkpoint is None else None
     times = Times(started=started, warm_s=time.monotonic() - started, before_s=before_s)
     with contextlib.ExitStack() as stack:  # flushes the log, whatever fails
-        stop = stack.enter_context(Stopping(resuming.resume_command(directory)))
+        stop = stack.enter_context(Stopping(resuming.resume_command(directory, config)))
         times.clock = stack.enter_context(contextlib.closing(open_clock(config.timeline_folder, "driver")))
         log = stack.enter_context(contextlib.closing(MetricsLog(directory, config.wandb, encode(config))))
         session = None

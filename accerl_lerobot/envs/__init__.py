@@ -8,30 +8,25 @@ from __future__ import annotations
 
 from accerl_lerobot.config.parsing import discover, imported
 from accerl_lerobot.envs.base import ChunkResult, EnvConfig, HistoryWorld, World, WorldSpec
-from accerl_lerobot.envs.gym_env import GymConfig, GymWorld
-from accerl_lerobot.envs.lerobot_env import LeRobotEnvConfig, LeRobotWorld
-from accerl_lerobot.envs.libero import LiberoConfig, LiberoWorld
-from accerl_lerobot.envs.metaworld import MetaWorld, MetaWorldConfig
+from accerl_lerobot.envs.gym_env import GymConfig
+from accerl_lerobot.envs.lerobot_env import LeRobotEnvConfig
+from accerl_lerobot.envs.libero import LiberoConfig
+from accerl_lerobot.envs.metaworld import MetaWorldConfig
 from accerl_lerobot.envs.reward_model import JudgedWorld, RewardModelConfig, load_judge
-from accerl_lerobot.envs.simulated import SimulatedConfig, SimulatedWorld
+from accerl_lerobot.envs.simulated import SimulatedConfig
 from accerl_lerobot.errors import InputError
 
 __all__ = [
     "ChunkResult",
     "EnvConfig",
     "GymConfig",
-    "GymWorld",
     "HistoryWorld",
     "JudgedWorld",
     "LeRobotEnvConfig",
-    "LeRobotWorld",
     "LiberoConfig",
-    "LiberoWorld",
-    "MetaWorld",
     "MetaWorldConfig",
     "RewardModelConfig",
     "SimulatedConfig",
-    "SimulatedWorld",
     "World",
     "WorldSpec",
     "make_world",

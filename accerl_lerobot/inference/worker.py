@@ -123,11 +123,7 @@ class InferenceWorker:
         now, busy_s = time.monotonic(), self._busy_s
         share = (busy_s - self._busy_told_s) / max(1e-9, now - self._since)
         self._since, self._busy_told_s = now, busy_s
-        return {
-            **self._batcher.metrics(),
-            "version": float(self._version),
-            "busy_share": share,
-        }
+        return self._batcher.metrics() | {"version": float(self._version), "busy_share": share}
 
     def _serve(self) -> None:
         batch: list[PendingRequest] = []

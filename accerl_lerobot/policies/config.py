@@ -174,10 +174,9 @@ def register_policy(policy_type: str, model: str, *families: str) -> None:
 
 
 def register_policies(wanted: str | None = None) -> None:
-    """Fills LeRobot's registry of policy types, if `wanted` is missing from its installed plugins as well.
+    """Fills LeRobot's registry of policy types; those of installed plugins too, if `wanted` is missing.
 
-    Of LeRobot's own types, the code of `wanted` alone is imported; of all if it is None or another's.
-    """
+    Of LeRobot's own types, the code of `wanted` alone is imported; of all if it is None or another's."""
     import_policies(wanted if wanted in POLICIES.keys() - PLUGINS.keys() else None)
     from lerobot.configs.policies import PreTrainedConfig
     from lerobot.utils.import_utils import register_third_party_plugins

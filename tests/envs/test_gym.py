@@ -15,7 +15,8 @@ import pytest
 
 from accerl_lerobot.config.parsing import parse
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig
-from accerl_lerobot.envs import GymConfig, GymWorld, make_world
+from accerl_lerobot.envs import GymConfig, make_world
+from accerl_lerobot.envs.gym_env import GymWorld
 from accerl_lerobot.errors import InputError
 from tests.runs import pip_installed, replacing, tiny_run, trained
 

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from accerl_lerobot.envs import GymConfig, LeRobotEnvConfig, LeRobotWorld, MetaWorldConfig, make_world
+from accerl_lerobot.envs import GymConfig, LeRobotEnvConfig, MetaWorldConfig, make_world
+from accerl_lerobot.envs.lerobot_env import LeRobotWorld
 from accerl_lerobot.errors import InputError
 
 pytest.importorskip("lerobot")

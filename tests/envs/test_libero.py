@@ -11,7 +11,8 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from accerl_lerobot.envs import LiberoConfig, LiberoWorld, make_world
+from accerl_lerobot.envs import LiberoConfig, make_world
+from accerl_lerobot.envs.libero import LiberoWorld
 from accerl_lerobot.envs.libero_simulator import (
     FPS,
     TIMESTEP,

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from accerl_lerobot.demos.record import make_expert
-from accerl_lerobot.envs import MetaWorld, MetaWorldConfig, make_world
+from accerl_lerobot.envs import MetaWorldConfig, make_world
 from accerl_lerobot.envs import metaworld as gl
-from accerl_lerobot.envs.metaworld import description, expert_name, groups
+from accerl_lerobot.envs.metaworld import MetaWorld, description, expert_name, groups
 from accerl_lerobot.errors import InputError
 
 pytest.importorskip("metaworld")

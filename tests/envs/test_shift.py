@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from accerl_lerobot.demos.record import SIDECAR, DemosConfig, record_demos
-from accerl_lerobot.envs import MetaWorld, MetaWorldConfig
-from accerl_lerobot.envs.metaworld import ShiftConfig
+from accerl_lerobot.envs import MetaWorldConfig
+from accerl_lerobot.envs.metaworld import MetaWorld, ShiftConfig
 
 pytest.importorskip("metaworld")
 TASK = "push-v3"

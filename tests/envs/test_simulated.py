@@ -6,7 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from accerl_lerobot.envs import SimulatedConfig, SimulatedWorld
+from accerl_lerobot.envs import SimulatedConfig
+from accerl_lerobot.envs.simulated import SimulatedWorld
 
 
 def held(world: SimulatedWorld, count: int = 10) -> np.ndarray:

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot.envs import SimulatedWorld, World, make_world
+from accerl_lerobot.envs import World, make_world
+from accerl_lerobot.envs.simulated import SimulatedWorld
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.world_model.contract import Reset, State, WorldModel
 from accerl_lerobot.world_model.data import model_arrays
