@@ -75,7 +75,7 @@ def load_lerobot_config(config: PolicyConfig) -> Any:
     """
     folder = _checkpoint_folder(config)
     kind = _registered_type(config, folder)
-    from lerobot.configs.policies import PreTrainedConfig
+    from lerobot.configs.policies import PreTrainedConfig  # late, see `deferred`: it imports diffusers
 
     with _refusing(config, "its config.json is not one of this LeRobot's policies"):
         sampler_config(config, kind, prefix=f"{config.path} is of this type: ")
