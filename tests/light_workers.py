@@ -20,6 +20,7 @@ from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE
 from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.inference.batcher import Batcher
+from accerl_lerobot.rollout.runner import EpisodePlans
 from accerl_lerobot.rollout.worker import Report, RolloutWorker
 from accerl_lerobot.trainer.peers import LearnerSettings
 from accerl_lerobot.transport.endpoint import Endpoint
@@ -111,9 +112,9 @@ def _decision(request: Request, version: int) -> Decision:
 class FalteringRollout(RolloutWorker):
     """The first process in the first seat fails when it is to report for the third time."""
 
-    def __init__(self, env: Any, config: Any, tasks: Any, seed: int, *where: Any) -> None:
-        super().__init__(env, config, tasks, seed, *where)
-        self._left = 2 if where[:2] == (0, 0) else 1_000_000
+    def __init__(self, env: Any, config: Any, plans: EpisodePlans, *others: Any) -> None:
+        super().__init__(env, config, plans, *others)
+        self._left = 2 if plans.worker == plans.incarnation == 0 else 1_000_000
 
     def report(self, *arguments: Any) -> Report:
         self._left -= 1

@@ -26,8 +26,8 @@ class AlgorithmConfig(Section, draccus.ChoiceRegistry, section="algorithm"):
     """Base of every algorithm config; subclasses register under the name given on the command line."""
 
     update: ClassVar[str]
-    """``module:class`` of the trainer's updates: made from adapter, algorithm and `TrainerConfig`, and, of a
-    `RatioConfig`, the ranks; a subclass of `trainer.update.BaseUpdate`."""
+    """``module:class`` of the trainer's updates, made from adapter, algorithm and `TrainerConfig`: a
+    `trainer.update.RatioUpdate`, which is given the ranks too, or `trainer.off_policy.OffPolicyUpdate`."""
 
     discover_packages_path: str | None = field(default=None, metadata={"registers": True})
     """Package to import that registers ``algorithm.type``, where that is not one of ours."""

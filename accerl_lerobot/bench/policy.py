@@ -19,17 +19,17 @@ from rich.table import Table
 
 from accerl_lerobot.bench import as_table, host, ranged, spread
 from accerl_lerobot.config.ranges import Device, Range, Repeats, Section
-from accerl_lerobot.demos.backbone import write_backbone
+from accerl_lerobot.demos.backbone import Sizes, write_backbone
 from accerl_lerobot.policies.config import TuningConfig
 
 STATE = "observation.state"
 STATE_DIM, ACTION_DIM, TOKENS = 8, 7, 48
 """LIBERO's sizes: end-effector state, end-effector action; length of a padded instruction."""
-SMOLVLM2_500M = {
-    "hidden": 960, "layers": 32, "heads": 15, "kv_heads": 5, "intermediate": 2560, "embeddings": 49280,
-    "vision_hidden": 768, "vision_layers": 12, "vision_heads": 12, "vision_intermediate": 3072,
-    "patch": 16, "image": 512, "shuffle": 4,
-}  # fmt: skip
+SMOLVLM2_500M = Sizes(
+    hidden=960, layers=32, heads=15, kv_heads=5, intermediate=2560, embeddings=49280,
+    vision_hidden=768, vision_layers=12, vision_heads=12, vision_intermediate=3072,
+    patch=16, image=512, shuffle=4,
+)  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -242,6 +242,6 @@ def lerobot_config(config: BenchPolicyConfig, directory: Path) -> Any:
     outputs = {"action": PolicyFeature(type=FeatureType.ACTION, shape=(ACTION_DIM,))}
     fields: dict[str, Any] = {"input_features": inputs, "output_features": outputs, "push_to_hub": False}
     if config.type == "smolvla":
-        backbone = write_backbone(directory / "backbone", [], **SMOLVLM2_500M)
+        backbone = write_backbone(directory / "backbone", [], SMOLVLM2_500M)
         fields |= {"vlm_model_name": str(backbone), "load_vlm_weights": False, "num_vlm_layers": 16}
     return make_policy_config(config.type, **fields, device="cpu")

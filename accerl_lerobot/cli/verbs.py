@@ -23,7 +23,7 @@ from accerl_lerobot.bench.latency import BenchLatencyConfig
 from accerl_lerobot.bench.policy import BenchPolicyConfig
 from accerl_lerobot.bench.throughput import BenchThroughputConfig
 from accerl_lerobot.bench.world import BenchWorldConfig
-from accerl_lerobot.checkpoint.layout import CONFIG, write_atomically
+from accerl_lerobot.checkpoint.layout import CHECKPOINTS, CONFIG, LAST, PRETRAINED, write_atomically
 from accerl_lerobot.cli.export import ExportConfig, export_config, export_episodes
 from accerl_lerobot.config.parsing import read_arguments
 from accerl_lerobot.config.ranges import Device, NewFolder, Section, Seed
@@ -188,13 +188,14 @@ def train(arguments: list[str], load: Load | None = None) -> int:
         f"success {'' if before is None else f'{before:.1%} → '}{summary['success_after']:.1%} "
         f"in {summary['wall_s']:.0f} s; see {directory / 'success_curve.png'}"
     )
-    return _told(summary)
+    console.say(f"policy {directory / CHECKPOINTS / LAST / PRETRAINED}; accerl report {directory} says more")
+    return 0 if sys.stdout.isatty() else _told(summary)
 
 
 def demos(arguments: list[str]) -> int:
     """``accerl demos``."""
     config: DemosRun = parse(DemosRun, arguments, recipe_class=RunConfig)
-    from accerl_lerobot.demos.record import SIDECAR, record_demos
+    from accerl_lerobot.demos.record import record_demos
     from accerl_lerobot.engine.preflight import check_world
     from accerl_lerobot.engine.sizes import check_disk
 
@@ -202,8 +203,6 @@ def demos(arguments: list[str]) -> int:
         check_disk(config.root, "root")
         check_world(config.env)
         path = record_demos(config.env, config.demos, config.root, config.seed)
-        tally = json.loads((path / SIDECAR).read_text())
-        sys.stderr.write("{episodes} episodes, {frames} frames, {successes} successes\n".format(**tally))
     sys.stdout.write(f"{path}\n")
     return 0
 

@@ -42,32 +42,31 @@ class BackboneConfig(Section, section="sft.backbone"):
             raise InputError("sft.backbone.hidden", self.hidden, "use a multiple of 8")
 
 
-def write_backbone(
-    directory: Path,
-    texts: Sequence[str] = (),
-    *,
-    hidden: int = 96,
-    layers: int = 2,
-    heads: int = 4,
-    kv_heads: int = 2,
-    intermediate: int = 0,
-    vision_hidden: int = 64,
-    vision_layers: int = 2,
-    vision_heads: int = 4,
-    vision_intermediate: int = 0,
-    patch: int = 16,
-    image: int = 64,
-    shuffle: int = 2,
-    vocabulary: int = 512,
-    embeddings: int = 0,
-) -> Path:
+@dataclass(frozen=True, kw_only=True)
+class Sizes:
+    """A SmolVLM's sizes: `BackboneConfig`'s, and others that no recipe changes."""
+
+    hidden: int = 96
+    layers: int = 2
+    heads: int = 4
+    kv_heads: int = 2
+    intermediate: int = 0  # 0: twice the width, as below
+    vision_hidden: int = 64
+    vision_layers: int = 2
+    vision_heads: int = 4
+    vision_intermediate: int = 0
+    patch: int = 16
+    image: int = 64
+    shuffle: int = 2  # side of the square of image tokens that become one token of the language model
+    vocabulary: int = 512  # tokens at most
+    embeddings: int = 0  # rows of the table; at least as many as there are tokens
+
+
+def write_backbone(directory: Path, texts: Sequence[str] = (), sizes: Sizes = Sizes()) -> Path:
     """Writes config, tokeniser and image processor into `directory`; no weights.
 
-    The tokeniser merges bytes on `texts` into at most `vocabulary` tokens, so that these instructions
-    become a few tokens instead of one per byte; any other text still encodes, byte by byte. `embeddings`
-    are rows of the table, by default as many as there are tokens; ``intermediate`` widths are by default
-    twice the others. `shuffle` is the side of the square of image tokens that become one token of the
-    language model.
+    The tokeniser merges bytes on `texts`, so that these instructions become a few tokens instead of one per
+    byte; any other text still encodes, byte by byte.
     """
     from tokenizers import Tokenizer, decoders, models, pre_tokenizers, trainers
     from transformers import (
@@ -82,7 +81,7 @@ def write_backbone(
     raw.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
     raw.decoder = decoders.ByteLevel()
     trainer = trainers.BpeTrainer(
-        vocab_size=vocabulary,
+        vocab_size=sizes.vocabulary,
         special_tokens=list(SPECIAL_TOKENS),
         initial_alphabet=sorted(pre_tokenizers.ByteLevel.alphabet()),
         show_progress=False,
@@ -105,24 +104,24 @@ def write_backbone(
     architecture = SmolVLMConfig(
         image_token_id=ids["<image>"],
         pad_token_id=ids["<|pad|>"],
-        scale_factor=shuffle,
+        scale_factor=sizes.shuffle,
         vision_config={
-            "hidden_size": vision_hidden,
-            "intermediate_size": vision_intermediate or 2 * vision_hidden,
-            "num_hidden_layers": vision_layers,
-            "num_attention_heads": vision_heads,
-            "image_size": image,
-            "patch_size": patch,
+            "hidden_size": sizes.vision_hidden,
+            "intermediate_size": sizes.vision_intermediate or 2 * sizes.vision_hidden,
+            "num_hidden_layers": sizes.vision_layers,
+            "num_attention_heads": sizes.vision_heads,
+            "image_size": sizes.image,
+            "patch_size": sizes.patch,
         },
         text_config={
             "model_type": "llama",
-            "hidden_size": hidden,
-            "intermediate_size": intermediate or 2 * hidden,
-            "num_hidden_layers": layers,
-            "num_attention_heads": heads,
-            "num_key_value_heads": kv_heads,
-            "head_dim": hidden // heads,
-            "vocab_size": max(embeddings, len(ids)),
+            "hidden_size": sizes.hidden,
+            "intermediate_size": sizes.intermediate or 2 * sizes.hidden,
+            "num_hidden_layers": sizes.layers,
+            "num_attention_heads": sizes.heads,
+            "num_key_value_heads": sizes.kv_heads,
+            "head_dim": sizes.hidden // sizes.heads,
+            "vocab_size": max(sizes.embeddings, len(ids)),
             "pad_token_id": ids["<|pad|>"],
             "max_position_embeddings": 1024,
             "rms_norm_eps": 1e-5,
@@ -135,7 +134,7 @@ def write_backbone(
         image_processor=SmolVLMImageProcessor(),
         tokenizer=tokenizer,
         video_processor=SmolVLMVideoProcessor(),
-        image_seq_len=(image // patch // shuffle) ** 2,
+        image_seq_len=(sizes.image // sizes.patch // sizes.shuffle) ** 2,
         chat_template="{% for m in messages %}{{ m['content'] }}{% endfor %}",
     ).save_pretrained(directory)
     return directory

@@ -12,12 +12,12 @@ import concurrent.futures
 import importlib.metadata
 import itertools
 import json
-import logging
 import math
 import multiprocessing
 import os
 import shutil
 import signal
+import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -46,7 +46,6 @@ REPO_ID = "accerl/demos"  # name of a recorded dataset, which is where its folde
 SIDECAR = Path("meta") / "accerl_demos.json"
 """Inside the dataset: the two configs, what came of them, and the versions that decide on the physics."""
 
-_logger = logging.getLogger(__name__)
 _MAX_EPISODES = 10_000
 _MAX_TRIES = 50
 MOST_PROCESSES = 8  # simulators at once, each of some 100 MB; a container may see more cores than it has
@@ -311,7 +310,7 @@ def record_demos(env_config: EnvConfig, config: DemosConfig, root: str, seed: in
             "versions": {k: importlib.metadata.version(v) for k, v in _VERSIONS.items() if find_spec(k)},
         }
         (unfinished / SIDECAR).write_text(json.dumps(sidecar, indent=2) + "\n")
-    _logger.info("%s: %s", folder, tally)
+    sys.stderr.write("{episodes} episodes, {frames} frames, {successes} successes\n".format(**tally))
     return folder
 
 

@@ -25,7 +25,7 @@ from accerl_lerobot.checkpoint.layout import CHECKPOINTS, LAST, PRETRAINED, disp
 from accerl_lerobot.checkpoint.safety import Origin, read_json
 from accerl_lerobot.config.parsing import as_text
 from accerl_lerobot.config.ranges import Commit, DatasetConfig, LearningRate, Range, Section, Steps, Threads
-from accerl_lerobot.demos.backbone import BackboneConfig, write_backbone
+from accerl_lerobot.demos.backbone import BackboneConfig, Sizes, write_backbone
 from accerl_lerobot.errors import InputError, check_absent
 from accerl_lerobot.experience import SUCCESS
 from accerl_lerobot.policies.config import discovery, register_policies
@@ -158,7 +158,7 @@ def run_sft(
         config = replace(config, init_path=str(fetched_checkpoint(config.init_path, None, "sft.init_path")))
     output_dir.parent.mkdir(parents=True, exist_ok=True)
     if config.init_path is None and config.backbone is not None:
-        write_backbone(output_dir.parent / "backbone", texts, **vars(config.backbone))
+        write_backbone(output_dir.parent / "backbone", texts, Sizes(**vars(config.backbone)))
     config = _with_backbone_in_place(config, output_dir.parent / "init")
     command = sft_command(config, dataset, output_dir, seed, device, picked(dataset, config.pick))
     logger.info("%s", shlex.join(command))

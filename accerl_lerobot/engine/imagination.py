@@ -38,7 +38,7 @@ from accerl_lerobot.world_model.data import load_datasets, open_datasets
 from accerl_lerobot.world_model.online import OnlineLearner, Promotion
 from accerl_lerobot.world_model.reference import OracleModel, ShuffledModel, learned_part
 from accerl_lerobot.world_model.rollouts import Imagination
-from accerl_lerobot.world_model.store import LEARNT, load_roles, load_world_model, rehearse_world_model
+from accerl_lerobot.world_model.store import load_roles, load_world_model, rehearse_world_model
 from accerl_lerobot.world_model.success_model import SuccessPairsRewardModel
 
 LEARN = "imagination.learn.dataset"
@@ -61,10 +61,8 @@ def make_learner(config: RunConfig) -> OnlineLearner:
     assert success is not None  # only an oracle has none
     roles = load_roles(Path(str(config.imagination.path)), IMAGINATION)
     known = load_datasets({LEARN: config.imagination.learn.dataset}, model.spec).get(LEARN, [])
-    offline = [episode for episode in known if roles.get(episode.key, LEARNT) == LEARNT]
-    held_out = [episode for episode in known if roles.get(episode.key, LEARNT) != LEARNT]
     longest = _longest(world, model.spec.chunk)
-    settings = (config.imagination.learn, offline, held_out, roles, longest, config.seed)
+    settings = (config.imagination.learn, known, roles, longest, config.seed)
     return OnlineLearner(learned_part(model), success, *settings)
 
 

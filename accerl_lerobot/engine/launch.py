@@ -89,7 +89,7 @@ class RayEngine(Engine):
         self._limit = config.launch.stall_s
         self._version = 0 if state is None else saved_version(state)
         self._rollouts = RolloutWorkers(config, tasks, history, state)
-        self._inference = InferenceReplicas(config, self._version, state, load, self._move)
+        self._inference = InferenceReplicas(config, self._version, state, load, self._on_new_inference)
         self._others: list[WorkerSlot] = []
         self._imagining: list[WorkerSlot] = []  # the one that imagines, and the world model's trainer
         self._updates: list[dict[str, float]] = []
@@ -234,12 +234,12 @@ class RayEngine(Engine):
         for worker, reference in [(w, w.actor.ready.remote()) for w in self._everyone()]:
             here = plan.places[worker.name].node.number == 0
             worker.await_start(reference, max(START_S, self._limit), here)
-        self._deciding = self._inference.open()  # the rollout workers share this list, see `_move`
+        self._deciding = self._inference.open()
         self._inserting = self._replay.endpoint("insert", self._limit)
         self._replay.work = self._replay.actor.run.remote()
         self._rollouts.run(self._deciding, self._inserting)
 
-    def _move(self, index: int, inference: Endpoint) -> None:
+    def _on_new_inference(self, index: int, inference: Endpoint) -> None:
         self._deciding[index] = inference
         self._rollouts.move(index, inference)
         if self._imagining and index == len(self._deciding) - 1:

@@ -32,7 +32,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.inference.batcher import merge_metrics
 from accerl_lerobot.metrics import numbered
 from accerl_lerobot.policies.config import Load
-from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, budgets, incarnation_after
+from accerl_lerobot.rollout.runner import EpisodePlan, EpisodePlans, EpisodeResult, budgets, incarnation_after
 from accerl_lerobot.rollout.worker import Report
 from accerl_lerobot.transport.endpoint import Endpoint
 from accerl_lerobot.transport.shared_memory import available
@@ -171,7 +171,7 @@ class RolloutSlot(WorkerSlot):
         self.incarnation = 0  # grows with every process; part of its seeds and of its segments' keys
         self.outstanding: dict[tuple[str, int], EpisodePlan] = {}  # planned episodes without a result
         self.unsent: list[EpisodePlan] = []
-        self.moved: Endpoint | None = None  # where its replica is now, until the process has been told
+        self.new_inference: Endpoint | None = None  # where its replica is now, until it has been told
         self.spent = budget == 0  # True if replay has all episodes of the budget
 
     @property
@@ -221,14 +221,15 @@ class RolloutWorkers(Replicas[RolloutSlot]):
             self._restore(state)
 
     def run(self, inference: list[Endpoint], replay: Endpoint) -> None:
-        self._inference, self._replay = inference, replay
+        self._inference, self._replay = list(inference), replay
         for worker in self._all:
             self._run(worker)
 
     def move(self, replica: int, inference: Endpoint) -> None:
         """Tell the clients of an inference replica its new endpoint."""
+        self._inference[replica] = inference
         for worker in self._all[replica :: len(self._inference)]:
-            worker.moved = inference
+            worker.new_inference = inference
 
     def plan(self, plans: list[EpisodePlan]) -> None:
         for worker in self._all:
@@ -237,8 +238,8 @@ class RolloutWorkers(Replicas[RolloutSlot]):
     def ask(self, training: bool) -> None:
         """Ask each worker for a report, unless one is outstanding."""
         for worker in self._all:
-            if worker.ask("report", training, worker.unsent, self.in_turn, worker.moved):
-                worker.unsent, worker.moved = [], None
+            if worker.ask("report", training, worker.unsent, self.in_turn, worker.new_inference):
+                worker.unsent, worker.new_inference = [], None
 
     def counters(self) -> dict[str, float]:
         """Sums over all processes since the run began."""
@@ -290,8 +291,8 @@ class RolloutWorkers(Replicas[RolloutSlot]):
         actor = ray.remote(RolloutWorker).options(**actor_options(place), max_concurrency=4, **NO_HUB_TOKEN)
         # A node that does not see the run's folder would write a timeline that nobody finds.
         timeline = None if place.node.unseen else c.timeline_folder
-        slot = (worker.index, worker.incarnation, worker.budget)
-        return actor.remote(c.env, c.rollout, self._tasks, c.seed, *slot, self._history, timeline)
+        plans = EpisodePlans(self._tasks, c.seed, worker.budget, worker.index, worker.incarnation)
+        return actor.remote(c.env, c.rollout, plans, self._history, timeline)
 
     def _restart(self, worker: RolloutSlot, error: Exception) -> None:
         if lost := self._has_left(node := self._plan.places[worker.name].node, error):
@@ -300,7 +301,7 @@ class RolloutWorkers(Replicas[RolloutSlot]):
         worker.discard(error, None if lost else self._launch.max_restarts)
         self._past["restarts"] += 1
         self._past.update(worker.counters)
-        worker.incarnation, worker.moved = worker.next_incarnation, None
+        worker.incarnation, worker.new_inference = worker.next_incarnation, None
         worker.unsent = list(worker.outstanding.values())
         worker.occupy(self._new(worker))
         self._run(worker)
@@ -322,7 +323,7 @@ class InferenceReplicas(Replicas[WorkerSlot]):
     """The inference replicas of a run; rollout worker i asks replica i modulo their number.
 
     A restart loses nothing, as a request carries its noise and clients ask the successor again. It gets the
-    newest weights before they are told its address: `moved` is called with its index and endpoint.
+    newest weights before they are told its address: `on_new` is called with its index and endpoint.
     """
 
     def __init__(
@@ -331,11 +332,11 @@ class InferenceReplicas(Replicas[WorkerSlot]):
         version: int,
         state: Path | None,
         load: Load | None,
-        moved: Callable[[int, Endpoint], None],
+        on_new: Callable[[int, Endpoint], None],
     ) -> None:
         super().__init__(config, [WorkerSlot(n) for n in numbered("inference", config.inference.workers)])
         self._arguments = (config.policy, config.inference, version, state, load, config.timeline_folder)
-        self._moved = moved
+        self._on_new = on_new
         self._in_turn = False
         self.restarts = 0  # restarts of all replicas since this engine began
         self.trainer: Any = None  # handle of the trainer, once it publishes weights
@@ -381,7 +382,7 @@ class InferenceReplicas(Replicas[WorkerSlot]):
                 break
             except (RayError, TimeoutError, WorkerError) as again:
                 worker.since, error = math.inf, again
-        self._moved(self._all.index(worker), endpoint)
+        self._on_new(self._all.index(worker), endpoint)
         logger.info("%s worker is up again", worker.name)
 
     def _serve(self, worker: WorkerSlot) -> Endpoint:

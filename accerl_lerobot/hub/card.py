@@ -201,7 +201,6 @@ def model_card(repo_id: str, artifact: str, folder: Path, files: Files, provenan
     sections = [recipe.get(name) or {} for name in ("dataset", "online")]
     # Beside a folder the name is a label, and no dataset on the Hub.
     datasets = [s["repo_id"] for s in sections if s.get("repo_id") and not s.get("root")]
-    stock = lerobot_eval_arguments(env)
     data = ModelCardData(
         library_name="lerobot",
         pipeline_tag="robotics",
@@ -224,12 +223,20 @@ def model_card(repo_id: str, artifact: str, folder: Path, files: Files, provenan
         number=number,
         shown=sorted(name for name in files if name.startswith(f"{FOLDER}/") or "/" not in name),
         recipe_path=f"{local}/{place}" if recipe else None,
-        stock=[*discovery(config.get("type")), *stock] if stock else None,
+        stock=lerobot_eval_command(local, config, env),
         # With one of its own, LeRobot finds the backbone only once a pull has set its place.
         has_backbone=str(config.get("vlm_model_name") or "").startswith(("/", BACKBONE)),
         recipe=own_recipe.decode() if isinstance(own_recipe, bytes) else "",
     )
     return f"{card}\n"
+
+
+def lerobot_eval_command(policy: str, config: Mapping[str, Any], env: Mapping[str, Any]) -> str | None:
+    """Stock LeRobot's evaluation of a policy with this config.json in this environment of a recipe."""
+    stock = lerobot_eval_arguments(env)
+    counts = "--eval.n_episodes=50 --eval.batch_size=5"
+    flags = " ".join([f"--policy.path={policy}", *discovery(config.get("type")), *(stock or ())])
+    return f"lerobot-eval {flags} {counts}" if stock else None
 
 
 def dataset_card(repo_id: str, folder: Path) -> str:

@@ -25,7 +25,7 @@ from accerl_lerobot.experience import TASK, Decision, Request, Segment
 from accerl_lerobot.policies import saving
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.family import Encoded, Family, Model, pooled
-from accerl_lerobot.policies.teacher import PREFIX, Teacher
+from accerl_lerobot.policies.teacher import TEACHER_PREFIX, Teacher
 
 HIDDEN = 128
 OBS_STATE = "observation.state"
@@ -261,7 +261,7 @@ class LeRobotAdapter(PolicyAdapter):
             if parameter.requires_grad
         }
         teacher = {} if self.teacher is None else dict(self.teacher.named_parameters())
-        return named | {PREFIX + name: parameter for name, parameter in teacher.items()}
+        return named | {TEACHER_PREFIX + name: parameter for name, parameter in teacher.items()}
 
     def example_requests(self) -> list[Request]:
         """Two requests with random observations for this policy, and instructions of unequal length."""

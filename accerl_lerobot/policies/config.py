@@ -35,7 +35,7 @@ class SamplerConfig(Section, draccus.ChoiceRegistry, section="policy.sampler"):
 @SamplerConfig.register_subclass("flow")
 @dataclass(frozen=True, kw_only=True)
 class FlowSamplerConfig(SamplerConfig):
-    """Flow policies: the last denoising step is Gaussian; see `flow.py`."""
+    """Flow policies: Gaussian noise on the denoised chunk; see `flow.py`."""
 
     family = "accerl_lerobot.policies.flow:FlowFamily"
 

@@ -64,17 +64,14 @@ class _Finder:
 
 def import_policies(wanted: str | None) -> None:
     """Imports ``lerobot.policies``, and runs the package of one policy type, or of all."""
-    if not os.environ.get(OURS):
-        importlib.import_module(PARENT)
-    if PARENT not in sys.modules:
-        # transformers and diffusers each ask for all installed distributions, 0.7 s here.
-        metadata: Any = importlib.metadata
-        metadata.packages_distributions = functools.cache(metadata.packages_distributions)
-        sys.meta_path.insert(0, _Finder)
-        try:
-            importlib.import_module(PARENT)
-        finally:
-            sys.meta_path.remove(_Finder)
+    importlib.import_module(PARENT)
     for name in [name for name in sys.modules if name.rpartition(".")[0] == PARENT]:
         if wanted is None or name == f"{PARENT}.{wanted}":
             run(sys.modules[name])
+
+
+if os.environ.get(OURS):  # now, as much of LeRobot imports the policies or diffusers
+    # transformers and diffusers each ask for all installed distributions, 0.7 s here.
+    metadata: Any = importlib.metadata
+    metadata.packages_distributions = functools.cache(metadata.packages_distributions)
+    sys.meta_path.insert(0, _Finder)

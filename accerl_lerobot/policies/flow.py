@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Likelihood of flow policies: Gaussian noise in the last denoising step.
+"""Likelihood of flow policies: Gaussian noise on the denoised chunk.
 
 A flow policy integrates x from t = 1 (noise) to t = 0 (action) in N Euler steps of δ = 1/N:
 x ← x − δ·v(x, t). That map has no usable density, so exploration adds N(0, s²) to its result. Given the
@@ -70,7 +70,7 @@ def flow_shape(config: Any, num_steps: int) -> FlowShape:
 
 
 class FlowFamily(Family):
-    """Flow policies explored by noise in their last denoising step. The latent is ``path``, (2, K, D)."""
+    """Flow policies explored by noise on the denoised chunk. The latent is ``path``, (2, K, D)."""
 
     def __init__(self, model: FlowModel, sampler: FlowSamplerConfig) -> None:
         super().__init__(model, sampler)
@@ -81,12 +81,12 @@ class FlowFamily(Family):
 
     def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
         n, size = self.shape.num_steps, (self.shape.chunk_size, self.shape.padded_dim)
-        # Noise of every step is drawn, though only the last is noisy: recorded runs used these numbers.
+        # As many as steps are drawn, though one is used: recorded runs used these numbers.
         x0, eps = self.noise(requests, size, (n, *size), device=encoded.features.device)
         return self.sample(encoded.context, x0, eps[:, -1], self.exploring(requests, x0.device))
 
     def sample(self, velocity: Velocity, x0: Tensor, eps: Tensor, explore: Tensor) -> Action:
-        """Denoises `x0` (B, K, D), where `explore` (B,) with last noise `eps` (B, K, D), else as LeRobot."""
+        """Denoises `x0` (B, K, D), and adds noise `eps` (B, K, D) where `explore` (B,), else as LeRobot."""
         mean = self.shape.integrate(velocity, x0)
         x = torch.where(explore[:, None, None], mean + self._std(x0) * eps, mean)
         return Action(

@@ -19,6 +19,8 @@ from typing import Any, NamedTuple
 
 import draccus
 import torch
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 
 from accerl_lerobot.checkpoint.isolation import rehearse
 from accerl_lerobot.checkpoint.layout import BACKBONE, CONFIG_FOLDERS, PREPROCESSOR, STEP_FOLDERS
@@ -75,8 +77,6 @@ def load_lerobot_config(config: PolicyConfig) -> Any:
     """
     folder = _checkpoint_folder(config)
     kind = _registered_type(config, folder)
-    from lerobot.configs.policies import PreTrainedConfig  # late, see `deferred`: it imports diffusers
-
     with _refusing(config, "its config.json is not one of this LeRobot's policies"):
         sampler_config(config, kind, prefix=f"{config.path} is of this type: ")
         lerobot_config = PreTrainedConfig.from_pretrained(folder)
@@ -131,9 +131,6 @@ def load_adapter(config: PolicyConfig, *, rehearsal: bool = False) -> LeRobotAda
         InputError: see `load_lerobot_config` and `LeRobotAdapter.self_check`; or a file did not load.
     """
     lerobot_config = load_lerobot_config(config)
-    # After the line above, which keeps it from importing the code of all policy types.
-    from lerobot.policies.factory import get_policy_class, make_pre_post_processors
-
     folder, origin = _checkpoint_folder(config), Origin("policy.path", config.path)
     model_class: type[Model] = imported(POLICIES[lerobot_config.type][0])
     with (

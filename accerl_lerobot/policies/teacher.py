@@ -25,7 +25,7 @@ from accerl_lerobot.seeds import episode_of
 WIDTH = 256
 NOISE = 0.25  # standard deviation of its exploration, in normalised action units
 TASK_BITS = 16  # numbers of a state that stand for the task
-PREFIX = "teacher."  # how names of its weights begin among those that are published
+TEACHER_PREFIX = "teacher."  # how names of its weights begin among those that are published
 
 
 class Ensemble(nn.Module):

@@ -40,7 +40,8 @@ class ReplayConfig(Section, section="replay"):
     max_lag: Steps = 50
     """A segment whose oldest decision is more updates behind the trainer than this is retired, at least 0.
 
-    A safety net: choose the pace so that `lag_bound` stays below it, and nothing is thrown away.
+    A safety net: choose the pace so that `lag_bound` stays below it, and nothing is thrown away. What an
+    off-policy algorithm keeps in a memory of its own may be older.
     """
     ahead: Annotated[int, Range("[1, 100000000]")] = 512
     """Decisions to learn from, each counted as often as it will be, that the rollouts may be ahead of the
@@ -94,7 +95,7 @@ def lag_bound(
 ) -> int:
     """The largest lag of a decision that is drawn from replay, in updates, for people to read.
 
-        lag ≤ min(max_lag, pickup + drawn) + prefetch
+        lag ≤ min(max_lag, pickup + drawn + prefetch)
         drawn = ⌊⌈samples_per_insert⌉ · (max(ahead, min_decisions) + 2·in_flight + capacity) / batch⌋ − 1
 
     Between a segment's first decision and its being drawn, each update has drawn a batch out of what was
@@ -107,19 +108,17 @@ def lag_bound(
     """
     decisions = max(config.ahead, config.min_decisions) + 2 * in_flight + config.capacity
     drawn = math.ceil(config.samples_per_insert) * decisions // batch_decisions - 1
-    return min(config.max_lag, pickup + drawn) + prefetch
+    return min(config.max_lag, pickup + drawn + prefetch)
 
 
 def lag_limits(config: RunConfig) -> tuple[int, int]:
     """The largest lag under this recipe, and what its pace alone would allow; in updates."""
-    ahead = 1 if config.launch.engine == "ray" else 0  # of publications under way, and of batches drawn early
+    early = 1 if config.launch.engine == "ray" else 0  # publications under way, and batches drawn early
     batch, in_flight = config.trainer.batch_decisions, config.rollout.in_flight
-    counts = {"batch_decisions": batch, "in_flight": in_flight, "prefetch": ahead}
-    bound, of_pace = (
-        lag_bound(replay, pickup=ahead + config.trainer.hold_back, **counts)
-        for replay in (config.replay, replace(config.replay, max_lag=10**9))
-    )
-    return bound, of_pace
+    counts = {"batch_decisions": batch, "in_flight": in_flight, "prefetch": early}
+    counts["pickup"] = early + config.trainer.hold_back
+    of_pace = lag_bound(replace(config.replay, max_lag=10**9), **counts)
+    return lag_bound(config.replay, **counts), of_pace
 
 
 Schedule = Literal["asynchronous", "overlap", "synchronous"]

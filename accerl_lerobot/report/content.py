@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 import yaml
 
-from accerl_lerobot.checkpoint.layout import SUMMARY
+from accerl_lerobot.checkpoint.layout import CHECKPOINTS, LAST, PRETRAINED, SUMMARY
 from accerl_lerobot.config.parsing import decode
 from accerl_lerobot.console import count, duration, number, percent, rate
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.hub.card import lerobot_eval_command, read_json
 from accerl_lerobot.replay.pacing import lag_limits
 from accerl_lerobot.report.charts import COLOURS, Chart, Series, line, rates
 from accerl_lerobot.report.read import Record, Run, apart, column, differences, newest
@@ -127,6 +128,7 @@ def run_page(run: Run, now: float) -> dict[str, Any]:
     sections = [
         success,
         Section("Videos", videos=videos),
+        Section("Policy", tables=_uses(run)),
         *others,
         Section("Recipe", text, tables=tables, details=run.config_text),
     ]
@@ -138,6 +140,16 @@ def run_page(run: Run, now: float) -> dict[str, Any]:
         "warnings": list(warnings(run, bound, now)),
         "sections": [section for section in sections if not section.empty],
     }
+
+
+def _uses(run: Run) -> list[Table]:
+    policy = run.path.resolve() / CHECKPOINTS / LAST / PRETRAINED
+    if not policy.is_dir():
+        return []
+    rows = [("publish it", f"accerl push --path={policy} --repo_id=USER/NAME")]
+    if stock := lerobot_eval_command(str(policy), read_json(policy / "config.json"), run.section("env")):
+        rows.insert(0, ("evaluate it with LeRobot alone", stock))
+    return [(f"{policy}, a LeRobot checkpoint", ("", "command"), rows)]
 
 
 def comparison_page(runs: Sequence[Run], now: float) -> dict[str, Any]:

@@ -154,12 +154,17 @@ def incarnation_after(incarnation: int, starts: int) -> int:
 
 
 class EpisodePlans:
-    """The episodes of one worker, in order."""
+    """The episodes of one worker, in order.
+
+    `incarnation` is how often the worker has been restarted, part of the seeds and of its segments' keys;
+    `budget` limits the exploring ones.
+    """
 
     def __init__(
         self, tasks: tuple[str, ...], seed: int, budget: int | None, worker: int = 0, incarnation: int = 0
     ) -> None:
-        self._tasks, self._seed, self._worker, self._budget = tasks, seed, worker, budget
+        self.worker, self.incarnation = worker, incarnation
+        self._tasks, self._seed, self._budget = tasks, seed, budget
         self.starts = incarnation * STARTS_PER_INCARNATION  # where it is in the worker's seeds
         # Filled and emptied on different threads: appending to and popping from a deque is atomic.
         self._queued: deque[EpisodePlan] = deque()
@@ -176,8 +181,8 @@ class EpisodePlans:
         if self._budget is not None:
             self._budget -= 1
         number, self.starts = self.starts, self.starts + 1
-        task = self._tasks[(number + self._worker) % len(self._tasks)]
-        return EpisodePlan(task=task, seed=train_seed(self._seed, self._worker, number), explore=True)
+        task = self._tasks[(number + self.worker) % len(self._tasks)]
+        return EpisodePlan(task=task, seed=train_seed(self._seed, self.worker, number), explore=True)
 
     @property
     def spent(self) -> bool:

@@ -51,27 +51,18 @@ class Report:
 
 
 class RolloutWorker:
-    """Becomes a threaded Ray actor in `launch`: `run` on one thread, `report` on another.
-
-    `incarnation` is how often it has been restarted, part of the segments' keys and of the seeds; `budget`
-    limits the exploring episodes.
-    """
+    """Becomes a threaded Ray actor in `launch`: `run` on one thread, `report` on another."""
 
     def __init__(
         self,
         env: EnvConfig,
         config: RolloutConfig,
-        tasks: tuple[str, ...],
-        seed: int,
-        index: int = 0,
-        incarnation: int = 0,
-        budget: int | None = None,
+        plans: EpisodePlans,
         history: int = 1,
         timeline: Path | None = None,
     ) -> None:
-        self._clock = open_clock(timeline, f"rollout {index}")
-        self._plans = EpisodePlans(tasks, seed, budget, index, incarnation)
-        self._spent = False
+        self._clock = open_clock(timeline, f"rollout {plans.worker}")
+        self._plans, self._spent = plans, False
         self._max_pending = MAX_PENDING
         # Shared by the two threads: appending to and popping from a deque is atomic.
         self._results: deque[EpisodeResult] = deque()
@@ -81,7 +72,8 @@ class RolloutWorker:
         self._deciding = ReconnectingClient("inference")
         worlds = [make_world(env, history, config.reward_model) for _ in range(config.worlds)]
         callbacks = self._outbox.append, self._results.append
-        self._runner = RolloutRunner(worlds, self._next, config, f"rollout{index}.{incarnation}", *callbacks)
+        name = f"rollout{plans.worker}.{plans.incarnation}"
+        self._runner = RolloutRunner(worlds, self._next, config, name, *callbacks)
         self._clock.enter(WAIT_IN)
 
     def ready(self) -> int:

@@ -23,7 +23,7 @@ from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.ranks import ALONE, Ranks
 from accerl_lerobot.trainer.sharding import swapped_in
 
-CRITIC = "value_head."  # how names of the critic's weights begin
+CRITIC_PREFIX = "value_head."  # how names of the critic's weights begin
 CLIP = 0.2  # PPO's usual range: a mismatch outside it would be clipped as if the policy had moved
 
 
@@ -32,7 +32,7 @@ class Probe:
 
     def __init__(self, adapter: PolicyAdapter, config: TrainerConfig, ranks: Ranks = ALONE) -> None:
         self.adapter, self._config, self._ranks = adapter, config, ranks
-        self._live = [p for name, p in adapter.trainable().items() if not name.startswith(CRITIC)]
+        self._live = [p for name, p in adapter.trainable().items() if not name.startswith(CRITIC_PREFIX)]
         self._copy: list[Tensor] = []
         self._version: int | None = None  # version of the copy; None: there is none
         self._next = 0

@@ -28,10 +28,10 @@ from accerl_lerobot.config.parsing import imported
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.policies.adapter import PolicyAdapter
-from accerl_lerobot.policies.teacher import PREFIX
+from accerl_lerobot.policies.teacher import TEACHER_PREFIX
 from accerl_lerobot.trainer.batch import MAX_NONFINITE, Batch, NonFiniteError, collate, pick, turns
 from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.trainer.probe import CRITIC, Probe
+from accerl_lerobot.trainer.probe import CRITIC_PREFIX, Probe
 from accerl_lerobot.trainer.ranks import ALONE, Ranks
 from accerl_lerobot.trainer.sharding import arrange, synchronise
 
@@ -52,8 +52,8 @@ class BaseUpdate(ABC):
         self.version = self.skipped = self._skipped_in_a_row = 0
         self._schedule_updates = config.updates
         named = adapter.trainable().items()
-        self._policy = [p for k, p in named if not k.startswith((CRITIC, PREFIX))]
-        self._value = [p for k, p in named if k.startswith(CRITIC)]
+        self._policy = [p for k, p in named if not k.startswith((CRITIC_PREFIX, TEACHER_PREFIX))]
+        self._value = [p for k, p in named if k.startswith(CRITIC_PREFIX)]
         self.optimizer = torch.optim.AdamW(self._policy, lr=config.lr, betas=config.betas, weight_decay=0.0)
 
     @abstractmethod

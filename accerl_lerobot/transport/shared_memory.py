@@ -60,7 +60,7 @@ def aligned(offset: int) -> int:
     return -(-offset // ALIGNMENT) * ALIGNMENT
 
 
-class Encoded(NamedTuple):
+class Packed(NamedTuple):
     """A message that is ready to be written; its arrays are still the sender's."""
 
     header: bytes
@@ -77,7 +77,7 @@ class Encoded(NamedTuple):
             end = aligned(end) + array.nbytes
 
 
-def encode(message: Any) -> Encoded:
+def pack(message: Any) -> Packed:
     """Encode what `snapshot` can save; a `TypeError` names the place of anything else."""
     named: dict[str, np.ndarray] = {}
     tree = to_json(message, "message", named)
@@ -86,10 +86,10 @@ def encode(message: Any) -> Encoded:
     size = _SIZE.size + len(header)
     for array in arrays:
         size = aligned(size) + array.nbytes
-    return Encoded(header, arrays, size)
+    return Packed(header, arrays, size)
 
 
-def decode(buffer: Any, start: int = 0, *, copy: bool = True) -> Any:
+def unpack(buffer: Any, start: int = 0, *, copy: bool = True) -> Any:
     """Decode the message that begins at `start`; unless `copy`, its arrays are views of the buffer."""
     (length,) = _SIZE.unpack_from(buffer, start)
     end = start + _SIZE.size + length
@@ -197,18 +197,18 @@ class SharedMemoryClient(Client):
         self._sent = 0
 
     def send(self, message: object) -> int:
-        encoded, file = encode(message), None
+        packed, file = pack(message), None
         if not self._free and len(self._slots) == SLOTS:
             raise TimeoutError(f"{self.name}: none of {SLOTS} messages under way has been answered")
         index = self._free.pop() if self._free else len(self._slots)
-        if index == len(self._slots) or len(self._slots[index]) < encoded.size:
-            slot, file = new_slot(encoded.size + LEAST)
+        if index == len(self._slots) or len(self._slots[index]) < packed.size:
+            slot, file = new_slot(packed.size + LEAST)
             self._slots[index : index + 1] = [slot]
-        encoded.write(self._slots[index], 0)
+        packed.write(self._slots[index], 0)
         self._sent += 1
         self._under_way[self._sent] = index
         try:
-            send_token(self._socket, Token(False, index, self._sent, 0, encoded.size, time.monotonic()), file)
+            send_token(self._socket, Token(False, index, self._sent, 0, packed.size, time.monotonic()), file)
         except OSError as error:
             raise self._gone(error) from error
         return self._sent
@@ -238,7 +238,7 @@ class SharedMemoryClient(Client):
         if slot is not None:
             self._slots[index] = slot
         self._free.append(index)
-        reply = decode(self._slots[index], token.start)
+        reply = unpack(self._slots[index], token.start)
         if token.failed:
             raise ServiceStoppedError(f"{self.name}: {reply}")
         return token.ticket, reply
@@ -346,20 +346,20 @@ class SharedMemoryServer(Server):
         token, slot = packet
         if slot is not None:
             connection.slots[token.slot] = slot
-        message = decode(connection.slots[token.slot], token.start, copy=self._copy)
+        message = unpack(connection.slots[token.slot], token.start, copy=self._copy)
         reply = functools.partial(self._reply, connection, token)
         sent = min(token.sent, time.monotonic())
         received.append(PendingRequest(message, sent, lambda: connection.closed, reply))
 
     def _reply(self, to: _Connection, asked: Token, reply: object, error: BaseException | None) -> None:
         """Write it behind the message, whose arrays it may consist of, or into a larger slot."""
-        encoded = encode(reply if error is None else str(stopped(error)))
+        packed = pack(reply if error is None else str(stopped(error)))
         start, file = aligned(asked.start + asked.size), None
-        if start + encoded.size > len(to.slots[asked.slot]):
-            to.slots[asked.slot], file = new_slot(start + encoded.size)
+        if start + packed.size > len(to.slots[asked.slot]):
+            to.slots[asked.slot], file = new_slot(start + packed.size)
             start = 0
-        encoded.write(to.slots[asked.slot], start)
-        token = asked._replace(failed=error is not None, start=start, size=encoded.size)
+        packed.write(to.slots[asked.slot], start)
+        token = asked._replace(failed=error is not None, start=start, size=packed.size)
         try:
             send_token(to.socket, token, file)
         except OSError:  # it has died, or does not read although it may have few messages under way

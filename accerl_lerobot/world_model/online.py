@@ -80,8 +80,8 @@ class Promotion(NamedTuple):
 class OnlineLearner:
     """Trains as real segments come in: `add`, `step` while any is pending, `promote` when validation is due.
 
-    It starts at a copy of both models, and knows episodes to train on and held-out ones, and the `roles` of
-    those it was trained and validated on before. A rollout has `longest` chunks at most.
+    It starts at a copy of both models. Of the `known` episodes it trains on those without another role in
+    `roles`, those that it was trained and validated on before. A rollout has at most `longest` chunks.
     """
 
     def __init__(
@@ -89,8 +89,7 @@ class OnlineLearner:
         model: LearnableWorldModel,
         success: SuccessPairsRewardModel,
         config: OnlineLearnConfig,
-        offline: Sequence[Episode] = (),
-        held_offline: Sequence[Episode] = (),
+        known: Sequence[Episode] = (),
         roles: Mapping[str, str] | None = None,
         longest: int = 15,
         seed: int = 0,
@@ -107,8 +106,9 @@ class OnlineLearner:
         )
         self._learner = Learner(copy.deepcopy(model).requires_grad_(True), training, seed)
         self._success = SuccessLearner(copy.deepcopy(success).requires_grad_(True), training, seed)
-        self._offline, self._held_offline = list(offline), list(held_offline)
         self._roles = {key: LEARNT if role == LEARNT else HELD_OUT for key, role in (roles or {}).items()}
+        self._offline = [e for e in known if self._roles.get(e.key, LEARNT) == LEARNT]
+        self._held_offline = [e for e in known if self._roles.get(e.key, LEARNT) != LEARNT]
         self._roles |= {episode.key: LEARNT for episode in self._offline}
         self._learnt: deque[Episode] = deque(maxlen=MEMORY)
         self._held: deque[Episode] = deque(maxlen=max(1, round(MEMORY * config.held_out)))

@@ -105,8 +105,9 @@ def pretrain(run: WorldModelRun, directory: Path, console: Console) -> dict[str,
     store.save_world_model(directory / "world_model", serving, success, roles)
     with console.stage("validation"):
         found = validation.validate_datasets(
-            serving, held_out, config.validation, success, directory, fresh=fresh, seed=run.seed
+            serving, held_out, config.validation, success, fresh=fresh, seed=run.seed
         )
+        validation.preview_videos(directory, serving, held_out, config.validation, run.seed)
     success.config.threshold = found["datasets"][fresh]["threshold"]
     success.save_pretrained(directory / "world_model" / store.SUCCESS)
     counts = {"learnt": data.count_episodes(learnt), "held_out": data.count_episodes(held)}

@@ -196,16 +196,18 @@ def _checks(
     }
 
 
-def preview_video(
-    path: Path, model: WorldModel, episodes: Sequence[Episode], config: ValidationConfig, seed: int
+def preview_videos(
+    folder: Path, model: WorldModel, datasets: dict[str, list[Episode]], config: ValidationConfig, seed: int
 ) -> None:
     """Real frames, predicted ones, and those predicted with another episode's actions, one row each."""
-    rng = np.random.default_rng((seed, 3))
-    windows = validation_windows(episodes, model, replace(config, max_windows=PREVIEW_ROWS), seed)
-    lines = [windows.frames[:, windows.context - 1 :]]
-    for of in (windows, data.shuffle_actions(windows, rng)):
-        lines.append(predict(model, windows, of.actions).frames)
-    write_video(path, [[list(_enlarge(clip)) for clip in line] for line in lines], fps=FPS)
+    for name, episodes in datasets.items():
+        rng = np.random.default_rng((seed, 3))
+        windows = validation_windows(episodes, model, replace(config, max_windows=PREVIEW_ROWS), seed)
+        lines = [windows.frames[:, windows.context - 1 :]]
+        for of in (windows, data.shuffle_actions(windows, rng)):
+            lines.append(predict(model, windows, of.actions).frames)
+        video = folder / ("preview.mp4" if name == DATASET else f"preview_{name}.mp4")
+        write_video(video, [[list(_enlarge(clip)) for clip in line] for line in lines], fps=FPS)
 
 
 def _enlarge(frames: np.ndarray) -> np.ndarray:
@@ -219,13 +221,12 @@ def validate_datasets(
     datasets: dict[str, list[Episode]],
     config: ValidationConfig,
     success: SuccessPairsRewardModel,
-    directory: Path,
     *,
     fresh: str | None,
     threshold: float | None = None,
     seed: int = 0,
 ) -> dict[str, Any]:
-    """Validates a world model on each dataset, by its name, and makes a video of each in `directory`.
+    """Validates a world model on each dataset, by its name.
 
     On the dataset `fresh` the success threshold is chosen: of each fold, on the others. All other datasets
     are classified by `threshold`; None: the one that is chosen on all of `fresh`.
@@ -239,8 +240,6 @@ def validate_datasets(
         given = None if name == fresh else threshold
         results[name] = validate(model, datasets[name], config, success, seed, given)
         threshold = results[name]["threshold"] if threshold is None else threshold
-        video = "preview.mp4" if name == DATASET else f"preview_{name}.mp4"
-        preview_video(directory / video, model, datasets[name], config, seed)
     checks = {
         check if name == DATASET else f"{name}.{check}": held
         for name in datasets
@@ -283,13 +282,6 @@ def evaluate(config: WorldModelEvalRun, directory: Path, console: Console) -> di
             fresh = name
         datasets[name] = kept
     with console.stage("validation"):
-        return validate_datasets(
-            model.to(device),
-            datasets,
-            config.validation,
-            success.to(device),
-            directory,
-            fresh=fresh,
-            threshold=success.config.threshold,
-            seed=config.seed,
-        )
+        preview_videos(directory, model.to(device), datasets, config.validation, config.seed)
+        known = {"fresh": fresh, "threshold": success.config.threshold, "seed": config.seed}
+        return validate_datasets(model, datasets, config.validation, success.to(device), **known)

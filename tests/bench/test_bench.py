@@ -86,7 +86,7 @@ def test_three_arms_in_turns(env: EnvConfig, least: float):
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     build = bench.lerobot_config
-    sizes = {"hidden": 32, "heads": 2, "kv_heads": 1, "vision_hidden": 16, "vision_layers": 1, "patch": 32}
+    sizes = backbone.Sizes(hidden=32, heads=2, kv_heads=1, vision_hidden=16, vision_layers=1, patch=32)
     monkeypatch.setattr(bench, "SMOLVLM2_500M", sizes)
 
     def shrunk(config: BenchPolicyConfig, directory: Path) -> Any:
@@ -111,6 +111,6 @@ def test_it_measures(small: None, precision: str, low: float, high: float) -> No
 
 
 def test_the_published_backbone_has_the_published_size(tmp_path: Path) -> None:
-    backbone.write_backbone(tmp_path / "b", **bench.SMOLVLM2_500M)
+    backbone.write_backbone(tmp_path / "b", sizes=bench.SMOLVLM2_500M)
     text = json.loads((tmp_path / "b" / "config.json").read_text())["text_config"]
     assert (text["hidden_size"], text["intermediate_size"], text["vocab_size"]) == (960, 2560, 49280)

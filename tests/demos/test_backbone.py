@@ -6,7 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from accerl_lerobot.demos.backbone import SPECIAL_TOKENS, write_backbone
+from accerl_lerobot.demos.backbone import SPECIAL_TOKENS, Sizes, write_backbone
 
 TEXTS = ["Open the door", "Close the drawer"]
 
@@ -31,7 +31,7 @@ def test_the_vocabulary_is_bounded_and_ids_are_those_of_the_config(tmp_path: Pat
     from transformers import AutoConfig
 
     many = [f"Task number {i} of a benchmark: {i * 7919}" for i in range(200)]
-    directory = write_backbone(tmp_path / "backbone", many, vocabulary=300)
+    directory = write_backbone(tmp_path / "backbone", many, Sizes(vocabulary=300))
     tokenizer, config = tokenizer_of(directory), AutoConfig.from_pretrained(directory)
     assert len(tokenizer) == config.text_config.vocab_size <= 300
     assert config.image_token_id == tokenizer.convert_tokens_to_ids("<image>")

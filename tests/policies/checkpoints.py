@@ -59,11 +59,11 @@ def write_policy(
 
 def with_backbone(directory: Path, image: int) -> dict[str, Any]:
     """Fields of a policy on a tiny SmolVLM, which is written beside the policy's folder."""
-    from accerl_lerobot.demos.backbone import write_backbone
+    from accerl_lerobot.demos.backbone import Sizes, write_backbone
 
-    sizes = {"hidden": 32, "heads": 2, "kv_heads": 1, "patch": 8, "image": image}
-    sizes |= {"vision_hidden": 16, "vision_layers": 1, "vision_heads": 2}
-    backbone = write_backbone(directory.parent / f"{directory.name}-backbone", ["Match the target"], **sizes)
+    vision = {"vision_hidden": 16, "vision_layers": 1, "vision_heads": 2, "patch": 8, "image": image}
+    sizes = Sizes(hidden=32, heads=2, kv_heads=1, **vision)
+    backbone = write_backbone(directory.parent / f"{directory.name}-backbone", ["Match the target"], sizes)
     return {
         "image": image,
         "vlm_model_name": str(backbone),

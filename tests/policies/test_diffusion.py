@@ -18,7 +18,7 @@ from accerl_lerobot.experience import TASK, Request
 from accerl_lerobot.policies.adapter import stack_observations
 from accerl_lerobot.policies.config import DiffusionSamplerConfig, PolicyConfig
 from accerl_lerobot.policies.family import Family
-from accerl_lerobot.rollout.runner import RolloutConfig
+from accerl_lerobot.rollout.runner import EpisodePlans, RolloutConfig
 from accerl_lerobot.rollout.worker import RolloutWorker
 from accerl_lerobot.trainer.config import TrainerConfig
 from tests.policies.checkpoints import write_diffusion
@@ -149,7 +149,7 @@ def test_a_world_without_a_history_is_refused_in_words(looking: Path):
 
 
 def test_a_rollout_process_asks_with_the_history():
-    worker = RolloutWorker(WORLD, RolloutConfig(worlds=1), ("match",), 0, history=OBSERVED)
+    worker = RolloutWorker(WORLD, RolloutConfig(worlds=1), EpisodePlans(("match",), 0, None), OBSERVED)
     asked: list[Request] = []
 
     def decide(due: list[Request]) -> list[Request]:

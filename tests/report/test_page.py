@@ -63,6 +63,7 @@ def test_a_run_that_was_really_made(tiny_checkpoint: Path, tmp_path: Path) -> No
     (video,) = seen.named("video")
     assert video["src"].startswith("data:video/mp4;base64,") and "controls" in video
     assert "trainer.updates 12 1000" in seen.text and "env.type simulated metaworld" in seen.text
+    assert f"lerobot-eval --policy.path={directory}/checkpoints/last/pretrained_model --env.disc" in seen.text
 
 
 def test_everything_needed_is_inside(pictures: None, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ import pytest
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.experience import Decision, Request, Segment
 from accerl_lerobot.rollout import worker as module
-from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutConfig
+from accerl_lerobot.rollout.runner import EpisodePlan, EpisodePlans, EpisodeResult, RolloutConfig
 from accerl_lerobot.rollout.worker import MAX_PENDING, RolloutWorker
 from accerl_lerobot.transport.contract import ServiceStoppedError
 from tests.rollout.worlds import evaluate
@@ -38,7 +38,7 @@ class Stage:
     """A worker whose loop runs on a thread; `inference` answers at once, `replay` as the test says."""
 
     def __init__(self, config: RolloutConfig, insert: Callable[[list[Segment]], Any]) -> None:
-        self.worker = RolloutWorker(WORLD, config, ("match",), 0)
+        self.worker = RolloutWorker(WORLD, config, EpisodePlans(("match",), 0, None))
         self.episodes: list[EpisodeResult] = []
         self.explored = 0
         self.over = False
@@ -224,7 +224,7 @@ def test_a_world_that_hangs_shows_in_the_report(stage, monkeypatch: pytest.Monke
 
 def test_who_has_not_been_set_to_work_does_not_hang():
     """Others may take long to start."""
-    worker = RolloutWorker(WORLD, RolloutConfig(worlds=1), ("match",), 0)
+    worker = RolloutWorker(WORLD, RolloutConfig(worlds=1), EpisodePlans(("match",), 0, None))
     time.sleep(0.05)
     report = worker.report(True, [])
     assert (report.busy_s, report.in_world) == (0.0, False)

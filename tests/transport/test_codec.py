@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from accerl_lerobot.transport.shared_memory import decode, encode
+from accerl_lerobot.transport.shared_memory import pack, unpack
 from tests.transport.contract import messages, same
 
 
 def written(message: Any, start: int = 0, room: int = 0) -> bytearray:
-    encoded = encode(message)
-    buffer = bytearray(start + encoded.size + room)
-    encoded.write(buffer, start)
+    packed = pack(message)
+    buffer = bytearray(start + packed.size + room)
+    packed.write(buffer, start)
     return buffer
 
 
@@ -25,13 +25,13 @@ def written(message: Any, start: int = 0, room: int = 0) -> bytearray:
 def test_what_is_written_is_read(start: int, copy: bool):
     for message in messages():
         buffer = written(message, start, room=100)
-        assert same(decode(buffer, start, copy=copy), message)
+        assert same(unpack(buffer, start, copy=copy), message)
 
 
 def test_views_are_of_the_buffer_and_copies_are_not():
     message = {"image": np.zeros(100, np.uint8)}
     buffer = written(message)
-    view, copy = (decode(buffer, copy=own)["image"] for own in (False, True))
+    view, copy = (unpack(buffer, copy=own)["image"] for own in (False, True))
     buffer[:] = b"\xff" * len(buffer)
     assert (view == 255).all() and (copy == 0).all()
 
@@ -54,4 +54,4 @@ class Stranger:
 )
 def test_what_cannot_be_sent_is_refused(message: Any, said: str):
     with pytest.raises(TypeError, match=said):
-        encode(message)
+        pack(message)

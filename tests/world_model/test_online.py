@@ -26,13 +26,15 @@ from accerl_lerobot.world_model.online import (
     episode_weights,
 )
 from accerl_lerobot.world_model.pixels import PixelWorldModel
+from accerl_lerobot.world_model.store import HELD_OUT
 from tests.runs import adjusted
 from tests.world_model.real_segments import SPEC, K, real_episode
 
 
 def learner(**config: Any) -> OnlineLearner:
     torch.manual_seed(0)
-    known = (config.pop("offline", []), config.pop("held_out_offline", []))
+    held_out = config.pop("held_out_offline", [])
+    known = config.pop("offline", []) + held_out, {episode.key: HELD_OUT for episode in held_out}
     fields: dict[str, Any] = {"steps_per_episode": 2.0, "validate_every": 4, "held_out": 0.25}
     fields |= {"validation": ValidationConfig(depth=2)} | config
     learn = adjusted(OnlineLearnConfig, **fields)(steps_per_episode=fields.pop("steps_per_episode"))

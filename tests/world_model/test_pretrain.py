@@ -294,7 +294,7 @@ def test_one_that_does_not_know_the_dataset_is_tried_on_all_of_it(
     assert {name: one["episodes"] for name, one in found["datasets"].items()} == {DATASET: 8}
 
 
-def test_a_threshold_is_chosen_anew_only_where_it_comes_from(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+def test_a_threshold_is_chosen_anew_only_where_it_comes_from(monkeypatch: pytest.MonkeyPatch):
     calls: list[tuple[str, float | None]] = []
 
     def validate(model: Any, episodes: Any, config: Any, success: Any, seed: int, threshold: Any) -> Any:
@@ -303,7 +303,6 @@ def test_a_threshold_is_chosen_anew_only_where_it_comes_from(monkeypatch: pytest
         return {"checks": {"skill": check}, "threshold": 0.6 if threshold is None else threshold}
 
     monkeypatch.setattr(validation, "validate", validate)
-    monkeypatch.setattr(validation, "preview_video", lambda path, *_: None)
     datasets: Any = {DATASET: "demos", ONLINE: "a policy's"}
     for fresh, saved, wanted in (
         (ONLINE, None, [("a policy's", None), ("demos", 0.6)]),
@@ -312,8 +311,6 @@ def test_a_threshold_is_chosen_anew_only_where_it_comes_from(monkeypatch: pytest
     ):
         calls.clear()
         of: dict[str, Any] = {"model": None, "success": None, "fresh": fresh, "threshold": saved}
-        found = validation.validate_datasets(
-            datasets=datasets, config=ValidationConfig(), directory=tmp_path, **of
-        )
+        found = validation.validate_datasets(datasets=datasets, config=ValidationConfig(), **of)
         assert calls == wanted and list(found["datasets"]) == [DATASET, ONLINE] and not found["passed"]
         assert {k: c["holds"] for k, c in found["checks"].items()} == {"skill": True, "online.skill": False}
