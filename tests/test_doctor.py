@@ -191,7 +191,7 @@ class TestResources:
 
     def test_a_pace_that_would_waste_is_warned_about(self) -> None:
         lag = checks(self.recipe(replay={"max_lag": 3}))["lag"]
-        assert lag.status == WARN and lag.text.startswith("at most 4 updates") and "thrown away" in lag.text
+        assert lag.status == WARN and lag.text.startswith("at most 3 updates") and "thrown away" in lag.text
 
 
 def test_imagination_is_checked_where_there_is_any(capsys: pytest.CaptureFixture[str]) -> None:
