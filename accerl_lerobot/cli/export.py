@@ -70,7 +70,7 @@ def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
     """Writes the dataset, which appears at ``config.root`` when it is complete.
 
     Returns:
-        ``episodes``, ``frames``, ``successes``, and ``unlike``, those that differed and were left out.
+        ``episodes``, ``frames``, ``successes``, and ``left_out``, those that played otherwise than the run's.
     """
     run, root = Path(str(config.path)).expanduser(), record.check_free(config.root)
     wanted, picks_all = config.pick == "successes", config.pick == "all"
@@ -92,7 +92,7 @@ def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
 def _write(config: ExportConfig, chosen: list[list[Done]], root: Path, console: Console) -> dict[str, int]:
     with closing(make_world(config.env)) as world:
         spec = world.spec
-    tally = {"episodes": 0, "frames": 0, "successes": 0, "unlike": 0}
+    tally = {"episodes": 0, "frames": 0, "successes": 0, "left_out": 0}
     version = {VERSION: {"dtype": "int64", "shape": (1,), "names": None}}
     stored = read_recipe(Path(str(config.path)).expanduser() / CONFIG).get("rollout")
     given = {k: v for k, v in stored.items() if k == "decision_cost"} if isinstance(stored, dict) else {}
@@ -105,12 +105,12 @@ def _write(config: ExportConfig, chosen: list[list[Done]], root: Path, console: 
         for number, (episode, parts) in enumerate(zip(repeated, chosen, strict=True), start=1):
             stage.update(number, f"{tally['successes']} successes")
             if episode is None:
-                tally["unlike"] += 1
+                tally["left_out"] += 1
                 continue
             versions = np.concatenate([np.repeat(part.versions, part.steps) for part in parts])
             record.save_episode(dataset, episode, tally, {VERSION: versions[:, None].astype(np.int64)})
-    if tally["unlike"]:
-        console.say(f"{tally['unlike']} of {len(chosen)} episodes differed from the run and are left out")
+    if tally["left_out"]:
+        console.say(f"{tally['left_out']} of {len(chosen)} episodes differed from the run and are left out")
     return tally
 
 

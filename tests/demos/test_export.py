@@ -45,7 +45,7 @@ def test_every_whole_episode_is_in_the_dataset_step_by_step(run, tmp_path, capsy
     assert exported(run, tmp_path / "set") == 0
     found = json.loads(capsys.readouterr().out)
     episodes = list(whole_episodes(read_journal(run / "episodes.jsonl")))
-    assert found["episodes"] == len(episodes) > 8 and found["unlike"] == 0
+    assert found["episodes"] == len(episodes) > 8 and found["left_out"] == 0
     assert found["successes"] == sum(e[-1].success for e in episodes)
     assert 0 < found["successes"] < len(episodes), "there is something to tell apart"
     dataset = LeRobotDataset("accerl/rollouts", root=tmp_path / "set")
@@ -101,7 +101,7 @@ def test_episodes_that_cannot_be_repeated_are_left_out(run, tmp_path, capsys):
     capsys.readouterr()
     assert exported(other, tmp_path / "set") == 0
     out, err = capsys.readouterr()
-    assert json.loads(out)["unlike"] == 1 and "differed from the run and are left out" in err
+    assert json.loads(out)["left_out"] == 1 and "differed from the run and are left out" in err
     (other / "episodes.jsonl").write_text(json.dumps(changed | {"ended": True}) + "\n")
     assert exported(other, tmp_path / "second") == 2
     assert "none of its episodes could be repeated" in capsys.readouterr().err
