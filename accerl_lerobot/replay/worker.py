@@ -156,6 +156,8 @@ class ReplayWorker:
 
     async def save(self, directory: Path, version: int) -> None:
         """Writes its part of ``training_state``, as it was when the trainer had made `version` updates."""
+        if self._failure is not None:  # a segment may be stored that the journal could not take
+            raise self._failure
         self._clock.enter(CHECKPOINT)
         fault_point("replay.save")
         state = {

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -98,8 +99,7 @@ def test_sample_waits_for_what_is_new():
 def test_sample_that_finds_everything_too_old_lets_rollouts_in_and_waits_on():
     async def scene(worker: ReplayWorker) -> None:
         await worker.insert([make_segment("old", 8, version=0)])
-        late = start(worker.insert([make_segment("new", 8, version=9)]))
-        assert await waits(late)
+        assert await waits(late := start(worker.insert([make_segment("new", 8, version=9)])))
         segments = await worker.sample(BATCH, trainer_version=9)
         assert [s.key for s in segments] == ["new"] and await late
         assert (await worker.metrics())["retired_segments"] == 1
@@ -117,13 +117,13 @@ def test_what_breaks_in_here_ends_this_worker_and_blames_nobody_else(broken: str
 
         running = start(worker.run())
         await worker.insert([make_segment("a", 8)])
-        late = start(worker.insert([make_segment("b", 8)]))
-        assert await waits(late)
+        assert await waits(start(worker.insert([make_segment("b", 8)])))
         setattr(worker._replay, broken, fall_over)
         with pytest.raises(ServiceStoppedError, match="no space left"):
             await (worker.sample(BATCH, 0) if broken == "sample" else worker.insert([make_imagined("c")]))
-        with pytest.raises(OSError, match="no space left"):
-            await running
+        for refused in (running, worker.save(Path("nowhere"), 1)):  # no checkpoint of what is half done
+            with pytest.raises(OSError, match="no space left"):
+                await refused
         with pytest.raises(ServiceStoppedError, match="no space left"):
             await worker.insert([make_imagined("d")])
 
