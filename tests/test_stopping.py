@@ -44,6 +44,7 @@ def test_a_library_that_starts_is_neither_interrupted_nor_heeds_signals_itself()
             signal.alarm(600)  # as Ray's C++ code does for 3 s
         assert signal.alarm(0) == 0
         assert stop.asked == signal.SIGTERM
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job of a shell ignores it
     with pytest.raises(KeyboardInterrupt), deferred():
         os.kill(os.getpid(), signal.SIGINT)
 
