@@ -115,13 +115,14 @@ def draw(path: Path, result: dict[str, Any]) -> None:
     tasks, names = (list(dict.fromkeys(row[key] for row in rows)) for key in ("task", "algorithm"))
     with drawing(path) as axes:
         for i, name in enumerate(names):
+            groups = {}  # x → success of each seed
             for j, task in enumerate(tasks):
                 success = [r["success"] for r in rows if (r["task"], r["algorithm"]) == (task, name)]
-                x = j + 0.8 * (i + 0.5) / len(names) - 0.4
-                if success:
-                    label = name if j == 0 else None
-                    axes.bar(x, sum(success) / len(success), 0.75 / len(names), color=f"C{i}", label=label)
-                    axes.scatter([x] * len(success), success, s=10, color="black", zorder=3)
+                groups |= {j + 0.8 * (i + 0.5) / len(names) - 0.4: success} if success else {}
+            heights = [sum(success) / len(success) for success in groups.values()]
+            axes.bar(list(groups), heights, 0.75 / len(names), color=f"C{i}", label=name)
+            for x, success in groups.items():
+                axes.scatter([x] * len(success), success, s=10, color="black", zorder=3)
         axes.set_xticks(range(len(tasks)), [t.removesuffix("-v3") for t in tasks], rotation=20, ha="right")
         axes.set(ylabel="success", ylim=(0, 1.02))
         axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1), ncols=2)
