@@ -118,7 +118,8 @@ def draw(path: Path, result: dict[str, Any]) -> None:
             groups = {}  # x → success of each seed
             for j, task in enumerate(tasks):
                 success = [r["success"] for r in rows if (r["task"], r["algorithm"]) == (task, name)]
-                groups |= {j + 0.8 * (i + 0.5) / len(names) - 0.4: success} if success else {}
+                if success:
+                    groups[j + 0.8 * (i + 0.5) / len(names) - 0.4] = success
             heights = [sum(success) / len(success) for success in groups.values()]
             axes.bar(list(groups), heights, 0.75 / len(names), color=f"C{i}", label=name)
             for x, success in groups.items():
