@@ -109,14 +109,14 @@ def test_ranks_listen_on_the_loopback_interface_only(story: Story):
 
 
 def test_a_rank_that_hangs_is_named(story: Story):
+    """By the first call after it stopped: an update, or lending the weights for inference."""
     assert story.error.startswith("trainer worker failed for good:")
-    assert "trainer rank 1 did not do step: no answer" in story.error
+    assert "trainer rank 1 did not do " in story.error and ": no answer" in story.error
 
 
 def test_one_rank_goes_on_from_what_two_have_saved(story: Story):
     updates = story.version + 4
-    trainer = replace(TWO, updates=updates, ranks=1)
-    config = replace(story.config, trainer=trainer)
+    config = replace(story.config, trainer=replace(TWO, updates=updates, ranks=1))
     state = story.saved / TRAINING_STATE
     (state / STEP).write_text(json.dumps({"step": story.version}))
     engine = RayEngine(config, ("match",), state=state)
