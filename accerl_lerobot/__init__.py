@@ -27,24 +27,15 @@ if TYPE_CHECKING:
         load_policy,
         resume,
         train,
-    )
+    )  # fmt: skip
     from accerl_lerobot.engine.stopping import StoppedError
     from accerl_lerobot.errors import InputError
 
 __version__ = "0.1.0"
 __all__ = [
-    "ActingPolicy",
-    "EvaluationResult",
-    "InputError",
-    "RunConfig",
-    "StoppedError",
-    "TrainResult",
-    "evaluate",
-    "load_config",
-    "load_policy",
-    "resume",
-    "train",
-]
+    "ActingPolicy", "EvaluationResult", "InputError", "RunConfig", "StoppedError", "TrainResult",
+    "evaluate", "load_config", "load_policy", "resume", "train",
+]  # fmt: skip
 _ELSEWHERE = {"RunConfig": "engine.config", "StoppedError": "engine.stopping", "InputError": "errors"}
 
 

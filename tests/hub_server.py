@@ -419,12 +419,8 @@ def serving(folder: Path) -> Iterator[HubServer]:
 def environment(server: HubServer, home: Path, token: str | None = WRITER) -> dict[str, str]:
     """Environment of a process that takes the server for the Hub, with an empty cache in `home`."""
     found = {
-        "HF_ENDPOINT": server.url,
-        "HF_HOME": str(home),
-        "HF_HUB_OFFLINE": "0",
-        "HF_HUB_DISABLE_XET": "1",
-        "HF_HUB_DISABLE_PROGRESS_BARS": "1",
-        "HF_HUB_DISABLE_TELEMETRY": "1",
+        "HF_ENDPOINT": server.url, "HF_HOME": str(home), "HF_HUB_OFFLINE": "0", "HF_HUB_DISABLE_XET": "1",
+        "HF_HUB_DISABLE_PROGRESS_BARS": "1", "HF_HUB_DISABLE_TELEMETRY": "1",
         "HF_HUB_DISABLE_UPDATE_CHECK": "1",
-    }
+    }  # fmt: skip
     return found | ({"HF_TOKEN": token} if token else {})

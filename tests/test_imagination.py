@@ -44,15 +44,9 @@ from tests.runs import adjusted, drive, polls, tiny_run
 # About half of all episodes succeed when it is acted at random.
 ENV = SimulatedConfig(max_steps=16, hold=8, tolerance=0.45)
 LOOSE = ValidationConfig(
-    skill_first=-1e9,
-    skill_last=-1e9,
-    sensitivity=0.0,
-    auroc=-1.0,
-    false_success=1.0,
-    recall=-1.0,
-    stride=4,
-    max_windows=40,
-)
+    skill_first=-1e9, skill_last=-1e9, sensitivity=0.0, auroc=-1.0, false_success=1.0, recall=-1.0,
+    stride=4, max_windows=40,
+)  # fmt: skip
 CONSTANTS = ("window", "min_real_episodes", "max_gap")
 
 

@@ -14,6 +14,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import psutil
 import pytest
@@ -294,6 +295,23 @@ def test_one_that_was_there_before_is_left_as_it_is(stand: Stand):
     own.start()
     own.close()
     assert stand.calls == [] and stand.there
+
+
+@pytest.mark.parametrize("failures", [0, 1])
+def test_one_that_starts_beside_the_imports(stand: Stand, monkeypatch: pytest.MonkeyPatch, failures: int):
+    modules: list[str] = []
+    starts = iter([*failures * [MagicMock(side_effect=WorkerError("busy"))], stand.init])
+    monkeypatch.setattr(ray_session, "start_ray", lambda launch: next(starts)(launch))
+    monkeypatch.setattr(ray_session, "imported", modules.append)
+    monkeypatch.setattr(ray_session, "prepare", lambda joins: None)
+    with ray_session.opened(LaunchConfig(), now=True) as session:
+        assert modules == ["accerl_lerobot.policies.loading:load_adapter"]
+        assert stand.there == (not failures)
+        assert session is not None
+        session.start()  # as the engine does
+    assert stand.calls == ["init", "shutdown"]
+    with ray_session.opened(LaunchConfig(engine="local"), now=True) as session:
+        assert session is None
 
 
 @pytest.fixture

@@ -35,18 +35,11 @@ DISTRIBUTED = {"rendezvous.py", "ranks.py", "sharding.py", "tensors.py"}
 """Files that may know of other processes of a `torch.distributed` group."""
 
 LIGHT = [
-    "accerl_lerobot.algorithms",
-    "accerl_lerobot.cli",
-    "accerl_lerobot.demos.record",
-    "accerl_lerobot.envs",
-    "accerl_lerobot.experience",
-    "accerl_lerobot.inference.batcher",
-    "accerl_lerobot.replay.worker",
-    "accerl_lerobot.rollout.worker",
-    "accerl_lerobot.timeline",
-    "accerl_lerobot.trainer.config",
+    "accerl_lerobot.algorithms", "accerl_lerobot.cli", "accerl_lerobot.demos.record", "accerl_lerobot.envs",
+    "accerl_lerobot.experience", "accerl_lerobot.inference.batcher", "accerl_lerobot.replay.worker",
+    "accerl_lerobot.rollout.worker", "accerl_lerobot.timeline", "accerl_lerobot.trainer.config",
     "accerl_lerobot.transport.weights",
-]
+]  # fmt: skip
 """Modules of processes that hold no policy: torch and LeRobot would cost each 400 MB and four seconds."""
 
 

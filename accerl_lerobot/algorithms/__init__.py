@@ -23,15 +23,6 @@ from accerl_lerobot.algorithms.contract import (
 from accerl_lerobot.algorithms.objective import GIPOConfig, LossOutput, PPOConfig
 
 __all__ = [
-    "AWRConfig",
-    "AlgorithmConfig",
-    "ChunkCriticConfig",
-    "GIPOConfig",
-    "Level",
-    "LossInputs",
-    "LossOutput",
-    "OffPolicyConfig",
-    "PPOConfig",
-    "RatioConfig",
-    "SelfImitationConfig",
-]
+    "AWRConfig", "AlgorithmConfig", "ChunkCriticConfig", "GIPOConfig", "Level", "LossInputs", "LossOutput",
+    "OffPolicyConfig", "PPOConfig", "RatioConfig", "SelfImitationConfig",
+]  # fmt: skip

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import statistics
 import time
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -44,7 +45,7 @@ class Block:
     processors: float  # busy share of all cores, whoever uses them
 
 
-class Measured:
+class Measured(AbstractContextManager["Measured"]):
     """An engine that has begun to train, as a context manager; for the arguments see `RayEngine`."""
 
     def __init__(
@@ -59,9 +60,6 @@ class Measured:
         # Each decision is learned from so often: a block has whole rounds of updates.
         self._round = math.ceil(config.replay.samples_per_insert)
         self.engine.train()
-
-    def __enter__(self) -> Measured:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.engine.close()

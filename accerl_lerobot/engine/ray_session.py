@@ -22,13 +22,15 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import psutil
 
 from accerl_lerobot import guardian
+from accerl_lerobot.config.parsing import imported
 from accerl_lerobot.engine.stopping import WorkerError, arrived, deferred, pause_s
 from accerl_lerobot.errors import InputError
 
@@ -352,3 +354,20 @@ class RaySession:
         stopped_s = time.monotonic() - self._stopped.setdefault(process, time.monotonic())
         limit = min(HURRY_S, self._launch.stall_s) if arrived() else self._launch.stall_s
         return f"has been stopped for {stopped_s:.0f} s" if stopped_s > limit else ""
+
+
+@contextlib.contextmanager
+def opened(launch: LaunchConfig, now: bool) -> Iterator[RaySession | None]:
+    """The Ray of a run, None in the local engine; `now`: start it beside the import of LeRobot."""
+    if launch.engine == "local":
+        yield None
+        return
+    with contextlib.closing(RaySession(launch)) as session:
+        if now:
+            prepare(joins=launch.address is not None)
+            import ray  # noqa: F401  # now, as two threads that import the same modules may see parts of them
+
+            with ThreadPoolExecutor(1) as pool, contextlib.suppress(WorkerError):  # failures come again later
+                pool.submit(imported, "accerl_lerobot.policies.loading:load_adapter")
+                session.start()
+        yield session

@@ -1,15 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """One run from start to summary: demonstrations → SFT → evaluation → asynchronous RL → evaluation.
 
-outputs/<run>/
-  config.yaml            the resolved config; `accerl train --config_path=…/config.yaml` repeats the run,
-                         and resumes it with `--resume=true`
-  demos/                 a LeRobotDataset, if this run recorded one
-  sft/                   LeRobot's own training output, sft.log beside it
-  checkpoints/NNNNNN/    LeRobot's layout, and everything needed to resume; `last` is the newest
-  metrics.jsonl          and tensorboard/
-  timeline/              what every worker did when, see `accerl timeline`
-  success_curve.png, summary.json, and before_after.mp4 unless evaluation.before=false
+``docs/cli.md`` lists the files of a run's folder.
 
 `train`, `resume`, `evaluate` and `load_policy` are the Python interface, imported from `accerl_lerobot`.
 Recording and Ray start processes that import the main module again, so a script calls `train` under
@@ -87,47 +79,49 @@ def start(
     config: RunConfig, console: Console, recipe: Path | None = None, load: Load | None = None
 ) -> tuple[Path, dict[str, Any]]:
     """Do a new run, or with ``config.resume`` the rest of the one whose config is `recipe`."""
-    wanted = None
-    if config.resume:
-        directory, wanted = resuming.resumed_run(recipe, config)
-    else:
-        if load is None:
-            check_start(config, console.say)  # before there is a folder
-        directory = make_output_dir(config)
-    console.say(f"run {directory}")
-    how = resuming.resume_command(directory, config)
-    guardian.explain(remedy=f"to resume: {how}")
-    try:
-        with (
-            redirect_stdout(sys.stderr),
-            kept_traceback(directory),
-            resuming.locked(directory, "config_path", "another process resumes it"),
-        ):
-            return directory, execute(config, directory, console, wanted, load)
-    except InputError:
-        if wanted is None:
-            discard_unused(directory)
-        raise
-    except BaseException as error:
-        if is_full(error):
-            console.say(f"the disk of {directory} is full; free some space, then {how}")
-        elif isinstance(error, WorkerError) and error.brief:
-            console.say(f"{error}; to resume: {how}")
-        elif not isinstance(error, StoppedError):
-            verb = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
-            console.say(f"{verb}; to resume: {how}")
-        raise
+    wanted, given = None, config.resume or config.policy.path is not None
+    with ray_session.opened(config.launch, now=given) as session:  # not before SFT
+        if config.resume:
+            directory, wanted = resuming.resumed_run(recipe, config)
+        else:
+            if load is None:
+                check_start(config, console.say)  # before there is a folder
+            directory = make_output_dir(config)
+        console.say(f"run {directory}")
+        how = resuming.resume_command(directory, config)
+        guardian.explain(remedy=f"to resume: {how}")
+        try:
+            with (
+                redirect_stdout(sys.stderr),
+                kept_traceback(directory),
+                resuming.locked(directory, "config_path", "another process resumes it"),
+            ):
+                return directory, execute(config, directory, console, wanted, load, session)
+        except InputError:
+            if wanted is None:
+                discard_unused(directory)
+            raise
+        except BaseException as error:
+            if is_full(error):
+                console.say(f"the disk of {directory} is full; free some space, then {how}")
+            elif isinstance(error, WorkerError) and error.brief:
+                console.say(f"{error}; to resume: {how}")
+            elif not isinstance(error, StoppedError):
+                verb = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
+                console.say(f"{verb}; to resume: {how}")
+            raise
 
 
 def play_evaluation(config: RunConfig, console: Console, filmed: int = 0) -> list[EpisodeResult]:
     """Play the evaluation episodes of a run with LeRobot's sampler, on seeds that are never trained on."""
-    check_memory(config)
-    spec = check_world(config.env, config.rollout.reward_model)
-    engine = make_engine(config, spec.tasks, check_policy(config, spec))
-    with contextlib.closing(engine):
-        count = config.evaluation.episodes
-        engine.plan(evaluation_plans(spec.tasks, count, "eval", seed=config.seed, filmed=filmed))
-        return run_plans(engine, count, "eval", console)
+    with ray_session.opened(config.launch, now=True) as session:
+        check_memory(config)
+        spec = check_world(config.env, config.rollout.reward_model)
+        engine = make_engine(config, spec.tasks, check_policy(config, spec), session=session)
+        with contextlib.closing(engine):
+            count = config.evaluation.episodes
+            engine.plan(evaluation_plans(spec.tasks, count, "eval", seed=config.seed, filmed=filmed))
+            return run_plans(engine, count, "eval", console)
 
 
 def make_engine(
@@ -212,7 +206,12 @@ def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfi
 
 
 def execute(
-    config: RunConfig, directory: Path, console: Console, wanted: str | None = None, load: Load | None = None
+    config: RunConfig,
+    directory: Path,
+    console: Console,
+    wanted: str | None = None,
+    load: Load | None = None,
+    session: RaySession | None = None,
 ) -> dict[str, Any]:
     """Do all phases and return the summary, which is also in ``summary.json``."""
     started = time.monotonic()
@@ -241,10 +240,6 @@ def execute(
         stop = stack.enter_context(Stopping(resuming.resume_command(directory, config)))
         times.clock = stack.enter_context(contextlib.closing(open_clock(config.timeline_folder, "driver")))
         log = stack.enter_context(contextlib.closing(MetricsLog(directory, config.wandb, encode(config))))
-        session = None
-        if config.launch.engine != "local":
-            ray_session.prepare(joins=config.launch.address is not None)
-            session = stack.enter_context(contextlib.closing(ray_session.RaySession(config.launch)))
         recovery = resuming.Recovery(config.launch.max_restarts)
         while True:  # a run, or what is left of it, by one set of workers
             history = 1 if load is not None else check_policy(config, spec, own=True)

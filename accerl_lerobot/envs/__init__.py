@@ -17,20 +17,10 @@ from accerl_lerobot.envs.simulated import SimulatedConfig
 from accerl_lerobot.errors import InputError
 
 __all__ = [
-    "ChunkResult",
-    "EnvConfig",
-    "GymConfig",
-    "HistoryWorld",
-    "JudgedWorld",
-    "LeRobotEnvConfig",
-    "LiberoConfig",
-    "MetaWorldConfig",
-    "RewardModelConfig",
-    "SimulatedConfig",
-    "World",
-    "WorldSpec",
+    "ChunkResult", "EnvConfig", "GymConfig", "HistoryWorld", "JudgedWorld", "LeRobotEnvConfig",
+    "LiberoConfig", "MetaWorldConfig", "RewardModelConfig", "SimulatedConfig", "World", "WorldSpec",
     "make_world",
-]
+]  # fmt: skip
 
 
 def make_world(config: EnvConfig, history: int = 1, reward_model: RewardModelConfig | None = None) -> World:

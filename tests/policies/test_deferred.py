@@ -4,11 +4,12 @@
 import os
 import subprocess
 import sys
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
 
-from accerl_lerobot.policies.deferred import OURS
+from accerl_lerobot.policies.deferred import OURS, _distributions
 
 CODE = """
 import sys
@@ -37,3 +38,8 @@ def test_whoever_calls_us_has_all_of_lerobot(tiny_checkpoint: Path, monkeypatch:
     monkeypatch.delenv(OURS, raising=False)
     code = CODE.replace('["smolvla"]', '["smolvla", "act", "groot"]')
     subprocess.run([sys.executable, "-c", code, str(tiny_checkpoint)], check=True, timeout=300)
+
+
+def test_distributions_are_those_that_python_finds():
+    ours, pythons = ({k: sorted(v) for k, v in f().items()} for f in (_distributions, packages_distributions))
+    assert ours == pythons and len(ours) > 50
