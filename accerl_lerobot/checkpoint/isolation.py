@@ -35,13 +35,8 @@ Processor time, because a busy machine must not refuse a good file."""
 PATIENCE = 20  # times its processor time after which a child is given up, whatever it waits for
 LONGEST = 1000  # characters of a child's message
 NO_MEMORY = (
-    "MemoryError",
-    "can't allocate",
-    "Cannot allocate",
-    "bad_alloc",
-    "Unable to allocate",
-    "malloc of",
-)
+    "MemoryError", "can't allocate", "Cannot allocate", "bad_alloc", "Unable to allocate", "malloc of",
+)  # fmt: skip
 """Words of errors, of Python, PyTorch, Linux, C++, NumPy and Arrow."""
 PR_SET_PDEATHSIG = 1
 

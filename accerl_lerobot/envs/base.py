@@ -157,13 +157,9 @@ class EpisodeWorld(World):
             if self._done:
                 break
         return ChunkResult(
-            observation=self._observe(),
-            rewards=np.asarray(rewards, np.float32),
-            terminated=terminated,
-            truncated=truncated,
-            success=self._success,
-            info={} if step.finite else {"nonfinite": 1.0},
-        )
+            observation=self._observe(), rewards=np.asarray(rewards, np.float32), terminated=terminated,
+            truncated=truncated, success=self._success, info={} if step.finite else {"nonfinite": 1.0},
+        )  # fmt: skip
 
 
 def checked_actions(actions: np.ndarray, spec: WorldSpec) -> np.ndarray:

@@ -131,16 +131,11 @@ class LeRobotWorld(EpisodeWorld):
             raise InputError("env.kwargs", self.config.kwargs, f"{remedy}; try obs_type=pixels_agent_pos")
         space = env.action_space
         return WorldSpec(
-            images=images,
-            state_dim=len(observation[_STATE]),
-            action_dim=space.shape[0],
-            action_low=np.asarray(space.low, np.float32),
-            action_high=np.asarray(space.high, np.float32),
-            fps=int(self._lerobot_config.fps),
-            max_steps=self.config.max_steps,
-            tasks=tuple(self._envs),
+            images=images, state_dim=len(observation[_STATE]), action_dim=space.shape[0],
+            action_low=np.asarray(space.low, np.float32), action_high=np.asarray(space.high, np.float32),
+            fps=int(self._lerobot_config.fps), max_steps=self.config.max_steps, tasks=tuple(self._envs),
             instructions=tuple(filter(None, map(self._instruction, self._envs))),
-        )
+        )  # fmt: skip
 
     def _observe(self) -> Observation:
         from lerobot.envs.utils import preprocess_observation

@@ -176,8 +176,9 @@ class OffPolicyUpdate(BaseUpdate):
         return range(due)
 
     def remember(self, segment: Segment) -> None:
-        executed = self.adapter.processing.normalise(torch.from_numpy(segment.actions))
-        self.memory.add(segment, executed.numpy())
+        for reading in segment.readings():
+            executed = self.adapter.processing.normalise(torch.from_numpy(reading.actions))
+            self.memory.add(reading, executed.numpy())
 
     def tensor(self, name: str, rows: np.ndarray) -> Tensor:
         """Rows of a column, where the policy lives."""

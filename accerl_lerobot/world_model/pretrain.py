@@ -43,14 +43,10 @@ def world_spec(config: WorldModelConfig, env: EnvConfig) -> WorldModelSpec:
     with closing(make_world(env)) as world:
         spec = world.spec
     return WorldModelSpec(
-        cameras=tuple(spec.images),
-        image_size=(config.image_size, config.image_size),
-        state_dim=spec.state_dim,
-        action_dim=spec.action_dim,
-        chunk=config.chunk,
-        context=config.model.context,
-        fps=spec.fps,
-    )
+        cameras=tuple(spec.images), image_size=(config.image_size, config.image_size),
+        state_dim=spec.state_dim, action_dim=spec.action_dim, chunk=config.chunk,
+        context=config.model.context, fps=spec.fps,
+    )  # fmt: skip
 
 
 def pretrain(run: WorldModelRun, directory: Path, console: Console) -> dict[str, Any]:

@@ -56,15 +56,9 @@ class OracleModel(WorldModel):
     def __init__(self, world: WorldSpec, executed: int, make: Callable[[], World]) -> None:
         height, width, _ = next(iter(world.images.values()))
         self.spec = WorldModelSpec(
-            cameras=tuple(world.images),
-            image_size=(height, width),
-            state_dim=world.state_dim,
-            action_dim=world.action_dim,
-            chunk=executed,
-            fps=world.fps,
-            context=1,
-            tasks=world.tasks,
-        )
+            cameras=tuple(world.images), image_size=(height, width), state_dim=world.state_dim,
+            action_dim=world.action_dim, chunk=executed, fps=world.fps, context=1, tasks=world.tasks,
+        )  # fmt: skip
         self._make, self._longest = make, world.max_steps + executed
         self._simulators: list[World] = []
         self._where: list[bytes] = []

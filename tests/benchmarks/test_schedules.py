@@ -25,17 +25,9 @@ __all__ = ["light_ray"]
 
 def block(schedule: str, rate: float, processors: float = 0.2, waits: float = 0.5) -> Block:
     return Block(
-        schedule=schedule,
-        seconds=1.0,
-        updates=4,
-        decisions_per_s=rate,
-        env_steps_per_s=4 * rate,
-        lag_mean=1.0,
-        trainer_waits=waits,
-        batch_size=2.0,
-        inference_busy=0.5,
-        processors=processors,
-    )
+        schedule=schedule, seconds=1.0, updates=4, decisions_per_s=rate, env_steps_per_s=4 * rate,
+        lag_mean=1.0, trainer_waits=waits, batch_size=2.0, inference_busy=0.5, processors=processors,
+    )  # fmt: skip
 
 
 def test_bounds_by_hand():
@@ -73,15 +65,9 @@ def test_a_small_run_of_everything(light_ray: None, tmp_path: Path, monkeypatch:
     trace = tmp_path / "drawers.txt"
     trace.write_text("1\n3\n")
     config = BenchAsyncVsSyncConfig(
-        **small,
-        cvs=(),
-        traces=(str(trace),),
-        seconds=0.2,
-        rounds=1,
-        learning_updates=2,
-        seeds=(0,),
+        **small, cvs=(), traces=(str(trace),), seconds=0.2, rounds=1, learning_updates=2, seeds=(0,),
         output_dir=str(tmp_path),
-    )
+    )  # fmt: skip
     monkeypatch.setattr(async_vs_sync, "TRIALS", 4)
     result = bench_async_vs_sync(config)
     (law,) = result["laws"]

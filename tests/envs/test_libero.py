@@ -110,16 +110,10 @@ def test_torques_against_the_definition():
     full = full @ full.T + 9 * np.eye(9)
     entries = np.arange(49).reshape(7, 7)
     arm = Arm(
-        jacobian=rng.normal(size=(2, 3, 9)),
-        packed_mass=full[:7, :7].ravel().copy(),
-        mass_entries=entries,
-        bias=rng.normal(size=9),
-        qpos=rng.normal(size=9),
-        qvel=rng.normal(size=9),
-        dofs=np.arange(7),
-        position=rng.normal(size=3),
-        rotation=np.linalg.qr(rng.normal(size=(3, 3)))[0],
-    )
+        jacobian=rng.normal(size=(2, 3, 9)), packed_mass=full[:7, :7].ravel().copy(), mass_entries=entries,
+        bias=rng.normal(size=9), qpos=rng.normal(size=9), qvel=rng.normal(size=9), dofs=np.arange(7),
+        position=rng.normal(size=3), rotation=np.linalg.qr(rng.normal(size=(3, 3)))[0],
+    )  # fmt: skip
     turned = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     gains = np.stack([np.full(6, 150.0), np.full(6, 24.5)])
     aim = Aim(rng.normal(size=3), turned, rng.normal(size=7), gains)

@@ -53,15 +53,10 @@ def like() -> Segment:
     observation = world.reset(3, world.spec.tasks[0])
     seen = {name: np.stack([value] * 2) for name, value in observation.items() if name != "task"}
     return make_segment(
-        "explored",
-        1,
-        observations=seen,
-        task=str(observation["task"]),
-        actions=np.zeros((1, K, world.spec.action_dim), np.float32),
-        steps=np.array([K]),
-        terminated=True,
+        "explored", 1, observations=seen, task=str(observation["task"]),
+        actions=np.zeros((1, K, world.spec.action_dim), np.float32), steps=np.array([K]), terminated=True,
         origin=Origin("match", 0, 0),
-    )
+    )  # fmt: skip
 
 
 def test_decisions_are_the_frames_from_every_step_on(dataset: DatasetConfig, like: Segment):
