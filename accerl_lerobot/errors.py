@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+ERROR_LOG = "error.log"  # file of a run's folder with the tracebacks of unexpected errors
 TOKEN = re.compile(r"\bhf_\w{6,}")  # of the Hub, which somebody may have typed where it does not belong
 LONGEST, LONGEST_REMEDY, MOST_SHOWN = 200, 1200, 600
 """Characters that are shown of a value, of a remedy and of an unexpected error; a whole section may have been
@@ -98,14 +99,13 @@ def output_folder(path: str) -> Path:
 
 @contextmanager
 def kept_traceback(directory: Path) -> Iterator[None]:
-    """Appends the traceback of an unexpected error to ``error.log`` in a run's folder, and adds a note that
-    says so."""
+    """Appends the traceback of an unexpected error to `ERROR_LOG` in a run's folder, and notes that."""
     try:
         yield
     except InputError:
         raise
     except Exception as error:
-        log = directory / "error.log"
+        log = directory / ERROR_LOG
         with contextlib.suppress(OSError):  # the disk may be full
             with log.open("a") as file:
                 traceback.print_exception(error, file=file)

@@ -57,7 +57,7 @@ def help_text(command: str, config_class: type[Any], what: str, section: str = "
     head = [
         f"usage: {command} {_bare(config_class)} [--section.field=value …]",
         "",
-        textwrap.fill(f"{what[0].upper()}{what[1:]}. Fields not given keep the value shown.", WIDTH),
+        textwrap.fill(f"{what[0].upper()}{what[1:]}. Shown are defaults; a recipe counts more.", WIDTH),
         "",
     ]
     full = _in_full(listed)

@@ -17,7 +17,6 @@ import multiprocessing
 import os
 import shutil
 import signal
-import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -29,11 +28,11 @@ from typing import Annotated, Any
 
 import draccus
 import numpy as np
-from rich.progress import Progress
 
 from accerl_lerobot import guardian
 from accerl_lerobot.config.parsing import imported
 from accerl_lerobot.config.ranges import Range, Section, Share
+from accerl_lerobot.console import Console
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.envs.base import EnvConfig, World, WorldSpec
 from accerl_lerobot.envs.metaworld import MetaWorld, expert_name, import_mujoco
@@ -276,7 +275,9 @@ class DemosConfig(Section, section="demos"):
     """Apply ``env.shift`` to the demonstrations too; otherwise they show the world without it."""
 
 
-def record_demos(env_config: EnvConfig, config: DemosConfig, root: str, seed: int = 0) -> Path:
+def record_demos(
+    env_config: EnvConfig, config: DemosConfig, root: str, seed: int = 0, console: Console | None = None
+) -> Path:
     """Records demonstrations, disjoint ones for different seeds.
 
     The dataset appears at `root` only when it is complete.
@@ -284,7 +285,7 @@ def record_demos(env_config: EnvConfig, config: DemosConfig, root: str, seed: in
     Returns:
         The dataset's folder; open it with ``LeRobotDataset(REPO_ID, root=...)``.
     """
-    folder = check_free(root)
+    folder, console = check_free(root), console or Console()
     if not config.shifted:
         env_config = env_config.nominal()
     world = make_world(env_config)
@@ -297,12 +298,13 @@ def record_demos(env_config: EnvConfig, config: DemosConfig, root: str, seed: in
     with appearing(folder) as unfinished:
         with (
             simulated(env_config, record, range(config.episodes)) as episodes,
-            Progress(transient=True) as progress,
+            console.stage("demonstrations", total=config.episodes) as stage,
             new_dataset(unfinished, REPO_ID, spec, env_config) as dataset,
         ):
-            for episode, discarded in progress.track(episodes, config.episodes, description="recording"):
+            for episode, discarded in episodes:
                 save_episode(dataset, episode, tally)
                 tally["discarded"] += discarded
+                stage.update(tally["episodes"])
         sidecar = {
             "env": draccus.encode(env_config, EnvConfig),
             "demos": asdict(config) | {"seed": seed},
@@ -310,7 +312,7 @@ def record_demos(env_config: EnvConfig, config: DemosConfig, root: str, seed: in
             "versions": {k: importlib.metadata.version(v) for k, v in _VERSIONS.items() if find_spec(k)},
         }
         (unfinished / SIDECAR).write_text(json.dumps(sidecar, indent=2) + "\n")
-    sys.stderr.write("{episodes} episodes, {frames} frames, {successes} successes\n".format(**tally))
+    console.say("{episodes} episodes, {frames} frames, {successes} successes".format(**tally))
     return folder
 
 

@@ -182,12 +182,12 @@ class Loop:
                 "there was nothing to learn from: see docs/troubleshooting.md"
             )
         after, results = self._evaluate("after", self.steps)
+        summary = plain(self._summary(after, last))
+        layout.write_atomically(self.directory / layout.SUMMARY, json.dumps(summary, indent=2) + "\n")
+        success_curve(self.directory / "success_curve.png", self.evaluations, self.curve)
         if any(result.frames for result in filmed):
             film = self.directory / "before_after.mp4"
             before_after(film, (filmed, self.before), (results, after), fps=20)
-        success_curve(self.directory / "success_curve.png", self.evaluations, self.curve)
-        summary = plain(self._summary(after, last))
-        layout.write_atomically(self.directory / layout.SUMMARY, json.dumps(summary, indent=2) + "\n")
         for left in self.directory.glob(f"{FILMED}.*"):
             left.unlink()
         layout.prune(self.directory / layout.CHECKPOINTS)  # it has ended

@@ -195,8 +195,7 @@ def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfi
     if dataset.repo_id is None:
         root = directory / layout.DEMOS  # there once it is complete
         if not root.exists():
-            with console.stage("demonstrations"):
-                record_demos(config.env, config.demos, str(root), config.seed)
+            record_demos(config.env, config.demos, str(root), config.seed, console)
         dataset = replace(dataset, repo_id=REPO_ID, root=str(root))
     device = str(resolve_device(config.policy.device))
     path = fine_tune(config.sft, dataset, directory, config.seed, device, console)

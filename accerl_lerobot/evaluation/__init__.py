@@ -226,12 +226,13 @@ def before_after(
     columns = math.ceil(math.sqrt(len(both)))
     blank = np.full_like(filmed[0][both[0]].frames[0], 255)
     width = columns * (blank.shape[1] + GAP) - GAP
+    texts = [f"{name} RL: {_rate_text(of[1])}" for name, of in (("before", before), ("after", after))]
     halves = []
-    for name, half, (_, summary) in zip(("before", "after"), filmed, (before, after), strict=True):
+    for text, half in zip(texts, filmed, strict=True):
         clips = [_with_outcome(half[i].frames, half[i].success) for i in both]
         clips += [[blank]] * (-len(both) % columns)
         lines = [clips[i : i + columns] for i in range(0, len(clips), columns)]
-        halves.append([[[_caption(f"{name} RL: {_rate_text(summary)}", width)]], *lines])
+        halves.append([[[_caption(text, width, max(map(len, texts)))]], *lines])
     between = [np.full((len(left[0][0]), 2 * GAP, 3), 255, np.uint8) for left in halves[0]]
     rows = [[*left, [gap], *right] for left, gap, right in zip(halves[0], between, halves[1], strict=True)]
     write_video(path, rows, fps)
@@ -244,11 +245,11 @@ def _rate_text(summary: dict[str, Any] | None) -> str:
     return f"{summary['success']:.0%} success [{low:.0%}, {high:.0%}], n = {summary['n']}"
 
 
-def _caption(text: str, width: int) -> np.ndarray:
-    """Black text, 8 to 20 pixels high, in a picture as wide as asked."""
+def _caption(text: str, width: int, longest: int) -> np.ndarray:
+    """Black text, 8 to 20 pixels high, in a picture as wide as asked; as high as the `longest` one's."""
     from PIL import Image, ImageDraw, ImageFont
 
-    size = min(20, max(8, 2 * width // len(text)))
+    size = min(20, max(8, 2 * width // longest))
     image = Image.new("RGB", (width, size + 12), "white")
     ImageDraw.Draw(image).text((4, 4), text, fill="black", font=ImageFont.load_default(size))
     return np.asarray(image)

@@ -16,7 +16,7 @@ from accerl_lerobot.checkpoint.layout import CHECKPOINTS, LAST, PRETRAINED, SUMM
 from accerl_lerobot.config.parsing import decode
 from accerl_lerobot.console import count, duration, number, percent, rate
 from accerl_lerobot.engine.config import RunConfig
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.errors import ERROR_LOG, InputError
 from accerl_lerobot.hub.card import lerobot_eval_command, read_json
 from accerl_lerobot.replay.pacing import lag_limits
 from accerl_lerobot.report.charts import COLOURS, Chart, Series, line, rates
@@ -175,9 +175,9 @@ def comparison_page(runs: Sequence[Run], now: float) -> dict[str, Any]:
 
 
 def status(run: Run, now: float) -> str:
-    if run.result is None:
+    if run.result is None and not run.error:
         return "still going" if now - run.written < RECENT_S else "not finished"
-    return "finished"
+    return "failed" if run.error else "finished"
 
 
 def warnings(run: Run, bound: int | None, now: float) -> Iterator[str]:
@@ -185,7 +185,9 @@ def warnings(run: Run, bound: int | None, now: float) -> Iterator[str]:
     if run.result is None:
         age = now - run.written
         at = datetime.datetime.fromtimestamp(run.written).strftime("%d %B %Y, %H:%M")
-        if age < RECENT_S:
+        if run.error:
+            yield f"The run failed: {run.error} The traceback is in {ERROR_LOG}."
+        elif age < RECENT_S:
             yield f"The run is still going: there is no {SUMMARY} yet. This page shows it {at}."
         else:
             ago = f"It last wrote {at}, {duration(age)} ago."

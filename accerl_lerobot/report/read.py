@@ -23,7 +23,7 @@ from accerl_lerobot.checkpoint.safety import Origin, check_folder, read_json
 from accerl_lerobot.config.parsing import encode, read_recipe
 from accerl_lerobot.console import ABSENT
 from accerl_lerobot.engine.config import RunConfig
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.errors import ERROR_LOG, InputError
 from accerl_lerobot.metrics import METRICS
 
 Record = dict[str, Any]
@@ -40,6 +40,7 @@ class Run:
     result: Record | None  # summary.json; None: not finished
     truncated: bool
     written: float
+    error: str  # last line of its error.log, if nothing was written since; empty: it has not failed
     videos: tuple[Path, ...]
 
     @property
@@ -93,7 +94,9 @@ def read_run(path: Path) -> Run:
     records: dict[str, list[Record]] = {}
     for line in lines:
         records.setdefault(line["kind"], []).append(line)
-    result = path / SUMMARY
+    written = max(_modified(file) for file in path.iterdir() if file.suffix != ".html")
+    result, log = path / SUMMARY, path / ERROR_LOG
+    failed = log.is_file() and _modified(log) >= written
     return Run(
         path=path,
         config=config,
@@ -101,9 +104,14 @@ def read_run(path: Path) -> Run:
         records=records,
         result=read_json(result, origin) if result.is_file() else None,
         truncated=truncated,
-        written=max(file.stat().st_mtime for file in path.iterdir() if file.suffix != ".html"),
+        written=written,
+        error=(log.read_text(errors="replace").splitlines() or ["?"])[-1] if failed else "",
         videos=tuple(sorted(path.glob("*.mp4"))),
     )
+
+
+def _modified(path: Path) -> float:
+    return path.stat().st_mtime
 
 
 def column(records: Sequence[Record], name: str) -> np.ndarray:

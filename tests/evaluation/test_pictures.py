@@ -8,6 +8,7 @@ from typing import Any
 
 import imageio.v2 as imageio
 import numpy as np
+import pytest
 
 from accerl_lerobot import evaluation
 from accerl_lerobot.evaluation import GAP, before_after, success_curve, write_video
@@ -21,6 +22,13 @@ def evaluated(env_steps: float, successes: int, n: int) -> dict[str, Any]:
 
 def clip(frames: int, colour: tuple[int, int, int], side: int = 32) -> list[np.ndarray]:
     return [np.full((side, side, 3), colour, np.uint8) for _ in range(frames)]
+
+
+def result(index: int, success: bool, frames: list[np.ndarray]) -> EpisodeResult:
+    plan = EpisodePlan(task="t", seed=index, explore=False, index=index)
+    return EpisodeResult(
+        plan=plan, success=success, episode_return=0.0, steps=1, decisions=1, versions=(0, 0), frames=frames,
+    )  # fmt: skip
 
 
 def read(path: Path) -> np.ndarray:
@@ -46,20 +54,13 @@ def test_clips_stand_side_by_side_and_hold_their_last_frame(tmp_path: Path) -> N
 
 
 def test_before_beside_after_with_outcomes_and_numbers(tmp_path, monkeypatch):
-    def result(index: int, success: bool, frames: list[np.ndarray]) -> EpisodeResult:
-        plan = EpisodePlan(task="t", seed=index, explore=False, index=index)
-        return EpisodeResult(
-            plan=plan, success=success, episode_return=0.0, steps=1, decisions=1, versions=(0, 0),
-            frames=frames,
-        )  # fmt: skip
-
     grey = clip(3, (120, 120, 120), side=64)
     before = [result(i, i == 0, grey) for i in (1, 0, 2)] + [result(3, True, [])]
     after = [result(i, i != 2, grey) for i in range(4)]
     captions: list[Any] = []
     caption = evaluation._caption
     monkeypatch.setattr(
-        evaluation, "_caption", lambda text, width: captions.append(text) or caption(text, width)
+        evaluation, "_caption", lambda text, *sizes: captions.append(text) or caption(text, *sizes)
     )
     numbers = evaluated(0, 46, 100), evaluated(1, 98, 100)
     before_after(tmp_path / "film.mp4", (before, numbers[0]), (after, numbers[1]), fps=4)
@@ -81,6 +82,14 @@ def test_before_beside_after_with_outcomes_and_numbers(tmp_path, monkeypatch):
     assert captions == [
         "before RL: 46% success [37%, 56%], n = 100", "after RL: 98% success [93%, 99%], n = 100",
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize("side", [32, 48, 64, 96, 97, 128])
+def test_captions_of_unequal_length_are_of_one_height(tmp_path: Path, side: int) -> None:
+    episodes = [result(i, False, clip(1, (0, 0, 0), side)) for i in range(16)]
+    numbers = [evaluated(0, 0, 5), evaluated(1, 100, 100)]
+    before_after(tmp_path / "film.mp4", (episodes, numbers[0]), (episodes, numbers[1]), fps=1)
+    assert read(tmp_path / "film.mp4").shape[1] > 4 * side
 
 
 def test_without_frames_there_is_no_video(tmp_path: Path) -> None:

@@ -153,8 +153,11 @@ def test_a_run_that_is_going_on_and_one_that_has_died(tmp_path: Path) -> None:
     assert "still going" in going.text and "there is no summary.json yet" in going.text
     assert "40 of 40 updates on door-open-v3 so far, with 60 % success while exploring" in going.text
     assert "The last line of metrics.jsonl is incomplete" in going.text and len(going.named("svg")) >= 14
+    (folder / "error.log").write_text("Traceback …\nValueError: no film\n")
+    failed = page_of(folder).text
+    assert "The run failed: ValueError: no film The traceback is in error.log." in failed
     for path in folder.iterdir():
-        os.utime(path, (time.time() - 7200, time.time() - 7200))
+        os.utime(path, (time.time() - 7200, time.time() - 7200 - (path.name == "error.log")))
     died = page_of(folder).text
     assert "not finished" in died and "it ended early, or waits" in died
     assert "2 h 00 min ago" in died
