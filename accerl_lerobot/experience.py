@@ -7,9 +7,8 @@ NumPy only: a rollout worker that imports this file stays free of torch and LeRo
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -89,50 +88,6 @@ class Segment:
     source: str = REAL  # ``real`` or ``imagined``
     origin: Origin  # where it begins; of an imagined one, the real observation that it was imagined from
     world_version: int | None = None  # version of the world model that imagined it, in gradient steps
-    between: dict[str, np.ndarray] = field(default_factory=dict)
-    """Observations between decisions, each (T, N − 1, ...), and ``next.reward`` (T, K), by env step; empty
-    unless N, ``rollout.observations_per_decision``, is above 1."""
 
     def __len__(self) -> int:
         return len(self.reward)
-
-    @staticmethod
-    def offsets(count: int, chunk: int) -> list[int]:
-        """Env steps after a decision at which `count` observations are made, its own first."""
-        return [chunk * i // count for i in range(count)]
-
-    def readings(self) -> Iterator[Segment]:
-        """This whole episode, and again as if it had been decided where it was observed between decisions."""
-        yield self
-        seen = dict(self.between)
-        if (rewards := seen.pop(REWARD, None)) is None:
-            return
-        chunk = self.actions.shape[1]
-        executed = np.arange(chunk) < self.steps[:, None]
-        actions, cost = self.actions[executed], rewards[0].sum() - self.reward[0]
-        for i, offset in enumerate(self.offsets(1 + next(iter(seen.values())).shape[1], chunk)[1:]):
-            starts = np.arange(offset, executed.sum(), chunk)
-            if n := len(starts):
-                rows = {k: np.concatenate([v[:n, i], self.observations[k][-1:]]) for k, v in seen.items()}
-                yield decided_at(
-                    starts, rows, actions, rewards[executed], chunk, cost, task=self.task,
-                    version=self.version[:n], success=self.success, key=self.key, origin=self.origin,
-                )  # fmt: skip
-
-
-def decided_at(
-    starts: np.ndarray, observations: dict[str, np.ndarray], actions: np.ndarray, rewards: np.ndarray,
-    chunk: int, decision_cost: float, **fields: Any,
-) -> Segment:  # fmt: skip
-    """The segment of a whole episode, had it been decided at `starts`, env steps (T,), what was done then.
-
-    `observations` are each (T + 1, ...), `actions` (E, A) and `rewards` (E,), of each env step.
-    """
-    last, t = len(rewards) - 1, len(starts)
-    return Segment(
-        observations=observations, latent={}, log_prob=np.zeros((t, 0), np.float32),
-        actions=actions[np.minimum(starts[:, None] + np.arange(chunk), last)],
-        reward=np.add.reduceat(rewards, starts) - np.float32(decision_cost),
-        steps=np.minimum(chunk, len(rewards) - starts),
-        terminated=True, **fields,
-    )  # fmt: skip

@@ -135,8 +135,7 @@ class RunConfig(Section):
         """Decisions in the trainer's own memory at the end."""
         if not isinstance(self.algorithm, OffPolicyConfig):
             return 0
-        seen = self.rollout.observations_per_decision * self.trainer.updates * self.trainer.batch_decisions
-        return min(self.algorithm.memory, seen)
+        return min(self.algorithm.memory, self.trainer.updates * self.trainer.batch_decisions)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -145,9 +144,6 @@ class RunConfig(Section):
             raise InputError("policy.path", self.policy.path, remedy)
         if isinstance(self.algorithm, OffPolicyConfig):
             self._check_off_policy()
-        elif (looks := self.rollout.observations_per_decision) > 1:
-            remedy = f"algorithm.type={self.algorithm.type} learns from decisions only; use 1"
-            raise InputError("rollout.observations_per_decision", looks, remedy)
         if (held := self.trainer.hold_back) >= self.replay.max_lag:
             remedy = f"use more than trainer.hold_back, {held}, or all is thrown away as too old"
             raise InputError("replay.max_lag", self.replay.max_lag, remedy)

@@ -56,8 +56,8 @@ def memory_parts_gib(config: RunConfig, history: int = 1) -> dict[str, float]:
         "inference.workers": 0.0 if local else (config.inference.workers - 1) * POLICY_PROCESS_GIB,
         "rollout.workers": 0.0 if local else rollout.workers * ROLLOUT_PROCESS_GIB,
         "rollout.worlds": rollout.workers * rollout.worlds * simulator,
-        "rollout.segment_length": rollout.in_flight * rollout.observations_per_decision * pictures,
-        "replay.capacity": config.replay.capacity * rollout.observations_per_decision * pictures,
+        "rollout.segment_length": rollout.in_flight * pictures,
+        "replay.capacity": config.replay.capacity * pictures,
         "algorithm.memory": config.remembered * pictures,
         "evaluation.videos": frames * 3 * FILM[0] ** 2 / GIB,
     }

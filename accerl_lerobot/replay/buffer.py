@@ -183,8 +183,7 @@ class Replay:
 
 def is_finite(segment: Segment) -> bool:
     """True if no floating-point number of the segment is a NaN or an infinity."""
-    named = (*segment.latent.values(), *segment.observations.values(), *segment.between.values())
-    arrays = [segment.log_prob, segment.reward, *named]
+    arrays = [segment.log_prob, segment.reward, *segment.latent.values(), *segment.observations.values()]
     return all(bool(np.isfinite(a).all()) for a in arrays if np.issubdtype(a.dtype, np.inexact))
 
 

@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from typing import Annotated, Any
 
 import numpy as np
@@ -22,7 +21,7 @@ from accerl_lerobot.checkpoint.snapshot import kind
 from accerl_lerobot.config.ranges import NonNegative, Range, Section, Steps
 from accerl_lerobot.envs.base import ChunkResult, World
 from accerl_lerobot.envs.reward_model import RewardModelConfig
-from accerl_lerobot.experience import REAL, REWARD, TASK, Decision, Observation, Origin, Request, Segment
+from accerl_lerobot.experience import REAL, TASK, Decision, Observation, Origin, Request, Segment
 from accerl_lerobot.seeds import noise_seed, train_seed
 
 STARTS_PER_INCARNATION = 1000
@@ -40,8 +39,6 @@ class SegmentBuilder:
     source: str = REAL
     taken: list[tuple[Decision, np.ndarray, float, int]] = field(default_factory=list)
     """Decisions, each with its actions, reward and env steps."""
-    between: list[dict[str, np.ndarray]] = field(default_factory=list)
-    """A part of `Segment.between` for each decision; empty if nothing is observed there."""
 
     @property
     def latest(self) -> Observation:
@@ -76,10 +73,9 @@ class SegmentBuilder:
             key=key,
             source=self.source,
             origin=self.origin,
-            between={k: np.stack([one[k] for one in self.between]) for k in (*self.between, {})[0]},
         )
         self.origin = self.origin._replace(decision=self.origin.decision + len(decisions))
-        self.observations, self.taken, self.between = [self.latest], [], []
+        self.observations, self.taken = [self.latest], []
         return segment
 
 
@@ -112,9 +108,6 @@ class RolloutConfig(Section, section="rollout"):
     """Worlds per process; while some wait for a decision the others step."""
     segment_length: Annotated[int, Range("[1, 10000]")] = 16
     """Largest number of decisions in a segment."""
-    observations_per_decision: Annotated[int, Range("[1, 1000]")] = 1
-    """Observations of each chunk, at equal distances, which off-policy algorithms learn from as if each had
-    been decided on; 1: only those that were."""
     decision_cost: NonNegative = 0.01
     """Subtracted from the reward of every decision, so that faster is better."""
     episodes: Steps = 0
@@ -276,7 +269,7 @@ class RolloutRunner:
         """Executes `decision`; the request is about the same episode, or the first of the next one."""
         world, episode = self.worlds[slot], self._episodes[slot]
         assert episode is not None
-        result, seen = _execute(world, episode, decision.chunk, self.config.observations_per_decision)
+        result = _execute(world, episode, decision.chunk)
         episode.chunks.append(decision.chunk)
         self.counters.env_steps += result.steps
         self.counters.decisions += 1
@@ -294,11 +287,6 @@ class RolloutRunner:
         episode.versions.append(decision.version)
         actions = np.clip(decision.chunk, world.spec.action_low, world.spec.action_high)
         episode.builder.add(decision, actions, reward, result.steps, result.observation)
-        if seen:
-            rewards = np.zeros(len(actions), np.float32)
-            rewards[: result.steps] = result.rewards
-            rows = {k: np.stack([np.asarray(o[k]) for o in seen]) for k in seen[0] if k != TASK}
-            episode.builder.between.append(rows | {REWARD: rewards})
         if result.done or episode.builder.full:
             self._sequence += 1
             segment = episode.builder.cut(f"{self.name}.{self._sequence}", result.done, result.success)
@@ -344,33 +332,30 @@ class RolloutRunner:
         self.counters.episodes += 1
         versions = episode.versions or [0]
         result = EpisodeResult(
-            plan=episode.plan, success=success, episode_return=episode.episode_return, steps=episode.steps,
-            decisions=len(episode.versions), versions=(min(versions), max(versions)), frames=episode.frames,
-        )  # fmt: skip
+            plan=episode.plan,
+            success=success,
+            episode_return=episode.episode_return,
+            steps=episode.steps,
+            decisions=len(episode.versions),
+            versions=(min(versions), max(versions)),
+            frames=episode.frames,
+        )
         self.on_episode(result)
 
 
-def _execute(
-    world: World, episode: ActiveEpisode, actions: np.ndarray, observed: int
-) -> tuple[ChunkResult, list[Observation]]:
-    """Executes a chunk, in parts if it is filmed, with a frame of each, or `observed` more than once.
-
-    Also returns what was observed between; after the end of the episode, the last observation stands there.
-    """
-    (side, every), length = episode.plan.film or (0, 0), len(actions)
-    if not side and not episode.plan.explore:
-        return world.step_chunk(actions), []
-    starts = range(0, length, every) if side else Segment.offsets(min(observed, length), length)
-    results = []
-    for begin, end in pairwise([*starts, length]):
-        results.append(world.step_chunk(actions[begin:end]))
-        if side:
-            episode.frames.append(world.render(side, side))
-        if results[-1].done:
+def _execute(world: World, episode: ActiveEpisode, actions: np.ndarray) -> ChunkResult:
+    """Executes a chunk; if it is filmed, part by part, with a frame of each."""
+    if episode.plan.film is None:
+        return world.step_chunk(actions)
+    side, every = episode.plan.film
+    rewards = []
+    for i in range(0, len(actions), every):
+        result = world.step_chunk(actions[i : i + every])
+        rewards.append(result.rewards)
+        episode.frames.append(world.render(side, side))
+        if result.done:
             break
-    seen = [result.observation for result in results]
-    seen = [] if side else (seen + len(starts) * seen[-1:])[: len(starts) - 1]
-    return replace(results[-1], rewards=np.concatenate([result.rewards for result in results])), seen
+    return replace(result, rewards=np.concatenate(rewards))
 
 
 def _finite(observation: Observation) -> bool:

@@ -13,7 +13,7 @@ import numpy as np
 
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos.dataset_files import frames_of, open_metadata, opened, pixels_of
-from accerl_lerobot.experience import REWARD, SUCCESS, Origin, Segment, decided_at
+from accerl_lerobot.experience import REWARD, SUCCESS, Origin, Segment
 from accerl_lerobot.policies.config import Load, PolicyConfig
 
 logger = logging.getLogger(__name__)
@@ -80,12 +80,21 @@ def recorded(
             end, actions = len(rewards), columns.pop("action")
             for phase in range(min(phases, end)):
                 starts = np.arange(phase, end, chunk)
-                seen = {name: rows[[*starts, end - 1]] for name, rows in columns.items()}
-                yield decided_at(
-                    starts, seen, actions, rewards, chunk, decision_cost,
-                    task=task, version=np.zeros(len(starts), np.int64), success=success, key="demonstration",
+                t, reward = len(starts), np.add.reduceat(rewards, starts)
+                yield Segment(
+                    observations={name: rows[[*starts, end - 1]] for name, rows in columns.items()},
+                    task=task,
+                    latent={},
+                    log_prob=np.zeros((t, 0), np.float32),
+                    actions=actions[np.minimum(starts[:, None] + np.arange(chunk), end - 1)],
+                    reward=reward - np.float32(decision_cost),
+                    version=np.zeros(t, np.int64),
+                    steps=np.minimum(chunk, end - starts),
+                    terminated=True,
+                    success=success,
+                    key="demonstration",
                     origin=Origin(task="", seed=index, decision=0),
-                )  # fmt: skip
+                )
 
 
 def _episode(

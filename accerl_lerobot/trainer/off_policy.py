@@ -176,9 +176,8 @@ class OffPolicyUpdate(BaseUpdate):
         return range(due)
 
     def remember(self, segment: Segment) -> None:
-        for reading in segment.readings():
-            executed = self.adapter.processing.normalise(torch.from_numpy(reading.actions))
-            self.memory.add(reading, executed.numpy())
+        executed = self.adapter.processing.normalise(torch.from_numpy(segment.actions))
+        self.memory.add(segment, executed.numpy())
 
     def tensor(self, name: str, rows: np.ndarray) -> Tensor:
         """Rows of a column, where the policy lives."""

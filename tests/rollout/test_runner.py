@@ -58,34 +58,6 @@ def test_an_episode_that_ends_within_a_chunk_counts_the_steps_that_were_made():
     assert recorder.runner.counters.env_steps == 5 and recorder.runner.counters.decisions == 3
 
 
-@pytest.mark.parametrize("last", [1, 2])  # env steps of the last decision
-def test_observations_between_decisions_are_read_as_if_they_had_been_decided_on(last: int):
-    config = replace(CONFIG, observations_per_decision=5, decision_cost=0.25)  # two, as a chunk has
-    recorder = Recorder([ScriptedWorld(steps=4 + last)], [explore()], config)
-    recorder.play()
-    (segment,) = recorder.segments
-    whole, between = segment.readings()
-    assert whole is segment and steps_seen(whole) == [0, 2, 4, 4 + last]
-    np.testing.assert_array_equal(whole.reward, [1.75, 1.75, last - 0.25])
-    if last == 1:
-        assert steps_seen(between) == [1, 3, 5] and between.steps.tolist() == [2, 2]
-    else:
-        assert steps_seen(between) == [1, 3, 5, 6] and between.steps.tolist() == [2, 2, 1]
-    np.testing.assert_array_equal(between.reward, between.steps - 0.25)
-    expected = np.array([[1, 2], [3, 4], [5, 5]][: len(between)], np.float32) / 100  # the last is repeated
-    np.testing.assert_array_equal(between.actions[..., 0], expected)
-    assert between.terminated and between.success and between.task == segment.task
-    images = between.observations["observation.images.front"][:, 0, 0, 0]
-    assert images.tolist() == steps_seen(between)
-
-
-def test_an_episode_too_short_to_be_observed_between_decisions_is_read_once():
-    recorder = Recorder([ScriptedWorld(steps=1)], [explore()], replace(CONFIG, observations_per_decision=2))
-    recorder.play()
-    assert [len(reading) for reading in recorder.segments[0].readings()] == [1]
-    assert [Segment.offsets(n, 10) for n in (1, 3, 5)] == [[0], [0, 3, 6], [0, 2, 4, 6, 8]]
-
-
 def test_every_decision_costs():
     config = replace(CONFIG, decision_cost=0.25)
     recorder = Recorder([ScriptedWorld(steps=8)], [explore()], config)

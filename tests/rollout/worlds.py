@@ -71,7 +71,7 @@ def decide(request: Request, version: int = 0) -> Decision:
     """A decision whose latent and log-prob are the step it was made at: they can be told apart."""
     step = float(np.asarray(request.observation["observation.state"])[1])
     return Decision(
-        chunk=((step + np.arange(CHUNK)) / 100)[:, None].astype(np.float32),  # names the env step
+        chunk=np.zeros((CHUNK, 1), np.float32),
         latent={"x": np.array([step, step], np.float32)},
         log_prob=np.array([-step], np.float32),
         version=version,

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot.algorithms import AWRConfig, ChunkCriticConfig, GIPOConfig, SelfImitationConfig
+from accerl_lerobot.algorithms import AWRConfig, ChunkCriticConfig, SelfImitationConfig
 from accerl_lerobot.engine.preflight import check_start
 from accerl_lerobot.envs import SimulatedConfig, make_world
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import ENVIRONMENT_STATE, REWARD, TASK, Origin, Request, Segment
+from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Origin, Request, Segment
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.config import FlowSamplerConfig, PolicyConfig
 from accerl_lerobot.policies.family import Encoded
@@ -327,15 +327,6 @@ def test_a_step_imitates_successes_only(tiny_checkpoint: Path):
     assert low < loss < high
 
 
-def test_what_was_observed_between_decisions_is_remembered_too(tiny_checkpoint: Path):
-    update, segment = imitator(tiny_checkpoint, policy_steps=0.0), episode([0.0, 1.0])
-    seen = {name: rows[:-1, None].repeat(3, 1) for name, rows in segment.observations.items()}
-    segment.between = seen | {REWARD: np.eye(4, dtype=np.float32)[[3, 3]] * segment.reward[:, None]}
-    update.step([segment])
-    np.testing.assert_allclose(update.memory["return"], [update.memory.gamma, 1] * 4, rtol=1e-6)
-    assert update.memory["success"].all()
-
-
 def test_less_memory_gives_the_same_step(tiny_checkpoint: Path):
     def step(**options: Any) -> tuple[dict[str, float], dict[str, np.ndarray]]:
         torch.manual_seed(0)
@@ -362,7 +353,6 @@ def test_what_is_not_finite_is_skipped_and_ends_the_run(tiny_checkpoint: Path):
     assert all(np.array_equal(before[name], after[name]) for name in before if name.startswith("policy."))
 
 
-TWICE = RolloutConfig(observations_per_decision=2)
 SECTIONS: dict[str, Any] = {
     "env": ENV,
     "algorithm": ChunkCriticConfig(),
@@ -378,7 +368,6 @@ SECTIONS: dict[str, Any] = {
         ({"replay": ReplayConfig(samples_per_insert=2.0)}, r"replay\.samples_per_insert=2\.0: .*use 1\.0"),
         ({"trainer": TrainerConfig(ranks=2)}, r"trainer\.ranks=2: .*use 1"),
         ({"rollout": RolloutConfig(segment_length=3)}, r"rollout\.segment_length=3: .*use at least 4"),
-        ({"algorithm": GIPOConfig(), "rollout": TWICE}, r"observations_per_decision=2: .*use 1"),
     ],
 )
 def test_what_it_cannot_learn_from_is_refused(tiny_checkpoint: Path, sections: dict[str, Any], message: str):
