@@ -27,7 +27,7 @@ if TYPE_CHECKING:
         load_policy,
         resume,
         train,
-    )  # fmt: skip
+    )
     from accerl_lerobot.engine.stopping import StoppedError
     from accerl_lerobot.errors import InputError
 

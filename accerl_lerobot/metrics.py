@@ -48,11 +48,18 @@ class MetricsLog:
         if wandb.enable:
             import wandb as client
 
-            note = directory / ".wandb-id"  # a run that is gone on with is the same one there
+            # A run that is gone on with is the same one there.
+            note = directory / ".wandb-id"
             if not note.is_file():
                 note.write_text(secrets.token_hex(8))
-            names: dict[str, Any] = {"project": wandb.project, "name": directory.name, "id": note.read_text()}
-            self._wandb = client.init(dir=str(directory), resume="allow", config=config, **names)
+            self._wandb = client.init(
+                project=wandb.project,
+                dir=str(directory),
+                name=directory.name,
+                id=note.read_text(),
+                resume="allow",
+                config=config,
+            )
 
     @property
     def wall_s(self) -> float:

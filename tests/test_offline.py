@@ -31,10 +31,16 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def arguments(checkpoint: Path, root: Path, out: Path) -> list[str]:
     fields = {
-        "policy.path": checkpoint, "policy.device": "cpu", "output_dir": out,
-        "dataset.repo_id": "me/robot", "dataset.root": root, "trainer.updates": 30,
-        "trainer.lr": 1e-3, "trainer.warmup_updates": 0, "trainer.value_warmup_updates": 0,
-    }  # fmt: skip
+        "policy.path": checkpoint,
+        "policy.device": "cpu",
+        "dataset.repo_id": "me/robot",
+        "dataset.root": root,
+        "output_dir": out,
+        "trainer.updates": 30,
+        "trainer.lr": 1e-3,
+        "trainer.warmup_updates": 0,
+        "trainer.value_warmup_updates": 0,
+    }
     return ["offline", *(f"--{name}={value}" for name, value in fields.items())]
 
 

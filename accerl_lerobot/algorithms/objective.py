@@ -226,6 +226,10 @@ class PPOConfig(RatioConfig):
         surrogate = (rho * advantage).minimum(rho.clamp(low, high) * advantage)
         dropped = ((advantage > 0.0) & (rho > high)) | ((advantage < 0.0) & (rho < low))
         return assemble(
-            inputs, self, policy_loss=-mean_over_ratios(surrogate, inputs, self.level), log_ratio=logs,
-            weight=(~dropped).to(logs.dtype), clip=(self.clip_low, self.clip_high),
-        )  # fmt: skip
+            inputs,
+            self,
+            policy_loss=-mean_over_ratios(surrogate, inputs, self.level),
+            log_ratio=logs,
+            weight=(~dropped).to(logs.dtype),
+            clip=(self.clip_low, self.clip_high),
+        )

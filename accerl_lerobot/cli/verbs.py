@@ -386,10 +386,22 @@ def _told(result: dict[str, Any], code: int = 0) -> int:
 
 
 CONFIGS: dict[str, type[Any]] = {
-    "train": RunConfig, "demos": DemosRun, "sft": SFTRun, "offline": OfflineRun, "eval": EvalRun,
-    "world-model": WorldModelRun, "world-model-eval": WorldModelEvalRun, "push": PushConfig,
-    "pull": PullConfig, "report": ReportConfig, "timeline": TimelineConfig, "export": ExportConfig,
-    "doctor": RunConfig, "bench world": BenchWorldConfig, "bench policy": BenchPolicyConfig,
-    "bench throughput": BenchThroughputConfig, "bench latency": BenchLatencyConfig,
-}  # fmt: skip
+    "train": RunConfig,
+    "demos": DemosRun,
+    "sft": SFTRun,
+    "offline": OfflineRun,
+    "eval": EvalRun,
+    "world-model": WorldModelRun,
+    "world-model-eval": WorldModelEvalRun,
+    "push": PushConfig,
+    "pull": PullConfig,
+    "report": ReportConfig,
+    "timeline": TimelineConfig,
+    "export": ExportConfig,
+    "doctor": RunConfig,
+    "bench world": BenchWorldConfig,
+    "bench policy": BenchPolicyConfig,
+    "bench throughput": BenchThroughputConfig,
+    "bench latency": BenchLatencyConfig,
+}
 """Verb → what its command line is parsed into."""

@@ -82,9 +82,13 @@ class LocalEngine(Engine):
         worlds = [make_world(config.env, history, config.rollout.reward_model) for _ in range(count)]
         self._plans = EpisodePlans(tasks, config.seed, config.rollout.episodes or None)
         self._runner = RolloutRunner(
-            worlds, lambda: self._plans.next(self._exploring), config.rollout, "local", self._outbox.append,
+            worlds,
+            lambda: self._plans.next(self._exploring),
+            config.rollout,
+            "local",
+            self._outbox.append,
             self._episodes.append,
-        )  # fmt: skip
+        )
         if state is not None:
             self._restore(state)
         self._clock.enter(WAIT_IN)
@@ -134,10 +138,14 @@ class LocalEngine(Engine):
         snapshot.save(state / "replay", self._replay.state())
         acting = None if self._acting is self._adapter else self._acting.export_trainable()
         engine = {
-            "generators": global_generators(), "rng": self._rng, "acting": (self._acting_version, acting),
-            "held_back": self._delay.state(), "outbox": list(self._outbox), "plans": self._plans.state(),
+            "generators": global_generators(),
+            "rng": self._rng,
+            "acting": (self._acting_version, acting),
+            "held_back": self._delay.state(),
+            "outbox": list(self._outbox),
+            "plans": self._plans.state(),
             "runner": self._runner.state(),
-        }  # fmt: skip
+        }
         snapshot.save(state / LOCAL, engine)
         if self._imagination is not None:
             learner = None if self._world_learner is None else self._world_learner.state()

@@ -157,9 +157,13 @@ class EpisodeWorld(World):
             if self._done:
                 break
         return ChunkResult(
-            observation=self._observe(), rewards=np.asarray(rewards, np.float32), terminated=terminated,
-            truncated=truncated, success=self._success, info={} if step.finite else {"nonfinite": 1.0},
-        )  # fmt: skip
+            observation=self._observe(),
+            rewards=np.asarray(rewards, np.float32),
+            terminated=terminated,
+            truncated=truncated,
+            success=self._success,
+            info={} if step.finite else {"nonfinite": 1.0},
+        )
 
 
 def checked_actions(actions: np.ndarray, spec: WorldSpec) -> np.ndarray:

@@ -139,7 +139,7 @@ def evaluation_plans(
             index=i,
             group=group,
             film=FILM if i < filmed else None,
-        )  # fmt: skip
+        )
         for i in range(episodes)
     ]
 

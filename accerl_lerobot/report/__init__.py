@@ -63,10 +63,14 @@ def write_report(config: ReportConfig) -> Path:
         trim_blocks=True, lstrip_blocks=True,
     ).get_template("page.html")  # fmt: skip
     html = template.render(
-        **page, version=__version__, points=POINTS, colours=COLOURS, video_mb=VIDEO_MB,
+        **page,
+        version=__version__,
+        points=POINTS,
+        colours=COLOURS,
+        video_mb=VIDEO_MB,
         base64=lambda path: base64.b64encode(path.read_bytes()).decode(),
         address=lambda path: quote(os.path.relpath(path.resolve(), folder)),
-    )  # fmt: skip
+    )
     try:
         output.write_text(html, encoding="utf-8")
     except OSError as error:

@@ -175,19 +175,21 @@ def comparison_page(runs: Sequence[Run], now: float) -> dict[str, Any]:
 
 
 def status(run: Run, now: float) -> str:
-    if run.result is None and not run.error:
+    if run.error:
+        return "failed"
+    if run.result is None:
         return "still going" if now - run.written < RECENT_S else "not finished"
-    return "failed" if run.error else "finished"
+    return "finished"
 
 
 def warnings(run: Run, bound: int | None, now: float) -> Iterator[str]:
     """Caveats of a run's numbers: one plain sentence each, none if all is well."""
-    if run.result is None:
+    if run.error:
+        yield f"The run failed: {run.error} The traceback is in {ERROR_LOG}."
+    elif run.result is None:
         age = now - run.written
         at = datetime.datetime.fromtimestamp(run.written).strftime("%d %B %Y, %H:%M")
-        if run.error:
-            yield f"The run failed: {run.error} The traceback is in {ERROR_LOG}."
-        elif age < RECENT_S:
+        if age < RECENT_S:
             yield f"The run is still going: there is no {SUMMARY} yet. This page shows it {at}."
         else:
             ago = f"It last wrote {at}, {duration(age)} ago."

@@ -172,11 +172,15 @@ class RatioUpdate(BaseUpdate):
                 targets = self._targets(batch, self.ranks.gather(mine, len(batch)), bootstrap)
             device = evaluation.log_prob.device
             inputs = LossInputs(
-                log_prob_new=evaluation.log_prob, log_prob_old=batch.log_prob[rows].to(device),
-                advantage=targets[0][rows].to(device), value=evaluation.value,
-                returns=targets[1][rows].to(device), entropy=evaluation.entropy,
-                factors=None if factors is None else factors[rows].to(device), ratios_per_decision=ratios,
-            )  # fmt: skip
+                log_prob_new=evaluation.log_prob,
+                log_prob_old=batch.log_prob[rows].to(device),
+                advantage=targets[0][rows].to(device),
+                value=evaluation.value,
+                returns=targets[1][rows].to(device),
+                entropy=evaluation.entropy,
+                factors=None if factors is None else factors[rows].to(device),
+                ratios_per_decision=ratios,
+            )
             output = self.algorithm.loss(inputs)
             share = len(rows) / len(batch) if own else 0.0
             synchronise(self.adapter, number == len(parts))

@@ -58,10 +58,14 @@ def episode_from_segments(segments: Sequence[Segment], spec: WorldModelSpec) -> 
     chunks = np.concatenate([segment.actions for segment in segments])
     actions = chunks[np.arange(chunks.shape[1]) < steps[:, None]]
     return Episode(
-        frames=frames, times=np.concatenate([[0], np.cumsum(steps)]).astype(np.int64),
-        state=robot.astype(np.float32), actions=actions,
-        success_at=len(actions) - 1 if segments[-1].success else -1, task=segments[-1].task, own=True,
-    )  # fmt: skip
+        frames=frames,
+        times=np.concatenate([[0], np.cumsum(steps)]).astype(np.int64),
+        state=robot.astype(np.float32),
+        actions=actions,
+        success_at=len(actions) - 1 if segments[-1].success else -1,
+        task=segments[-1].task,
+        own=True,
+    )
 
 
 class Promotion(NamedTuple):

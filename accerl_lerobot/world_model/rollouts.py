@@ -186,11 +186,17 @@ class Imagination:
             models = (copied(learned_part(self._model)), copied(self._success))
             promoted = (*models, self._success.config.threshold, self._roles)
         return {
-            "counters": dict(self.counters), "switch": replace(self.switch),
-            "version": (self.version, self.awaits_model), "starts": list(self._starts), "rng": self._rng,
-            "rows": list(self._rows), "frames": self._frames, "model_state": self._state,
-            "sequence": (self._sequence, self._uncertain_in_a_row), "promoted": promoted,
-        }  # fmt: skip
+            "counters": dict(self.counters),
+            "switch": replace(self.switch),
+            "version": (self.version, self.awaits_model),
+            "starts": list(self._starts),
+            "rng": self._rng,
+            "rows": list(self._rows),
+            "frames": self._frames,
+            "model_state": self._state,
+            "sequence": (self._sequence, self._uncertain_in_a_row),
+            "promoted": promoted,
+        }
 
     def restore(self, state: dict[str, Any]) -> None:
         """Continues from a `state`, with the models of then."""
@@ -277,9 +283,13 @@ class Imagination:
         """Counters, the model's version, and the success rates that the kill switch compares."""
         imagined, real = self.switch.shares
         return {name: float(count) for name, count in self.counters.items()} | {
-            "version": float(self.version), "threshold": self._threshold, "success": self.switch.share,
-            "success_imagined": imagined, "success_real": real, "on": float(self.on),
-        }  # fmt: skip
+            "version": float(self.version),
+            "threshold": self._threshold,
+            "success": self.switch.share,
+            "success_imagined": imagined,
+            "success_real": real,
+            "on": float(self.on),
+        }
 
     def _end(self, i: int, terminated: bool = False, success: bool = False) -> None:
         row, self._rows[i] = self._rows[i], None

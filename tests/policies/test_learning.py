@@ -132,10 +132,14 @@ def test_a_random_policy_gets_better(name: str, tmp_path: Path):
         ),
         algorithm=run.algorithm,
         trainer=TrainerConfig(
-            updates=run.updates, batch_decisions=run.batch, lr=run.lr, value_lr=run.value_lr,
-            warmup_updates=3, value_warmup_updates=5,
+            updates=run.updates,
+            batch_decisions=run.batch,
+            lr=run.lr,
+            value_lr=run.value_lr,
+            warmup_updates=3,
+            value_warmup_updates=5,
         ),
-    )  # fmt: skip
+    )
     engine = LocalEngine(config, ("match",), history=run.history)
     before, return_before = played(engine)
     engine.train()

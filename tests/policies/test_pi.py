@@ -176,11 +176,16 @@ def test_decoding_is_lerobot_s_and_never_fails(fast: LeRobotAdapter, caplog: pyt
         return [*tokens, *[end] * (LENGTH - len(tokens))]
 
     rows = {
-        "one coefficient": padded(zero - 8), "a sign": padded(zero + 8),
-        "pairs": padded(zeros, zeros, zeros, zeros), "text between": padded(97, zero - 8, 98),
-        "nothing": padded(), "only text": list(range(97, 97 + LENGTH)), "too long": [zero - 1] * LENGTH,
-        "not FAST's": padded(VOCABULARY - 1), "half a letter": padded(half),
-    }  # fmt: skip
+        "one coefficient": padded(zero - 8),
+        "a sign": padded(zero + 8),
+        "pairs": padded(zeros, zeros, zeros, zeros),
+        "text between": padded(97, zero - 8, 98),
+        "nothing": padded(),
+        "only text": list(range(97, 97 + LENGTH)),
+        "too long": [zero - 1] * LENGTH,
+        "not FAST's": padded(VOCABULARY - 1),
+        "half a letter": padded(half),
+    }
     chunks = fast.model.chunk(torch.tensor(list(rows.values())))
     assert caplog.messages == []
     by_name = dict(zip(rows, chunks, strict=True))

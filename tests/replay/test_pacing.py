@@ -170,9 +170,15 @@ def test_promises_hold_under_hostile_schedules(
 ) -> None:
     for seed in range(3):
         simulation = Simulation(
-            config=ReplayConfig(max_lag=10_000, **settings), batch=batch, longest=longest, workers=5,
-            in_flight=2 * 5 * longest, publish_every=1 + seed, gate=gate, seed=seed,
-        )  # fmt: skip
+            config=ReplayConfig(max_lag=10_000, **settings),
+            batch=batch,
+            longest=longest,
+            workers=5,
+            in_flight=2 * 5 * longest,
+            publish_every=1 + seed,
+            gate=gate,
+            seed=seed,
+        )
         simulation.run(4000)
         assert simulation.version > 30
 

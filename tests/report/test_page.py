@@ -156,6 +156,9 @@ def test_a_run_that_is_going_on_and_one_that_has_died(tmp_path: Path) -> None:
     (folder / "error.log").write_text("Traceback …\nValueError: no film\n")
     failed = page_of(folder).text
     assert "The run failed: ValueError: no film The traceback is in error.log." in failed
+    filmed = write_run(tmp_path / "filmed")  # its summary is written before the video
+    (filmed / "error.log").write_text("ValueError: no film\n")
+    assert "The run failed: ValueError: no film" in page_of(filmed).text
     for path in folder.iterdir():
         os.utime(path, (time.time() - 7200, time.time() - 7200 - (path.name == "error.log")))
     died = page_of(folder).text

@@ -138,9 +138,14 @@ def test_no_part_of_a_split_is_empty(share: float):
 
 
 SPEC = WorldModelSpec(
-    cameras=("observation.images.corner2",), image_size=(64, 64), state_dim=4, action_dim=4, chunk=10,
-    context=2, fps=80,
-)  # fmt: skip
+    cameras=("observation.images.corner2",),
+    image_size=(64, 64),
+    state_dim=4,
+    action_dim=4,
+    chunk=10,
+    context=2,
+    fps=80,
+)
 
 
 @pytest.fixture(scope="module")
