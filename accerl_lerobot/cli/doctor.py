@@ -274,7 +274,7 @@ def _resolve(arguments: list[str]) -> tuple[RunConfig | None, int, list[Check]]:
 
     try:
         config: RunConfig = parse(RunConfig, arguments)
-        history = check_start(config)
+        _, history = check_start(config)
     except InputError as error:
         return None, 1, [Check("recipe", FAIL, str(error))]
     return config, history, [Check("recipe", OK, "resolves")]

@@ -16,6 +16,7 @@ import gc
 import importlib
 import json
 import shlex
+import sys
 import typing
 from collections.abc import Iterator
 from pathlib import Path
@@ -35,11 +36,13 @@ DISCOVER = "discover_packages_path"
 def imported(path: str) -> Any:
     """Object behind a table's ``module:name``."""
     module, _, name = path.partition(":")
-    collects = gc.isenabled()
+    collects, known = gc.isenabled(), module in sys.modules
     gc.disable()  # LeRobot's modules leave little garbage, and looking for it is a fifth of their import
     try:
         return getattr(importlib.import_module(module), name)
     finally:
+        if not known:
+            gc.freeze()  # or the next collection would look at all of them
         if collects:
             gc.enable()
 

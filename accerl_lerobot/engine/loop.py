@@ -170,7 +170,7 @@ class Loop:
             if evaluation.before:
                 self.before, filmed = self._evaluate("before", 0.0)
                 snapshot.save(self.directory / FILMED, [result for result in filmed if result.frames])
-            self.base = self.engine.poll().rollout
+                self.base = self.engine.poll().rollout
             if self.config.save_every_updates or self.config.save_every_s:
                 self._save()
         last = self._train()

@@ -90,8 +90,9 @@ def check_loss(algorithm: RatioConfig) -> None:
         raise InputError("algorithm.type", algorithm.type, why) from error
 
 
-def check_start(config: RunConfig, say: Callable[[str], object] = str) -> int:
-    """Refuse a run that could not begin or whose outcome could not be used; what can be is checked here."""
+def check_start(config: RunConfig, say: Callable[[str], object] = str) -> tuple[WorldSpec, int]:
+    """Refuse a run that could not begin, or whose outcome could not be used, as far as can be told; returns what
+    the environment offers, and the policy's ``n_obs_steps``."""
     from accerl_lerobot.demos.dataset_files import open_metadata
     from accerl_lerobot.policies.loading import resolve_device
 
@@ -133,7 +134,7 @@ def check_start(config: RunConfig, say: Callable[[str], object] = str) -> int:
     if off_policy and meta is not None:  # one that cannot be remembered is left out
         _say_if_unlike(config, spec, meta, history)
     check_disk(config.output_dir)
-    return history
+    return spec, history
 
 
 def _say_if_unlike(config: RunConfig, spec: WorldSpec, meta: Any, history: int) -> None:

@@ -52,6 +52,7 @@ from accerl_lerobot.timeline import RECOVERY, open_clock
 if TYPE_CHECKING:
     from accerl_lerobot.demos.sft import SFTConfig
     from accerl_lerobot.engine.ray_session import RaySession
+    from accerl_lerobot.envs import WorldSpec
     from accerl_lerobot.policies.adapter import LeRobotAdapter
 
 logger = logging.getLogger(__name__)
@@ -79,13 +80,13 @@ def start(
     config: RunConfig, console: Console, recipe: Path | None = None, load: Load | None = None
 ) -> tuple[Path, dict[str, Any]]:
     """Do a new run, or with ``config.resume`` the rest of the one whose config is `recipe`."""
-    wanted, given = None, config.resume or config.policy.path is not None
+    wanted, spec, given = None, None, config.resume or config.policy.path is not None
     with ray_session.opened(config.launch, now=given) as session:  # not before SFT
         if config.resume:
             directory, wanted = resuming.resumed_run(recipe, config)
         else:
             if load is None:
-                check_start(config, console.say)  # before there is a folder
+                spec, _ = check_start(config, console.say)  # before there is a folder
             directory = make_output_dir(config)
         console.say(f"run {directory}")
         how = resuming.resume_command(directory, config)
@@ -96,7 +97,7 @@ def start(
                 kept_traceback(directory),
                 resuming.locked(directory, "config_path", "another process resumes it"),
             ):
-                return directory, execute(config, directory, console, wanted, load, session)
+                return directory, execute(config, directory, console, wanted, load, session, spec)
         except InputError:
             if wanted is None:
                 discard_unused(directory)
@@ -211,15 +212,16 @@ def execute(
     wanted: str | None = None,
     load: Load | None = None,
     session: RaySession | None = None,
+    spec: WorldSpec | None = None,
 ) -> dict[str, Any]:
-    """Do all phases and return the summary, which is also in ``summary.json``."""
+    """Do all phases and return the summary, which is also in ``summary.json``; `spec`: of a checked run."""
     started = time.monotonic()
     checkpoint = None if wanted is None else resuming.checkpoint_of(directory, wanted, console)
     if wanted is not None and checkpoint is None and load is None:
         check_start(config)
     text = yaml.safe_dump(encode(replace(config, resume=False)), sort_keys=False)
     layout.write_atomically(directory / layout.CONFIG, text)
-    spec = check_world(config.env)
+    spec = spec or check_world(config.env)
     check_placement(replace(config, output_dir=str(directory)))
     if checkpoint is not None:
         layout.go_back_to(checkpoint)

@@ -125,10 +125,5 @@ class JudgedWorld(WrappedWorld):
         success = not result.info.get("nonfinite") and self.succeeded(result.observation)
         rewards = np.zeros_like(result.rewards)
         rewards[-1] = success
-        return replace(
-            result,
-            rewards=rewards,
-            success=success,
-            terminated=result.terminated or success,
-            truncated=result.truncated and not success,
-        )
+        ended, out_of_time = result.terminated or success, result.truncated and not success
+        return replace(result, rewards=rewards, success=success, terminated=ended, truncated=out_of_time)

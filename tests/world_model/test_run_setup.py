@@ -118,7 +118,7 @@ def test_what_would_be_fine_tuned_is_looked_at_before(tiny_checkpoint: Path, tmp
     for start in (check_imagination, check_start):
         with pytest.raises(InputError, match=r"^sft\.init_path='nowhere'"):
             start(replace(tuned, sft=replace(tuned.sft, init_path="nowhere")))
-    assert check_start(tuned) == 1
+    assert check_start(tuned)[1] == 1
 
 
 def test_a_dataset_that_is_not_there_is_named_by_its_section(tiny_checkpoint: Path, tmp_path: Path):
