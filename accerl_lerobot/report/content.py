@@ -382,7 +382,7 @@ def _tiles(run: Run, bound: int | None) -> list[tuple[str, str, str]]:
         ("wall time", duration(run.wall_s), spent),
         ("updates", updates, f"of {run.section('trainer').get('updates')}"),
         ("lag", number(mean, 2), f"largest {number(largest)}, bound {number(bound)}"),
-        ("algorithm", str(run.section("algorithm").get("type")).upper(), ""),
+        ("algorithm", str(run.section("algorithm").get("type")), ""),
         ("seed", str(run.config.get("seed")), ""),
     ]
 

@@ -55,7 +55,7 @@ def test_a_run_that_was_really_made(tiny_checkpoint: Path, tmp_path: Path) -> No
     after, (low, high) = summary["success_after"], (f"{100 * end:.0f}" for end in summary["ci95_after"])
     assert f"success after {100 * after:.3g} % [{low}, {high}] %, n = 8" in seen.text
     assert f"{100 * after:.3g} % [{low}, {high}] 8" in seen.text, "the evaluation's row"
-    for part in (f"env steps {summary['env_steps']:,}", "GIPO", "seed 0", "finished", "updates 12 of 12"):
+    for part in (f"env steps {summary['env_steps']:,}", "gipo", "seed 0", "finished", "updates 12 of 12"):
         assert part in seen.text
     for name in ("lag", "env steps", "decisions", "updates", "policy loss", "value loss"):
         assert f" {name} " in seen.text
@@ -190,9 +190,9 @@ def test_runs_side_by_side(tmp_path: Path) -> None:
     c = write_run(tmp_path / "c", finished=False)
     text = page_of(a, b, c, output=str(tmp_path / "all.html")).text
     assert "2 of 3 finished" in text and "3 training runs" in text
-    assert f"{a} 40 % [31, 50] 90 % [83, 94] GIPO 0 4,000 3.5" in text
-    assert f"{b} 30 % [22, 40] 60 % [50, 69] PPO 1 4,000 3.5" in text
-    assert "c 40 % [31, 50] 40 % [31, 50] GIPO" in text and "c: The run is still going" in text
+    assert f"{a} 40 % [31, 50] 90 % [83, 94] gipo 0 4,000 3.5" in text
+    assert f"{b} 30 % [22, 40] 60 % [50, 69] ppo 1 4,000 3.5" in text
+    assert "c 40 % [31, 50] 40 % [31, 50] gipo" in text and "c: The run is still going" in text
     assert "algorithm.type gipo ppo gipo" in text and "replay.capacity" not in text
     assert f"{a} 40 % → 90 %" in text
 
