@@ -112,13 +112,7 @@ def strike(victim: Victim, orders: Path, name: str, target: str, fault: str, rng
 
 
 def _befall(
-    victim: Victim,
-    orders: Path,
-    name: str,
-    target: str,
-    fault: str,
-    place: str,
-    rng: random.Random,
+    victim: Victim, orders: Path, name: str, target: str, fault: str, place: str, rng: random.Random
 ) -> tuple[float, int]:
     """Makes it happen; when it did, by the monotonic clock, and to which process."""
     if place != ANYWHERE:

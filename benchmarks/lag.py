@@ -96,12 +96,7 @@ def compare(config: BenchLagConfig, results: Results) -> dict[str, Any]:
                     "lag_mean": sum(c["lag_mean"] for c in of) / len(of),
                 }
             )
-    return {
-        "config": asdict(config),
-        "starts": results.before,
-        "groups": groups,
-        "cells": cells,
-    }
+    return {"config": asdict(config), "starts": results.before, "groups": groups, "cells": cells}
 
 
 def table(result: dict[str, Any]) -> Table:

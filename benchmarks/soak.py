@@ -113,12 +113,7 @@ def bench_soak(config: BenchSoakConfig) -> dict[str, Any]:
 
 
 def _block(
-    config: BenchSoakConfig,
-    victim: Victim,
-    orders: Path,
-    name: str,
-    kind: str,
-    rng: random.Random,
+    config: BenchSoakConfig, victim: Victim, orders: Path, name: str, kind: str, rng: random.Random
 ) -> dict[str, Any]:
     """Some seconds of the run; the fault, if any, is early enough that the block bears all of it."""
     before, began, struck = _made(victim), time.monotonic(), None

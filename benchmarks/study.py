@@ -217,10 +217,7 @@ class Study:
             chosen += ["--sft.steps=0", f"--policy.path={checkpoint}"]
             if self.starts[cell.seed].dataset.repo_id is None:
                 root = self.start(cell.seed) / DEMOS
-                chosen += [
-                    f"--dataset.repo_id={REPO_ID}",
-                    f"--dataset.root={root}",
-                ]
+                chosen += [f"--dataset.repo_id={REPO_ID}", f"--dataset.root={root}"]
         return self._parse(cell.seed, chosen, self.folder(cell))
 
     def _parse(self, seed: int, chosen: list[str], folder: Path) -> RunConfig:

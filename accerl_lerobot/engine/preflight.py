@@ -91,8 +91,8 @@ def check_loss(algorithm: RatioConfig) -> None:
 
 
 def check_start(config: RunConfig, say: Callable[[str], object] = str) -> tuple[WorldSpec, int]:
-    """Refuse a run that could not begin, or whose outcome could not be used, as far as can be told; returns what
-    the environment offers, and the policy's ``n_obs_steps``."""
+    """Refuse a run that could not begin, or whose outcome could not be used, as far as can be told; returns
+    what the environment offers, and the policy's ``n_obs_steps``."""
     from accerl_lerobot.demos.dataset_files import open_metadata
     from accerl_lerobot.policies.loading import resolve_device
 

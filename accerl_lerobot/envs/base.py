@@ -13,7 +13,7 @@ import difflib
 import json
 import shlex
 from abc import ABC, abstractmethod
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, ClassVar, NamedTuple, Self
@@ -285,27 +285,33 @@ def task_code(tasks: Sequence[str], task: str) -> np.ndarray:
     return np.eye(len(tasks))[tasks.index(task)] if len(tasks) > 1 else np.zeros(0)
 
 
+_spare: dict[tuple[SuiteConfig, str], list[Any]] = defaultdict(list)
+"""Simulators of this process that no world has, by config and task."""
+
+
 class SuiteWorld(EpisodeWorld):
-    """A world of many tasks; the simulator of each is built when the task is first played, then kept."""
+    """A world of many tasks; simulators are kept, and shared by worlds that play the same tasks in turn."""
+
+    simulator: Any = None  # of the current task; for experts, not for policies
 
     def __init__(self, config: SuiteConfig, spec: WorldSpec) -> None:
         self.config, self.spec = config, spec
-        self._simulators: dict[str, Any] = {}
 
     @abstractmethod
     def _build(self, task: str) -> Any:
         """Builds a simulator: it has `reset`, `step`, which tells success and if all numbers are finite,
         `state`, `everything` (numbers of ``observation.environment_state``), `render` and `close`."""
 
-    @property
-    def simulator(self) -> Any:
-        """The simulator of the current task; for experts, not for policies."""
-        return self._simulators[self._task]
-
     def _begin(self, seed: int, task: str) -> None:
-        if task not in self._simulators:
-            self._simulators[task] = self._build(task)
-        self._simulators[task].reset(seed)
+        self._put_back()
+        self._key = self.config, task
+        self.simulator = _spare[self._key].pop() if _spare[self._key] else self._build(task)
+        self.simulator.reset(seed)
+
+    def _put_back(self) -> None:
+        if self.simulator is not None:
+            _spare[self._key].append(self.simulator)
+        self.simulator = None
 
     def _step(self, action: np.ndarray) -> Step:
         success, finite = self.simulator.step(action)
@@ -317,9 +323,11 @@ class SuiteWorld(EpisodeWorld):
         return np.asarray(self.simulator.render(self.config.cameras[0], height, width))
 
     def close(self) -> None:
-        for simulator in self._simulators.values():
-            simulator.close()
-        self._simulators, self._task, self._done = {}, "", True
+        self._put_back()
+        for key in [key for key in _spare if key[0] == self.config]:
+            for simulator in _spare.pop(key):
+                simulator.close()
+        self._task, self._done = "", True
 
     def _observe(self) -> Observation:
         simulator, spec = self.simulator, self.spec

@@ -171,13 +171,8 @@ class Simulator:
 
     def everything(self) -> np.ndarray:
         """Robot and objects of interest, float64 (57,), as they are now; absent objects are zeros."""
-        data = self.data
-        arm = (
-            data.qpos[self._joints],
-            data.qvel[self._dofs],
-            data.site_xpos[self._site],
-            data.xquat[self._hand],
-        )
+        data, joints, dofs = self.data, self._joints, self._dofs
+        arm = data.qpos[joints], data.qvel[dofs], data.site_xpos[self._site], data.xquat[self._hand]
         fingers = data.qpos[self._fingers], data.qvel[self._finger_dofs]
         numbers = np.zeros((MAX_OBJECTS, OBJECT_NUMBERS))
         for row, name in zip(numbers, self.env.obj_of_interest, strict=False):

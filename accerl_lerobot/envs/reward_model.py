@@ -44,8 +44,7 @@ class RewardModelConfig(Section, section=REWARD_MODEL):
 
 @functools.lru_cache(maxsize=1)
 def load_judge(config: RewardModelConfig) -> Callable[[Observation], bool]:
-    """Loads a reward model, one for all worlds of a process; the result tells if an observation is a
-    success."""
+    """Loads a reward model, one for all worlds of a process; the result tells if it sees a success."""
     import torch
     from lerobot.configs.rewards import RewardModelConfig as LeRobotConfig
     from lerobot.processor import PolicyProcessorPipeline

@@ -47,8 +47,7 @@ class SimulatedConfig(EnvConfig):
     """``success`` (1.0 at the first success, which ends the episode) or ``dense`` (1 − distance at each step;
     no success ends the episode)."""
     environment_state: bool = False
-    """True if observations hold ``observation.environment_state``: the state, and the share of `max_steps`
-    gone."""
+    """True if observations hold ``observation.environment_state``: the state, and the share of time gone."""
 
     @property
     def state_size(self) -> int:

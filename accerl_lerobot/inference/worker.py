@@ -41,8 +41,7 @@ class InferenceConfig(Section, section="inference"):
     """Batching of decisions."""
 
     workers: Annotated[int, Range("[1, 1000]")] = 1
-    """Inference replicas, each with a copy of the policy; rollout worker i asks replica i modulo their
-    number."""
+    """Inference replicas, each with a copy of the policy; worker i asks replica i modulo their number."""
     max_batch: Annotated[int, Range("[1, 65536]")] = 16
     """Largest number of observations per forward pass."""
     max_wait_s: Annotated[float, Range("[0, 10)")] = 0.002

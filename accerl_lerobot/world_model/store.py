@@ -37,8 +37,7 @@ from accerl_lerobot.world_model.success_model import SuccessPairsRewardModel
 
 CONFIG, WEIGHTS, SUCCESS = "config.json", "model.safetensors", "success_model"
 LEARNT, HELD_OUT, THRESHOLD = "learnt", "held out", "threshold"
-"""Roles of episodes: the model was trained on it; it was held out; the success threshold was chosen on it,
-too."""
+"""Roles of episodes: the model was trained on it; it was held out; the threshold was chosen on it, too."""
 
 
 def save_world_model(

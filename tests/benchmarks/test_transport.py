@@ -11,14 +11,7 @@ import pytest
 from rich.console import Console
 
 from accerl_lerobot.transport.shared_memory import available
-from benchmarks.transport import (
-    RAY,
-    SHARED_MEMORY,
-    SLOT,
-    BenchTransportConfig,
-    bench_transport,
-    table,
-)
+from benchmarks.transport import RAY, SHARED_MEMORY, SLOT, BenchTransportConfig, bench_transport, table
 from tests.light_workers import light_ray
 
 __all__ = ["light_ray"]

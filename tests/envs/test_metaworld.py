@@ -41,6 +41,25 @@ def test_success_terminates_with_one_reward_and_a_last_picture(monkeypatch: pyte
     assert len(frames) == len(results) + 1, "one picture at the reset and one per chunk"
 
 
+def test_worlds_share_simulators_in_turn(monkeypatch: pytest.MonkeyPatch):
+    built, build = [], gl.Simulator
+    monkeypatch.setattr(gl, "Simulator", lambda task, config: built.append(task) or build(task, config))
+    config = MetaWorldConfig(task=f"{TASK},door-open-v3", max_steps=20)
+    a, b = MetaWorld(config), MetaWorld(config)
+    first = a.reset(0, TASK)
+    b.reset(0, "door-open-v3")
+    a.reset(1, "door-open-v3")
+    again, held = b.reset(0, TASK), a.simulator
+    assert built == [TASK, "door-open-v3", "door-open-v3"], "b has the one that a has put back"
+    assert all(np.array_equal(first[name], again[name]) for name in first)
+    b.reset(0, "door-open-v3")
+    assert a.simulator is held is not b.simulator and len(built) == 3
+    a.close()
+    b.close()
+    a.reset(0, TASK)
+    assert built[3:] == [TASK], "all were closed"
+
+
 def test_touch_is_told_as_metaworld_tells_it(monkeypatch: pytest.MonkeyPatch):
     task, told = "push-v3", []
     world = MetaWorld(MetaWorldConfig(task=task))

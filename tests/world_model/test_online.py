@@ -13,18 +13,10 @@ import torch
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.experience import IMAGINED, Segment
 from accerl_lerobot.world_model import online
-from accerl_lerobot.world_model.config import (
-    OnlineLearnConfig,
-    PixelModelConfig,
-    ValidationConfig,
-)
+from accerl_lerobot.world_model.config import OnlineLearnConfig, PixelModelConfig, ValidationConfig
 from accerl_lerobot.world_model.data import model_arrays
 from accerl_lerobot.world_model.learners import new_success_model
-from accerl_lerobot.world_model.online import (
-    OnlineLearner,
-    episode_from_segments,
-    episode_weights,
-)
+from accerl_lerobot.world_model.online import OnlineLearner, episode_from_segments, episode_weights
 from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.store import HELD_OUT
 from tests.runs import adjusted

@@ -201,14 +201,7 @@ def test_ended_rollouts_start_anew_beside_the_others():
 
 
 def test_rollouts_from_resets_are_compared_with_real_episodes(bright: Any):
-    batch, made = imagination(
-        Counting(),
-        bright,
-        rollouts=4,
-        window=4,
-        min_real_episodes=3,
-        world=ENDLESS,
-    )
+    batch, made = imagination(Counting(), bright, rollouts=4, window=4, min_real_episodes=3, world=ENDLESS)
     for seed in range(4):
         batch.remember(real_episode(seed)[0])
     play(batch, 3)

@@ -58,8 +58,7 @@ def run(checkpoint: Path, folder: Path, learn: OnlineLearnConfig, roles: dict[st
 
 
 @pytest.mark.parametrize(
-    ("name", "made"),
-    [("learned", PixelWorldModel), ("shuffled", ShuffledModel), ("oracle", OracleModel)],
+    ("name", "made"), [("learned", PixelWorldModel), ("shuffled", ShuffledModel), ("oracle", OracleModel)]
 )
 def test_what_a_run_can_imagine_with(name: Any, made: type, tiny_checkpoint: Path, tmp_path: Path):
     config = run(tiny_checkpoint, tmp_path / "model", OnlineLearnConfig(), {})
