@@ -70,8 +70,7 @@ class OffPolicyConfig(AlgorithmConfig):
     policy_steps: NonNegative = 0.5
     """Gradient steps of the policy for each new decision, after ``trainer.value_warmup_updates``."""
     memory: Annotated[int, Range("[1000, 100000000]")] = 100_000
-    """Decisions that the trainer remembers; the oldest leave first. At images of 64 pixels, 100,000 are
-    1.2 GB."""
+    """Decisions that the trainer remembers; the oldest leave first. With 64 pixels, 100,000 are 1.2 GB."""
 
 
 @AlgorithmConfig.register_subclass("self_imitation")

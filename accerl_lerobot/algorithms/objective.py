@@ -31,8 +31,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 LOG_RATIO_CLAMP = 20.0
-"""Limit of |log ρ|, beyond which the gradient of ρ is zero: float32 overflows at 88, and ρ is squared and
-summed."""
+"""Limit of |log ρ|, beyond which ρ has no gradient: float32 overflows at 88, and ρ is squared."""
 KL_LINEAR_ABOVE = 3.0
 """Above this log ρ (ρ ≈ 20) the KL penalty is continued linearly: its gradient, (ρ − 1)·∇log π, is unbounded,
 so that one stale sample could decide a whole update."""

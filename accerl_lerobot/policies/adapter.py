@@ -99,8 +99,7 @@ class PolicyAdapter(nn.Module, ABC):
 
     @abstractmethod
     def trainable(self) -> dict[str, nn.Parameter]:
-        """Parameters that the trainer updates and publishes, by name; the critic's begin with
-        ``value_head.``"""
+        """Parameters that the trainer updates and publishes; the critic's begin with ``value_head.``"""
 
     @abstractmethod
     def copy_weights(self) -> Any:

@@ -13,6 +13,7 @@ import draccus
 from accerl_lerobot.config.parsing import imported
 from accerl_lerobot.config.ranges import Commit, Device, Range, Section
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.experience import ENVIRONMENT_STATE
 from accerl_lerobot.policies.deferred import import_policies
 
 if TYPE_CHECKING:
@@ -191,7 +192,10 @@ def discovery(policy_type: str | None) -> list[str]:
 
 
 def check_observations(policy_config: Any, field: str) -> None:
-    """Refuses an observation history that LeRobot's policy of this type does not read."""
+    """Refuses the simulator's state, and a history that LeRobot's policy of this type does not read."""
+    if ENVIRONMENT_STATE in (policy_config.input_features or {}):
+        remedy = "no policy is given the simulator's state; train it without, as accerl sft does"
+        raise InputError("policy.input_features", ENVIRONMENT_STATE, remedy)
     if policy_config.n_obs_steps != 1 and policy_config.type not in USES_HISTORY:
         remedy = f"only {', '.join(USES_HISTORY)} looks back; a {policy_config.type} policy takes 1"
         raise InputError(field, policy_config.n_obs_steps, remedy)

@@ -199,8 +199,7 @@ class ImaginationConfig(Section, section="imagination"):
     samples_per_insert: ClassVar[float] = 2.0
     """How often an imagined decision is trained on, on average; see `imagined_replay`."""
     max_uncertainty: ClassVar[float] = 2.0
-    """A rollout ends before a prediction with a higher uncertainty, where 1 is the 95th percentile on
-    training data."""
+    """A rollout ends before a prediction less certain than this; 1: 95th percentile on training data."""
     memory: ClassVar[int] = 256
     """Newest real episodes at whose resets rollouts start."""
     max_gap: ClassVar[float] = 0.5

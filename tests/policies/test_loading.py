@@ -20,6 +20,7 @@ from safetensors.torch import load_file, save_file
 
 from accerl_lerobot.checkpoint.layout import BACKBONE, FAST, PRETRAINED, displaced, relocate, save_checkpoint
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.experience import ENVIRONMENT_STATE
 from accerl_lerobot.policies.adapter import stack_observations
 from accerl_lerobot.policies.config import FlowSamplerConfig, PolicyConfig, SamplerConfig
 from accerl_lerobot.policies.loading import load_adapter, load_lerobot_config, resolve_device
@@ -107,6 +108,13 @@ def test_a_config_of_something_else(damaged: Any, text: str | None, why: str):
     if text is not None:
         (path / "config.json").write_text(text)
     refused(path, f"policy.path=.*{why}")
+
+
+def test_a_policy_that_reads_the_simulators_state(damaged: Any):
+    path = damaged("act")
+    inputs = json.loads((path / "config.json").read_text())["input_features"]
+    edit_config(path, input_features=inputs | {ENVIRONMENT_STATE: {"type": "ENV", "shape": [3]}})
+    refused(path, "policy.input_features='observation.environment_state': no policy is given")
 
 
 @pytest.mark.parametrize(
