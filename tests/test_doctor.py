@@ -147,6 +147,7 @@ class TestResources:
             ({"rollout": {"workers": 4}}, "memory", ""),
             ({"rollout": {"workers": 5}}, "cpu", "lower rollout.workers"),
             ({"trainer": {"num_threads": 8}}, "cpu", "trainer.num_threads"),
+            ({"env": {"task": "all"}, "rollout": {"worlds": 4}}, "memory", ""),
             ({"env": {"image_size": 480}, "replay": {"capacity": 100_000}}, "memory", "GiB needed: lower"),
         ],
     )

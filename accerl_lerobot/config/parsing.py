@@ -15,6 +15,7 @@ import difflib
 import gc
 import importlib
 import json
+import os
 import shlex
 import sys
 import typing
@@ -36,12 +37,12 @@ DISCOVER = "discover_packages_path"
 def imported(path: str) -> Any:
     """Object behind a table's ``module:name``."""
     module, _, name = path.partition(":")
-    collects, known = gc.isenabled(), module in sys.modules
+    collects, new = gc.isenabled(), module not in sys.modules
     gc.disable()  # LeRobot's modules leave little garbage, and looking for it is a fifth of their import
     try:
         return getattr(importlib.import_module(module), name)
     finally:
-        if not known:
+        if new and os.environ.get("ACCERL_ONE_POLICY"):  # a process of our own, see `policies.deferred`
             gc.freeze()  # or the next collection would look at all of them
         if collects:
             gc.enable()

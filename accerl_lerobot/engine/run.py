@@ -218,7 +218,7 @@ def execute(
     started = time.monotonic()
     checkpoint = None if wanted is None else resuming.checkpoint_of(directory, wanted, console)
     if wanted is not None and checkpoint is None and load is None:
-        check_start(config)
+        spec, _ = check_start(config)
     text = yaml.safe_dump(encode(replace(config, resume=False)), sort_keys=False)
     layout.write_atomically(directory / layout.CONFIG, text)
     spec = spec or check_world(config.env)

@@ -47,8 +47,7 @@ def memory_parts_gib(config: RunConfig, history: int = 1) -> dict[str, float]:
 
     rollout, films, local = config.rollout, config.evaluation, config.launch.engine == "local"
     tasks = len(getattr(config.env, "tasks", ("one",)))
-    # Worlds of a process share them; a task that two play at a time has two.
-    simulators = (rollout.worlds + tasks - 1) * SIMULATOR_GIB.get(config.env.type, 0.0)
+    simulators = min(rollout.worlds * tasks, tasks + 2 * rollout.worlds)  # as shared by a process's worlds
     pictures = history * observation_bytes(config) / GIB
     loaded = 2 + config.trainer.ranks  # the driver, inference and the trainer each load torch
     frames = min(films.videos, films.episodes) * config.env.max_steps / FILM[1]
@@ -56,7 +55,7 @@ def memory_parts_gib(config: RunConfig, history: int = 1) -> dict[str, float]:
         "trainer.ranks": POLICY_PROCESS_GIB if local else RAY_GIB + loaded * POLICY_PROCESS_GIB,
         "inference.workers": 0.0 if local else (config.inference.workers - 1) * POLICY_PROCESS_GIB,
         "rollout.workers": 0.0 if local else rollout.workers * ROLLOUT_PROCESS_GIB,
-        "rollout.worlds": rollout.workers * simulators,
+        "rollout.worlds": rollout.workers * simulators * SIMULATOR_GIB.get(config.env.type, 0.0),
         "rollout.segment_length": rollout.in_flight * pictures,
         "replay.capacity": config.replay.capacity * pictures,
         "algorithm.memory": config.remembered * pictures,

@@ -285,14 +285,14 @@ def task_code(tasks: Sequence[str], task: str) -> np.ndarray:
     return np.eye(len(tasks))[tasks.index(task)] if len(tasks) > 1 else np.zeros(0)
 
 
-_spare: dict[tuple[SuiteConfig, str], list[Any]] = defaultdict(list)
-"""Simulators of this process that no world has, by config and task."""
+_spare: dict[tuple[str, str], list[Any]] = defaultdict(list)  # simulators no world has, by config and task
 
 
 class SuiteWorld(EpisodeWorld):
     """A world of many tasks; simulators are kept, and shared by worlds that play the same tasks in turn."""
 
     simulator: Any = None  # of the current task; for experts, not for policies
+    _key = "", ""  # config and task of the simulator
 
     def __init__(self, config: SuiteConfig, spec: WorldSpec) -> None:
         self.config, self.spec = config, spec
@@ -303,9 +303,13 @@ class SuiteWorld(EpisodeWorld):
         `state`, `everything` (numbers of ``observation.environment_state``), `render` and `close`."""
 
     def _begin(self, seed: int, task: str) -> None:
-        self._put_back()
-        self._key = self.config, task
-        self.simulator = _spare[self._key].pop() if _spare[self._key] else self._build(task)
+        if self.simulator is None or self._key[1] != task:
+            self._put_back()
+            self._key = repr(self.config), task
+            try:
+                self.simulator = _spare[self._key].pop()
+            except IndexError:  # LeRobot plays tasks in threads, so looking first would not do
+                self.simulator = self._build(task)
         self.simulator.reset(seed)
 
     def _put_back(self) -> None:
@@ -318,14 +322,14 @@ class SuiteWorld(EpisodeWorld):
         return Step(success=success, ended=success, finite=finite)
 
     def render(self, height: int, width: int) -> np.ndarray:
-        if not self._task:
+        if self.simulator is None:
             raise RuntimeError("nothing to render: call reset first")
         return np.asarray(self.simulator.render(self.config.cameras[0], height, width))
 
     def close(self) -> None:
         self._put_back()
-        for key in [key for key in _spare if key[0] == self.config]:
-            for simulator in _spare.pop(key):
+        for key in [key for key in list(_spare) if key[0] == repr(self.config)]:
+            for simulator in _spare.pop(key, ()):
                 simulator.close()
         self._task, self._done = "", True
 

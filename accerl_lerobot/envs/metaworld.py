@@ -202,8 +202,7 @@ class MetaWorldConfig(SuiteConfig):
     STATE_NUMBERS = 39
 
     task: str = "drawer-open-v3"
-    """Task names separated by commas, or LeRobot's groups: easy, medium, hard, very_hard, all. A world keeps
-    each task it has played, at about 90 MB a task."""
+    """Task names separated by commas, or LeRobot's groups: easy, medium, hard, very_hard, all."""
     camera: str = "corner2"
     """Camera names separated by commas; each becomes ``observation.images.<name>``."""
     image_size: Annotated[int, Range("[64, 480]")] = 64

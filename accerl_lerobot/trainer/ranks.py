@@ -29,8 +29,7 @@ class Ranks:
     rank, size = 0, 1
 
     def gather(self, mine: Tensor, total: int) -> Tensor:
-        """Rows of all ranks, in order, from each one's own: (rows, ...), on the CPU, as `np.array_split` has
-        them."""
+        """All ranks' rows, from each one's own: (rows, ...), on the CPU in the order of `np.array_split`."""
         return mine
 
     def average(self, parameters: Sequence[nn.Parameter]) -> None:

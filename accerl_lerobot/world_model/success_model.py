@@ -30,8 +30,7 @@ ALONE = 0.25
 """Share of pairs whose first frame is replaced by the second in training, so that the second frame is judged
 and not their distance."""
 NOISE, SHIFT = 0.03, 3
-"""Largest standard deviation of the noise on frames in training, where 1 is white, and their largest shift in
-pixels."""
+"""Noise on frames in training, its largest std where 1 is white, and their largest shift in pixels."""
 
 
 @RewardModelConfig.register_subclass("success_pairs")

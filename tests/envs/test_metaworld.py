@@ -56,6 +56,8 @@ def test_worlds_share_simulators_in_turn(monkeypatch: pytest.MonkeyPatch):
     assert a.simulator is held is not b.simulator and len(built) == 3
     a.close()
     b.close()
+    with pytest.raises(RuntimeError, match="nothing to render"):
+        b.render(64, 64)
     a.reset(0, TASK)
     assert built[3:] == [TASK], "all were closed"
 

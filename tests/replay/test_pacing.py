@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pacing under thousands of random and hostile steps: never stuck, never over-used, never staler than
-stated."""
+"""Pacing under thousands of random and hostile steps: never stuck, over-used, or staler than stated."""
 
 import math
 from dataclasses import dataclass, field
