@@ -26,7 +26,7 @@ from accerl_lerobot.policies.loading import sizes_of
 from accerl_lerobot.trainer.sharding import Watch, forget
 
 FAKED_FROM = 10**9
-"""SmolVLA cannot be faked: its image encoder indexes by a mask, whose shape does not say how many hold."""
+"""SmolVLA cannot be faked: its encoder indexes by a mask, whose shape does not say how many are True."""
 FLOAT32 = 4
 
 

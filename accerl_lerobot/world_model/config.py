@@ -199,7 +199,7 @@ class ImaginationConfig(Section, section="imagination"):
     samples_per_insert: ClassVar[float] = 2.0
     """How often an imagined decision is trained on, on average; see `imagined_replay`."""
     max_uncertainty: ClassVar[float] = 2.0
-    """A rollout ends before a prediction less certain than this; 1: 95th percentile on training data."""
+    """Uncertainty above which a rollout ends before a prediction; 1 is training data's 95th percentile."""
     memory: ClassVar[int] = 256
     """Newest real episodes at whose resets rollouts start."""
     max_gap: ClassVar[float] = 0.5
