@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 
 from accerl_lerobot.config.ranges import Range
 from accerl_lerobot.envs.base import EnvConfig, SuiteConfig, SuiteWorld, unit_spec
-from accerl_lerobot.envs.libero_simulator import FPS, MAX_OBJECTS, OBJECT_NUMBERS, ROBOT_NUMBERS, Simulator
+from accerl_lerobot.envs.libero_simulator import FPS, NUMBERS, Simulator
 from accerl_lerobot.envs.libero_tasks import instruction, suites
 from accerl_lerobot.errors import InputError, expanded
 
@@ -34,7 +34,7 @@ class LiberoConfig(SuiteConfig):
     expert = "accerl_lerobot.demos.libero_expert:libero_expert"
     world = "accerl_lerobot.envs.libero:LiberoWorld"
     groups = staticmethod(suites)
-    STATE_NUMBERS = ROBOT_NUMBERS + MAX_OBJECTS * OBJECT_NUMBERS
+    STATE_NUMBERS = NUMBERS
 
     task: str = "libero_object"
     """Suites (libero_spatial, libero_object, libero_goal, libero_10, libero_90), or single tasks such as
@@ -54,9 +54,9 @@ class LiberoConfig(SuiteConfig):
     """Folder of LIBERO's meshes and textures; if empty, the installed package's or, where it has none, a copy
     of those on the Hub."""
     environment_state: bool = False
-    """True if observations hold ``observation.environment_state``: joints and hand of the robot, poses of the
-    objects that the task is about, the share of `max_steps` gone, and which of several tasks it is. For
-    ``algorithm.type=chunk_critic``."""
+    """True if observations hold ``observation.environment_state``: joints and hand of the robot, positions
+    of the objects that the task is about, distances between all these, the share of `max_steps` gone, and
+    which of several tasks it is. For ``algorithm.type=chunk_critic``."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -26,8 +26,9 @@ SETTLING = 10  # env steps without motion before the first observation, as in Le
 MAX_OBJECTS = 4  # most objects that a task names as those it is about
 MAX_FACES = 2000
 ARENA = "64M"  # memory of a simulation's contacts and constraints; some 6 MB are used
-ROBOT_NUMBERS, OBJECT_NUMBERS = 25, 8
+NUMBERS = 25 + MAX_OBJECTS * 4 + 6 * 10  # of robot, objects, and distances
 TIMESTEP = 0.002
+NEAR = 0.03  # distance in m at which `distances` begins to squash
 STILL = np.array([0, 0, 0, 0, 0, 0, -1], np.float32)
 
 
@@ -170,14 +171,18 @@ class Simulator:
         return np.concatenate(parts).astype(np.float32)
 
     def everything(self) -> np.ndarray:
-        """Robot and objects of interest, float64 (57,), as they are now; absent objects are zeros."""
+        """Robot and objects of interest as they are now, and `distances`, float64 (101,).
+
+        An object has its position and its joint's; what there is not lies in the hand. How objects are turned
+        is left out: a bowl looks the same from all sides, and a critic would have to learn that.
+        """
         data, joints, dofs = self.data, self._joints, self._dofs
         arm = data.qpos[joints], data.qvel[dofs], data.site_xpos[self._site], data.xquat[self._hand]
         fingers = data.qpos[self._fingers], data.qvel[self._finger_dofs]
-        numbers = np.zeros((MAX_OBJECTS, OBJECT_NUMBERS))
-        for row, name in zip(numbers, self.env.obj_of_interest, strict=False):
-            row[:3], row[3:7], row[7] = *self.pose(name), self.opening(name)
-        return np.concatenate([*arm, *fingers, numbers.ravel()])
+        points, openings = np.tile(self._position, (1 + MAX_OBJECTS, 1)), np.zeros(MAX_OBJECTS)
+        for i, name in enumerate(self.env.obj_of_interest):
+            points[1 + i], openings[i] = self.pose(name)[0], self.opening(name)
+        return np.concatenate([*arm, *fingers, points[1:].ravel(), openings, distances(points)])
 
     def pose(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Position (3,) and quaternion (4,), w first, of an object, a fixture or a region in the world."""
@@ -272,6 +277,14 @@ def operational_space_torques(arm: Arm, aim: Aim) -> np.ndarray:
     for i in range(n):
         torques[i] += arm.bias[dofs[i]]
     return torques
+
+
+def distances(points: np.ndarray) -> np.ndarray:
+    """Vectors between all pairs of points, (P, 3) in m, as they are and again squashed, for what is near:
+    float64 (P·(P − 1)/2·6,)."""
+    i, j = np.triu_indices(len(points), 1)
+    vectors = (points[j] - points[i]).ravel()
+    return np.concatenate([vectors, np.tanh(vectors / NEAR)])
 
 
 class SensorClock:
