@@ -2,7 +2,7 @@
 """Faults that a run survives: in each of its processes, at named points and at any moment, and their cost.
 
     python -m benchmarks faults                                          # a run made of time: seconds each
-    python -m benchmarks faults --recipe=recipes/quickstart.yaml --faults=kill --targets=driver --repeats=5
+    python -m benchmarks faults --recipe=recipes/gipo.yaml --faults=kill --targets=driver --repeats=5
 
 One run for each target, in which things go wrong again and again (`hits.py`), in an order drawn from the
 seed; each is proved to have happened. A cell is target × fault. After each the run's log is looked at, and at

@@ -2,7 +2,7 @@
 """Everything that needs a GPU to be known, in one command: ``make gpu-check``.
 
 SmolVLA of its published size decides and learns in both precisions: seconds, memory beside its estimate, and
-how far its log-probs are from each other at equal weights. Then the quickstart's policy is trained for a few
+how far its log-probs are from each other at equal weights. Then recipes/gipo.yaml is trained for a few
 updates with trainer and inference on the GPU, so that weights travel from one to the other; and once more by
 two ranks where there are two GPUs.
 """
@@ -40,7 +40,7 @@ class BenchGpuConfig(Section):
     """Folder for gpu.json, gpu.md and the runs."""
     device: Device = "cuda"
     """cuda; cpu tries the command itself."""
-    recipe: str = "recipes/quickstart.yaml"
+    recipe: str = "recipes/gipo.yaml"
     """The runs', with fewer demonstrations, steps and episodes."""
     updates: Annotated[int, Range("[1, 100000]")] = 20
     """Updates of each run."""

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The effect of staleness on each algorithm: one recipe, with published weights held back on purpose.
 
-    python -m benchmarks lag --recipe=recipes/quickstart.yaml --updates=200
+    python -m benchmarks lag --recipe=recipes/gipo.yaml --updates=200
 
 Lag is what `trainer.hold_back` and replay make it; see `study.py`.
 """

@@ -43,7 +43,7 @@ LOG_LINES = 12
 class StudyConfig(Section):
     """Fields that all studies have."""
 
-    recipe: str = "recipes/quickstart.yaml"
+    recipe: str = "recipes/gipo.yaml"
     """The run that every cell is a variation of; read once, when the study starts."""
     output_dir: str = "outputs/study"
     """Folder of the runs and of what they say together; finished runs in it are kept."""

@@ -140,5 +140,4 @@ class LossInputs:
     is never looked at. None: all exist."""
     ratios_per_decision: float | None = None
     """Mean number of ratios per decision of the batch that this one is a micro-batch of; with it the losses
-    of micro-batches, weighted by their decisions, add up to that of the batch. None: this is the whole
-    batch."""
+    of micro-batches, weighted by their decisions, add up to that of the batch. None: this is all of it."""

@@ -115,7 +115,7 @@ def _seconds(update: dict[str, float]) -> float:
 class BenchThroughputConfig(Section):
     """Speed of a recipe on this machine under each schedule."""
 
-    recipe: str = "recipes/quickstart.yaml"
+    recipe: str = "recipes/gipo.yaml"
     """The run."""
     policy_path: str | None = None
     """The LeRobot checkpoint that acts and learns."""

@@ -17,7 +17,6 @@ from accerl_lerobot.envs.libero_simulator import Simulator
 WIDEST = 0.068  # widest object that fits between the open fingers with some room, in m
 DEPTH = 0.015  # distance of the grip site below an object's top; the palm is 2.4 cm above the grip site
 EASY_REACH = 0.72  # distance from the robot's base that a hand pointing straight down reaches easily, in m
-OTHER_SIDE = 1.0  # cost of a rim's left side: a person, too, mostly takes the same one
 DOWN = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
 """Rotation of a hand that points down; its fingers close along the world's y axis."""
 _CORNERS = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
@@ -114,7 +113,7 @@ class Scene:
             middle = (flat.min(0) + flat.max(0)) / 2
             radius = np.ptp(flat @ axes.T, axis=0)[:, None] / 2 - 0.012
             points = np.concatenate([middle + radius * axes, middle - radius * axes])
-            cost = np.repeat([OTHER_SIDE, 0.0], len(axes))
+            cost = np.repeat([1.0, 0.0], len(axes))  # people, too, mostly take the same side
         yaws = np.tile(yaws, len(points) // len(yaws))
         hands = np.concatenate([points, np.full((len(points), 1), height)], -1)
         ways = points - self.base, points - position[:2] + goal[:2] - self.base

@@ -26,9 +26,9 @@ SETTLING = 10  # env steps without motion before the first observation, as in Le
 MAX_OBJECTS = 4  # most objects that a task names as those it is about
 MAX_FACES = 2000
 ARENA = "64M"  # memory of a simulation's contacts and constraints; some 6 MB are used
-NUMBERS = 25 + MAX_OBJECTS * 4 + 6 * 10  # of robot, objects, and distances
+NUMBERS = 25 + MAX_OBJECTS * 4 + 6 * 10  # of robot, objects, and what lies between them
 TIMESTEP = 0.002
-NEAR = 0.03  # distance in m at which `distances` begins to squash
+NEAR = 0.03  # distance in m for which a critic's eyes are sharpest
 STILL = np.array([0, 0, 0, 0, 0, 0, -1], np.float32)
 
 
@@ -171,10 +171,10 @@ class Simulator:
         return np.concatenate(parts).astype(np.float32)
 
     def everything(self) -> np.ndarray:
-        """Robot and objects of interest as they are now, and `distances`, float64 (101,).
+        """Robot and objects of interest as they are now, float64 (101,).
 
-        An object has its position and its joint's; what there is not lies in the hand. How objects are turned
-        is left out: a bowl looks the same from all sides, and a critic would have to learn that.
+        An object has its position and its joint's; what there is not lies in the hand. Then come the vectors
+        between all these, and again squashed. No turns: a bowl looks the same from all sides.
         """
         data, joints, dofs = self.data, self._joints, self._dofs
         arm = data.qpos[joints], data.qvel[dofs], data.site_xpos[self._site], data.xquat[self._hand]
@@ -182,7 +182,10 @@ class Simulator:
         points, openings = np.tile(self._position, (1 + MAX_OBJECTS, 1)), np.zeros(MAX_OBJECTS)
         for i, name in enumerate(self.env.obj_of_interest):
             points[1 + i], openings[i] = self.pose(name)[0], self.opening(name)
-        return np.concatenate([*arm, *fingers, points[1:].ravel(), openings, distances(points)])
+        pairs = np.triu_indices(len(points), 1)
+        vectors = (points[pairs[1]] - points[pairs[0]]).ravel()
+        near = np.tanh(vectors / NEAR)
+        return np.concatenate([*arm, *fingers, points[1:].ravel(), openings, vectors, near])
 
     def pose(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Position (3,) and quaternion (4,), w first, of an object, a fixture or a region in the world."""
@@ -277,14 +280,6 @@ def operational_space_torques(arm: Arm, aim: Aim) -> np.ndarray:
     for i in range(n):
         torques[i] += arm.bias[dofs[i]]
     return torques
-
-
-def distances(points: np.ndarray) -> np.ndarray:
-    """Vectors between all pairs of points, (P, 3) in m, as they are and again squashed, for what is near:
-    float64 (P·(P − 1)/2·6,)."""
-    i, j = np.triu_indices(len(points), 1)
-    vectors = (points[j] - points[i]).ravel()
-    return np.concatenate([vectors, np.tanh(vectors / NEAR)])
 
 
 class SensorClock:

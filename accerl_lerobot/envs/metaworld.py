@@ -36,11 +36,6 @@ from accerl_lerobot.errors import InputError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-MT10 = (
-    "reach-v3", "push-v3", "pick-place-v3", "door-open-v3", "drawer-open-v3", "drawer-close-v3",
-    "button-press-topdown-v3", "peg-insert-side-v3", "window-open-v3", "window-close-v3",
-)  # fmt: skip
-
 
 @functools.cache
 def _tables() -> dict[str, Any]:
@@ -54,8 +49,8 @@ def _tables() -> dict[str, Any]:
 
 @functools.cache
 def groups() -> dict[str, tuple[str, ...]]:
-    """LeRobot's difficulty groups, plus MetaWorld's ``mt10`` and ``all`` 50 tasks."""
-    named = {"mt10": MT10} | {name: tuple(tasks) for name, tasks in _tables()["DIFFICULTY_TO_TASKS"].items()}
+    """LeRobot's difficulty groups, plus ``all`` 50 tasks."""
+    named = {name: tuple(tasks) for name, tasks in _tables()["DIFFICULTY_TO_TASKS"].items()}
     return named | {"all": tuple(sorted(_tables()["TASK_DESCRIPTIONS"]))}
 
 
@@ -207,7 +202,7 @@ class MetaWorldConfig(SuiteConfig):
     STATE_NUMBERS = 39
 
     task: str = "drawer-open-v3"
-    """Task names separated by commas, or groups: easy, medium, hard, very_hard (LeRobot's), mt10, all."""
+    """Task names separated by commas, or LeRobot's groups: easy, medium, hard, very_hard, all."""
     camera: str = "corner2"
     """Camera names separated by commas; each becomes ``observation.images.<name>``."""
     image_size: Annotated[int, Range("[64, 480]")] = 64

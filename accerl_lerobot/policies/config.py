@@ -93,8 +93,7 @@ class TuningConfig(Section, section="policy.tuning"):
 
     mode: Literal["checkpoint", "full", "expert", "lora"] = "checkpoint"
     """checkpoint: what its LeRobot config leaves trainable. full: everything. expert: the action expert
-    without the vision-language backbone. lora: low-rank adapters; saved merged, so that stock LeRobot loads
-    the result."""
+    without the vision-language backbone. lora: low-rank adapters; saved merged, for stock LeRobot."""
     rank: Annotated[int, Range("[1, 65536]")] = 16
     """lora: rank of the adapters, whose output is not scaled."""
     targets: str | None = None

@@ -40,8 +40,7 @@ class TrainerConfig(Section, section="trainer"):
     advantage_memory: Annotated[float, Range("[0, 1)")] = 0.0
     """Advantages are normalised by the moments of this batch and of those before it, of which each earlier
     one is weighted by this factor once more; 0: this batch alone. A small batch may hold nothing but
-    failures; its advantages are then the critic's noise, which its own standard deviation would make as loud
-    as any."""
+    failures; its advantages are then the critic's noise, which their own deviation would make loud."""
     grad_clip: Positive = 1.0
     """Largest gradient norm of the policy, and of the critic head, each by itself."""
     betas: tuple[Annotated[float, Range("[0, 1)")], Annotated[float, Range("[0, 1)")]] = (0.9, 0.95)

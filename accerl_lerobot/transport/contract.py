@@ -40,8 +40,7 @@ class Client(ABC):
 
     @abstractmethod
     def send(self, message: Any) -> int:
-        """Send a message without waiting for its reply; returns its ticket. A `TimeoutError` if too many are
-        under way."""
+        """Sends without waiting for a reply; returns a ticket. A `TimeoutError` if too many are under way."""
 
     @abstractmethod
     def done(self, timeout: float) -> list[tuple[int, Any]]:

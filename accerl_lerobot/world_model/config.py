@@ -185,8 +185,7 @@ class ImaginationConfig(Section, section="imagination"):
     """Share of the decisions of a batch that are imagined; 0: none."""
     model: Literal["learned", "shuffled", "oracle"] = "learned"
     """World model. learned: the one in `path`. oracle: a simulator, the best there can be. shuffled (the
-    learned one, given another rollout's actions): a placebo; a gain that it gives too is not the world
-    model's."""
+    learned one, given another rollout's actions): a placebo, whose gain is not the world model's."""
     path: str | None = None
     """The folder ``world_model`` that ``accerl world-model`` has written; oracle needs none."""
     discover_packages_path: str | None = None

@@ -115,7 +115,8 @@ class PixelWorldModel(LearnableWorldModel):
     def _predict(self, state: State, actions: Tensor, executed: Tensor) -> Prediction:
         chunk, newest = self._chunk(state, actions, executed), _to_floats(state["frames"][:, -1])
         image = (newest + self.change * self._change(state, chunk)).clamp(-1, 1)
-        frames = _to_bytes(image, len(self.spec.cameras))
+        pixels = ((image + 1) * 127.5).round().clamp(0, 255).byte()
+        frames = pixels.unflatten(1, (len(self.spec.cameras), 3)).movedim(2, -1)
         motions = self._motions(state, chunk)
         robot = state["robot"][:, -1] + self.motion_mean + self.motion_std * motions.mean(0)
         # Without a state it is NaN: the mean of nothing.
@@ -177,10 +178,6 @@ def _advance(state: State, frames: Tensor, robot: Tensor, actions: Tensor) -> St
 def _to_floats(frames: Tensor) -> Tensor:
     """uint8 (B, V, H, W, 3) to float32 (B, 3·V, H, W) in [−1, 1]."""
     return (frames.float() / 127.5 - 1).movedim(-1, 2).flatten(1, 2)
-
-
-def _to_bytes(image: Tensor, cameras: int) -> Tensor:
-    return ((image + 1) * 127.5).round().clamp(0, 255).byte().unflatten(1, (cameras, 3)).movedim(2, -1)
 
 
 class FrameNetwork(nn.Module):
