@@ -209,9 +209,11 @@ def test_chunks_give_the_states_of_single_steps(world: LiberoWorld):
     for key in at_once:
         assert np.array_equal(at_once[key], singly[key]), key
     assert at_once["observation.state"].shape == (8,) and at_once[IMAGE].shape == (64, 64, 3)
-    assert at_once["observation.environment_state"].shape == (world.config.state_size,)
-    assert at_once["task"].startswith("pick up the black bowl")
-    assert list(at_once["observation.environment_state"][-3:]) == pytest.approx([10 / 280, 0, 1])
+    state = at_once["observation.environment_state"]
+    assert state.shape == (world.config.state_size,) and at_once["task"].startswith("pick up the black bowl")
+    way = world.simulator.pose("akita_black_bowl_1")[0] - world.simulator.hand[0]
+    assert np.array([state[41:44], state[71:74]]) == pytest.approx(np.array([way, np.tanh(way / 0.03)]))
+    assert list(state[-3:]) == pytest.approx([10 / 280, 0, 1])
 
 
 def stock_physics(task: str, seed: int, steps: int) -> Iterator[tuple[np.ndarray, np.ndarray, bool]]:

@@ -49,8 +49,7 @@ def test_a_request_larger_than_a_batch_is_served_alone() -> None:
 
 
 def test_first_in_first_out_nothing_lost_nobody_starves() -> None:
-    """A random load, served whenever due by a server that takes its time; large requests are not
-    overtaken."""
+    """A random load, served when due by a server that takes its time; large requests are not overtaken."""
     rng = random.Random(1)
     batcher: Batcher[list[int]] = Batcher(max_batch=8, max_wait_s=WAIT)
     now, sent, served, busy_until = 0.0, 0, [], 0.0

@@ -195,8 +195,7 @@ def test_a_tight_max_lag_retires_but_never_stalls(max_lag: int) -> None:
 
 
 def test_evenly_matched_sides_waste_nothing() -> None:
-    """With room to spare, every decision is trained on exactly as often as asked, none evicted or retired
-    unused."""
+    """With room to spare, every decision is trained on just as often as asked, none goes unused."""
     config = ReplayConfig(capacity=128, min_decisions=16, samples_per_insert=2.0, ahead=32, max_lag=200)
     simulation = Simulation(
         config=config, batch=16, longest=4, workers=4, in_flight=32, publish_every=1, gate="insert", seed=0
