@@ -43,8 +43,7 @@ class GymConfig(EnvConfig):
     image_size: Annotated[int, Range("[0, 1024]")] = 0
     """Height and width that images are resized to, in pixels; 0: as they are."""
     state: tuple[str, ...] = ()
-    """Keys whose numbers, one after the other, are ``observation.state``; empty: the whole observation, if it
-    is one vector."""
+    """Keys whose numbers are, in turn, ``observation.state``; empty: the observation, if it is one vector."""
     environment_state: tuple[str, ...] = ()
     """Keys whose numbers, and the share of `max_steps` gone, are ``observation.environment_state``, for
     ``algorithm.type=chunk_critic``. ``state``: the same as `state`."""

@@ -54,8 +54,7 @@ class PushConfig(Section):
     repo_id: RepoId = ""
     """``user/name`` on the Hub; created if it does not exist."""
     private: bool = True
-    """Keep the repository private. A public repository is written to only when this is false, and a private
-    one stays private."""
+    """Keep the repository private. Only false writes to a public one, and a private one stays private."""
     evaluation: str | None = None
     """Folder or file that ``accerl eval`` wrote about this policy; its numbers go into the card. None: those
     of the policy's run."""

@@ -64,8 +64,7 @@ class GaussianSamplerConfig(SamplerConfig):
     family = "accerl_lerobot.policies.gaussian:GaussianFamily"
 
     std: Annotated[float, Range("(0, 2]")] = 0.2
-    """Std of every action at the start, in normalised units. It is learned, between a quarter of this and 2.5
-    times as much."""
+    """Std of every action at the start, normalised. It is learned, from a quarter to 2.5 times as much."""
 
     @property
     def bounds(self) -> tuple[float, float]:

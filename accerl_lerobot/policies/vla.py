@@ -205,10 +205,8 @@ def data_only() -> Iterator[None]:
     from lerobot.processor import tokenizer_processor
     from transformers import AutoTokenizer
 
-    def text_tokenizer(name: str, **options: Any) -> Any:
-        return AutoTokenizer.from_pretrained(name, **options | {"trust_remote_code": False})
-
-    text = SimpleNamespace(from_pretrained=text_tokenizer)
+    load, never = AutoTokenizer.from_pretrained, {"trust_remote_code": False}
+    text = SimpleNamespace(from_pretrained=lambda name, **options: load(name, **options | never))
     ours: dict[str, Any] = {"AutoProcessor": FastTokenizer, "AutoTokenizer": text}
     with patch.multiple(modeling_pi0_fast, **ours), patch.multiple(tokenizer_processor, **ours):
         yield

@@ -55,7 +55,7 @@ class Critic(nn.Module):
         self.network = Ensemble(len(teacher.mean) + math.prod(teacher.chunk), 1, MEMBERS)
 
     def forward(self, state: Tensor, chunk: Tensor) -> Tensor:
-        return self.network(torch.cat([state, chunk.flatten(1)], -1))[..., 0]
+        return self.network(torch.cat([state, chunk.flatten(1)], -1))[..., 0].float()
 
 
 class ChunkCriticUpdate(OffPolicyUpdate):
@@ -149,12 +149,12 @@ class ChunkCriticUpdate(OffPolicyUpdate):
             self.teacher.low.copy_(low - margin)
             self.teacher.high.copy_(high + margin)
         known = won if len(won) >= BATCH else np.arange(len(self.memory))
-        for _ in range(FIRST_STEPS):
+        for _ in self.repeat(FIRST_STEPS):
             rows = drawn(known, BATCH)
             loss = (self.teacher(self.tensor("state", rows)) - self.tensor("chunk", rows)).square().mean()
             self._descend("teacher", loss)
         # Or the teacher would at once climb a critic that knows nothing.
-        for _ in range(min(len(self.memory), MOST_FIRST)):
+        for _ in self.repeat(min(len(self.memory), MOST_FIRST)):
             self._critic_step(bounds)
         with torch.no_grad():
             self.teacher.ready.fill_(1)

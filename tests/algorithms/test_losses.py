@@ -119,8 +119,7 @@ def test_ppo_by_hand(rho: float, advantage: float, expected: float, moves: bool)
 
 @pytest.mark.parametrize("level", ["token", "chunk"])
 def test_gipo_gradient_is_that_of_importance_sampling_with_the_weight_held_still(level: Any) -> None:
-    """−E[ω ρ Â ∇log π], with ω a constant: by its formula, and by finite differences over a policy
-    parameter."""
+    """−E[ω ρ Â ∇log π], with ω a constant: by its formula and by finite differences over a parameter."""
     inputs = make_inputs(spread=0.6)
     config = GIPOConfig(level=level, sigma=0.7, kl_coef=0.0)
     got = gradient(inputs, config.loss(inputs).loss)

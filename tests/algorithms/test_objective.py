@@ -81,8 +81,7 @@ def test_micro_batches_add_up(config: RatioConfig, level: Any) -> None:
 
 
 def test_kl_estimates_behaviour_to_policy_in_value_and_gradient() -> None:
-    """μ = N(0, 1), π = N(m, s): samples of μ, KL(μ‖π) = log s + (1 + m²)/(2s²) − ½ and its slope m/s² in
-    m."""
+    """μ = N(0, 1), π = N(m, s): samples, KL(μ‖π) = log s + (1 + m²)/(2s²) − ½ and its slope m/s² in m."""
     noise = torch.randn(200_000, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     mean = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
     s = 1.2

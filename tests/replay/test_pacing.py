@@ -104,8 +104,7 @@ class Simulation:
         self.carried[worker] = (segment, self.replay.counters.inserted_decisions)
 
     def insert(self, worker: int) -> None:
-        """Inserts, unless another worker would be carrying for longer than assumed: then that one goes
-        first."""
+        """Inserts, unless another would be carrying for longer than assumed: then that one goes first."""
         if worker not in self.carried or (self.gate == "insert" and not self.replay.may_insert()):
             return
         oldest = min(self.carried, key=lambda w: self.carried[w][1])
