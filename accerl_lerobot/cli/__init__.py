@@ -50,7 +50,7 @@ def usage() -> str:
         "",
         "examples:",
         "  accerl doctor quickstart",
-        "  accerl train --config_path=quickstart --trainer.lr=1e-5",
+        "  accerl train --config_path=quickstart --trainer.lr=2e-4",
         "  accerl eval --config_path=RUN/config.yaml --policy.path=RUN/checkpoints/last/pretrained_model",
         "",
         "accerl VERB --help lists what people change, --help=all every field. ACCERL_LOG=INFO says more.",

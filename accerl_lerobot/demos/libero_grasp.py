@@ -113,7 +113,7 @@ class Scene:
             middle = (flat.min(0) + flat.max(0)) / 2
             radius = np.ptp(flat @ axes.T, axis=0)[:, None] / 2 - 0.012
             points = np.concatenate([middle + radius * axes, middle - radius * axes])
-            cost = np.repeat([1.0, 0.0], len(axes))  # people, too, mostly take the same side
+            cost = np.repeat([1.0, 0.0], len(axes))  # the side of −y, if it is free
         yaws = np.tile(yaws, len(points) // len(yaws))
         hands = np.concatenate([points, np.full((len(points), 1), height)], -1)
         ways = points - self.base, points - position[:2] + goal[:2] - self.base

@@ -125,10 +125,10 @@ class PolicyConfig(Section, section="policy"):
     its Python code, which you have read, runs with your rights, and no other does."""
     device: Device = "auto"
     """cpu, cuda, or auto."""
-    precision: Literal["fp32", "bf16"] = "fp32"
-    """fp32, or bf16: the network runs in bfloat16 under autocast, weights and log-probs stay in fp32. A
-    ``dtype`` in the checkpoint's LeRobot config is taken as float32, and saved so: updates of RL are smaller
-    than bfloat16 resolves."""
+    precision: Literal["fp32", "bf16", "auto"] = "fp32"
+    """fp32, or bf16: networks run in bfloat16 under autocast, weights and log-probs stay in fp32; auto: bf16
+    where the processor computes in it. A ``dtype`` in the checkpoint's LeRobot config is taken, and saved, as
+    float32: updates of RL are smaller than bfloat16 resolves."""
     sampler: SamplerConfig | None = None
     """How it explores. None: the first family of its policy type, with that family's defaults."""
     tuning: TuningConfig = field(default_factory=TuningConfig)

@@ -144,7 +144,10 @@ def load_adapter(config: PolicyConfig, *, rehearsal: bool = False) -> LeRobotAda
     device = torch.device(lerobot_config.device)
     policy.to(device).eval()
     model = model_class(policy)
-    if config.precision == "fp32" and device.type == "cuda":
+    if (precision := config.precision) == "auto":
+        on_cpu = device.type == "cpu" and torch.cpu._is_avx512_bf16_supported()
+        precision = "bf16" if on_cpu or (device.type == "cuda" and torch.cuda.is_bf16_supported()) else "fp32"
+    if precision == "fp32" and device.type == "cuda":
         # torch convolves with 10 bits of mantissa there. For batches of different sizes cuDNN chooses other
         # algorithms; what they round differently is divided by the std of the noise in every log-prob.
         torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = False
@@ -163,7 +166,7 @@ def load_adapter(config: PolicyConfig, *, rehearsal: bool = False) -> LeRobotAda
         sampler = sampler_config(config, lerobot_config.type)
         family = imported(sampler.family)(model, sampler)
         critic = ValueHead(model.width)
-        adapter = LeRobotAdapter(policy, processing, model, family, critic, config.precision)
+        adapter = LeRobotAdapter(policy, processing, model, family, critic, precision)
         if (folder / untrusted.OURS).is_file():
             _load_ours(adapter, folder, origin)
         requests = adapter.example_requests()

@@ -149,12 +149,12 @@ class ChunkCriticUpdate(OffPolicyUpdate):
             self.teacher.low.copy_(low - margin)
             self.teacher.high.copy_(high + margin)
         known = won if len(won) >= BATCH else np.arange(len(self.memory))
-        for _ in self.repeat(FIRST_STEPS):
+        for _ in range(FIRST_STEPS):
             rows = drawn(known, BATCH)
             loss = (self.teacher(self.tensor("state", rows)) - self.tensor("chunk", rows)).square().mean()
             self._descend("teacher", loss)
         # Or the teacher would at once climb a critic that knows nothing.
-        for _ in self.repeat(min(len(self.memory), MOST_FIRST)):
+        for _ in range(min(len(self.memory), MOST_FIRST)):
             self._critic_step(bounds)
         with torch.no_grad():
             self.teacher.ready.fill_(1)
@@ -165,13 +165,14 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         names = ("state", "chunk", "reward", "discount", "return")
         state, chunk, reward, discount, returns = (self.tensor(name, rows) for name in names)
         following = self.tensor("state", self.memory["following"][rows])
-        with torch.no_grad():
+        with torch.no_grad(), self.adapter.autocast():
             planned = self.teacher(following)
             planned = planned + SMOOTHING * torch.randn_like(planned)
             bootstrap = pessimistic(self.slow(self.teacher.scaled(following), planned))
             predicted = reward + discount * bootstrap.clamp(*bounds)
             target = (1 - MONTE_CARLO) * predicted + MONTE_CARLO * returns
-        q = self.critic(self.teacher.scaled(state), chunk)
+        with self.adapter.autocast():
+            q = self.critic(self.teacher.scaled(state), chunk)
         loss = (q - target).square().mean(1).sum()
         norm = self._descend("critic", loss, clip=math.inf)
         with torch.no_grad():
@@ -190,10 +191,11 @@ class ChunkCriticUpdate(OffPolicyUpdate):
     def _teacher_step(self, won: np.ndarray) -> dict[str, float]:
         """One gradient step of the teacher; `won` are the rows of successful episodes."""
         state = self.tensor("state", drawn(self.imitable(), BATCH))
-        q = self.critic(self.teacher.scaled(state), self.teacher(state))
-        loss = -pessimistic(q).mean() / q.detach().abs().mean().clamp(min=SMALLEST_SCALE)
         rows = drawn(won, BATCH)
-        gap = self.teacher(self.tensor("state", rows)) - self.tensor("chunk", rows)
+        with self.adapter.autocast():
+            q = self.critic(self.teacher.scaled(state), self.teacher(state))
+            gap = self.teacher(self.tensor("state", rows)) - self.tensor("chunk", rows)
+        loss = -pessimistic(q).mean() / q.detach().abs().mean().clamp(min=SMALLEST_SCALE)
         distance = gap.square().mean() / DISTANCE**2
         self._descend("teacher", loss + IMITATION * distance)
         metrics = {"teacher_value": q.mean(), "disagreement": q.std(0).mean(), "distance": distance}

@@ -168,18 +168,12 @@ class OffPolicyUpdate(BaseUpdate):
         self._owed = dict(state["owed"])
         self.memory.restore(state["memory"])
 
-    def steps(self, name: str, each: float, new: int) -> Iterator[None]:
+    def steps(self, name: str, each: float, new: int) -> range:
         """As many steps as are due at ``each`` for a new decision; what is left over is due later."""
         owed = self._owed.get(name, 0.0) + each * new
         due = int(owed)
         self._owed[name] = owed - due
-        return self.repeat(due)
-
-    def repeat(self, count: int) -> Iterator[None]:
-        """So many steps, each in the policy's precision: autocast keeps weights that a step has changed."""
-        for _ in range(count):
-            with self.adapter.autocast():
-                yield
+        return range(due)
 
     def remember(self, segment: Segment) -> None:
         executed = self.adapter.processing.normalise(torch.from_numpy(segment.actions))
@@ -194,8 +188,9 @@ class OffPolicyUpdate(BaseUpdate):
         metrics: dict[str, float] = {}
         self.optimizer.zero_grad(set_to_none=True)
         for part in np.array_split(rows, math.ceil(len(rows) / self.config.micro_batch)):
-            encoded = self.adapter.encode(*self.memory.observations(part))
-            imitation = self.adapter.family.imitation_loss(encoded, self.target(part)).float()
+            with self.adapter.autocast():
+                encoded = self.adapter.encode(*self.memory.observations(part))
+                imitation = self.adapter.family.imitation_loss(encoded, self.target(part)).float()
             losses = self.losses(part, encoded, imitation)
             losses = {name: len(part) / len(rows) * value for name, value in losses.items()}
             torch.stack(list(losses.values())).sum().backward()

@@ -75,9 +75,8 @@ def taught(checkpoint: Path) -> LeRobotAdapter:
 def learner(
     checkpoint: Path, algorithm: ChunkCriticConfig | None = None, **trainer: Any
 ) -> ChunkCriticUpdate:
-    adapter = taught(checkpoint)
     config = TrainerConfig(**{"warmup_updates": 0, "value_warmup_updates": 0} | trainer)
-    return ChunkCriticUpdate(adapter, algorithm or ChunkCriticConfig(), config)
+    return ChunkCriticUpdate(taught(checkpoint), algorithm or ChunkCriticConfig(), config)
 
 
 class TestMemory:
@@ -258,15 +257,16 @@ def test_teacher_and_policy_go_where_the_critic_leads(
     monkeypatch.setattr(chunk_critic, "IMITATION", 0.0)
     algorithm = ChunkCriticConfig(critic_steps=6.0, policy_steps=0.5)
     update = learner(tiny_checkpoint, algorithm, lr=1e-3, value_lr=1e-3, value_warmup_updates=2)
-    update.adapter.precision = precision
+    update.adapter.precision, cast = precision, set()
+    update.critic.register_forward_hook(lambda *_: cast.add(torch.is_autocast_enabled("cpu")))
     rng, metrics = np.random.default_rng(0), {}
     before = first_action(update)
     for _ in range(10):
         metrics = update.step(tried(rng, lambda up: (1 + up) / 2))
         assert bool(update.teacher.ready) == (update.version > 2)
+    assert cast == {precision == "bf16"}
     state = update.tensor("state", np.arange(1))
-    taught_action = update.adapter.processing.unnormalise(update.teacher(state).detach())[0, 0, 0]
-    assert taught_action > 0.3
+    assert update.adapter.processing.unnormalise(update.teacher(state).detach())[0, 0, 0] > 0.3
     assert first_action(update) > before + 0.2
     assert metrics["explained_variance"] > 0.5 and metrics["memory_decisions"] == 10 * 32
 
