@@ -68,15 +68,12 @@ def chunks(segment: Segment) -> np.ndarray:
 
 def taught(checkpoint: Path) -> LeRobotAdapter:
     """A policy and a teacher that sees one number and the task."""
-    config = PolicyConfig(path=str(checkpoint), device="cpu")
-    return with_teacher(load_adapter, state=1, share=0.5, config=config, noise=0.1)
+    return with_teacher(load_adapter, 1, 0.5, PolicyConfig(path=str(checkpoint), device="cpu"), noise=0.1)
 
 
-def learner(
-    checkpoint: Path, algorithm: ChunkCriticConfig | None = None, **trainer: Any
-) -> ChunkCriticUpdate:
+def learner(path: Path, algorithm: ChunkCriticConfig | None = None, **trainer: Any) -> ChunkCriticUpdate:
     config = TrainerConfig(**{"warmup_updates": 0, "value_warmup_updates": 0} | trainer)
-    return ChunkCriticUpdate(taught(checkpoint), algorithm or ChunkCriticConfig(), config)
+    return ChunkCriticUpdate(taught(path), algorithm or ChunkCriticConfig(), config)
 
 
 class TestMemory:
@@ -257,7 +254,9 @@ def test_teacher_and_policy_go_where_the_critic_leads(
     monkeypatch.setattr(chunk_critic, "IMITATION", 0.0)
     algorithm = ChunkCriticConfig(critic_steps=6.0, policy_steps=0.5)
     update = learner(tiny_checkpoint, algorithm, lr=1e-3, value_lr=1e-3, value_warmup_updates=2)
-    update.adapter.precision, cast = precision, set()
+    monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: precision == "bf16")
+    automatic = PolicyConfig(path=str(tiny_checkpoint), device="cpu", precision="auto")
+    update.adapter.precision, cast = load_adapter(automatic).precision, set()
     update.critic.register_forward_hook(lambda *_: cast.add(torch.is_autocast_enabled("cpu")))
     rng, metrics = np.random.default_rng(0), {}
     before = first_action(update)
