@@ -28,7 +28,7 @@ MAX_FACES = 2000
 ARENA = "64M"  # memory of a simulation's contacts and constraints; some 6 MB are used
 NUMBERS = 25 + MAX_OBJECTS * 4 + 6 * 10  # of robot, objects, and what lies between them
 TIMESTEP = 0.002
-NEAR = 0.03  # distance in m for which a critic's eyes are sharpest
+NEAR = 0.03  # scale in m of the squashed vectors that a critic sees
 STILL = np.array([0, 0, 0, 0, 0, 0, -1], np.float32)
 
 
