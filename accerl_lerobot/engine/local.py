@@ -87,7 +87,7 @@ class LocalEngine(Engine):
             config.rollout,
             "local",
             self._outbox.append,
-            self._episodes.append,
+            lambda result: (self._plans.ended(result), self._episodes.append(result)),
         )
         if state is not None:
             self._restore(state)

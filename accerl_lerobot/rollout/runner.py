@@ -5,7 +5,7 @@ A slot is one world. `start` resets it and `advance` executes a decision in it; 
 the next decision. The Ray worker goes on with other slots meanwhile, the local engine answers at once.
 
 `EpisodePlans` says which episode a free world runs next: planned evaluations first, then exploring ones, of
-each task in turn, with seeds of this worker's own (`seeds.py`).
+each task in turn and of failing ones more often, with seeds of this worker's own (`seeds.py`).
 """
 
 from __future__ import annotations
@@ -26,6 +26,10 @@ from accerl_lerobot.seeds import noise_seed, train_seed
 
 STARTS_PER_INCARNATION = 1000
 """By how much a restarted worker skips ahead in its training seeds, so as not to repeat its episodes."""
+LEAST_SHARE = 0.1
+"""How often a task that never fails is explored, compared with one that always does."""
+RECENT = 20
+"""Episodes of a task that tell how often it fails now."""
 
 
 @kind
@@ -168,6 +172,9 @@ class EpisodePlans:
         self.starts = incarnation * STARTS_PER_INCARNATION  # where it is in the worker's seeds
         # Filled and emptied on different threads: appending to and popping from a deque is atomic.
         self._queued: deque[EpisodePlan] = deque()
+        self._failing = np.ones(len(tasks))
+        # Episodes that each task is still to get. The first one's is the worker's own; equals take turns.
+        self._owed = -1e-6 * ((np.arange(len(tasks)) - worker) % len(tasks))
 
     def queue(self, plans: Iterable[EpisodePlan]) -> None:
         self._queued.extend(plans)
@@ -181,8 +188,21 @@ class EpisodePlans:
         if self._budget is not None:
             self._budget -= 1
         number, self.starts = self.starts, self.starts + 1
-        task = self._tasks[(number + self.worker) % len(self._tasks)]
+        shares = np.maximum(self._failing, LEAST_SHARE)
+        owed = self._owed + shares / shares.sum()
+        chosen = int(np.argmax(owed))
+        owed[chosen] -= 1
+        self._owed = owed
+        task = self._tasks[chosen]
         return EpisodePlan(task=task, seed=train_seed(self._seed, self.worker, number), explore=True)
+
+    def ended(self, result: EpisodeResult) -> None:
+        """Tasks that fail more are explored more."""
+        if result.plan.explore:
+            index = self._tasks.index(result.plan.task)
+            change = np.zeros(len(self._tasks))
+            change[index] = ((not result.success) - self._failing[index]) / RECENT
+            self._failing = self._failing + change
 
     @property
     def spent(self) -> bool:
@@ -190,11 +210,13 @@ class EpisodePlans:
         return self._budget is not None and self._budget <= 0
 
     def state(self) -> dict[str, Any]:
-        return {"budget": self._budget, "starts": self.starts, "queued": list(self._queued)}
+        state = {"budget": self._budget, "starts": self.starts, "queued": list(self._queued)}
+        return state | {"failing": self._failing, "owed": self._owed}
 
     def restore(self, state: dict[str, Any]) -> None:
         self._budget, self.starts = state["budget"], state["starts"]
         self._queued.extend(state["queued"])
+        self._failing, self._owed = state["failing"], state["owed"]
 
 
 @kind

@@ -71,7 +71,7 @@ class RolloutWorker:
         self._outbox: list[Segment] = []
         self._deciding = ReconnectingClient("inference")
         worlds = [make_world(env, history, config.reward_model) for _ in range(config.worlds)]
-        callbacks = self._outbox.append, self._results.append
+        callbacks = self._outbox.append, lambda result: (plans.ended(result), self._results.append(result))
         name = f"rollout{plans.worker}.{plans.incarnation}"
         self._runner = RolloutRunner(worlds, self._next, config, name, *callbacks)
         self._clock.enter(WAIT_IN)

@@ -267,6 +267,26 @@ def test_every_episode_has_its_own_seed_and_tasks_take_turns():
     assert all(p.explore for p in plans)
 
 
+def test_a_task_that_fails_more_is_explored_more_and_goes_on_so_after_a_restart():
+    plans = make()
+    for plan in (found := take(plans, 300)):
+        success = plan.task == "pull"
+        plans.ended(
+            EpisodeResult(
+                plan=plan, success=success, episode_return=0.0, steps=1, decisions=1, versions=(0, 0)
+            )
+        )
+    assert [p.task for p in found] == list(TASKS) * 100, "until it is known how they ended, tasks take turns"
+    state = plans.state()
+    for array in (state["failing"], state["owed"]):
+        array.setflags(write=False)  # as Ray hands arrays over
+    resumed = make()
+    resumed.restore(state)
+    found = take(plans, 210)
+    assert [sum(p.task == task for p in found) for task in TASKS] == [100, 10, 100]
+    assert found == take(resumed, 210)
+
+
 def test_evaluations_go_first_and_nothing_is_explored_before_it_is_time():
     plans = make()
     plans.queue([evaluate(index=0), evaluate(index=1)])
