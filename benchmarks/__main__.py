@@ -18,6 +18,7 @@ from benchmarks.faults import BenchFaultsConfig
 from benchmarks.few_shot import BenchFewShotConfig
 from benchmarks.gpu import BenchGpuConfig
 from benchmarks.lag import BenchLagConfig
+from benchmarks.latency import BenchLatencyConfig
 from benchmarks.scaling import BenchScalingConfig
 from benchmarks.soak import BenchSoakConfig
 from benchmarks.transport import BenchTransportConfig
@@ -30,6 +31,7 @@ CONFIGS: dict[str, type[Any]] = {
     "faults": BenchFaultsConfig,
     "soak": BenchSoakConfig,
     "async_vs_sync": BenchAsyncVsSyncConfig,
+    "latency": BenchLatencyConfig,
     "scaling": BenchScalingConfig,
     "batching": BenchBatchingConfig,
     "transport": BenchTransportConfig,

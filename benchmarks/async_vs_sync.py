@@ -21,13 +21,13 @@ from typing import Annotated, Any
 from rich.console import Group
 
 from accerl_lerobot.bench import as_table, host, ranged, spread
-from accerl_lerobot.bench.latency import TRACE
 from accerl_lerobot.bench.throughput import ARMS, Block
 from accerl_lerobot.config.ranges import Positive, Range, Repeats, Seed, Steps
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError, output_folder
 from accerl_lerobot.evaluation import Rate, drawing, evaluation_plans
 from accerl_lerobot.replay.pacing import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, Schedule
+from benchmarks.latency import TRACE
 from benchmarks.machinery import MOST_BUSY, MachineryConfig
 from benchmarks.records import as_markdown, write
 from benchmarks.simulated_world import read_trace
@@ -150,7 +150,7 @@ def _law(config: BenchAsyncVsSyncConfig, of: MachineryConfig) -> dict[str, Any]:
 def _named(law: dict[str, Any]) -> str:
     if law["trace"] is None:
         return f"{law['cv']:g}"
-    # `bench latency` calls all of them alike, in folders of their own.
+    # `benchmarks latency` calls all of them alike, in folders of their own.
     trace = Path(law["trace"])
     return f"{law['cv']:.2f} ({trace.stem if trace.name != TRACE else trace.resolve().parent.name})"
 

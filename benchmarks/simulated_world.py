@@ -14,12 +14,12 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from accerl_lerobot.bench.latency import RESET
 from accerl_lerobot.config.ranges import NonNegative, Range, Steps
 from accerl_lerobot.envs import ChunkResult, EnvConfig, SimulatedConfig
 from accerl_lerobot.envs.simulated import SimulatedWorld
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Observation
+from benchmarks.latency import RESET
 
 
 @EnvConfig.register_subclass("simulated_latency")

@@ -24,10 +24,8 @@ from typing import Any
 from accerl_lerobot.errors import InputError
 
 DATASET = Path(__file__).parents[1] / "datasets" / "metaworld_tiny"
-MEMORY = 3 * 1024**3
-"""Bytes of address space beyond what the libraries take."""
-SECONDS = 60
-"""For a single file."""
+MEMORY = 3 * 1024**3  # bytes of address space beyond what the libraries take
+SECONDS = 60  # for a single file
 VALUES: tuple[Any, ...] = (
     None, True, False, 0, -1, 1, 2, 3, 7, 64, 4097, 10**6, 10**9, 2**31, 2**63, 10**30, 10**400, 0.5, -0.0,
     1e308, float("nan"), float("inf"), "", "a", "..", "../../x", "/etc/passwd", "C:\\x", "a\x00b", "\ud800",
@@ -42,8 +40,7 @@ NAMES = (
 )  # fmt: skip
 
 
-CPU_S = 3
-"""Processor seconds of a child process that loads one."""
+CPU_S = 3  # processor seconds of a child process that loads one
 
 
 class TimeLimitError(Exception):

@@ -7,8 +7,7 @@ from typing import Any
 
 import torch
 
-ROUNDING = 1e-4
-"""Error of a float32 network, relative to its largest number; found are 1e-7 to 1e-5."""
+ROUNDING = 1e-4  # error of a float32 network, relative to its largest number; found are 1e-7 to 1e-5
 
 
 def assert_close(found: Any, expected: Any, *, rel: float = ROUNDING, largest: float = 0.0) -> None:

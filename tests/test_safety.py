@@ -184,8 +184,7 @@ def test_a_file_is_read_in_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert all(np.array_equal(found[name].numpy(), array) for name, array in arrays.items())
 
 
-TIMES = 30
-"""Factor on the shares of `tests.hostile`: about 24,000 files, of which about 140 are loaded."""
+TIMES = 30  # factor on the shares of `tests.hostile`: about 24,000 files, of which about 140 are loaded
 
 
 @pytest.mark.slow

@@ -19,7 +19,6 @@ from typing import Any
 import yaml
 
 from accerl_lerobot.algorithms import AlgorithmConfig, AWRConfig, ChunkCriticConfig, OffPolicyConfig
-from accerl_lerobot.bench.latency import BenchLatencyConfig
 from accerl_lerobot.bench.policy import BenchPolicyConfig
 from accerl_lerobot.bench.throughput import BenchThroughputConfig
 from accerl_lerobot.bench.world import BenchWorldConfig
@@ -402,6 +401,5 @@ CONFIGS: dict[str, type[Any]] = {
     "bench world": BenchWorldConfig,
     "bench policy": BenchPolicyConfig,
     "bench throughput": BenchThroughputConfig,
-    "bench latency": BenchLatencyConfig,
 }
 """Verb → what its command line is parsed into."""

@@ -26,10 +26,8 @@ from accerl_lerobot.seeds import noise_seed, train_seed
 
 STARTS_PER_INCARNATION = 1000
 """By how much a restarted worker skips ahead in its training seeds, so as not to repeat its episodes."""
-LEAST_SHARE = 0.1
-"""How often a task that never fails is explored, compared with one that always does."""
-RECENT = 20
-"""Episodes of a task that tell how often it fails now."""
+LEAST_SHARE = 0.1  # how often a task that never fails is explored, compared with one that always does
+RECENT = 20  # episodes of a task that tell how often it fails now
 
 
 @kind

@@ -93,9 +93,6 @@ def test_no_gradient_leaves() -> None:
     assert not any(x.requires_grad for x in out)
 
 
-# ---- normalisation
-
-
 def test_parts_of_different_size_equal_the_whole() -> None:
     x = torch.randn(5, 8, generator=torch.Generator().manual_seed(0)) * 3 + 7
     mask = torch.rand(5, 8, generator=torch.Generator().manual_seed(1)) < 0.7

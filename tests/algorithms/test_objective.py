@@ -77,9 +77,6 @@ def test_micro_batches_add_up(config: RatioConfig, level: Any) -> None:
     torch.testing.assert_close(total, expected)
 
 
-# ---- the KL
-
-
 def test_kl_estimates_behaviour_to_policy_in_value_and_gradient() -> None:
     """μ = N(0, 1), π = N(m, s): samples, KL(μ‖π) = log s + (1 + m²)/(2s²) − ½ and its slope m/s² in m."""
     noise = torch.randn(200_000, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -100,9 +97,6 @@ def test_kl_pulls_back_from_both_sides_with_a_bounded_slope() -> None:
     edge = math.expm1(KL_LINEAR_ABOVE)
     expected = [-1.0, math.expm1(-1.0), 0.0, math.expm1(1.0), edge, edge]
     np.testing.assert_allclose(slope.numpy(), expected, atol=1e-12)
-
-
-# ---- metrics
 
 
 def metrics_of(

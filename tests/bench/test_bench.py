@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from accerl_lerobot.bench import latency, world
 from accerl_lerobot.bench import policy as bench
-from accerl_lerobot.bench.latency import BenchLatencyConfig, bench_latency, described
+from accerl_lerobot.bench import world
 from accerl_lerobot.bench.policy import BenchPolicyConfig
 from accerl_lerobot.bench.world import BenchWorldConfig, bench_world
 from accerl_lerobot.demos import backbone
 from accerl_lerobot.envs import EnvConfig, LiberoConfig, MetaWorldConfig, SimulatedConfig
+from benchmarks import latency
+from benchmarks.latency import BenchLatencyConfig, bench_latency, described
 from benchmarks.simulated_world import LatencyConfig, read_trace
 from tests.envs.libero_assets import ASSETS, needs_assets
 

@@ -72,8 +72,6 @@ def test_not_exploring_is_lerobot_s_sampler_to_the_bit(
     assert np.abs(noisy - chunks).max() > 1e-2
 
 
-# ---- a policy that looks back, LeRobot's default, in a world
-
 OBSERVED = 2
 STATE = "observation.state"
 WORLD = SimulatedConfig(max_steps=13, tolerance=0.05, image_size=40)

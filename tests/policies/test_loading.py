@@ -68,9 +68,6 @@ def refused(path: Path, sentence: str, **options: object) -> None:
     assert "\n" not in str(caught.value)
 
 
-# ---- paths, configs, options
-
-
 @pytest.mark.parametrize(
     ("path", "sentence"),
     [
@@ -156,8 +153,6 @@ def test_devices(monkeypatch: pytest.MonkeyPatch):
     with pytest.raises(InputError, match="^policy.device='cuda:1': there are 1 such devices"):
         resolve_device("cuda:1")
 
-
-# ---- weights: each tensor of the policy is the file's
 
 OUT = "model.action_out_proj.weight"
 EXPERT = "model.paligemma_with_expert.gemma_expert."
@@ -262,9 +257,6 @@ def test_torchvision_s_weights_are_not_asked_for(
     stock.from_pretrained(saved(path, tmp_path / "saved"))
 
 
-# ---- LeRobot's internals: what the sampler is compared with at load
-
-
 @pytest.mark.parametrize(
     ("name", "method"),
     [
@@ -298,9 +290,6 @@ def test_weights_that_compute_nan_are_refused(written: Any):
     observations, tasks, _ = adapter_at(written("smolvla")).example()
     with pytest.raises(InputError, match="differs from its sampler by nan"):
         adapter.self_check(observations, tasks)
-
-
-# ---- files beside the weights
 
 
 @pytest.mark.parametrize("name", ["smolvla", "smolvla_bins"])
@@ -365,9 +354,6 @@ def test_names_of_the_environment_s_features_are_mapped(written: Any):
     assert pickle.dumps(decision) == pickle.dumps(adapter_at(path).decide([request], 0))
 
 
-# ---- critic and sampler beside the weights
-
-
 def test_the_critic_is_saved_and_loaded(written: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture):
     observed = stack_observations(requests(3))
     assert not adapter_at(written("smolvla")).values(*observed).any(), "LeRobot's own has none"
@@ -388,9 +374,6 @@ def test_another_sampler_is_pointed_out(written: Any, tmp_path: Path, caplog: py
         assert caplog.text == ""
         adapter_at(path, FlowSamplerConfig(noise_level=0.2))
     assert "policy.sampler.noise_level=0.2, there 0.4" in caplog.text
-
-
-# ---- tokenisers of π0, π0.5 and π0-FAST
 
 
 REMOTE_CODE = """

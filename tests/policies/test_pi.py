@@ -24,8 +24,7 @@ from tests.rounding import assert_close
 
 LANGUAGE_MODEL = "paligemma.model.language_model"
 LENGTH = 10
-FIRST = VOCABULARY - 1 - SKIP
-"""Token of FAST's token 0; the others lie below it."""
+FIRST = VOCABULARY - 1 - SKIP  # token of FAST's token 0; the others lie below it
 
 
 @pytest.fixture(scope="module", params=KINDS)
@@ -118,9 +117,6 @@ def test_a_camera_the_world_does_not_have_is_masked(tmp_path: Path):
         assert_close(chunks[1], chunks[0])
         values = [a.values(*stack_observations(asked)) for a in (one, two)]
         assert_close(values[1], values[0])
-
-
-# ---- π0-FAST
 
 
 @pytest.fixture(scope="module")

@@ -139,8 +139,6 @@ def test_a_critic_of_another_size(copied: Path):
     refused(copied, "value_head.safetensors: it is no critic of this policy")
 
 
-# ---- code and pickles
-
 COMMIT, NEWER = "0" * 39 + "1", "0" * 39 + "2"
 CODE = """
 from pathlib import Path

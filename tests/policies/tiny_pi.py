@@ -23,16 +23,12 @@ from accerl_lerobot.checkpoint.layout import BACKBONE, FAST
 from accerl_lerobot.policies.vla import data_only
 from tests.policies.checkpoints import write_policy
 
-PALIGEMMA = "google/paligemma-3b-pt-224"
-"""The tokeniser that LeRobot's processors ask the Hub for."""
-ACTIONS = "lerobot/fast-action-tokenizer"
-"""The tokeniser of actions that π0-FAST asks for."""
+PALIGEMMA = "google/paligemma-3b-pt-224"  # the tokeniser that LeRobot's processors ask the Hub for
+ACTIONS = "lerobot/fast-action-tokenizer"  # the tokeniser of actions that π0-FAST asks for
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
-KINDS = ("pi0", "pi05")
-"""Policies of the flow family."""
+KINDS = ("pi0", "pi05")  # policies of the flow family
 VOCABULARY = 400
-SKIP = 8
-"""PaliGemma's last tokens, which are none of FAST's; LeRobot's `fast_skip_tokens`."""
+SKIP = 8  # PaliGemma's last tokens, which are none of FAST's; LeRobot's `fast_skip_tokens`
 SCALE, LOWEST, CHARACTERS = 8.0, -32, 64
 """FAST rounds coefficients times the first to one of so many integers from the second on."""
 IMAGE = 32

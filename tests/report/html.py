@@ -5,8 +5,7 @@ from __future__ import annotations
 
 from html.parser import HTMLParser
 
-VOID = {"meta", "link", "img", "br", "hr", "input"}
-"""Elements without a content."""
+VOID = {"meta", "link", "img", "br", "hr", "input"}  # elements without a content
 
 
 class Seen(HTMLParser):
