@@ -87,7 +87,7 @@ class LocalEngine(Engine):
             config.rollout,
             "local",
             self._outbox.append,
-            lambda result: (self._plans.ended(result), self._episodes.append(result)),
+            self._end,
         )
         if state is not None:
             self._restore(state)
@@ -185,6 +185,10 @@ class LocalEngine(Engine):
                 self._imagination.close()
         except Exception:
             logger.exception("could not close all worlds")
+
+    def _end(self, result: EpisodeResult) -> None:
+        self._plans.ended(result)
+        self._episodes.append(result)
 
     @property
     def _exploring(self) -> bool:

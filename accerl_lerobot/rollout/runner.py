@@ -197,10 +197,9 @@ class EpisodePlans:
     def ended(self, result: EpisodeResult) -> None:
         """Tasks that fail more are explored more."""
         if result.plan.explore:
-            index = self._tasks.index(result.plan.task)
-            change = np.zeros(len(self._tasks))
-            change[index] = ((not result.success) - self._failing[index]) / RECENT
-            self._failing = self._failing + change
+            its = np.array(self._tasks) == result.plan.task
+            # Not in place: Ray hands over arrays that are read-only.
+            self._failing = self._failing + its * ((not result.success) - self._failing) / RECENT
 
     @property
     def spent(self) -> bool:

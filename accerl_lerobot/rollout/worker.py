@@ -71,7 +71,7 @@ class RolloutWorker:
         self._outbox: list[Segment] = []
         self._deciding = ReconnectingClient("inference")
         worlds = [make_world(env, history, config.reward_model) for _ in range(config.worlds)]
-        callbacks = self._outbox.append, lambda result: (plans.ended(result), self._results.append(result))
+        callbacks = self._outbox.append, self._end
         name = f"rollout{plans.worker}.{plans.incarnation}"
         self._runner = RolloutRunner(worlds, self._next, config, name, *callbacks)
         self._clock.enter(WAIT_IN)
@@ -152,6 +152,10 @@ class RolloutWorker:
         if plan is not None:
             self._clock.enter(COMPUTE)
         return plan
+
+    def _end(self, result: EpisodeResult) -> None:
+        self._plans.ended(result)
+        self._results.append(result)
 
     def _step(self, slot: int, decision: Decision | None, due: dict[int, Request]) -> bool:
         """Begin an episode, or execute a decision; False if nothing is due in this slot then."""
