@@ -170,9 +170,9 @@ class EpisodePlans:
         self.starts = incarnation * STARTS_PER_INCARNATION  # where it is in the worker's seeds
         # Filled and emptied on different threads: appending to and popping from a deque is atomic.
         self._queued: deque[EpisodePlan] = deque()
-        self._failing = np.ones(len(tasks))
+        self._failing = dict.fromkeys(tasks, 1.0)
         # Episodes that each task is still to get. The first one's is the worker's own; equals take turns.
-        self._owed = -1e-6 * ((np.arange(len(tasks)) - worker) % len(tasks))
+        self._owed = {task: -1e-6 * ((place - worker) % len(tasks)) for place, task in enumerate(tasks)}
 
     def queue(self, plans: Iterable[EpisodePlan]) -> None:
         self._queued.extend(plans)
@@ -186,20 +186,18 @@ class EpisodePlans:
         if self._budget is not None:
             self._budget -= 1
         number, self.starts = self.starts, self.starts + 1
-        shares = np.maximum(self._failing, LEAST_SHARE)
-        owed = self._owed + shares / shares.sum()
-        chosen = int(np.argmax(owed))
-        owed[chosen] -= 1
-        self._owed = owed
-        task = self._tasks[chosen]
+        shares = {task: max(failing, LEAST_SHARE) for task, failing in self._failing.items()}
+        for task, share in shares.items():
+            self._owed[task] += share / sum(shares.values())
+        task = max(self._tasks, key=self._owed.__getitem__)
+        self._owed[task] -= 1
         return EpisodePlan(task=task, seed=train_seed(self._seed, self.worker, number), explore=True)
 
     def ended(self, result: EpisodeResult) -> None:
         """Tasks that fail more are explored more."""
         if result.plan.explore:
-            its = np.array(self._tasks) == result.plan.task
-            # Not in place: Ray hands over arrays that are read-only.
-            self._failing = self._failing + its * ((not result.success) - self._failing) / RECENT
+            task = result.plan.task
+            self._failing[task] += ((not result.success) - self._failing[task]) / RECENT
 
     @property
     def spent(self) -> bool:
@@ -208,12 +206,12 @@ class EpisodePlans:
 
     def state(self) -> dict[str, Any]:
         state = {"budget": self._budget, "starts": self.starts, "queued": list(self._queued)}
-        return state | {"failing": self._failing, "owed": self._owed}
+        return state | {"failing": dict(self._failing), "owed": dict(self._owed)}
 
     def restore(self, state: dict[str, Any]) -> None:
         self._budget, self.starts = state["budget"], state["starts"]
         self._queued.extend(state["queued"])
-        self._failing, self._owed = state["failing"], state["owed"]
+        self._failing, self._owed = dict(state["failing"]), dict(state["owed"])
 
 
 @kind

@@ -19,7 +19,7 @@ TASKS = [
     pytest.param("libero_spatial/7", marks=pytest.mark.slow),
     pytest.param("libero_goal/7", marks=pytest.mark.slow),
 ]
-STARTS = (2_000_000_000, 5)  # A recorded start, and a drawn one
+STARTS = (2_000_000_000, 5)  # a recorded start, and a drawn one
 
 pytest.importorskip("libero", reason="LIBERO is not installed")
 
