@@ -170,7 +170,7 @@ class RunConfig(Section):
             remedy = "its critic reads the simulator's state: " + (
                 f"env.type={self.env.type} does not offer it, use gipo"
                 if offered is None
-                else "add --env.environment_state=true"
+                else "add --env.environment_state=" + ("true" if offered is False else "'[KEY, …]'")
             )
             raise InputError("algorithm.type", self.algorithm.type, remedy)
         only = f"algorithm.type={self.algorithm.type}"
