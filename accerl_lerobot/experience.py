@@ -7,6 +7,8 @@ NumPy only: a rollout worker that imports this file stays free of torch and LeRo
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -27,6 +29,7 @@ TASK = "task"
 ENVIRONMENT_STATE = "observation.environment_state"
 """LeRobot's name for what a simulator says of itself. Ours end it with the share of the time limit gone."""
 REWARD, SUCCESS = "next.reward", "next.success"  # LeRobot's names for what an env step led to
+TASK_BITS = 16  # numbers that stand for a task in `task_codes`
 REAL, IMAGINED = "real", "imagined"  # which worlds a segment can be from
 
 
@@ -91,3 +94,10 @@ class Segment:
 
     def __len__(self) -> int:
         return len(self.reward)
+
+
+def task_codes(tasks: Sequence[str]) -> np.ndarray:
+    """float32 (B, 16): ±1 for each of 16 bits of an instruction's hash, known without a list of all tasks."""
+    hashes = b"".join(hashlib.sha256(task.encode()).digest()[:TASK_BITS] for task in tasks)
+    bits = np.frombuffer(hashes, np.uint8).reshape(len(tasks), TASK_BITS) & 1
+    return np.where(bits, 1.0, -1.0).astype(np.float32)

@@ -9,7 +9,6 @@ Shapes: M networks side by side, B rows, S numbers of a state, K actions of A di
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from typing import Any
 
@@ -18,13 +17,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Observation, Request
+from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, TASK_BITS, Observation, Request, task_codes
 from accerl_lerobot.policies.config import Load, PolicyConfig
 from accerl_lerobot.seeds import episode_of
 
 WIDTH = 256
 NOISE = 0.25  # standard deviation of its exploration, in normalised action units
-TASK_BITS = 16  # numbers of a state that stand for the task
 TEACHER_PREFIX = "teacher."  # how names of its weights begin among those that are published
 
 
@@ -103,13 +101,7 @@ class Teacher(nn.Module):
 def state_of(observation: Observation) -> np.ndarray:
     """float32 (S,): what the simulator says of itself, and what stands for the task."""
     environment = np.asarray(observation[ENVIRONMENT_STATE], np.float32).reshape(-1)
-    return np.concatenate([environment, task_code(str(observation[TASK]))])
-
-
-def task_code(task: str) -> np.ndarray:
-    """±1 for each of 16 bits of the instruction's hash: known without a list of all tasks."""
-    bits = np.frombuffer(hashlib.sha256(task.encode()).digest(), np.uint8)[:TASK_BITS]
-    return np.where(bits & 1, 1.0, -1.0).astype(np.float32)
+    return np.concatenate([environment, task_codes([str(observation[TASK])])[0]])
 
 
 def with_teacher(load: Load, state: int, share: float, config: PolicyConfig, noise: float = NOISE) -> Any:

@@ -20,10 +20,9 @@ from accerl_lerobot.algorithms import AWRConfig, OffPolicyConfig
 from accerl_lerobot.algorithms.advantages import STD_EPSILON
 from accerl_lerobot.algorithms.objective import lag_metrics
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import ENVIRONMENT_STATE, Segment
+from accerl_lerobot.experience import ENVIRONMENT_STATE, Segment, task_codes
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.family import Encoded
-from accerl_lerobot.policies.teacher import TASK_BITS, task_code
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.update import BaseUpdate
 
@@ -73,7 +72,7 @@ class Memory:
         environment = seen.pop(ENVIRONMENT_STATE, np.empty((t, 0))).reshape(t, -1)
         if segment.task not in self.tasks:
             self.tasks.append(segment.task)
-        code = np.broadcast_to(task_code(segment.task), (t, TASK_BITS))
+        code = task_codes([segment.task] * t)
         columns: dict[str, Any] = {
             "state": np.concatenate([environment, code], 1).astype(np.float32),
             "chunk": chunk,

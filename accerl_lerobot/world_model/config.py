@@ -9,7 +9,7 @@ from typing import Annotated, ClassVar, Literal
 
 import draccus
 
-from accerl_lerobot.config.ranges import DatasetConfig, LearningRate, NonNegative, Range, Section
+from accerl_lerobot.config.ranges import DatasetConfig, LearningRate, Range, Section
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.replay.pacing import ReplayConfig
 
@@ -55,9 +55,6 @@ class PixelModelConfig(LearnableModelConfig):
 
     make = "accerl_lerobot.world_model.pixels:PixelWorldModel"
 
-    context_noise: NonNegative = 0.02
-    """Largest standard deviation of the noise on context and anchor in training, in units of [−1, 1].
-    Imagined frames are never as clean as the training data."""
     channels: tuple[Annotated[int, Range("[1, 65536]")], ...] = (64, 96)
     """Channels of each level of the network, finest first. Image height and width are multiples of 4, times
     2 for every further level."""

@@ -23,6 +23,7 @@ from torch import Tensor, nn
 
 from accerl_lerobot.checkpoint.snapshot import kind
 from accerl_lerobot.checkpoint.tensors import copied, optimizer_state, restore_optimizer
+from accerl_lerobot.experience import task_codes
 from accerl_lerobot.world_model.config import LearnConfig, SuccessLearnConfig, WorldModelConfig
 from accerl_lerobot.world_model.contract import LearnableWorldModel, WorldModel
 from accerl_lerobot.world_model.data import (
@@ -169,6 +170,7 @@ class Pairs(NamedTuple):
 
     before: np.ndarray  # uint8 (B, V, H, W, 3)
     after: np.ndarray
+    task: np.ndarray  # float32 (B, 16), see `experience.task_codes`
     success: np.ndarray  # bool (B,), True if the task had been achieved by the second frame
     progress: np.ndarray  # float (B,), share of the way to the success by then; NaN for episodes without one
 
@@ -202,7 +204,8 @@ class Examples:
         for episode, f in ((self.episodes[e], f) for e, f in at):
             earlier = episode.frame_at(int(episode.times[f] - rng.integers(self.chunk + 1)))
             progress = episode.progress(int(episode.times[f]))
-            pairs.append((episode.frames[earlier], episode.frames[f], episode.achieved[f], progress))
+            code = task_codes([episode.task])[0]
+            pairs.append((episode.frames[earlier], episode.frames[f], code, episode.achieved[f], progress))
         return Pairs(*map(np.stack, zip(*pairs, strict=True)))
 
     def chunks(self, count: int, rng: np.random.Generator) -> list[WindowStart]:
@@ -236,10 +239,11 @@ def imagine_pairs(
     pairs = Pairs(
         before=predictions.frames[rows, depths],
         after=predictions.ends[rows, depths],
+        task=task_codes([windows.task[m] for m in rows]),
         success=windows.success[rows, depths],
         progress=np.array(progress),
     )
-    wrong = EASY + success.probabilities(pairs.before, pairs.after)
+    wrong = EASY + success.probabilities(*pairs[:3])
     return pairs, np.where(pairs.success, 1.0, wrong)
 
 
@@ -272,9 +276,9 @@ class SuccessLearner(_Trainer):
             self._imagined = imagine_pairs(examples, world, self.model, REPLAYED, longest, self.rng)
         drawn = draw_pairs(*self._imagined, batch // 2, self.rng)
         pairs = Pairs(*(np.concatenate(both) for both in zip(recorded, drawn, strict=True)))
-        before, after = (self.model.as_floats(frames) for frames in pairs[:2])
-        success, progress = (torch.from_numpy(x.astype(np.float32)).to(before.device) for x in pairs[2:])
-        loss, metrics = self.model.loss(before, after, success, progress, self._generator)
+        before, after, task = self.model.inputs(*pairs[:3])
+        success, progress = (torch.from_numpy(x.astype(np.float32)).to(before.device) for x in pairs[3:])
+        loss, metrics = self.model.loss(before, after, task, success, progress, self._generator)
         self._descend(loss)
         return metrics
 

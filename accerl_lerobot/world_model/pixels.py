@@ -2,7 +2,7 @@
 """Our learned world model: frames by regression, the robot's state by a small ensemble.
 
 The network predicts the change from the newest frame to the one after the chunk, in units of its usual size.
-It sees the context, and the anchor, the real frame where the rollout started.
+It sees the context, the task, and the anchor, the real frame where the rollout started.
 
 The state is predicted apart from the image, by several heads from state, chunk and a coarse view of the
 frame; their disagreement is the uncertainty.
@@ -21,6 +21,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from accerl_lerobot.experience import TASK, TASK_BITS, task_codes
 from accerl_lerobot.world_model.config import SPACE_TO_DEPTH, PixelModelConfig
 from accerl_lerobot.world_model.contract import (
     Context,
@@ -34,6 +35,9 @@ from accerl_lerobot.world_model.contract import (
 from accerl_lerobot.world_model.data import Windows
 
 COARSE = 8  # side of the coarse view that the state heads get
+CONTEXT_NOISE = 0.02
+"""Largest std of the noise on context and anchor in training, in units of [−1, 1]: imagined frames are never
+as clean as recorded ones."""
 HEADS = 3  # size of the ensemble that predicts the robot's state; its disagreement is the uncertainty
 CONDITION, PLANES = 128, 8
 """Width of the conditioning vector that the adaptive norms read; channels of the action planes."""
@@ -46,12 +50,12 @@ class PixelWorldModel(LearnableWorldModel):
         super().__init__(spec, config)
         self.config: PixelModelConfig = config
         channels = 3 * len(spec.cameras)
-        chunk = spec.chunk * (spec.action_dim * spec.context + 1) + spec.action_dim + spec.state_dim
+        robot, action = spec.state_dim, spec.action_dim
+        chunk = spec.chunk * (action * spec.context + 1) + action + robot + TASK_BITS
         frames = (spec.context + 1) * channels
         self.network = FrameNetwork(channels, frames, chunk, spec.state_dim, config.channels)
         inputs = spec.state_dim * spec.context + chunk + channels * COARSE * COARSE
         self.heads = nn.ModuleList(_state_head(inputs, spec.state_dim) for _ in range(HEADS))
-        robot, action = spec.state_dim, spec.action_dim
         for name, size in {"robot": robot, "action": action, "motion": robot, "commanded": action}.items():
             self.register_buffer(f"{name}_mean", torch.zeros(size))
             self.register_buffer(f"{name}_std", torch.ones(size))
@@ -75,7 +79,8 @@ class PixelWorldModel(LearnableWorldModel):
         self.change.fill_(max(change, 1e-3))
 
     def begin(self, context: Context, tasks: Sequence[str], resets: Sequence[Reset] | None = None) -> State:
-        state = {name: x.to(self.change.device) for name, x in context._asdict().items()}
+        given = context._asdict() | {TASK: torch.from_numpy(task_codes(tasks))}
+        state = {name: x.to(self.change.device) for name, x in given.items()}
         return state | {"anchor": state["frames"][:, -1]}
 
     def step(self, state: State, actions: Tensor, seeds: Sequence[int]) -> Prediction:
@@ -133,8 +138,8 @@ class PixelWorldModel(LearnableWorldModel):
     def _change(self, state: State, chunk: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """The change in usual changes, (B, C, H, W); with a generator, the context is noisy."""
         frames = _to_floats(torch.cat([state["frames"], state["anchor"][:, None]], 1).flatten(1, 2))
-        if generator is not None and self.config.context_noise:
-            level = self.config.context_noise * torch.rand(len(frames), 1, 1, 1, generator=generator)
+        if generator is not None:
+            level = CONTEXT_NOISE * torch.rand(len(frames), 1, 1, 1, generator=generator)
             frames = frames + (level * torch.randn(frames.shape, generator=generator)).to(frames)
         robot = (state["robot"][:, -1] - self.robot_mean) / self.robot_std
         change: Tensor = self.network(frames, chunk, robot)
@@ -149,8 +154,8 @@ class PixelWorldModel(LearnableWorldModel):
         return torch.stack([head(inputs) for head in self.heads])
 
     def _chunk(self, state: State, actions: Tensor, executed: Tensor) -> Tensor:
-        """(B, K·(A + 1) + (L − 1)·K·A + A + S): normalised actions, which of them are executed, those before,
-        and how far the robot was commanded to move since the beginning and has moved.
+        """(B, K·(A + 1) + (L − 1)·K·A + A + S + 16): normalised actions, which of them are executed, those
+        before, how far the robot was commanded to move since the beginning and has moved, and the task.
 
         No frame shows how fast the robot moves, nor how far it has still to go to where it is commanded.
         """
@@ -158,7 +163,8 @@ class PixelWorldModel(LearnableWorldModel):
         before = (state["actions"] - self.action_mean) / self.action_std
         commanded = (state["commanded_sum"] - self.commanded_mean) / self.commanded_std
         moved = (state["robot"][:, -1] - state["initial_state"]) / self.robot_std
-        return torch.cat([normal.flatten(1), executed.float(), before.flatten(1), commanded, moved], 1)
+        known = (before.flatten(1), commanded, moved, state[TASK])
+        return torch.cat([normal.flatten(1), executed.float(), *known], 1)
 
 
 def _state_head(into: int, state: int) -> nn.Sequential:
@@ -168,10 +174,10 @@ def _state_head(into: int, state: int) -> nn.Sequential:
 
 
 def _advance(state: State, frames: Tensor, robot: Tensor, actions: Tensor) -> State:
-    """Shifts the context on to the newest frame; the anchor stays."""
+    """Shifts the context on to the newest frame; anchor and task stay."""
     newest = {"frames": frames, "robot": robot, "actions": actions}
     shifted = {key: torch.cat([state[key], new[:, None]], 1)[:, 1:] for key, new in newest.items()}
-    kept = {key: state[key] for key in ("anchor", "initial_state")}
+    kept = {key: state[key] for key in ("anchor", "initial_state", TASK)}
     return shifted | kept | {"commanded_sum": state["commanded_sum"] + actions.sum(1)}
 
 

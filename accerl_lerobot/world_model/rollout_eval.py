@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
+from accerl_lerobot.experience import task_codes
 from accerl_lerobot.world_model.config import ValidationConfig
 from accerl_lerobot.world_model.contract import WorldModel, context_of, select_rows
 from accerl_lerobot.world_model.data import Episode, Windows, WindowStart, cut_windows, hold_last_action
@@ -153,11 +154,13 @@ def score_episodes(
     left = np.arange(depth) < (depth - begun)[:, None]
     idle = predict(model, windows, np.zeros_like(windows.actions), lengths=left.sum(1))
 
+    codes = task_codes(windows.task)
+
     def best(path: np.ndarray, counted: np.ndarray) -> np.ndarray:
         highest = np.zeros(len(at))
         for d in range(depth):
             rows = np.flatnonzero(counted[:, d])
-            probability = success.probabilities(path[rows, d], path[rows, d + 1])
+            probability = success.probabilities(path[rows, d], path[rows, d + 1], codes[rows])
             highest[rows] = np.maximum(highest[rows], probability)
         return highest
 

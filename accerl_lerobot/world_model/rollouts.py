@@ -26,7 +26,16 @@ import torch
 from accerl_lerobot.checkpoint.snapshot import kind
 from accerl_lerobot.checkpoint.tensors import copied
 from accerl_lerobot.envs.base import WorldSpec
-from accerl_lerobot.experience import IMAGINED, TASK, Decision, Observation, Origin, Request, Segment
+from accerl_lerobot.experience import (
+    IMAGINED,
+    TASK,
+    Decision,
+    Observation,
+    Origin,
+    Request,
+    Segment,
+    task_codes,
+)
 from accerl_lerobot.rollout.runner import SegmentBuilder
 from accerl_lerobot.world_model.config import IMAGINATION, ImaginationConfig
 from accerl_lerobot.world_model.contract import (
@@ -249,7 +258,8 @@ class Imagination:
             assert prediction.success is not None  # an oracle's
             success = prediction.success.cpu().numpy()
         else:
-            success = self._success.probabilities(self._frames, frames)
+            tasks = task_codes([str(row.latest[TASK]) for row in self._rows if row is not None])
+            success = self._success.probabilities(self._frames, frames, tasks)
         uncertainty, self._frames = prediction.uncertainty.cpu().numpy(), frames.copy()
         for i, decision in enumerate(decisions):
             row = self._rows[i]

@@ -30,6 +30,7 @@ from accerl_lerobot.checkpoint.safety import (
 )
 from accerl_lerobot.config.parsing import DISCOVER, discover
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.experience import task_codes
 from accerl_lerobot.policies.untrusted import Unfilled, input_error
 from accerl_lerobot.world_model.config import LearnableModelConfig
 from accerl_lerobot.world_model.contract import Context, LearnableWorldModel, WorldModelSpec, new_model
@@ -137,9 +138,10 @@ def _predict_once(model: LearnableWorldModel, success: SuccessPairsRewardModel) 
     frames = torch.zeros((1, spec.context, len(spec.cameras), *spec.image_size, 3), dtype=torch.uint8)
     robot, commanded = torch.zeros(1, spec.context, spec.state_dim), torch.zeros(1, spec.action_dim)
     actions = torch.zeros(1, spec.context - 1, spec.chunk, spec.action_dim)
-    state = model.begin(Context(frames, robot, actions, commanded, robot[:, -1]), spec.tasks[:1] or ("",))
+    tasks = spec.tasks[:1] or ("",)
+    state = model.begin(Context(frames, robot, actions, commanded, robot[:, -1]), tasks)
     prediction = model.step(state, torch.zeros(1, spec.chunk, spec.action_dim), [0])
-    success.probabilities(frames[:, -1].numpy(), prediction.frames.numpy())
+    success.probabilities(frames[:, -1].numpy(), prediction.frames.numpy(), task_codes(tasks))
 
 
 def _origin(directory: Path, section: str) -> Origin:

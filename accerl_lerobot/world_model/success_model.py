@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The success model, a LeRobot reward model: did a chunk achieve the task, and how far along is it?
 
-A convolutional network of 0.3 million weights looks at the frames before and after a chunk, so it can be
-trained beside a policy. Cameras share their convolutions, and their features are averaged, so it serves any
-number of them.
+A convolutional network of 0.3 million weights looks at the frames before and after a chunk and knows the
+task, so that one serves several tasks of a scene. Cameras share their convolutions, and their features are
+averaged, so it serves any number of them.
 
-Shapes: B batch, V cameras, C×H×W image.
+Shapes: B batch, V cameras, C×H×W image; tasks are (B, 16), see `experience.task_codes`.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.experience import TASK, TASK_BITS, task_codes
 
 IMAGES = "observation.image"
 GRID, HIDDEN = 4, 128  # side of the feature map that is flattened, and width of the layer behind it
@@ -70,35 +71,38 @@ class SuccessPairsRewardModel(PreTrainedRewardModel):
             layers += [nn.Conv2d(into, width, 3, stride=2, padding=1), norm, nn.SiLU()]
             into = width
         self.convolutions = nn.Sequential(*layers)
-        self.hidden = nn.Linear(into * GRID * GRID, HIDDEN)
+        self.hidden = nn.Linear(into * GRID * GRID + TASK_BITS, HIDDEN)
         self.out = nn.Linear(HIDDEN, 2)
 
-    def logits(self, before: Tensor, after: Tensor) -> tuple[Tensor, Tensor]:
+    def logits(self, before: Tensor, after: Tensor, task: Tensor) -> tuple[Tensor, Tensor]:
         """Success and progress, each (B,), from frames (B, V, 3, H, W) in [0, 1]."""
         pairs = 2 * torch.cat([before, after - before + 0.5], 2) - 1
         seen = self.convolutions(pairs.flatten(0, 1))
-        seen = functional.adaptive_avg_pool2d(seen, GRID).flatten(1)
-        features = functional.silu(self.hidden(seen)).unflatten(0, before.shape[:2]).mean(1)
+        seen = functional.adaptive_avg_pool2d(seen, GRID).flatten(1).unflatten(0, before.shape[:2])
+        seen = torch.cat([seen, task[:, None].expand(-1, seen.shape[1], -1)], -1)
+        features = functional.silu(self.hidden(seen)).mean(1)
         success, progress = self.out(features).unbind(1)
         return success, progress
 
     @torch.no_grad()
-    def probabilities(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    def probabilities(self, before: np.ndarray, after: np.ndarray, task: np.ndarray) -> np.ndarray:
         """float32 (M,): P that the second frames show a success; frames uint8 (M, V, H, W, 3)."""
         parts = [
-            torch.sigmoid(self.logits(*(self.as_floats(x[i : i + BATCH]) for x in (before, after)))[0])
+            torch.sigmoid(self.logits(*self.inputs(*(x[i : i + BATCH] for x in (before, after, task))))[0])
             for i in range(0, len(before), BATCH)
         ]
         return torch.cat(parts).cpu().numpy() if parts else np.zeros(0, np.float32)
 
-    def as_floats(self, frames: np.ndarray) -> Tensor:
-        """uint8 (B, V, H, W, 3) to float (B, V, 3, H, W) in [0, 1]."""
-        return torch.from_numpy(frames).movedim(-1, 2).to(self.out.weight.device).float() / 255
+    def inputs(self, before: np.ndarray, after: np.ndarray, task: np.ndarray) -> tuple[Tensor, ...]:
+        """Frames uint8 (B, V, H, W, 3) to float (B, V, 3, H, W) in [0, 1], and tasks, on its device."""
+        x, y, code = (torch.from_numpy(each).to(self.out.weight.device) for each in (before, after, task))
+        return x.movedim(-1, 2).float() / 255, y.movedim(-1, 2).float() / 255, code
 
     def loss(
         self,
         before: Tensor,
         after: Tensor,
+        task: Tensor,
         success: Tensor,
         progress: Tensor | None = None,
         generator: torch.Generator | None = None,
@@ -110,7 +114,7 @@ class SuccessPairsRewardModel(PreTrainedRewardModel):
         """
         if self.training:
             before, after = self._augmented(before, after, generator)
-        logits, along = self.logits(before, after)
+        logits, along = self.logits(before, after, task)
         each = functional.binary_cross_entropy_with_logits(logits, success, reduction="none")
         total = each.new_zeros(())
         kinds = [kind for kind in (success > 0.5, success <= 0.5) if kind.any()]
@@ -123,12 +127,15 @@ class SuccessPairsRewardModel(PreTrainedRewardModel):
         return total, {"loss": total.item()} | metrics
 
     @torch.no_grad()
-    def compute_reward(self, batch: dict[str, Tensor]) -> Tensor:
-        """P(success), (B,), of LeRobot's batches: pairs of frames, or single frames, which stand for both."""
+    def compute_reward(self, batch: dict[str, Any]) -> Tensor:
+        """P(success), (B,), of LeRobot's batches: ``task``, B instructions, and pairs of frames, or single
+        frames, which stand for both.
+        """
         images = torch.stack([batch[key] for key in sorted(batch) if key.startswith(IMAGES)], 1)
         images = images.float() / 255 if images.dtype == torch.uint8 else images.float()
         before, after = (images, images) if images.ndim == 5 else (images[:, :, 0], images[:, :, -1])
-        return torch.sigmoid(self.logits(before, after)[0])
+        task = torch.from_numpy(task_codes(batch[TASK])).to(images.device)
+        return torch.sigmoid(self.logits(before, after, task)[0])
 
     def _augmented(
         self, before: Tensor, after: Tensor, generator: torch.Generator | None = None

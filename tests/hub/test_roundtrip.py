@@ -16,6 +16,7 @@ import torch
 
 from accerl_lerobot import cli
 from accerl_lerobot.checkpoint.layout import save_checkpoint
+from accerl_lerobot.experience import TASK_BITS
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.loading import load_adapter
 from accerl_lerobot.policies.saving import save_pretrained
@@ -132,5 +133,6 @@ def test_a_world_model_brings_its_success_model(hub: HubServer, tmp_path: Path):
         assert all(torch.equal(value, second.state_dict()[key]) for key, value in first.state_dict().items())
     alone = SuccessPairsRewardModel.from_pretrained(str(tmp_path / "pulled" / "success_model"), strict=True)
     frames = torch.from_numpy(np.random.default_rng(0).random((2, 1, 3, 16, 16), dtype=np.float32))
+    task = torch.ones(2, TASK_BITS)
     with torch.no_grad():
-        assert torch.equal(alone.logits(frames, frames)[0], judge.logits(frames, frames)[0])
+        assert torch.equal(alone.logits(frames, frames, task)[0], judge.logits(frames, frames, task)[0])

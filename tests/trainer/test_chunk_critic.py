@@ -16,13 +16,13 @@ from accerl_lerobot.algorithms import AWRConfig, ChunkCriticConfig, SelfImitatio
 from accerl_lerobot.engine.preflight import check_start
 from accerl_lerobot.envs import SimulatedConfig, make_world
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Origin, Request, Segment
+from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, TASK_BITS, Origin, Request, Segment
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.config import FlowSamplerConfig, PolicyConfig
 from accerl_lerobot.policies.family import Encoded
 from accerl_lerobot.policies.flow import FlowFamily, FlowShape
 from accerl_lerobot.policies.loading import load_adapter
-from accerl_lerobot.policies.teacher import TASK_BITS, Ensemble, Teacher, state_of, with_teacher
+from accerl_lerobot.policies.teacher import Ensemble, Teacher, state_of, with_teacher
 from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.seeds import noise_seed

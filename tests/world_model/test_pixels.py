@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from accerl_lerobot.world_model import pixels
 from accerl_lerobot.world_model.config import LearnConfig, PixelModelConfig, WorldModelConfig
 from accerl_lerobot.world_model.contract import Prediction, WorldModelSpec, context_of
 from accerl_lerobot.world_model.data import Episode, Windows, cut_windows, shuffle_actions, window_starts
@@ -187,22 +188,33 @@ def test_statistics_by_hand():
     assert float(made.change) == pytest.approx(np.sqrt(np.square(off / 127.5).mean()), rel=1e-4)
 
 
-def test_only_what_is_learned_from_is_shown_with_noise():
+def test_only_what_is_learned_from_is_shown_with_noise(monkeypatch):
     """Beside the context's, no noise is in its loss."""
     of = windows(dots(3))
-    clean, noisy, noisier = (awake(model(context_noise=level)) for level in (0.0, 0.05, 0.5))
-    for made in (clean, noisy, noisier):
-        made.fit_statistics(of)
+    made = awake(model())
+    made.fit_statistics(of)
+    levels = (0.0, 0.05, 0.5)
 
-    def loss(made: PixelWorldModel, seed: int) -> float:
+    def loss(level: float, seed: int) -> float:
+        monkeypatch.setattr(pixels, "CONTEXT_NOISE", level)
         return made.loss(of, torch.Generator().manual_seed(seed))[0].item()
 
-    assert loss(clean, 0) == loss(clean, 1)
-    assert loss(noisy, 0) == loss(noisy, 0) != loss(noisy, 1)
-    off = [abs(loss(made, 0) - loss(clean, 0)) for made in (noisy, noisier)]
+    assert loss(0.0, 0) == loss(0.0, 1)
+    assert loss(0.05, 0) == loss(0.05, 0) != loss(0.05, 1)
+    off = [abs(loss(level, 0) - loss(0.0, 0)) for level in levels[1:]]
     assert 0 < 3 * off[0] < off[1], "as much as was asked for"
-    for one, other in zip(rollout(clean, of), rollout(noisier, of), strict=True):
+    clean = rollout(made, of)
+    monkeypatch.setattr(pixels, "CONTEXT_NOISE", 0.5)
+    for one, other in zip(clean, rollout(made, of), strict=True):
         assert torch.equal(one.frames, other.frames) and torch.equal(one.robot, other.robot)
+
+
+def test_every_chunk_is_predicted_for_the_task():
+    of = windows(dots(3))
+    made = awake(model())
+    one, other = (rollout(made, replace(of, task=(task,) * len(of))) for task in ("left", "right"))
+    for first, second in zip(one, other, strict=True):
+        assert not torch.equal(first.frames, second.frames) and not torch.equal(first.robot, second.robot)
 
 
 def test_the_loss_reaches_every_weight():

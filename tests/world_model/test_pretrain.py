@@ -21,6 +21,7 @@ from accerl_lerobot.demos.record import DemosConfig, record_demos
 from accerl_lerobot.engine.config import DatasetConfig
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.experience import TASK_BITS
 from accerl_lerobot.world_model import learners, pretrain, validation
 from accerl_lerobot.world_model.config import PixelModelConfig, ValidationConfig, WorldModelConfig
 from accerl_lerobot.world_model.contract import new_model
@@ -169,8 +170,8 @@ def test_a_saved_model_predicts_the_same(tmp_path: Path):
     assert again.spec == made.spec and again.config == made.config
     for one, other in zip(rollout(made, of), rollout(again, of), strict=True):
         assert torch.equal(one.frames, other.frames) and torch.equal(one.robot, other.robot)
-    pair = torch.rand(1, 1, 3, 16, 16)
-    assert torch.equal(success.logits(pair, pair)[0], loaded.logits(pair, pair)[0])
+    pair, task = torch.rand(1, 1, 3, 16, 16), torch.ones(1, TASK_BITS)
+    assert torch.equal(success.logits(pair, pair, task)[0], loaded.logits(pair, pair, task)[0])
     assert not any(p.requires_grad for p in again.parameters())
 
 

@@ -204,7 +204,7 @@ def test_half_of_what_is_drawn_are_successes():
         for p in at
     ]
     assert hits == [True] * 5 + [False] * 6
-    before, after, success, progress = examples.sample(11, rng)
+    before, after, _, success, progress = examples.sample(11, rng)
     assert success.tolist() == hits and before.shape == after.shape == (11, 1, SIZE, SIZE, 3)
     assert (progress[:5] == 1).all() and not (progress[5:] == 1).any()
 
@@ -217,7 +217,7 @@ def test_pairs_that_were_seen_are_as_far_apart_in_successes_as_in_failures():
         frames=np.broadcast_to(times[:, None, None, None, None], (60, 1, 2, 2, 3)).astype(np.uint8),
         times=times, state=np.zeros((60, 2), np.float32), success_at=59,
     )  # fmt: skip
-    before, after, success, _ = Examples([episode], K).sample(4000, np.random.default_rng(0))
+    before, after, _, success, _ = Examples([episode], K).sample(4000, np.random.default_rng(0))
     apart = (after.astype(int) - before)[:, 0, 0, 0, 0]
     assert set(apart.tolist()) == set(range(K + 1))
     assert apart[success].mean() == pytest.approx(apart[~success].mean(), abs=0.1)
