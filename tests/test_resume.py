@@ -19,11 +19,13 @@ import yaml
 
 from accerl_lerobot.cli import main
 from accerl_lerobot.console import Console
+from accerl_lerobot.engine import preflight
 from accerl_lerobot.engine import run as run_module
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig, decode, encode
 from accerl_lerobot.engine.local import LocalEngine
 from accerl_lerobot.engine.resuming import resume_command
 from accerl_lerobot.envs import SimulatedConfig
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
@@ -152,9 +154,22 @@ def test_more_updates_may_be_asked_for_and_nothing_else(whole: Path, capsys: pyt
     capsys.readouterr()
 
 
-def test_a_finished_run_goes_back_to_an_earlier_checkpoint(whole: Path, tmp_path: Path):
+def failing(*_: object) -> None:
+    raise InputError("env.type", "simulated", "it is gone")
+
+
+def test_a_finished_run_goes_back_to_an_earlier_checkpoint(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     run = tmp_path / "run"
     shutil.copytree(whole, run, symlinks=True)
+    (run / "wandb").mkdir()
+    (run / "wandb" / "debug-core.log").symlink_to(tmp_path / "elsewhere")  # as its client does
+    before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    monkeypatch.setattr(preflight, "check_world", failing)
+    assert go_on(run, config="checkpoints/000010/config.yaml") == 2
+    assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
+    monkeypatch.undo()
     assert go_on(run, config="checkpoints/000010/config.yaml") == 0
     assert records(run) == records(whole) and summary(run) == summary(whole)
 

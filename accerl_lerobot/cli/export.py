@@ -95,7 +95,11 @@ def _write(config: ExportConfig, chosen: list[list[Done]], root: Path, console: 
     tally = {"episodes": 0, "frames": 0, "successes": 0, "left_out": 0}
     version = {VERSION: {"dtype": "int64", "shape": (1,), "names": None}}
     stored = read_recipe(Path(str(config.path)).expanduser() / CONFIG).get("rollout")
-    given = {k: v for k, v in stored.items() if k == "decision_cost"} if isinstance(stored, dict) else {}
+    stored = stored if isinstance(stored, dict) else {}
+    if isinstance(judge := stored.get("reward_model"), dict) and judge.get("path"):
+        remedy = "rollout.reward_model told its successes, which a repeated episode does not have"
+        raise InputError("path", str(config.path), remedy)
+    given = {k: v for k, v in stored.items() if k == "decision_cost"}
     replay = partial(_replay, decode(RolloutConfig, given).decision_cost)
     with (
         console.stage("replaying episodes", total=len(chosen)) as stage,

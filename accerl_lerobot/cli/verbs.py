@@ -35,7 +35,7 @@ from accerl_lerobot.errors import InputError, check_absent, expanded, is_full, k
 from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.hub.card import PullConfig, PushConfig
 from accerl_lerobot.inference.worker import InferenceConfig
-from accerl_lerobot.metrics import WandBConfig
+from accerl_lerobot.metrics import WandBConfig, plain
 from accerl_lerobot.policies.config import Load, PolicyConfig
 from accerl_lerobot.report import ReportConfig, write_report
 from accerl_lerobot.rollout.runner import RolloutConfig
@@ -308,7 +308,7 @@ def _validated(
     from accerl_lerobot.world_model.validation import checks_table
 
     found, directory, console = _in_new_folder(config, work)
-    (directory / "validation.json").write_text(json.dumps(found, indent=2) + "\n")
+    (directory / "validation.json").write_text(json.dumps(plain(found), indent=2) + "\n")
     console.rich.print(checks_table(found))
     console.say(f"{'passed' if found['passed'] else 'FAILED'}; see {directory / 'preview.mp4'}")
     return _told(found, 0 if found["passed"] else 1)
@@ -380,7 +380,7 @@ def measure(module_name: str, config: Any) -> int:
 
 
 def _told(result: dict[str, Any], code: int = 0) -> int:
-    sys.stdout.write(json.dumps(result, indent=2) + "\n")
+    sys.stdout.write(json.dumps(plain(result), indent=2) + "\n")
     return code
 
 

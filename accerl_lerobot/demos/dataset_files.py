@@ -31,7 +31,7 @@ from accerl_lerobot.checkpoint.safety import (
     safe_join,
     unsafe_name,
 )
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.errors import InputError, expanded
 
 if TYPE_CHECKING:
     import pyarrow.parquet as pq
@@ -62,8 +62,10 @@ def open_metadata(dataset: DatasetConfig) -> Any:
         raise InputError(
             "dataset.repo_id", None, "name a LeRobotDataset; with dataset.root any label will do"
         )
-    if root is not None and not (Path(root) / INFO).is_file():
-        raise InputError("dataset.root", root, f"no {INFO} there; give the folder of a LeRobotDataset v3")
+    if root is not None:
+        root = str(expanded(root, "dataset.root"))
+        if not (Path(root) / INFO).is_file():
+            raise InputError("dataset.root", root, f"no {INFO} there; give the folder of a LeRobotDataset v3")
     try:
         with checked(origin_of(dataset), whole=root is not None):
             return LeRobotDatasetMetadata(name, root=root, revision=dataset.revision)

@@ -26,7 +26,7 @@ from accerl_lerobot.checkpoint.safety import Origin, read_json
 from accerl_lerobot.config.parsing import as_text
 from accerl_lerobot.config.ranges import Commit, DatasetConfig, LearningRate, Range, Section, Steps, Threads
 from accerl_lerobot.demos.backbone import BackboneConfig, Sizes, write_backbone
-from accerl_lerobot.errors import InputError, check_absent
+from accerl_lerobot.errors import InputError, check_absent, expanded
 from accerl_lerobot.experience import SUCCESS
 from accerl_lerobot.policies.config import discovery, register_policies
 
@@ -111,7 +111,8 @@ def sft_command(
     command += [f"{TRUST}{config.trust_remote_code}"] if config.trust_remote_code else []
     command += [f"--policy.{key}={as_text(value)}" for key, value in policy.items()]
     command += discovery(kind)
-    named = {"repo_id": dataset.repo_id, "root": dataset.root, "revision": dataset.revision}
+    root = None if dataset.root is None else expanded(dataset.root, "dataset.root")
+    named = {"repo_id": dataset.repo_id, "root": root, "revision": dataset.revision}
     command += [f"--dataset.{key}={value}" for key, value in named.items() if value]
     command += [f"--dataset.episodes={json.dumps(episodes)}"] if episodes is not None else []
     every = config.steps

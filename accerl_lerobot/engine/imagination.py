@@ -59,7 +59,7 @@ def make_learner(config: RunConfig) -> OnlineLearner:
     """Builds the learner of a run's world model, which starts at the saved one."""
     world, model, success = _load(config, load_lerobot_config(config.policy))
     assert success is not None  # only an oracle has none
-    roles = load_roles(Path(str(config.imagination.path)), IMAGINATION)
+    roles = load_roles(Path(str(config.imagination.path)).expanduser(), IMAGINATION)
     known = load_datasets({LEARN: config.imagination.learn.dataset}, model.spec).get(LEARN, [])
     longest = _longest(world, model.spec.chunk)
     settings = (config.imagination.learn, known, roles, longest, config.seed)
@@ -92,7 +92,7 @@ def _load(
     if not imagination.needs_path:
         return world, OracleModel(world, executed, lambda: make_world(config.env)), None
     device = resolve_device(config.policy.device)
-    path, package = Path(str(imagination.path)), imagination.discover_packages_path
+    path, package = Path(str(imagination.path)).expanduser(), imagination.discover_packages_path
     if first:
         rehearse_world_model(path, package, section=IMAGINATION)
     learned, success = load_world_model(path, package, section=IMAGINATION)

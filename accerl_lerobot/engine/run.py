@@ -217,22 +217,24 @@ def execute(
     """Do all phases and return the summary, which is also in ``summary.json``; `spec`: of a checked run."""
     started = time.monotonic()
     checkpoint = None if wanted is None else resuming.checkpoint_of(directory, wanted, console)
-    if wanted is not None and checkpoint is None and load is None:
-        spec, _ = check_start(config)
     text = yaml.safe_dump(encode(replace(config, resume=False)), sort_keys=False)
-    layout.write_atomically(directory / layout.CONFIG, text)
+    if wanted is None:  # a new run that is refused here can be resumed with other settings
+        layout.write_atomically(directory / layout.CONFIG, text)
+    if checkpoint is not None:
+        config = resuming.continued(config, directory, checkpoint)
+    if wanted is not None and load is None:
+        spec, _ = check_start(config)
     spec = spec or check_world(config.env)
     check_placement(replace(config, output_dir=str(directory)))
-    if checkpoint is not None:
-        layout.go_back_to(checkpoint)
-        config = resuming.continued(config, directory, checkpoint)
-        if load is None:
-            check_start(config)
-        console.say(f"going on from {checkpoint}")
     if config.imagination.share:
         from accerl_lerobot.engine.imagination import check_imagination
 
         check_imagination(config)
+    # Only now: a resume that is refused leaves the run as it was.
+    layout.write_atomically(directory / layout.CONFIG, text)
+    if checkpoint is not None:
+        layout.go_back_to(checkpoint)
+        console.say(f"going on from {checkpoint}")
     if checkpoint is None:
         config = warm_start(config, directory, console)
     config, before_s = replace(config, output_dir=str(directory)), 0.0 if checkpoint is None else None

@@ -118,7 +118,7 @@ class EvaluationConfig(Section, section="evaluation"):
     """Evaluate before training too; without it there is no video of before and after."""
     every_updates: Steps = 0
     """Evaluate while training, every so many updates; 0 does not."""
-    episodes_during: Annotated[int, Range("[1, 1000000]")] = 20
+    episodes_during: Annotated[int, Range("[1, 10000]")] = 20
     """Episodes of each evaluation while training."""
     videos: Annotated[int, Range("[0, 1000]")] = 16
     """Episodes filmed, the same before and after."""

@@ -115,6 +115,7 @@ def lag_limits(config: RunConfig) -> tuple[int, int]:
     """The largest lag under this recipe, and what its pace alone would allow; in updates."""
     early = 1 if config.launch.engine == "ray" else 0  # publications under way, and batches drawn early
     batch, in_flight = config.trainer.batch_decisions, config.rollout.in_flight
+    batch = max(1, batch - round(config.imagination.share * batch))  # real decisions
     counts = {"batch_decisions": batch, "in_flight": in_flight, "prefetch": early}
     counts["pickup"] = early + config.trainer.hold_back
     of_pace = lag_bound(replace(config.replay, max_lag=10**9), **counts)

@@ -40,7 +40,6 @@ WARNINGS = {
     "dropped_nonfinite": ("decision", "thrown away, because the environment returned NaN or infinity"),
     "replay_evicted_unused": ("segment", "left the replay buffer unused because it was full"),
     "replay_retired_unused": ("segment", "left the replay buffer unused, being older than replay.max_lag"),
-    "replay_lost_unused": ("segment", "not learned from were lost when the run was resumed"),
     "replay_dropped_nonfinite": ("segment", "refused by the replay buffer because of a NaN or infinity"),
 }
 """Counter → what is counted, and what happened; a run in which it is 0 needs no warning."""

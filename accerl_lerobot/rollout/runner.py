@@ -20,7 +20,7 @@ import numpy as np
 from accerl_lerobot.checkpoint.snapshot import kind
 from accerl_lerobot.config.ranges import NonNegative, Range, Section, Steps
 from accerl_lerobot.envs.base import ChunkResult, World
-from accerl_lerobot.envs.reward_model import RewardModelConfig
+from accerl_lerobot.envs.reward_model import JudgedWorld, RewardModelConfig
 from accerl_lerobot.experience import REAL, TASK, Decision, Observation, Origin, Request, Segment
 from accerl_lerobot.seeds import noise_seed, train_seed
 
@@ -365,6 +365,8 @@ def _execute(world: World, episode: ActiveEpisode, actions: np.ndarray) -> Chunk
     if episode.plan.film is None:
         return world.step_chunk(actions)
     side, every = episode.plan.film
+    if isinstance(world, JudgedWorld):
+        every = len(actions)  # or filmed episodes would be judged more often than others
     rewards = []
     for i in range(0, len(actions), every):
         result = world.step_chunk(actions[i : i + every])

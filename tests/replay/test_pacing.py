@@ -3,6 +3,7 @@
 
 import math
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.replay.buffer import Replay
-from accerl_lerobot.replay.pacing import ReplayConfig, entitle, lag_bound
+from accerl_lerobot.replay.pacing import ReplayConfig, entitle, lag_bound, lag_limits
 from tests.replay.segments import make_segment
 
 CONFIG = ReplayConfig(capacity=100, min_decisions=10, samples_per_insert=2.0, ahead=30)
@@ -62,6 +63,14 @@ def test_lag_bound_by_hand() -> None:
     assert lag_bound(CONFIG, **arguments) == 4 + 37 + 2
     capped = ReplayConfig(capacity=100, min_decisions=10, samples_per_insert=2.0, ahead=30, max_lag=9)
     assert lag_bound(capped, **arguments) == 9
+    of_32 = SimpleNamespace(batch_decisions=32, hold_back=4)  # 24 of them imagined
+    sections = {
+        "trainer": of_32,
+        "rollout": SimpleNamespace(in_flight=12),
+        "imagination": SimpleNamespace(share=0.75),
+    }
+    config: Any = SimpleNamespace(replay=capped, launch=SimpleNamespace(engine="local"), **sections)
+    assert lag_limits(config) == (9, 4 + 37)
 
 
 @dataclass(kw_only=True)

@@ -4,13 +4,15 @@
 from __future__ import annotations
 
 import pickle
+from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from accerl_lerobot.envs import SimulatedConfig, make_world
+from accerl_lerobot.envs import SimulatedConfig, World, make_world
+from accerl_lerobot.envs.reward_model import JudgedWorld
 from accerl_lerobot.experience import TASK, Decision, Observation, Origin, Request, Segment
 from accerl_lerobot.rollout.runner import (
     EpisodePlan,
@@ -163,9 +165,12 @@ def test_noise_depends_on_episode_and_decision_and_on_nothing_else():
     assert len(every) == 4 * 3 and len(set(every)) == len(every)
 
 
-def simulated_episode(film: bool, seed: int, tolerance: float) -> EpisodeResult:
+def simulated_episode(
+    film: bool, seed: int, tolerance: float, judge: Callable[[Observation], bool] | None = None
+) -> EpisodeResult:
     """One evaluation episode with actions drawn from the requests' own seeds."""
-    world = make_world(SimulatedConfig(max_steps=20, tolerance=tolerance))
+    world: World = make_world(SimulatedConfig(max_steps=20, tolerance=tolerance))
+    world = world if judge is None else JudgedWorld(world, judge)
     plan = EpisodePlan(task="match", seed=seed, explore=False, film=(8, 2) if film else None)
     recorder = Recorder([world], [plan], CONFIG)
     request: Request | None = recorder.runner.start(0)
@@ -187,6 +192,11 @@ def test_filming_changes_nothing(seed: int, tolerance: float, success: bool):
     assert plain.success is success and plain.frames == []
     assert len(filmed.frames) >= filmed.steps // 2 and all(f.shape == (8, 8, 3) for f in filmed.frames)
     assert replace(filmed, plan=plain.plan, frames=[]) == plain
+    asked: list[Observation] = []
+    for film in (False, True):
+        episode = simulated_episode(film, seed, 0.001, judge=lambda seen: bool(asked.append(seen)))
+        assert len(asked) == episode.decisions, "a reward model is asked as often of a filmed episode"
+        asked.clear()
 
 
 def observation(step: int) -> Observation:

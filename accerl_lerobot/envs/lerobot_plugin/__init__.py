@@ -7,6 +7,7 @@ A package and not a module, because LeRobot's plugin loader looks for submodules
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import sys
 from dataclasses import dataclass, field
@@ -87,7 +88,8 @@ class AccerlEnvConfig(EnvConfig):
     features_map: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        spec = make_world(self.world_config).spec  # refuses bad values now
+        with contextlib.closing(make_world(self.world_config)) as world:  # refuses bad values now
+            spec = world.spec
         self.fps = spec.fps
         self.features = {
             "action": PolicyFeature(type=FeatureType.ACTION, shape=(spec.action_dim,)),
@@ -119,7 +121,9 @@ class AccerlEnvConfig(EnvConfig):
         config, vectors, kind = self.world_config, {}, gym.vector.SyncVectorEnv
         if use_async_envs and n_envs > 1:
             kind = functools.partial(gym.vector.AsyncVectorEnv, context="forkserver")
-        for task in make_world(config).spec.tasks:
+        with contextlib.closing(make_world(config)) as world:
+            tasks = world.spec.tasks
+        for task in tasks:
             # A finished environment waits for its batch without simulating an episode nobody sees.
             make = freeze_after_episode_end(functools.partial(AccerlEnv, config, task))
             vectors[task] = {0: kind([make] * n_envs)}
