@@ -88,6 +88,10 @@ def test_a_run_with_types_of_other_packages(run: Path, tmp_path: Path, capsys: p
     assert exported(other, tmp_path / "set") == 2
     assert "if you trust it, add --env.discover_packages_path=accerl_lerobot.envs" in capsys.readouterr().err
     assert exported(other, tmp_path / "set", "--env.discover_packages_path=accerl_lerobot.envs") == 0
+    config["rollout"]["reward_model"]["path"] = "outputs/classifier"
+    (other / "config.yaml").write_text(yaml.safe_dump(config))
+    assert exported(other, tmp_path / "judged", "--env.discover_packages_path=accerl_lerobot.envs") == 2
+    assert "rollout.reward_model told its successes" in capsys.readouterr().err
 
 
 def test_episodes_that_cannot_be_repeated_are_left_out(run, tmp_path, capsys):
