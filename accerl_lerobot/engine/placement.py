@@ -255,14 +255,7 @@ def _nodes(config: RunConfig) -> list[Node]:
     if config.launch.address is None and len(nodes) == 1:
         return nodes
     wanted = {0}.union(*({n.number for n in candidates(nodes, role)} for role in roles_of(config)))
-    imagination = config.imagination
-    folders = {
-        "the run's folder": config.output_dir,
-        "policy.path": config.policy.path,
-        "dataset.root": config.dataset.root,
-        "imagination.path": imagination.path,
-        "imagination.learn.dataset.root": imagination.learn.dataset.root,
-    }
+    folders = {"the run's folder": config.output_dir, "policy.path": config.policy.path}
     files = {  # of folders that are here
         f"{name}, {folder}": Path(folder).absolute()
         for name, folder in folders.items()
