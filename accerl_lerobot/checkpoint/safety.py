@@ -76,23 +76,20 @@ def _check_link(path: Path, root: Path, name: str, origin: Origin) -> None:
         raise origin.refuse(name, "a link that leads out of the folder; put the file itself there")
 
 
-WANDB = "wandb"  # folder of Weights & Biases in a run
-
-
 def check_folder(folder: Path, origin: Origin) -> None:
     """Refuses what is no folder, or has a link that leads out, a pipe or a device."""
     if not folder.is_dir():
         remedy = "a file; name the folder of a run" if folder.exists() else "no such folder"
         raise InputError(origin.field, origin.value, remedy)
     for at, folders, files in os.walk(folder):
-        if Path(at) == folder and WANDB in folders:
-            folders.remove(WANDB)  # it links a log that lies elsewhere, and nothing here reads it
         for path in (Path(at, name) for name in (*folders, *files)):
             name = path.relative_to(folder).as_posix()
             _check_link(path, folder, name, origin)
             with contextlib.suppress(FileNotFoundError):  # the run may still be going on
                 if not path.is_dir() and not stat.S_ISREG(path.stat().st_mode):
                     raise origin.refuse(name, "neither a file nor a folder; remove it")
+        if Path(at) == folder and "wandb" in folders:
+            folders.remove("wandb")  # its client links a log that lies elsewhere, and nothing here reads it
 
 
 def check_name(name: object, what: str, origin: Origin) -> str:

@@ -218,7 +218,7 @@ def execute(
     started = time.monotonic()
     checkpoint = None if wanted is None else resuming.checkpoint_of(directory, wanted, console)
     text = yaml.safe_dump(encode(replace(config, resume=False)), sort_keys=False)
-    if wanted is None:  # a new run that is refused here can be resumed with other settings
+    if wanted is None:  # first: whatever fails from here on, the run can be resumed
         layout.write_atomically(directory / layout.CONFIG, text)
     if checkpoint is not None:
         config = resuming.continued(config, directory, checkpoint)
@@ -230,12 +230,12 @@ def execute(
         from accerl_lerobot.engine.imagination import check_imagination
 
         check_imagination(config)
-    # Only now: a resume that is refused leaves the run as it was.
-    layout.write_atomically(directory / layout.CONFIG, text)
+    if wanted is not None:  # only now: a resume that is refused leaves the run as it was
+        layout.write_atomically(directory / layout.CONFIG, text)
     if checkpoint is not None:
         layout.go_back_to(checkpoint)
         console.say(f"going on from {checkpoint}")
-    if checkpoint is None:
+    else:
         config = warm_start(config, directory, console)
     config, before_s = replace(config, output_dir=str(directory)), 0.0 if checkpoint is None else None
     times = Times(started=started, warm_s=time.monotonic() - started, before_s=before_s)

@@ -72,7 +72,7 @@ class Memory:
         environment = seen.pop(ENVIRONMENT_STATE, np.empty((t, 0))).reshape(t, -1)
         if segment.task not in self.tasks:
             self.tasks.append(segment.task)
-        code = task_codes([segment.task] * t)
+        code = task_codes([segment.task]).repeat(t, axis=0)
         columns: dict[str, Any] = {
             "state": np.concatenate([environment, code], 1).astype(np.float32),
             "chunk": chunk,

@@ -90,7 +90,7 @@ class AccerlEnvConfig(EnvConfig):
     def __post_init__(self) -> None:
         with contextlib.closing(make_world(self.world_config)) as world:  # refuses bad values now
             spec = world.spec
-        self.fps = spec.fps
+        self.fps, self.tasks = spec.fps, spec.tasks
         self.features = {
             "action": PolicyFeature(type=FeatureType.ACTION, shape=(spec.action_dim,)),
             "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(spec.state_dim,)),
@@ -121,9 +121,7 @@ class AccerlEnvConfig(EnvConfig):
         config, vectors, kind = self.world_config, {}, gym.vector.SyncVectorEnv
         if use_async_envs and n_envs > 1:
             kind = functools.partial(gym.vector.AsyncVectorEnv, context="forkserver")
-        with contextlib.closing(make_world(config)) as world:
-            tasks = world.spec.tasks
-        for task in tasks:
+        for task in self.tasks:
             # A finished environment waits for its batch without simulating an episode nobody sees.
             make = freeze_after_episode_end(functools.partial(AccerlEnv, config, task))
             vectors[task] = {0: kind([make] * n_envs)}
