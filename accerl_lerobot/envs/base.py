@@ -258,9 +258,7 @@ class SuiteConfig(EnvConfig):
 
     @property
     def state_size(self) -> int:
-        if not self.environment_state:
-            return 0
-        return self.STATE_NUMBERS + 1 + len(task_code(self.tasks, self.tasks[0]))
+        return self.STATE_NUMBERS + 1 if self.environment_state else 0
 
 
 def unit_spec(
@@ -278,11 +276,6 @@ def unit_spec(
         tasks=config.tasks,
         instructions=tuple(map(instruction, config.tasks)),
     )
-
-
-def task_code(tasks: Sequence[str], task: str) -> np.ndarray:
-    """Part of ``observation.environment_state`` that tells tasks apart: one-hot, or empty for one task."""
-    return np.eye(len(tasks))[tasks.index(task)] if len(tasks) > 1 else np.zeros(0)
 
 
 _spare: dict[tuple[str, str], list[Any]] = defaultdict(list)  # simulators no world has, by config and task
@@ -341,8 +334,8 @@ class SuiteWorld(EpisodeWorld):
         }
         observation["observation.state"] = simulator.state()
         if self.config.environment_state:
-            numbers = simulator.everything(), [self.late], task_code(spec.tasks, self._task)
-            observation[ENVIRONMENT_STATE] = np.concatenate(numbers).astype(np.float32)
+            numbers = np.append(simulator.everything(), self.late)
+            observation[ENVIRONMENT_STATE] = numbers.astype(np.float32)
         observation[TASK] = spec.instructions[spec.tasks.index(self._task)]
         return observation
 
