@@ -86,7 +86,10 @@ def start(
             directory, wanted = resuming.resumed_run(recipe, config)
         else:
             if load is None:
+                from accerl_lerobot.policies.loading import pinned
+
                 spec, _ = check_start(config, console.say)  # before there is a folder
+                config = replace(config, policy=pinned(config.policy))
             directory = make_output_dir(config)
         console.say(f"run {directory}")
         how = resuming.resume_command(directory, config)

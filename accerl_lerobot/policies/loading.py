@@ -199,6 +199,12 @@ def _checkpoint_folder(config: PolicyConfig) -> Path:
     return untrusted.fetched_checkpoint(config.path, config.revision, "policy.path")
 
 
+def pinned(config: PolicyConfig) -> PolicyConfig:
+    """With the commit that a Hub checkpoint has now, which all processes and a resumed run then load."""
+    local = config.path is None or Path(config.path).expanduser().exists()
+    return config if local else replace(config, revision=_checkpoint_folder(config).name)
+
+
 def _registered_type(config: PolicyConfig, folder: Path) -> Any:
     """The checkpoint's policy type; packages that may have it are imported."""
     discover(config.discover_packages_path, "policy")

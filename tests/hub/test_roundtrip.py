@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from accerl_lerobot import cli
 from accerl_lerobot.checkpoint.layout import save_checkpoint
 from accerl_lerobot.experience import TASK_BITS
 from accerl_lerobot.policies.config import PolicyConfig
-from accerl_lerobot.policies.loading import load_adapter
+from accerl_lerobot.policies.loading import load_adapter, pinned
 from accerl_lerobot.policies.saving import save_pretrained
 from accerl_lerobot.testing import perturb
 from tests.hub.folders import SUMMARY, write_json
@@ -95,6 +96,8 @@ def test_policies_load_wherever_they_are(hub: HubServer, run: Path, tmp_path: Pa
     commit = hub.repo("alice/policy").branches["main"]
     original = run.rename(tmp_path / "moved") / LAST  # whatever still names the old place is found out
     accerl("pull", "--repo_id=alice/policy", f"--output_dir={tmp_path / 'policy'}")
+    at_first = PolicyConfig(path="alice/policy", device="cpu")
+    assert pinned(at_first) == replace(at_first, revision=commit)
     hub.plant("alice/policy", {"model.safetensors": b"what came later"})
     pulled = str(tmp_path / "policy")
     places = [(str(original), None), (pulled, None), ("alice/policy", commit)]
