@@ -86,6 +86,13 @@ def test_another_rate_or_task(change: dict[str, Any], message: str):
         check_features(replace(OFFERED, **change), OFFERED, {}, "dataset.repo_id", "x")
 
 
+def test_a_rate_that_datasets_of_the_environment_are_known_to_name():
+    labelled = replace(OFFERED, labelled_fps=(5,))
+    check_features(replace(OFFERED, fps=5), labelled, {}, "dataset.repo_id", "x")
+    with pytest.raises(InputError, match="recorded at 6 Hz"):
+        check_features(replace(OFFERED, fps=6), labelled, {}, "dataset.repo_id", "x")
+
+
 def test_a_task_more_in_the_environment_is_only_warned_about(caplog: pytest.LogCaptureFixture):
     both = env_features(make_world(SimulatedConfig(task="match,mirror")).spec)
     check_features(OFFERED, both, {}, "dataset.repo_id", "x")

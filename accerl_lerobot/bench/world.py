@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Speed of our MetaWorld or LIBERO next to LeRobot's: both step random actions, in turns, on one machine.
 
-Three arms: ``ours`` (a picture per decision), ``ours_every_step`` (chunks of one, so a picture per step) and
+Arms: ``ours`` (a picture per decision), ``ours_every_step`` (chunks of one, so a picture per step) and
 ``stock`` (LeRobot's own environment, a picture per step: of MetaWorld 480 pixels with default lights, of
-LIBERO two of our size). Blocks go forth and back (A B C C B A), so that a machine that slows down slows every
-arm.
+LIBERO two of our size); of LIBERO also ``physics`` and ``stock_physics``, the loops alone, without pictures
+and resets. Blocks go forth and back (A B C C B A), so that a machine that slows down slows every arm.
 """
 
 from __future__ import annotations
@@ -26,13 +26,14 @@ from accerl_lerobot.bench import as_table, host, ranged, spread
 from accerl_lerobot.config.ranges import Positive, Range, Repeats, Section
 from accerl_lerobot.demos.record import simulators
 from accerl_lerobot.envs import EnvConfig, LiberoConfig, MetaWorldConfig, make_world
-from accerl_lerobot.envs.libero_tasks import load_libero
+from accerl_lerobot.envs.libero_simulator import Simulator
+from accerl_lerobot.envs.libero_tasks import bddl_file, load_libero
 from accerl_lerobot.envs.metaworld import import_mujoco
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.seeds import train_seed
 
 OURS, EVERY_STEP, STOCK = "ours", "ours_every_step", "stock"
-_ARMS = (OURS, EVERY_STEP, STOCK)
+PHYSICS, STOCK_PHYSICS = "physics", "stock_physics"
 Decide = Callable[[], int]  # steps an environment for one decision and returns the number of env steps
 
 
@@ -61,18 +62,24 @@ class BenchWorldConfig(Section):
         assert isinstance(self.env, MetaWorldConfig | LiberoConfig)
         return self.env.tasks[0]
 
+    @property
+    def arms(self) -> tuple[str, ...]:
+        alone = (PHYSICS, STOCK_PHYSICS) if isinstance(self.env, LiberoConfig) else ()
+        return (OURS, EVERY_STEP, STOCK, *alone)
+
 
 def bench_world(config: BenchWorldConfig) -> dict[str, Any]:
-    """Measures all three arms.
+    """Measures all arms.
 
     Returns: ``arms[name]`` with ``env_steps_per_s`` and ``decisions_per_s``, and ``ratio``, our env
-    steps per second over LeRobot's, of the blocks' pairs; see `spread`.
+    steps per second over LeRobot's, of the blocks' pairs, see `spread`; of LIBERO also ``physics_ratio``.
     """
-    blocks: dict[str, list[tuple[float, float]]] = {name: [] for name in _ARMS}
+    names = config.arms
+    blocks: dict[str, list[tuple[float, float]]] = {name: [] for name in names}
     with contextlib.ExitStack() as stack:
         # A process for each arm: two OpenGL contexts in one process disturb each other.
-        pools = {name: stack.enter_context(simulators(1, _start, name, config)) for name in _ARMS}
-        for name in (*_ARMS, *config.rounds * (*_ARMS, *reversed(_ARMS))):
+        pools = {name: stack.enter_context(simulators(1, _start, name, config)) for name in names}
+        for name in (*names, *config.rounds * (*names, *reversed(names))):
             blocks[name].append(pools[name].submit(_measure, config.seconds).result())
         machine = pools[OURS].submit(_host).result()
     arms = {}
@@ -80,10 +87,14 @@ def bench_world(config: BenchWorldConfig) -> dict[str, Any]:
         counted = zip(*values[1:], strict=True)  # the first warms up
         steps, decisions = (spread(list(rates)) for rates in counted)
         arms[name] = {"env_steps_per_s": steps, "decisions_per_s": decisions}
-    ours, stock = (arms[name]["env_steps_per_s"]["blocks"] for name in (OURS, STOCK))
-    ratio = spread([own / other for own, other in zip(ours, stock, strict=True)])
+
+    def ratio(*of: str) -> dict[str, Any]:
+        ours, stock = (arms[name]["env_steps_per_s"]["blocks"] for name in of)
+        return spread([own / other for own, other in zip(ours, stock, strict=True)])
+
     chosen = {"task": config.task, "chunk": config.chunk, "env": draccus.encode(config.env, EnvConfig)}
-    return {"config": chosen, "arms": arms, "ratio": ratio, "host": machine}
+    result = {"config": chosen, "arms": arms, "ratio": ratio(OURS, STOCK), "host": machine}
+    return result | ({"physics_ratio": ratio(PHYSICS, STOCK_PHYSICS)} if PHYSICS in names else {})
 
 
 def table(result: dict[str, Any]) -> Table:
@@ -91,6 +102,8 @@ def table(result: dict[str, Any]) -> Table:
     title = (
         f"{config['task']}, chunk {config['chunk']}: {ranged(ratio, '.1f')} times the env steps of LeRobot's"
     )
+    if "physics_ratio" in result:
+        title += f", physics alone {ranged(result['physics_ratio'], '.1f')} times"
     rows = [
         (name, *(ranged(rates[kind], ",.1f") for kind in ("env_steps_per_s", "decisions_per_s")))
         for name, rates in result["arms"].items()
@@ -110,7 +123,8 @@ def _start(arm: str, config: BenchWorldConfig) -> None:
     dims = make_world(config.env).spec.action_dim  # no simulator is built before the first reset
     actions = np.random.default_rng(0).uniform(-1, 1, (997, chunk, dims))
     chunks = itertools.cycle(actions.astype(np.float32))
-    _decide = _stock(config, chunks) if arm == STOCK else _ours(config, chunks)
+    make = {STOCK: _stock, PHYSICS: _physics, STOCK_PHYSICS: _stock_physics}.get(arm, _ours)
+    _decide = make(config, chunks)
 
 
 def _ours(config: BenchWorldConfig, chunks: Iterator[np.ndarray]) -> Decide:
@@ -140,6 +154,39 @@ def _stock(config: BenchWorldConfig, chunks: Iterator[np.ndarray]) -> Decide:
         elif terminated or truncated or not left:
             env.reset(seed=0)
             left = config.env.max_steps
+        return 1
+
+    return decide
+
+
+def _physics(config: BenchWorldConfig, chunks: Iterator[np.ndarray]) -> Decide:
+    assert isinstance(config.env, LiberoConfig)
+    simulator = Simulator(config.task, config.env.rendering, config.env.assets)
+    simulator.reset(train_seed(0, 0, 0))
+    return _put_back(config, simulator.env.sim, simulator.step, chunks)
+
+
+def _stock_physics(config: BenchWorldConfig, chunks: Iterator[np.ndarray]) -> Decide:
+    assert isinstance(config.env, LiberoConfig)
+    load_libero(config.env.assets)
+    from libero.libero.envs.env_wrapper import ControlEnv
+
+    with contextlib.redirect_stdout(io.StringIO()):
+        env = ControlEnv(str(bddl_file(config.task)), use_camera_obs=False, has_offscreen_renderer=False)
+        env.reset()
+    return _put_back(config, env.env.sim, env.step, chunks)
+
+
+def _put_back(
+    config: BenchWorldConfig, sim: Any, step: Callable[[np.ndarray], Any], chunks: Iterator[np.ndarray]
+) -> Decide:
+    """Steps robosuite's `sim` and puts it back where it began after each episode's time."""
+    start, steps = sim.get_state(), itertools.count(1)
+
+    def decide() -> int:
+        step(next(chunks)[0])
+        if next(steps) % config.env.max_steps == 0:
+            sim.set_state(start)
         return 1
 
     return decide

@@ -37,6 +37,7 @@ class WorldSpec:
     action_low: np.ndarray  # float32 (A,). Actions outside are clipped by the world.
     action_high: np.ndarray
     fps: int  # control rate in Hz
+    labelled_fps: tuple[int, ...] = ()  # other rates that datasets of the environment name for the same
     max_steps: int  # episode limit in env steps; reaching it truncates
     tasks: tuple[str, ...]  # names `World.reset` accepts
     instructions: tuple[str, ...] = ()
@@ -234,6 +235,8 @@ class SuiteConfig(EnvConfig):
     """Tasks of each group that `task` may name."""
     STATE_NUMBERS: ClassVar[int]
     """Numbers of ``observation.environment_state`` that are the simulator's."""
+    CAMERAS: ClassVar[tuple[str, ...]]
+    """Names that `camera` may have."""
 
     task: str
     camera: str
@@ -245,6 +248,9 @@ class SuiteConfig(EnvConfig):
         expand_tasks(self.task, type(self).groups())
         if not self.cameras or len(set(self.cameras)) < len(self.cameras):
             raise InputError("env.camera", self.camera, "name each camera once, separated by commas")
+        if unknown := [name for name in self.cameras if name not in self.CAMERAS]:
+            remedy = f"{unknown[0]!r} is none of: {', '.join(self.CAMERAS)}"
+            raise InputError("env.camera", self.camera, remedy)
 
     @property
     def tasks(self) -> tuple[str, ...]:
@@ -350,7 +356,6 @@ def lerobot_eval_arguments(env: Mapping[str, Any]) -> list[str]:
         owned = dataclasses.fields(EnvConfig.get_choice_class(str(kind)))
         usual = {own.name: draccus.encode(default_of(own)) for own in owned}
         given = {name: value for name, value in env.items() if value != usual.get(name)}
-        given.pop("assets", None)  # a folder of this machine
         plugin = {"discover_packages_path": "accerl_lerobot.envs.lerobot_plugin", "type": "accerl"}
         fields = plugin | {"world": json.dumps(given)}
         if package := given.get("discover_packages_path"):

@@ -7,7 +7,7 @@ datasets acts here as it is. Importing this file loads neither MuJoCo nor LIBERO
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
 from accerl_lerobot.config.ranges import Range
@@ -16,8 +16,12 @@ from accerl_lerobot.envs.libero_simulator import FPS, NUMBERS, Simulator
 from accerl_lerobot.envs.libero_tasks import instruction, suites
 from accerl_lerobot.errors import InputError, expanded
 
-CAMERAS = {"agentview": "image", "robot0_eye_in_hand": "image2"}
+LEROBOT_NAMES = {"agentview": "image", "robot0_eye_in_hand": "image2"}
 """LeRobot's names of the two cameras that policies see."""
+LIMITS = {"libero_spatial": 280, "libero_object": 280, "libero_goal": 300, "libero_10": 520, "libero_90": 400}
+"""LeRobot's episode limits in env steps."""
+LABELLED_FPS = (10,)
+"""Datasets of LIBERO's demonstrations on the Hub say so, whose actions were executed at 20 Hz."""
 STATE_DIM = 8
 ACTION_DIM = 7
 
@@ -35,6 +39,7 @@ class LiberoConfig(SuiteConfig):
     world = "accerl_lerobot.envs.libero:LiberoWorld"
     groups = staticmethod(suites)
     STATE_NUMBERS = NUMBERS
+    CAMERAS = (*LEROBOT_NAMES, "frontview", "birdview", "sideview", "galleryview", "robot0_robotview")
 
     task: str = "libero_object"
     """Suites (libero_spatial, libero_object, libero_goal, libero_10, libero_90), or single tasks such as
@@ -44,9 +49,9 @@ class LiberoConfig(SuiteConfig):
     LeRobot, others ``observation.images.<name>``."""
     image_size: Annotated[int, Range("[32, 480]")] = 256
     """Height and width of every image in pixels."""
-    max_steps: Annotated[int, Range("[1, 1000]")] = 280
-    """Episode limit in env steps. LeRobot has 280 for libero_spatial and libero_object, 300 for libero_goal,
-    520 for libero_10, 400 for libero_90."""
+    max_steps: Annotated[int, Range("[0, 1000]")] = 0
+    """Episode limit in env steps. 0: LeRobot's, which is 280 for libero_spatial and libero_object, 300 for
+    libero_goal, 520 for libero_10, 400 for libero_90; of several suites the largest."""
     rendering: Literal["stock", "fast"] = "stock"
     """``stock`` (LeRobot's pixels) or ``fast`` (no shadows, reflections or multisampling, and coarser meshes:
     several times faster in software)."""
@@ -55,13 +60,16 @@ class LiberoConfig(SuiteConfig):
     of those on the Hub."""
     environment_state: bool = False
     """True if observations hold ``observation.environment_state``: joints and hand of the robot, positions
-    of the objects that the task is about, distances between all these, the share of `max_steps` gone, and
-    which of several tasks it is. For ``algorithm.type=chunk_critic``."""
+    of the objects that the task is about, distances between all these, and the share of `max_steps` gone. For
+    ``algorithm.type=chunk_critic``."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.assets and not (expanded(self.assets, "env.assets") / "scenes").is_dir():
             raise InputError("env.assets", self.assets, "no folder of LIBERO's assets: it holds no scenes/")
+        if not self.max_steps:
+            longest = max(LIMITS[task.split("/")[0]] for task in self.tasks)
+            object.__setattr__(self, "max_steps", longest)
 
 
 class LiberoWorld(SuiteWorld):
@@ -70,8 +78,9 @@ class LiberoWorld(SuiteWorld):
     config: LiberoConfig
 
     def __init__(self, config: LiberoConfig) -> None:
-        images = [f"observation.images.{CAMERAS.get(camera, camera)}" for camera in config.cameras]
-        super().__init__(config, unit_spec(config, images, instruction, STATE_DIM, ACTION_DIM, FPS))
+        images = [f"observation.images.{LEROBOT_NAMES.get(camera, camera)}" for camera in config.cameras]
+        spec = unit_spec(config, images, instruction, STATE_DIM, ACTION_DIM, FPS)
+        super().__init__(config, replace(spec, labelled_fps=LABELLED_FPS))
 
     def _build(self, task: str) -> Simulator:
         return Simulator(task, self.config.rendering, self.config.assets)

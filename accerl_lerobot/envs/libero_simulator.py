@@ -9,16 +9,20 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import hashlib
 import io
 import re
+import threading
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 from unittest.mock import patch
 
 import numpy as np
 
-from accerl_lerobot.envs.libero_tasks import bddl_file, load_libero, recorded_states
+from accerl_lerobot.checkpoint.safety import brief
+from accerl_lerobot.envs.libero_tasks import REMEDY, bddl_file, load_libero, recorded_states
 from accerl_lerobot.envs.metaworld import diverged, draw_fast, import_mujoco, new_renderer
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.seeds import EVAL_SEEDS
 
 FPS = 20
@@ -30,6 +34,9 @@ NUMBERS = 25 + MAX_OBJECTS * 4 + 6 * 10  # of robot, objects, and what lies betw
 TIMESTEP = 0.002
 NEAR = 0.03  # scale in m of the squashed vectors that a critic sees
 STILL = np.array([0, 0, 0, 0, 0, 0, -1], np.float32)
+_alone = threading.RLock()
+"""Held where LIBERO uses what a process has one of: LeRobot plays tasks in threads."""
+_coarse: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
 
 
 class Arm(NamedTuple):
@@ -310,20 +317,21 @@ def _placed[Result](make: Callable[[], Result], seed: int) -> Result:
     """Result of LIBERO's code that places objects, which draws from NumPy's global generator; silent."""
     from robosuite.utils.errors import RandomizationError
 
-    state = np.random.get_state()
-    np.random.seed(seed)
-    try:
-        with contextlib.redirect_stdout(io.StringIO()):
+    with _alone, contextlib.redirect_stdout(io.StringIO()):
+        state = np.random.get_state()
+        np.random.seed(seed)
+        try:
             while True:
                 with contextlib.suppress(RandomizationError):  # the objects did not fit: it draws again
                     return make()
-    finally:
-        np.random.set_state(state)
+        finally:
+            np.random.set_state(state)
 
 
 def _build(task: str, assets: str) -> Any:
     """robosuite's environment of a task, which draws nothing."""
-    load_libero(assets)
+    with _alone:
+        load_libero(assets)
     from libero.libero.envs.env_wrapper import ControlEnv
     from robosuite.utils.binding_utils import MjSim
 
@@ -335,8 +343,12 @@ def _build(task: str, assets: str) -> Any:
         return compiled(re.sub(r"<size [^>]*>", f'<size memory="{ARENA}"/>', xml))
 
     compiled = MjSim.from_xml_string
-    with patch.object(MjSim, "from_xml_string", smaller):
-        env = _placed(build, 0)
+    try:
+        with _alone, patch.object(MjSim, "from_xml_string", smaller):
+            env = _placed(build, 0)
+    except (OSError, ValueError) as error:
+        why = f"the scene of {task} does not load ({brief(error)}); if the folder is incomplete, {REMEDY}"
+        raise InputError("env.assets", assets, why) from error
     env.hard_reset = False  # the scene is always the same: no need to compile it anew for each episode
     return env
 
@@ -382,7 +394,7 @@ def _make_cheap(model: Any) -> None:
             continue
         faces, first = model.mesh_face[at : at + count], int(model.mesh_vertadr[mesh])
         vertices = model.mesh_vert[first : first + int(model.mesh_vertnum[mesh])]
-        kept, merged = coarser(vertices, faces, MAX_FACES)
+        kept, merged = _coarser_once(vertices, faces)
         corners = model.mesh_facetexcoord[at : at + count][kept] + model.mesh_texcoordadr[mesh]
         if model.mesh_texcoordnum[mesh] == 3 * count:  # each corner has its own place in the texture
             places = model.mesh_texcoord[corners]
@@ -391,6 +403,14 @@ def _make_cheap(model: Any) -> None:
             array[at : at + len(kept)] = array[at : at + count][kept]
         model.mesh_face[at : at + len(kept)] = merged
         model.mesh_facenum[mesh] = len(kept)
+
+
+def _coarser_once(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """`coarser` of a mesh, computed once in a process: the robot and most objects are in many scenes."""
+    key = hashlib.sha256(vertices.tobytes() + faces.tobytes()).digest()
+    if key not in _coarse:
+        _coarse[key] = coarser(vertices, faces, MAX_FACES)
+    return _coarse[key]
 
 
 def coarser(vertices: np.ndarray, faces: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:

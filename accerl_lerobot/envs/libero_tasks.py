@@ -21,8 +21,11 @@ import numpy as np
 import yaml
 
 from accerl_lerobot.checkpoint.layout import write_atomically
+from accerl_lerobot.checkpoint.safety import brief
 from accerl_lerobot.errors import InputError, expanded
 
+REMEDY = "hf download lerobot/libero-assets --repo-type=dataset --local-dir=FOLDER, and name the folder"
+"""How to get LIBERO's meshes and textures where a run cannot."""
 SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10", "libero_90")
 
 
@@ -111,12 +114,12 @@ def assets_folder(given: str) -> Path:
 
     try:
         folder = Path(download_assets_from_huggingface())
-        if not (folder / "scenes").is_dir():
-            raise FileNotFoundError(f"{folder} is incomplete: remove it, and it is fetched again")
-        return folder
     except Exception as error:
-        remedy = "LIBERO's meshes are not installed and the Hub does not answer; name a folder that has them"
-        raise InputError("env.assets", given, f"{remedy} ({error})") from error
+        why = f"LIBERO's meshes are not installed, and the Hub did not give them ({brief(error)})"
+        raise InputError("env.assets", given, f"{why}; {REMEDY}") from error
+    if not (folder / "scenes").is_dir():
+        raise InputError("env.assets", given, f"{folder} is incomplete; remove it, and it is fetched again")
+    return folder
 
 
 def load_libero(assets: str) -> None:

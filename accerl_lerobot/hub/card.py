@@ -222,7 +222,7 @@ def model_card(repo_id: str, artifact: str, folder: Path, files: Files, provenan
         number=number,
         shown=sorted(name for name in files if name.startswith(f"{FOLDER}/") or "/" not in name),
         recipe_path=f"{local}/{place}" if recipe else None,
-        stock=lerobot_eval_command(local, config, env),
+        stock=lerobot_eval_command(local, config, {k: v for k, v in env.items() if k != "assets"}),
         # With one of its own, LeRobot finds the backbone only once a pull has set its place.
         has_backbone=str(config.get("vlm_model_name") or "").startswith(("/", BACKBONE)),
         recipe=own_recipe.decode() if isinstance(own_recipe, bytes) else "",

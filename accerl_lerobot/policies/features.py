@@ -27,6 +27,7 @@ class Features:
     shapes: dict[str, tuple[int, ...]]  # name → shape; images are (channels, height, width)
     any_size: bool = False  # images of any height and width fit
     fps: float | None = None  # control rate in Hz; None: not known
+    labelled_fps: tuple[float, ...] = ()  # see `WorldSpec.labelled_fps`
     tasks: tuple[str, ...] = ()  # instructions; empty: not known
 
 
@@ -34,7 +35,8 @@ def env_features(spec: WorldSpec) -> Features:
     """Features that an environment offers."""
     shapes: dict[str, tuple[int, ...]] = {name: (c, h, w) for name, (h, w, c) in spec.images.items()}
     shapes |= {STATE: (spec.state_dim,), ACTION: (spec.action_dim,)}
-    return Features(shapes=shapes, fps=spec.fps, tasks=spec.instructions)
+    labels = spec.labelled_fps
+    return Features(shapes=shapes, fps=spec.fps, labelled_fps=labels, tasks=spec.instructions)
 
 
 def policy_features(policy: Any) -> Features:
@@ -99,10 +101,11 @@ def check_features(
             remedy = "give both one image size" if image else "choose parties that were made for each other"
             sizes = f"its {name} is {shape}, but {shapes[name]} in the {offerer}"
             raise InputError(field, value, f"{sizes}; {remedy}")
-    if needed.fps and offered.fps and not math.isclose(needed.fps, offered.fps):
-        rates = f"recorded at {needed.fps:g} Hz, but the environment runs at {offered.fps:g} Hz"
-        remedy = "its actions would be executed at another rate; use a dataset of this rate, or set env.fps"
-        raise InputError(field, value, f"{rates}: {remedy}")
+    rates = (offered.fps, *offered.labelled_fps) if offered.fps else ()
+    if needed.fps and rates and not any(math.isclose(needed.fps, rate) for rate in rates):
+        why = f"recorded at {needed.fps:g} Hz, but the environment runs at {offered.fps:g} Hz"
+        remedy = "its actions would be executed at another rate; use a dataset of this rate"
+        raise InputError(field, value, f"{why}: {remedy}, or with env.type=gym set env.fps")
     known = {_plain(text) for text in needed.tasks}
     missing = [text for text in offered.tasks if _plain(text) not in known]
     if known and missing:

@@ -7,11 +7,12 @@ import contextlib
 import io
 import itertools
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from accerl_lerobot.envs import LiberoConfig, make_world
+from accerl_lerobot.envs import LiberoConfig, libero_tasks, make_world
 from accerl_lerobot.envs.libero import LiberoWorld
 from accerl_lerobot.envs.libero_simulator import (
     FPS,
@@ -52,6 +53,9 @@ def test_names_and_texts_are_liberos_own():
         *(f"libero_goal/{i}" for i in (0, 1, *range(3, 10))),
     )
     assert len(LiberoConfig(task="libero_90").tasks) == 90
+    limits = {"libero_object": 280, "libero_goal/3": 300, "libero_spatial,libero_10/0": 520}
+    assert {task: LiberoConfig(task=task).max_steps for task in limits} == limits
+    assert LiberoConfig(task="libero_10", max_steps=99).max_steps == 99
     assert task_name("libero_object/3") == "pick_up_the_bbq_sauce_and_place_it_in_the_basket"
     assert instruction("libero_object/3") == "pick up the bbq sauce and place it in the basket"
     assert instruction("libero_10/2") == "turn on the stove and put the moka pot on it"
@@ -65,6 +69,7 @@ def test_names_and_texts_are_liberos_own():
         ({"task": "libero_goal/10"}, "'libero_goal/10' is no task"),
         ({"task": ""}, "'' is no task; use names such as libero_spatial/0"),
         ({"camera": "agentview,agentview"}, "name each camera once"),
+        ({"camera": "agentview_image"}, "'agentview_image' is none of: agentview, robot0_eye_in_hand, "),
         ({"assets": "nowhere"}, "env.assets='nowhere': no folder of LIBERO's assets"),
     ],
 )
@@ -80,6 +85,22 @@ def test_recorded_starts_are_read_without_unpickling():
     starts = file.parents[2] / "init_files" / file.parent.name / f"{file.stem}.pruned_init"
     theirs = torch.load(starts, weights_only=False)
     assert len(theirs) == 50 and np.array_equal(recorded_states("libero_object/4"), theirs.ravel())
+
+
+def test_what_is_said_where_meshes_are_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    libero_tasks.configure()
+    from libero.libero.utils import download_utils
+
+    def unreachable() -> str:
+        raise OSError("no network")
+
+    monkeypatch.setattr(libero_tasks, "package", lambda: tmp_path)  # which has no assets/
+    monkeypatch.setattr(download_utils, "download_assets_from_huggingface", unreachable)
+    with pytest.raises(InputError, match=r"\(no network\); hf download lerobot/libero-assets"):
+        libero_tasks.assets_folder("")
+    monkeypatch.setattr(download_utils, "download_assets_from_huggingface", lambda: str(tmp_path))
+    with pytest.raises(InputError, match="is incomplete; remove it"):
+        libero_tasks.assets_folder("")
 
 
 @pytest.mark.parametrize("forced", [1, 2])
@@ -213,7 +234,7 @@ def test_chunks_give_the_states_of_single_steps(world: LiberoWorld):
     assert state.shape == (world.config.state_size,) and at_once["task"].startswith("pick up the black bowl")
     way = world.simulator.pose("akita_black_bowl_1")[0] - world.simulator.hand[0]
     assert np.array([state[41:44], state[71:74]]) == pytest.approx(np.array([way, np.tanh(way / 0.03)]))
-    assert list(state[-3:]) == pytest.approx([10 / 280, 0, 1])
+    assert state[-1] == pytest.approx(10 / 280)
 
 
 def stock_physics(task: str, seed: int, steps: int) -> Iterator[tuple[np.ndarray, np.ndarray, bool]]:

@@ -17,7 +17,7 @@ import gymnasium as gym
 import numpy as np
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
-from lerobot.envs.utils import freeze_after_episode_end
+from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
 
 from accerl_lerobot.config.parsing import DISCOVER, decode, discover
 from accerl_lerobot.envs import EnvConfig as WorldConfig
@@ -118,13 +118,15 @@ class AccerlEnvConfig(EnvConfig):
         self, n_envs: int, use_async_envs: bool = False
     ) -> dict[str, dict[int, gym.vector.VectorEnv]]:
         """One vector environment per task, as ``{task: {0: vector}}``."""
-        config, vectors, kind = self.world_config, {}, gym.vector.SyncVectorEnv
-        if use_async_envs and n_envs > 1:
-            kind = functools.partial(gym.vector.AsyncVectorEnv, context="forkserver")
+        config, vectors = self.world_config, {}
         for task in self.tasks:
-            # A finished environment waits for its batch without simulating an episode nobody sees.
-            make = freeze_after_episode_end(functools.partial(AccerlEnv, config, task))
-            vectors[task] = {0: kind([make] * n_envs)}
+            make = functools.partial(AccerlEnv, config, task)
+            if use_async_envs and n_envs > 1:  # one task's processes at a time
+                vector: Any = _LazyAsyncVectorEnv([make] * n_envs)
+            else:
+                # A finished environment waits for its batch without simulating an episode nobody sees.
+                vector = gym.vector.SyncVectorEnv([freeze_after_episode_end(make)] * n_envs)
+            vectors[task] = {0: vector}
         return vectors
 
 
