@@ -342,13 +342,14 @@ def _build(task: str, assets: str) -> Any:
         """Space for 5,000 contacts is 1.3 GB of addresses for each simulation: no process could be forked."""
         return compiled(re.sub(r"<size [^>]*>", f'<size memory="{ARENA}"/>', xml))
 
-    compiled = MjSim.from_xml_string
-    try:
-        with _alone, patch.object(MjSim, "from_xml_string", smaller):
-            env = _placed(build, 0)
-    except (OSError, ValueError) as error:
-        why = f"the scene of {task} does not load ({brief(error)}); if the folder is incomplete, {REMEDY}"
-        raise InputError("env.assets", assets, why) from error
+    with _alone:
+        compiled = MjSim.from_xml_string
+        try:
+            with patch.object(MjSim, "from_xml_string", smaller):
+                env = _placed(build, 0)
+        except (OSError, ValueError) as error:
+            why = f"the scene of {task} does not load ({brief(error)}); if the folder is incomplete, {REMEDY}"
+            raise InputError("env.assets", assets, why) from error
     env.hard_reset = False  # the scene is always the same: no need to compile it anew for each episode
     return env
 

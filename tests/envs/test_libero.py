@@ -8,6 +8,7 @@ import io
 import itertools
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -260,10 +261,10 @@ def stock_physics(task: str, seed: int, steps: int) -> Iterator[tuple[np.ndarray
 
 RECORDED, DRAWN = eval_seed(0, 7), train_seed(0, 0, 7)
 CASES = [
-    ("libero_object/0", RECORDED),
+    ("libero_object/0", RECORDED, "stock"),
     *(
-        pytest.param(f"libero_{task}", seed, marks=pytest.mark.slow)
-        for seed in (RECORDED, DRAWN)
+        pytest.param(f"libero_{task}", seed, rendering, marks=pytest.mark.slow)
+        for seed, rendering in ((RECORDED, "stock"), (DRAWN, "fast"))
         for task in ("object/0", "spatial/4", "goal/3", "goal/8", "10/2", "90/20")
         # LIBERO draws the opening of spatial/4's drawer once more for each reset that it has made before.
         if (seed, task) not in ((RECORDED, "object/0"), (DRAWN, "spatial/4"))
@@ -272,9 +273,9 @@ CASES = [
 
 
 @needs_assets
-@pytest.mark.parametrize(("task", "seed"), CASES)
-def test_physics_and_success_are_liberos(task: str, seed: int):
-    simulator = Simulator(task, "stock", ASSETS)
+@pytest.mark.parametrize(("task", "seed", "rendering"), CASES)
+def test_physics_and_success_are_liberos(task: str, seed: int, rendering: Any):
+    simulator = Simulator(task, rendering, ASSETS)
     simulator.reset(eval_seed(0, 3))  # of which nothing may be left
     simulator.step(some_actions(1)[0])
     simulator.reset(seed)
