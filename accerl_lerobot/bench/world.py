@@ -172,7 +172,8 @@ def _stock_physics(config: BenchWorldConfig, chunks: Iterator[np.ndarray]) -> De
     from libero.libero.envs.env_wrapper import ControlEnv
 
     with contextlib.redirect_stdout(io.StringIO()):
-        env = ControlEnv(str(bddl_file(config.task)), use_camera_obs=False, has_offscreen_renderer=False)
+        headless: dict[str, Any] = {"use_camera_obs": False, "has_offscreen_renderer": False}
+        env = ControlEnv(str(bddl_file(config.task)), ignore_done=True, **headless)
         env.reset()
     return _put_back(config, env.env.sim, env.step, chunks)
 
