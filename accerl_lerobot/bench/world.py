@@ -26,8 +26,8 @@ from accerl_lerobot.bench import as_table, host, ranged, spread
 from accerl_lerobot.config.ranges import Positive, Range, Repeats, Section
 from accerl_lerobot.demos.record import simulators
 from accerl_lerobot.envs import EnvConfig, LiberoConfig, MetaWorldConfig, make_world
-from accerl_lerobot.envs.libero_simulator import Simulator
-from accerl_lerobot.envs.libero_tasks import bddl_file, load_libero
+from accerl_lerobot.envs.libero_simulator import Simulator, liberos_own
+from accerl_lerobot.envs.libero_tasks import load_libero
 from accerl_lerobot.envs.metaworld import import_mujoco
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.seeds import train_seed
@@ -169,11 +169,8 @@ def _physics(config: BenchWorldConfig, chunks: Iterator[np.ndarray]) -> Decide:
 def _stock_physics(config: BenchWorldConfig, chunks: Iterator[np.ndarray]) -> Decide:
     assert isinstance(config.env, LiberoConfig)
     load_libero(config.env.assets)
-    from libero.libero.envs.env_wrapper import ControlEnv
-
     with contextlib.redirect_stdout(io.StringIO()):
-        headless: dict[str, Any] = {"use_camera_obs": False, "has_offscreen_renderer": False}
-        env = ControlEnv(str(bddl_file(config.task)), ignore_done=True, **headless)
+        env = liberos_own(config.task)
         env.reset()
     return _put_back(config, env.env.sim, env.step, chunks)
 

@@ -328,15 +328,19 @@ def _placed[Result](make: Callable[[], Result], seed: int) -> Result:
             np.random.set_state(state)
 
 
+def liberos_own(task: str) -> Any:
+    """LIBERO's own environment of a task, without cameras and without an end; `load_libero` comes first."""
+    from libero.libero.envs.env_wrapper import ControlEnv
+
+    file = str(bddl_file(task))
+    return ControlEnv(file, use_camera_obs=False, has_offscreen_renderer=False, ignore_done=True)
+
+
 def _build(task: str, assets: str) -> Any:
     """robosuite's environment of a task, which draws nothing."""
     with _alone:
         load_libero(assets)
-    from libero.libero.envs.env_wrapper import ControlEnv
     from robosuite.utils.binding_utils import MjSim
-
-    def build() -> Any:
-        return ControlEnv(str(bddl_file(task)), use_camera_obs=False, has_offscreen_renderer=False).env
 
     def smaller(xml: str) -> Any:
         """Space for 5,000 contacts is 1.3 GB of addresses for each simulation: no process could be forked."""
@@ -346,7 +350,7 @@ def _build(task: str, assets: str) -> Any:
         compiled = MjSim.from_xml_string
         try:
             with patch.object(MjSim, "from_xml_string", smaller):
-                env = _placed(build, 0)
+                env = _placed(lambda: liberos_own(task).env, 0)
         except (OSError, ValueError) as error:
             why = f"the scene of {task} does not load ({brief(error)}); if the folder is incomplete, {REMEDY}"
             raise InputError("env.assets", assets, why) from error
