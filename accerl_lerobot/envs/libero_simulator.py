@@ -211,8 +211,8 @@ class Simulator:
 
     def opening(self, name: str) -> float:
         """Position of the joint of a drawer, door or knob; 0 for what has none."""
-        known = self.env.get_object(name)
-        names = [] if known is None else known.joints
+        # A region of the table has None for its joints.
+        names = getattr(self.env.get_object(name), "joints", None) or ()
         hinges = [joint for joint in names if self.model.joint(joint).type[0] != 0]
         return float(self.data.joint(hinges[0]).qpos[0]) if hinges else 0.0
 

@@ -238,6 +238,20 @@ def test_chunks_give_the_states_of_single_steps(world: LiberoWorld):
     assert state[-1] == pytest.approx(10 / 280)
 
 
+@needs_assets
+def test_state_has_regions_of_the_table():
+    task = "libero_goal/5"  # push the plate to the front of the stove
+    config = LiberoConfig(task=task, image_size=64, rendering="fast", assets=ASSETS, environment_state=True)
+    with contextlib.closing(make_world(config)) as world:
+        assert isinstance(world, LiberoWorld)
+        state = world.reset(eval_seed(0, 0), task)["observation.environment_state"]
+        names = world.simulator.env.obj_of_interest
+        where = np.concatenate([world.simulator.pose(name)[0] for name in names])
+        region = next(i for i, name in enumerate(names) if name.endswith("region"))
+        assert world.simulator.opening(names[region]) == 0
+    assert state[25 : 25 + where.size] == pytest.approx(where, abs=1e-6)  # behind the robot's numbers
+
+
 def stock_physics(task: str, seed: int, steps: int) -> Iterator[tuple[np.ndarray, np.ndarray, bool]]:
     """Positions, velocities and success of LIBERO's own loop after the start and after each step."""
     from libero.libero.envs.env_wrapper import ControlEnv
