@@ -33,6 +33,7 @@ from accerl_lerobot import guardian
 from accerl_lerobot.config.parsing import imported
 from accerl_lerobot.config.ranges import Range, Section, Share
 from accerl_lerobot.console import Console
+from accerl_lerobot.engine.sizes import SIMULATOR_GIB, memory_gib
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.envs.base import EnvConfig, World, WorldSpec
 from accerl_lerobot.envs.metaworld import MetaWorld, expert_name, import_mujoco
@@ -47,7 +48,7 @@ SIDECAR = Path("meta") / "accerl_demos.json"
 
 _MAX_EPISODES = 10_000
 _MAX_TRIES = 50
-MOST_PROCESSES = 8  # simulators at once, each of some 100 MB; a container may see more cores than it has
+MOST_PROCESSES = 8  # a container may see more cores than it has
 _VERSIONS = {name: name for name in ("lerobot", "metaworld", "robosuite", "mujoco", "numpy")}
 _VERSIONS |= {"libero": "hf-libero"}  # module → distribution
 
@@ -203,7 +204,10 @@ def simulated[Item, Result](
 
     The first are already under way when the context is entered; few finished ones wait in memory.
     """
-    processes, left = min(len(os.sched_getaffinity(0)), MOST_PROCESSES, len(items)), iter(items)
+    # Each process comes to hold a simulator of every task.
+    each = len(getattr(env_config, "tasks", ("one",))) * SIMULATOR_GIB.get(env_config.type, 0.1)
+    cores, room = len(os.sched_getaffinity(0)), (memory_gib("MemAvailable") or math.inf) / each
+    processes, left = max(1, int(min(cores, MOST_PROCESSES, len(items), room))), iter(items)
     with simulators(processes, _open_world, env_config) as pool:
         waiting = collections.deque(pool.submit(work, item) for item in itertools.islice(left, 2 * processes))
 

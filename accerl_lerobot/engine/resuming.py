@@ -28,7 +28,7 @@ LOCK = ".lock"
 CHANGEABLE = (
     "resume", "output_dir", "evaluation", "launch", "wandb", "save_every_updates", "save_every_s",
     "trainer.updates", "trainer.num_threads", "trainer.ranks", "trainer.sharding",
-    "trainer.activation_checkpointing", "inference", "imagination.discover_packages_path",
+    "trainer.activation_checkpointing", "inference", "imagination.discover_packages_path", "env.assets",
 )  # fmt: skip
 """Fields and sections that may change when a run is resumed: what is learned, and from what, stays."""
 WARM_START = "warm_start.json"

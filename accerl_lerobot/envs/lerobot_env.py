@@ -60,7 +60,7 @@ class LeRobotEnvConfig(EnvConfig):
         if not self.name:
             raise InputError("env.name", self.name, "name one of LeRobot's environments, such as pusht")
         if self.name.startswith("libero"):
-            remedy = "LeRobot takes its starts in turn and not from the seed; use env.type=libero"
+            remedy = "LeRobot takes its starts in turn and not from the seed; use env.type=libero for LIBERO"
             raise InputError("env.name", self.name, remedy)
 
 

@@ -14,7 +14,6 @@ from accerl_lerobot.config.ranges import Range
 from accerl_lerobot.envs.base import EnvConfig, SuiteConfig, SuiteWorld, unit_spec
 from accerl_lerobot.envs.libero_simulator import FPS, NUMBERS, Simulator
 from accerl_lerobot.envs.libero_tasks import instruction, suites
-from accerl_lerobot.errors import InputError, expanded
 
 LEROBOT_NAMES = {"agentview": "image", "robot0_eye_in_hand": "image2"}
 """LeRobot's names of the two cameras that policies see."""
@@ -65,8 +64,6 @@ class LiberoConfig(SuiteConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.assets and not (expanded(self.assets, "env.assets") / "scenes").is_dir():
-            raise InputError("env.assets", self.assets, "no folder of LIBERO's assets: it holds no scenes/")
         if not self.max_steps:
             longest = max(LIMITS[task.split("/")[0]] for task in self.tasks)
             object.__setattr__(self, "max_steps", longest)

@@ -210,11 +210,11 @@ class Simulator:
         return self._position.copy(), self._rotation.copy()
 
     def opening(self, name: str) -> float:
-        """Position of the joint of a drawer, door or knob; 0 for what has none."""
+        """Position of the joint of a door or knob, sum of a cabinet's drawers; 0 for what has none."""
         # A region of the table has None for its joints.
         names = getattr(self.env.get_object(name), "joints", None) or ()
         hinges = [joint for joint in names if self.model.joint(joint).type[0] != 0]
-        return float(self.data.joint(hinges[0]).qpos[0]) if hinges else 0.0
+        return float(sum(self.data.joint(joint).qpos[0] for joint in hinges))
 
     def render(self, camera: str, height: int, width: int) -> np.ndarray:
         """Frame of a camera, uint8 (height, width, 3), turned as LeRobot's datasets have it."""

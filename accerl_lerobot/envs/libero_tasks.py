@@ -104,10 +104,13 @@ def assets_folder(given: str) -> Path:
     """Folder of meshes and textures: the one named, the installed package's, or a copy of the Hub's.
 
     Raises:
-        InputError: there is none, and the Hub could not be asked.
+        InputError: it is none, or there is none and the Hub could not be asked.
     """
     if given:
-        return expanded(given, "env.assets")
+        folder = expanded(given, "env.assets").absolute()
+        if not (folder / "scenes").is_dir():
+            raise InputError("env.assets", given, "no folder of LIBERO's assets: it holds no scenes/")
+        return folder
     if (local := package() / "assets").is_dir():
         return local
     from libero.libero.utils.download_utils import download_assets_from_huggingface

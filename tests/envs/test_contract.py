@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -12,18 +13,24 @@ import pytest
 from accerl_lerobot.envs import (
     EnvConfig,
     LeRobotEnvConfig,
+    LiberoConfig,
     MetaWorldConfig,
     SimulatedConfig,
     World,
     make_world,
 )
 from accerl_lerobot.errors import InputError
+from tests.envs.libero_assets import ASSETS, needs_assets
 
 CASES: dict[str, EnvConfig] = {
     "metaworld": MetaWorldConfig(task="drawer-open-v3", max_steps=25),
     "simulated": SimulatedConfig(max_steps=25, reward="dense", hold=7),
     "pusht": LeRobotEnvConfig(name="pusht", max_steps=25, reward="env", task="Push the T onto its mark"),
 }
+if importlib.util.find_spec("libero"):
+    CASES["libero"] = LiberoConfig(
+        task="libero_object/0", max_steps=25, image_size=64, rendering="fast", assets=ASSETS
+    )
 
 
 @dataclass
@@ -41,7 +48,10 @@ class Case:
         return (spec.action_low + draw * (spec.action_high - spec.action_low)).astype(np.float32)
 
 
-@pytest.fixture(scope="module", params=CASES)
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(name, marks=[needs_assets] if name == "libero" else []) for name in CASES],
+)
 def case(request: pytest.FixtureRequest) -> Iterator[Case]:
     pytest.importorskip({"metaworld": "metaworld", "pusht": "gym_pusht"}.get(request.param, "numpy"))
     world = make_world(CASES[request.param])

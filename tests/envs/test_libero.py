@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from accerl_lerobot.demos.record import disturbed, make_expert, played
 from accerl_lerobot.envs import LiberoConfig, libero_tasks, make_world
 from accerl_lerobot.envs.libero import LiberoWorld
 from accerl_lerobot.envs.libero_simulator import (
@@ -71,7 +72,6 @@ def test_names_and_texts_are_liberos_own():
         ({"task": ""}, "'' is no task; use names such as libero_spatial/0"),
         ({"camera": "agentview,agentview"}, "name each camera once"),
         ({"camera": "agentview_image"}, "'agentview_image' is none of: agentview, robot0_eye_in_hand, "),
-        ({"assets": "nowhere"}, "env.assets='nowhere': no folder of LIBERO's assets"),
     ],
 )
 def test_wrong_fields_are_refused(fields: dict[str, str], message: str):
@@ -89,6 +89,8 @@ def test_recorded_starts_are_read_without_unpickling():
 
 
 def test_what_is_said_where_meshes_are_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    with pytest.raises(InputError, match="env.assets='nowhere': no folder of LIBERO's assets"):
+        libero_tasks.assets_folder("nowhere")
     libero_tasks.configure()
     from libero.libero.utils import download_utils
 
@@ -202,23 +204,27 @@ def test_same_seed_same_episode_whatever_went_before(world: LiberoWorld):
 
 @needs_assets
 def test_starts_of_evaluation_are_the_recorded_ones_and_others_are_drawn(world: LiberoWorld):
-    world.reset(eval_seed(2, 0), "libero_object/0")
+    task = "libero_spatial/3"
+    world.reset(eval_seed(2, 0), task)
     simulator = world.simulator
-    objects = slice(9, simulator.model.nq)  # behind the arm and the fingers
+    bowl = slice(9, 11)  # x and y of the first object, behind the arm and the fingers
 
     def start(seed: int) -> np.ndarray:
-        world.reset(seed, "libero_object/0")
-        return simulator.data.qpos[objects].copy()
+        world.reset(seed, task)
+        return simulator.data.qpos[bowl].copy()
 
-    recorded = recorded_states("libero_object/0").reshape(50, -1)[:, 1 : 1 + simulator.model.nq][:, objects]
+    recorded = recorded_states(task).reshape(50, -1)[:, 1 : 1 + simulator.model.nq][:, bowl]
+
+    def distances(seed: int) -> np.ndarray:
+        return np.abs(start(seed) - recorded).max(axis=1)
+
     for index in (0, 7, 49, 50):
-        # They settle by less than two centimetres in half a second.
-        assert np.abs(start(eval_seed(2, index)) - recorded[index % 50])[:2].max() < 0.02
-    drawn = [start(seed) for seed in (train_seed(0, 0, 0), train_seed(0, 0, 1), demo_seed(0, 0))]
-    basket = slice(7, 9)  # x and y; LIBERO puts the soup always to the same place
-    for one in drawn:
-        assert np.abs(one[basket] - recorded[:, basket]).max(axis=1).min() > 1e-5
-    assert np.abs(drawn[0] - drawn[1])[basket].max() > 1e-3
+        found = distances(eval_seed(2, index))
+        assert found.argmin() == index % 50 and found.min() < 1e-3, "in half a second it hardly moves"
+    drawn = [train_seed(0, 0, 0), train_seed(0, 0, 1), demo_seed(0, 0)]
+    for seed in drawn:
+        assert distances(seed).min() > 1e-5
+    assert np.abs(start(drawn[0]) - start(drawn[1])).max() > 1e-3
 
 
 @needs_assets
@@ -239,20 +245,28 @@ def test_chunks_give_the_states_of_single_steps(world: LiberoWorld):
 
 
 @needs_assets
-def test_state_has_regions_of_the_table():
-    task = "libero_goal/5"  # push the plate to the front of the stove
+@pytest.mark.parametrize(
+    ("task", "opening"),
+    [
+        ("libero_goal/5", ()),  # a region of the table: push the plate to the front of the stove
+        pytest.param("libero_10/3", ("white_cabinet_1_bottom_level",), marks=pytest.mark.slow),
+        pytest.param("libero_10/5", (), marks=pytest.mark.slow),
+    ],
+)
+def test_state_has_all_that_a_task_is_about(task: str, opening: tuple[str, ...]):
     config = LiberoConfig(task=task, image_size=64, rendering="fast", assets=ASSETS, environment_state=True)
     with contextlib.closing(make_world(config)) as world:
         assert isinstance(world, LiberoWorld)
         state = world.reset(eval_seed(0, 0), task)["observation.environment_state"]
         names = world.simulator.env.obj_of_interest
         where = np.concatenate([world.simulator.pose(name)[0] for name in names])
-        region = next(i for i, name in enumerate(names) if name.endswith("region"))
-        assert world.simulator.opening(names[region]) == 0
+        joints = [world.simulator.data.joint(name).qpos[0] for name in opening]
     assert state[25 : 25 + where.size] == pytest.approx(where, abs=1e-6)  # behind the robot's numbers
+    openings = state[37:41]
+    assert openings.sum() == pytest.approx(sum(joints), abs=1e-6) and np.any(openings) == bool(opening)
 
 
-def stock_physics(task: str, seed: int, steps: int) -> Iterator[tuple[np.ndarray, np.ndarray, bool]]:
+def stock_physics(task: str, seed: int, actions: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, bool]]:
     """Positions, velocities and success of LIBERO's own loop after the start and after each step."""
     from libero.libero.envs.env_wrapper import ControlEnv
 
@@ -267,7 +281,7 @@ def stock_physics(task: str, seed: int, steps: int) -> Iterator[tuple[np.ndarray
         env.step([0, 0, 0, 0, 0, 0, -1])
     data = env.env.sim.data
     yield data.qpos.copy(), data.qvel.copy(), env.check_success()
-    for action in some_actions(steps):
+    for action in actions:
         env.step(action)
         yield data.qpos.copy(), data.qvel.copy(), env.check_success()
     env.close()
@@ -290,18 +304,32 @@ CASES = [
 
 @needs_assets
 @pytest.mark.parametrize(("task", "seed", "rendering"), CASES)
-def test_physics_and_success_are_liberos(task: str, seed: int, rendering: Any):
+def test_physics_are_liberos(task: str, seed: int, rendering: Any):
     simulator = Simulator(task, rendering, ASSETS)
     simulator.reset(eval_seed(0, 3))  # of which nothing may be left
     simulator.step(some_actions(1)[0])
     simulator.reset(seed)
-    actions = iter(some_actions(40))
-    for i, (qpos, qvel, success) in enumerate(stock_physics(task, seed, 40)):
+    actions = some_actions(40)
+    for i, (qpos, qvel, success) in enumerate(stock_physics(task, seed, actions)):
         if i:
-            assert simulator.step(next(actions))[0] == success
+            assert simulator.step(actions[i - 1])[0] == success
         assert np.abs(qpos - simulator.data.qpos).max() < 1e-9, i
         assert np.abs(qvel - simulator.data.qvel).max() < 1e-6, i
     simulator.close()
+
+
+@needs_assets
+@pytest.mark.slow
+def test_success_comes_when_liberos_does():
+    task = "libero_goal/7"
+    config = LiberoConfig(task=task, image_size=64, camera="agentview", rendering="fast", assets=ASSETS)
+    with contextlib.closing(make_world(config)) as world:
+        actions = disturbed(
+            make_expert(config, world, task), world.spec, RECORDED, noise=0.1, push=0, fail=False
+        )
+        episode = played(world, task, RECORDED, actions)
+    theirs = [success for *_, success in stock_physics(task, RECORDED, episode.actions)]
+    assert theirs == [False] * len(episode) + [True]
 
 
 @needs_assets
