@@ -57,15 +57,19 @@ def check_output(path: Path) -> None:
         raise InputError("output", str(path), "name a file in a folder that exists")
 
 
+def causes(error: BaseException | None) -> Iterator[BaseException]:
+    """An error and what it came from, newest first."""
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__
+
+
 def is_full(error: BaseException | None) -> bool:
     """True if an error is that of a full disk, here or in a worker whose error carries the text."""
-    while error is not None:
-        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-            return True
-        if os.strerror(errno.ENOSPC) in str(error):
-            return True
-        error = error.__cause__ or error.__context__
-    return False
+    return any(
+        getattr(link, "errno", None) in (errno.ENOSPC, errno.EDQUOT) or os.strerror(errno.ENOSPC) in str(link)
+        for link in causes(error)
+    )
 
 
 def expanded(path: str, field: str) -> Path:
@@ -88,13 +92,6 @@ def make_folder(path: Path, field: str, *, again: bool = False) -> None:
     except (OSError, ValueError) as error:
         why = getattr(error, "strerror", None) or str(error)
         raise InputError(field, str(path), f"cannot be created: {why}; name another folder") from error
-
-
-def output_folder(path: str) -> Path:
-    """The folder ``output_dir`` names, created if it is not there; results of before are kept in it."""
-    folder = expanded(path, "output_dir")
-    make_folder(folder, "output_dir", again=True)
-    return folder
 
 
 @contextmanager

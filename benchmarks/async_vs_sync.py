@@ -24,12 +24,12 @@ from accerl_lerobot.bench import as_table, host, ranged, spread
 from accerl_lerobot.bench.throughput import ARMS, Block
 from accerl_lerobot.config.ranges import Positive, Range, Repeats, Seed, Steps
 from accerl_lerobot.console import Console
-from accerl_lerobot.errors import InputError, output_folder
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import Rate, drawing, evaluation_plans
 from accerl_lerobot.replay.pacing import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, Schedule
 from benchmarks.latency import TRACE
 from benchmarks.machinery import MOST_BUSY, MachineryConfig
-from benchmarks.records import as_markdown, write
+from benchmarks.records import as_markdown, output_folder, write
 from benchmarks.simulated_world import read_trace
 
 LEARNING = MachineryConfig(worlds=4, latency_ms=4.0, image_size=16, decide_ms=1.0, update_ms=8.0)

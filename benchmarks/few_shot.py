@@ -18,9 +18,8 @@ from rich.table import Table
 from accerl_lerobot.bench import as_table
 from accerl_lerobot.config.ranges import Steps
 from accerl_lerobot.console import Console
-from accerl_lerobot.errors import output_folder
 from accerl_lerobot.evaluation import Rate, drawing
-from benchmarks.records import as_markdown, mean_interval, write
+from benchmarks.records import as_markdown, mean_interval, output_folder, write
 from benchmarks.study import Cell, Study, StudyConfig, named
 
 COLUMNS = ("task", "seed", "algorithm", "SFT", "after", "real episodes", "env steps")

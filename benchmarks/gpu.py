@@ -23,10 +23,9 @@ from accerl_lerobot.bench import as_table, host
 from accerl_lerobot.bench.policy import BenchPolicyConfig, bench_policy
 from accerl_lerobot.config.ranges import Device, Range, Repeats, Section
 from accerl_lerobot.console import Console
-from accerl_lerobot.errors import output_folder
 from accerl_lerobot.policies.config import TuningConfig
 from accerl_lerobot.trainer.footprint import PolicyMemory
-from benchmarks.records import as_markdown, write
+from benchmarks.records import as_markdown, output_folder, write
 
 COLUMNS = ("check", "result")
 GIB = 2**30

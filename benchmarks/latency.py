@@ -19,8 +19,8 @@ from accerl_lerobot.bench import as_table, host
 from accerl_lerobot.config.ranges import Range, Section, Seed
 from accerl_lerobot.console import Console
 from accerl_lerobot.envs import EnvConfig, MetaWorldConfig, World, make_world
-from accerl_lerobot.errors import output_folder
 from accerl_lerobot.seeds import train_seed
+from benchmarks.records import output_folder
 
 TRACE = "trace.txt"
 RESET = "reset"  # first word of a trace's lines about resets

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from accerl_lerobot.errors import expanded, make_folder
 from accerl_lerobot.evaluation import Interval
 
 
@@ -27,6 +28,13 @@ def mean_interval(values: Sequence[float], confidence: float = 0.95) -> Interval
     mean, error = float(np.mean(values)), float(np.std(values, ddof=1)) / math.sqrt(len(values))
     half = float(stdtrit(len(values) - 1, (1 + confidence) / 2)) * error
     return Interval(mean - half, mean + half)
+
+
+def output_folder(path: str) -> Path:
+    """The folder ``output_dir`` names, created if it is not there; results of before are kept in it."""
+    folder = expanded(path, "output_dir")
+    make_folder(folder, "output_dir", again=True)
+    return folder
 
 
 def as_markdown(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -19,10 +19,10 @@ from accerl_lerobot.bench import as_table, host, ranged, spread
 from accerl_lerobot.bench.throughput import Block
 from accerl_lerobot.config.ranges import NonNegative, Positive, Range, Repeats
 from accerl_lerobot.console import Console
-from accerl_lerobot.errors import InputError, output_folder
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.replay.pacing import ASYNCHRONOUS
 from benchmarks.machinery import MOST_BUSY, MachineryConfig
-from benchmarks.records import as_markdown, write
+from benchmarks.records import as_markdown, output_folder, write
 from benchmarks.simulated_world import read_trace
 
 

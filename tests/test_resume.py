@@ -191,7 +191,7 @@ def test_what_is_no_run_is_refused(
     [
         ("summary.json", "null", "a mapping is wanted"),
         ("summary.json", '{"updates": ', "not good JSON"),
-        ("summary.json", '{"updates": -1}', "use 0 to"),
+        ("summary.json", '{"updates": -1}', "use a whole number"),
         (".lock", None, "a link that leads out of the folder"),
         ("timeline", None, "a link that leads out of the folder"),
     ],

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import draccus
 
-from accerl_lerobot.config.ranges import NonNegative, Positive, Range, Section, Share
+from accerl_lerobot.config.ranges import NonNegative, Positive, Range, Section, Share, registered_name
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -34,10 +34,7 @@ class AlgorithmConfig(Section, draccus.ChoiceRegistry, section="algorithm"):
     gamma: Share = 0.99
     """Discount per decision (not per env step)."""
 
-    @property
-    def type(self) -> str:
-        """The registered name."""
-        return str(self.get_choice_name(self.__class__))
+    type = registered_name
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -92,12 +92,11 @@ def check_folder(folder: Path, origin: Origin) -> None:
             folders.remove("wandb")  # its client links a log that lies elsewhere, and nothing here reads it
 
 
-def check_name(name: object, what: str, origin: Origin) -> str:
+def check_name(name: object, what: str, origin: Origin) -> None:
     """A name that will become part of a path, such as a camera's; more than one part is refused."""
     why = unsafe_name(name) or ("it has a slash in it" if "/" in str(name) else "")
     if why:
         raise origin.refuse(what, f"the name {_shown(str(name))!r} cannot be part of a path: {why}")
-    return str(name)
 
 
 def file_size(path: Path, origin: Origin) -> int:
@@ -173,12 +172,6 @@ def _finite(tensor: Any) -> bool:
         return True
     least, most = (tensor.float() if tensor.itemsize == 1 else tensor).aminmax()
     return math.isfinite(least) and math.isfinite(most)
-
-
-def check_number(value: object, low: float, high: float, what: str, origin: Origin) -> None:
-    """Refuses a value that is no number within bounds."""
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
-        raise origin.refuse(what, f"{_shown(repr(value))}; use {low:g} to {high:g}")
 
 
 def check_not_pickled(folder: Path, weights: str, origin: Origin) -> None:

@@ -113,7 +113,7 @@ def _listed(cls: type[Any], prefix: str = "", usual: Any = None, all_types: bool
         hint, name = hints[field.name], f"{prefix}{field.name}"
         section, default = section_of(hint), getattr(usual, field.name, default_of(field))
         if section is None:
-            fields.append(Line(name, _shown(default), texts[field.name], range_in_words(hint)))
+            fields.append(Line(name, shown(default), texts[field.name], range_in_words(hint)))
         elif not (choices := choices_of(section)):
             note = "" if default is not None else " (off unless given)"
             sections.append(Line(name, None, f"{name}{note}: {_summary(section)}"))
@@ -155,12 +155,13 @@ def _in_brief(line: Line) -> str:
     return f"{start} {textwrap.shorten(text, WIDTH - COLUMN, placeholder=' …')}"
 
 
-def _shown(value: Any) -> str:
+def shown(value: Any) -> str:
+    """A value as one would type it."""
     if isinstance(value, str):
         return value
-    if isinstance(value, tuple):
-        value = list(value)
-    return yaml.safe_dump(value, default_flow_style=True, width=1000).removesuffix("\n...\n").strip()
+    plain = list(value) if isinstance(value, tuple) else value
+    text = yaml.safe_dump(plain, default_flow_style=True, width=10_000, allow_unicode=True)
+    return text.removesuffix("\n").removesuffix("\n...")
 
 
 def _summary(cls: type[Any]) -> str:

@@ -76,6 +76,8 @@ Repeats = Annotated[int, Range("[1, 100000]")]
 Commit = Annotated[str, Pattern(r"[0-9a-f]{40}", "the 40 hexadecimal digits of a commit")]
 
 
+registered_name = property(lambda section: str(section.get_choice_name(section.__class__)))
+"""Name under which a section's class is registered: its `type`."""
 LONGEST_TEXT = 4096  # characters of a text; no path is longer
 
 

@@ -33,7 +33,6 @@ from accerl_lerobot import guardian
 from accerl_lerobot.config.parsing import imported
 from accerl_lerobot.config.ranges import Range, Section, Share
 from accerl_lerobot.console import Console
-from accerl_lerobot.engine.sizes import SIMULATOR_GIB, memory_gib
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.envs.base import EnvConfig, World, WorldSpec
 from accerl_lerobot.envs.metaworld import MetaWorld, expert_name, import_mujoco
@@ -204,6 +203,8 @@ def simulated[Item, Result](
 
     The first are already under way when the context is entered; few finished ones wait in memory.
     """
+    from accerl_lerobot.engine.sizes import SIMULATOR_GIB, memory_gib
+
     # Each process comes to hold a simulator of every task.
     each = len(getattr(env_config, "tasks", ("one",))) * SIMULATOR_GIB.get(env_config.type, 0.1)
     cores, room = len(os.sched_getaffinity(0)), (memory_gib("MemAvailable") or math.inf) / each

@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import difflib
 import logging
@@ -22,7 +23,7 @@ from accerl_lerobot.checkpoint.safety import brief
 from accerl_lerobot.config.ranges import Range, check
 from accerl_lerobot.engine.sizes import check_disk, check_memory
 from accerl_lerobot.envs import EnvConfig, JudgedWorld, RewardModelConfig, WorldSpec, make_world
-from accerl_lerobot.errors import InputError, check_absent, expanded
+from accerl_lerobot.errors import InputError, causes, check_absent, expanded
 from accerl_lerobot.policies.features import (
     ACTION,
     ENV_STATE,
@@ -50,14 +51,11 @@ SIZES = ("chunk_size", "n_action_steps", "num_steps", "max_state_dim", "max_acti
 
 def check_world(env: EnvConfig, reward_model: RewardModelConfig | None = None) -> WorldSpec:
     """Build and reset an environment once, so that what is wrong with it shows before anything long."""
-    world = make_world(env, reward_model=reward_model)
-    try:
+    with contextlib.closing(make_world(env, reward_model=reward_model)) as world:
         observation = world.reset(0, world.spec.tasks[0])
         if isinstance(world, JudgedWorld):
             world.succeeded(observation)
         return world.spec
-    finally:
-        world.close()
 
 
 def check_policy(config: RunConfig, spec: WorldSpec, *, own: bool = False) -> int:
@@ -270,9 +268,7 @@ def check_sft_policy(config: SFTConfig) -> Any:
         # Without a device LeRobot looks for one.
         return draccus.decode(PreTrainedConfig.get_choice_class(kind), {"device": "cpu"} | fields)
     except draccus.utils.DraccusException as error:
-        chain: list[Any] = [error]
-        while (cause := chain[-1].__cause__ or chain[-1].__context__) is not None:
-            chain.append(cause)
+        chain: list[Any] = list(causes(error))
         where = next((e.key_path[0] for e in chain if getattr(e, "key_path", ())), None)
         name, given = ("sft.policy", fields) if where is None else (f"sft.policy.{where}", fields.get(where))
         raise InputError(name, given, f"LeRobot says: {' '.join(str(chain[-1]).split())}") from error

@@ -15,8 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from accerl_lerobot.checkpoint import layout
-from accerl_lerobot.checkpoint.safety import Origin, check_folder, check_number, read_json
+from accerl_lerobot.checkpoint.safety import Origin, check_folder, read_json
 from accerl_lerobot.config.parsing import consent_flags, consents, read_recipe
+from accerl_lerobot.config.ranges import Steps, check
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import RunConfig, decode, encode
 from accerl_lerobot.engine.stopping import WorkerError, pause_s
@@ -69,7 +70,7 @@ def resumed_run(path: Path | None, config: RunConfig) -> tuple[Path, str]:
     # From an earlier checkpoint there are updates left to make.
     if newest and summary.is_file():
         made: Any = read_json(summary, origin).get("updates")
-        check_number(made, 0, 1e9, f"{layout.SUMMARY}: updates", origin)
+        check(Steps, made, f"{summary}: updates")
         if made >= config.trainer.updates:
             remedy = f"the run {directory} has made them, and has ended; ask for more"
             raise InputError("trainer.updates", config.trainer.updates, remedy)

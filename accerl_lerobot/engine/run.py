@@ -31,6 +31,7 @@ import yaml
 from accerl_lerobot import guardian
 from accerl_lerobot.algorithms import ChunkCriticConfig, OffPolicyConfig
 from accerl_lerobot.checkpoint import layout
+from accerl_lerobot.config.parsing import as_text
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.record import REPO_ID, record_demos
@@ -323,7 +324,7 @@ def load_config(recipe: str | Path | None = None, changes: Mapping[str, Any] | N
         InputError: a field does not exist, or a value does not fit.
     """
     path = [] if recipe is None else [f"--config_path={recipe}"]
-    fields = [f"--{name}={_written(value)}" for name, value in (changes or {}).items()]
+    fields = [f"--{name}={as_text(value)}" for name, value in (changes or {}).items()]
     config: RunConfig = parse(RunConfig, [*path, *fields])
     return config
 
@@ -406,9 +407,3 @@ def _result(directory: Path, summary: dict[str, Any]) -> TrainResult:
 
 def _rate(results: list[EpisodeResult]) -> Rate:
     return Rate(successes=sum(r.success for r in results), n=len(results))
-
-
-def _written(value: Any) -> str:
-    if value is None or isinstance(value, bool):
-        return {None: "null", True: "true", False: "false"}[value]
-    return f"[{','.join(map(_written, value))}]" if isinstance(value, list | tuple) else str(value)

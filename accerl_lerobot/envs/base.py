@@ -21,7 +21,7 @@ from typing import Annotated, Any, ClassVar, NamedTuple, Self
 import draccus
 import numpy as np
 
-from accerl_lerobot.config.ranges import Range, Section, default_of
+from accerl_lerobot.config.ranges import Range, Section, default_of, registered_name
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Observation
 from accerl_lerobot.seeds import EVAL_SEEDS
@@ -193,10 +193,7 @@ class EnvConfig(Section, draccus.ChoiceRegistry, section="env"):
     max_steps: Annotated[int, Range("[1, 1000000]")] = 500
     """Episode limit in env steps; reaching it truncates."""
 
-    @property
-    def type(self) -> str:
-        """The registered name."""
-        return self.get_choice_name(self.__class__)
+    type = registered_name
 
     @property
     def state_size(self) -> int:

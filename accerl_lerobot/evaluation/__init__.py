@@ -11,7 +11,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import NormalDist
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -52,16 +51,13 @@ class Rate:
         Unlike p ± z√(p(1 − p)/n) it has width at 0 and at n successes and stays inside [0, 1]. For n = 0 it
         is [0, 1], as nothing is known.
         """
-        successes, n = self.successes, self.n
-        if not 0 <= successes <= n:
-            raise ValueError(f"{successes} successes in {n} episodes")
-        if n == 0:
+        from scipy.stats import binomtest
+
+        if not 0 <= self.successes <= self.n:
+            raise ValueError(f"{self.successes} successes in {self.n} episodes")
+        if self.n == 0:
             return Interval(0.0, 1.0)
-        z = NormalDist().inv_cdf(0.975)
-        p, share = successes / n, z * z / n
-        centre = (p + share / 2) / (1 + share)
-        half = z * math.sqrt(p * (1 - p) / n + share / (4 * n)) / (1 + share)
-        return Interval(0.0 if successes == 0 else centre - half, 1.0 if successes == n else centre + half)
+        return Interval(*map(float, binomtest(self.successes, self.n).proportion_ci(method="wilson")))
 
     def __str__(self) -> str:
         if self.n == 0:

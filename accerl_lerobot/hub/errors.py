@@ -22,7 +22,7 @@ from huggingface_hub.errors import (
 from huggingface_hub.utils._http import default_client_factory
 
 from accerl_lerobot.checkpoint.safety import REVISION
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.errors import InputError, causes
 
 CONNECT_S, SILENT_S = 30.0, 300.0
 """Timeouts of connecting and of each read; committing thousands of files takes a minute or two."""
@@ -77,10 +77,7 @@ def hub_errors(repo_id: str, revision: str | None, *, writing: bool) -> Iterator
 
 def _explain(error: BaseException, repo_id: str, revision: str | None, writing: bool) -> InputError | None:
     """The error in the user's words; None if it is not about the Hub."""
-    chain = [error]
-    while (cause := chain[-1].__cause__ or chain[-1].__context__) is not None and cause not in chain:
-        chain.append(cause)
-    for link in chain:
+    for link in causes(error):
         if isinstance(link, RevisionNotFoundError):
             return InputError("revision", revision, f"{repo_id} has no such commit, tag or branch")
         if isinstance(link, HfHubHTTPError):

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 import draccus
 
 from accerl_lerobot.config.parsing import imported
-from accerl_lerobot.config.ranges import Commit, Device, Range, Section
+from accerl_lerobot.config.ranges import Commit, Device, Range, Section, registered_name
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE
 from accerl_lerobot.policies.deferred import import_policies
@@ -27,10 +27,7 @@ class SamplerConfig(Section, draccus.ChoiceRegistry, section="policy.sampler"):
     family: ClassVar[str]
     """``module:class`` of the `family.Family`, made from the model and this config."""
 
-    @property
-    def type(self) -> str:
-        """The registered name, that of the family."""
-        return str(self.get_choice_name(self.__class__))
+    type = registered_name
 
 
 @SamplerConfig.register_subclass("flow")

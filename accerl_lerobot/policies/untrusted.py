@@ -35,7 +35,7 @@ from accerl_lerobot.checkpoint.safety import (
     safe_join,
     tensor_shapes,
 )  # fmt: skip
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.errors import InputError, causes
 
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
 OURS, VALUE_HEAD, FAMILY = "accerl.json", "value_head.safetensors", "family.safetensors"
@@ -226,7 +226,4 @@ class Unfilled(TorchFunctionMode):
 
 def input_error(error: BaseException) -> InputError | None:
     """The `InputError` that another error wraps, if there is one."""
-    if isinstance(error, InputError):
-        return error
-    link = error.__cause__ or error.__context__
-    return None if link is None else input_error(link)
+    return next((link for link in causes(error) if isinstance(link, InputError)), None)

@@ -44,7 +44,7 @@ def write_report(config: ReportConfig) -> Path:
     """Reads the runs and writes the page."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    from accerl_lerobot.report.charts import COLOURS, POINTS
+    from accerl_lerobot.report.charts import POINTS
     from accerl_lerobot.report.content import comparison_page, run_page
     from accerl_lerobot.report.read import read_run
 
@@ -66,7 +66,6 @@ def write_report(config: ReportConfig) -> Path:
         **page,
         version=__version__,
         points=POINTS,
-        colours=COLOURS,
         video_mb=VIDEO_MB,
         base64=lambda path: base64.b64encode(path.read_bytes()).decode(),
         address=lambda path: quote(os.path.relpath(path.resolve(), folder)),

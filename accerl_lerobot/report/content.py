@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from accerl_lerobot.checkpoint.layout import CHECKPOINTS, LAST, PRETRAINED, SUMMARY
+from accerl_lerobot.config.help import shown
 from accerl_lerobot.config.parsing import decode
 from accerl_lerobot.console import count, duration, number, percent, rate
 from accerl_lerobot.engine.config import RunConfig
@@ -21,12 +21,11 @@ from accerl_lerobot.hub.card import lerobot_eval_command, read_json
 from accerl_lerobot.replay.pacing import lag_limits
 from accerl_lerobot.report.charts import COLOURS, Chart, Series, line, rates
 from accerl_lerobot.report.read import Record, Run, apart, column, differences, newest
-from accerl_lerobot.timeline import STATES
+from accerl_lerobot.timeline.read import COLOURS as STATE_COLOURS
 from accerl_lerobot.timeline.read import read_timeline
 
 RECENT_S = 120.0
 FEW = 25  # exploring episodes below which their success says nothing; the first to end are the short ones
-STATE_COLOURS = dict(zip(STATES, (0, 7, 1, 3, 2, 6, 5, 4, 4), strict=True))
 MISMATCH = 1e-4  # nats between acting and learning at equal weights that rounding in float32 does not explain
 STEPS = "env steps of online experience"
 SHARE: dict[str, Any] = {"share": True, "bottom": -0.03, "top": 1.04}
@@ -100,7 +99,7 @@ class Section:
     title: str
     text: str = ""
     _: KW_ONLY
-    bars: Mapping[str, Sequence[tuple[str, float, str, int]]] = field(default_factory=dict)
+    bars: Mapping[str, Sequence[tuple[str, float, str, str]]] = field(default_factory=dict)
     """Role → name, share, text and colour of the parts of its time."""
     charts: Sequence[Chart] = ()
     tables: Sequence[Table] = ()
@@ -225,15 +224,6 @@ def warnings(run: Run, bound: int | None, now: float) -> Iterator[str]:
             yield "No rollout was imagined: no world model passed validation."
 
 
-def shown(value: Any) -> str:
-    """A value as one would type it."""
-    if isinstance(value, str):
-        return value
-    plain = list(value) if isinstance(value, tuple) else value
-    text = yaml.safe_dump(plain, default_flow_style=True, width=10_000, allow_unicode=True)
-    return text.removesuffix("\n").removesuffix("\n...")
-
-
 def _charts(records: Sequence[Record], specs: Sequence[Spec]) -> list[Chart]:
     update = column(records, "update")
     charts = []
@@ -309,7 +299,7 @@ def _imagination(run: Run) -> Section:
     return Section(title, text, charts=_charts(rollout, IMAGINATION))
 
 
-def _time_shares(run: Run) -> dict[str, list[tuple[str, float, str, int]]]:
+def _time_shares(run: Run) -> dict[str, list[tuple[str, float, str, str]]]:
     """How the time of each role divides in the training, as `Section.bars`; nothing without a timeline."""
     try:
         timeline = read_timeline(run.path)

@@ -9,7 +9,7 @@ from typing import Annotated, ClassVar, Literal
 
 import draccus
 
-from accerl_lerobot.config.ranges import DatasetConfig, LearningRate, Range, Section
+from accerl_lerobot.config.ranges import DatasetConfig, LearningRate, Range, Section, registered_name
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.replay.pacing import ReplayConfig
 
@@ -37,10 +37,7 @@ class LearnableModelConfig(Section, draccus.ChoiceRegistry, section="world_model
     context: Annotated[int, Range("[1, 1000]")] = 2
     """Frames the model sees, the newest included, a chunk apart."""
 
-    @property
-    def type(self) -> str:
-        """The registered name."""
-        return str(self.get_choice_name(self.__class__))
+    type = registered_name
 
     @property
     def multiple(self) -> int:
