@@ -119,9 +119,12 @@ def start(
 
 def play_evaluation(config: RunConfig, console: Console, filmed: int = 0) -> list[EpisodeResult]:
     """Play the evaluation episodes of a run with LeRobot's sampler, on seeds that are never trained on."""
+    from accerl_lerobot.policies.loading import pinned
+
     with ray_session.opened(config.launch, now=True) as session:
         check_memory(config)
         spec = check_world(config.env, config.rollout.reward_model)
+        config = replace(config, policy=pinned(config.policy))
         engine = make_engine(config, spec.tasks, check_policy(config, spec), session=session)
         with contextlib.closing(engine):
             count = config.evaluation.episodes
