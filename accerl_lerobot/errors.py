@@ -59,7 +59,9 @@ def check_output(path: Path) -> None:
 
 def causes(error: BaseException | None) -> Iterator[BaseException]:
     """An error and what it came from, newest first."""
-    while error is not None:
+    known: list[BaseException] = []
+    while error is not None and error not in known:
+        known.append(error)
         yield error
         error = error.__cause__ or error.__context__
 
