@@ -96,7 +96,8 @@ class SimulatedWorld(EpisodeWorld):
     def render(self, height: int, width: int) -> np.ndarray:
         image = np.full((height, width, 3), 40, np.uint8)
         for channel, point in ((1, self._target), (0, self._mean())):
-            row, column = _pixel(point[0], height), _pixel(point[1], width)
+            # Where −1 … 1 lie among so many pixels.
+            row, column = np.rint((point + 1.0) / 2 * (np.array([height, width]) - 1)).astype(int)
             radius = max(1, min(height, width) // 16)
             rows = slice(max(0, row - radius), row + radius + 1)
             image[rows, max(0, column - radius) : column + radius + 1, channel] = 255
@@ -118,8 +119,3 @@ class SimulatedWorld(EpisodeWorld):
         if self.config.environment_state:
             observation[ENVIRONMENT_STATE] = np.append(state, self.late).astype(np.float32)
         return observation
-
-
-def _pixel(value: float, size: int) -> int:
-    """Where −1 … 1 lies among `size` pixels."""
-    return round((float(value) + 1) / 2 * (size - 1))

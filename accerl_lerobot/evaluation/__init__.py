@@ -145,11 +145,11 @@ BORDER = 5
 
 
 @contextmanager
-def drawing(path: Path, size: tuple[float, float] = (7, 4)) -> Iterator[Any]:
-    """Axes to draw on, with a grid, which are a PNG when the context is left; `size` in inches."""
+def drawing(path: Path) -> Iterator[Any]:
+    """Axes to draw on, with a grid, which are a PNG when the context is left."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=size, dpi=120, layout="tight")
+    figure = Figure(figsize=(7, 4), dpi=120, layout="tight")
     axes = figure.subplots()
     axes.grid(alpha=0.3)
     yield axes
