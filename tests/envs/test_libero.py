@@ -334,7 +334,9 @@ def test_success_comes_when_liberos_does():
 
 @needs_assets
 @pytest.mark.slow
-@pytest.mark.parametrize("task", ["libero_object/1", "libero_goal/2"])
+@pytest.mark.parametrize(
+    "task", ["libero_object/1", "libero_goal/2", "libero_spatial/3", "libero_10/0", "libero_90/20"]
+)
 def test_observations_are_lerobots(task: str):
     """LeRobot's environment and processor first: once ours has an OpenGL context, theirs draws into it."""
     simulator = Simulator(task, "stock", ASSETS)  # sets the folder of assets
