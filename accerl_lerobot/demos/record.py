@@ -207,8 +207,8 @@ def simulated[Item, Result](
 
     # Each process comes to hold a simulator of every task.
     each = len(getattr(env_config, "tasks", ("one",))) * SIMULATOR_GIB.get(env_config.type, 0.1)
-    cores, room = len(os.sched_getaffinity(0)), (memory_gib("MemAvailable") or math.inf) / each
-    processes, left = max(1, int(min(cores, MOST_PROCESSES, len(items), room))), iter(items)
+    cores, fitting = len(os.sched_getaffinity(0)), (memory_gib("MemAvailable") or math.inf) / each
+    processes, left = max(1, int(min(cores, MOST_PROCESSES, len(items), fitting))), iter(items)
     with simulators(processes, _open_world, env_config) as pool:
         waiting = collections.deque(pool.submit(work, item) for item in itertools.islice(left, 2 * processes))
 

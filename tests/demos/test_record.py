@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+import concurrent.futures
+import contextlib
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from accerl_lerobot.demos import record
 from accerl_lerobot.demos.record import (
     SIDECAR,
     DemosConfig,
@@ -171,3 +174,24 @@ def test_replaying_its_actions_gives_its_frames():
         assert result.rewards[0] == reward
     assert result.terminated and reward == 1.0
     world.close()
+
+
+@pytest.mark.parametrize(("free", "processes"), [(100.0, 2), (0.2, 1), (None, 2)])
+def test_no_more_simulators_than_memory_for_them(
+    monkeypatch: pytest.MonkeyPatch, free: float | None, processes: int
+):
+    began: list[int] = []
+
+    @contextlib.contextmanager
+    def counted(count: int, *_: object):
+        began.append(count)
+        with concurrent.futures.ThreadPoolExecutor(1) as pool:
+            yield pool
+
+    monkeypatch.setattr(record, "simulators", counted)
+    monkeypatch.setattr(record.os, "sched_getaffinity", lambda _: {0, 1})
+    monkeypatch.setattr("accerl_lerobot.engine.sizes.memory_gib", lambda entry: free)
+    config = MetaWorldConfig(task="reach-v3,push-v3")  # 0.34 GiB in each process
+    with record.simulated(config, abs, [-1, 2, -3]) as results:
+        assert list(results) == [1, 2, 3]
+    assert began == [processes]
