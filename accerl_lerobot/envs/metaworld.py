@@ -199,7 +199,7 @@ class MetaWorldConfig(SuiteConfig):
     world = "accerl_lerobot.envs.metaworld:MetaWorld"
     groups = staticmethod(groups)
     STATE_NUMBERS = 39
-    CAMERAS = ("topview", "corner", "corner2", "corner3", "corner4", "behindGripper", "gripperPOV")
+    CAMERAS = ("topview", "corner", "corner2", "corner3", "behindGripper", "gripperPOV")
 
     task: str = "drawer-open-v3"
     """Task names separated by commas, or LeRobot's groups: easy, medium, hard, very_hard, all."""

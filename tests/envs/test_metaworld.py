@@ -121,6 +121,13 @@ def test_another_process_sees_the_same_episode_and_prints_nothing_at_its_end():
     assert output.stdout.strip() == hashlib.sha1(b"".join(parts)).hexdigest()
 
 
+def test_every_camera_that_may_be_named_shows_something_else():
+    world = make_world(MetaWorldConfig(task=TASK, camera=",".join(MetaWorldConfig.CAMERAS)))
+    seen = world.reset(0, TASK)
+    frames = {seen[f"observation.images.{name}"].tobytes() for name in MetaWorldConfig.CAMERAS}
+    assert len(frames) == len(MetaWorldConfig.CAMERAS)
+
+
 def test_cameras_and_tasks_side_by_side():
     world = make_world(MetaWorldConfig(task="reach-v3,drawer-open-v3", camera="corner2,topview"))
     one, other = world.reset(0, "reach-v3"), world.reset(0, "drawer-open-v3")
