@@ -126,6 +126,7 @@ def test_every_camera_that_may_be_named_shows_something_else():
     seen = world.reset(0, TASK)
     frames = {seen[f"observation.images.{name}"].tobytes() for name in MetaWorldConfig.CAMERAS}
     assert len(frames) == len(MetaWorldConfig.CAMERAS)
+    world.close()
 
 
 def test_cameras_and_tasks_side_by_side():
