@@ -72,27 +72,32 @@ FULL = "full"  # a folder that nothing can be written into
 
 
 class LightInference:
-    """Answers at once with noise drawn from each request's seed; breaks on request."""
+    """Answers at once with noise drawn from each request's seed; on request breaks at the next weights."""
 
     def __init__(self, *_: Any) -> None:
         self._broken: asyncio.Future[None] = asyncio.get_event_loop().create_future()
-        self._version = 0
+        self._version, self._failing = 0, False
 
     async def ready(self) -> int:
         return os.getpid()
 
     async def serve(self) -> None:
-        await self._broken
+        try:
+            await self._broken
+        finally:
+            await asyncio.sleep(0.5)  # the trainer, which hears of it at once, notices before the engine
 
     async def listen(self) -> Address:
         return serve_on_loop(self.receive).address
 
     async def fail(self) -> None:
-        self._broken.set_exception(ArithmeticError("the forward pass fell over"))
+        self._failing = True
 
     async def receive(self, message: list[Request] | WeightUpdate) -> list[Decision] | None:
         from accerl_lerobot.transport.contract import ServiceStoppedError
 
+        if isinstance(message, WeightUpdate) and self._failing and not self._broken.done():
+            self._broken.set_exception(ArithmeticError("the forward pass fell over"))
         if self._broken.done():
             raise ServiceStoppedError("the inference service has stopped")
         if isinstance(message, WeightUpdate):

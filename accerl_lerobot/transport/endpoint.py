@@ -15,6 +15,7 @@ from accerl_lerobot.transport.shared_memory import Address, SharedMemoryClient, 
 
 logger = logging.getLogger(__name__)
 
+LAST_WORDS_S = 5.0  # from noticing that a service has failed to ending its process
 RETRY_S = 1.0  # between two attempts to connect to a service that was lost
 
 
@@ -28,9 +29,12 @@ class Endpoint:
     actor: Any = None  # Ray's handle of its process
 
     def kill(self) -> None:
+        """End its process, once one that has failed has had time to tell the engine why."""
         import ray
 
-        ray.kill(self.actor)
+        timer = threading.Timer(LAST_WORDS_S, ray.kill, (self.actor,))
+        timer.daemon = True
+        timer.start()
 
     def connect(self) -> Client:
         if self.address is not None and available() and self.address.node == this_node():
