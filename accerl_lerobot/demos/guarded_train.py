@@ -14,8 +14,9 @@ import contextlib
 import json
 import math
 import sys
-from typing import Any
+from typing import Any, NamedTuple
 
+import torch
 from torch.utils.data import Dataset
 
 from accerl_lerobot.checkpoint.safety import Origin
@@ -27,7 +28,21 @@ from accerl_lerobot.policies.untrusted import guarded, input_error
 
 PACKAGE = f"--policy.{DISCOVER}="
 MAX_BYTES = 4 * 1024**3
-"""Datasets that would take more memory than this as float images are read the stock way."""
+"""Datasets whose images would take more memory than this are read the stock way."""
+
+
+class _Pixels(NamedTuple):
+    """A float image in [0, 1] as the bytes that it was made of, a quarter of its memory."""
+
+    values: torch.Tensor
+
+
+def _small(value: Any) -> Any:
+    """An image as `_Pixels`, if that gives it back exactly; anything else as it is."""
+    if not isinstance(value, torch.Tensor) or value.dtype != torch.float32 or value.ndim < 3:
+        return value
+    values = (value * 255).round().clamp(0, 255).to(torch.uint8)
+    return _Pixels(values) if torch.equal(values / 255, value) else value
 
 
 class CachedDataset(Dataset[Any]):
@@ -48,8 +63,9 @@ class CachedDataset(Dataset[Any]):
     def __getitem__(self, index: int) -> dict[str, Any]:
         item = self._items.get(index)
         if item is None:
-            item = self._items[index] = self._dataset[index]
-        return dict(item)
+            item = {name: _small(value) for name, value in self._dataset[index].items()}
+            self._items[index] = item
+        return {name: v.values / 255 if isinstance(v, _Pixels) else v for name, v in item.items()}
 
     def __getattr__(self, name: str) -> Any:
         if name == "_dataset":  # not there yet while a loader process unpickles this object
@@ -66,7 +82,7 @@ def _adapted(stock: Any) -> Any:
         if train.meta.camera_keys:
             train.meta.features.pop(ENVIRONMENT_STATE, None)
         fixed = not cfg.dataset.image_transforms.enable and not cfg.dataset.streaming
-        item = sum(4 * math.prod(train.meta.features[key]["shape"]) for key in train.meta.camera_keys)
+        item = sum(math.prod(train.meta.features[key]["shape"]) for key in train.meta.camera_keys)
         if fixed and len(train) * item * cfg.policy.n_obs_steps <= MAX_BYTES:
             train = CachedDataset(train)
         return train, evaluation

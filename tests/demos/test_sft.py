@@ -69,6 +69,16 @@ def test_cached_items_are_the_stock_ones_at_every_reading():
     assert cached.meta is dataset.meta and cached.num_frames == 365
 
 
+def test_cached_float_images_take_one_byte_per_value_and_come_back_exactly():
+    image, depth = torch.arange(256, dtype=torch.uint8).reshape(1, 16, 16) / 255, torch.rand(1, 16, 16)
+    items = [{"image": image, "depth": depth, "action": torch.rand(4, 2), "task": "reach"}]
+    cached = guarded_train.CachedDataset(items)
+    for _ in range(2):
+        assert equal(cached[0], items[0])
+    kept = cached._items[0]
+    assert kept["image"].values.dtype == torch.uint8 and kept["depth"] is depth
+
+
 def test_the_checkpoint_that_is_best_on_held_out_episodes_is_used(tmp_path: Path):
     path = run_sft(replace(TINY, steps=4, held_out=0.3), LOCAL, tmp_path / "sft", seed=0)
     lines = [line for line in (tmp_path / "sft.log").read_text().splitlines() if "eval_loss=" in line]
