@@ -18,7 +18,7 @@ from rich.table import Table
 from accerl_lerobot.bench import as_table
 from accerl_lerobot.config.ranges import Steps
 from accerl_lerobot.console import Console
-from accerl_lerobot.evaluation import Rate, drawing
+from accerl_lerobot.evaluation import Rate, success_by_task
 from benchmarks.records import as_markdown, mean_interval, output_folder, write
 from benchmarks.study import Cell, Study, StudyConfig, named
 
@@ -110,22 +110,10 @@ def _rows(result: dict[str, Any]) -> list[list[str]]:
 
 def draw(path: Path, result: dict[str, Any]) -> None:
     """A group of bars per task, one bar per algorithm; dots are seeds."""
-    rows = result["rows"]
-    tasks, names = (list(dict.fromkeys(row[key] for row in rows)) for key in ("task", "algorithm"))
-    with drawing(path) as axes:
-        for i, name in enumerate(names):
-            groups = {}  # x → success of each seed
-            for j, task in enumerate(tasks):
-                success = [r["success"] for r in rows if (r["task"], r["algorithm"]) == (task, name)]
-                if success:
-                    groups[j + 0.8 * (i + 0.5) / len(names) - 0.4] = success
-            heights = [sum(success) / len(success) for success in groups.values()]
-            axes.bar(list(groups), heights, 0.75 / len(names), color=f"C{i}", label=name)
-            for x, success in groups.items():
-                axes.scatter([x] * len(success), success, s=10, color="black", zorder=3)
-        axes.set_xticks(range(len(tasks)), [t.removesuffix("-v3") for t in tasks], rotation=20, ha="right")
-        axes.set(ylabel="success", ylim=(0, 1.02))
-        axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1), ncols=2)
+    arms: dict[str, dict[str, list[float]]] = {}
+    for row in result["rows"]:
+        arms.setdefault(row["algorithm"], {}).setdefault(row["task"], []).append(row["success"])
+    success_by_task(path, arms)
 
 
 def _row(of: dict[str, Any], seed: int, start: dict[str, Any], summary: dict[str, Any]) -> dict[str, Any]:

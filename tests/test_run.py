@@ -70,13 +70,17 @@ def test_the_summary_has_what_is_promised(finished: Finished):
 
 def test_the_evaluation_before_can_be_left_out(tiny_checkpoint: Path, tmp_path: Path):
     config = local_run(
-        tiny_checkpoint, tmp_path / "run", evaluation=EvaluationConfig(episodes=4, before=False, videos=0)
+        tiny_checkpoint,
+        tmp_path / "run",
+        env=SimulatedConfig(max_steps=12, tolerance=0.4, task="match,mirror"),
+        evaluation=EvaluationConfig(episodes=4, before=False, videos=0),
     )
     directory = run.make_output_dir(config)
     summary = run.execute(config, directory, Console())
     assert [r["group"] for r in records(directory, "evaluation")] == ["after"]
     assert summary["success_before"] is summary["ci95_before"] is None and summary["n_after"] == 4
-    assert (directory / "success_curve.png").is_file() and not (directory / "before_after.mp4").exists()
+    assert {"success_curve.png", "success_by_task.png"} <= {path.name for path in directory.iterdir()}
+    assert not (directory / "before_after.mp4").exists()
 
 
 def test_the_run_directory_is_complete(finished: Finished):

@@ -19,7 +19,13 @@ from accerl_lerobot.checkpoint import layout, snapshot
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.stopping import Stopping
-from accerl_lerobot.evaluation import before_after, evaluation_plans, success_curve, summarise
+from accerl_lerobot.evaluation import (
+    before_after,
+    evaluation_plans,
+    success_by_task,
+    success_curve,
+    summarise,
+)
 from accerl_lerobot.metrics import MetricsLog, plain
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.timeline import CHECKPOINT, EVALUATION, TRAINING, Clock, NoClock
@@ -185,6 +191,14 @@ class Loop:
         summary = plain(self._summary(after, last))
         layout.write_atomically(self.directory / layout.SUMMARY, json.dumps(summary, indent=2) + "\n")
         success_curve(self.directory / "success_curve.png", self.evaluations, self.curve)
+        if len(after["tasks"]) > 1:
+            ends = {"before": self.before, "after": after}
+            arms = {
+                name: {task: [of["success"]] for task, of in end["tasks"].items()}
+                for name, end in ends.items()
+                if end is not None
+            }
+            success_by_task(self.directory / "success_by_task.png", arms)
         if any(result.frames for result in filmed):
             film = self.directory / "before_after.mp4"
             before_after(film, (filmed, self.before), (results, after), fps=20)

@@ -7,7 +7,7 @@ A rate is never reported without n and an interval.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -142,6 +142,7 @@ def evaluation_plans(
 
 GAP = 4
 BORDER = 5
+MOST_LEVEL = 12  # most tasks whose names stand nearly level under their bars
 
 
 @contextmanager
@@ -182,6 +183,31 @@ def success_curve(
             axes.annotate(f"n={e['n']}", place, textcoords="offset points", xytext=(6, -12), fontsize=8)
         axes.set(xlabel="env steps of online experience", ylabel="success", ylim=(-0.02, 1.02))
         axes.legend(loc="lower right")
+
+
+def success_by_task(path: Path, arms: Mapping[str, Mapping[str, Sequence[float]]]) -> None:
+    """Draws a group of bars per task, one bar per arm, each the mean over policies, which are dots.
+
+    `arms` is arm → task → success of each policy; the last arm sorts the tasks.
+    """
+    means = {name: {t: sum(of) / len(of) for t, of in success.items()} for name, success in arms.items()}
+    *_, last = means.values()
+    tasks = sorted({t for of in arms.values() for t in of}, key=lambda task: (last.get(task, 0.0), task))
+    with drawing(path) as axes:
+        for i, (name, success) in enumerate(arms.items()):
+            x = [tasks.index(task) + 0.8 * (i + 0.5) / len(arms) - 0.4 for task in success]
+            axes.bar(x, list(means[name].values()), 0.75 / len(arms), color=f"C{i}", label=name)
+            for place, values in zip(x, success.values(), strict=True):
+                if len(values) > 1:
+                    axes.scatter([place] * len(values), values, s=10, color="black", zorder=3)
+        labels = [task.removesuffix("-v3") for task in tasks]
+        many = len(tasks) > MOST_LEVEL
+        axes.set_xticks(
+            range(len(tasks)), labels, rotation=90 if many else 20, ha="center" if many else "right"
+        )
+        axes.tick_params(axis="x", labelsize=6 if many else 10)
+        axes.set(ylabel="success", ylim=(0, 1.02))
+        axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1), ncols=len(arms))
 
 
 def write_video(path: Path, rows: Sequence[Sequence[Sequence[np.ndarray]]], fps: int) -> None:

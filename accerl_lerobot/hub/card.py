@@ -121,7 +121,7 @@ Files = dict[str, Path | bytes]  # name in the repository → a file, or its con
 FOLDER = "accerl_run"  # folder in which a policy or world model carries files of its run
 EVALUATION, VALIDATION = "evaluation.json", "validation.json"
 KEPT = {
-    POLICY: (RECIPE, SUMMARY, EVALUATION, "success_curve.png", "before_after.mp4"),
+    POLICY: (RECIPE, SUMMARY, EVALUATION, "success_curve.png", "success_by_task.png", "before_after.mp4"),
     WORLD_MODEL: (RECIPE, VALIDATION, "preview.mp4", "preview_online.mp4"),
 }
 """Artifact type → files of its run that go with it."""
