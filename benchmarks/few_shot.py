@@ -109,7 +109,7 @@ def _rows(result: dict[str, Any]) -> list[list[str]]:
 
 
 def draw(path: Path, result: dict[str, Any]) -> None:
-    """A group of bars per task, one bar per algorithm; dots are seeds."""
+    """A group of bars per task, one bar per algorithm, sorted by the last one's success."""
     arms: dict[str, dict[str, list[float]]] = {}
     for row in result["rows"]:
         arms.setdefault(row["algorithm"], {}).setdefault(row["task"], []).append(row["success"])

@@ -82,7 +82,11 @@ def _adapted(stock: Any) -> Any:
         if train.meta.camera_keys:
             train.meta.features.pop(ENVIRONMENT_STATE, None)
         fixed = not cfg.dataset.image_transforms.enable and not cfg.dataset.streaming
-        item = sum(math.prod(train.meta.features[key]["shape"]) for key in train.meta.camera_keys)
+        # Depth stays float; see `_small`.
+        item = sum(
+            (4 if key in train.meta.depth_keys else 1) * math.prod(train.meta.features[key]["shape"])
+            for key in train.meta.camera_keys
+        )
         if fixed and len(train) * item * cfg.policy.n_obs_steps <= MAX_BYTES:
             train = CachedDataset(train)
         return train, evaluation

@@ -142,7 +142,7 @@ def evaluation_plans(
 
 GAP = 4
 BORDER = 5
-MOST_LEVEL = 12  # most tasks whose names stand nearly level under their bars
+MAX_SLANTED = 12  # with more tasks than this, their names are vertical
 
 
 @contextmanager
@@ -186,22 +186,23 @@ def success_curve(
 
 
 def success_by_task(path: Path, arms: Mapping[str, Mapping[str, Sequence[float]]]) -> None:
-    """Draws a group of bars per task, one bar per arm, each the mean over policies, which are dots.
+    """Draws a group of bars per task, one bar per arm, the mean over policies; where several, they are dots.
 
     `arms` is arm → task → success of each policy; the last arm sorts the tasks.
     """
     means = {name: {t: sum(of) / len(of) for t, of in success.items()} for name, success in arms.items()}
     *_, last = means.values()
+    dots = any(len(of) > 1 for success in arms.values() for of in success.values())
     tasks = sorted({t for of in arms.values() for t in of}, key=lambda task: (last.get(task, 0.0), task))
     with drawing(path) as axes:
         for i, (name, success) in enumerate(arms.items()):
             x = [tasks.index(task) + 0.8 * (i + 0.5) / len(arms) - 0.4 for task in success]
             axes.bar(x, list(means[name].values()), 0.75 / len(arms), color=f"C{i}", label=name)
             for place, values in zip(x, success.values(), strict=True):
-                if len(values) > 1:
+                if dots:
                     axes.scatter([place] * len(values), values, s=10, color="black", zorder=3)
         labels = [task.removesuffix("-v3") for task in tasks]
-        many = len(tasks) > MOST_LEVEL
+        many = len(tasks) > MAX_SLANTED
         axes.set_xticks(
             range(len(tasks)), labels, rotation=90 if many else 20, ha="center" if many else "right"
         )

@@ -15,7 +15,7 @@ from accerl_lerobot.transport.shared_memory import Address, SharedMemoryClient, 
 
 logger = logging.getLogger(__name__)
 
-LAST_WORDS_S = 5.0  # from noticing that a service has failed to ending its process
+LAST_WORDS_S = 2.0  # from noticing that a service is lost to ending its process
 RETRY_S = 1.0  # between two attempts to connect to a service that was lost
 
 
@@ -29,12 +29,16 @@ class Endpoint:
     actor: Any = None  # Ray's handle of its process
 
     def kill(self) -> None:
-        """End its process, once one that has failed has had time to tell the engine why."""
-        import ray
-
-        timer = threading.Timer(LAST_WORDS_S, ray.kill, (self.actor,))
+        """End its process, after `LAST_WORDS_S`: one that has failed tells the engine why before that."""
+        timer = threading.Timer(LAST_WORDS_S, self._kill)
         timer.daemon = True
         timer.start()
+
+    def _kill(self) -> None:
+        import ray
+
+        if ray.is_initialized():  # or it would start a new one
+            ray.kill(self.actor)
 
     def connect(self) -> Client:
         if self.address is not None and available() and self.address.node == this_node():

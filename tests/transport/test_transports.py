@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 
 import pytest
@@ -45,6 +46,18 @@ def connect(service: Endpoint) -> Iterator[Callable[[], Client]]:
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
 def test_contract(check: Check, connect: Callable[[], Client]):
     check(connect)
+
+
+def test_an_endpoint_is_ended_a_moment_after_it_is_told(light_ray: None, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(module, "LAST_WORDS_S", 1.0)
+    actor = ray.remote(Service).options(num_cpus=0).remote()
+    ray.get(actor.obey.remote(("pid", None)), timeout=60)
+    Endpoint(name="service", method=None, actor=actor).kill()
+    ray.get(actor.obey.remote(("pid", None)), timeout=60)
+    with pytest.raises(ray.exceptions.RayActorError):
+        for _ in range(600):
+            time.sleep(0.1)
+            ray.get(actor.obey.remote(("pid", None)), timeout=60)
 
 
 HERE, ELSEWHERE = "this node", "another node"
