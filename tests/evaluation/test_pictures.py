@@ -47,12 +47,15 @@ def test_the_curve_is_drawn(tmp_path: Path) -> None:
 def test_bars_are_as_high_as_success_and_sorted_by_it(tmp_path: Path, count: int) -> None:
     path = tmp_path / "tasks.png"
     after = {f"task-{i}-v3": [1.0 - i / count] for i in range(count)}
-    success_by_task(path, {"before": {"task-0-v3": [0.5, 0.5]}, "after": after})
+    success_by_task(path, {"before": {"task-0-v3": [0.5]}, "after": after})
     image = np.asarray(imageio.imread(path))[..., :3].astype(int)
     assert image.shape[:2] == (480, 840)
     bars = abs(image[60:] - (255, 127, 14)).sum(-1) < 30  # of "after", below the legend
     heights = bars.sum(0)[bars.any(0)]
     assert (np.diff(heights) >= 0).all() and heights[-1] > 300, "the best task stands at the right"
+    success_by_task(path, {"after": after | {"task-0-v3": [1.0, 0.5]}})
+    dotted = np.asarray(imageio.imread(path))[150:300, :, :3]
+    assert (dotted.max(-1) < 40).sum() > (image[150:300].max(-1) < 40).sum(), "several policies are dots"
 
 
 def test_clips_stand_side_by_side_and_hold_their_last_frame(tmp_path: Path) -> None:
