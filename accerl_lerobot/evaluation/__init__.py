@@ -198,15 +198,11 @@ def success_by_task(path: Path, arms: Mapping[str, Mapping[str, Sequence[float]]
         for i, (name, success) in enumerate(arms.items()):
             x = [tasks.index(task) + 0.8 * (i + 0.5) / len(arms) - 0.4 for task in success]
             axes.bar(x, list(means[name].values()), 0.75 / len(arms), color=f"C{i}", label=name)
-            for place, values in zip(x, success.values(), strict=True):
-                if dots:
-                    axes.scatter([place] * len(values), values, s=10, color="black", zorder=3)
+            for place, values in zip(x, success.values(), strict=True) if dots else ():
+                axes.scatter([place] * len(values), values, s=10, color="black", zorder=3)
         labels = [task.removesuffix("-v3") for task in tasks]
-        many = len(tasks) > MAX_SLANTED
-        axes.set_xticks(
-            range(len(tasks)), labels, rotation=90 if many else 20, ha="center" if many else "right"
-        )
-        axes.tick_params(axis="x", labelsize=6 if many else 10)
+        angle, side, size = (90, "center", 6) if len(tasks) > MAX_SLANTED else (20, "right", 10)
+        axes.set_xticks(range(len(tasks)), labels, rotation=angle, ha=side, fontsize=size)
         axes.set(ylabel="success", ylim=(0, 1.02))
         axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1), ncols=len(arms))
 

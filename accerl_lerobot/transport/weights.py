@@ -112,7 +112,7 @@ class WeightPublisher:
 
 
 def _end(endpoint: Endpoint, error: Exception) -> None:
-    """End a replica that may be alive and out of reach: it would serve with old weights for ever."""
+    """End a replica that may be alive and out of reach: with old weights it would serve for ever."""
     logger.warning("%s does not get weights any more: %s", endpoint.name, error)
     endpoint.kill()
 
