@@ -40,12 +40,13 @@ TINY = SFTConfig(
 )  # fmt: skip
 
 
-def stock_dataset() -> Any:
+def stock_dataset(episodes: list[int] | None = None) -> Any:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     return LeRobotDataset(
         "accerl/metaworld_tiny",
         root=ROOT,
+        episodes=episodes,
         delta_timestamps={"action": [i / 80 for i in range(4)]},
         video_backend="pyav",
         return_uint8=True,
@@ -67,6 +68,22 @@ def test_cached_items_are_the_stock_ones_at_every_reading():
             assert equal(cached[index], dataset[index])
     assert cached[364]["action_is_pad"].tolist() == [False, True, True, True]
     assert cached.meta is dataset.meta and cached.num_frames == 365
+
+
+@pytest.mark.parametrize("episodes", [None, [1, 2]])
+def test_a_chunk_is_read_without_decoding_its_images(episodes: list[int] | None, monkeypatch: Any):
+    from lerobot.datasets.dataset_reader import DatasetReader
+
+    from datasets import Image
+
+    dataset = stock_dataset(episodes)
+    indices = (0, 7, 88, len(dataset) - 1)
+    stock = [dataset[index] for index in indices]
+    decode, decoded = Image.decode_example, []
+    monkeypatch.setattr(Image, "decode_example", lambda *args, **kw: decoded.append(1) or decode(*args, **kw))
+    monkeypatch.setattr(DatasetReader, "_query_hf_dataset", guarded_train.query_rows)
+    assert all(equal(dataset[index], item) for index, item in zip(indices, stock, strict=True))
+    assert len(decoded) == len(indices) * len(dataset.meta.camera_keys)
 
 
 def test_cached_float_images_take_one_byte_per_value_and_come_back_exactly():
