@@ -18,7 +18,13 @@ from accerl_lerobot.algorithms import GIPOConfig, LossInputs, LossOutput, PPOCon
 from accerl_lerobot.engine.preflight import check_loss
 from accerl_lerobot.envs import SimulatedConfig, make_world
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.policies.features import Features, check_features, env_features, policy_features
+from accerl_lerobot.policies.features import (
+    Features,
+    check_features,
+    env_features,
+    fine_tuned_features,
+    policy_features,
+)
 from tests.policies.checkpoints import write_act, write_diffusion
 
 ROOT = Path(__file__).parents[1]
@@ -105,6 +111,20 @@ def test_renamed_and_empty_cameras():
     visual = SimpleNamespace(type=SimpleNamespace(name="VISUAL"), shape=(3, 8, 8))
     padded = SimpleNamespace(input_features={"observation.images.empty_camera_0": visual}, output_features={})
     assert policy_features(padded).shapes == {}
+
+
+def test_a_policy_that_pads_takes_the_states_and_cameras_that_it_is_fine_tuned_on():
+    kinds = {FRONT: "VISUAL", "observation.images.top": "VISUAL", STATE: "STATE", "action": "ACTION"}
+    shapes = {FRONT: (3, 8, 8), "observation.images.top": (3, 8, 8), STATE: (6,), "action": (6,)}
+    features = {k: SimpleNamespace(type=SimpleNamespace(name=kinds[k]), shape=shapes[k]) for k in kinds}
+    base = SimpleNamespace(input_features=features, output_features={}, max_state_dim=8, empty_cameras=0)
+    assert fine_tuned_features(base, OFFERED, {}).shapes == OFFERED.shapes
+    top = {FRONT: "observation.images.top"}
+    assert fine_tuned_features(base, OFFERED, top).shapes.keys() == {top[FRONT], STATE, "action"}
+    for other in ({FRONT: "observation.images.side"}, {FRONT: STATE}):  # LeRobot would refuse the dataset
+        assert fine_tuned_features(base, OFFERED, other).shapes == shapes
+    del base.empty_cameras
+    assert fine_tuned_features(base, OFFERED, {}).shapes == shapes
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
@@ -195,6 +215,15 @@ def test_what_the_machine_lacks(
     where = f"--{'root' if arguments[0] == 'demos' else 'output_dir'}={out}"
     assert refused(capsys, *arguments, where).startswith("accerl: " + line.replace("{out}", str(out)))
     assert not out.exists()
+
+
+def test_a_second_gpu_is_no_device_of_ray_s_workers(capsys: pytest.CaptureFixture[str], monkeypatch: Any):
+    import torch
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    line = refused(capsys, *QUICK, "--policy.device=cuda:1")
+    assert line.startswith("accerl: policy.device='cuda:1': Ray shows each worker its own GPU only; use cuda")
 
 
 @pytest.mark.parametrize(

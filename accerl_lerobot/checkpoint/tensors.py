@@ -7,6 +7,8 @@ by what they can do: the class itself costs an import that nobody needs who trai
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -18,9 +20,25 @@ def in_parts(tensor: Tensor) -> bool:
     return hasattr(tensor, "full_tensor")
 
 
+_lends: list[None] = []
+
+
+@contextmanager
+def lending() -> Iterator[None]:
+    """Inside, `whole` contributes this process's parts for another one that asks, and gives nothing back."""
+    _lends.append(None)
+    try:
+        yield
+    finally:
+        _lends.pop()
+
+
 def whole(tensor: Tensor) -> Tensor:
     """All of it, on the CPU if it was in parts; every process of the group asks for it at the same time."""
-    return tensor.full_tensor().cpu() if in_parts(tensor) else tensor
+    if not in_parts(tensor):
+        return tensor
+    full: Tensor = tensor.full_tensor()
+    return torch.empty(0) if _lends else full.cpu()
 
 
 def part_of(tensor: Tensor, like: Tensor) -> Tensor:
@@ -41,10 +59,12 @@ def place(tensor: Tensor) -> tuple[object, ...]:
 
 
 def optimizer_state(optimizer: torch.optim.Optimizer) -> dict[int, dict[str, torch.Tensor]]:
-    """A copy of what it knows of each parameter, in order; rates are not its own."""
+    """A copy on the CPU of what it knows of each parameter, in order; rates are not its own."""
     known: dict[int, dict[str, Any]] = optimizer.state_dict()["state"]
     return {
-        place: {name: whole(torch.as_tensor(value).detach()).clone() for name, value in of.items()}
+        place: {
+            name: whole(torch.as_tensor(value).detach()).to("cpu", copy=True) for name, value in of.items()
+        }
         for place, of in known.items()
     }
 

@@ -126,7 +126,8 @@ def _remember(
         left = f"{len(outcomes)} of {meta.total_episodes} episodes fit into {most} decisions"
         logger.warning("%s, the others are left out", left)
     counts = {"episodes": len(outcomes), "successes": sum(outcomes.values()), "decisions": len(update.memory)}
-    if not counts["successes"]:
+    rewarded = counts["successes"] or np.ptp(update.memory["return"])  # graded, perhaps, without a success
+    if not (len(update.imitable()) and rewarded):
         remedy = "none of its episodes is a success; there is nothing to imitate"
         raise InputError("dataset.repo_id", config.dataset.repo_id, remedy)
     console.say(f"{counts['episodes']} episodes, {counts['successes']} of them successes; "
@@ -145,7 +146,9 @@ def _imitation(update: Any) -> dict[str, float | None]:
         if len(rows):
             with torch.random.fork_rng(), update.adapter.autocast():
                 torch.manual_seed(0)
-                encoded = update.adapter.encode(*update.memory.observations(rows))
-                loss = update.adapter.family.imitation_loss(encoded, update.target(rows))
-            found[name] = float(loss.float().mean())
+                losses = []
+                for part in np.array_split(rows, math.ceil(len(rows) / update.config.micro_batch)):
+                    encoded = update.adapter.encode(*update.memory.observations(part))
+                    losses.append(update.adapter.family.imitation_loss(encoded, update.target(part)))
+            found[name] = float(torch.cat(losses).float().mean())
     return found

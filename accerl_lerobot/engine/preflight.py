@@ -17,6 +17,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Any
 
 import draccus
+import yaml
 
 from accerl_lerobot.algorithms import LossInputs, OffPolicyConfig, RatioConfig
 from accerl_lerobot.checkpoint.safety import brief
@@ -32,6 +33,7 @@ from accerl_lerobot.policies.features import (
     check_features,
     dataset_features,
     env_features,
+    fine_tuned_features,
     policy_features,
     resizes,
 )
@@ -99,7 +101,10 @@ def check_start(config: RunConfig, say: Callable[[str], object] = str) -> tuple[
     if config.policy.path is None and not config.sft.steps:
         remedy = "give a LeRobot checkpoint, or sft.steps > 0 to make one; the recipe quickstart does"
         raise InputError("policy.path", None, remedy)
-    resolve_device(config.policy.device)  # refuses one that is not there
+    device = resolve_device(config.policy.device)  # refuses one that is not there
+    if device.index and config.launch.engine == "ray":
+        remedy = "Ray shows each worker its own GPU only; use cuda, and CUDA_VISIBLE_DEVICES to choose"
+        raise InputError("policy.device", config.policy.device, remedy)
     if isinstance(config.algorithm, RatioConfig):
         check_loss(config.algorithm)
     if 0 < config.trainer.updates <= config.trainer.value_warmup_updates:
@@ -158,11 +163,13 @@ def check_training_data(
     about = "dataset.repo_id", dataset.repo_id
     data = None if meta is None else replace(dataset_features(meta), any_size=resizes(policy))
     if sft.init_path is not None:
-        needs = policy_features(policy)
+        given = [arg.partition("=")[2] for arg in sft.extra_args if arg.startswith("--rename_map=")]
+        renames = yaml.safe_load(given[-1]) if given else {}
+        needs = policy_features(policy) if data is None else fine_tuned_features(policy, data, renames)
         if offered is not None:
             check_features(needs, offered, rename_map, "sft.init_path", sft.init_path)
-        if data is not None and not any(arg.startswith("--rename_map") for arg in sft.extra_args):
-            check_features(needs, data, {}, "sft.init_path", sft.init_path, "dataset")
+        if data is not None:
+            check_features(needs, data, renames, "sft.init_path", sft.init_path, "dataset")
         if data is not None:  # cameras may have names of their own in it
             vectors = {k: shape for k, shape in data.shapes.items() if k in (STATE, ACTION)}
             data = replace(data, shapes=vectors)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import logging
 import math
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
@@ -18,6 +19,8 @@ from accerl_lerobot.config.ranges import Range
 from accerl_lerobot.envs.base import EnvConfig, EpisodeWorld, Step, WorldSpec
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Observation
+
+logger = logging.getLogger(__name__)
 
 FPS = 20  # control rate of environments that name none
 RENDER = "render"  # in `GymConfig.images`: the picture that the environment renders
@@ -79,10 +82,13 @@ class GymWorld(EpisodeWorld):
 
         self.config = config
         self._pictures: dict[str, np.ndarray] = {}  # images of the last observation, by camera
-        kwargs = {"render_mode": "rgb_array"} if RENDER in config.images.values() else {}
+        # Without Gymnasium's time limit: ours counts.
+        kwargs: dict[str, Any] = {"max_episode_steps": -1, "disable_env_checker": True}
+        if RENDER in config.images.values():
+            kwargs["render_mode"] = "rgb_array"
+        self._tells = not config.success
         try:
-            # `unwrapped` leaves out Gymnasium's time limit: ours counts, and it truncates.
-            self._env = gymnasium.make(config.id, **(kwargs | config.kwargs)).unwrapped
+            self._env: Any = gymnasium.make(config.id, **(kwargs | config.kwargs))
         except (gymnasium.error.Error, TypeError, ValueError) as error:
             remedy = f"gymnasium.make refuses it ({error}); is env.discover_packages_path the package of it?"
             raise InputError("env.id", config.id, remedy) from error
@@ -104,6 +110,8 @@ class GymWorld(EpisodeWorld):
         )
 
     def _begin(self, seed: int, task: str) -> None:
+        if self._steps and not self._tells:
+            _warn_of_missing(self.config.success, ", ".join(self._info) or "nothing")
         self._raw, _ = self._env.reset(seed=seed)
 
     def render(self, height: int, width: int) -> np.ndarray:
@@ -118,6 +126,7 @@ class GymWorld(EpisodeWorld):
 
     def _step(self, action: np.ndarray) -> Step:
         self._raw, reward, ended, cut, info = self._env.step(action)
+        self._info, self._tells = info, self._tells or self.config.success in info
         finite = math.isfinite(reward) and finite_numbers(self._raw)
         success = bool(info.get(self.config.success, False)) if self.config.success else bool(ended)
         return Step(
@@ -153,6 +162,14 @@ class GymWorld(EpisodeWorld):
         if any(part.dtype.kind not in "fiub" for part in parts):
             raise InputError(f"env.{name}", list(keys), "name keys with numbers")
         return np.concatenate([part.astype(np.float32).ravel() for part in parts])
+
+
+@functools.cache  # once in a process
+def _warn_of_missing(key: str, given: str) -> None:
+    logger.warning(
+        "env.success=%r: an episode has ended, and the environment's info never had this key, which counts "
+        "as a failure; it has %s", key, given,
+    )  # fmt: skip
 
 
 def resized(frame: np.ndarray, height: int, width: int) -> np.ndarray:

@@ -154,7 +154,7 @@ class LeRobotWorld(EpisodeWorld):
         return observation
 
     def _instruction(self, task: str) -> str:
-        env = self._envs[task]
+        env = self._envs[task].unwrapped
         for name in ("task_description", "task"):
             if isinstance(text := getattr(env, name, None), str) and text:
                 return text
@@ -180,10 +180,18 @@ def _check_hub(config: LeRobotEnvConfig, hub_path: str | None) -> None:
 def _single_envs(vectors: dict[str, dict[int, Any]]) -> dict[str, Any]:
     """Names each single environment ``suite`` or, where there are several, ``suite/number``."""
     flat = [(suite, number, vector) for suite, tasks in vectors.items() for number, vector in tasks.items()]
-    # `unwrapped` leaves out Gymnasium's time limit: ours counts, and it truncates.
     if len(flat) == 1:
-        return {flat[0][0]: flat[0][2].envs[0].unwrapped}
-    return {f"{suite}/{number}": vector.envs[0].unwrapped for suite, number, vector in flat}
+        return {flat[0][0]: _unlimited(flat[0][2].envs[0])}
+    return {f"{suite}/{number}": _unlimited(vector.envs[0]) for suite, number, vector in flat}
+
+
+def _unlimited(env: Any) -> Any:
+    """Without Gymnasium's time limit, as ours counts, but with the environment's own wrappers."""
+    from gymnasium.wrappers import OrderEnforcing, TimeLimit
+
+    while isinstance(env, (OrderEnforcing, TimeLimit)):
+        env = env.env
+    return env
 
 
 def _batched(raw: Any) -> Any:

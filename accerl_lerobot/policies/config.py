@@ -20,6 +20,9 @@ if TYPE_CHECKING:
     from accerl_lerobot.policies.adapter import PolicyAdapter
 
 
+Precision = Literal["fp32", "bf16", "auto"]
+
+
 @dataclass(frozen=True, kw_only=True)
 class SamplerConfig(Section, draccus.ChoiceRegistry, section="policy.sampler"):
     """Base of every sampler config; one for each family of likelihood."""
@@ -122,7 +125,7 @@ class PolicyConfig(Section, section="policy"):
     its Python code, which you have read, runs with your rights, and no other does."""
     device: Device = "auto"
     """cpu, cuda, or auto."""
-    precision: Literal["fp32", "bf16", "auto"] = "fp32"
+    precision: Precision = "fp32"
     """fp32, or bf16: networks run in bfloat16 under autocast, weights and log-probs stay in fp32; auto: bf16
     where the processor computes in it. A ``dtype`` in the checkpoint's LeRobot config is taken, and saved, as
     float32: updates of RL are smaller than bfloat16 resolves."""
@@ -229,6 +232,8 @@ def override(policy_config: Any, config: PolicyConfig) -> None:
         setattr(policy_config, name, config.num_steps)
     if hasattr(policy_config, "dtype"):
         policy_config.dtype = "float32"  # see `PolicyConfig.precision`
+    if hasattr(policy_config, "compile_model"):
+        policy_config.compile_model = False  # a compiled sampler rounds unlike the re-scoring pass
     if config.n_action_steps is not None:
         chunk = int(getattr(policy_config, "chunk_size", 0) or getattr(policy_config, "horizon", 1))
         if policy_config.type in USES_HISTORY:

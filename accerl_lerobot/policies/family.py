@@ -60,9 +60,6 @@ class Model(ABC):
         if (rtc := getattr(policy.config, "rtc_config", None)) is not None and rtc.enabled:
             remedy = "real-time chunking changes the sampler's density; turn it off"
             raise InputError("policy.rtc_config.enabled", True, remedy)
-        if getattr(policy.config, "compile_model", False):
-            remedy = "a compiled sampler rounds unlike the re-scoring pass; set it to false in config.json"
-            raise InputError("policy.compile_model", True, remedy)
         self.policy = policy
 
     @staticmethod

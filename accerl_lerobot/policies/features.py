@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import logging
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from accerl_lerobot.errors import InputError
@@ -48,6 +48,23 @@ def policy_features(policy: Any) -> Features:
 def resizes(policy: Any) -> bool:
     """True if a policy resizes its images by itself, by LeRobot's config of it."""
     return any(getattr(policy, field, None) for field in RESIZERS)
+
+
+def pads(policy: Any) -> bool:
+    """True if a policy pads states and actions and goes without some of its cameras, as SmolVLA and π0 do."""
+    return hasattr(policy, "max_state_dim") and hasattr(policy, "empty_cameras")
+
+
+def fine_tuned_features(policy: Any, dataset: Features, renames: dict[str, str]) -> Features:
+    """Features that a policy needs once it is fine-tuned on a dataset; `renames` is dataset name → its name.
+
+    One that pads takes the dataset's states and actions, and of its cameras those that are there.
+    """
+    needed = policy_features(policy)
+    there = {renames.get(name, name): shape for name, shape in dataset.shapes.items()}
+    common = {name: there[name] for name in needed.shapes if name in there}
+    sees = any(len(shape) == 3 for shape in common.values())
+    return replace(needed, shapes=common) if pads(policy) and sees else needed
 
 
 def dataset_features(meta: Any) -> Features:

@@ -33,6 +33,7 @@ from accerl_lerobot.policies.adapter import LeRobotAdapter, Processing, ValueHea
 from accerl_lerobot.policies.config import (
     POLICIES,
     PolicyConfig,
+    Precision,
     SamplerConfig,
     check_observations,
     override,
@@ -40,6 +41,7 @@ from accerl_lerobot.policies.config import (
     sampler_config,
 )  # fmt: skip
 from accerl_lerobot.policies.family import Model
+from accerl_lerobot.policies.features import STATE, pads, policy_features
 from accerl_lerobot.policies.saving import tune
 
 logger = logging.getLogger(__name__)
@@ -69,6 +71,15 @@ def resolve_device(name: str, field: str = "policy.device") -> torch.device:
     return device
 
 
+def precision_on(device: torch.device, wanted: Precision) -> Precision:
+    """fp32 or bf16: what is `wanted`, or, for ``auto``, bf16 where the device itself computes in it."""
+    if wanted != "auto":
+        return wanted
+    if device.type == "cuda":
+        return "bf16" if torch.cuda.is_bf16_supported(including_emulation=False) else "fp32"
+    return "bf16" if device.type == "cpu" and torch.cpu._is_avx512_bf16_supported() else "fp32"
+
+
 def load_lerobot_config(config: PolicyConfig) -> Any:
     """The checkpoint's LeRobot policy config, without its weights.
 
@@ -80,6 +91,7 @@ def load_lerobot_config(config: PolicyConfig) -> Any:
     with _refusing(config, "its config.json is not one of this LeRobot's policies"):
         sampler_config(config, kind, prefix=f"{config.path} is of this type: ")
         lerobot_config = PreTrainedConfig.from_pretrained(folder)
+        _correct_inputs(lerobot_config, folder, Origin("policy.path", config.path))
     lerobot_config.device = str(resolve_device(config.device))
     override(lerobot_config, config)
     check_observations(lerobot_config, "policy.n_obs_steps")
@@ -113,7 +125,9 @@ def policy_sizes(config: PolicyConfig) -> Sizes:
 
 def rehearsed[T](config: PolicyConfig, task: Callable[[LeRobotAdapter], T]) -> T:
     """Result, which JSON can hold, of `task` with the policy of `policy_sizes`, in a child process."""
-    there, origin = replace(config, device="cpu"), Origin("policy.path", config.path)
+    precision = precision_on(resolve_device(config.device), config.precision)
+    there = replace(config, device="cpu", precision=precision)
+    origin = Origin("policy.path", config.path)
     return rehearse(lambda: task(load_adapter(there, rehearsal=True)), _checkpoint_folder(config), origin)
 
 
@@ -139,14 +153,12 @@ def load_adapter(config: PolicyConfig, *, rehearsal: bool = False) -> LeRobotAda
         model_class.loading(),
         untrusted.Unfilled(),
     ):
-        policy = get_policy_class(lerobot_config.type)(lerobot_config)
+        policy = _built(lerobot_config)
     load_weights(policy, model_class, folder / untrusted.WEIGHTS, config.path, read=not rehearsal)
     device = torch.device(lerobot_config.device)
     policy.to(device).eval()
     model = model_class(policy)
-    if (precision := config.precision) == "auto":
-        on_cpu = device.type == "cpu" and torch.cpu._is_avx512_bf16_supported()
-        precision = "bf16" if on_cpu or (device.type == "cuda" and torch.cuda.is_bf16_supported()) else "fp32"
+    precision = precision_on(device, config.precision)
     if precision == "fp32" and device.type == "cuda":
         # torch convolves with 10 bits of mantissa there. For batches of different sizes cuDNN chooses other
         # algorithms; what they round differently is divided by the std of the noise in every log-prob.
@@ -177,6 +189,21 @@ def load_adapter(config: PolicyConfig, *, rehearsal: bool = False) -> LeRobotAda
             adapter.decide([replace(requests[0], observation=observation)], 0)
         tune(policy, model, config.tuning)
     return adapter
+
+
+def _built(lerobot_config: Any) -> Any:
+    """LeRobot's policy in float32, without the backbone's weights, which its own file has, too.
+
+    LeRobot builds SmolVLA's backbone and expert in the backbone's bfloat16, in which small steps of a
+    gradient are lost.
+    """
+    asked = getattr(lerobot_config, "load_vlm_weights", None)
+    if asked is not None:
+        lerobot_config.load_vlm_weights = False
+    policy = get_policy_class(lerobot_config.type)(lerobot_config).float()
+    if asked is not None:
+        policy.config.load_vlm_weights = asked
+    return policy
 
 
 @contextlib.contextmanager
@@ -236,6 +263,32 @@ def _load_ours(adapter: LeRobotAdapter, folder: Path, origin: Origin) -> None:
         except RuntimeError as error:
             remedy = f"it is no critic of this policy; remove it to start anew ({brief(error)})"
             raise origin.refuse(untrusted.VALUE_HEAD, remedy) from error
+
+
+def _correct_inputs(lerobot_config: Any, folder: Path, origin: Origin) -> None:
+    """Gives a policy that pads the inputs that it was trained on, by the statistics that it normalises by.
+
+    LeRobot's fine-tuning leaves those of the policy that it started from in ``config.json``, whatever states
+    and cameras the dataset had.
+    """
+    if not pads(lerobot_config) or not (folder / PREPROCESSOR).is_file():
+        return
+    seen: dict[str, tuple[int, ...]] = {}
+    renames: dict[str, str] = {}
+    for step in _stored_steps(folder):
+        renames |= step.get("config", {}).get("rename_map", {})
+        if step["registry_name"] == "normalizer_processor" and "state_file" in step:
+            stored = tensor_shapes(folder / step["state_file"], origin)
+            seen |= {
+                k.removesuffix(".mean"): shape for k, (_, shape) in stored.items() if k.endswith(".mean")
+            }
+    seen = {renames.get(name, name): shape for name, shape in seen.items()}
+    inputs = lerobot_config.input_features
+    cameras = {name for name, shape in policy_features(lerobot_config).shapes.items() if len(shape) == 3}
+    for name in cameras - seen.keys() if cameras & seen.keys() else ():
+        del inputs[name]
+    if STATE in inputs and STATE in seen:
+        inputs[STATE] = replace(inputs[STATE], shape=seen[STATE])
 
 
 def _use_backbone(lerobot_config: Any, folder: Path, path: str | None) -> None:

@@ -84,7 +84,7 @@ def merged_state_dict(policy: nn.Module) -> dict[str, Tensor] | None:
     for name, layer in layers.items():
         weight = state[f"{name}.base_layer.weight"]
         state[f"{name}.base_layer.weight"] = weight + layer.get_delta_weight("default").to(weight)
-    return {k.replace(".base_layer.", "."): whole(v.detach()).cpu().contiguous() for k, v in state.items()}
+    return {k.replace(".base_layer.", "."): v.detach() for k, v in state.items()}
 
 
 class Weights(NamedTuple):

@@ -43,9 +43,9 @@ def unlike(meta: Any, wanted: dict[str, tuple[int, ...]]) -> str | None:
 def demonstrations(dataset: DatasetConfig, decision_cost: float, like: Segment) -> Iterator[Segment]:
     """Reads whole episodes, each up to ``like.actions.shape[1]`` times: from its first step, its second, ….
 
-    An episode ends with its first ``next.success``; without that feature, all episodes are successes. Rewards
-    are ``next.reward``, or 1 for success, less `decision_cost` for each decision. Names and shapes are those
-    of `like`, an explored episode; a dataset of others is not read, which is logged.
+    Rewards are ``next.reward``, or 1 for success, less `decision_cost` for each decision; ends and success
+    are those of `_episode`. Names and shapes are those of `like`, an explored episode; a dataset of others is
+    not read, which is logged.
     """
     meta = open_metadata(dataset)
     wanted = {name: rows.shape[1:] for name, rows in like.observations.items()}
@@ -100,15 +100,24 @@ def recorded(
 def _episode(
     frames: Iterator[dict[str, Any]], wanted: dict[str, tuple[int, ...]]
 ) -> tuple[dict[str, np.ndarray], np.ndarray, bool, str]:
-    """Observations and actions, each (T, ...), and rewards (T,) up to the first success; it, and the task."""
+    """Observations and actions, each (T, ...), and rewards (T,) of an episode; its success, and its task.
+
+    It ends with the first ``next.success``, unless its first frame has that already: then all of them are
+    labelled, and it ends with the last one. Without the feature a reward above 0 is success, and without
+    rewards too each episode is one.
+    """
     rows: list[dict[str, np.ndarray]] = []
     rewards: list[float] = []
+    labelled = False
     for frame in frames:
         rows.append({name: _numbers(frame[name], shape) for name, shape in wanted.items()})
         rewards.append(float(frame.get(REWARD, 0.0)))
-        task, success = str(frame["task"]), bool(frame.get(SUCCESS, True))
-        if SUCCESS in frame and success:
+        task, success = str(frame["task"]), bool(frame.get(SUCCESS, False))
+        labelled |= success and len(rows) == 1
+        if success and not labelled:
             break
+    if SUCCESS not in frame:
+        success = REWARD not in frame or max(rewards) > 0
     if REWARD not in frame:
         rewards[-1] = float(success)
     columns = {name: np.stack([row[name] for row in rows]) for name in wanted}

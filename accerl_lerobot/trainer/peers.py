@@ -105,13 +105,19 @@ class TrainerRank:
 
     def lend_weights(self) -> None:
         """Its part of the trainable weights, for the first rank to export."""
-        self._adapter.export_trainable()
+        from accerl_lerobot.checkpoint.tensors import lending
+
+        with lending():
+            self._adapter.export_trainable()
 
     def lend_state(self) -> None:
         """Its part of all that is saved, in the order in which the first rank asks for it."""
-        self._adapter.copy_weights()
-        self.lend_weights()
-        self._update.state()
+        from accerl_lerobot.checkpoint.tensors import lending
+
+        with lending():
+            self._adapter.copy_weights()
+            self._adapter.export_trainable()
+            self._update.state()
 
 
 class Peers:

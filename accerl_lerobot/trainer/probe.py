@@ -39,7 +39,7 @@ class Probe:
         self.renew(0)
 
     def state(self) -> dict[str, Any]:
-        weights = [whole(tensor.detach()).clone() for tensor in self._copy]
+        weights = [whole(tensor.detach()).to("cpu", copy=True) for tensor in self._copy]
         return {"version": self._version, "next": self._next, "weights": weights}
 
     def restore(self, state: dict[str, Any]) -> None:

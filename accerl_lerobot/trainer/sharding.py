@@ -63,12 +63,6 @@ def forget(seen: Watch) -> None:
         block.forward = partial(checkpoint, block.forward, use_reentrant=False)
 
 
-def synchronise(adapter: PolicyAdapter, now: bool) -> None:
-    """Have the next backward pass average gradients over ranks, or, if not `now`, keep them back."""
-    if hasattr(adapter, "set_requires_gradient_sync"):
-        adapter.set_requires_gradient_sync(now)
-
-
 @contextmanager
 def swapped_in(
     adapter: PolicyAdapter, live: Sequence[nn.Parameter], tensors: Sequence[Tensor]

@@ -33,7 +33,7 @@ from accerl_lerobot.trainer.batch import MAX_NONFINITE, Batch, NonFiniteError, c
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.probe import CRITIC_PREFIX, Probe
 from accerl_lerobot.trainer.ranks import ALONE, Ranks
-from accerl_lerobot.trainer.sharding import arrange, synchronise
+from accerl_lerobot.trainer.sharding import arrange
 
 
 def make_update(
@@ -48,6 +48,7 @@ class BaseUpdate(ABC):
     """The optimiser around one adapter, and what the updates of all algorithms share."""
 
     def __init__(self, adapter: Any, config: TrainerConfig) -> None:
+        arrange(adapter, config)
         self.adapter, self.config = adapter, config
         self.version = self.skipped = self._skipped_in_a_row = 0
         self._schedule_updates = config.updates
@@ -112,7 +113,6 @@ class RatioUpdate(BaseUpdate):
     ) -> None:
         self.algorithm, self.ranks = algorithm, ranks
         self.ranks.begin_alike(list(adapter.trainable().values()))
-        arrange(adapter, config)
         super().__init__(adapter, config)
         self._moments = torch.zeros(3, dtype=torch.float64)
         self._probe = Probe(adapter, config, self.ranks)
@@ -164,7 +164,7 @@ class RatioUpdate(BaseUpdate):
             ratios = float(present(factors, self.algorithm.level).sum()) / len(factors)
         means: dict[str, float] = {}
         samples: list[Tensor] = []
-        for number, (rows, own) in enumerate(parts, 1):
+        for rows, own in parts:
             evaluation = self.adapter.evaluate(*batch.part(rows))
             counted = slice(None) if own else slice(0)
             if targets is None:
@@ -183,7 +183,6 @@ class RatioUpdate(BaseUpdate):
             )
             output = self.algorithm.loss(inputs)
             share = len(rows) / len(batch) if own else 0.0
-            synchronise(self.adapter, number == len(parts))
             loss = output.loss * share * self.ranks.size  # a gradient is the mean over ranks
             (loss * math.nan if fault_point("trainer.loss") else loss).backward()
             for name, mean in output.means.items():

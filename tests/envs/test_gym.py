@@ -9,7 +9,9 @@ import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -43,7 +45,7 @@ def config(*more: str) -> GymConfig:
 def test_observations_are_mapped():
     world = make_world(config("--env.environment_state=[goal]", "--env.image_size=16"))
     assert isinstance(world, GymWorld)
-    seen, raw = world.reset(3, "reach/Reach-v0"), world._env.observation()
+    seen, raw = world.reset(3, "reach/Reach-v0"), world._env.unwrapped.observation()
     assert seen["observation.state"].tolist() == [*raw["agent_pos"], *raw["goal"]]
     assert seen["observation.environment_state"].tolist() == [*raw["goal"], 0.0]
     assert seen["observation.images.front"].shape == (16, 16, 3) and seen["task"] == "Reach the goal"
@@ -69,11 +71,34 @@ def test_the_first_success_ends_the_episode():
     world = make_world(config())
     world.reset(0, "reach/Reach-v0")
     for _ in range(16):
-        way = (world._env.goal - world._env.agent) / world._env.speed  # type: ignore[attr-defined]
+        inner = world._env.unwrapped
+        way = (inner.goal - inner.agent) / inner.speed
         result = world.step_chunk(way[None])
         if result.done:
             break
     assert result.terminated and result.success and result.rewards.tolist() == [1.0]
+
+
+class Tilted(gymnasium.Wrapper):
+    """Half the action, as a wrapper that the environment is registered with."""
+
+    def step(self, action: Any) -> Any:
+        return self.env.step(action / 2)
+
+
+def test_the_environment_keeps_its_wrappers_but_not_its_time_limit(caplog: pytest.LogCaptureFixture):
+    tilted = lambda **options: Tilted(gymnasium.make("Pendulum-v1", **options))  # noqa: E731
+    gymnasium.register("Tilted-v0", tilted, max_episode_steps=2)
+    observed = []
+    for name, torque in (("Tilted-v0", 2.0), ("Pendulum-v1", 1.0)):
+        world = make_world(GymConfig(id=name, images={}, reward="env", max_steps=6))
+        for _ in range(2):
+            world.reset(1, name)
+            result = world.step_chunk(np.full((6, 1), torque, np.float32))
+            assert result.truncated and result.steps == 6
+        observed.append(result.observation["observation.state"].tolist())
+    assert observed[0] == observed[1]
+    assert len(caplog.messages) == 1 and "env.success='is_success': an episode has ended" in caplog.text
 
 
 @pytest.mark.parametrize(

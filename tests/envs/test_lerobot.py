@@ -6,6 +6,7 @@ from __future__ import annotations
 import importlib
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -16,11 +17,12 @@ from accerl_lerobot.errors import InputError
 pytest.importorskip("lerobot")
 
 
-class Scripted:
+class Scripted(gymnasium.Wrapper):
     """Stands in for a simulator that succeeds at its third step."""
 
     def __init__(self, env) -> None:
-        self.env, self.count = env, 0
+        super().__init__(env)
+        self.count = 0
 
     def reset(self, seed: int):
         self.count = 0

@@ -23,7 +23,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE
 from accerl_lerobot.policies.adapter import stack_observations
 from accerl_lerobot.policies.config import FlowSamplerConfig, PolicyConfig, SamplerConfig
-from accerl_lerobot.policies.loading import load_adapter, load_lerobot_config, resolve_device
+from accerl_lerobot.policies.loading import load_adapter, load_lerobot_config, precision_on, resolve_device
 from accerl_lerobot.policies.saving import save_pretrained
 from accerl_lerobot.testing import perturb
 from tests.policies.cases import CASES
@@ -119,7 +119,6 @@ def test_a_policy_that_reads_the_simulators_state(damaged: Any):
     [
         ("smolvla", {"rtc_config": {"enabled": True}}, {}, "policy.rtc_config.enabled=True: real-time"),
         ("smolvla", {"adapt_to_pi_aloha": True}, {}, "policy.adapt_to_pi_aloha=True: "),
-        ("smolvla", {"compile_model": True}, {}, "policy.compile_model=True: a compiled sampler rounds"),
         ("pi0_fast", {"temperature": 0.7}, {}, "policy.temperature=0.7: LeRobot's sampler has to be greedy"),
         ("pi0_fast", {"n_action_steps": 3}, {}, "policy.n_action_steps=3: LeRobot decodes so many rows from"),
         ("pi0_fast", {}, {"num_steps": 3}, "policy.num_steps=3: a pi0_fast policy does not denoise"),
@@ -133,12 +132,9 @@ def test_a_policy_that_reads_the_simulators_state(damaged: Any):
 def test_options_under_which_its_density_would_be_another(
     damaged: Any, monkeypatch: pytest.MonkeyPatch, name: str, changes: dict, options: dict, sentence: str
 ):
-    monkeypatch.setattr(torch, "compile", lambda function, **options: function)
-    precision = torch.get_float32_matmul_precision()
     path = damaged(name)
     edit_config(path, **changes)
     refused(path, sentence, **options)
-    torch.set_float32_matmul_precision(precision)
 
 
 def test_devices(monkeypatch: pytest.MonkeyPatch):
@@ -152,6 +148,29 @@ def test_devices(monkeypatch: pytest.MonkeyPatch):
     assert resolve_device("auto") == torch.device("cuda")
     with pytest.raises(InputError, match="^policy.device='cuda:1': there are 1 such devices"):
         resolve_device("cuda:1")
+
+
+@pytest.mark.parametrize(("here", "emulated"), [(False, True), (True, False)])
+def test_auto_is_bf16_where_the_gpu_itself_computes_in_it(here: bool, emulated: bool, monkeypatch: Any):
+    def supported(including_emulation: bool = True) -> bool:
+        return here or (emulated and including_emulation)
+
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", supported)
+    assert precision_on(torch.device("cuda"), "auto") == ("bf16" if here else "fp32")
+    assert precision_on(torch.device("cuda"), "bf16") == "bf16"
+
+
+def test_a_smolvla_is_float32_and_its_backbone_s_weights_are_not_read(tmp_path: Path):
+    """The published backbone's config asks for bfloat16, in which LeRobot builds the expert."""
+    path = write_smolvla(tmp_path / "policy")
+    text = tmp_path / "policy-backbone/config.json"
+    backbone = json.loads(text.read_text())
+    backbone["text_config"]["dtype"] = "bfloat16"
+    text.write_text(json.dumps(backbone))
+    edit_config(path, load_vlm_weights=True, compile_model=True)
+    adapter = load_adapter(PolicyConfig(path=str(path), device="cpu"))
+    assert {parameter.dtype for parameter in adapter.policy.parameters()} == {torch.float32}
+    assert adapter.policy.config.load_vlm_weights and not adapter.policy.config.compile_model
 
 
 OUT = "model.action_out_proj.weight"
@@ -352,6 +371,34 @@ def test_names_of_the_environment_s_features_are_mapped(written: Any):
     renamed = {k.replace("front", "top"): v for k, v in request.observation.items()}
     decision = adapter.decide([replace(request, observation=renamed)], 0)
     assert pickle.dumps(decision) == pickle.dumps(adapter_at(path).decide([request], 0))
+
+
+@pytest.mark.parametrize("renames", [{}, {"observation.images.front": "observation.images.camera1"}])
+def test_inputs_of_the_base_policy_in_the_config_give_way_to_the_statistics(renames: dict, tmp_path: Path):
+    """LeRobot keeps the base policy's: states of six numbers, three cameras."""
+    from lerobot.configs.types import FeatureType, PolicyFeature
+
+    camera = next(iter(renames.values()), "observation.images.camera1")
+    stats = {next(iter(renames), camera): {"mean": torch.zeros(3, 1, 1), "std": torch.ones(3, 1, 1)}}
+    path = write_smolvla(tmp_path / "policy", camera=camera, max_state_dim=8, stats=stats)
+    config = json.loads((path / "config.json").read_text())
+    inputs = config["input_features"]
+    inputs |= {f"observation.images.camera{i}": inputs[camera] for i in (2, 3)}
+    inputs["observation.state"]["shape"] = [6]
+    (path / "config.json").write_text(json.dumps(config))
+    steps = json.loads((path / PROCESSOR).read_text())
+    steps["steps"][0]["config"]["rename_map"] = renames
+    (path / PROCESSOR).write_text(json.dumps(steps))
+
+    features = {
+        camera: PolicyFeature(FeatureType.VISUAL, (3, 32, 32)),
+        "observation.state": PolicyFeature(FeatureType.STATE, (4,)),
+    }
+    assert load_lerobot_config(PolicyConfig(path=str(path), device="cpu")).input_features == features
+    adapter = load_adapter(PolicyConfig(path=str(path), device="cpu"))
+    save_pretrained(adapter, tmp_path / "saved", PolicyConfig(path=str(path)))
+    stored = json.loads((tmp_path / "saved/config.json").read_text())["input_features"]
+    assert stored.keys() == features.keys() and stored["observation.state"]["shape"] == [4]
 
 
 def test_the_critic_is_saved_and_loaded(written: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture):

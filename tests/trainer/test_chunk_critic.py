@@ -33,6 +33,7 @@ from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.off_policy import AWRUpdate, Memory, OffPolicyUpdate
 from accerl_lerobot.trainer.update import make_update
 from tests.replay.segments import make_segment
+from tests.rounding import assert_close
 from tests.runs import tiny_run
 
 GAMMA = 0.9
@@ -268,6 +269,22 @@ def test_teacher_and_policy_go_where_the_critic_leads(
     assert update.adapter.processing.unnormalise(update.teacher(state).detach())[0, 0, 0] > 0.3
     assert first_action(update) > before + 0.2
     assert metrics["explained_variance"] > 0.5 and metrics["memory_decisions"] == 10 * 32
+
+
+def test_blocks_that_forget_compute_again_and_learn_the_same(tiny_checkpoint: Path):
+    counts, weights = [], []
+    for forget in (False, True):
+        update = imitator(tiny_checkpoint, 1.0, activation_checkpointing=forget)
+        calls: list[None] = []
+        for module in update.adapter.policy.modules():
+            module.register_forward_hook(lambda *_, calls=calls: calls.append(None))
+        torch.manual_seed(0)
+        update.step([episode([1.0])])
+        counts.append(len(calls))
+        weights.append(update.adapter.export_trainable())
+    assert counts[1] > counts[0]
+    for name, mine in weights[0].items():
+        assert_close(mine, weights[1][name])
 
 
 def awr(checkpoint: Path, algorithm: AWRConfig | None = None, **trainer: Any) -> AWRUpdate:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from accerl_lerobot.algorithms import AlgorithmConfig, ChunkCriticConfig, SelfImitationConfig
@@ -87,6 +88,26 @@ def test_decisions_are_the_frames_from_every_step_on(dataset: DatasetConfig, lik
                 np.testing.assert_array_equal(segment.actions[t, k], frames[last]["action"].numpy())
             assert segment.steps[t] == min(K, len(frames) - at)
     assert {segment.success for segment in read} == {True, False}
+
+
+@pytest.mark.parametrize(
+    ("labels", "length", "rewards", "success"),
+    [
+        ({"next.success": [0, 0, 1, 1]}, 3, [0, 0, 1], True),
+        ({"next.success": [1, 1, 1, 1]}, 4, [0, 0, 0, 1], True),  # the episode's label, at every frame
+        ({"next.success": [0, 0, 0, 0]}, 4, [0, 0, 0, 0], False),
+        ({"next.success": [0, 1, 1, 1], "next.reward": [-1, -2, 0, 0]}, 2, [-1, -2], True),
+        ({"next.reward": [0, 0, 0, 1]}, 4, [0, 0, 0, 1], True),
+        ({"next.reward": [0, 0, 0, 0]}, 4, [0, 0, 0, 0], False),
+        ({}, 4, [0, 0, 0, 1], True),
+    ],
+)
+def test_labels_of_an_episode(labels: dict, length: int, rewards: list[float], success: bool):
+    frames = [{k: torch.tensor(v[i]) for k, v in labels.items()} for i in range(4)]
+    frames = [{"action": torch.tensor([float(i)]), "task": "go"} | frame for i, frame in enumerate(frames)]
+    columns, found, won, task = module._episode(iter(frames), {"action": (1,)})
+    assert columns["action"].tolist() == [[float(i)] for i in range(length)]
+    assert (found.tolist(), won, task) == (rewards, success, "go")
 
 
 def test_of_a_long_dataset_only_a_part_is_read(
