@@ -222,6 +222,9 @@ def model_card(repo_id: str, artifact: str, folder: Path, files: Files, provenan
         number=number,
         shown=sorted(name for name in files if name.startswith(f"{FOLDER}/") or "/" not in name),
         recipe_path=f"{local}/{place}" if recipe else None,
+        # Of a policy's runs, only those of `accerl offline` have no environment.
+        verb="world-model" if artifact == WORLD_MODEL else "train" if env else "offline",
+        improved="" if not recipe else f" improved {'by online RL' if env else 'on recorded episodes'}",
         stock=lerobot_eval_command(local, config, {k: v for k, v in env.items() if k != "assets"}),
         # With one of its own, LeRobot finds the backbone only once a pull has set its place.
         has_backbone=str(config.get("vlm_model_name") or "").startswith(("/", BACKBONE)),
