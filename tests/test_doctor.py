@@ -232,7 +232,7 @@ def test_a_policy_is_compared_with_its_device(usable_gib, status, words, monkeyp
 
 @pytest.mark.parametrize(("sharding", "kept"), [("ddp", "4.0"), ("zero2", "3.4"), ("zero3", "1.4")])
 def test_ranks_keep_their_parts_of_a_policy(sharding, kept, monkeypatch):
-    """Of 3.5 GiB a quarter each, 0.5 of a batch whole; zero2 holds all of the 2 GiB of weights, too."""
+    """A quarter each of 3.5 GiB, and a batch of 0.5; zero2 holds all of the 2 GiB of weights, too."""
     memory = PolicyMemory(*(int(engine_sizes.GIB * size) for size in (2, 0.5, 0, 0, 0.5, 0)))
     monkeypatch.setattr(loading, "rehearsed", lambda config, task: memory)
     monkeypatch.setattr(doctor, "_device_memory", lambda *_: (engine_sizes.GIB * 12.0, 1, "a GPU"))

@@ -7,6 +7,7 @@ Each test begins where nobody has heard of them: who forgets to import the packa
 from __future__ import annotations
 
 import importlib
+import re
 import shutil
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from lerobot.configs.policies import PreTrainedConfig
@@ -32,8 +34,11 @@ from accerl_lerobot.policies.config import PLUGINS, POLICIES, PolicyConfig
 from accerl_lerobot.policies.flow import FlowFamily
 from accerl_lerobot.policies.loading import load_adapter, rehearsed_config
 from accerl_lerobot.testing import check_policy
+from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.trainer.update import make_update
 from tests.policies.checkpoints import write_policy
 from tests.runs import pip_installed, tiny_run, trained
+from tests.trainer.test_chunk_critic import episode
 
 SOURCE = Path(__file__).parent / "packages" / "lerobot_policy_mlp_flow"
 PACKAGE, POLICY, ALGORITHM = SOURCE.name, "mlp_flow", "cispo"
@@ -176,6 +181,26 @@ def test_help_knows_types_of_a_package_that_is_named(capsys: pytest.CaptureFixtu
     assert "cispo" not in capsys.readouterr().out
     assert cli.main(["train", NAMED[0], "--help=algorithm"]) == 0
     assert "algorithm.type=cispo: Settings of CISPO." in capsys.readouterr().out
+
+
+def test_the_off_policy_algorithm_of_the_page(tmp_path: Path, monkeypatch: Any, tiny_checkpoint: Path):
+    page = (Path(__file__).parents[1] / "docs" / "extending.md").read_text()
+    (code,) = (b for b in re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL) if "RWRUpdate" in b)
+    (tmp_path / "rwr.py").write_text(code)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    try:
+        flags = ["--algorithm.discover_packages_path=rwr", "--algorithm.type=rwr"]
+        algorithm = parse(RunConfig, ["--config_path=few_shot", *flags]).algorithm
+        adapter = load_adapter(PolicyConfig(path=str(tiny_checkpoint), device="cpu"))
+        update: Any = make_update(adapter, algorithm, TrainerConfig(warmup_updates=0, value_warmup_updates=0))
+        metrics = update.step([episode([0.0, 1.0]), episode([0.0])])
+        assert len(update.imitable()) == 3 and metrics["imitation_loss"] > 0
+        (loss,) = update.losses(np.arange(3), None, torch.tensor([1.0, 2.0, 3.0])).values()
+        weights = np.exp(np.array([algorithm.gamma, 1.0, 0.0]) / 0.25)
+        assert float(loss) == pytest.approx(weights @ [1, 2, 3] / weights.sum())
+    finally:
+        AlgorithmConfig.get_known_choices().pop("rwr", None)
+        sys.modules.pop("rwr", None)
 
 
 def test_it_trains_with_its_own_algorithm(checkpoint: Path):

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import logging
-import math
 import os
 import re
 import shlex
@@ -33,9 +32,7 @@ from accerl_lerobot.policies.config import discovery, register_policies
 logger = logging.getLogger(__name__)
 
 TRUST = "--trust_remote_code="
-HELD_OUT = re.compile(r"\bstep (\d+): eval_loss=(\S+)")  # LeRobot's report of a loss on held-out episodes
 PROGRESS = re.compile(r"\bstep:(\d+\.?\d*)([KM]?) .*\bloss:(nan|inf|\d+\.?\d*)\b")
-CANDIDATES = 10  # checkpoints of which the best on held-out episodes is used
 REFUSED = "accerl refuses: "
 """Begins the last line of a trainer that met something it must not use; JSON follows."""
 LOG_EVERY, WARMUP_STEPS = 25, 20
@@ -55,9 +52,6 @@ class SFTConfig(Section, section="sft"):
     """Peak learning rate; LeRobot's preset warms up and decays it over `steps`, if the policy type's does."""
     pick: Literal["all", "successes", "failures"] = "all"
     """Episodes that are imitated, by their ``next.success``; the others stay in the dataset."""
-    held_out: Annotated[float, Range("[0, 1)")] = 0.0
-    """Share of each task's episodes that is not trained on: the checkpoint, one of ten, that predicts these
-    actions best is used; 0: all are trained on, and the last checkpoint is used."""
     num_threads: Threads = 2
     """CPU threads of the trainer."""
     init_path: str | None = None
@@ -115,17 +109,13 @@ def sft_command(
     named = {"repo_id": dataset.repo_id, "root": root, "revision": dataset.revision}
     command += [f"--dataset.{key}={value}" for key, value in named.items() if value]
     command += [f"--dataset.episodes={json.dumps(episodes)}"] if episodes is not None else []
-    every = config.steps
-    if config.held_out:
-        every = math.ceil(config.steps / CANDIDATES)
-        command += [f"--dataset.eval_split={config.held_out}", f"--eval_steps={every}"]
     command += [
         f"--output_dir={output_dir}",
         f"--steps={config.steps}",
         f"--batch_size={config.batch_size}",
         "--num_workers=0",  # best where the dataset fits into memory, see `guarded_train`
         f"--seed={seed}",
-        f"--save_freq={every}",
+        f"--save_freq={config.steps}",
         f"--log_freq={LOG_EVERY}",
         "--env_eval_freq=0",
         "--wandb.enable=false",
@@ -197,9 +187,7 @@ def run_sft(
             raise InputError(*json.loads(last.removeprefix(REFUSED)))
         tail = "".join(log.read_text().splitlines(keepends=True)[-15:])
         raise RuntimeError(f"lerobot-train ended with exit code {code}; the end of {log}:\n{tail}")
-    checkpoints = output_dir / CHECKPOINTS
-    chosen = _best(log.read_text(), checkpoints) if config.held_out else checkpoints / LAST
-    return chosen / PRETRAINED
+    return output_dir / CHECKPOINTS / LAST / PRETRAINED
 
 
 def picked(dataset: DatasetConfig, pick: str) -> list[int] | None:
@@ -222,18 +210,6 @@ def picked(dataset: DatasetConfig, pick: str) -> list[int] | None:
     if not wanted:
         raise InputError("sft.pick", pick, f"none of the dataset's {meta.total_episodes} episodes; use all")
     return wanted
-
-
-def _best(log: str, checkpoints: Path) -> Path:
-    """The checkpoint with the lowest loss on held-out episodes; the last one, if none has a finite loss."""
-    losses = {int(step): float(loss) for step, loss in HELD_OUT.findall(log)}
-    saved = {int(path.name): path for path in checkpoints.iterdir() if path.name.isdecimal()}
-    found = {step: losses[step] for step in saved if math.isfinite(losses.get(step, math.nan))}
-    if not found:
-        return checkpoints / LAST
-    best = min(found, key=found.__getitem__)
-    logger.info("loss on held-out episodes: %s; step %d is used", losses, best)
-    return saved[best]
 
 
 def _with_backbone_in_place(config: SFTConfig, copy: Path) -> SFTConfig:
