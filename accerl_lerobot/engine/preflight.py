@@ -162,23 +162,35 @@ def check_training_data(
     offered = None if spec is None else env_features(spec)
     about = "dataset.repo_id", dataset.repo_id
     data = None if meta is None else replace(dataset_features(meta), any_size=resizes(policy))
+    source = data or offered  # without a dataset, demonstrations of the environment
     if sft.init_path is not None:
-        given = [arg.partition("=")[2] for arg in sft.extra_args if arg.startswith("--rename_map=")]
-        renames = yaml.safe_load(given[-1]) if given else {}
-        needs = policy_features(policy) if data is None else fine_tuned_features(policy, data, renames)
+        renames = _dataset_renames(sft)
+        needs = policy_features(policy) if source is None else fine_tuned_features(policy, source, renames)
         if offered is not None:
             check_features(needs, offered, rename_map, "sft.init_path", sft.init_path)
         if data is not None:
             check_features(needs, data, renames, "sft.init_path", sft.init_path, "dataset")
-        if data is not None:  # cameras may have names of their own in it
+            # Its cameras may have names of their own.
             vectors = {k: shape for k, shape in data.shapes.items() if k in (STATE, ACTION)}
             data = replace(data, shapes=vectors)
     if offered is not None and data is not None:
         check_features(data, offered, rename_map if sft.init_path is None else {}, *about)
-    source = data or offered
     if sft.init_path is None and source is not None:
         _check_new_policy(policy, source, sft)
     return meta
+
+
+def _dataset_renames(sft: SFTConfig) -> dict[str, str]:
+    """``lerobot-train``'s ``--rename_map``: the dataset's names → the policy's."""
+    given = [arg.partition("=")[2] for arg in sft.extra_args if arg.startswith("--rename_map=")]
+    try:
+        found = yaml.safe_load(given[-1]) if given else {}
+    except yaml.YAMLError:
+        found = None
+    if not isinstance(found, dict):
+        remedy = "--rename_map is a mapping from the dataset's names to the policy's"
+        raise InputError("sft.extra_args", given[-1], remedy)
+    return found
 
 
 def _check_new_policy(policy: Any, source: Features, sft: SFTConfig) -> None:

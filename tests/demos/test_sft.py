@@ -8,6 +8,7 @@ import os
 import shutil
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,14 @@ from accerl_lerobot.demos import guarded_train, sft
 from accerl_lerobot.demos.backbone import BackboneConfig
 from accerl_lerobot.demos.record import DemosConfig, record_demos
 from accerl_lerobot.demos.sft import SFTConfig, picked, run_sft, sft_command
-from accerl_lerobot.envs import SimulatedConfig
+from accerl_lerobot.engine.config import RunConfig
+from accerl_lerobot.engine.preflight import check_start
+from accerl_lerobot.envs import MetaWorldConfig, SimulatedConfig
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.policies.features import policy_features
+from accerl_lerobot.policies.loading import rehearsed_config
+from tests.policies.checkpoints import edit_config, write_smolvla
 from tests.policies.tiny import adapter_at
 from tests.rounding import assert_close
 
@@ -93,6 +100,36 @@ def test_cached_float_images_take_one_byte_per_value_and_come_back_exactly():
         assert equal(cached[0], items[0])
     kept = cached._items[0]
     assert kept["image"].values.dtype == torch.uint8 and kept["depth"] is depth
+
+
+@pytest.mark.slow
+def test_what_lerobot_fine_tunes_from_another_robot_s_policy_is_taken_for_what_it_is(tmp_path: Path):
+    """Three cameras, six joints and six actions before, one, four and four afterwards."""
+    start = write_smolvla(
+        tmp_path / "base",
+        camera="observation.images.camera1",
+        state_dim=6,
+        action_dim=6,
+        padded_dim=8,
+        max_state_dim=8,
+    )
+    inputs = json.loads((start / "config.json").read_text())["input_features"]
+    inputs |= {f"observation.images.camera{i}": inputs["observation.images.camera1"] for i in (2, 3)}
+    edit_config(start, input_features=inputs)
+    rename = json.dumps({CAMERA: "observation.images.camera1"})
+    config = SFTConfig(steps=1, batch_size=4, init_path=str(start), extra_args=[f"--rename_map={rename}"])
+    world = MetaWorldConfig(task="drawer-open-v3", image_size=64)
+    policy = PolicyConfig(path=None, device="cpu", rename_map=json.loads(rename))
+    run = RunConfig(env=world, sft=config, dataset=LOCAL, policy=policy)
+    check_start(run)
+    tuned = replace(policy, path=str(run_sft(config, LOCAL, tmp_path / "sft", seed=0)))
+    assert len(json.loads((Path(tuned.path) / "config.json").read_text())["input_features"]) == 4
+    needed = policy_features(rehearsed_config(tuned)).shapes
+    assert {name: len(shape) for name, shape in needed.items()} == {
+        "observation.images.camera1": 3, "observation.state": 1, "action": 1,
+    }  # fmt: skip
+    assert needed["observation.state"] == needed["action"] == (4,)
+    check_start(replace(run, policy=tuned, sft=SFTConfig()))
 
 
 class TestPick:
