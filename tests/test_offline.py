@@ -7,8 +7,9 @@ import json
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
-from lerobot.datasets.dataset_tools import delete_episodes, remove_feature
+from lerobot.datasets.dataset_tools import add_features, delete_episodes, remove_feature
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from accerl_lerobot.cli import main
@@ -94,3 +95,20 @@ def test_episodes_without_labels_are_refused(tiny_checkpoint, recorded, tmp_path
     delete_episodes(data, won, output_dir=tmp_path / "lost", repo_id="me/robot")
     assert main(arguments(tiny_checkpoint, tmp_path / "lost", tmp_path / "out")) == 2
     assert "none of its episodes is a success" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("algorithm", "code"), [("awr", 0), ("self_imitation", 2)])
+def test_graded_rewards_without_a_success_are_enough_for_awr(
+    algorithm, code, tiny_checkpoint, recorded, tmp_path, capsys
+):
+    data = LeRobotDataset("me/robot", root=recorded)
+    bare = remove_feature(
+        data, ["next.success", "next.reward"], output_dir=tmp_path / "bare", repo_id="me/robot"
+    )
+    costs = np.array([[-float(i)] for i in bare.hf_dataset.with_format("numpy")["episode_index"]], np.float32)
+    feature = {"dtype": "float32", "shape": (1,), "names": None}
+    add_features(bare, {"next.reward": (costs, feature)}, output_dir=tmp_path / "graded", repo_id="me/robot")
+    run = arguments(tiny_checkpoint, tmp_path / "graded", tmp_path / "out")
+    assert main([*run, f"--algorithm.type={algorithm}"]) == code
+    out, err = capsys.readouterr()
+    assert json.loads(out)["successes"] == 0 if code == 0 else "none of its episodes is a success" in err

@@ -123,6 +123,9 @@ def test_a_policy_that_pads_takes_the_states_and_cameras_that_it_is_fine_tuned_o
     assert fine_tuned_features(base, OFFERED, top).shapes.keys() == {top[FRONT], STATE, "action"}
     for other in ({FRONT: "observation.images.side"}, {FRONT: STATE}):  # LeRobot would refuse the dataset
         assert fine_tuned_features(base, OFFERED, other).shapes == shapes
+    two = with_shape(OFFERED, "observation.images.wrist", (3, 32, 32))
+    assert fine_tuned_features(base, two, {}).shapes == shapes  # neither has all of the other's cameras
+    assert fine_tuned_features(base, two, {FRONT: FRONT}).shapes == OFFERED.shapes
     del base.empty_cameras
     assert fine_tuned_features(base, OFFERED, {}).shapes == shapes
 

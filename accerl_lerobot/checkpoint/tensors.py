@@ -55,7 +55,8 @@ def part_of(tensor: Tensor, like: Tensor) -> Tensor:
 def place(tensor: Tensor) -> tuple[object, ...]:
     """Equal for tensors that are the same memory, seen in the same way."""
     mine = tensor.to_local() if in_parts(tensor) else tensor
-    return mine.untyped_storage().data_ptr(), mine.storage_offset(), tensor.shape, tensor.stride()
+    # Not its address, which is 0 for every part without a row: ranks would ask for different tensors.
+    return mine.untyped_storage()._cdata, mine.storage_offset(), tensor.shape, tensor.stride()
 
 
 def optimizer_state(optimizer: torch.optim.Optimizer) -> dict[int, dict[str, torch.Tensor]]:
@@ -81,4 +82,4 @@ def restore_optimizer(optimizer: torch.optim.Optimizer, state: dict[int, dict[st
 
 
 def copied(module: torch.nn.Module) -> dict[str, torch.Tensor]:
-    return {name: tensor.detach().clone() for name, tensor in module.state_dict().items()}
+    return {name: tensor.detach().to("cpu", copy=True) for name, tensor in module.state_dict().items()}

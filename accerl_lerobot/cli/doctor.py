@@ -208,7 +208,7 @@ def policy_fits(config: RunConfig) -> Iterator[Check]:
     memory = PolicyMemory(*rehearsed(config.policy, measure))
     batch = math.ceil(trainer.batch_decisions / trainer.ranks) if ratio else POLICY_BATCH
     decisions = min(batch, trainer.micro_batch)
-    kept: float = memory.trainer(0, sizes.trained_copies(config)) - memory.learning_batch
+    kept: float = memory.weights + sizes.trained_copies(config) * memory.trained
     if trainer.zero:  # zero2 holds all weights from the forward pass to the end of the backward pass
         kept = kept / trainer.ranks + (memory.weights if trainer.sharding == "zero2" else 0)
     kept += memory.learning_batch

@@ -115,20 +115,21 @@ def _remember(
     size = sum(math.prod(shape) * (1 if len(shape) == 3 else 4) for shape in wanted.values())
     most = max(1, min(algorithm.memory, BYTES // size))
     outcomes: dict[int, bool] = {}
+    totals: dict[int, float] = {}
     with console.stage("reading the dataset", total=meta.total_frames) as stage:
         frames = 0
         for segment in recorded(config.dataset, meta, wanted, chunk, most, most):
             update.remember(segment)
             outcomes[segment.origin.seed] = segment.success
+            totals.setdefault(segment.origin.seed, float(segment.reward.sum()))
             frames += int(segment.steps.sum())
             stage.update(min(frames, meta.total_frames))
     if len(outcomes) < meta.total_episodes:
         left = f"{len(outcomes)} of {meta.total_episodes} episodes fit into {most} decisions"
         logger.warning("%s, the others are left out", left)
     counts = {"episodes": len(outcomes), "successes": sum(outcomes.values()), "decisions": len(update.memory)}
-    rewarded = counts["successes"] or np.ptp(update.memory["return"])  # graded, perhaps, without a success
-    if not (len(update.imitable()) and rewarded):
-        remedy = "none of its episodes is a success; there is nothing to imitate"
+    if not len(update.imitable()) or (not counts["successes"] and len(set(totals.values())) < 2):
+        remedy = "none of its episodes is a success, or better than another; there is nothing to imitate"
         raise InputError("dataset.repo_id", config.dataset.repo_id, remedy)
     console.say(f"{counts['episodes']} episodes, {counts['successes']} of them successes; "
                 f"{counts['decisions']} decisions")  # fmt: skip

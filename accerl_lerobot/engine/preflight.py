@@ -73,6 +73,15 @@ def check_policy(config: RunConfig, spec: WorldSpec, *, own: bool = False) -> in
     return int(policy.n_obs_steps)
 
 
+def check_device(config: RunConfig) -> None:
+    """Refuse a device that is not there, or that is not there for Ray's workers."""
+    from accerl_lerobot.policies.loading import resolve_device
+
+    if resolve_device(config.policy.device).index and config.launch.engine == "ray":
+        remedy = "Ray shows each worker its own GPU only; use cuda, and CUDA_VISIBLE_DEVICES to choose"
+        raise InputError("policy.device", config.policy.device, remedy)
+
+
 def check_loss(algorithm: RatioConfig) -> None:
     """Refuse an objective, which may be somebody's own, that gives no gradient on a small batch."""
     import torch
@@ -94,17 +103,13 @@ def check_start(config: RunConfig, say: Callable[[str], object] = str) -> tuple[
     """Refuse a run that could not begin, or whose outcome could not be used, as far as can be told; returns
     what the environment offers, and the policy's ``n_obs_steps``."""
     from accerl_lerobot.demos.dataset_files import open_metadata
-    from accerl_lerobot.policies.loading import resolve_device
 
     if config.output_dir is not None and not config.resume:
         check_absent(expanded(config.output_dir, "output_dir"))
     if config.policy.path is None and not config.sft.steps:
         remedy = "give a LeRobot checkpoint, or sft.steps > 0 to make one; the recipe quickstart does"
         raise InputError("policy.path", None, remedy)
-    device = resolve_device(config.policy.device)  # refuses one that is not there
-    if device.index and config.launch.engine == "ray":
-        remedy = "Ray shows each worker its own GPU only; use cuda, and CUDA_VISIBLE_DEVICES to choose"
-        raise InputError("policy.device", config.policy.device, remedy)
+    check_device(config)
     if isinstance(config.algorithm, RatioConfig):
         check_loss(config.algorithm)
     if 0 < config.trainer.updates <= config.trainer.value_warmup_updates:
@@ -132,7 +137,8 @@ def check_start(config: RunConfig, say: Callable[[str], object] = str) -> tuple[
         remembered = off_policy and config.dataset.repo_id is not None
         meta = open_metadata(config.dataset) if remembered else None
     else:
-        meta = check_training_data(config.sft, config.dataset, policy, spec, renames)
+        trained = policy if config.sft.init_path is None else sft_policy(config.sft)
+        meta = check_training_data(config.sft, config.dataset, trained, spec, renames)
     history = int(policy.n_obs_steps)
     if off_policy and meta is not None:  # one that cannot be remembered is left out
         _say_if_unlike(config, spec, meta, history)
@@ -169,12 +175,17 @@ def check_training_data(
         if offered is not None:
             check_features(needs, offered, rename_map, "sft.init_path", sft.init_path)
         if data is not None:
-            check_features(needs, data, renames, "sft.init_path", sft.init_path, "dataset")
+            known = {name: new for name, new in renames.items() if name in data.shapes}
+            check_features(needs, data, known, "sft.init_path", sft.init_path, "dataset")
             # Its cameras may have names of their own.
             vectors = {k: shape for k, shape in data.shapes.items() if k in (STATE, ACTION)}
             data = replace(data, shapes=vectors)
     if offered is not None and data is not None:
         check_features(data, offered, rename_map if sft.init_path is None else {}, *about)
+    for name, most in ((STATE, "max_state_dim"), (ACTION, "max_action_dim")):
+        limit, size = getattr(policy, most, None), 0 if source is None else source.shapes.get(name, (0,))[0]
+        if limit is not None and limit < size:
+            raise InputError(f"sft.policy.{most}", limit, f"{name} has {size} numbers; use at least that")
     if sft.init_path is None and source is not None:
         _check_new_policy(policy, source, sft)
     return meta
@@ -182,7 +193,8 @@ def check_training_data(
 
 def _dataset_renames(sft: SFTConfig) -> dict[str, str]:
     """``lerobot-train``'s ``--rename_map``: the dataset's names → the policy's."""
-    given = [arg.partition("=")[2] for arg in sft.extra_args if arg.startswith("--rename_map=")]
+    flags = " ".join(sft.extra_args).split("--rename_map")[1:]
+    given = [flag[1:].partition(" --")[0] for flag in flags]
     try:
         found = yaml.safe_load(given[-1]) if given else {}
     except yaml.YAMLError:
@@ -194,14 +206,9 @@ def _dataset_renames(sft: SFTConfig) -> dict[str, str]:
 
 
 def _check_new_policy(policy: Any, source: Features, sft: SFTConfig) -> None:
-    """Have LeRobot check the features that it will give a new policy, and compare what it does not: the sizes
-    to which SmolVLA and π0 pad states and actions."""
+    """Have LeRobot check the features that it will give a new policy."""
     from lerobot.configs.types import FeatureType, PolicyFeature
 
-    for name, most in ((STATE, "max_state_dim"), (ACTION, "max_action_dim")):
-        limit, shape = getattr(policy, most, None), source.shapes.get(name, (0,))
-        if limit is not None and limit < shape[0]:
-            raise InputError(f"sft.policy.{most}", limit, f"{name} has {shape[0]} numbers; use at least that")
     kinds = {STATE: FeatureType.STATE, ENV_STATE: FeatureType.ENV, ACTION: FeatureType.ACTION}
     features = {
         name: PolicyFeature(type=kinds.get(name, FeatureType.VISUAL), shape=shape)

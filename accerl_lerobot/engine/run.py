@@ -39,7 +39,7 @@ from accerl_lerobot.engine import ray_session, resuming
 from accerl_lerobot.engine.config import RunConfig, encode, parse
 from accerl_lerobot.engine.loop import Engine, Loop, Times, run_plans
 from accerl_lerobot.engine.placement import check_placement
-from accerl_lerobot.engine.preflight import check_policy, check_start, check_world
+from accerl_lerobot.engine.preflight import check_device, check_policy, check_start, check_world
 from accerl_lerobot.engine.sizes import check_memory
 from accerl_lerobot.engine.stopping import StoppedError, Stopping, WorkerError
 from accerl_lerobot.errors import InputError, check_absent, expanded, is_full, kept_traceback, make_folder
@@ -122,6 +122,7 @@ def play_evaluation(config: RunConfig, console: Console, filmed: int = 0) -> lis
     from accerl_lerobot.policies.loading import pinned
 
     with ray_session.opened(config.launch, now=True) as session:
+        check_device(config)
         check_memory(config)
         spec = check_world(config.env, config.rollout.reward_model)
         config = replace(config, policy=pinned(config.policy))

@@ -82,13 +82,10 @@ class GymWorld(EpisodeWorld):
 
         self.config = config
         self._pictures: dict[str, np.ndarray] = {}  # images of the last observation, by camera
-        # Without Gymnasium's time limit: ours counts.
-        kwargs: dict[str, Any] = {"max_episode_steps": -1, "disable_env_checker": True}
-        if RENDER in config.images.values():
-            kwargs["render_mode"] = "rgb_array"
+        kwargs = {"render_mode": "rgb_array"} if RENDER in config.images.values() else {}
         self._tells = not config.success
         try:
-            self._env: Any = gymnasium.make(config.id, **(kwargs | config.kwargs))
+            self._env = unlimited(gymnasium.make(config.id, **(kwargs | config.kwargs)))
         except (gymnasium.error.Error, TypeError, ValueError) as error:
             remedy = f"gymnasium.make refuses it ({error}); is env.discover_packages_path the package of it?"
             raise InputError("env.id", config.id, remedy) from error
@@ -111,7 +108,7 @@ class GymWorld(EpisodeWorld):
 
     def _begin(self, seed: int, task: str) -> None:
         if self._steps and not self._tells:
-            _warn_of_missing(self.config.success, ", ".join(self._info) or "nothing")
+            _warn_of_missing(self.config.success)
         self._raw, _ = self._env.reset(seed=seed)
 
     def render(self, height: int, width: int) -> np.ndarray:
@@ -126,7 +123,7 @@ class GymWorld(EpisodeWorld):
 
     def _step(self, action: np.ndarray) -> Step:
         self._raw, reward, ended, cut, info = self._env.step(action)
-        self._info, self._tells = info, self._tells or self.config.success in info
+        self._tells = self._tells or self.config.success in info
         finite = math.isfinite(reward) and finite_numbers(self._raw)
         success = bool(info.get(self.config.success, False)) if self.config.success else bool(ended)
         return Step(
@@ -165,11 +162,21 @@ class GymWorld(EpisodeWorld):
 
 
 @functools.cache  # once in a process
-def _warn_of_missing(key: str, given: str) -> None:
+def _warn_of_missing(key: str) -> None:
     logger.warning(
-        "env.success=%r: an episode has ended, and the environment's info never had this key, which counts "
-        "as a failure; it has %s", key, given,
-    )  # fmt: skip
+        "env.success=%r: the environment's info had no such key in an episode, which counts as a failure", key
+    )
+
+
+def unlimited(env: Any) -> Any:
+    """An environment with its wrappers, but without Gymnasium's time limit: ours counts, and it truncates."""
+    import gymnasium
+
+    if isinstance(env, gymnasium.wrappers.TimeLimit):
+        return unlimited(env.env)
+    if isinstance(env, gymnasium.Wrapper):
+        env.env = unlimited(env.env)
+    return env
 
 
 def resized(frame: np.ndarray, height: int, width: int) -> np.ndarray:

@@ -20,7 +20,7 @@ import numpy as np
 
 from accerl_lerobot.config.ranges import Range
 from accerl_lerobot.envs.base import EnvConfig, EpisodeWorld, Step, WorldSpec
-from accerl_lerobot.envs.gym_env import finite_numbers, resized
+from accerl_lerobot.envs.gym_env import finite_numbers, resized, unlimited
 from accerl_lerobot.envs.metaworld import close_at_exit, import_mujoco
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK, Observation
@@ -181,17 +181,8 @@ def _single_envs(vectors: dict[str, dict[int, Any]]) -> dict[str, Any]:
     """Names each single environment ``suite`` or, where there are several, ``suite/number``."""
     flat = [(suite, number, vector) for suite, tasks in vectors.items() for number, vector in tasks.items()]
     if len(flat) == 1:
-        return {flat[0][0]: _unlimited(flat[0][2].envs[0])}
-    return {f"{suite}/{number}": _unlimited(vector.envs[0]) for suite, number, vector in flat}
-
-
-def _unlimited(env: Any) -> Any:
-    """Without Gymnasium's time limit, as ours counts, but with the environment's own wrappers."""
-    from gymnasium.wrappers import OrderEnforcing, TimeLimit
-
-    while isinstance(env, (OrderEnforcing, TimeLimit)):
-        env = env.env
-    return env
+        return {flat[0][0]: unlimited(flat[0][2].envs[0])}
+    return {f"{suite}/{number}": unlimited(vector.envs[0]) for suite, number, vector in flat}
 
 
 def _batched(raw: Any) -> Any:

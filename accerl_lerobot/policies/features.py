@@ -58,13 +58,15 @@ def pads(policy: Any) -> bool:
 def fine_tuned_features(policy: Any, dataset: Features, renames: dict[str, str]) -> Features:
     """Features that a policy needs once it is fine-tuned on a dataset; `renames` is dataset name → its name.
 
-    One that pads takes the dataset's states and actions, and of its cameras those that are there.
+    One that pads takes the dataset's states and actions, and of its cameras those that are there; without
+    `renames` LeRobot wants one's cameras to be among the other's.
     """
     needed = policy_features(policy)
     there = {renames.get(name, name): shape for name, shape in dataset.shapes.items()}
-    common = {name: there[name] for name in needed.shapes if name in there}
-    sees = any(len(shape) == 3 for shape in common.values())
-    return replace(needed, shapes=common) if pads(policy) and sees else needed
+    mine, theirs = ({k for k, s in shapes.items() if len(s) == 3} for shapes in (needed.shapes, there))
+    if not pads(policy) or not mine & theirs or not (renames or mine <= theirs or theirs <= mine):
+        return needed
+    return replace(needed, shapes={name: there[name] for name in needed.shapes if name in there})
 
 
 def dataset_features(meta: Any) -> Features:

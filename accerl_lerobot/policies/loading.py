@@ -197,12 +197,11 @@ def _built(lerobot_config: Any) -> Any:
     LeRobot builds SmolVLA's backbone and expert in the backbone's bfloat16, in which small steps of a
     gradient are lost.
     """
-    asked = getattr(lerobot_config, "load_vlm_weights", None)
-    if asked is not None:
+    if asked := getattr(lerobot_config, "load_vlm_weights", False):
         lerobot_config.load_vlm_weights = False
     policy = get_policy_class(lerobot_config.type)(lerobot_config).float()
-    if asked is not None:
-        policy.config.load_vlm_weights = asked
+    if asked:
+        policy.config.load_vlm_weights = True
     return policy
 
 

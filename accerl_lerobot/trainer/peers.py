@@ -116,7 +116,7 @@ class TrainerRank:
 
         with lending():
             self._adapter.copy_weights()
-            self._adapter.export_trainable()
+            self.lend_weights()
             self._update.state()
 
 

@@ -130,7 +130,7 @@ def test_a_policy_that_reads_the_simulators_state(damaged: Any):
     ],
 )  # fmt: skip
 def test_options_under_which_its_density_would_be_another(
-    damaged: Any, monkeypatch: pytest.MonkeyPatch, name: str, changes: dict, options: dict, sentence: str
+    damaged: Any, name: str, changes: dict, options: dict, sentence: str
 ):
     path = damaged(name)
     edit_config(path, **changes)
