@@ -41,6 +41,11 @@ def whole(tensor: Tensor) -> Tensor:
     return torch.empty(0) if _lends else full.cpu()
 
 
+def copy_of(tensor: Tensor) -> Tensor:
+    """A copy of all of it on the CPU; see `whole`."""
+    return whole(tensor.detach()).to("cpu", copy=True)
+
+
 def part_of(tensor: Tensor, like: Tensor) -> Tensor:
     """A whole tensor as `like` is: on its device, and the same part of it."""
     tensor = tensor.to(like.device)
@@ -63,9 +68,7 @@ def optimizer_state(optimizer: torch.optim.Optimizer) -> dict[int, dict[str, tor
     """A copy on the CPU of what it knows of each parameter, in order; rates are not its own."""
     known: dict[int, dict[str, Any]] = optimizer.state_dict()["state"]
     return {
-        place: {
-            name: whole(torch.as_tensor(value).detach()).to("cpu", copy=True) for name, value in of.items()
-        }
+        place: {name: copy_of(torch.as_tensor(value)) for name, value in of.items()}
         for place, of in known.items()
     }
 
@@ -82,4 +85,4 @@ def restore_optimizer(optimizer: torch.optim.Optimizer, state: dict[int, dict[st
 
 
 def copied(module: torch.nn.Module) -> dict[str, torch.Tensor]:
-    return {name: tensor.detach().to("cpu", copy=True) for name, tensor in module.state_dict().items()}
+    return {name: copy_of(tensor) for name, tensor in module.state_dict().items()}

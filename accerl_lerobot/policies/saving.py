@@ -21,7 +21,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from accerl_lerobot.checkpoint.layout import BACKBONE, FAST, relocate
-from accerl_lerobot.checkpoint.tensors import place, whole
+from accerl_lerobot.checkpoint.tensors import copy_of, place
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import PolicyConfig, SamplerConfig, TuningConfig
 from accerl_lerobot.policies.family import Model
@@ -139,5 +139,5 @@ def _copied(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     """Copies on the CPU; what shared its memory shares it again, so that it is written once."""
     places = {name: place(t) for name, t in tensors.items()}
     kept = {places[name]: t for name, t in tensors.items()}
-    copies = {at: whole(t.detach()).to("cpu", copy=True).contiguous() for at, t in kept.items()}
+    copies = {at: copy_of(t).contiguous() for at, t in kept.items()}
     return {name: copies[at] for name, at in places.items()}

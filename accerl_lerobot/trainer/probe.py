@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from accerl_lerobot.checkpoint.tensors import part_of, whole
+from accerl_lerobot.checkpoint.tensors import copy_of, part_of
 from accerl_lerobot.policies.adapter import PolicyAdapter
 from accerl_lerobot.trainer.batch import Batch
 from accerl_lerobot.trainer.config import TrainerConfig
@@ -39,7 +39,7 @@ class Probe:
         self.renew(0)
 
     def state(self) -> dict[str, Any]:
-        weights = [whole(tensor.detach()).to("cpu", copy=True) for tensor in self._copy]
+        weights = [copy_of(tensor) for tensor in self._copy]
         return {"version": self._version, "next": self._next, "weights": weights}
 
     def restore(self, state: dict[str, Any]) -> None:
