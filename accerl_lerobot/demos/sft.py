@@ -32,7 +32,7 @@ from accerl_lerobot.policies.config import discovery, register_policies
 logger = logging.getLogger(__name__)
 
 TRUST = "--trust_remote_code="
-PROGRESS = re.compile(r"\bstep:(\d+\.?\d*)([KM]?) .*\bloss:(nan|inf|\d+\.?\d*)\b")
+PROGRESS = re.compile(r"(?:\| (\d+)/\d+ \[.*)?\bstep:(\d+\.?\d*)([KM]?) .*\bloss:(nan|inf|\d+\.?\d*)\b")
 REFUSED = "accerl refuses: "
 """Begins the last line of a trainer that met something it must not use; JSON follows."""
 LOG_EVERY, WARMUP_STEPS = 25, 20
@@ -136,7 +136,7 @@ def run_sft(
     """Trains and returns the ``pretrained_model`` folder; the parent of `output_dir` gets ``sft.log``.
 
     A new backbone's tokeniser learns `texts`, the dataset's instructions. `on_step` receives step and loss as
-    progress is reported, from 1000 on rounded to thousands.
+    progress is reported.
 
     Raises:
         InputError: `output_dir` exists; the checkpoint to start from, or the dataset, is not to be trusted.
@@ -236,8 +236,12 @@ def policy_fields(kind: str, field: str) -> set[str]:
 
 
 def _parse_progress(line: str) -> tuple[int, float] | None:
-    """LeRobot logs lines such as ``step:50 smpl:3K ep:40 epch:1.2 loss:0.512 grdn:… lr:…``."""
+    """LeRobot logs lines such as ``Training: 4%| | 1200/30000 [01:02<…]INFO … step:1K smpl:77K … loss:0.512 …``.
+
+    Where it draws no bar (under Slurm), steps are rounded to thousands.
+    """
     if (found := PROGRESS.search(line)) is None:
         return None
-    scale = {"": 1, "K": 1_000, "M": 1_000_000}[found[2]]
-    return int(float(found[1]) * scale), float(found[3])
+    exact, step, suffix, loss = found.groups()
+    scale = {"": 1, "K": 1_000, "M": 1_000_000}[suffix]
+    return int(exact) if exact else int(float(step) * scale), float(loss)
