@@ -92,9 +92,11 @@ def test_wandb_only_when_enabled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     log = MetricsLog(tmp_path, WandBConfig(enable=True, project="p"), {"seed": 1})
     log.write("train", 4, {"loss": 1.0, "nan": float("nan"), "name": "x"})
     log.close()
-    started, logged, finished = calls
+    MetricsLog(tmp_path, WandBConfig(enable=True, project="p"), {"seed": 1}).close()
+    started, logged, finished, resumed, _ = calls
     assert started["project"] == "p" and started["config"] == {"seed": 1}
     assert logged == {"train/loss": 1.0, "update": 4} and finished == "finish"
+    assert resumed["id"] == started["id"] and resumed["resume"] == "allow", "one run, gone on with"
 
 
 def explained(section: str) -> set[str]:

@@ -14,10 +14,12 @@ from typing import Any
 import pytest
 
 from accerl_lerobot import cli
-from accerl_lerobot.algorithms import GIPOConfig, LossInputs, LossOutput, PPOConfig, RatioConfig
-from accerl_lerobot.engine.preflight import check_loss
+from accerl_lerobot.algorithms import AWRConfig, GIPOConfig, LossInputs, LossOutput, PPOConfig, RatioConfig
+from accerl_lerobot.demos.sft import SFTConfig
+from accerl_lerobot.engine.preflight import _dataset_renames, check_imitates, check_loss
 from accerl_lerobot.envs import SimulatedConfig, make_world
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.features import (
     Features,
     check_features,
@@ -257,6 +259,28 @@ def test_a_simulator_that_is_not_installed(
     for verb, more in (("train", [*sft, f"--output_dir={out}"]), ("demos", [f"--root={out}"])):
         assert refused(capsys, verb, *env, *more) == line
         assert not out.exists()
+
+
+def test_an_off_policy_algorithm_needs_a_policy_that_imitates_a_chunk():
+    act = SimpleNamespace(type="act", use_relative_actions=False)
+    check_imitates(AWRConfig(), PolicyConfig(path="x"), act)
+    act.use_relative_actions = True
+    with pytest.raises(InputError, match=r"^policy\.use_relative_actions=True: algorithm\.type=awr keeps"):
+        check_imitates(AWRConfig(), PolicyConfig(path="x"), act)
+    with pytest.raises(InputError, match=r"^policy\.sampler\.type='tokens': .*use flow or gaussian"):
+        check_imitates(AWRConfig(), PolicyConfig(path="x"), SimpleNamespace(type="pi0_fast"))
+
+
+def test_lerobot_s_own_map_of_names():
+    def renames(*flags: str) -> dict[str, str]:
+        policy = {"type": "act"}
+        return _dataset_renames(SFTConfig(steps=1, policy=policy, extra_args=[*flags]))
+
+    assert renames() == renames("--tolerance_s=1") == {}
+    assert renames('--rename_map={"a": "b"}', "--tolerance_s=1") == {"a": "b"}
+    for wrong in ("[1, 2]", "{", "x"):
+        with pytest.raises(InputError, match=r"^sft\.extra_args=.*is a mapping from the dataset's names"):
+            renames(f"--rename_map={wrong}")
 
 
 def detached(self: GIPOConfig, inputs: LossInputs) -> LossOutput:

@@ -17,9 +17,12 @@ from typing import Any
 import pytest
 import yaml
 
+from accerl_lerobot.algorithms import SelfImitationConfig
 from accerl_lerobot.cli import main
 from accerl_lerobot.console import Console
-from accerl_lerobot.engine import preflight
+from accerl_lerobot.demos import sft
+from accerl_lerobot.demos.record import DemosConfig
+from accerl_lerobot.engine import preflight, resuming
 from accerl_lerobot.engine import run as run_module
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig, decode, encode
 from accerl_lerobot.engine.local import LocalEngine
@@ -27,6 +30,8 @@ from accerl_lerobot.engine.resuming import resume_command
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import EvaluationConfig
+from accerl_lerobot.policies.config import GaussianSamplerConfig, PolicyConfig
+from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
 from tests.runs import tiny_run
@@ -111,6 +116,49 @@ def test_a_run_that_was_asked_to_stop_goes_on_as_if_it_had_not(
     assert summary(run) == summary(whole)
     assert files(run) == files(whole)
     assert (run / "before_after.mp4").is_file() and not list(run.glob(".before*"))
+
+
+def test_a_run_that_another_process_has_resumed_is_left_alone(whole: Path, capsys):
+    with resuming.locked(whole, "output_dir", "in use"):
+        assert go_on(whole, "--trainer.updates=99") == 2
+    assert "another process resumes it" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_run_that_fell_over_in_its_sft_keeps_its_demonstrations(tmp_path: Path, monkeypatch, capsys):
+    """And they begin the memory of an off-policy algorithm."""
+    run, trainer = tmp_path / "run", sft.run_sft
+    small = {"type": "act", "chunk_size": 4, "n_action_steps": 4, "dim_model": 8, "n_heads": 1}
+    small |= {"n_encoder_layers": 1, "n_vae_encoder_layers": 1, "dim_feedforward": 8, "latent_dim": 2}
+    sections: dict[str, Any] = {
+        "env": SimulatedConfig(max_steps=16, tolerance=0.4, environment_state=True),
+        "demos": DemosConfig(episodes=3),
+        "sft": sft.SFTConfig(steps=2, batch_size=2, policy=small | {"pretrained_backbone_weights": None}),
+        "policy": PolicyConfig(device="cpu", sampler=GaussianSamplerConfig(std=0.3)),
+        "algorithm": SelfImitationConfig(),
+        "replay": ReplayConfig(capacity=64, min_decisions=16, ahead=32, samples_per_insert=1),
+        "rollout": RolloutConfig(worlds=4, segment_length=4),
+        "trainer": TrainerConfig(updates=3, batch_decisions=16, warmup_updates=0, value_warmup_updates=0),
+        "evaluation": EvaluationConfig(episodes=2, videos=0),
+    }
+
+    def falls(*arguments: Any, **fields: Any) -> Path:
+        trainer(*arguments, **fields)
+        raise ArithmeticError("it fell over")
+
+    with monkeypatch.context() as context:
+        context.setattr(sft, "run_sft", falls)
+        assert main(["train", str(recipe(tmp_path, Path("x"), **sections)), f"--output_dir={run}"]) == 1
+    assert "to resume: accerl train --resume=true" in " ".join(capsys.readouterr().err.split())
+    made = (run / "demos" / "meta" / "info.json").stat().st_mtime_ns
+    assert go_on(run) == 0
+    assert "there is no checkpoint yet" in capsys.readouterr().err
+    assert (run / "demos" / "meta" / "info.json").stat().st_mtime_ns == made, "they were not recorded again"
+    begun = run / json.loads((run / "warm_start.json").read_text())["policy"]
+    assert (begun / "model.safetensors").is_file()
+    first, *_, last = [r for r in records(run) if r["kind"] == "train"]
+    assert first["memory_decisions"] > 16 + 3 * 4 and last["memory_decisions"] > first["memory_decisions"]
+    assert summary(run)["updates"] == 3
 
 
 def test_a_run_that_fell_over_goes_on_from_its_last_whole_checkpoint(

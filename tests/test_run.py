@@ -15,6 +15,7 @@ from accerl_lerobot.console import Console
 from accerl_lerobot.engine import resuming, run
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig
 from accerl_lerobot.engine.loop import Engine, Progress, Saved
+from accerl_lerobot.engine.preflight import check_start
 from accerl_lerobot.engine.stopping import WorkerError
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.evaluation import EvaluationConfig
@@ -131,6 +132,27 @@ def test_checkpoints_load_again(finished: Finished):
         weights.append(load_adapter(policy).export_trainable())
     assert weights[0].keys() == weights[1].keys()
     assert any((weights[0][k] != weights[1][k]).any() for k in weights[0])
+
+
+def test_checkpoints_by_time(tiny_checkpoint: Path, tmp_path: Path):
+    trainer = TrainerConfig(updates=3, batch_decisions=16, warmup_updates=0, value_warmup_updates=0)
+    evaluation = EvaluationConfig(episodes=2, before=False, videos=0)
+    fields: dict[str, Any] = {"trainer": trainer, "evaluation": evaluation, "save_every_updates": 0}
+    for seconds, versions in ((1e-9, {0, 1, 2, 3}), (1e9, {0, 3})):
+        config = local_run(tiny_checkpoint, tmp_path / str(seconds), **fields, save_every_s=seconds)
+        directory = run.make_output_dir(config)
+        run.execute(config, directory, Console())
+        found = (directory / "checkpoints").iterdir()
+        assert {int(path.name) for path in found if not path.is_symlink()} == versions
+
+
+def test_a_critic_s_warm_up_as_long_as_the_run_is_warned_about(
+    tiny_checkpoint: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
+    for updates, warned in ((3, False), (2, True)):
+        trainer = TrainerConfig(updates=updates, batch_decisions=16, value_warmup_updates=2)
+        check_start(local_run(tiny_checkpoint, tmp_path / "run", trainer=trainer))
+        assert ("the policy will not change" in caplog.text) is warned
 
 
 def test_without_a_name_the_folder_is_named_after_the_time(

@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from lerobot.datasets.dataset_tools import delete_episodes, remove_feature
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos import guarded_train, sft
@@ -147,6 +149,15 @@ class TestPick:
         command = sft_command(TINY, dataset, tmp_path, 0, "cpu", [0, 2])
         assert "--dataset.episodes=[0, 2]" in command
 
+    def test_none_of_a_kind_or_no_labels_at_all_are_refused(self, dataset: DatasetConfig, tmp_path: Path):
+        data = LeRobotDataset("a/b", root=dataset.root)
+        delete_episodes(data, [0, 2], output_dir=tmp_path / "lost", repo_id="a/b")
+        remove_feature(data, ["next.success"], output_dir=tmp_path / "bare", repo_id="a/b")
+        with pytest.raises(InputError, match=r"^sft\.pick='successes': none of .* 2 episodes; use all"):
+            picked(replace(dataset, root=str(tmp_path / "lost")), "successes")
+        with pytest.raises(InputError, match=r"^sft\.pick='failures': .*not labelled by next\.success"):
+            picked(replace(dataset, root=str(tmp_path / "bare")), "failures")
+
 
 def test_two_steps_of_lerobot_s_trainer_give_a_checkpoint(tmp_path: Path):
     path = run_sft(TINY, LOCAL, tmp_path / "sft", seed=0, texts=["Open a drawer"])
@@ -186,7 +197,7 @@ def test_progress_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         "INFO 2026-01-01 12:00:00 train.py:1 step:25 smpl:2K ep:4 epch:0.41 loss:1.250 grdn:2.0 lr:1.0e-03",
         "a line: with colons",
         "step:2K loss:0.5",
-        "Training:  15%|█▍   | 2975/20000 [18:59<3:52:57,  1.22step/s]INFO step:3K smpl:190K loss:0.259 grdn:0.7",
+        "Training:  15%|█▍ | 2975/20000 [18:59<3:52:57,  1.22step/s]INFO step:3K smpl:190K loss:0.259",
         "step:1M loss:nan",
         "step:? loss:0.5",
     ]

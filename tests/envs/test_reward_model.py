@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import re
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,7 @@ import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.rewards import RewardClassifierConfig, make_reward_pre_post_processors
 from lerobot.rewards.classifier.modeling_classifier import Classifier
+from safetensors.torch import load_file, save_file
 from transformers import ResNetConfig, ResNetModel
 
 from accerl_lerobot.engine.config import LaunchConfig
@@ -117,7 +119,9 @@ def edited(folder: Path, **fields: Any) -> None:
     file.write_text(json.dumps(json.loads(file.read_text()) | fields))
 
 
-def test_what_cannot_judge_is_refused_in_one_line(encoder: Path, tmp_path: Path):
+def test_what_cannot_judge_is_refused_in_one_line(
+    encoder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     def refused(message: str, env: SimulatedConfig = ENV) -> None:
         with pytest.raises(InputError, match=message):
             check_world(env, RewardModelConfig(path=str(path)))
@@ -136,8 +140,13 @@ def test_what_cannot_judge_is_refused_in_one_line(encoder: Path, tmp_path: Path)
     refused(r"\*_preprocessor\.json: 0 of them")
     path = tmp_path / "c"
     write_classifier(path, encoder)
-    edited(path, type="sarm")
-    refused("it cannot be loaded|looks at several observations at once")
+    tensors = load_file(path / "model.safetensors")
+    tensors.pop(last := sorted(tensors)[-1])
+    save_file(tensors, path / "model.safetensors")
+    refused(rf"1 tensors are missing, such as {re.escape(last)}; save it again")
+    with monkeypatch.context() as context:
+        context.setattr(RewardClassifierConfig, "observation_delta_indices", [-1, 0])
+        refused("looks at several observations at once")
     path = tmp_path / "d"
     write_classifier(path, encoder)
     edited(path, latent_dim=3)

@@ -36,11 +36,23 @@ def read(path: Path) -> np.ndarray:
 
 
 def test_the_curve_is_drawn(tmp_path: Path) -> None:
-    path = tmp_path / "curve.png"
-    success_curve(path, [evaluated(0, 30, 100), evaluated(5000, 95, 100)], [(100, 0.3), (4000, 0.9)])
-    image = np.asarray(imageio.imread(path))
-    assert image.shape[:2] == (480, 840)
-    assert len(np.unique(image[..., :3].reshape(-1, 3), axis=0)) > 20
+    """Pixels of rates and intervals are as far apart as the rates are, and exploration is there in grey."""
+
+    def drawn(e: dict[str, Any], training: list[tuple[float, float]]) -> tuple[np.ndarray, np.ndarray]:
+        success_curve(tmp_path / "curve.png", [e, e | {"env_steps": 5000}], training)
+        image = np.asarray(imageio.imread(tmp_path / "curve.png"))[..., :3].astype(int)
+        assert image.shape == (480, 840, 3)
+        return abs(image - (31, 119, 180)).sum(-1) < 30, abs(image - 178).sum(-1) < 30
+
+    rates = [evaluated(0, *of) for of in ((50, 100), (5, 10), (90, 100))]
+    ends = [np.flatnonzero(drawn(e, [])[0][:, :300].any(1))[[0, -1]] for e in rates]
+    tall = [bottom - top for top, bottom in ends]
+    scale = [pixels / (e["ci95"][1] - e["ci95"][0]) for pixels, e in zip(tall, rates, strict=True)]
+    assert scale == pytest.approx([scale[0]] * 3, rel=0.06) and 300 < scale[0] < 480
+    higher = ends[0].mean() - ends[2].mean()
+    assert higher == pytest.approx(scale[0] * (np.mean(rates[2]["ci95"]) - 0.5), rel=0.06)
+    grey = [drawn(rates[0], training)[1].sum() for training in ([], [(0, 0.2), (5000, 0.8)])]
+    assert grey[1] > grey[0] + 500
 
 
 @pytest.mark.parametrize("count", [2, 50])

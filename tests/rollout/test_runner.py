@@ -24,7 +24,7 @@ from accerl_lerobot.rollout.runner import (
     incarnation_after,
 )
 from accerl_lerobot.seeds import train_seed
-from tests.rollout.worlds import CHUNK, Recorder, ScriptedWorld, evaluate, explore
+from tests.rollout.worlds import CHUNK, Recorder, ScriptedWorld, decide, evaluate, explore
 
 CONFIG = RolloutConfig(worlds=1, segment_length=3, decision_cost=0.0)
 
@@ -80,6 +80,21 @@ def test_a_result_has_the_totals_of_its_episode():
     (result,) = recorder.results
     assert (result.success, result.episode_return, result.steps, result.decisions) == (True, 9.0, 9, 5)
     assert result.versions == (7, 7) and recorder.runner.counters.episodes == 1
+
+
+def test_a_world_that_does_not_show_the_same_again_cannot_be_resumed_in_an_episode():
+    begun = Recorder([ScriptedWorld(steps=9)], [explore()], CONFIG).runner
+    request = begun.start(0)
+    assert request is not None
+    begun.advance(0, decide(request))
+    state = begun.state()
+    world = ScriptedWorld(steps=9)
+    resumed = Recorder([world], [], CONFIG).runner
+    resumed.restore(state)
+    assert world.now == CHUNK and resumed.counters.decisions == 1
+    world.render = lambda height, width: np.full((height, width, 3), 99, np.uint8)
+    with pytest.raises(RuntimeError, match=r"does not show again .* after 1 decisions"):
+        resumed.restore(state)
 
 
 def test_results_name_the_oldest_and_the_newest_weights():

@@ -123,18 +123,29 @@ class TestMemory:
             Memory(1000, GAMMA, n_step=2).add(segment, chunks(segment))
 
 
+def slowly(ensemble: Ensemble, member: int, x: np.ndarray) -> np.ndarray:
+    """What one member makes of rows, in NumPy and float64."""
+    h = x.astype(np.float64)
+    weights, biases = (
+        [p[member].detach().double().numpy() for p in all_] for all_ in (ensemble.weights, ensemble.biases)
+    )
+    for weight, bias in zip(weights[:-1], biases[:-1], strict=True):
+        h = h @ weight + bias
+        h = (h - h.mean(1, keepdims=True)) / np.sqrt(h.var(1, keepdims=True) + 1e-5)
+        h = h / (1 + np.exp(-h))
+    return h @ weights[-1] + biases[-1]
+
+
 def test_the_ensemble_equals_a_slow_one():
     torch.manual_seed(0)
     ensemble = Ensemble(inputs=11, outputs=2, members=3)
+    with torch.no_grad():
+        for bias in ensemble.biases:
+            bias.normal_()
     x = torch.randn(5, 11)
     for member in range(3):
-        h = x.double().numpy()
-        weights = [w[member].detach().double().numpy() for w in ensemble.weights]
-        for weight in weights[:-1]:
-            h = h @ weight
-            h = (h - h.mean(1, keepdims=True)) / np.sqrt(h.var(1, keepdims=True) + 1e-5)
-            h = h / (1 + np.exp(-h))
-        np.testing.assert_allclose(ensemble(x)[member].detach(), h @ weights[-1], rtol=1e-4, atol=1e-5)
+        expected = slowly(ensemble, member, x.numpy())
+        np.testing.assert_allclose(ensemble(x)[member].detach(), expected, rtol=1e-4, atol=1e-5)
 
 
 def test_a_teacher_keeps_to_its_range_and_scales_what_it_sees():
@@ -199,6 +210,89 @@ def test_actions_are_normalised_as_they_are_unnormalised_and_constant_ones_are_0
     processing.postprocessor = lambda chunk: chunk * torch.tensor([0.5, 0.0]) + torch.tensor([1.0, 3.0])
     chunk = torch.tensor([[[2.0, 3.0], [1.0, 4.0]]])
     assert processing.normalise(chunk).tolist() == [[[2.0, 0.0], [0.0, 0.0]]]
+
+
+def test_a_step_of_critic_and_teacher_by_hand(tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch):
+    """On all rows of a memory of two episodes, in NumPy; noise is 1 throughout."""
+    torch.manual_seed(0)
+    update = learner(tiny_checkpoint, ChunkCriticConfig(gamma=GAMMA), value_warmup_updates=9)
+    actions = np.random.default_rng(0).uniform(-1, 1, (2, 6, 4, 2)).astype(np.float32)
+    played = [
+        episode([0.5, 0.0, -1.0, 0.0, 0.0, last], actions=a)
+        for last, a in zip((1.0, -9.0), actions, strict=True)
+    ]
+    update.step(played)
+    memory, teacher = update.memory, update.teacher
+    update._scale_states()
+    with torch.no_grad():
+        for weight in (update.critic.network.weights[-1], update.slow.network.weights[-1]):
+            weight.mul_(100)
+        update.slow.network.biases[-1].add_(0.5)
+    every = np.arange(12)
+    monkeypatch.setattr(chunk_critic, "drawn", lambda among, _: among)
+    monkeypatch.setattr(torch, "randn_like", torch.ones_like)
+    losses: dict[str, float] = {}
+    monkeypatch.setattr(
+        update, "_descend", lambda name, loss, **_: losses.update({name: float(loss.detach())}) or 7.0
+    )
+
+    def scaled(rows: np.ndarray) -> np.ndarray:
+        states = memory["state"]
+        return ((states[rows] - states.mean(0)) / np.maximum(states.std(0), 1e-3)).clip(-10, 10)
+
+    def planned(rows: np.ndarray) -> np.ndarray:
+        return np.tanh(slowly(teacher.network, 0, scaled(rows))).reshape(-1, 4, 2)
+
+    def valued(critic: chunk_critic.Critic, rows: np.ndarray, chunk: np.ndarray) -> np.ndarray:
+        seen = np.concatenate([scaled(rows), chunk.reshape(len(rows), 8)], 1)
+        return np.stack([slowly(critic.network, i, seen)[:, 0] for i in range(6)])
+
+    before = [p.detach().clone() for p in update.slow.parameters()]
+    following = memory["following"][every]
+    ahead = valued(update.slow, following, planned(following) + 0.1)
+    bootstrap = ahead.mean(0) - ahead.std(0, ddof=1)
+    bounds = float(np.quantile(bootstrap, 0.3)), float(np.quantile(bootstrap, 0.7))
+    target = memory["reward"] + memory["discount"] * bootstrap.clip(*bounds)
+    q = valued(update.critic, every, memory["chunk"])
+    error = np.square(q - (0.75 * target + 0.25 * memory["return"])).mean(1)
+    metrics = update._critic_step(bounds)
+    assert losses["critic"] == pytest.approx(error.sum(), rel=1e-5)
+    unexplained = (memory["return"] - q.mean(0)).var() / memory["return"].var()
+    by_hand = {"value_loss": error.mean(), "value_mean": q.mean(), "explained_variance": 1 - unexplained}
+    by_hand |= {"return_mean": memory["return"].mean(), "value_grad_norm": 7.0}
+    assert metrics == pytest.approx(by_hand, rel=1e-3)
+    for old, new, fast in zip(before, update.slow.parameters(), update.critic.parameters(), strict=True):
+        torch.testing.assert_close(new, old + 0.01 * (fast - old))
+
+    won = np.arange(6)
+    metrics = update._teacher_step(won)
+    q = valued(update.critic, every, planned(every))
+    gap = np.square(planned(won) - memory["chunk"][won]).mean() / 0.3**2
+    gain = (q.mean(0) - q.std(0, ddof=1)).mean() / abs(q).mean()
+    assert losses["teacher"] == pytest.approx(0.5 * gap - gain, rel=1e-3)
+    by_hand = {"teacher_value": q.mean(), "disagreement": q.std(0, ddof=1).mean(), "distance": gap}
+    assert metrics == pytest.approx(by_hand, rel=1e-3)
+
+    features = torch.randn(12, 3, update.adapter.model.width)
+    encoded = Encoded(features=features, mask=torch.tensor([[1.0, 1.0, 0.0]]).expand(12, 3), context=None)
+    read = update.reader(features[:, :2].mean(1)).detach().numpy()
+    found = update.losses(every, encoded, torch.zeros(12))["perception_loss"]
+    assert float(found.detach()) == pytest.approx(0.5 * np.square(read - scaled(every)).mean(), rel=1e-3)
+
+
+def test_success_is_told_by_who_acted(tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch):
+    update = learner(tiny_checkpoint, value_warmup_updates=9)
+    segments = [episode([float(won)]) for won in (1, 1, 0, 0)]
+    for seed, segment in enumerate(segments):
+        segment.origin = Origin("match", seed, 0)
+    monkeypatch.setattr(update.teacher, "plays", lambda episode: episode > 0)
+    metrics = update.step(segments)
+    assert (metrics["policy_success"], metrics["teacher_success"]) == (0.5, 0.0), "it is not ready"
+    with torch.no_grad():
+        update.teacher.ready.fill_(1)
+    metrics = update.step(segments)
+    assert metrics["policy_success"] == pytest.approx(3 / 5)
+    assert metrics["teacher_success"] == pytest.approx(1 / 3)
 
 
 def test_nothing_is_learnt_before_the_first_success(tiny_checkpoint: Path):
