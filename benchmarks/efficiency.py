@@ -39,7 +39,7 @@ ARMS = {
     "none": ("--imagination.share=0",),
     "learned": ("--imagination.model=learned", "--imagination.learn.steps_per_episode=5"),
     "frozen": ("--imagination.model=learned", "--imagination.learn.steps_per_episode=0"),
-    "shuffled": ("--imagination.model=shuffled",),
+    "shuffled": ("--imagination.model=shuffled", "--imagination.learn.steps_per_episode=0"),
     "oracle": ("--imagination.model=oracle",),
 }
 """Options of each arm."""
@@ -89,7 +89,7 @@ def cells(config: BenchEfficiencyConfig, recipe: RunConfig) -> list[Cell]:
                     *ARMS[arm],
                     f"--rollout.episodes={budget}",
                     f"--replay.samples_per_insert={uses}",
-                    f"--replay.max_lag={max(updates, recipe.replay.max_lag)}",
+                    f"--replay.max_lag={max(updates, uses, recipe.replay.max_lag)}",
                 )
                 made.append(
                     Cell(

@@ -39,6 +39,7 @@ from accerl_lerobot.world_model.learners import new_success_model
 from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.pretrain import world_spec
 from accerl_lerobot.world_model.store import save_world_model
+from tests.policies.checkpoints import write_diffusion
 from tests.runs import adjusted, drive, polls, tiny_run
 
 # About half of all episodes succeed when it is acted at random.
@@ -256,10 +257,10 @@ def test_one_that_hangs_is_found_when_it_is_saved(kind: type, tmp_path: Path):
 def test_what_does_not_fit_is_refused_before_the_run_begins(
     tiny_checkpoint: Path, world_model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    def told(*options: str) -> str:
+    def told(*options: str, share: float = 0.5) -> str:
         arguments = [
-            "train", "--env.type=simulated", f"--policy.path={tiny_checkpoint}", "--imagination.share=0.5",
-            f"--output_dir={tmp_path / 'out'}", *options,
+            "train", "--env.type=simulated", f"--policy.path={tiny_checkpoint}",
+            f"--imagination.share={share}", f"--output_dir={tmp_path / 'out'}", *options,
         ]  # fmt: skip
         assert cli.main(arguments) == 2
         return capsys.readouterr().err
@@ -268,8 +269,22 @@ def test_what_does_not_fit_is_refused_before_the_run_begins(
     assert "imagination.path='nowhere': config.json: is missing" in told("--imagination.path=nowhere")
     paid = told(f"--imagination.path={world_model}", "--env.reward=dense")
     assert "env.reward='dense': use success with imagination.share" in paid
+    for model in ("learned", "oracle"):
+        seen = told(
+            f"--imagination.path={world_model}",
+            f"--imagination.model={model}",
+            "--env.environment_state=true",
+        )
+        assert "env.environment_state=True: no policy reads it, and nothing imagined has it" in seen
+    few = told(f"--imagination.path={world_model}", "--rollout.episodes=4")
+    assert "rollout.episodes=4: none is held out, so no world model can pass: use at least 5" in few
+    whole = told("--imagination.model=oracle", share=0.999)
+    assert "imagination.share=0.999: that is 128 of the trainer.batch_decisions=128; leave both some" in whole
     looks = told(f"--imagination.path={world_model}", "--env.image_size=32", "--policy.n_action_steps=2")
     assert "executes 2 actions per decision; train one with world_model.chunk=2" in looks
+    tiny_checkpoint = write_diffusion(tmp_path / "back", image=32, n_obs_steps=2)
+    history = told("--imagination.model=oracle")
+    assert "policy.n_obs_steps=2: the policy looks back so many env steps" in history
     assert not (tmp_path / "out" / "checkpoints").exists()
 
 

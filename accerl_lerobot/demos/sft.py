@@ -236,7 +236,7 @@ def policy_fields(kind: str, field: str) -> set[str]:
 
 
 def _parse_progress(line: str) -> tuple[int, float] | None:
-    """LeRobot logs lines such as ``Training: 4%| | 1200/30000 [01:02<…]INFO … step:1K smpl:77K … loss:0.512 …``.
+    """LeRobot logs lines such as ``Training: 4%| | 1200/30000 [01:02<…]INFO … step:1K … loss:0.512 …``.
 
     Where it draws no bar (under Slurm), steps are rounded to thousands.
     """

@@ -159,6 +159,10 @@ class RunConfig(Section):
         if self.trainer.updates:
             # `engine.imagination` checks that a whole imagined rollout fits too.
             self.replay.check(batch_decisions=batch, segment_decisions=length)
+        share = self.imagination.share
+        if share and not 0 < round(share * batch) < batch:
+            remedy = f"that is {round(share * batch)} of the trainer.batch_decisions={batch}; leave both some"
+            raise InputError("imagination.share", share, remedy)
         if self.launch.schedule != ASYNCHRONOUS and (self.imagination.share or self.rollout.episodes):
             remedy = "use asynchronous, or leave out imagination.share and rollout.episodes"
             raise InputError("launch.schedule", self.launch.schedule, remedy)

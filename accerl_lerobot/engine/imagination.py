@@ -70,7 +70,11 @@ def check_imagination(config: RunConfig) -> None:
     """Refuses, before a run begins, what `make_imagination` would refuse in the middle of it."""
     _, model, _ = _load(config, policy_to_be(config), first=True)
     if config.imagination.learns:
-        open_datasets({LEARN: config.imagination.learn.dataset}, model.spec)
+        learn, episodes = config.imagination.learn, config.rollout.episodes
+        if learn.dataset.repo_id is None and 0 < episodes < (least := math.ceil(1 / learn.held_out)):
+            why = f"none is held out, so no world model can pass: use at least {least}, or name {LEARN}"
+            raise InputError("rollout.episodes", episodes, why)
+        open_datasets({LEARN: learn.dataset}, model.spec)
 
 
 def _load(
@@ -84,29 +88,36 @@ def _load(
     if (reward := getattr(config.env, "reward", "success")) != "success":
         why = "use success with imagination.share: imagined rollouts end with a success, and pay for it"
         raise InputError("env.reward", reward, why)
+    if config.env.state_size:
+        why = "no policy reads it, and nothing imagined has it; leave it out, or use imagination.share=0"
+        raise InputError("env.environment_state", getattr(config.env, "environment_state", None), why)
+    if policy.n_obs_steps > 1:
+        why = "the policy looks back so many env steps, and only one frame per decision is imagined; use a"
+        raise InputError("policy.n_obs_steps", policy.n_obs_steps, f"{why} policy with 1, or no imagination")
     with closing(make_world(config.env)) as environment:
         world = environment.spec
     imagination.imagined_replay(config.replay).check(
         batch_decisions=config.trainer.batch_decisions, segment_decisions=_longest(world, executed)
     )
+    judge = config.rollout.reward_model
     if not imagination.needs_path:
-        return world, OracleModel(world, executed, lambda: make_world(config.env)), None
+        return world, OracleModel(world, executed, lambda: make_world(config.env, reward_model=judge)), None
     device = resolve_device(config.policy.device)
     path, package = Path(str(imagination.path)).expanduser(), imagination.discover_packages_path
     if first:
         rehearse_world_model(path, package, section=IMAGINATION)
     learned, success = load_world_model(path, package, section=IMAGINATION)
-    check_fit(learned.spec, world, executed, policy.n_obs_steps)
+    check_fit(learned.spec, world, executed)
+    if first:  # the driver keeps off the GPU
+        return world, learned, success
     success.config.device = str(device)
     success.to(device)
     model = learned.to(device)
     return world, ShuffledModel(model) if imagination.model == "shuffled" else model, success
 
 
-def check_fit(spec: WorldModelSpec, world: WorldSpec, executed: int, history: int) -> None:
-    """Refuses a world model that does not fit environment and policy, which executes so many actions per
-    decision and sees `history` env steps.
-    """
+def check_fit(spec: WorldModelSpec, world: WorldSpec, executed: int) -> None:
+    """Refuses one that does not fit environment and policy, which executes so many actions per decision."""
     field, again = f"{IMAGINATION}.path", "train one of this world"
     if missing := [camera for camera in world.images if camera not in spec.cameras]:
         why = f"the world shows this camera, the world model {spec.cameras!r}; {again}"
@@ -122,9 +133,6 @@ def check_fit(spec: WorldModelSpec, world: WorldSpec, executed: int, history: in
     if spec.chunk != executed:
         why = f"env steps per prediction, and the policy executes {executed} actions per decision"
         raise InputError(field, spec.chunk, f"{why}; train one with world_model.chunk={executed}")
-    if history > 1:
-        why = "the policy looks back so many env steps, and only one frame per decision is imagined"
-        raise InputError("policy.n_obs_steps", history, f"{why}; use a policy with 1, or imagination.share=0")
 
 
 def _is_of(task: str, known: Sequence[str]) -> bool:
@@ -244,9 +252,7 @@ class ImaginationWorker(_Worker):
             self._clock.enter(CHECKPOINT)
             with self._changing:
                 may_promote = self._may_promote  # first: the last model comes before the word that it is
-                if self._promoted:
-                    self._clock.enter(WEIGHT_SYNC)
-                    self._core.swap(self._promoted.pop())
+                self._swap()
                 self._clock.enter(COMPUTE)
                 for segment in news.segments:
                     self._core.remember(segment)
@@ -280,6 +286,13 @@ class ImaginationWorker(_Worker):
                 if self._outbox:
                     pending.add(connection.send(self._outbox))
                     self._outbox.clear()
+        with self._changing:  # for the last checkpoint
+            self._swap()
+
+    def _swap(self) -> None:
+        if self._promoted:
+            self._clock.enter(WEIGHT_SYNC)
+            self._core.swap(self._promoted.pop())
 
 
 class WorldLearningWorker(_Worker):

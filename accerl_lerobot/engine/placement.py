@@ -256,6 +256,9 @@ def _nodes(config: RunConfig) -> list[Node]:
         return nodes
     wanted = {0}.union(*({n.number for n in candidates(nodes, role)} for role in roles_of(config)))
     folders = {"the run's folder": config.output_dir, "policy.path": config.policy.path}
+    if config.imagination.share:
+        folders["imagination.path"] = config.imagination.path
+        folders["imagination.learn.dataset.root"] = config.imagination.learn.dataset.root
     files = {  # of folders that are here
         f"{name}, {folder}": Path(folder).absolute()
         for name, folder in folders.items()

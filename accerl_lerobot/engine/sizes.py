@@ -50,6 +50,8 @@ def memory_parts_gib(config: RunConfig, history: int = 1) -> dict[str, float]:
     simulators = min(rollout.worlds * tasks, tasks + 2 * rollout.worlds)  # as shared by a process's worlds
     pictures = history * observation_bytes(config) / GIB
     loaded = 2 + config.trainer.ranks  # the driver, inference and the trainer each load torch
+    imagination = config.imagination  # a second store, and one or two processes that load torch
+    workers = 0.0 if local else (1 + imagination.learns) * POLICY_PROCESS_GIB
     frames = min(films.videos, films.episodes) * config.env.max_steps / FILM[1]
     return {
         "trainer.ranks": POLICY_PROCESS_GIB if local else RAY_GIB + loaded * POLICY_PROCESS_GIB,
@@ -59,6 +61,7 @@ def memory_parts_gib(config: RunConfig, history: int = 1) -> dict[str, float]:
         "rollout.segment_length": rollout.in_flight * pictures,
         "replay.capacity": config.replay.capacity * pictures,
         "algorithm.memory": config.remembered * pictures,
+        "imagination.share": 0.0 if not imagination.share else config.replay.capacity * pictures + workers,
         "evaluation.videos": frames * 3 * FILM[0] ** 2 / GIB,
     }
 

@@ -86,7 +86,7 @@ class SuccessLearnConfig(Section, section="world_model.success"):
 
     steps: Annotated[int, Range("[1, 1000000000]")] = 400
     """Gradient steps."""
-    batch: Annotated[int, Range("[2, 65536]")] = 32
+    batch: Annotated[int, Range("[4, 65536]")] = 32
     """Pairs of frames per gradient step."""
     lr: LearningRate = 1e-3
 

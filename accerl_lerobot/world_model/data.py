@@ -12,6 +12,7 @@ of a chunk, L frames of context, R chunks of a window, B batch.
 from __future__ import annotations
 
 import hashlib
+import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -27,6 +28,8 @@ from accerl_lerobot.experience import SUCCESS
 if TYPE_CHECKING:
     from accerl_lerobot.config.ranges import DatasetConfig
     from accerl_lerobot.world_model.contract import WorldModelSpec
+
+logger = logging.getLogger(__name__)
 
 DATASET, ONLINE = "dataset", "online"
 """Config sections of a verb's datasets, of which the second has a policy's own episodes."""
@@ -130,12 +133,13 @@ def hold_last_action(actions: np.ndarray, steps: np.ndarray) -> np.ndarray:
 
 
 def shuffle_actions(windows: Windows, rng: np.random.Generator) -> Windows:
-    """Gives each window the actions of another one, from another episode where there is one."""
+    """Gives each window the actions of another one, from another episode where there is one, or its own."""
     rows, groups = np.arange(len(windows)), windows.episode
     donors = np.empty_like(rows)
     for i in rows:
         others = rows[groups != groups[i]]
-        donors[i] = rng.choice(others if len(others) else rows[rows != i])
+        others = others if len(others) else rows[rows != i]
+        donors[i] = rng.choice(others) if len(others) else i
     return replace(windows, actions=windows.actions[donors])
 
 
@@ -247,7 +251,8 @@ def open_datasets(sections: dict[str, DatasetConfig], spec: WorldModelSpec) -> d
 def load_datasets(sections: dict[str, DatasetConfig], spec: WorldModelSpec) -> dict[str, list[Episode]]:
     """Reads LeRobotDatasets into memory, one uint8 image of the spec's size per env step and camera.
 
-    Two with an episode in common are refused: it may be on both sides of a split.
+    Two with an episode in common are refused, as it may be on both sides of a split; one that a dataset has
+    twice is used once.
     """
     loaded: dict[str, list[Episode]] = {}
     known: set[str] = set()
@@ -255,12 +260,16 @@ def load_datasets(sections: dict[str, DatasetConfig], spec: WorldModelSpec) -> d
         dataset = sections[section]
         with name_section(section), opened(dataset, meta) as data:
             episodes = [_episode(data, i, spec, section == ONLINE) for i in range(meta.total_episodes)]
-            keys = {episode.key for episode in episodes}
+            once = {episode.key: episode for episode in episodes}
+            if len(once) < len(episodes):
+                text = "%s: %d episodes are in it more than once, and are used once"
+                logger.warning(text, dataset.repo_id, len(episodes) - len(once))
+            keys = once.keys()
             if twice := len(keys & known):
                 remedy = f"{twice} of its episodes are in the other dataset, too; name one with others"
                 raise InputError("dataset.repo_id", dataset.repo_id, remedy)
         known |= keys
-        loaded[section] = episodes
+        loaded[section] = list(once.values())
     return loaded
 
 

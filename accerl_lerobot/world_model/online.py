@@ -31,7 +31,7 @@ from accerl_lerobot.world_model.contract import LearnableWorldModel, WorldModelS
 from accerl_lerobot.world_model.data import Episode, WindowStart, model_arrays
 from accerl_lerobot.world_model.learners import Examples, Learner, SuccessLearner
 from accerl_lerobot.world_model.rollout_eval import Scores, choose_threshold, score_episodes
-from accerl_lerobot.world_model.store import HELD_OUT, LEARNT
+from accerl_lerobot.world_model.store import HELD_OUT, LEARNT, THRESHOLD
 from accerl_lerobot.world_model.success_model import SuccessPairsRewardModel
 from accerl_lerobot.world_model.validation import fit_uncertainty_scale, validate
 
@@ -107,8 +107,9 @@ class OnlineLearner:
         self._learner = Learner(copy.deepcopy(model).requires_grad_(True), training, seed)
         self._success = SuccessLearner(copy.deepcopy(success).requires_grad_(True), training, seed)
         self._roles = {key: LEARNT if role == LEARNT else HELD_OUT for key, role in (roles or {}).items()}
-        self._offline = [e for e in known if self._roles.get(e.key, LEARNT) == LEARNT]
-        self._held_offline = [e for e in known if self._roles.get(e.key, LEARNT) != LEARNT]
+        usable = [e for e in known if len(e.frames) > 1]
+        self._offline = [e for e in usable if self._roles.get(e.key, LEARNT) == LEARNT]
+        self._held_offline = [e for e in usable if self._roles.get(e.key, LEARNT) != LEARNT]
         self._roles |= {episode.key: LEARNT for episode in self._offline}
         self._learnt: deque[Episode] = deque(maxlen=MEMORY)
         self._held: deque[Episode] = deque(maxlen=max(1, round(MEMORY * config.held_out)))
@@ -236,7 +237,8 @@ class OnlineLearner:
             return None
         self.promoted += 1
         choose_also_on(list(self._held))
-        return Promotion(model.cpu(), success.cpu(), self.version, dict(self._roles))
+        roles = self._roles | {episode.key: THRESHOLD for episode in self._held}
+        return Promotion(model.cpu(), success.cpu(), self.version, roles)
 
     def state(self) -> dict[str, Any]:
         """Copies all that `restore` needs. A validation whose outcome has not been served is repeated."""

@@ -18,7 +18,7 @@ from accerl_lerobot.world_model.data import model_arrays
 from accerl_lerobot.world_model.learners import new_success_model
 from accerl_lerobot.world_model.online import OnlineLearner, episode_from_segments, episode_weights
 from accerl_lerobot.world_model.pixels import PixelWorldModel
-from accerl_lerobot.world_model.store import HELD_OUT
+from accerl_lerobot.world_model.store import HELD_OUT, THRESHOLD
 from tests.runs import adjusted
 from tests.world_model.real_segments import SPEC, K, real_episode
 
@@ -179,6 +179,10 @@ def test_what_passes_is_promoted_and_what_does_not_is_not(monkeypatch: pytest.Mo
             assert promotion is not None and promotion.version == made.version == 16
             assert not any(p.requires_grad for p in promotion.model.parameters())
             assert not promotion.success.training
+            chosen_on = {key for key, role in promotion.roles.items() if role == THRESHOLD}
+            assert chosen_on == {episode.key for episode in made._held}, (
+                "they are no judges of this threshold"
+            )
     assert tried == [[False, True], [False, True, True]]
     assert made.metrics()["check_auroc"] == 0.5 and made.metrics()["promoted"] == 1
     assert made.pending_steps == 0
