@@ -1,13 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fixtures shared by all tests: offline, and one tiny checkpoint of LeRobot's own SmolVLA class."""
+"""Fixtures shared by all tests: offline, one tiny checkpoint of LeRobot's own SmolVLA class, and one Ray."""
 
 from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import pytest
+
+if TYPE_CHECKING:
+    from accerl_lerobot.engine.launch import RayEngine
 
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -28,3 +33,39 @@ def tiny_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from tests.policies.checkpoints import write_smolvla
 
     return write_smolvla(tmp_path_factory.mktemp("tiny") / "pretrained_model")
+
+
+@pytest.fixture(scope="session")
+def light_ray() -> Iterator[None]:
+    """Ray for the rest of the test session; engines that find it leave it running."""
+    import ray
+
+    from accerl_lerobot.engine.ray_session import start_ray
+
+    if not ray.is_initialized():
+        start_ray()
+    yield
+    ray.shutdown()
+
+
+@pytest.fixture
+def light_engine(light_ray: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., RayEngine]]:
+    """Makes asynchronous engines with stand-ins for inference and trainer, and closes them."""
+    from accerl_lerobot.engine import launch
+    from accerl_lerobot.inference import worker as inference
+    from accerl_lerobot.trainer import worker as trainer
+    from tests.light_workers import LightInference, LightTrainer
+    from tests.runs import tiny_run
+
+    monkeypatch.setattr(launch, "POLL_S", 0.05)
+    monkeypatch.setattr(inference, "InferenceWorker", LightInference)
+    monkeypatch.setattr(trainer, "TrainerWorker", LightTrainer)
+    made: list[RayEngine] = []
+
+    def make(state: Path | None = None, **sections: Any) -> RayEngine:
+        made.append(launch.RayEngine(tiny_run(Path("nowhere"), **sections), ("match",), state=state))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.close()

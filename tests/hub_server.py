@@ -28,6 +28,7 @@ from urllib.parse import unquote, urlsplit
 LARGE = (".safetensors", ".parquet", ".mp4", ".png", ".bin")
 """Suffixes of files that are stored as LFS objects, as the Hub's .gitattributes has it."""
 WRITER, READER, STRANGER = "hf_writerwriterwriter", "hf_readerreaderreader", "hf_strangerstranger"
+NOBODY = "hf_nobodysnobodys"  # which the server does not know
 ACCOUNTS = {WRITER: ("alice", "write"), READER: ("alice", "read"), STRANGER: ("mallory", "write")}
 """Token → whose it is, and its role."""
 

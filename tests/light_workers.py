@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A Ray that several test modules share, and workers that start in no time because they hold no policy."""
+"""Workers that start in no time because they hold no policy."""
 
 from __future__ import annotations
 
@@ -9,12 +9,10 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-import pytest
 
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE
@@ -26,45 +24,6 @@ from accerl_lerobot.trainer.peers import LearnerSettings
 from accerl_lerobot.transport.endpoint import Endpoint
 from accerl_lerobot.transport.shared_memory import Address, serve_on_loop
 from accerl_lerobot.transport.weights import WeightPublisher, WeightUpdate
-
-if TYPE_CHECKING:
-    from accerl_lerobot.engine.launch import RayEngine
-
-
-@pytest.fixture(scope="session")
-def light_ray() -> Iterator[None]:
-    """Ray for the rest of the test session; engines that find it leave it running."""
-    import ray
-
-    from accerl_lerobot.engine.ray_session import start_ray
-
-    if not ray.is_initialized():
-        start_ray()
-    yield
-    ray.shutdown()
-
-
-@pytest.fixture
-def light_engine(light_ray: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., RayEngine]]:
-    """Makes asynchronous engines with stand-ins for inference and trainer, and closes them."""
-    from accerl_lerobot.engine import launch
-    from accerl_lerobot.inference import worker as inference
-    from accerl_lerobot.trainer import worker as trainer
-    from tests.runs import tiny_run
-
-    monkeypatch.setattr(launch, "POLL_S", 0.05)
-    monkeypatch.setattr(inference, "InferenceWorker", LightInference)
-    monkeypatch.setattr(trainer, "TrainerWorker", LightTrainer)
-    made: list[RayEngine] = []
-
-    def make(state: Path | None = None, **sections: Any) -> RayEngine:
-        made.append(launch.RayEngine(tiny_run(Path("nowhere"), **sections), ("match",), state=state))
-        return made[-1]
-
-    yield make
-    for one in made:
-        one.close()
-
 
 NO_WEIGHTS = "a path without weights"
 HANGS = "hangs"  # a folder that whoever writes into it hangs

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import subprocess
 import sys
@@ -10,6 +11,9 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+
+from rich.console import Console
+from rich.table import Table
 
 from accerl_lerobot.algorithms import AlgorithmConfig, RatioConfig
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig
@@ -41,6 +45,13 @@ def replacing(arguments: list[str], *more: str) -> list[str]:
     """A command line in which `more` replaces flags of the same names."""
     names = {argument.partition("=")[0] for argument in more}
     return [a for a in arguments if a.partition("=")[0] not in names] + list(more)
+
+
+def printed(table: Table) -> str:
+    """A table as a wide terminal shows it."""
+    console = Console(width=200, record=True, file=io.StringIO())
+    console.print(table)
+    return console.export_text()
 
 
 def tiny_run(checkpoint: Path, **sections: Any) -> RunConfig:

@@ -57,8 +57,6 @@ def test_verb_help_lists_fields_with_their_docstrings(verb: str, capsys: pytest.
     assert cli.main([verb, "--help=all"]) == 0
     out = capsys.readouterr().out
     assert out.startswith(f"usage: accerl {verb}") and max(map(len, out.splitlines())) <= 140
-    if verb == "bench":
-        return
     if verb in ("train", "doctor"):
         assert "  --trainer.lr=" in out and "Peak learning rate of the policy" in out
         assert "algorithm.type=gipo (default)" in out and "--algorithm.clip_low" in out

@@ -24,8 +24,6 @@ from lerobot.configs.policies import PreTrainedConfig
 from accerl_lerobot import cli, load_policy
 from accerl_lerobot.algorithms import AlgorithmConfig
 from accerl_lerobot.config.parsing import parse
-from accerl_lerobot.config.ranges import DatasetConfig
-from accerl_lerobot.demos.sft import SFTConfig, sft_command
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig
 from accerl_lerobot.envs import SimulatedConfig, make_world
 from accerl_lerobot.errors import InputError
@@ -168,12 +166,6 @@ def test_a_package_that_is_not_there(checkpoint: Path):
     config = replace(named(checkpoint), discover_packages_path="no_such_package")
     with pytest.raises(InputError, match=r"^policy\.discover_packages_path='no_such_package': cannot be imp"):
         rehearsed_config(config)
-
-
-def test_lerobot_s_trainer_is_told_of_it(checkpoint: Path, tmp_path: Path):
-    importlib.import_module(PACKAGE)
-    for sft in (SFTConfig(steps=1, policy={"type": POLICY}), SFTConfig(steps=1, init_path=str(checkpoint))):
-        assert FLAG in sft_command(sft, DatasetConfig(repo_id="a/b"), tmp_path / "sft", 0, "cpu")
 
 
 def test_help_knows_types_of_a_package_that_is_named(capsys: pytest.CaptureFixture[str]):

@@ -36,18 +36,8 @@ from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.transport.shared_memory import available
 from benchmarks.simulated_world import LatencyConfig
 from benchmarks.victims import alive
-from tests.light_workers import (
-    FULL,
-    HANGS,
-    NO_WEIGHTS,
-    FalteringRollout,
-    LightInference,
-    light_engine,
-    light_ray,
-)
+from tests.light_workers import FULL, HANGS, NO_WEIGHTS, FalteringRollout, LightInference
 from tests.runs import collect, drive, polls, until
-
-__all__ = ["light_engine", "light_ray"]
 
 SLOW = LatencyConfig(max_steps=16, frame_ms=4.0)
 HARD = LatencyConfig(max_steps=16, tolerance=0.02, frame_ms=20.0)

@@ -192,6 +192,8 @@ def test_a_run_that_does_not_fit_does_not_begin(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(placement, "this_machine", lambda: machine)
     trainer = TrainerConfig(updates=1, batch_decisions=16, ranks=2)
     config = tiny_run(Path("nowhere"), trainer=trainer, policy=PolicyConfig(path="nowhere"))
-    with pytest.raises(InputError, match=r"trainer\.ranks=2: .* 2 ranks on 1 GPUs leave 1 without"):
+    with pytest.raises(
+        InputError, match=r"trainer\.ranks=2: .* 2 ranks on 1 GPUs leave 1 without; use at most 1"
+    ):
         execute(config, tmp_path, Console())
     assert [path.name for path in tmp_path.iterdir()] == ["config.yaml"]

@@ -26,6 +26,7 @@ from accerl_lerobot.hub.card import PullConfig
 from accerl_lerobot.policies.config import TuningConfig
 from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.timeline.read import TimelineConfig
+from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.world_model.config import PixelModelConfig, WorldModelConfig
 from benchmarks.__main__ import CONFIGS as BENCHMARKS
 from benchmarks.async_vs_sync import BenchAsyncVsSyncConfig
@@ -110,6 +111,11 @@ RULES = [
     (LaunchConfig, {"placement": {"rollout": " "}}, "launch.placement.rollout=' ': use one of"),
     (SFTConfig, {"policy": {"chunk_size": 4}}, "sft.policy="),
     (TimelineConfig, {"runs": ()}, "runs="),
+    (
+        TrainerConfig,
+        {"ranks": 9, "batch_decisions": 8},
+        "trainer.ranks=9: use at most trainer.batch_decisions, 8",
+    ),
     (TuningConfig, {"targets": "("}, "policy.tuning.targets='(': not a regular"),
     (WorldModelConfig, {"image_size": 60}, "world_model.image_size="),
 ]

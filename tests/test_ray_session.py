@@ -24,9 +24,6 @@ from accerl_lerobot.engine.config import LaunchConfig
 from accerl_lerobot.engine.ray_session import RaySession, process_kind
 from accerl_lerobot.engine.stopping import WorkerError
 from accerl_lerobot.errors import InputError
-from tests.light_workers import light_ray
-
-__all__ = ["light_ray"]
 
 TOKEN, TOKEN_PATH = "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"
 VARIABLES = (*ray_session.WORKERS, *ray_session.PRIVATE, "RAY_AUTH_MODE", TOKEN, TOKEN_PATH, "RAY_TMPDIR")

@@ -24,10 +24,7 @@ from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
 from benchmarks.simulated_world import LatencyConfig
-from tests.light_workers import light_engine, light_ray
 from tests.runs import drive, polls, until
-
-__all__ = ["light_engine", "light_ray"]
 
 UPDATES, DURING = 60, 12
 TWO = RolloutConfig(workers=2, worlds=2, segment_length=3)

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -47,11 +49,24 @@ def config_of(checkpoint: Path, case: str) -> RunConfig:
     sections = dict(CASES[case])
     trainer: dict[str, Any] = {"updates": 14, "batch_decisions": 16, "lr": 1e-3, "advantage_memory": 0.5}
     sections["trainer"] = TrainerConfig(**trainer | {"warmup_updates": 2} | sections.pop("trainer", {}))
-    return tiny_run(checkpoint, seed=3, **sections)
+    config = tiny_run(checkpoint, seed=3, **sections)
+    return replace(config, launch=replace(config.launch, engine="local"))
+
+
+def begin(checkpoint: Path, case: str, state: Path | None = None) -> LocalEngine:
+    """An engine that trains, from the beginning or from `state`."""
+    config = config_of(checkpoint, case)
+    tasks = ("match", "mirror") if case == "several tasks" else ("match",)
+    engine = make_engine(config, tasks, history=1, state=state)
+    assert isinstance(engine, LocalEngine)
+    if state is None:
+        engine.plan(evaluation_plans(tasks, 9, "during"))  # some of them are under way when it is left
+    engine.train()
+    return engine
 
 
 def weights(engine: LocalEngine) -> dict[str, np.ndarray]:
-    return engine._adapter.export_trainable()
+    return {name: tensor.copy() for name, tensor in engine._adapter.export_trainable().items()}
 
 
 def told(history: list[Progress]) -> list[Any]:
@@ -60,40 +75,42 @@ def told(history: list[Progress]) -> list[Any]:
     return [[u for p in history for u in p.updates], episodes, history[-1].rollout, history[-1].replay]
 
 
+Whole = Callable[[str], tuple[list[Any], dict[str, np.ndarray]]]
+
+
+@pytest.fixture(scope="module")
+def whole(tiny_checkpoint: Path) -> Whole:
+    """Words of a case's run that was never left, and the weights that it ends with."""
+
+    @functools.cache
+    def made(case: str) -> tuple[list[Any], dict[str, np.ndarray]]:
+        engine = begin(tiny_checkpoint, case)
+        said = told(drive(engine))
+        engine.close()
+        return said, weights(engine)
+
+    return made
+
+
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("left_at", [pytest.param(1, marks=pytest.mark.slow), 7])
 def test_a_run_that_was_left_goes_on_as_if_it_had_not(
-    case: str, left_at: int, tiny_checkpoint: Path, tmp_path: Path
+    case: str, left_at: int, whole: Whole, tiny_checkpoint: Path, tmp_path: Path
 ):
-    config = config_of(tiny_checkpoint, case)
-    config = replace(config, launch=replace(config.launch, engine="local"))
-    tasks = ("match", "mirror") if case.startswith("tasks") else ("match",)
-
-    def begin() -> LocalEngine:
-        engine = make_engine(config, tasks, history=1)
-        assert isinstance(engine, LocalEngine)
-        engine.plan(evaluation_plans(tasks, 9, "during"))  # some of them are under way when it is left
-        engine.train()
-        return engine
-
-    whole = begin()
-    expected = drive(whole)
-    first = begin()
+    expected, learnt = whole(case)
+    first = begin(tiny_checkpoint, case)
     before = until(first, left_at)
     saved = first.save(tmp_path)
     assert saved == (before[-1].version, [])
     between = drive(first)
     first.close()
-    again = make_engine(config, tasks, history=1, state=tmp_path / TRAINING_STATE)
-    assert isinstance(again, LocalEngine)
-    again.train()
+    again = begin(tiny_checkpoint, case, tmp_path / TRAINING_STATE)
     after = drive(again)
-    assert told(before + between) == told(expected), "saving changes nothing"
-    assert told(before + after) == told(expected)
+    assert told(before + between) == expected, "saving changes nothing"
+    assert told(before + after) == expected
     assert len(after) == len(between) > 1
-    for name, tensor in weights(whole).items():
-        np.testing.assert_array_equal(tensor, weights(again)[name])
-    whole.close()
+    for name, tensor in weights(again).items():
+        np.testing.assert_array_equal(tensor, learnt[name])
     again.close()
 
 

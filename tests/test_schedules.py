@@ -25,12 +25,9 @@ from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.world_model.config import ImaginationConfig
 from benchmarks.simulated_policy import SimulatedPolicyConfig, load_simulated
 from benchmarks.simulated_world import LatencyConfig
-from tests.light_workers import light_ray
 from tests.replay.segments import make_segment
 from tests.replay.test_worker import BATCH, play, start, waits
 from tests.runs import collect, polls
-
-__all__ = ["light_ray"]
 
 
 @pytest.mark.parametrize(
@@ -95,13 +92,13 @@ def test_with_overlap_one_batch_is_collected_meanwhile():
     play(scene, ReplayConfig(capacity=64, min_decisions=8, ahead=16, samples_per_insert=1.0))
 
 
-def run_of(schedule: Any, updates: int = 6) -> RunConfig:
+def run_of(schedule: Any) -> RunConfig:
     return RunConfig(
         env=LatencyConfig(max_steps=16, reward="dense", frame_ms=3.0, latency_cv=0.5),
         rollout=RolloutConfig(workers=2, worlds=2, segment_length=4, decision_cost=0.0),
         inference=InferenceConfig(max_batch=3),
         replay=ReplayConfig(capacity=256, min_decisions=16, ahead=16, samples_per_insert=1.0),
-        trainer=TrainerConfig(updates=updates, batch_decisions=16, probe_every=0),
+        trainer=TrainerConfig(updates=6, batch_decisions=16, probe_every=0),
         launch=LaunchConfig(schedule=schedule, stall_s=60.0),
     )
 
@@ -214,16 +211,12 @@ def test_what_services_say_merge_metrics():
 def test_services_without_callers_are_refused():
     with pytest.raises(InputError, match=r"inference\.workers=2.*rollout\.workers, 1"):
         RunConfig(inference=InferenceConfig(workers=2))
-    with pytest.raises(InputError, match=r"inference\.workers=0"):
-        InferenceConfig(workers=0)
     local = LaunchConfig(engine="local")
     with pytest.raises(InputError, match=r"inference\.workers=2.*local"):
         RunConfig(inference=InferenceConfig(workers=2), rollout=RolloutConfig(workers=2), launch=local)
 
 
 def test_schedules_that_cannot_be_are_refused():
-    with pytest.raises(InputError, match=r"launch\.schedule.*use asynchronous, overlap or synchronous"):
-        LaunchConfig(schedule="sometimes")  # type: ignore[arg-type]
     with pytest.raises(InputError, match=r"launch\.schedule.*engine=local"):
         LaunchConfig(schedule=OVERLAP, engine="local")
     launch = LaunchConfig(schedule=SYNCHRONOUS)

@@ -25,8 +25,9 @@ def slow_gae(rewards, values, bootstrap, terminated, lengths, gamma, lam):
     return advantages, returns
 
 
-def batch(seed: int = 0, s: int = 6, t: int = 7) -> Batch:
-    generator = torch.Generator().manual_seed(seed)
+def batch() -> Batch:
+    s, t = 6, 7
+    generator = torch.Generator().manual_seed(0)
     rewards = torch.randn(s, t, generator=generator, dtype=torch.float64)
     values = torch.randn(s, t, generator=generator, dtype=torch.float64)
     bootstrap = torch.randn(s, generator=generator, dtype=torch.float64)

@@ -119,26 +119,16 @@ def test_ppo_by_hand(rho: float, advantage: float, expected: float, moves: bool)
 
 @pytest.mark.parametrize("level", ["token", "chunk"])
 def test_gipo_gradient_is_that_of_importance_sampling_with_the_weight_held_still(level: Any) -> None:
-    """−E[ω ρ Â ∇log π], with ω a constant: by its formula and by finite differences over a parameter."""
+    """−E[ω ρ Â ∇log π], with ω a constant."""
     inputs = make_inputs(spread=0.6)
     config = GIPOConfig(level=level, sigma=0.7, kl_coef=0.0)
     got = gradient(inputs, config.loss(inputs).loss)
     advantage = inputs.advantage.numpy()[:, None]
-
-    def surrogate(new: np.ndarray, weight: np.ndarray) -> float:
-        logs = np.array(grouped(new - inputs.log_prob_old.numpy(), level))
-        return float(-np.mean(weight * np.exp(logs) * advantage))
-
     new = inputs.log_prob_new.detach().numpy()
     logs = np.array(grouped(new - inputs.log_prob_old.numpy(), level))
     weight = np.exp(-0.5 * (logs / 0.7) ** 2)
     formula = np.broadcast_to(-weight * np.exp(logs) * advantage / logs.size, new.shape)
     np.testing.assert_allclose(got.numpy(), formula, atol=1e-12)
-    for i, j in [(0, 0), (5, 2), (11, 1)]:
-        step = np.zeros_like(new)
-        step[i, j] = 1e-5
-        slope = (surrogate(new + step, weight) - surrogate(new - step, weight)) / 2e-5
-        assert got[i, j].item() == pytest.approx(slope, abs=1e-9)
 
 
 @each_algorithm

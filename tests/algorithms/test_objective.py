@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Extent of one ratio, factors that do not exist, the KL, and each logged number by hand."""
+"""Factors that do not exist, the KL, and each logged number by hand."""
 
 from __future__ import annotations
 
@@ -16,27 +16,15 @@ from accerl_lerobot.algorithms.objective import (
     KL_LINEAR_ABOVE,
     kl_from_behaviour,
     lag_metrics,
-    mean_over_ratios,
-    present,
     sample_metrics,
 )
 from tests.algorithms.inputs import gradient, make_inputs
 from tests.runs import ALGORITHMS
 
-X = torch.tensor([[1.0, 2.0, 4.0, 8.0, 16.0, 32.0]])
-FACTORS = torch.tensor([[True, True, True, True, False, False]])
 each_level = pytest.mark.parametrize("level", ["token", "chunk"])
 each_algorithm = pytest.mark.parametrize(
     "config", [AlgorithmConfig.get_choice_class(name)() for name in ALGORITHMS], ids=str
 )
-
-
-def test_means_weigh_existing_factors_alike() -> None:
-    """One decision has four, the other one: (1 + 2 + 4 + 8 + 10) / 5."""
-    factors = torch.cat([FACTORS, torch.tensor([[True, False, False, False, False, False]])])
-    x = torch.cat([X, torch.tensor([[10.0, 99.0, 99.0, 99.0, 99.0, 99.0]])])
-    inputs = replace(make_inputs(n=2, factors=6), factors=factors)
-    assert mean_over_ratios(x, inputs, "token").item() == 5.0
 
 
 @each_algorithm
@@ -57,24 +45,6 @@ def test_what_does_not_exist_is_never_looked_at(config: RatioConfig, level: Any)
     slope = gradient(dirty, got.loss)
     torch.testing.assert_close(slope, gradient(clean, expected.loss))
     assert (slope[~factors] == 0).all() and (slope[factors] != 0).any()
-
-
-@each_algorithm
-@each_level
-def test_micro_batches_add_up(config: RatioConfig, level: Any) -> None:
-    """Parts of 2 and 5 decisions, with different numbers of factors, against all 7."""
-    config = replace(config, level=level)
-    factors = torch.arange(4) < torch.tensor([4, 4, 1, 2, 1, 3, 1])[:, None]
-    whole = replace(make_inputs(n=7, factors=4), factors=factors)
-    expected = gradient(whole, config.loss(whole).loss)
-    each = present(factors, level).sum().item() / 7
-    total = torch.zeros_like(expected)
-    for rows in (slice(0, 2), slice(2, 7)):
-        fields = {k: v[rows] for k, v in vars(whole).items() if isinstance(v, torch.Tensor)}
-        part = replace(whole, **fields, ratios_per_decision=each)
-        share = len(part.value) / 7
-        total += gradient(whole, config.loss(part).loss * share)
-    torch.testing.assert_close(total, expected)
 
 
 def test_kl_estimates_behaviour_to_policy_in_value_and_gradient() -> None:

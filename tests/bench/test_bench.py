@@ -3,14 +3,12 @@
 
 from __future__ import annotations
 
-import io
 import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from accerl_lerobot.bench import policy as bench
 from accerl_lerobot.bench import world
@@ -22,6 +20,7 @@ from benchmarks import latency
 from benchmarks.latency import BenchLatencyConfig, bench_latency, described
 from benchmarks.simulated_world import LatencyConfig, read_trace
 from tests.envs.libero_assets import ASSETS, needs_assets
+from tests.runs import printed
 
 
 def test_durations_by_hand():
@@ -79,9 +78,7 @@ def test_three_arms_in_turns(env: EnvConfig, least: float):
     ours = arms["ours"]
     assert ours["env_steps_per_s"]["median"] == pytest.approx(5 * ours["decisions_per_s"]["median"], rel=0.1)
     assert result["ratio"]["min"] > least, "the whole point of our own world"
-    console = Console(width=120, record=True, file=io.StringIO())
-    console.print(world.table(result))
-    assert "stock" in console.export_text()
+    assert "stock" in printed(world.table(result))
 
 
 @pytest.fixture

@@ -10,9 +10,6 @@ import pytest
 
 from benchmarks import batching
 from benchmarks.batching import BenchBatchingConfig
-from tests.light_workers import light_ray
-
-__all__ = ["light_ray"]
 
 
 def test_turns_of_a_rule_are_put_together():

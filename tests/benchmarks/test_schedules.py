@@ -18,9 +18,6 @@ from benchmarks.async_vs_sync import compare as compare_schedules
 from benchmarks.async_vs_sync import table as schedules_table
 from benchmarks.machinery import MachineryConfig
 from benchmarks.scaling import BenchScalingConfig, bench_scaling
-from tests.light_workers import light_ray
-
-__all__ = ["light_ray"]
 
 
 def block(schedule: str, rate: float, processors: float = 0.2, waits: float = 0.5) -> Block:

@@ -3,18 +3,14 @@
 
 from __future__ import annotations
 
-import io
 import json
 from pathlib import Path
 
 import pytest
-from rich.console import Console
 
 from accerl_lerobot.transport.shared_memory import available
 from benchmarks.transport import RAY, SHARED_MEMORY, SLOT, BenchTransportConfig, bench_transport, table
-from tests.light_workers import light_ray
-
-__all__ = ["light_ray"]
+from tests.runs import printed
 
 
 @pytest.mark.skipif(not available(), reason="no memfd, epoll and eventfd here")
@@ -30,6 +26,4 @@ def test_all_arms_in_turns(light_ray: None, tmp_path: Path):
     for row in found.values():
         assert len(row["p50_us"]["blocks"]) == len(row["calls_per_s"]["blocks"]) == 2
         assert 0 < row["p50_us"]["min"] <= row["p50_us"]["median"] <= row["p99_us"]["max"]
-    console = Console(width=140, record=True, file=io.StringIO())
-    console.print(table(result))
-    assert "shared_memory" in console.export_text()
+    assert "shared_memory" in printed(table(result))

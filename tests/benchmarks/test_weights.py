@@ -3,18 +3,14 @@
 
 from __future__ import annotations
 
-import io
 import json
 from pathlib import Path
 
 import pytest
-from rich.console import Console
 
 from accerl_lerobot.errors import InputError
 from benchmarks.weights import ARMS, BenchWeightsConfig, bench_weights, table
-from tests.light_workers import light_ray
-
-__all__ = ["light_ray"]
+from tests.runs import printed
 
 
 def test_all_arms_at_all_sizes(light_ray: None, tmp_path: Path):
@@ -28,9 +24,7 @@ def test_all_arms_at_all_sizes(light_ray: None, tmp_path: Path):
             assert len(cell[kind]["blocks"]) == 2 and cell[f"{kind}_ms"]["min"] > 0
         assert cell["applied_ms"]["median"] > cell["pause_ms"]["median"]
         assert cell["mb"]["median"] == pytest.approx(cell["size_mb"], rel=0.02)
-    console = Console(width=200, record=True, file=io.StringIO())
-    console.print(table(result))
-    shown = console.export_text()
+    shown = printed(table(result))
     assert all(arm in shown and arm in (root / "weights.md").read_text() for arm in ARMS)
     with pytest.raises(InputError, match="^output_dir=.*the folder exists"):
         bench_weights(config)

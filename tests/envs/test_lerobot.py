@@ -13,6 +13,7 @@ import pytest
 from accerl_lerobot.envs import GymConfig, LeRobotEnvConfig, MetaWorldConfig, make_world
 from accerl_lerobot.envs.lerobot_env import LeRobotWorld
 from accerl_lerobot.errors import InputError
+from tests.hub_cache import cached_repo
 
 pytest.importorskip("lerobot")
 
@@ -158,12 +159,9 @@ def arena(tmp_path, monkeypatch: pytest.MonkeyPatch):
     from huggingface_hub import constants
 
     marker = tmp_path / "was-run"
-    snapshot = tmp_path / "models--them--arena" / "snapshots" / COMMIT
-    snapshot.mkdir(parents=True)
     code = f"from pathlib import Path\nPath({str(marker)!r}).touch()\n"
-    (snapshot / "env.py").write_text(f"{code}def make_env(**options): raise OSError('ran')\n")
-    (snapshot.parents[1] / "refs").mkdir()
-    (snapshot.parents[1] / "refs" / "main").write_text(COMMIT)
+    env = cached_repo(tmp_path, "them/arena", COMMIT) / "env.py"
+    env.write_text(f"{code}def make_env(**options): raise OSError('ran')\n")
     monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path))
     return marker
 

@@ -9,8 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import yaml
 
+from accerl_lerobot import cli
+from tests.hub_server import NOBODY, READER, STRANGER, WRITER
+
+TOKENS = (WRITER, READER, STRANGER, NOBODY)
 SUMMARY = {
     "success_before": 0.25, "success_after": 0.75, "n_before": 40, "n_after": 40,
     "ci95_before": [0.1419, 0.4019], "ci95_after": [0.5981, 0.8581],
@@ -19,6 +24,16 @@ SUMMARY = {
     "env_steps": 12345, "episodes": 321, "updates": 12, "lag_mean": 3.25, "rl_s": 60.0,
     "algorithm": "gipo", "seed": 3,
 }  # fmt: skip
+
+
+def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """The one line of a command that is refused."""
+    capsys.readouterr()
+    assert cli.main(list(arguments)) == 2
+    out, err = capsys.readouterr()
+    (line,) = [line for line in err.splitlines() if line.startswith("accerl: ")]
+    assert out == "" and "Traceback" not in err and not any(token in err for token in TOKENS)
+    return line
 
 
 def write_json(path: Path, content: Any) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from accerl_lerobot import cli
-from tests.hub.folders import write_policy_folder
+from tests.hub.folders import refusal, write_policy_folder
 from tests.hub_server import STRANGER, Answer, Fault, HubServer
 
 NAME = "alice/door"
@@ -52,11 +52,8 @@ def refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Refusal:
 
     def do(*more: str, name: str = NAME) -> str:
         before = our_paths()
-        capsys.readouterr()
-        assert cli.main(["pull", f"--repo_id={name}", f"--output_dir={tmp_path / 'pulled'}", *more]) == 2
-        out, err = capsys.readouterr()
-        (line,) = [line for line in err.splitlines() if line.startswith("accerl: ")]
-        assert out == "" and "Traceback" not in err and our_paths() == before
+        line = refusal(capsys, "pull", f"--repo_id={name}", f"--output_dir={tmp_path / 'pulled'}", *more)
+        assert our_paths() == before
         return line
 
     return do

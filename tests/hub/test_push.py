@@ -15,8 +15,8 @@ from accerl_lerobot import cli
 from accerl_lerobot.checkpoint.layout import digest
 from accerl_lerobot.hub import errors
 from accerl_lerobot.hub.card import MARK
-from tests.hub.folders import write_json, write_policy_folder
-from tests.hub_server import READER, WRITER, Fault, HubServer
+from tests.hub.folders import refusal, write_json, write_policy_folder
+from tests.hub_server import NOBODY, READER, WRITER, Fault, HubServer
 
 TINY = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
 NAME = "alice/door"
@@ -44,12 +44,7 @@ def refused(capsys: pytest.CaptureFixture[str]) -> Refusal:
     """The one line of a push that is refused."""
 
     def do(path: Path, *more: str) -> str:
-        capsys.readouterr()
-        assert cli.main(["push", f"--path={path}", f"--repo_id={NAME}", *more]) == 2
-        out, err = capsys.readouterr()
-        (line,) = [line for line in err.splitlines() if line.startswith("accerl: ")]
-        assert out == "" and "Traceback" not in err and "hf_" not in err
-        return line
+        return refusal(capsys, "push", f"--path={path}", f"--repo_id={NAME}", *more)
 
     return do
 
@@ -124,7 +119,7 @@ def test_whatever_breaks_there_is_no_half_a_commit(hub, policy, pushed, refused,
 def test_tokens(hub, policy, refused, monkeypatch, tmp_path):
     monkeypatch.delenv("HF_TOKEN")
     assert "pushing needs a token; log in with 'hf auth login', or set HF_TOKEN" in refused(policy)
-    monkeypatch.setenv("HF_TOKEN", "hf_nobodysnobodys")
+    monkeypatch.setenv("HF_TOKEN", NOBODY)
     assert "the Hub does not accept the token" in refused(policy)
     monkeypatch.setenv("HF_TOKEN", READER)
     assert "the token may not write here; use one with the right to write" in refused(policy)

@@ -24,7 +24,7 @@ from accerl_lerobot.policies.saving import save_pretrained
 from accerl_lerobot.testing import perturb
 from tests.hub.folders import SUMMARY, write_json
 from tests.hub_server import HubServer, environment
-from tests.world_model.test_pixels import model
+from tests.world_model.test_pixels import dots, model, windows
 
 ROOT = Path(__file__).parents[2]
 TINY = ROOT / "datasets" / "metaworld_tiny"
@@ -127,13 +127,18 @@ def test_a_world_model_brings_its_success_model(hub: HubServer, tmp_path: Path):
     from accerl_lerobot.world_model.success_model import SuccessPairsRewardModel
 
     world, success, roles = model(), new_success_model(5), {"a": "learnt", "b": "held out"}
+    world.fit_statistics(windows(dots(2)))
     save_world_model(tmp_path / "world_model", world, success, roles)
     accerl("push", f"--path={tmp_path / 'world_model'}", "--repo_id=alice/world")
     accerl("pull", "--repo_id=alice/world", f"--output_dir={tmp_path / 'pulled'}")
     came, judge = load_world_model(tmp_path / "pulled")
-    assert load_roles(tmp_path / "pulled") == roles and came.spec == world.spec
+    assert load_roles(tmp_path / "pulled") == roles
+    assert (came.spec, came.config) == (world.spec, world.config)
+    assert not any(p.requires_grad for p in came.parameters())
     for first, second in ((world, came), (success, judge)):
-        assert all(torch.equal(value, second.state_dict()[key]) for key, value in first.state_dict().items())
+        loaded = second.state_dict() | dict(second.named_buffers())
+        saved = first.state_dict() | dict(first.named_buffers())
+        assert all(torch.equal(value, loaded[key]) for key, value in saved.items())
     alone = SuccessPairsRewardModel.from_pretrained(str(tmp_path / "pulled" / "success_model"), strict=True)
     frames = torch.from_numpy(np.random.default_rng(0).random((2, 1, 3, 16, 16), dtype=np.float32))
     task = torch.ones(2, TASK_BITS)

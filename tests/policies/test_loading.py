@@ -26,6 +26,7 @@ from accerl_lerobot.policies.config import FlowSamplerConfig, PolicyConfig, Samp
 from accerl_lerobot.policies.loading import load_adapter, load_lerobot_config, precision_on, resolve_device
 from accerl_lerobot.policies.saving import save_pretrained
 from accerl_lerobot.testing import perturb
+from tests.hub_cache import cached_repo
 from tests.policies.cases import CASES
 from tests.policies.checkpoints import edit_config, write_smolvla
 from tests.policies.tiny import adapter_at, requests
@@ -343,15 +344,12 @@ def test_a_backbone_that_is_gone_is_named(tmp_path: Path):
 def test_a_checkpoint_on_the_hub_is_loaded_whole(
     written: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    # The layout of the Hub's cache, as after a download: critic and backbone must come along.
+    # Critic and backbone must come along.
     from huggingface_hub import constants
 
     monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "hub"))
-    repository = tmp_path / "hub" / "models--me--policy"
-    path = saved(written("smolvla"), repository / "snapshots" / "abc")
+    path = saved(written("smolvla"), cached_repo(tmp_path / "hub", "me/policy", "abc"))
     edit_config(path, vlm_model_name="/on/another/machine")
-    (repository / "refs").mkdir()
-    (repository / "refs" / "main").write_text("abc")
     assert decided("me/policy") == decided(path)
     with pytest.raises(InputError, match="not loadable from the Hub"):
         load_adapter(PolicyConfig(path="me/policy", revision="v9", device="cpu"))
@@ -447,7 +445,7 @@ def remote(cache: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Puts code into the Hub repository of FAST's tokeniser; it leaves a mark when it is run."""
     from transformers import dynamic_module_utils
 
-    snapshot = cache / f"models--{ACTIONS.replace('/', '--')}" / "snapshots" / COMMIT
+    snapshot = cached_repo(cache, ACTIONS, COMMIT)
     marker = cache / "was-run"
     (snapshot / "processing_action_tokenizer.py").write_text(REMOTE_CODE.format(marker=str(marker)))
     monkeypatch.setattr(dynamic_module_utils, "HF_MODULES_CACHE", str(cache / "modules"))

@@ -22,6 +22,7 @@ from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.loading import load_adapter
 from accerl_lerobot.policies.saving import save_pretrained
 from accerl_lerobot.policies.untrusted import Unfilled, check_checkpoint, guarded
+from tests.hub_cache import cached_repo
 from tests.policies.checkpoints import edit_config, write_act, write_smolvla
 
 PRE = "policy_preprocessor.json"
@@ -154,17 +155,13 @@ class Repository:
     """A model in the Hub's cache whose code leaves a mark when it is run; the newest version is `NEWER`."""
 
     def __init__(self, cache: Path) -> None:
-        self.marker, self.name = cache / "was-run", "them/model"
-        self.folder = cache / "models--them--model"
+        self.cache, self.marker, self.name = cache, cache / "was-run", "them/model"
         for commit in (COMMIT, NEWER):
-            snapshot = self.folder / "snapshots" / commit
-            snapshot.mkdir(parents=True)
+            snapshot = cached_repo(cache, self.name, commit)
             code = CODE.format(marker=str(self.marker), commit=commit)
             (snapshot / "their_code.py").write_text(code)
             auto = {"AutoConfig": "their_code.TheirConfig", "AutoModel": "their_code.TheirModel"}
             (snapshot / "config.json").write_text(json.dumps({"model_type": "theirs", "auto_map": auto}))
-        (self.folder / "refs").mkdir()
-        (self.folder / "refs" / "main").write_text(NEWER)
 
 
 @pytest.fixture
@@ -208,7 +205,7 @@ def test_nobody_is_asked_at_the_terminal(theirs: Repository, monkeypatch: pytest
 
 def test_code_in_a_folder_is_refused_even_where_a_commit_is_named(theirs: Repository, tmp_path: Path):
     folder = tmp_path / "downloaded"
-    (theirs.folder / "snapshots" / COMMIT).rename(folder)
+    cached_repo(theirs.cache, theirs.name, COMMIT).rename(folder)
     for revision in (None, COMMIT):
         with guarded("policy", revision), pytest.raises(InputError, match="^policy.trust_remote_code="):
             load(str(folder), trust_remote_code=True)

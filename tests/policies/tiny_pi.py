@@ -21,6 +21,7 @@ import pytest
 
 from accerl_lerobot.checkpoint.layout import BACKBONE, FAST
 from accerl_lerobot.policies.vla import data_only
+from tests.hub_cache import cached_repo
 from tests.policies.checkpoints import write_policy
 
 PALIGEMMA = "google/paligemma-3b-pt-224"  # the tokeniser that LeRobot's processors ask the Hub for
@@ -123,20 +124,18 @@ def hub(cache: Path) -> Iterator[None]:
     from huggingface_hub import constants
 
     for name, write in ((PALIGEMMA, write_tokenizer), (ACTIONS, write_fast)):
-        repository = cache / f"models--{name.replace('/', '--')}"
-        if not repository.exists():
-            snapshot = write(repository / "snapshots" / COMMIT)
-            (snapshot / "config.json").write_text('{"model_type": "paligemma"}')
-            (repository / "refs").mkdir()
-            (repository / "refs" / "main").write_text(COMMIT)
+        config = cached_repo(cache, name, COMMIT) / "config.json"
+        if not config.exists():
+            write(config.parent)
+            config.write_text('{"model_type": "paligemma"}')
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(constants, "HF_HUB_CACHE", str(cache))
         yield
 
 
 def write_pi(
-    directory: Path, kind: str, *, state_dim: int = 4, padded_dim: int = 2, chunk: int = 4, executed: int = 4,
-    num_steps: int = 3, prompt: int = 48, seed: int = 1, whole: bool = True, **fields: Any,
+    directory: Path, kind: str, *, padded_dim: int = 2, chunk: int = 4, executed: int = 4,
+    num_steps: int = 3, prompt: int = 48, whole: bool = True, **fields: Any,
 ) -> Path:  # fmt: skip
     """Saves a random policy with identity-like normalisation as LeRobot does; call it within `small`.
 
@@ -147,8 +146,8 @@ def write_pi(
     cache = directory.parent / f"{directory.name}-hub"
     with hub(cache), data_only():
         write_policy(
-            directory, kind, image=IMAGE, state_dim=state_dim, seed=seed, prepare=_spread,
-            chunk_size=chunk, n_action_steps=executed, max_state_dim=state_dim, max_action_dim=padded_dim,
+            directory, kind, image=IMAGE, seed=1, prepare=_spread,
+            chunk_size=chunk, n_action_steps=executed, max_state_dim=4, max_action_dim=padded_dim,
             image_resolution=(IMAGE, IMAGE), tokenizer_max_length=prompt,
             **({"num_inference_steps": num_steps} if kind in KINDS else fast), **fields,
         )  # fmt: skip

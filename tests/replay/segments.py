@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Small segments for the replay tests."""
+"""Small segments for the replay tests, and what is so of every store."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 
 from accerl_lerobot.experience import Origin, Segment
+from accerl_lerobot.replay.buffer import Replay
 
 
 def make_segment(key: str, n: int = 4, version: int | list[int] = 0, **replace: Any) -> Segment:
@@ -28,3 +30,15 @@ def make_segment(key: str, n: int = 4, version: int | list[int] = 0, **replace: 
         "key": key,
     }
     return Segment(**{**fields, **replace})
+
+
+def assert_books_balance(replay: Replay) -> None:
+    """All that came in is here or gone, and no segment is drawn more often than it may."""
+    c, entries = replay.counters, replay._entries
+    assert c.inserted_segments == len(entries) + c.evicted_segments + c.retired_segments
+    assert c.inserted_decisions == replay.stored_decisions + c.evicted_decisions + c.retired_decisions
+    assert replay.stored_decisions == sum(len(e.segment) for e in entries)
+    assert c.unique_decisions <= c.trained_decisions
+    assert replay.stored_decisions <= replay.config.capacity
+    assert replay.available_decisions == sum(len(e.segment) for e in entries if e.uses < e.draws)
+    assert all(e.uses <= e.draws <= math.ceil(replay.config.samples_per_insert) for e in entries)

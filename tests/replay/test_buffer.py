@@ -12,7 +12,7 @@ from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.experience import IMAGINED, REAL
 from accerl_lerobot.replay.buffer import DRAWS, MixedReplay, Replay
 from accerl_lerobot.replay.pacing import ReplayConfig
-from tests.replay.segments import make_segment
+from tests.replay.segments import assert_books_balance, make_segment
 
 
 def make_replay(**settings: Any) -> Replay:
@@ -21,15 +21,6 @@ def make_replay(**settings: Any) -> Replay:
 
 def keys(segments: list[Any]) -> list[str]:
     return [s.key for s in segments]
-
-
-def assert_books_balance(replay: Replay) -> None:
-    c = replay.counters
-    for unit in ("segments", "decisions"):
-        gone = sum(getattr(c, f"{how}_{unit}") for how in ("evicted", "retired"))
-        assert getattr(c, f"inserted_{unit}") == replay.metrics()[f"stored_{unit}"] + gone
-    assert c.unique_decisions <= c.trained_decisions
-    assert replay.stored_decisions <= replay.config.capacity
 
 
 def test_the_oldest_leave_first_and_by_decisions() -> None:
@@ -127,27 +118,6 @@ def test_a_trainer_that_resumed_behind_its_samples_retires_nothing() -> None:
     replay = make_replay()
     replay.insert(make_segment("a", version=30))
     assert keys(replay.sample(4, 10, np.random.default_rng(0))) == ["a"]
-
-
-def test_books_balance_under_random_use() -> None:
-    rng = np.random.default_rng(3)
-    replay = make_replay(samples_per_insert=1.7, max_lag=3)
-    version = 0
-    for i in range(3000):
-        if rng.random() < 0.6:
-            n = int(rng.integers(1, 7))
-            replay.insert(make_segment(f"k{i}", n, version=max(0, version - int(rng.integers(0, 4)))))
-        else:
-            drawn = replay.sample(int(rng.integers(1, 12)), version, rng)
-            assert len(set(keys(drawn))) == len(drawn)
-            assert all(version - s.version.min() <= 3 for s in drawn)
-            version += bool(drawn)
-        assert_books_balance(replay)
-        c = replay.counters
-        entries = replay._entries
-        assert replay.available_decisions == sum(len(e.segment) for e in entries if e.uses < e.draws)
-        assert all(e.uses <= e.draws <= 2 for e in entries)
-    assert c.retired_segments > 20 and c.evicted_segments > 20 and version > 200
 
 
 def carried(replay: Replay, version: int | None, folder: Path) -> Replay:

@@ -18,6 +18,8 @@ from accerl_lerobot.evaluation import Rate
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.world_model.config import ImaginationConfig
 
+EPISODES = 100
+"""Episodes of each evaluation."""
 HOSTILE = "<script>document.title = 'owned'</script>\"'><img src=x onerror=\"document.title = 'owned'\">"
 """Hostile names of a task, or any other text of a run."""
 
@@ -49,12 +51,11 @@ def write_run(
     config: RunConfig | None = None,
     tasks: Sequence[str] = ("door-open-v3",),
     successes: tuple[int, int] = (40, 90),
-    n: int = 100,
     finished: bool = True,
     rollout: dict[str, Any] | None = None,
     train: dict[str, Any] | None = None,
 ) -> Path:
-    """A run of ``accerl train`` with an evaluation before and, if `finished`, after, of `n` episodes each.
+    """A run of ``accerl train`` with an evaluation before and, if `finished`, after.
 
     `rollout` and `train` are further numbers of each record of the workers and of the trainer.
     """
@@ -62,12 +63,12 @@ def write_run(
     config = config or run_config()
     (folder / "config.yaml").write_text(yaml.safe_dump(encode(config), sort_keys=False))
     updates = config.trainer.updates
-    evaluations = [evaluation("before", 0.0, successes[0], n, tasks)]
+    evaluations = [evaluation("before", 0.0, successes[0], tasks)]
     lines = [{"kind": "evaluation", "wall_s": 5.0, "update": 0, **evaluations[0]}]
     for update in range(1, updates + 1):
-        lines += [train_record(update) | (train or {}), rollout_record(update, n, rollout or {})]
+        lines += [train_record(update) | (train or {}), rollout_record(update, rollout or {})]
     if finished:
-        evaluations.append(evaluation("after", 100.0 * updates, successes[1], n, tasks))
+        evaluations.append(evaluation("after", 100.0 * updates, successes[1], tasks))
         lines.append({"kind": "evaluation", "wall_s": 12.0 + updates, "update": updates, **evaluations[1]})
     (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     if finished:
@@ -76,7 +77,8 @@ def write_run(
     return folder
 
 
-def evaluation(group: str, steps: float, successes: int, n: int, tasks: Sequence[str]) -> dict[str, Any]:
+def evaluation(group: str, steps: float, successes: int, tasks: Sequence[str]) -> dict[str, Any]:
+    n = EPISODES
     rate = {"success": successes / n, "n": n, "ci95": [*Rate(successes=successes, n=n).interval()]}
     return {
         **rate,
@@ -99,12 +101,12 @@ def train_record(update: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def rollout_record(update: int, evaluated: int, more: dict[str, Any]) -> dict[str, Any]:
-    """100 env steps and one episode a second, after `evaluated` episodes of 10 steps each."""
+def rollout_record(update: int, more: dict[str, Any]) -> dict[str, Any]:
+    """100 env steps and one episode a second, after the evaluation's of 10 steps each."""
     return {
         "kind": "rollout", "wall_s": 10.0 + update, "update": update, "restarts": 0.0,
-        "env_steps": 10.0 * evaluated + 100.0 * update, "decisions": evaluated + 10.0 * update,
-        "episodes": evaluated + float(update), "success_exploring": min(1.0, 0.2 + update / 100),
+        "env_steps": 10.0 * EPISODES + 100.0 * update, "decisions": EPISODES + 10.0 * update,
+        "episodes": EPISODES + float(update), "success_exploring": min(1.0, 0.2 + update / 100),
         "inference_batches": 5.0 * update, "inference_batch_size_mean": 3.0,
         "inference_wait_mean_s": 0.002, "inference_busy_share": 0.3, **more,
     }  # fmt: skip
@@ -124,13 +126,13 @@ def summary(config: RunConfig, evaluations: Sequence[dict[str, Any]], tasks: Seq
     }  # fmt: skip
 
 
-def imagined(share: float = 0.5, on: float = 1.0) -> dict[str, Any]:
+def imagined(on: float = 1.0) -> dict[str, Any]:
     """Numbers of the workers where something is imagined."""
     return {
         "imagination_rollouts": 100.0, "imagination_decisions": 700.0, "imagination_successes": 60.0,
         "imagination_uncertain": 3.0, "imagination_success": 0.6, "imagination_success_imagined": 0.7,
         "imagination_success_real": 0.4, "imagination_on": on, "imagination_promoted": 1.0,
-        "imagination_rejected": 2.0, "imagination_learn_episodes": 30.0, "replay_imagined_share": share,
+        "imagination_rejected": 2.0, "imagination_learn_episodes": 30.0, "replay_imagined_share": 0.5,
         "replay_trained_decisions": 100.0, "replay_imagined_trained_decisions": 300.0,
         "imagination_check_skill_changed_first": 0.7,
     }  # fmt: skip

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run's folder as data: truncated, missing or damaged files, and a run that was resumed."""
+"""A run's folder as data: truncated, missing or damaged files."""
 
 from __future__ import annotations
 
@@ -12,24 +12,6 @@ import pytest
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.report.read import column, newest, read_run
 from tests.report.folders import write_run
-
-
-def test_a_finished_run(tmp_path: Path) -> None:
-    run = read_run(write_run(tmp_path / "run"))
-    assert run.name == "run" and not run.truncated
-    assert {kind: len(records) for kind, records in run.records.items()} == {
-        "train": 40, "rollout": 40, "evaluation": 2,
-    }  # fmt: skip
-    assert run.result is not None and run.result["success_after"] == 0.9
-
-
-def test_a_run_that_is_not_finished_or_did_not_come_to_its_metrics(tmp_path: Path) -> None:
-    folder = write_run(tmp_path / "run", finished=False)
-    run = read_run(folder)
-    assert run.result is None and len(run.records["train"]) == 40
-    (folder / "metrics.jsonl").unlink()
-    run = read_run(folder)
-    assert run.records == {} and not run.truncated and run.outcomes == []
 
 
 @pytest.mark.parametrize("tail", [b'{"kind": "tra', b"\xff\xfe", b"7"])

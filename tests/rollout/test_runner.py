@@ -37,6 +37,7 @@ def test_an_episode_is_cut_into_segments_without_a_gap():
     recorder = Recorder([ScriptedWorld(steps=14, end="limit")], [explore()], CONFIG)
     recorder.play()
     assert [len(s) for s in recorder.segments] == [3, 3, 1]
+    assert [s.origin.decision for s in recorder.segments] == [0, 3, 6]
     assert [steps_seen(s) for s in recorder.segments] == [[0, 2, 4, 6], [6, 8, 10, 12], [12, 14]]
     # A decision's latent names the step it was made at: it must stand beside that observation.
     for segment in recorder.segments:
@@ -121,8 +122,9 @@ def test_keys_are_unique_over_slots_episodes_and_incarnations():
     assert len(keys) == 3 * 6 * 2 and len(set(keys)) == len(keys)
 
 
-def test_a_nan_is_counted_and_the_next_episode_goes_on():
-    worlds = [ScriptedWorld(steps=20, nan_at=9)]
+@pytest.mark.parametrize("nan_in", ["reward", "state", "info"])
+def test_a_nan_is_counted_and_the_next_episode_goes_on(nan_in: str):
+    worlds = [ScriptedWorld(steps=20, nan_at=9, nan_in=nan_in)]
     recorder = Recorder(worlds, [explore(1)], CONFIG)
     recorder.play()
     # Decisions 1 to 3 had become a segment; the 4th and 5th had not when the 5th met the NaN.
@@ -254,25 +256,6 @@ def test_everything_about_a_decision_stays_together():
     assert segment.log_prob.dtype == segment.reward.dtype == np.float32
     assert segment.version.dtype == segment.steps.dtype == np.int64
     assert segment.task == "push" and TASK not in segment.observations
-
-
-def test_the_next_segment_begins_where_this_one_was_cut():
-    builder = collected(3)
-    builder.cut("k1")
-    add(builder, 3, reward=0.0, steps=1)
-    segment = builder.cut("k2")
-    assert states(segment) == [3, 4] and segment.origin == ("push-v3", 7, 3)
-
-
-def test_full_at_its_length():
-    assert not collected(3).full and collected(4).full
-
-
-@pytest.mark.parametrize("terminated", [False, True])
-def test_how_it_ended_is_kept(terminated: bool):
-    segment = collected(2).cut("k", terminated, success=terminated)
-    assert segment.terminated == segment.success == terminated and states(segment) == [0, 1, 2]
-    assert segment.source == "real" and segment.key == "k"
 
 
 TASKS = ("push", "pull", "lift")

@@ -21,11 +21,12 @@ class ScriptedWorld(World):
     Args:
         steps: length of an episode in env steps.
         end: ``success`` (terminates), ``failure`` (terminates) or ``limit`` (truncates).
-        nan_at: step of an episode whose reward is NaN; 0 for never.
+        nan_at: step of an episode that is no number; 0 for never.
+        nan_in: what of it: its ``reward``, the ``state`` after it, or what the world says in ``info``.
     """
 
-    def __init__(self, steps: int = 5, end: str = "success", nan_at: int = 0) -> None:
-        self.steps, self.end, self.nan_at = steps, end, nan_at
+    def __init__(self, steps: int = 5, end: str = "success", nan_at: int = 0, nan_in: str = "reward") -> None:
+        self.steps, self.end, self.nan_at, self.nan_in = steps, end, nan_at, nan_in
         one = np.ones(1, np.float32)
         self.spec = WorldSpec(
             images={CAMERA: (8, 8, 3)}, state_dim=2, action_dim=1, action_low=-one, action_high=one,
@@ -33,34 +34,35 @@ class ScriptedWorld(World):
         )  # fmt: skip
         self.seed = self.now = 0
         self.task = ""
-        self.closed = False
 
     def reset(self, seed: int, task: str) -> Observation:
         self.seed, self.task, self.now = seed, task, 0
         return self._observe()
 
     def step_chunk(self, actions: np.ndarray) -> ChunkResult:
-        rewards = []
+        rewards, broken = [], False
         for _ in actions:
             self.now += 1
-            rewards.append(np.nan if self.now == self.nan_at else 1.0)
+            broken = broken or self.now == self.nan_at
+            rewards.append(np.nan if broken and self.nan_in == "reward" else 1.0)
             if self.now == self.steps:
                 break
         over = self.now == self.steps
         terminated = over and self.end != "limit"
+        observation = self._observe()
+        if broken and self.nan_in == "state":
+            observation["observation.state"] = np.full(2, np.nan, np.float32)
         return ChunkResult(
-            observation=self._observe(),
+            observation=observation,
             rewards=np.asarray(rewards, np.float32),
             terminated=terminated,
             truncated=over and self.end == "limit",
             success=over and self.end == "success",
+            info={"nonfinite": 1.0} if broken and self.nan_in == "info" else {},
         )
 
     def render(self, height: int, width: int) -> np.ndarray:
         return np.full((height, width, 3), self.now, np.uint8)
-
-    def close(self) -> None:
-        self.closed = True
 
     def _observe(self) -> Observation:
         state = np.array([self.seed, self.now], np.float32)

@@ -31,13 +31,11 @@ def a_clock(
     return Clock(run / TIMELINE, worker, begins=begins, part_bytes=part_bytes, now=hands), hands
 
 
-def write_worker(
-    run: Path, worker: str, spans: Iterable[tuple[int, float]], *, at_s: float = 0.0, part_bytes: int = 10**6
-) -> None:
+def write_worker(run: Path, worker: str, spans: Iterable[tuple[int, float]], *, at_s: float = 0.0) -> None:
     """One process of a worker, to its end; `spans`: states, and how many seconds it was in each."""
     at = round(at_s * SECOND)
     begins = Moment("here", UP + at, 2 * UP + at)
-    clock, hands = a_clock(run, worker, begins=begins, part_bytes=part_bytes)
+    clock, hands = a_clock(run, worker, begins=begins)
     for state, length in spans:
         clock.enter(state)
         hands.now += round(length * SECOND)

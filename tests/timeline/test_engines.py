@@ -11,10 +11,7 @@ import pytest
 from accerl_lerobot.engine.config import LaunchConfig
 from accerl_lerobot.engine.local import LocalEngine
 from accerl_lerobot.timeline.read import ABSENT, Timeline, read_timeline
-from tests.light_workers import light_ray
 from tests.runs import drive, tiny_run
-
-__all__ = ["light_ray"]
 
 
 def adds_up(timeline: Timeline) -> None:

@@ -3,14 +3,12 @@
 
 from __future__ import annotations
 
-import io
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
-from rich.console import Console
 
 from accerl_lerobot.cli import main
 from accerl_lerobot.errors import InputError
@@ -33,6 +31,7 @@ from accerl_lerobot.timeline.read import (
     show_timelines,
     timeline_table,
 )
+from tests.runs import printed
 from tests.timeline.folders import SECOND, UP, a_clock, write_worker
 
 
@@ -158,9 +157,7 @@ def test_pictures_stand_above_each_other_and_are_replaced(long_run, tmp_path, mo
         show_timelines(TimelineConfig(runs=(str(long_run), str(other)), seconds=4.0))
     with Image.open(tmp_path / "timeline.png") as image:
         assert image.width == one[0] and image.height > 1.5 * one[1]
-    console = Console(width=79, record=True, file=io.StringIO())
-    console.print(timeline_table(show_timelines(TimelineConfig(runs=(str(long_run), str(other))))))
-    text = console.export_text()
+    text = printed(timeline_table(show_timelines(TimelineConfig(runs=(str(long_run), str(other))))))
     assert "other" in text and "bubble" in text and "50.0" in text
 
 

@@ -15,9 +15,6 @@ import ray
 from accerl_lerobot.trainer import peers as module
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.peers import Peers, RankError
-from tests.light_workers import light_ray
-
-__all__ = ["light_ray"]
 
 THREE = TrainerConfig(ranks=3)
 WAIT_S = 2.0

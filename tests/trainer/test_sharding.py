@@ -201,11 +201,6 @@ def test_a_policy_without_blocks_cannot_forget():
         arrange(LinearAdapter(), TrainerConfig(activation_checkpointing=True))
 
 
-def test_more_ranks_than_decisions_are_refused():
-    with pytest.raises(InputError, match=r"trainer\.ranks=9: use at most .*, 8"):
-        TrainerConfig(ranks=9, batch_decisions=8)
-
-
 @pytest.mark.parametrize(
     ("ranks", "gpus", "others", "shares"),
     [
@@ -225,11 +220,3 @@ def test_no_two_ranks_share_a_gpu(ranks: int, gpus: int, others: int, shares: tu
     assert found == pytest.approx(shares)
     assert ranks * found[0] + others * found[1] <= gpus + 1e-9
     assert ranks == 1 or not gpus or found[0] > 0.5
-
-
-def test_more_ranks_than_gpus_are_refused_with_the_arithmetic():
-    config = TrainerConfig(ranks=4)
-    with pytest.raises(
-        InputError, match=r"trainer\.ranks=4: .* 4 ranks on 3 GPUs leave 1 without; use at most 3"
-    ):
-        config.gpu_shares(3, 1)

@@ -43,7 +43,6 @@ class Case(NamedTuple):
 
     kind: str
     config: dict[str, Any] = SHARDED
-    level: Any = "chunk"
     options: dict[str, Any] = {}
 
 
@@ -61,7 +60,7 @@ def learn(case: Case, folder: Path, config: TrainerConfig, group: Ranks) -> dict
         torch.manual_seed(0)
         adapter = adapter_at(folder / case.kind / "pretrained_model", **case.options)
         perturb(adapter, 0.02)
-        update = RatioUpdate(adapter, GIPOConfig(level=case.level), config, group)
+        update = RatioUpdate(adapter, GIPOConfig(level="chunk"), config, group)
         metrics = [update.step(batch)]
         gradients = {
             name: torch.zeros(p.shape) if p.grad is None else whole(p.grad).clone()

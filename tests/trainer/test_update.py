@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot.algorithms import GIPOConfig
+from accerl_lerobot.algorithms import GIPOConfig, PPOConfig, RatioConfig
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.trainer.batch import MAX_NONFINITE, NonFiniteError, collate
 from accerl_lerobot.trainer.config import TrainerConfig
@@ -26,8 +26,10 @@ PLAIN = TrainerConfig(
 LENGTHS = (3, 5, 1, 4)
 
 
-def make_update(config: TrainerConfig = PLAIN, seed: int = 0, **algorithm: Any) -> RatioUpdate:
-    return RatioUpdate(LinearAdapter(seed), GIPOConfig(**algorithm), config)
+def make_update(
+    config: TrainerConfig = PLAIN, kind: type[RatioConfig] = GIPOConfig, **algorithm: Any
+) -> RatioUpdate:
+    return RatioUpdate(LinearAdapter(), kind(**algorithm), config)
 
 
 def with_counts(segments: list[Segment]) -> list[Segment]:
@@ -92,11 +94,14 @@ def test_micro_batches_give_the_gradient_of_the_whole_batch(micro_batch: int):
     assert found["decisions"] == sum(LENGTHS)
 
 
+@pytest.mark.parametrize("kind", [GIPOConfig, PPOConfig])
 @pytest.mark.parametrize("level", ["token", "chunk"])
-def test_micro_batches_add_up_when_decisions_have_different_numbers_of_factors(level: Any):
+def test_micro_batches_add_up_when_decisions_have_different_numbers_of_factors(
+    kind: type[RatioConfig], level: Any
+):
     segments = with_counts(make_segments(LENGTHS))
     whole, parts, blind = (
-        make_update(replace(PLAIN, micro_batch=size), level=level) for size in (1000, 5, 1000)
+        make_update(replace(PLAIN, micro_batch=size), kind, level=level) for size in (1000, 5, 1000)
     )
     whole.step(segments)
     parts.step(segments)
@@ -231,16 +236,3 @@ def test_the_memory_of_advantages_by_hand():
     one, two = (np.asarray(b[0].reward, np.float64) - bias for b in batches)
     expected = [0.5 * one.sum() + two.sum(), 0.5 * (one**2).sum() + (two**2).sum(), 0.5 * 3 + 3]
     assert_close(update._moments, expected)
-
-
-def test_a_cut_is_bootstrapped_and_a_termination_is_not():
-    (segment,) = make_segments((2,))
-    means = {}
-    for name in ("terminated", "cut"):
-        update = make_update(gamma=0.9, lam=1.0)
-        ended = replace(segment, terminated=name == "terminated")
-        last = critic_values(update, [segment])[0][-1]
-        means[name] = update.step([ended])["return_mean"]
-    # λ = 1: the bootstrap enters the last return with γ and the first with γ².
-    assert means["cut"] - means["terminated"] == pytest.approx((0.9 + 0.81) / 2 * last, abs=1e-4)
-    assert abs(last) > 0.1

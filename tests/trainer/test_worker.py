@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -22,7 +24,6 @@ from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.peers import LearnerSettings
 from accerl_lerobot.trainer.worker import TrainerWorker
 from accerl_lerobot.transport.weights import WeightPublisher, WeightUpdate
-from tests.local_ray import Handle, Local
 from tests.trainer.linear import LinearAdapter, make_segments
 from tests.transport.played import played
 
@@ -32,13 +33,18 @@ def copied(tensors: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {name: tensor.copy() for name, tensor in tensors.items()}
 
 
+def handle(**methods: Callable[..., Any]) -> Any:
+    """An actor handle made of functions; where there is no Ray, a reference is the answer itself."""
+    return SimpleNamespace(**{name: SimpleNamespace(remote=method) for name, method in methods.items()})
+
+
 class Stage:
     """A trainer, a replay that counts what it is asked for, and a reader that keeps what it is sent."""
 
     def __init__(self, batches: int = 1000, directory: Path | None = None, **config: Any) -> None:
         self.asked: list[tuple[int, int]] = []
         self.received: list[tuple[int, dict[str, np.ndarray]]] = []
-        self.replay = Handle(sample=self._sample, learnt=lambda: None)
+        self.replay = handle(sample=self._sample, learnt=lambda: None)
         self.reader = played(self._receive)
         self._batches = batches
         defaults = {"updates": 6, "batch_decisions": 7, "warmup_updates": 0, "value_warmup_updates": 0}
@@ -59,7 +65,10 @@ class Stage:
 
 @pytest.fixture(autouse=True)
 def _without_ray(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "ray", Local)
+    local = SimpleNamespace(
+        get=lambda reference: reference, wait=lambda references, timeout: (references, [])
+    )
+    monkeypatch.setattr(module, "ray", local)
     monkeypatch.setattr(module, "FIRST_S", 0.05)
     monkeypatch.setattr(loading, "load_adapter", lambda policy: LinearAdapter())
 
@@ -112,7 +121,7 @@ def test_a_batch_that_nothing_can_be_learnt_from_is_kept(tmp_path: Path):
             segment.reward[0] = np.nan
         return segments
 
-    stage.replay = Handle(sample=sample, learnt=lambda: None)
+    stage.replay = handle(sample=sample, learnt=lambda: None)
     with pytest.raises(NonFiniteError, match=r"5 steps in a row.*its batch is in .*nonfinite-000007\.json"):
         stage.run()
     kept = snapshot.load(tmp_path / "nonfinite-000007")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Faults of shared memory alone: slots, their files, tokens, strangers."""
+"""Faults of shared memory alone: slots, their files, tokens, strangers, and what cannot be sent."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from accerl_lerobot.transport.shared_memory import (
     SharedMemoryClient,
     SharedMemoryServer,
     available,
+    pack,
 )
 
 pytestmark = pytest.mark.skipif(not available(), reason="no memfd, epoll and eventfd here")
@@ -245,3 +247,24 @@ def test_a_service_that_takes_nothing_is_not_waited_for_for_ever(stage, monkeypa
     with pytest.raises(ServiceStoppedError, match="service cannot be connected to: .*unavailable"):
         for _ in range(10 * SLOTS):
             one.caller()
+
+
+@dataclass
+class Stranger:
+    """An object of no registered kind."""
+
+    a: int = 1
+
+
+@pytest.mark.parametrize(
+    ("message", "said"),
+    [
+        (Stranger(), "message: a Stranger cannot be"),
+        ([{1, 2}], "message.0: a set cannot be"),
+        (np.array([object()]), "an array of object cannot be"),
+        (np.array(["text"]), "an array of <U4 cannot be"),
+    ],
+)
+def test_what_cannot_be_sent_is_refused(message: Any, said: str):
+    with pytest.raises(TypeError, match=said):
+        pack(message)

@@ -13,10 +13,7 @@ from accerl_lerobot.transport import endpoint as module
 from accerl_lerobot.transport.contract import Client, ServiceStoppedError
 from accerl_lerobot.transport.endpoint import Endpoint, RayClient
 from accerl_lerobot.transport.shared_memory import Address, available
-from tests.light_workers import light_ray
 from tests.transport.contract import CHECKS, Check, Service
-
-__all__ = ["light_ray"]
 
 NO_MEMORY = pytest.mark.skipif(not available(), reason="no memfd, epoll and eventfd here")
 WAYS = [pytest.param("ray"), pytest.param("auto", marks=NO_MEMORY)]

@@ -3,11 +3,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from accerl_lerobot.envs import SimulatedConfig, World, make_world
+from accerl_lerobot.envs import SimulatedConfig, make_world
 from accerl_lerobot.experience import Decision, Origin, Segment
 from accerl_lerobot.rollout.runner import SegmentBuilder
 from accerl_lerobot.world_model.contract import WorldModelSpec
@@ -34,11 +32,9 @@ def decided(chunk: np.ndarray, version: int = 0) -> Decision:
     )
 
 
-def real_episode(
-    seed: int, *, world: World | None = None, length: int = 8, solve_at: int = 99, **config: Any
-) -> list[Segment]:
+def real_episode(seed: int, *, length: int = 8, solve_at: int = 99) -> list[Segment]:
     """An episode of random chunks, which are right from decision `solve_at` on."""
-    world = world or make_world(SimulatedConfig(**{**vars(WORLD), **config}))
+    world = make_world(WORLD)
     rng = np.random.default_rng(seed)
     builder = SegmentBuilder([world.reset(seed, "match")], length, Origin("match", seed, 0))
     segments: list[Segment] = []
