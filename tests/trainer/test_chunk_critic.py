@@ -124,7 +124,7 @@ class TestMemory:
 
 
 def slowly(ensemble: Ensemble, member: int, x: np.ndarray) -> np.ndarray:
-    """What one member makes of rows, in NumPy and float64."""
+    """Outputs of one member, in NumPy and float64."""
     h = x.astype(np.float64)
     weights, biases = (
         [p[member].detach().double().numpy() for p in all_] for all_ in (ensemble.weights, ensemble.biases)
