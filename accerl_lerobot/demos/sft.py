@@ -238,10 +238,10 @@ def policy_fields(kind: str, field: str) -> set[str]:
 def _parse_progress(line: str) -> tuple[int, float] | None:
     """LeRobot logs lines such as ``Training: 4%| | 1200/30000 [01:02<…]INFO … step:1K … loss:0.512 …``.
 
-    Where it draws no bar (under Slurm), steps are rounded to thousands.
+    From 1000 on steps are the bar's, which may be a moment old; without one (under Slurm) thousands.
     """
     if (found := PROGRESS.search(line)) is None:
         return None
     exact, step, suffix, loss = found.groups()
     scale = {"": 1, "K": 1_000, "M": 1_000_000}[suffix]
-    return int(exact) if exact else int(float(step) * scale), float(loss)
+    return int(exact) if exact and suffix else int(float(step) * scale), float(loss)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Training of a world model on the policy's episodes during a run.
 
-The loss is that of the pre-training. Batches are of real windows only: some from the pre-training data, the
-others from the policy's episodes, the newest and the failed ones more often, as demonstrations do not show
-how the policy fails. Some episodes are held out, and a model is used only once it has passed validation on
-them.
+The loss is that of the pre-training with its defaults. Batches are of real windows only: some from the
+pre-training data, the others from the policy's episodes, the newest and the failed ones more often, as
+demonstrations do not show how the policy fails. Some episodes are held out, and a model is used only once it
+has passed validation on them.
 """
 
 from __future__ import annotations

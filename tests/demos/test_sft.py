@@ -196,6 +196,7 @@ def test_progress_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     lines = [
         "INFO 2026-01-01 12:00:00 train.py:1 step:25 smpl:2K ep:4 epch:0.41 loss:1.250 grdn:2.0 lr:1.0e-03",
         "a line: with colons",
+        "Training:   1%|  | 48/9000 [00:01<3:52:57,  1.22step/s]INFO step:50 smpl:3K loss:1.0",
         "step:2K loss:0.5",
         "Training:  15%|█▍ | 2975/20000 [18:59<3:52:57,  1.22step/s]INFO step:3K smpl:190K loss:0.259",
         "step:1M loss:nan",
@@ -204,8 +205,8 @@ def test_progress_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     command_that(monkeypatch, f"print({chr(10).join(lines)!r})")
     seen: list[tuple[int, float]] = []
     run_sft(TINY, HUB, tmp_path / "sft", seed=0, on_step=lambda step, loss: seen.append((step, loss)))
-    assert seen[:3] == [(25, 1.25), (2000, 0.5), (2975, 0.259)]
-    assert seen[3][0] == 1_000_000 and np.isnan(seen[3][1]) and len(seen) == 4
+    assert seen[:4] == [(25, 1.25), (50, 1.0), (2000, 0.5), (2975, 0.259)]
+    assert seen[4][0] == 1_000_000 and np.isnan(seen[4][1]) and len(seen) == 5
 
 
 def test_an_interrupted_caller_takes_the_trainer_along(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
