@@ -173,16 +173,19 @@ class Study:
     """The runs of a study, all of them settled before the first one starts."""
 
     def __init__(self, config: StudyConfig, cells: Sequence[Cell], common: Sequence[str] = ()) -> None:
-        from accerl_lerobot.policies.loading import pinned
-
         self.config, self.root = config, expanded(config.output_dir, "output_dir").resolve()
         self.common = list(common)
         self.cells = list(cells)
+        policy = self._parse(config.seeds[0], [], self.root).policy
+        if policy.path is not None:
+            from accerl_lerobot.policies.loading import pinned
+
+            if revision := pinned(policy).revision:
+                self.common.append(f"--policy.revision={revision}")
         self.starts = {
             seed: self._parse(seed, ["--trainer.updates=0", "--imagination.share=0"], self.start(seed))
             for seed in config.seeds
         }
-        self.starts = {seed: replace(run, policy=pinned(run.policy)) for seed, run in self.starts.items()}
         self.runs = [self._of(cell) for cell in self.cells]
 
     def start(self, seed: int) -> Path:
@@ -221,8 +224,6 @@ class Study:
             if self.starts[cell.seed].dataset.repo_id is None:
                 root = self.start(cell.seed) / DEMOS
                 chosen += [f"--dataset.repo_id={REPO_ID}", f"--dataset.root={root}"]
-        elif revision := self.starts[cell.seed].policy.revision:  # pinned
-            chosen.append(f"--policy.revision={revision}")
         return self._parse(cell.seed, chosen, self.folder(cell))
 
     def _parse(self, seed: int, chosen: list[str], folder: Path) -> RunConfig:

@@ -15,6 +15,7 @@ from accerl_lerobot.engine.local import LocalEngine
 from accerl_lerobot.engine.loop import Progress
 from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.trainer.config import TrainerConfig
+from benchmarks.simulated_world import LatencyConfig
 from tests.runs import ALGORITHMS, collect, drive, tiny_run
 
 
@@ -89,3 +90,18 @@ def test_closing_does_not_hide_why_it_is_called(tiny_checkpoint: Path, caplog: p
     engine._runner.close = close  # type: ignore[method-assign]
     engine.close()
     assert "the renderer is gone" in caplog.text
+
+
+def test_a_nan_from_the_world_is_counted_and_the_run_goes_on(tiny_checkpoint: Path):
+    config = tiny_run(tiny_checkpoint, env=LatencyConfig(max_steps=16, nan_after=21))
+    history, _ = train(config)
+    assert history[-1].done and history[-1].rollout["dropped_nonfinite"] > 0
+    assert history[-1].replay["dropped_nonfinite"] == 0, "the runner should have kept it from replay"
+
+
+def test_a_world_that_crashes_ends_the_run_with_its_own_error(tiny_checkpoint: Path):
+    engine = LocalEngine(tiny_run(tiny_checkpoint, env=LatencyConfig(crash_after=9)), ("match",))
+    engine.train()
+    with pytest.raises(RuntimeError, match="simulated crash after 9 env steps"):
+        drive(engine)
+    engine.close()

@@ -163,7 +163,7 @@ class RunConfig(Section):
         if share and not 0 < round(share * batch) < batch:
             remedy = f"that is {round(share * batch)} of the trainer.batch_decisions={batch}; leave both some"
             raise InputError("imagination.share", share, remedy)
-        if self.launch.schedule != ASYNCHRONOUS and (self.imagination.share or self.rollout.episodes):
+        if self.launch.schedule != ASYNCHRONOUS and (share or self.rollout.episodes):
             remedy = "use asynchronous, or leave out imagination.share and rollout.episodes"
             raise InputError("launch.schedule", self.launch.schedule, remedy)
 

@@ -135,11 +135,12 @@ def hold_last_action(actions: np.ndarray, steps: np.ndarray) -> np.ndarray:
 def shuffle_actions(windows: Windows, rng: np.random.Generator) -> Windows:
     """Gives each window the actions of another one, from another episode where there is one, or its own."""
     rows, groups = np.arange(len(windows)), windows.episode
-    donors = np.empty_like(rows)
+    donors = rows.copy()
     for i in rows:
         others = rows[groups != groups[i]]
         others = others if len(others) else rows[rows != i]
-        donors[i] = rng.choice(others) if len(others) else i
+        if len(others):
+            donors[i] = rng.choice(others)
     return replace(windows, actions=windows.actions[donors])
 
 

@@ -147,6 +147,10 @@ def test_what_cannot_judge_is_refused_in_one_line(
     with monkeypatch.context() as context:
         context.setattr(RewardClassifierConfig, "observation_delta_indices", [-1, 0])
         refused("looks at several observations at once")
+    path = tmp_path / "another type"
+    write_classifier(path, encoder)
+    edited(path, type="sarm")
+    refused("it cannot be loaded|looks at several observations at once")
     path = tmp_path / "d"
     write_classifier(path, encoder)
     edited(path, latent_dim=3)

@@ -26,14 +26,14 @@ SUMMARY = {
 }  # fmt: skip
 
 
-def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """The one line of a command that is refused."""
+def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[str, str]:
+    """The one line of a command that is refused, and all that it has said."""
     capsys.readouterr()
     assert cli.main(list(arguments)) == 2
     out, err = capsys.readouterr()
     (line,) = [line for line in err.splitlines() if line.startswith("accerl: ")]
     assert out == "" and "Traceback" not in err and not any(token in err for token in TOKENS)
-    return line
+    return line, err
 
 
 def write_json(path: Path, content: Any) -> None:

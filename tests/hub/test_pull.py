@@ -52,7 +52,7 @@ def refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Refusal:
 
     def do(*more: str, name: str = NAME) -> str:
         before = our_paths()
-        line = refusal(capsys, "pull", f"--repo_id={name}", f"--output_dir={tmp_path / 'pulled'}", *more)
+        line, _ = refusal(capsys, "pull", f"--repo_id={name}", f"--output_dir={tmp_path / 'pulled'}", *more)
         assert our_paths() == before
         return line
 

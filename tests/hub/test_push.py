@@ -44,7 +44,9 @@ def refused(capsys: pytest.CaptureFixture[str]) -> Refusal:
     """The one line of a push that is refused."""
 
     def do(path: Path, *more: str) -> str:
-        return refusal(capsys, "push", f"--path={path}", f"--repo_id={NAME}", *more)
+        line, said = refusal(capsys, "push", f"--path={path}", f"--repo_id={NAME}", *more)
+        assert "hf_" not in said
+        return line
 
     return do
 
