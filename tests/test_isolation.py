@@ -8,6 +8,7 @@ import os
 import resource
 import shutil
 import signal
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -78,6 +79,47 @@ def test_the_line_of_a_check_is_passed_on(tmp_path: Path):
 def test_a_child_that_waits_for_ever_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(isolation, "PATIENCE", 0.4)
     refused(lambda: time.sleep(1000), tmp_path, "takes more than 1 s")
+
+
+def test_a_child_that_waits_for_a_lock_of_the_fork_is_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Held by a thread of the parent at the first fork, free at the second."""
+    monkeypatch.setattr(isolation, "IDLE_S", 0.5)
+    lock, forks = threading.Lock(), 0
+    fork = os.fork
+
+    def counted() -> int:
+        nonlocal forks
+        forks += 1
+        if forks == 1:
+            lock.acquire()
+        child = fork()
+        if forks == 1 and child:
+            lock.release()
+        return child
+
+    monkeypatch.setattr(os, "fork", counted)
+
+    def task() -> str:
+        with lock:
+            return "loaded"
+
+    assert rehearse(task, tmp_path, ORIGIN) == "loaded" and forks == 2
+
+
+def test_a_child_that_works_is_not_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(isolation, "IDLE_S", 0.5)
+    started = tmp_path / "started"
+
+    def work() -> int:
+        started.write_text(started.read_text() + "x" if started.exists() else "x")
+        until = time.process_time() + 2
+        while time.process_time() < until:
+            pass
+        return len(started.read_text())
+
+    assert rehearse(work, tmp_path, ORIGIN) == 1
 
 
 def test_what_is_good_leaves_nothing_behind(tmp_path: Path, capfd: pytest.CaptureFixture[str]):

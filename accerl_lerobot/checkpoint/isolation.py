@@ -33,6 +33,9 @@ CPU_S, CPU_S_PER_BYTE = 15, 1e-7
 """Seconds of processor time, and those for each byte of the files: a decision computes with all weights.
 Processor time, because a busy machine must not refuse a good file."""
 PATIENCE = 20  # times its processor time after which a child is given up, whatever it waits for
+IDLE_S = 10.0
+"""Seconds without processor time after which a child is replaced: it may wait for a lock that another thread
+of this process held at the fork and that nobody in the child can release."""
 LONGEST = 1000  # characters of a child's message
 NO_MEMORY = (
     "MemoryError", "can't allocate", "Cannot allocate", "bad_alloc", "Unable to allocate", "malloc of",
@@ -51,6 +54,24 @@ def rehearse[T](task: Callable[[], T], folder: Path, origin: Origin, pattern: st
         return task()
     size = sum(path.stat().st_size for path in folder.glob(pattern) if path.is_file())
     memory, cpu_s = SLACK + PER_BYTE * size, round(CPU_S + CPU_S_PER_BYTE * size)
+    deadline = time.monotonic() + PATIENCE * cpu_s
+    message, status = _try(task, memory, cpu_s, deadline)
+    while status is None and time.monotonic() < deadline:
+        message, status = _try(task, memory, cpu_s, deadline)
+    answer = json.loads(message) if message else {"why": _cause(status, cpu_s)}
+    if "result" in answer:
+        return cast(T, answer["result"])
+    why = answer["why"]
+    if any(words in why for words in NO_MEMORY):
+        why = f"takes more than {memory // MIB} MiB beside the libraries"
+    elif "field" in answer:
+        raise InputError(answer["field"], answer["value"], why)
+    remedy = "the size of its files does not account for that; get it again, or another one"
+    raise InputError(origin.field, origin.value, f"loading it, tried in a process apart, {why}; {remedy}")
+
+
+def _try(task: Callable[[], object], memory: int, cpu_s: int, deadline: float) -> tuple[bytes, int | None]:
+    """A child's message, and how it ended; None if it was given up."""
     reader, writer = os.pipe()
     parent = os.getpid()
     with warnings.catch_warnings():  # Python's about threads: the child runs none of the others
@@ -62,22 +83,13 @@ def rehearse[T](task: Callable[[], T], folder: Path, origin: Origin, pattern: st
     os.close(writer)
     status = None
     try:
-        message, status = _wait(child, reader, PATIENCE * cpu_s)
+        message, status = _wait(child, reader, deadline)
     finally:
         os.close(reader)
         if status is None:  # it may still run
             os.kill(child, signal.SIGKILL)
             os.waitpid(child, 0)
-    answer = json.loads(message) if message else {"why": _cause(status, cpu_s)}
-    if "result" in answer:
-        return cast(T, answer["result"])
-    why = answer["why"]
-    if any(words in why for words in NO_MEMORY):
-        why = f"takes more than {memory // MIB} MiB beside the libraries"
-    elif "field" in answer:
-        raise InputError(answer["field"], answer["value"], why)
-    remedy = "the size of its files does not account for that; get it again, or another one"
-    raise InputError(origin.field, origin.value, f"loading it, tried in a process apart, {why}; {remedy}")
+    return message, status
 
 
 def _cause(status: int | None, cpu_s: int) -> str:
@@ -126,11 +138,22 @@ def _confine(memory: int, cpu_s: int) -> None:
         resource.setrlimit(kind, (limit, limit))
 
 
-def _wait(child: int, reader: int, seconds: float) -> tuple[bytes, int | None]:
-    """The child's message, and how it ended; None if it takes longer."""
-    deadline, message = time.monotonic() + seconds, b""
-    while select.select([reader], [], [], max(0.0, deadline - time.monotonic()))[0]:
-        if not (part := os.read(reader, select.PIPE_BUF)):  # it has closed its end
-            return message, os.waitpid(child, 0)[1]
-        message += part
-    return message, None
+def _wait(child: int, reader: int, deadline: float) -> tuple[bytes, int | None]:
+    """The child's message, and how it ended; None if it takes longer, or does nothing for `IDLE_S`."""
+    message, worked = b"", -1
+    while (left := deadline - time.monotonic()) > 0:
+        if select.select([reader], [], [], min(left, IDLE_S))[0]:
+            if not (part := os.read(reader, select.PIPE_BUF)):  # it has closed its end
+                return message, os.waitpid(child, 0)[1]
+            message += part
+        elif (ticks := _ticks(child)) == worked:
+            break
+        else:
+            worked = ticks
+    return b"", None
+
+
+def _ticks(process: int) -> int:
+    """Processor time that it has taken, in clock ticks."""
+    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    return int(fields[11]) + int(fields[12])
