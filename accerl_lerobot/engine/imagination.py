@@ -9,6 +9,7 @@ batches are real; from then on the trainer waits for imagined segments as it doe
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 import threading
@@ -38,8 +39,10 @@ from accerl_lerobot.world_model.data import load_datasets, open_datasets
 from accerl_lerobot.world_model.online import OnlineLearner, Promotion
 from accerl_lerobot.world_model.reference import OracleModel, ShuffledModel, learned_part
 from accerl_lerobot.world_model.rollouts import Imagination
-from accerl_lerobot.world_model.store import load_roles, load_world_model, rehearse_world_model
+from accerl_lerobot.world_model.store import load_failed, load_roles, load_world_model, rehearse_world_model
 from accerl_lerobot.world_model.success_model import SuccessPairsRewardModel
+
+logger = logging.getLogger(__name__)
 
 LEARN = "imagination.learn.dataset"
 MAX_PENDING = 2  # messages to replay that may be pending before imagination pauses
@@ -67,14 +70,29 @@ def make_learner(config: RunConfig) -> OnlineLearner:
 
 
 def check_imagination(config: RunConfig) -> None:
-    """Refuses, before a run begins, what `make_imagination` would refuse in the middle of it."""
+    """Refuses, before a run begins, what `make_imagination` would refuse in the middle of it; warns of a
+    world model that is used as it is and has failed its validation."""
     _, model, _ = _load(config, policy_to_be(config), first=True)
+    if config.imagination.needs_path and not config.imagination.learns:
+        _warn_of_failed(Path(str(config.imagination.path)).expanduser())
     if config.imagination.learns:
         learn, episodes = config.imagination.learn, config.rollout.episodes
         if learn.dataset.repo_id is None and 0 < episodes < (least := math.ceil(1 / learn.held_out)):
             why = f"none is held out, so no world model can pass: use at least {least}, or name {LEARN}"
             raise InputError("rollout.episodes", episodes, why)
         open_datasets({LEARN: learn.dataset}, model.spec)
+
+
+def _warn_of_failed(path: Path) -> None:
+    failed = load_failed(path, IMAGINATION)
+    if failed == []:
+        return
+    why = "was never validated" if failed is None else f"failed its validation ({', '.join(failed)[:200]})"
+    logger.warning(
+        "the world model of imagination.path=%s %s and is used all the same; train it longer or on more "
+        "episodes, or use imagination.learn.steps_per_episode, with which only one that passes is used",
+        path, why,
+    )  # fmt: skip
 
 
 def _load(

@@ -104,6 +104,8 @@ def pretrain(run: WorldModelRun, directory: Path, console: Console) -> dict[str,
             serving, held_out, config.validation, success, fresh=fresh, seed=run.seed
         )
         validation.preview_videos(directory, serving, held_out, config.validation, run.seed)
+    failed = (name for name, check in found["checks"].items() if not check["holds"])
+    store.note_failed(directory / "world_model", failed)
     success.config.threshold = found["datasets"][fresh]["threshold"]
     success.save_pretrained(directory / "world_model" / store.SUCCESS)
     counts = {"learnt": data.count_episodes(learnt), "held_out": data.count_episodes(held)}

@@ -2,7 +2,7 @@
 """World models on disk: configs as JSON, weights as safetensors, the success model in LeRobot's format.
 
 world_model/
-  config.json          spec, config of the model, and the episodes it is known from
+  config.json          spec, config of the model, the episodes it is known from, and the checks it failed
   model.safetensors    weights and statistics
   success_model/       a LeRobot reward model
 """
@@ -10,7 +10,7 @@ world_model/
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 
@@ -20,6 +20,7 @@ from lerobot.configs.rewards import RewardModelConfig
 from safetensors.torch import save_file
 
 from accerl_lerobot.checkpoint.isolation import rehearse
+from accerl_lerobot.checkpoint.layout import write_atomically
 from accerl_lerobot.checkpoint.safety import (
     Origin,
     brief,
@@ -59,6 +60,24 @@ def save_world_model(
     device, success.config.device = success.config.device, "cpu"
     success.save_pretrained(directory / SUCCESS)
     success.config.device = device
+
+
+def note_failed(directory: Path, checks: Iterable[str]) -> None:
+    """Adds to a saved world model which checks of its validation failed."""
+    path = directory / CONFIG
+    content = json.loads(path.read_text()) | {"failed_checks": list(checks)}
+    write_atomically(path, json.dumps(content, indent=2) + "\n")
+
+
+def load_failed(directory: Path, section: str = "") -> list[str] | None:
+    """The checks that a saved world model failed; None if it was never validated."""
+    origin = _origin(directory, section)
+    failed = read_json(safe_join(directory, CONFIG, origin), origin).get("failed_checks")
+    if failed is not None and not (
+        isinstance(failed, list) and all(isinstance(name, str) for name in failed)
+    ):
+        raise origin.refuse(f"{CONFIG}: failed_checks", "not one of accerl world-model")
+    return failed
 
 
 def load_roles(directory: Path, section: str = "") -> dict[str, str]:

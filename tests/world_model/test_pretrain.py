@@ -29,6 +29,7 @@ from accerl_lerobot.world_model.learners import new_success_model
 from accerl_lerobot.world_model.store import (
     LEARNT,
     THRESHOLD,
+    load_failed,
     load_roles,
     load_world_model,
     rehearse_world_model,
@@ -88,6 +89,8 @@ def test_from_a_dataset_to_a_validation(demos: Path, tmp_path: Path, capsys: pyt
     world, success = load_world_model(out / "world_model")
     assert success.config.chunk == world.spec.chunk == 5
     assert success.config.threshold == pytest.approx(one["threshold"])
+    failed = [name for name, check in found["checks"].items() if not check["holds"]]
+    assert load_failed(out / "world_model") == failed != []
     assert world.spec.cameras == ("observation.images.front",) and float(world.uncertainty_scale) != 1
     assert (out / "preview.mp4").stat().st_size > 1000
 

@@ -29,7 +29,14 @@ from accerl_lerobot.world_model.online import Promotion
 from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.pretrain import world_spec
 from accerl_lerobot.world_model.reference import OracleModel, ShuffledModel
-from accerl_lerobot.world_model.store import HELD_OUT, LEARNT, THRESHOLD, load_roles, save_world_model
+from accerl_lerobot.world_model.store import (
+    HELD_OUT,
+    LEARNT,
+    THRESHOLD,
+    load_roles,
+    note_failed,
+    save_world_model,
+)
 from accerl_lerobot.world_model.success_model import SuccessPairsRewardModel
 from tests.runs import tiny_run
 
@@ -118,6 +125,47 @@ def test_what_would_be_fine_tuned_is_looked_at_before(tiny_checkpoint: Path, tmp
         with pytest.raises(InputError, match=r"^sft\.init_path='nowhere'"):
             start(replace(tuned, sft=replace(tuned.sft, init_path="nowhere")))
     assert check_start(tuned)[1] == 1
+
+
+@pytest.mark.parametrize(
+    ("failed", "steps", "told"),
+    [
+        (None, 0, "was never validated and is used all the same"),
+        (
+            ["recall", "online.auroc"],
+            0,
+            "failed its validation (recall, online.auroc) and is used all the same",
+        ),
+        ([], 0, None),
+        (["recall"], 5, None),
+    ],
+)
+def test_a_model_that_failed_its_validation_is_not_used_silently(
+    failed: list[str] | None,
+    steps: int,
+    told: str | None,
+    tiny_checkpoint: Path,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+):
+    """Only one that passes is used where it learns."""
+    config = run(tiny_checkpoint, tmp_path / "model", OnlineLearnConfig(steps_per_episode=steps), {})
+    if failed is not None:
+        note_failed(tmp_path / "model", failed)
+    check_imagination(config)
+    logged = [record.getMessage() for record in caplog.records if record.name.endswith("engine.imagination")]
+    assert [told in line for line in logged if told] == ([True] if told else []) and bool(logged) == bool(
+        told
+    )
+
+
+def test_what_a_model_failed_is_a_list_of_names(tiny_checkpoint: Path, tmp_path: Path):
+    config = run(tiny_checkpoint, tmp_path / "model", OnlineLearnConfig(steps_per_episode=0), {})
+    note_failed(tmp_path / "model", [])
+    path = tmp_path / "model" / "config.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"failed_checks": 7}))
+    with pytest.raises(InputError, match=r"^imagination\.path=.*config\.json: failed_checks"):
+        check_imagination(config)
 
 
 def test_a_dataset_that_is_not_there_is_named_by_its_section(tiny_checkpoint: Path, tmp_path: Path):
