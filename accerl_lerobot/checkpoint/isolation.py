@@ -55,7 +55,7 @@ def rehearse[T](task: Callable[[], T], folder: Path, origin: Origin, pattern: st
     size = sum(path.stat().st_size for path in folder.glob(pattern) if path.is_file())
     memory, cpu_s = SLACK + PER_BYTE * size, round(CPU_S + CPU_S_PER_BYTE * size)
     deadline = time.monotonic() + PATIENCE * cpu_s
-    message, status = _try(task, memory, cpu_s, deadline)
+    message, status = b"", None
     while status is None and time.monotonic() < deadline:
         message, status = _try(task, memory, cpu_s, deadline)
     answer = json.loads(message) if message else {"why": _cause(status, cpu_s)}

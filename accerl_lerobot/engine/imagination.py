@@ -73,14 +73,14 @@ def check_imagination(config: RunConfig) -> None:
     """Refuses, before a run begins, what `make_imagination` would refuse in the middle of it; warns of a
     world model that is used as it is and has failed its validation."""
     _, model, _ = _load(config, policy_to_be(config), first=True)
-    if config.imagination.needs_path and not config.imagination.learns:
-        _warn_of_failed(Path(str(config.imagination.path)).expanduser())
     if config.imagination.learns:
         learn, episodes = config.imagination.learn, config.rollout.episodes
         if learn.dataset.repo_id is None and 0 < episodes < (least := math.ceil(1 / learn.held_out)):
             why = f"none is held out, so no world model can pass: use at least {least}, or name {LEARN}"
             raise InputError("rollout.episodes", episodes, why)
         open_datasets({LEARN: learn.dataset}, model.spec)
+    elif config.imagination.needs_path:
+        _warn_of_failed(Path(str(config.imagination.path)).expanduser())
 
 
 def _warn_of_failed(path: Path) -> None:

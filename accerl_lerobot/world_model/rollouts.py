@@ -48,7 +48,7 @@ from accerl_lerobot.world_model.contract import (
 )
 from accerl_lerobot.world_model.data import model_arrays, resize
 from accerl_lerobot.world_model.reference import OracleModel, ShuffledModel, learned_part
-from accerl_lerobot.world_model.store import save_world_model
+from accerl_lerobot.world_model.store import note_failed, save_world_model
 from accerl_lerobot.world_model.success_model import SuccessPairsRewardModel
 
 if TYPE_CHECKING:
@@ -227,6 +227,7 @@ class Imagination:
         """Saves the models that were promoted last; nothing if none were."""
         if self.version and self._success is not None:
             save_world_model(directory, learned_part(self._model), self._success, self._roles)
+            note_failed(directory, ())  # or it would not have been promoted
 
     @property
     def on(self) -> bool:
