@@ -24,7 +24,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from accerl_lerobot.checkpoint.safety import MIB, Origin, read_json, safe_join
+from accerl_lerobot.checkpoint.safety import (
+    MIB,
+    Origin,
+    leads_out,
+    read_json,
+    safe_join,
+    texts_in,
+)  # fmt: skip
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.fault_points import fault_point
 
@@ -50,6 +57,19 @@ STEP_FOLDERS = {
 }
 """LeRobot processor step → its option that names files, and our folder for them."""
 PREPROCESSOR = "policy_preprocessor.json"
+BACKBONE_FILES = (
+    "config.json", "*_config.json", "tokenizer.json", "vocab.json", "vocab.txt", "merges.txt", "*.model",
+    "special_tokens_map.json", "added_tokens.json", "chat_template.*", "processing_*.py",
+)  # fmt: skip
+"""Files of a backbone's folder, without its weights."""
+BACKBONE_WEIGHTS = ("model*.safetensors", "model.safetensors.index.json")
+NAMING = ("config.json", "*_config.json", "*processor.json", "accerl.json", "info.json", "config.yaml")
+"""Files of a checkpoint, dataset or run whose texts may be taken for names of other files."""
+NOT_READ = "train_config.json"  # LeRobot's record of a training
+RECORDED = ("pretrained_path", "_name_or_path", "name_or_path", "special_tokens_map_file")
+"""Keys that say where something once was. Nothing reads it there."""
+LOOKED_UP = ("_name", "_path", "vocab_file", "merges_file", "tokenizer_file")
+"""Endings of keys whose values LeRobot and transformers look for below the current folder first."""
 
 
 def save_checkpoint(checkpoints: Path, write: Callable[[Path], int]) -> Path:
@@ -273,6 +293,26 @@ def _local_names(directory: Path) -> tuple[dict[str, Any], dict[str, Any], list[
     config, processor = (json.loads((directory / name).read_text()) for name in ("config.json", PREPROCESSOR))
     named = [(place, place[0].get(place[1]) or "") for place in places_of_names(config, processor)]
     return config, processor, [at for at, name in named if Path(name).is_absolute() or name == at[2]]
+
+
+def check_names(folder: Path, origin: Origin) -> None:
+    """Refuses files from elsewhere that name a file outside their own folder.
+
+    The name of a backbone or tokeniser that lies in the folder is accepted: it is not read.
+    """
+    for path in sorted(path for path in folder.rglob("*") if any(map(path.match, NAMING))):
+        if path.name == NOT_READ or not path.is_file():
+            continue
+        name, is_json = path.relative_to(folder).as_posix(), path.suffix == ".json"
+        content = read_json(path, origin)
+        places = places_of_names(content, content) if is_json and path.parent == folder else []
+        replaced = {(id(fields), key) for fields, key, own in places if (folder / own).is_dir()}
+        for fields, key, text in texts_in(content):
+            if key in RECORDED or (id(fields), key) in replaced:
+                continue
+            if leads_out(text) or is_json and key.endswith(LOOKED_UP) and os.path.exists(text):
+                why = f"{text[:80]!r} is a place on this machine, which files from elsewhere may not name"
+                raise origin.refuse(f"{name}: {key}", f"{why}; a copy of a backbone goes into {BACKBONE}/")
 
 
 def places_of_names(config: dict[str, Any], processor: dict[str, Any]) -> list[Place]:

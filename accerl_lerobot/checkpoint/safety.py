@@ -13,11 +13,12 @@ import math
 import os
 import re
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+import yaml
 from safetensors import SafetensorError, safe_open
 
 from accerl_lerobot.errors import InputError
@@ -31,6 +32,7 @@ PICKLES = (".bin", ".pt", ".pth", ".pkl", ".pickle", ".ckpt")
 REVISION = re.compile(r"[0-9a-f]{40}")
 HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]{0,95}(/[A-Za-z0-9][\w.-]{0,95})?", re.ASCII)
 _DRIVE = re.compile(r"[A-Za-z]:")
+_ABSOLUTE = re.compile(r"(~[^/\s]*)?/[\w.]|[A-Za-z]:[\\/]|file:|~$")
 _CONTROL = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
 
 
@@ -76,6 +78,47 @@ def _check_link(path: Path, root: Path, name: str, origin: Origin) -> None:
         raise origin.refuse(name, "a link that leads out of the folder; put the file itself there")
 
 
+def matching_files(root: Path, patterns: Iterable[str], origin: Origin) -> dict[str, Path]:
+    """Files below `root` whose names match a pattern, by these names; hidden ones are left out.
+
+    A ``*`` stands for a part of one name. A link that leads out of `root` is refused.
+    """
+    found: dict[str, Path] = {}
+    for path in (path for pattern in patterns for path in sorted(root.glob(pattern))):
+        name = path.relative_to(root).as_posix()
+        if not any(part.startswith(".") for part in name.split("/")):
+            _check_link(path, root, name, origin)
+            if path.is_file():
+                found[name] = path
+    return found
+
+
+def leads_out(text: str) -> bool:
+    """True for a text that, as the name of a file, is absolute or goes above its folder."""
+    return _ABSOLUTE.match(text) is not None or ".." in re.split(r"[\\/]", text)
+
+
+def texts_in(content: Any) -> Iterator[tuple[dict[str, Any], str, str]]:
+    """(mapping, key, text) of every text below a key of JSON or YAML, those in lists included."""
+    parts, seen = [content], set()
+    while parts:
+        part = parts.pop()
+        if id(part) in seen or not isinstance(part, dict):
+            continue
+        seen.add(id(part))
+        for key, value in part.items():
+            values = [value]
+            while values:
+                value = values.pop()
+                if isinstance(value, list) and id(value) not in seen:
+                    seen.add(id(value))
+                    values += value
+                elif isinstance(value, str):
+                    yield part, str(key), value
+                elif isinstance(value, dict):
+                    parts.append(value)
+
+
 def check_folder(folder: Path, origin: Origin) -> None:
     """Refuses what is no folder, or has a link that leads out, a pipe or a device."""
     if not folder.is_dir():
@@ -111,18 +154,19 @@ def file_size(path: Path, origin: Origin) -> int:
 
 
 def read_json(path: Path, origin: Origin, most: int = JSON_MOST) -> dict[str, Any]:
-    """The mapping in a JSON file of at most `most` bytes."""
+    """The mapping in a JSON file, or a YAML one by its suffix, of at most `most` bytes."""
+    parse, language = (yaml.safe_load, "YAML") if path.suffix == ".yaml" else (json.loads, "JSON")
     if (size := file_size(path, origin)) > most:
         remedy = f"{size} bytes, more than the {most} that such a file may have; it is not what it says"
         raise origin.refuse(path.name, remedy)
     try:
         with path.open("rb") as file:
-            content = json.loads(file.read(most + 1).decode())
+            content = parse(file.read(most + 1).decode())
     except OSError as error:
         raise origin.refuse(path.name, f"cannot be read ({error.strerror})") from error
-    except (RecursionError, ValueError) as error:
-        why = "it is nested too deeply" if isinstance(error, RecursionError) else error
-        raise origin.refuse(path.name, f"not good JSON ({why})") from error
+    except (RecursionError, ValueError, yaml.YAMLError) as error:
+        why = "it is nested too deeply" if isinstance(error, RecursionError) else brief(error)
+        raise origin.refuse(path.name, f"not good {language} ({why})") from error
     if not isinstance(content, dict):
         raise origin.refuse(path.name, f"a mapping is wanted, not {type(content).__name__}")
     return content

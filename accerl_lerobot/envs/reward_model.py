@@ -12,12 +12,11 @@ import functools
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 
-from accerl_lerobot.checkpoint.safety import Origin, brief, read_json, tensor_shapes
+from accerl_lerobot.checkpoint.safety import Origin, brief, tensor_shapes
 from accerl_lerobot.config.ranges import Commit, Range, Section
 from accerl_lerobot.envs.base import ChunkResult, World, WrappedWorld
 from accerl_lerobot.errors import InputError
@@ -51,21 +50,15 @@ def load_judge(config: RewardModelConfig) -> Callable[[Observation], bool]:
     from lerobot.rewards.factory import get_reward_model_class
     from lerobot.utils.import_utils import register_third_party_plugins
 
-    from accerl_lerobot.checkpoint.layout import BACKBONE
     from accerl_lerobot.policies import untrusted
 
     assert config.path is not None
     origin = Origin(f"{REWARD_MODEL}.path", config.path)
     folder = untrusted.fetched_checkpoint(config.path, config.revision, origin.field)
-    fetched = not Path(config.path).expanduser().exists()
-    stored = read_json(folder / "config.json", origin)
-    untrusted.check_origin(
-        stored.get("model_name"), folder / BACKBONE, "config.json: model_name", origin, fetched
-    )
     names = [path.name for path in folder.glob("*_preprocessor.json")]
     if len(names) != 1:
         raise origin.refuse("*_preprocessor.json", f"{len(names)} of them; lerobot-train writes one")
-    untrusted.check_processor(folder, names[0], origin, fetched=fetched)
+    untrusted.check_processor(folder, names[0], origin)
     register_third_party_plugins()
     try:
         trusted = config.trust_remote_code

@@ -18,7 +18,17 @@ from typing import Annotated, Any, Literal
 from huggingface_hub import DatasetCard, ModelCard, ModelCardData
 
 from accerl_lerobot.checkpoint import safety
-from accerl_lerobot.checkpoint.layout import AWAY, BACKBONE, CHECKPOINTS, PREPROCESSOR, PRETRAINED, SUMMARY
+from accerl_lerobot.checkpoint.layout import (
+    AWAY,
+    BACKBONE,
+    BACKBONE_FILES,
+    BACKBONE_WEIGHTS,
+    CHECKPOINTS,
+    FAST,
+    PREPROCESSOR,
+    PRETRAINED,
+    SUMMARY,
+)  # fmt: skip
 from accerl_lerobot.checkpoint.layout import CONFIG as RECIPE
 from accerl_lerobot.config.parsing import read_recipe
 from accerl_lerobot.config.ranges import NewFolder, Pattern, Section
@@ -125,6 +135,21 @@ KEPT = {
     WORLD_MODEL: (RECIPE, VALIDATION, "preview.mp4", "preview_online.mp4"),
 }
 """Artifact type → files of its run that go with it."""
+CONTENTS = {
+    POLICY: (
+        CONFIG, "train_config.json", "model*.safetensors", "model.safetensors.index.json",
+        "policy_*processor.json", "*processor_step_*.safetensors",
+        "accerl.json", "value_head.safetensors", "family.safetensors",
+        *(f"{own}/{name}" for own in (BACKBONE, FAST) for name in BACKBONE_FILES + BACKBONE_WEIGHTS),
+        *(f"{FOLDER}/{name}" for name in KEPT[POLICY]),
+    ),
+    WORLD_MODEL: (
+        CONFIG, WEIGHTS, f"success_model/{CONFIG}", f"success_model/{WEIGHTS}",
+        *(f"{FOLDER}/{name}" for name in KEPT[WORLD_MODEL]),
+    ),
+    DATASET: ("meta/*", "meta/*/*/*.parquet", "data/*/*.parquet", "videos/*/*/*.mp4"),
+}  # fmt: skip
+"""Artifact type → its files, the only ones that are pushed beside a card and a licence."""
 MARK = "<!-- Written by accerl push, and anew each time. Delete this line to keep what you change. -->"
 
 
@@ -156,7 +181,8 @@ def find_provenance(folder: Path, artifact: str, evaluation: str | None) -> Prov
         is_last = step.isdigit() and int(step) == summary.get("updates")
         measured = home == carried or artifact != POLICY or is_last
         names = KEPT.get(artifact, ()) if measured else (RECIPE,)
-        files = {f"{FOLDER}/{name}": home / name for name in names if (home / name).is_file()}
+        there = safety.matching_files(home, names, safety.Origin("path", str(folder)))
+        files = {f"{FOLDER}/{name}": path for name, path in there.items()}
         known["validation"] = read_json(home / VALIDATION)
         with contextlib.suppress(InputError):
             known["recipe"] = read_recipe(home / RECIPE)

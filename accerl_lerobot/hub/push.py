@@ -10,9 +10,7 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import re
-from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -21,6 +19,7 @@ from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, ge
 from huggingface_hub.errors import RepositoryNotFoundError
 
 from accerl_lerobot.checkpoint import layout
+from accerl_lerobot.checkpoint.safety import Origin, matching_files
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.hub import card
 from accerl_lerobot.hub.errors import LOGIN, check_commit, hub_errors
@@ -33,7 +32,6 @@ PICTURES = (".png", ".jpg", ".gif", ".svg", ".mp4")
 """Endings of files that a card may show, which somebody may have added on the Hub."""
 FOLDERS = (card.FOLDER, layout.BACKBONE, "success_model", "meta", "data", "videos", "images")
 """Top folders of what is pushed."""
-WEIGHTS = (".safetensors", ".bin", ".pt", ".pth")
 RECORDS = (".json", ".jsonl", ".yaml", ".yml", ".md", ".txt", ".log", ".csv", ".html")
 VOCABULARIES = ("tokenizer.json", "vocab.json", "merges.txt", "added_tokens.json", "special_tokens_map.json")
 PATH = re.compile(r"(?<![\w:/.~}>\-])(?:~|)(?:/[\w.+@%,\-]+){2,}/?")
@@ -64,10 +62,12 @@ def stage(config: card.PushConfig, folder: Path, artifact: str) -> tuple[card.Fi
     files = contents(folder, artifact)
     for name, path in provenance.files.items():
         files[name] = scrubbed(name, path.read_bytes(), folder) if is_record(name) else path
-    readme, repo_id = folder / card.CARD, config.repo_id
-    own = readme.is_file() and card.MARK not in readme.read_text()
+    repo_id = config.repo_id
+    readme = matching_files(folder, [card.CARD], Origin("path", str(folder))).values()
+    own = any(card.MARK not in path.read_text() for path in readme)
     if own:
-        text = readme.read_text()
+        (path,) = readme
+        text = path.read_text()
     elif artifact == card.DATASET:
         text = card.dataset_card(repo_id, folder)
     else:
@@ -157,12 +157,18 @@ def _tag(api: HfApi, where: dict[str, Any], commit: str) -> None:
 def contents(folder: Path, artifact: str) -> card.Files:
     """Files of a folder that are pushed, without paths of this machine.
 
-    A policy without its backbone is refused.
+    Their names are those of the artifact's type. A link that leads out is refused, and so is a policy without
+    its backbone.
     """
-    files: card.Files = {name: path for name, path in _walk(folder) if name not in NOT_CONTENTS}
-    if artifact == card.DATASET:  # LeRobot leaves images behind that are in the tables or videos now
-        files = {name: path for name, path in files.items() if not name.startswith("images/")}
+    origin = Origin("path", str(folder))
+    patterns = (*card.CONTENTS[artifact], "LICENSE*")
+    files: card.Files = {**matching_files(folder, patterns, origin)}
+    others = [path.name for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
+    if left := sorted(set(others) - files.keys() - set(NOT_CONTENTS)):
+        logger.warning("not pushed, as no part of a %s: %s", artifact, ", ".join(left))
     if artifact == card.POLICY:
+        if (folder / card.RECORD).is_file():
+            layout.check_names(folder, origin)
         _bring_backbone(files, folder)
     for name, content in files.items():
         if is_record(name):
@@ -171,26 +177,17 @@ def contents(folder: Path, artifact: str) -> card.Files:
     return files
 
 
-def _walk(folder: Path) -> Iterator[tuple[str, Path]]:
-    """Files below a folder by their names in a repository, without hidden ones and linked folders."""
-    for at, folders, names in os.walk(folder):
-        folders[:] = sorted(f for f in folders if not f.startswith(".") and f != "__pycache__")
-        for name in sorted(names):
-            path = Path(at, name)
-            if not name.startswith(".") and path.is_file():
-                yield path.relative_to(folder).as_posix(), path
-
-
 def _bring_backbone(files: card.Files, home: Path) -> None:
     """Points a policy at the backbone beside it, which is copied there if it is elsewhere on this machine."""
     config, processor = card.read_json(home / card.CONFIG), card.read_json(home / layout.PREPROCESSOR)
     before = json.dumps([config, processor])
     elsewhere = Path(config.get("vlm_model_name") or "")
     if elsewhere.is_absolute() and not (home / layout.BACKBONE).is_dir():
-        for name, path in _walk(elsewhere):
-            # The policy's own file holds its weights, unless LeRobot builds it from the backbone's.
-            if config.get("load_vlm_weights") or path.suffix not in WEIGHTS:
-                files[f"{layout.BACKBONE}/{name}"] = path
+        # The policy's own file holds its weights, unless LeRobot builds it from the backbone's.
+        weights = layout.BACKBONE_WEIGHTS if config.get("load_vlm_weights") else ()
+        origin = Origin("path", str(elsewhere))
+        for name, path in matching_files(elsewhere, layout.BACKBONE_FILES + weights, origin).items():
+            files[f"{layout.BACKBONE}/{name}"] = path
     ours = layout.CONFIG_FOLDERS.values()
     has = {own for own in ours if any(name.startswith(f"{own}/") for name in files)}
     for fields, key, own in layout.places_of_names(config, processor):

@@ -20,7 +20,8 @@ import draccus
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from accerl_lerobot.checkpoint.layout import BACKBONE, FAST, relocate
+from accerl_lerobot.checkpoint.layout import BACKBONE, BACKBONE_FILES, BACKBONE_WEIGHTS, FAST, relocate
+from accerl_lerobot.checkpoint.safety import Origin, matching_files
 from accerl_lerobot.checkpoint.tensors import copy_of, place
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import PolicyConfig, SamplerConfig, TuningConfig
@@ -130,9 +131,10 @@ def _save_backbone(lerobot_config: Any, preprocessor: Any, directory: Path) -> N
     source = Path(lerobot_config.vlm_model_name)
     if source.is_absolute() and source.resolve() != (directory / BACKBONE).resolve():
         # The policy's own file holds the backbone's weights, unless LeRobot builds it from the backbone's.
-        weights = () if lerobot_config.load_vlm_weights else ("*.safetensors", "*.bin", "*.pt", "*.pth")
-        ignore = shutil.ignore_patterns(*weights)
-        shutil.copytree(source, directory / BACKBONE, ignore=ignore, dirs_exist_ok=True)
+        wanted = BACKBONE_FILES + (BACKBONE_WEIGHTS if lerobot_config.load_vlm_weights else ())
+        (directory / BACKBONE).mkdir(exist_ok=True)
+        for name, file in matching_files(source, wanted, Origin("policy.path", str(source))).items():
+            shutil.copyfile(file, directory / BACKBONE / name)
 
 
 def _copied(tensors: dict[str, Tensor]) -> dict[str, Tensor]:

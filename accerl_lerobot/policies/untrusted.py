@@ -23,7 +23,13 @@ import torch
 from torch import nn
 from torch.overrides import TorchFunctionMode
 
-from accerl_lerobot.checkpoint.layout import BACKBONE, CONFIG_FOLDERS, PREPROCESSOR, STEP_FOLDERS
+from accerl_lerobot.checkpoint.layout import (
+    BACKBONE,
+    CONFIG_FOLDERS,
+    PREPROCESSOR,
+    STEP_FOLDERS,
+    check_names,
+)  # fmt: skip
 from accerl_lerobot.checkpoint.safety import (
     HUB_ID,
     Origin,
@@ -77,11 +83,10 @@ def check_checkpoint(folder: Path, origin: Origin, *, fetched: bool = False) -> 
     """
     config = read_json(safe_join(folder, CONFIG, origin), origin)
     for key, own in CONFIG_FOLDERS.items():
-        check_origin(config.get(key), folder / own, f"{CONFIG}: {key}", origin, fetched)
-    check_origin(config.get("vision_encoder_name"), None, f"{CONFIG}: vision_encoder_name", origin, fetched)
+        check_name(config.get(key), folder / own, f"{CONFIG}: {key}", origin)
     for name in PROCESSORS:
         if safe_join(folder, name, origin).exists():
-            check_processor(folder, name, origin, fetched=fetched)
+            check_processor(folder, name, origin)
     check_not_pickled(folder, WEIGHTS, origin)
     for name in (WEIGHTS, VALUE_HEAD, FAMILY):
         if safe_join(folder, name, origin).exists():
@@ -89,6 +94,8 @@ def check_checkpoint(folder: Path, origin: Origin, *, fetched: bool = False) -> 
     if safe_join(folder, OURS, origin).exists():
         check_ours(read_json(folder / OURS, origin), origin)
     _check_beside(folder, origin)
+    if fetched:
+        check_names(folder, origin)
 
 
 def check_ours(ours: dict[str, Any], origin: Origin) -> None:
@@ -97,7 +104,7 @@ def check_ours(ours: dict[str, Any], origin: Origin) -> None:
             raise origin.refuse(f"{OURS}: {key}", "a mapping is wanted; remove the file to start without it")
 
 
-def check_processor(folder: Path, name: str, origin: Origin, *, fetched: bool = False) -> None:
+def check_processor(folder: Path, name: str, origin: Origin) -> None:
     """Checks a processor file: only LeRobot's registered steps, with state files in this folder."""
     steps = read_json(folder / name, origin).get("steps")
     if not isinstance(steps, list):
@@ -114,7 +121,7 @@ def check_processor(folder: Path, name: str, origin: Origin, *, fetched: bool = 
         if kind in STEP_FOLDERS:
             option, own = STEP_FOLDERS[kind]
             named = step.get("config", {}).get(option)
-            check_origin(named, folder / own, f"{name}: {option}", origin, fetched)
+            check_name(named, folder / own, f"{name}: {option}", origin)
 
 
 def check_statistics(folder: Path, origin: Origin) -> None:
@@ -126,8 +133,8 @@ def check_statistics(folder: Path, origin: Origin) -> None:
                 deque(read_tensors(folder / step["state_file"], origin), maxlen=0)
 
 
-def check_origin(name: Any, own: Path | None, what: str, origin: Origin, fetched: bool) -> None:
-    """Checks that a backbone or tokeniser is the checkpoint's own, the Hub's, or at a path of a local one's.
+def check_name(name: Any, own: Path, what: str, origin: Origin) -> None:
+    """Checks that a backbone or tokeniser has the form of a Hub id, or is a folder.
 
     `own` is the checkpoint's own folder of it; `what` says file and key, for the error.
     """
@@ -135,12 +142,9 @@ def check_origin(name: Any, own: Path | None, what: str, origin: Origin, fetched
         return
     if not isinstance(name, str) or len(name) > 1024 or "\x00" in name:
         raise origin.refuse(what, "a name is wanted")
-    if own is not None and own.is_dir() and Path(name).is_absolute():
-        return  # it is not read: the checkpoint's own goes first
     if Path(name).is_absolute():
-        if fetched or ".." in Path(name).parts:
-            remedy = "a folder of this machine, which a checkpoint from elsewhere may not name"
-            raise origin.refuse(what, f"{name[:80]!r}: {remedy}; put a copy into {BACKBONE}/")
+        if ".." in Path(name).parts and not own.is_dir():
+            raise origin.refuse(what, f"{name[:80]!r} leads elsewhere; name the folder without ..")
     elif not HUB_ID.fullmatch(name):
         raise origin.refuse(what, f"{name[:80]!r} is neither a Hub id nor an absolute path")
 

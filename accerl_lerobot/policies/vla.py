@@ -43,6 +43,8 @@ from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TO
 from scipy.fft import dct
 from torch import Tensor
 
+from accerl_lerobot.checkpoint.layout import BACKBONE_FILES
+from accerl_lerobot.checkpoint.safety import Origin, matching_files
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.family import Encoded
 from accerl_lerobot.policies.flow import FlowModel, Velocity, flow_shape
@@ -193,9 +195,10 @@ class FastTokenizer:
     def save_pretrained(self, directory: Path) -> None:
         """Copies its files; code, where it lies beside them, for those who run it."""
         directory.mkdir(parents=True, exist_ok=True)
-        for file in self.folder.iterdir():
-            if file.suffix in (".json", ".py") and not (directory / file.name).exists():
-                shutil.copyfile(file, directory / file.name)
+        files = matching_files(self.folder, BACKBONE_FILES, Origin("policy.path", str(self.folder)))
+        for name, file in files.items():
+            if not (directory / name).exists():
+                shutil.copyfile(file, directory / name)
 
 
 @contextlib.contextmanager

@@ -12,7 +12,7 @@ import yaml
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.hub.card import PullConfig, PushConfig, find_provenance, recognise, repo_type
-from accerl_lerobot.hub.push import contents, is_record, scrubbed
+from accerl_lerobot.hub.push import contents, is_record, scrubbed, stage
 from tests.hub.folders import SUMMARY, write_json, write_policy_folder, write_run_folder
 
 TINY = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
@@ -77,17 +77,50 @@ def test_what_is_no_name_of_a_repository(name: str | None):
             make()
 
 
-def test_hidden_files_and_what_a_pull_left_stay_here(tmp_path: Path):
+def test_only_what_belongs_to_a_policy_is_pushed(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     folder = write_policy_folder(tmp_path / "policy")
-    for name in (".cache/huggingface/x.json", ".secret", "accerl_pulled.json"):
+    own = {path.name for path in folder.iterdir()}
+    others = (".cache/huggingface/x.json", ".secret", "accerl_pulled.json", "id_rsa", "passwords.json",
+              "backbone/notes.txt", "backbone/deep/config.json", "accerl_run/wallet.json")  # fmt: skip
+    for name in (*others, "backbone/config.json", "LICENSE", "accerl_run/summary.json"):
         write_json(folder / name, {})
     (folder / "linked").symlink_to(tmp_path)
-    assert {n for n in contents(folder, "policy") if not (folder / n).exists()} == set()
-    assert not {
-        n
-        for n in contents(folder, "policy")
-        if "secret" in n or "cache" in n or "accerl_" in n or "link" in n
-    }
+    found = set(contents(folder, "policy"))
+    assert found == own | {"backbone/config.json", "LICENSE", "accerl_run/summary.json"}
+    assert "not pushed, as no part of a policy: id_rsa, passwords.json" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "name", ["config.json", "accerl.json", "backbone", "backbone/tokenizer.json", "README.md", "accerl_run"]
+)
+def test_no_link_that_leads_out_is_pushed(tmp_path: Path, name: str):
+    secret = tmp_path / "secret"
+    for file in ("config.json", "tokenizer.json", "summary.json"):
+        write_json(secret / file, {"type": "act", "n_obs_steps": 1})
+    folder = write_policy_folder(tmp_path / "policy")
+    (folder / name).parent.mkdir(exist_ok=True)
+    (folder / name).unlink(missing_ok=True)
+    (folder / name).symlink_to(secret if "." not in name else secret / "config.json")
+    with pytest.raises(InputError, match=f"{name}.*: a link that leads out of the folder"):
+        stage(PushConfig(path=str(folder), repo_id="a/b"), folder, "policy")
+
+
+def test_a_linked_file_of_a_run_or_of_a_backbone_elsewhere_is_not_pushed(tmp_path: Path):
+    write_json(tmp_path / "secret.json", SUMMARY)
+    run = write_run_folder(tmp_path / "run")
+    (run / "summary.json").unlink()
+    (run / "summary.json").symlink_to(tmp_path / "secret.json")
+    with pytest.raises(InputError, match="summary.json: a link that leads out"):
+        find_provenance(run / "checkpoints" / "last" / "pretrained_model", "policy", None)
+    write_json(tmp_path / "backbone" / "id_rsa.json", {})
+    (tmp_path / "backbone" / "config.json").symlink_to(tmp_path / "secret.json")
+    folder = write_policy_folder(tmp_path / "policy", vlm_model_name=str(tmp_path / "backbone"))
+    with pytest.raises(InputError, match="config.json: a link that leads out"):
+        contents(folder, "policy")
+    (tmp_path / "backbone" / "config.json").unlink()
+    (tmp_path / "backbone" / "config.json").write_text("{}")
+    brought = {name for name in contents(folder, "policy") if name.startswith("backbone/")}
+    assert brought == {"backbone/config.json"}
 
 
 def test_a_backbone_elsewhere_is_brought(tmp_path: Path):

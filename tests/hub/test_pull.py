@@ -11,7 +11,10 @@ from typing import Any
 import pytest
 
 from accerl_lerobot import cli
-from tests.hub.folders import refusal, write_policy_folder
+from accerl_lerobot.checkpoint.layout import check_names
+from accerl_lerobot.checkpoint.safety import Origin
+from accerl_lerobot.errors import InputError
+from tests.hub.folders import refusal, write_json, write_policy_folder
 from tests.hub_server import STRANGER, Answer, Fault, HubServer
 
 NAME = "alice/door"
@@ -112,7 +115,7 @@ def test_names_that_lead_elsewhere(hub: HubServer, policy: Path, refused: Refusa
 @pytest.mark.parametrize(
     ("planted", "words"),
     [
-        ({"policy_preprocessor.json": b"[1]"}, "one of its files is not what its name says"),
+        ({"policy_preprocessor.json": b"[1]"}, "policy_preprocessor.json: a mapping is wanted"),
         ({"config.json": b"[]"}, "no known artifact"),
     ],
 )
@@ -205,7 +208,6 @@ def test_huggingface_hub_alone_writes_where_a_header_says(hub: HubServer, policy
     from huggingface_hub import hf_hub_download, set_client_factory
     from huggingface_hub.utils._http import default_client_factory
 
-    from accerl_lerobot.errors import InputError
     from accerl_lerobot.policies.untrusted import fetched_checkpoint
 
     hub.change = changed("/resolve/", lambda answer: answer.headers.update({"ETag": "../../../escaped"}))
@@ -253,6 +255,65 @@ def test_no_recipe_that_was_pulled_lets_code_run(hub, policy, pulled, tmp_path, 
         assert "a file cannot allow this, only the command line can" in "".join(capsys.readouterr())
     assert cli.main(["export", f"--path={run}", f"--root={tmp_path / 'set'}"]) == 2
     assert f"add --env.trust_remote_code=true --env.kwargs.hub_path={ARENA}" in capsys.readouterr().err
+
+
+STEP = {"registry_name": "tokenizer_processor", "config": {"tokenizer_name": "SECRET"}}
+UNKNOWN = {"registry_name": "theirs", "config": {"nested": [{"vocabulary_path": "SECRET"}]}}
+
+
+@pytest.mark.parametrize(
+    ("file", "content"),
+    [
+        ("config.json", {"type": "smolvla", "n_obs_steps": 1, "vlm_model_name": "SECRET"}),
+        ("config.json", {"type": "smolvla_bins", "n_obs_steps": 1, "vision_encoder_name": "SECRET"}),
+        ("config.json", {"type": "groot", "n_obs_steps": 1, "base_model_path": "SECRET"}),
+        ("policy_preprocessor.json", {"steps": [STEP]}),
+        ("policy_preprocessor.json", {"steps": [UNKNOWN]}),
+        ("policy_postprocessor.json", {"steps": [UNKNOWN]}),
+        ("adapter_config.json", {"peft_type": "LORA", "base_model_name_or_path": "SECRET"}),
+        ("backbone/tokenizer_config.json", {"vocab_file": "SECRET"}),
+        ("backbone/config.json", {"vision_config": {"weights_path": "SECRET"}}),
+        ("accerl_run/config.yaml", {"dataset": {"repo_id": "a/b", "root": "SECRET"}}),
+        ("accerl_run/config.yaml", {"policy": {"path": "SECRET"}}),
+        ("accerl_run/config.yaml", {"rollout": {"reward_model": {"path": "SECRET"}}}),
+    ],
+)
+def test_no_place_of_this_machine_is_named(hub, policy, refused, tmp_path, monkeypatch, file, content):
+    (tmp_path / "hub" / "secret").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "hub")
+    names = [str(tmp_path / "hub" / "secret"), "~/secret", "../secret", "a/../../secret", "C:/secret"]
+    for name in names if file.endswith(".yaml") else [*names, "secret"]:
+        write_json(policy / file, json.loads(json.dumps(content).replace("SECRET", name)))
+        with pytest.raises(InputError, match=f"{file}: .* is a place on this machine"):
+            check_names(policy, Origin("policy.path", "theirs"))
+    hub.plant(NAME, {file: (policy / file).read_bytes()})
+    assert f"{file}: " in (line := refused()) and "is a place on this machine" in line
+
+
+def test_no_place_of_this_machine_is_named_by_a_world_model_or_dataset(hub: HubServer, refused: Refusal):
+    world = {"spec": {}, "model": {"type": "theirs", "backbone": "/etc/ssl"}}
+    hub.plant("alice/world", {"config.json": json.dumps(world).encode(), "model.safetensors": b"x"})
+    assert "config.json: backbone: '/etc/ssl' is a place" in refused(name="alice/world")
+    info = {"codebase_version": "v3.0", "data_path": "../{chunk_index}/{file_index}.parquet"}
+    files = {"meta/info.json": json.dumps(info).encode(), "meta/episodes/x": b"", "data/x": b""}
+    hub.plant("alice/data", files | {"meta/tasks.parquet": b""}, repo_type="dataset")
+    assert "meta/info.json: data_path" in refused(name="alice/data")
+
+
+def test_places_that_nothing_reads_are_no_reason_to_refuse(hub, policy, pulled, tmp_path):
+    config = json.loads((policy / "config.json").read_text()) | {"vlm_model_name": "/gone/backbone"}
+    elsewhere = {"dataset": {"root": "/data/mine"}, "output_dir": "/data/out"}
+    backbone = {"_name_or_path": "/gone/smolvlm", "text_config": {"_name_or_path": "/gone"}}
+    files = {
+        "config.json": config | {"pretrained_path": "/gone/pretrained"},
+        "train_config.json": elsewhere,
+        "backbone/config.json": backbone,
+        "backbone/tokenizer_config.json": {"name_or_path": "/gone", "pad_token": "/", "eos_token": "</s>"},
+    }
+    hub.plant(NAME, {name: json.dumps(content).encode() for name, content in files.items()})
+    pulled()
+    config = json.loads((tmp_path / "pulled" / "config.json").read_text())
+    assert config["vlm_model_name"] == str(tmp_path / "pulled" / "backbone")
 
 
 def test_a_folder_that_is_there_is_not_touched(

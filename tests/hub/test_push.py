@@ -149,13 +149,14 @@ def test_what_is_private_does_not_go_where_all_can_see(hub, policy, pushed, refu
 
 
 def test_a_push_replaces_what_the_last_one_left_but_not_what_a_card_shows(hub, policy, pushed):
-    (policy / "notes.json").write_text("{}")
+    (policy / "family.safetensors").write_bytes(b"x")
     pushed(policy)
+    assert "family.safetensors" in hub.files(NAME)
     added = {"added on the Hub.gif": b"by hand", "LICENSE": b"mine", "notes/a.json": b"{}"}
     hub.plant(NAME, added)
-    (policy / "notes.json").unlink()
+    (policy / "family.safetensors").unlink()
     pushed(policy)
-    assert "notes.json" not in hub.files(NAME) and added.items() <= hub.files(NAME).items()
+    assert "family.safetensors" not in hub.files(NAME) and added.items() <= hub.files(NAME).items()
 
 
 def test_a_card_written_on_the_hub_stays(hub: HubServer, policy: Path, pushed: Push):

@@ -96,7 +96,8 @@ def test_backbones_are_not_fetched_from_just_anywhere(copied: Path):
             "a/b/c",
             "https://example.com/x",
         ),
-        "may not name": ("/a/../secret", "/somewhere/secret"),
+        "leads elsewhere": ("/a/../secret",),
+        "may not name": ("/somewhere/secret",),
         "a name is wanted": (7, "a\x00"),
     }
     for why, names in refusals.items():
