@@ -8,9 +8,13 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 from rich.console import Console as RichConsole
 from rich.progress import BarColumn, Progress, Task, TextColumn, TimeElapsedColumn
+from rich.text import Text
+
+from accerl_lerobot.errors import printable
 
 PLAIN_EVERY_S = 15.0  # seconds between two lines of one stage when the output is not a terminal
 
@@ -36,11 +40,18 @@ class Stage:
             self._console.print(f"  {self._task.description} {text}", highlight=False, soft_wrap=True)
 
 
+class _Terminal(RichConsole):
+    """Rich's console, which shows text without its control characters."""
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        return super().render_str(printable(text, keep="\n"), **options)
+
+
 class Console:
     """Where stages and results are announced."""
 
     def __init__(self) -> None:
-        self.rich = RichConsole(stderr=True)
+        self.rich = _Terminal(stderr=True)
         self._started = time.monotonic()
 
     def say(self, text: str) -> None:

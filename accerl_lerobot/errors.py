@@ -8,6 +8,7 @@ import errno
 import os
 import re
 import traceback
+import unicodedata
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -38,7 +39,22 @@ class InputError(ValueError):
             value = f"{value[: LONGEST - 1]}…"
         if len(remedy) > LONGEST_REMEDY:  # what to do stands at its end
             remedy = f"{remedy[:half]}…{remedy[-half:]}"
-        return TOKEN.sub("<token>", " ".join(f"{self.field}={value}: {remedy}".split()))
+        return TOKEN.sub("<token>", printable(" ".join(f"{self.field}={value}: {remedy}".split())))
+
+
+def printable(text: str, keep: str = "") -> str:
+    """Text whose control characters, bidirectional ones included, are escaped, except those in `keep`.
+
+    Messages quote files and servers, and a terminal obeys control characters.
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c in keep or not _controls(c) else repr(c)[1:-1] for c in text)
+
+
+def _controls(character: str) -> bool:
+    category = unicodedata.category(character)
+    return category.startswith("C") or category in ("Zl", "Zp")
 
 
 def check_absent(path: Path, field: str = "output_dir") -> None:
@@ -120,4 +136,5 @@ def one_line(error: BaseException) -> str:
     words = " … ".join(lines if len(lines) < 2 else [lines[0], lines[-1]])
     text = f"{type(cause).__name__}: {words}" if words else type(cause).__name__
     notes = getattr(error, "__notes__", ()) or ("ACCERL_LOG=DEBUG shows the traceback",)
-    return " ".join("; ".join([TOKEN.sub("<token>", text[:MOST_SHOWN]), *notes]).split())
+    line = " ".join("; ".join([TOKEN.sub("<token>", text[:MOST_SHOWN]), *notes]).split())
+    return printable(line)

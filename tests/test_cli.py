@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import errno
 import json
+import logging
 import os
 import signal
 import subprocess
@@ -15,9 +16,11 @@ from typing import Any
 
 import pytest
 import yaml
+from rich.table import Table
 
 from accerl_lerobot import cli
 from accerl_lerobot.cli import verbs
+from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import RunConfig, encode
 from accerl_lerobot.engine.stopping import WorkerError
 from accerl_lerobot.errors import InputError, kept_traceback, one_line
@@ -112,6 +115,28 @@ def test_every_error_is_one_line(error, code, line, monkeypatch, capsys, caplog)
     out, err = capsys.readouterr()
     assert out == "" and err.startswith(f"accerl: {line}") and err.count("\n") == 1
     assert ("in broken" in caplog.text) is (code == 1), "the traceback"
+
+
+HOSTILE = "\x1b[2J\x9b2J\u202egpj.\u2028x\x07"
+
+
+@pytest.mark.parametrize("error", [InputError(f"a{HOSTILE}", 1, HOSTILE), RuntimeError(HOSTILE)])
+def test_control_characters_are_escaped_where_a_message_becomes_a_line(error, monkeypatch, capsys):
+    def broken(arguments: list[str]) -> int:
+        logging.getLogger("accerl_lerobot").warning("the file says %s", HOSTILE)
+        console = Console()
+        console.say(HOSTILE)
+        table = Table(HOSTILE)
+        table.add_row(HOSTILE)
+        console.rich.print(table)
+        raise error
+
+    monkeypatch.setattr(verbs, "train", broken)
+    monkeypatch.setattr(logging.root, "handlers", [])
+    cli.main(["train"])
+    err = capsys.readouterr().err
+    assert all(character.isprintable() or character == "\n" for character in err)
+    assert err.count("\\x1b[2J") == 5 + isinstance(error, InputError) and "\\u202e" in err
 
 
 def test_an_error_in_a_run_leaves_its_traceback_in_the_folder(tmp_path: Path) -> None:

@@ -322,6 +322,14 @@ def test_a_world_that_does_not_return_is_no_reason_to_wait_for_ever(engine):
 
 
 @pytest.mark.slow
+def test_eight_slow_resets_one_after_another_are_progress(engine):
+    slow = LatencyConfig(max_steps=4, frame_ms=600.0)
+    one = engine(env=slow, rollout=RolloutConfig(worlds=8), launch=LaunchConfig(stall_s=3.0, max_restarts=0))
+    one.plan(evaluation_plans(("match",), 8, "before"))
+    assert len(collect(one, "before", 8)) == 8
+
+
+@pytest.mark.slow
 def test_a_run_in_which_nothing_moves_ends(engine):
     one = engine(launch=LaunchConfig(stall_s=5.0), trainer=ENDLESS)
     until_training(one)

@@ -114,6 +114,22 @@ def test_who_joins_a_cluster_has_the_user_s_token_and_nothing_else(bare: pytest.
     assert "mine" not in ray_session.forwarded_environment().values()
 
 
+def test_a_folder_in_which_ray_cannot_make_sockets_is_refused_at_once(bare: pytest.MonkeyPatch):
+    bare.setenv("RAY_TMPDIR", f"/tmp/{'x' * 105}")
+    why = r"^RAY_TMPDIR='/tmp/x+': 110 bytes, .* leaves 37 to it; use a shorter one, or unset RAY_TMPDIR$"
+    with pytest.raises(InputError, match=why):
+        ray_session.prepare()
+    with pytest.raises(InputError, match=why), ray_session.opened(LaunchConfig(), now=False):
+        pass  # also where Ray starts only after SFT
+    bare.setenv("RAY_TMPDIR", "/dev/null/x")
+    with pytest.raises(InputError, match="^RAY_TMPDIR='/dev/null/x': /dev/null cannot hold folders"):
+        ray_session.prepare()
+    bare.setenv("RAY_TMPDIR", "/tmp/short/new")
+    ray_session.prepare()
+    bare.delenv("RAY_TMPDIR")  # as the message proposes
+    ray_session.prepare()
+
+
 LOOPBACK = {"127.0.0.1", "::1", "::ffff:127.0.0.1"}
 
 

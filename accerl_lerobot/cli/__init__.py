@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 
 from accerl_lerobot import __version__
 from accerl_lerobot.engine.stopping import TerminatedError, interrupted
-from accerl_lerobot.errors import InputError, one_line
+from accerl_lerobot.errors import InputError, one_line, printable
 
 LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR")
 VERBS = {
@@ -96,8 +96,7 @@ def main(arguments: list[str] | None = None) -> int:
     if verb not in VERBS:
         near = difflib.get_close_matches(verb, VERBS, n=1)
         hint = f"did you mean {near[0]}? Otherwise " if near else ""
-        sys.stderr.write(f"accerl: no verb {verb!r}; {hint}use one of {', '.join(VERBS)}\n")
-        return 2
+        return _refuse("accerl", f"no verb {verb!r}; {hint}use one of {', '.join(VERBS)}")
     return exit_code("accerl", lambda: run(verb, rest))
 
 
@@ -148,7 +147,16 @@ def set_up_logging() -> None:
     level = os.environ.get("ACCERL_LOG", "WARNING").upper()
     if level not in LEVELS:
         raise InputError("ACCERL_LOG", level, f"use {', '.join(LEVELS)}")
-    logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s")
+    handler = logging.StreamHandler()
+    handler.setFormatter(_Printable("%(levelname)s %(name)s: %(message)s"))
+    logging.basicConfig(level=level, handlers=[handler])
+
+
+class _Printable(logging.Formatter):
+    """Log lines without control characters of the files and servers that they quote."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return printable(super().format(record), keep="\n\t")
 
 
 @contextlib.contextmanager
@@ -163,7 +171,7 @@ def guarded() -> Iterator[None]:
 
 def _refuse(program: str, text: str) -> int:
     with contextlib.suppress(OSError):  # whoever reads it may be gone
-        sys.stderr.write(f"{program}: {text}\n")
+        sys.stderr.write(f"{program}: {printable(text)}\n")
     return 2
 
 

@@ -111,7 +111,10 @@ def libraries(config: RunConfig | None) -> Iterator[Check]:
     """Ray, with the environment a run would give it, torch, and the GPUs that it sees."""
     from accerl_lerobot.engine import ray_session
 
-    ray_session.prepare(joins=config is not None and config.launch.address is not None)
+    try:
+        ray_session.prepare(joins=config is not None and config.launch.address is not None)
+    except InputError as error:
+        yield Check("ray", FAIL, str(error))
     for name in ("ray", "torch"):
         try:
             module = importlib.import_module(name)

@@ -26,7 +26,9 @@ from typing import Any
 import draccus
 import yaml
 
+from accerl_lerobot.checkpoint.layout import CONFIG
 from accerl_lerobot.checkpoint.safety import brief
+from accerl_lerobot.config.lerobot import FLAGS, hint_for
 from accerl_lerobot.config.ranges import check, hints_of, is_optional, is_union, unmarked, wanted
 from accerl_lerobot.errors import InputError, expanded
 
@@ -68,24 +70,6 @@ LARGEST_RECIPE = 2**18  # bytes of a recipe at most
 RECIPES = "recipes"
 TYPE = "type"  # the key that picks one config of several, as in ``env.type``
 LONGEST_KEY = 80
-LEROBOT = {
-    "steps": "use trainer.updates or sft.steps",
-    "batch_size": "use trainer.batch_decisions or sft.batch_size",
-    "num_workers": "use rollout.workers",
-    "save_freq": "use save_every_updates or save_every_s",
-    "eval_freq": "use evaluation.every_updates",
-    "eval.n_episodes": "use evaluation.episodes",
-    "eval.batch_size": "use rollout.worlds and rollout.workers",
-    "rename_map": "use policy.rename_map",
-    "optimizer.lr": "use trainer.lr or sft.lr",
-    "policy.type": "use policy.path (a checkpoint) or sft.policy.type (a new policy)",
-    "policy.pretrained_path": "use policy.path",
-    "policy.use_amp": "use policy.precision=bf16",
-    "policy.use_peft": "use policy.tuning.mode=lora",
-    "policy.push_to_hub": "leave it out, and use accerl push --path=POLICY --repo_id=USER/NAME afterwards",
-    "policy.repo_id": "leave it out, and use accerl push --path=POLICY --repo_id=USER/NAME afterwards",
-}
-"""LeRobot's names of what has another name here → what to do."""
 REGISTERS = "registers"
 """In a field's metadata: the package that it names registers types of the section that the field is in."""
 CONSENT = {"trust_remote_code", "hub_path", DISCOVER, "extra_args", "address"}
@@ -196,7 +180,13 @@ def read_arguments(arguments: list[str], bare: str | None = None) -> tuple[Path 
         if bare in given:
             raise InputError(bare, given[bare], f"leave out --{bare} or {entries[0]}: name them in one way")
         given[bare] = entries
-    return (None if path is None else expanded(path, "config_path")), given
+    return (None if path is None else _recipe_path(expanded(path, "config_path"))), given
+
+
+def _recipe_path(path: Path) -> Path:
+    """A recipe, that of a run for its folder, or that of a checkpoint for its folder or its policy's."""
+    places = (path / CONFIG, path.parent / CONFIG)
+    return next((place for place in places if place.is_file()), path) if path.is_dir() else path
 
 
 def shipped_recipes() -> dict[str, Path]:
@@ -212,6 +202,9 @@ def read_recipe(path: Path) -> dict[str, Any]:
         shipped = shipped_recipes()
         bare = path.stem if str(path.parent) == RECIPES else str(path)  # as in the repository
         path = shipped.get(bare, path)
+    if path.is_dir():
+        remedy = f"a folder without {CONFIG}, so no run or checkpoint; name a recipe"
+        raise InputError("config_path", str(path), remedy)
     if not path.is_file():
         names = [*(str(p) for p in path.parent.glob("*.y*ml")), *shipped]
         near = difflib.get_close_matches(str(path), names, n=3)
@@ -435,34 +428,54 @@ def _apart(field: Any, section: type[Any]) -> dict[str, Any]:
     return {} if default is None or default == section() else encode(default)
 
 
-def dotted_fields(cls: type[Any], path: tuple[str, ...] = ()) -> Iterator[str]:
+def dotted_fields(cls: type[Any]) -> Iterator[str]:
     """Every field as it is written on the command line, those of all choices included."""
+    return (name for name, _ in _fields(cls))
+
+
+def _fields(cls: type[Any], path: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
+    """Dotted name and annotation of every field."""
     hints = hints_of(cls)
     for field in dataclasses.fields(cls):
         section, here = section_of(hints[field.name]), (*path, field.name)
         if section is None:
-            yield ".".join(here)
+            yield ".".join(here), hints[field.name]
             continue
         for kind in choices_of(section).values() or (section,):
-            yield from dotted_fields(kind, here)
+            yield from _fields(kind, here)
 
 
 def _unknown(key: str, value: Any, path: tuple[str, ...], names: list[str], whole: type[Any]) -> InputError:
     """The error for a field that a config does not have: what it resembles, or where it belongs."""
     if len(key) > LONGEST_KEY:
         return InputError(key[:LONGEST_KEY], value, "no such field")
-    here = dotted = ".".join((*path, key))
+    here = leaf_name = ".".join((*path, key))
     leaf = value
-    while dotted not in LEROBOT and isinstance(leaf, dict) and len(leaf) == 1:
-        ((below, leaf),) = leaf.items()
-        dotted += f".{below}"
-    if dotted in LEROBOT:
-        return InputError(dotted, leaf, f"the name is LeRobot's; {LEROBOT[dotted]}")
+    while isinstance(leaf, dict) and leaf:
+        below, leaf = next(iter(leaf.items()))
+        leaf_name += f".{below}"
+    hints = dict(_fields(whole))
     near = [".".join((*path, name)) for name in difflib.get_close_matches(key, names, n=3)]
-    near += [name for name in dotted_fields(whole) if name.rpartition(".")[2] == key and name != here]
+    lerobot_name = leaf_name in FLAGS or not near  # only what is no misspelling is of a section of LeRobot's
+    if lerobot_name and (hint := hint_for(leaf_name, leaf, hints.keys())):
+        return InputError(leaf_name, leaf, f"the name is LeRobot's; {hint}")
+    # The same name elsewhere, where the value would fit or no section was named.
+    near += [
+        name
+        for name, kind in hints.items()
+        if name.rpartition(".")[2] == key and name != here and (not path or _takes(kind, value))
+    ]
     where = f"{'.'.join(path)} has" if path else "there are"
     hint = f"did you mean {' or '.join(dict.fromkeys(near[:4]))}?" if near else f"{where} {', '.join(names)}"
     return InputError(here, value, f"no such field; {hint}")
+
+
+def _takes(hint: Any, value: Any) -> bool:
+    try:
+        _leaf(hint, value, "")
+    except InputError:
+        return False
+    return True
 
 
 def _names(cls: type[Any]) -> set[str]:

@@ -31,7 +31,7 @@ from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.loop import Engine, Progress, Saved
 from accerl_lerobot.engine.placement import actor_options, place_workers
 from accerl_lerobot.engine.ray_session import RaySession
-from accerl_lerobot.engine.replicas import START_S, InferenceReplicas, RolloutSlot, RolloutWorkers, WorkerSlot
+from accerl_lerobot.engine.replicas import InferenceReplicas, RolloutSlot, RolloutWorkers, WorkerSlot
 from accerl_lerobot.engine.stopping import WorkerError
 from accerl_lerobot.policies.config import Load
 from accerl_lerobot.replay.pacing import ASYNCHRONOUS, Schedule
@@ -233,7 +233,7 @@ class RayEngine(Engine):
         self._rollouts.start(plan)
         for worker, reference in [(w, w.actor.ready.remote()) for w in self._everyone()]:
             here = plan.places[worker.name].node.number == 0
-            worker.await_start(reference, max(START_S, self._limit), here)
+            worker.await_start(reference, worker.start_timeout(self._limit), here)
         self._deciding = self._inference.open()
         self._inserting = self._replay.endpoint("insert", self._limit)
         self._replay.work = self._replay.actor.run.remote()
@@ -313,7 +313,7 @@ class RayEngine(Engine):
     def _check_moving(self, progress: Progress) -> None:
         """End a run in which every worker answers and nothing moves."""
         imagined = tuple(progress.imagination.get(k) for k in ("decisions", "learn_steps", "validation_s"))
-        state = (progress.version, progress.rollout.get("decisions"), progress.rollout["restarts"], imagined)
+        state = (progress.version, self._rollouts.moves, progress.rollout["restarts"], imagined)
         now = time.monotonic()
         waiting = self._rollouts.outstanding or (self._training and not self._done)
         # Where one worker is to blame, that is found a moment later.

@@ -40,6 +40,8 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 FIELD = "launch.address"
+SOCKET_BYTES = 103 if sys.platform == "darwin" else 107  # of a socket's path at most
+RAY_BYTES = 70  # at most of it Ray's own part: /session_…/sockets/plasma_store
 STARTS = 4  # attempts to start a private Ray, which gives up after 30 s; a busy machine may need more
 CONNECT_S, ANSWER_S = 5.0, 60.0
 """Timeouts for a TCP connection to a cluster, and for ``ray status``, most of which is importing Ray."""
@@ -85,7 +87,11 @@ UNAUTHORISED = ("Unauthenticated", "UNAUTHENTICATED", "InvalidAuthToken", "Authe
 
 
 def prepare(joins: bool = False) -> None:
-    """Set the environment variables that Ray and its workers read; what is set already stays."""
+    """Set the environment variables that Ray and its workers read; what is set already stays.
+
+    Raises:
+        InputError: RAY_TMPDIR cannot hold the files of a private Ray.
+    """
     for key, value in WORKERS.items():
         os.environ.setdefault(key, value)
     if joins:
@@ -95,6 +101,7 @@ def prepare(joins: bool = False) -> None:
     if not os.environ.get("RAY_TMPDIR"):
         # Sockets and logs: Ray's own choice is a folder that every user of the machine may write to.
         os.environ["RAY_TMPDIR"] = str(private_folder())
+    check_sockets(os.environ["RAY_TMPDIR"])
     if "ray" in sys.modules:
         return
     for key, value in PRIVATE.items():
@@ -102,6 +109,19 @@ def prepare(joins: bool = False) -> None:
     if not any(os.environ.get(k) for k in _AUTH):
         os.environ["RAY_AUTH_MODE"] = "token"
         os.environ["RAY_AUTH_TOKEN_PATH"] = str(write_token())
+
+
+def check_sockets(folder: str) -> None:
+    """Refuse a RAY_TMPDIR in which Ray cannot make its sockets."""
+    size, most = len(os.fsencode(os.path.abspath(folder))), SOCKET_BYTES - RAY_BYTES
+    if size > most:
+        why = f"{size} bytes, and a socket's path leaves {most} to it; use a shorter one, or unset RAY_TMPDIR"
+        raise InputError("RAY_TMPDIR", folder, why)
+    above = Path(os.path.abspath(folder))
+    while not above.exists():
+        above = above.parent
+    if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
+        raise InputError("RAY_TMPDIR", folder, f"{above} cannot hold folders; use another one")
 
 
 def check_private() -> None:
@@ -144,8 +164,8 @@ def write_token() -> Path:
 def private_folder() -> Path:
     """A folder of mode 0700, which this process's guardian removes when the process has ended."""
     temporary = tempfile.gettempdir()
-    # A socket's path has 107 bytes at most, and Ray's part of it takes up to 70.
-    folder = Path(tempfile.mkdtemp(prefix="accerl-", dir=temporary if len(temporary) <= 16 else "/tmp"))
+    short = len(temporary) <= 16  # there is room for Ray's sockets, see `RAY_BYTES`
+    folder = Path(tempfile.mkdtemp(prefix="accerl-", dir=temporary if short else "/tmp"))
     guardian.remove(folder)
     return folder
 
@@ -362,6 +382,8 @@ def opened(launch: LaunchConfig, now: bool) -> Iterator[RaySession | None]:
     if launch.engine == "local":
         yield None
         return
+    if launch.address is None and (folder := os.environ.get("RAY_TMPDIR")):
+        check_sockets(folder)
     with contextlib.closing(RaySession(launch)) as session:
         if now:
             prepare(joins=launch.address is not None)

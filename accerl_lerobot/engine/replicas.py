@@ -73,6 +73,10 @@ class WorkerSlot:
         self._question: Any = None
         self._asked = 0.0
 
+    def start_timeout(self, limit: float) -> float:
+        """Seconds that a new process may take before it answers, where an answer may take `limit` later."""
+        return max(START_S, limit)
+
     def await_start(self, reference: Any, timeout: float, here: bool) -> None:
         """Wait for the answer to ``ready``, its process id, which is of this node if `here`."""
         pid = self.result(reference, "ready", timeout)
@@ -165,9 +169,9 @@ class Replicas[W: WorkerSlot](ABC):
 class RolloutSlot(WorkerSlot):
     """A rollout worker, and what its next process has to know; `budget`: exploring episodes left."""
 
-    def __init__(self, index: int, budget: int | None) -> None:
+    def __init__(self, index: int, budget: int | None, worlds: int = 1) -> None:
         super().__init__(f"rollout {index}")
-        self.index, self.budget = index, budget
+        self.index, self.budget, self._worlds = index, budget, worlds
         self.incarnation = 0  # grows with every process; part of its seeds and of its segments' keys
         self.outstanding: dict[tuple[str, int], EpisodePlan] = {}  # planned episodes without a result
         self.unsent: list[EpisodePlan] = []
@@ -194,10 +198,14 @@ class RolloutSlot(WorkerSlot):
         self.outstanding |= {(plan.group, plan.index): plan for plan in plans}
         self.unsent += plans
 
+    def start_timeout(self, limit: float) -> float:
+        """See the base class; its worlds are made one after the other."""
+        return max(START_S, limit * self._worlds)
+
     def hung(self, limit: float) -> str:
         """Also a world that does not return."""
         report: Report | None = self.told
-        if (why := super().hung(limit if report else max(START_S, limit))) or report is None:
+        if (why := super().hung(limit if report else self.start_timeout(limit))) or report is None:
             return why
         if report.busy_s > limit:
             what = "its world has not returned" if report.in_world else "it has done nothing"
@@ -211,7 +219,8 @@ class RolloutWorkers(Replicas[RolloutSlot]):
     def __init__(
         self, config: RunConfig, tasks: tuple[str, ...], history: int, state: Path | None = None
     ) -> None:
-        super().__init__(config, [RolloutSlot(i, left) for i, left in enumerate(budgets(config.rollout))])
+        shares = enumerate(budgets(config.rollout))
+        super().__init__(config, [RolloutSlot(i, left, config.rollout.worlds) for i, left in shares])
         self._tasks, self._history = tasks, history
         self._past: Counter[str] = Counter(restarts=0)  # counters of processes that have ended
         self._inference: list[Endpoint] = []
@@ -256,6 +265,11 @@ class RolloutWorkers(Replicas[RolloutSlot]):
     def spent(self) -> bool:
         """True if replay has all exploring episodes of the budget."""
         return all(worker.spent for worker in self._all)
+
+    @property
+    def moves(self) -> int:
+        """Resets and executed chunks of the worlds of today's processes."""
+        return sum(worker.told.moves for worker in self._all if worker.told is not None)
 
     @property
     def busy_s(self) -> float:
@@ -373,7 +387,8 @@ class InferenceReplicas(Replicas[WorkerSlot]):
             time.sleep(pause_s(worker.restarts - 1))
             worker.occupy(self._new(worker))
             try:  # to serve with the trainer's newest weights
-                worker.await_start(worker.actor.ready.remote(), max(START_S, limit), here.number == 0)
+                timeout = worker.start_timeout(limit)
+                worker.await_start(worker.actor.ready.remote(), timeout, here.number == 0)
                 endpoint = self._serve(worker)
                 if self._in_turn:
                     self._lock(worker)

@@ -134,6 +134,8 @@ class PolicyConfig(Section, section="policy"):
     tuning: TuningConfig = field(default_factory=TuningConfig)
     rename_map: dict[str, str] = field(default_factory=dict)
     """World feature name → policy feature name, as in LeRobot's ``--rename_map``."""
+    temporal_ensemble_coeff: Literal["checkpoint"] | None = "checkpoint"
+    """null: ACT does not average over earlier chunks, whose actions depend on more than the observation."""
     num_steps: Annotated[int, Range("[1, 10000]")] | None = None
     """Denoising steps; None keeps the checkpoint's. Written into what is saved."""
     n_action_steps: Annotated[int, Range("[1, 100000]")] | None = None
@@ -224,6 +226,8 @@ def override(policy_config: Any, config: PolicyConfig) -> None:
     if hasattr(policy_config, "pretrained_backbone_weights"):
         # The checkpoint has them; LeRobot would download torchvision's first, even when told to stay offline.
         policy_config.pretrained_backbone_weights = None
+    if config.temporal_ensemble_coeff is None and hasattr(policy_config, "temporal_ensemble_coeff"):
+        policy_config.temporal_ensemble_coeff = None
     if config.num_steps is not None:
         names = (name for name in ("num_steps", "num_inference_steps") if hasattr(policy_config, name))
         if (name := next(names, None)) is None:

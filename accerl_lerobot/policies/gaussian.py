@@ -101,7 +101,7 @@ class ACT(GaussianModel):
         config = policy.config
         if (coefficient := config.temporal_ensemble_coeff) is not None:
             remedy = "averaging over earlier chunks makes actions depend on more than the observation"
-            raise InputError("policy.temporal_ensemble_coeff", coefficient, f"{remedy}; set it to null")
+            raise InputError("policy.temporal_ensemble_coeff", coefficient, f"{remedy}; use null")
         self.executed, self.action_dim = config.n_action_steps, config.action_feature.shape[0]
         self.width = self.row_width = config.dim_model
 

@@ -228,7 +228,7 @@ class Pi0Fast(TokenModel):
             raise InputError("policy.temperature", config.temperature, f"{remedy}policy.sampler.temperature")
         if config.n_action_steps != (rows := config.chunk_size):
             # The coefficients of K rows, read as those of fewer, are another, faster and larger movement.
-            remedy = f"LeRobot decodes so many rows from the coefficients of {rows}; use all of them"
+            remedy = f"LeRobot decodes so many rows from the coefficients of {rows}; use {rows}"
             raise InputError("policy.n_action_steps", config.n_action_steps, remedy)
         config.validate_action_token_prefix = False
         logging.root.addFilter(_decodable)

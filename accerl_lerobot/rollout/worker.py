@@ -46,6 +46,7 @@ class Report:
     busy_s: float = 0.0
     """Seconds for which its thread has been at what it does now; 0 before `RolloutWorker.run`."""
     in_world: bool = False  # True if that is to step or reset a world
+    moves: int = 0  # resets and executed chunks of its worlds
     spent: bool = False  # every exploring episode that was paid for has been played, and replay has it
     starts: int = 0  # see `EpisodePlans.starts`
 
@@ -68,6 +69,7 @@ class RolloutWorker:
         self._results: deque[EpisodeResult] = deque()
         self._training = threading.Event()
         self._active: tuple[float, bool] | None = None  # since when the thread does what, see `Report`
+        self._moves = 0
         self._outbox: list[Segment] = []
         self._deciding = ReconnectingClient("inference")
         worlds = [make_world(env, history, config.reward_model) for _ in range(config.worlds)]
@@ -104,6 +106,7 @@ class RolloutWorker:
             counters={k: float(v) for k, v in vars(self._runner.counters).items()},
             busy_s=now - since,
             in_world=in_world,
+            moves=self._moves,
             spent=self._spent,
             starts=self._plans.starts,
         )
@@ -166,6 +169,7 @@ class RolloutWorker:
             fault_point("rollout.step")
             request = self._runner.advance(slot, decision)
         self._active = time.monotonic(), False
+        self._moves += decision is not None or request is not None
         if request is not None:
             due[slot] = request
         return request is not None

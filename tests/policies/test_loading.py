@@ -19,6 +19,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from accerl_lerobot.checkpoint.layout import BACKBONE, FAST, PRETRAINED, displaced, relocate, save_checkpoint
+from accerl_lerobot.engine.config import RunConfig, parse
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE
 from accerl_lerobot.policies.adapter import stack_observations
@@ -126,7 +127,7 @@ def test_a_policy_that_reads_the_simulators_state(damaged: Any):
         ("smolvla", {}, {"n_action_steps": 6}, "policy.n_action_steps=6: use 1 to 5, the chunk the policy"),
         ("diffusion", {}, {"n_action_steps": 8}, "policy.n_action_steps=8: use 1 to 7, the chunk the policy"),
         ("diffusion", {}, {"num_steps": 21}, "policy.num_steps=21: use at most 20, as many as it was"),
-        ("act", {"temporal_ensemble_coeff": 0.1, "n_action_steps": 1}, {}, "policy.temporal_ensemble_coeff"),
+        ("act", {"temporal_ensemble_coeff": 0.1, "n_action_steps": 1}, {}, "policy.temporal_en.*use null"),
         ("act", {}, {"sampler": FlowSamplerConfig()}, "policy.sampler.type='flow': use gaussian: "),
     ],
 )  # fmt: skip
@@ -136,6 +137,14 @@ def test_options_under_which_its_density_would_be_another(
     path = damaged(name)
     edit_config(path, **changes)
     refused(path, sentence, **options)
+
+
+def test_averaging_over_chunks_is_switched_off_as_the_message_proposes(damaged: Any):
+    path = damaged("act")
+    edit_config(path, temporal_ensemble_coeff=0.1, n_action_steps=1)
+    arguments = [f"--policy.path={path}", "--policy.temporal_ensemble_coeff=null"]
+    config = parse(RunConfig, [*arguments, "--policy.n_action_steps=2"]).policy
+    assert load_adapter(config).policy.config.n_action_steps == 2
 
 
 def test_devices(monkeypatch: pytest.MonkeyPatch):
