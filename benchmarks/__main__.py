@@ -21,6 +21,7 @@ from benchmarks.lag import BenchLagConfig
 from benchmarks.latency import BenchLatencyConfig
 from benchmarks.scaling import BenchScalingConfig
 from benchmarks.soak import BenchSoakConfig
+from benchmarks.third_party import BenchThirdPartyConfig
 from benchmarks.transport import BenchTransportConfig
 from benchmarks.weights import BenchWeightsConfig
 
@@ -37,6 +38,7 @@ CONFIGS: dict[str, type[Any]] = {
     "transport": BenchTransportConfig,
     "weights": BenchWeightsConfig,
     "gpu": BenchGpuConfig,
+    "third_party": BenchThirdPartyConfig,
 }
 """Module with a function ``bench_NAME`` and a ``table`` of what it returns → its fields."""
 
