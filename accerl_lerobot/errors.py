@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import functools
+import logging
 import os
 import re
 import traceback
@@ -12,6 +14,8 @@ import unicodedata
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+logger = logging.getLogger(__name__)
 
 ERROR_LOG = "error.log"  # file of a run's folder with the tracebacks of unexpected errors
 TOKEN = re.compile(r"\bhf_\w{6,}")  # of the Hub, which somebody may have typed where it does not belong
@@ -110,6 +114,21 @@ def make_folder(path: Path, field: str, *, again: bool = False) -> None:
     except (OSError, ValueError) as error:
         why = getattr(error, "strerror", None) or str(error)
         raise InputError(field, str(path), f"cannot be created: {why}; name another folder") from error
+
+
+@functools.cache
+def warn_once(text: str) -> None:
+    """Warns, unless this process has warned so before."""
+    logger.warning(text)
+
+
+@contextmanager
+def for_viewing(what: str) -> Iterator[None]:
+    """Goes on without something that people only look at, such as a film, if it cannot be made."""
+    try:
+        yield
+    except Exception as error:
+        warn_once(f"there is no {what} ({one_line(error)})")
 
 
 @contextmanager

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from accerl_lerobot.config.ranges import Section
+from accerl_lerobot.errors import for_viewing
 from accerl_lerobot.fault_points import fault_point
 
 METRICS = "metrics.jsonl"  # name of the file in a run's folder
@@ -52,14 +53,15 @@ class MetricsLog:
             note = directory / ".wandb-id"
             if not note.is_file():
                 note.write_text(secrets.token_hex(8))
-            self._wandb = client.init(
-                project=wandb.project,
-                dir=str(directory),
-                name=directory.name,
-                id=note.read_text(),
-                resume="allow",
-                config=config,
-            )
+            with for_viewing("record in Weights & Biases"):
+                self._wandb = client.init(
+                    project=wandb.project,
+                    dir=str(directory),
+                    name=directory.name,
+                    id=note.read_text(),
+                    resume="allow",
+                    config=config,
+                )
 
     @property
     def wall_s(self) -> float:
@@ -76,10 +78,12 @@ class MetricsLog:
         fault_point("driver.metrics")
         self._file.write(json.dumps(record) + "\n")
         scalars = {k: float(v) for k, v in finite.items() if isinstance(v, (int, float))}
-        for name, value in scalars.items():
-            self._board.add_scalar(f"{kind}/{name}", value, update)
+        with for_viewing("record in TensorBoard"):
+            for name, value in scalars.items():
+                self._board.add_scalar(f"{kind}/{name}", value, update)
         if self._wandb is not None:
-            self._wandb.log({f"{kind}/{k}": v for k, v in scalars.items()} | {"update": update})
+            with for_viewing("record in Weights & Biases"):
+                self._wandb.log({f"{kind}/{k}": v for k, v in scalars.items()} | {"update": update})
 
     def state(self) -> dict[str, Any]:
         """All that `restore` needs: how far the file goes, and the seconds."""
@@ -97,9 +101,11 @@ class MetricsLog:
 
     def close(self) -> None:
         self._file.close()
-        self._board.close()
+        with for_viewing("record in TensorBoard"):
+            self._board.close()
         if self._wandb is not None:
-            self._wandb.finish()
+            with for_viewing("record in Weights & Biases"):
+                self._wandb.finish()
 
 
 def cut_back(path: Path, size: int) -> None:

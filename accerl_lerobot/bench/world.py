@@ -26,9 +26,9 @@ from accerl_lerobot.bench import as_table, host, ranged, spread
 from accerl_lerobot.config.ranges import Positive, Range, Repeats, Section
 from accerl_lerobot.demos.record import simulators
 from accerl_lerobot.envs import EnvConfig, LiberoConfig, MetaWorldConfig, make_world
+from accerl_lerobot.envs.graphics import import_mujoco
 from accerl_lerobot.envs.libero_simulator import Simulator, liberos_own
 from accerl_lerobot.envs.libero_tasks import load_libero
-from accerl_lerobot.envs.metaworld import import_mujoco
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.seeds import train_seed
 
@@ -116,11 +116,10 @@ _decide: Decide
 
 def _start(arm: str, config: BenchWorldConfig) -> None:
     global _decide
-    import_mujoco()
-    if arm == STOCK:
-        del os.environ["LP_NUM_THREADS"]  # ours draws with one thread, LeRobot's by default with all
     chunk = config.chunk if arm == OURS else 1
     dims = make_world(config.env).spec.action_dim  # no simulator is built before the first reset
+    if arm == STOCK:
+        del os.environ["LP_NUM_THREADS"]  # ours draws with one thread, LeRobot's by default with all
     actions = np.random.default_rng(0).uniform(-1, 1, (997, chunk, dims))
     chunks = itertools.cycle(actions.astype(np.float32))
     make = {STOCK: _stock, PHYSICS: _physics, STOCK_PHYSICS: _stock_physics}.get(arm, _ours)

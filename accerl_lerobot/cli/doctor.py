@@ -36,7 +36,7 @@ on a CPU, for gradients under way and fragmentation; on a GPU CUDA's libraries n
 
 DRAW = """
 import time
-from accerl_lerobot.envs.metaworld import import_mujoco, new_renderer
+from accerl_lerobot.envs.graphics import import_mujoco, new_renderer
 mujoco = import_mujoco()
 model = mujoco.MjModel.from_xml_string(
     "<mujoco><worldbody><light pos='0 0 3'/><geom size='.3' rgba='1 0 0 1'/></worldbody></mujoco>"
@@ -130,7 +130,7 @@ def libraries(config: RunConfig | None) -> Iterator[Check]:
 
 def rendering(*, needed: bool, script: str = DRAW) -> Check:
     """Draws a frame in a process of its own; if it is not `needed`, a failure is only a warning."""
-    from accerl_lerobot.envs.metaworld import choose_backend
+    from accerl_lerobot.envs.graphics import choose_backend
 
     command, remedy = [sys.executable, "-c", script], "set MUJOCO_GL to osmesa or egl"
     if importlib.util.find_spec("mujoco") is None:

@@ -72,6 +72,8 @@ TYPE = "type"  # the key that picks one config of several, as in ``env.type``
 LONGEST_KEY = 80
 REGISTERS = "registers"
 """In a field's metadata: the package that it names registers types of the section that the field is in."""
+PREPARES = "prepares"
+"""In the same field's metadata: a function to call before the package is imported."""
 CONSENT = {"trust_remote_code", "hub_path", DISCOVER, "extra_args", "address"}
 """Names of the fields that let somebody's code run with the user's rights: from the Hub, from a package, by
 further arguments of ``lerobot-train``, or from a Ray cluster, which exchanges pickles with the run. Only the
@@ -322,6 +324,7 @@ def register_types(cls: type[Any], tree: dict[str, Any], path: tuple[str, ...] =
     for field in dataclasses.fields(cls):
         value, section = tree.get(field.name), section_of(hints_of(cls)[field.name])
         if field.metadata.get(REGISTERS) and value is not None:
+            field.metadata.get(PREPARES, bool)()
             discover(str(value), ".".join(path))
         elif section is not None and isinstance(value, dict):
             register_types(section, value, (*path, field.name))

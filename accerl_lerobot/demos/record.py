@@ -35,7 +35,7 @@ from accerl_lerobot.config.ranges import Range, Section, Share
 from accerl_lerobot.console import Console
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.envs.base import EnvConfig, World, WorldSpec
-from accerl_lerobot.envs.metaworld import MetaWorld, expert_name, import_mujoco
+from accerl_lerobot.envs.metaworld import MetaWorld, expert_name
 from accerl_lerobot.envs.simulated import SimulatedWorld
 from accerl_lerobot.errors import InputError, check_absent, expanded
 from accerl_lerobot.experience import ENVIRONMENT_STATE, REWARD, SUCCESS
@@ -136,7 +136,6 @@ def disturbed(
 
 def metaworld_expert(world: World, task: str) -> Expert:
     """MetaWorld's own policy for the task."""
-    import_mujoco()
     from metaworld import policies
 
     assert isinstance(world, MetaWorld)

@@ -33,6 +33,7 @@ from accerl_lerobot.engine.placement import actor_options, place_workers
 from accerl_lerobot.engine.ray_session import RaySession
 from accerl_lerobot.engine.replicas import InferenceReplicas, RolloutSlot, RolloutWorkers, WorkerSlot
 from accerl_lerobot.engine.stopping import WorkerError
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import Load
 from accerl_lerobot.replay.pacing import ASYNCHRONOUS, Schedule
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
@@ -61,6 +62,8 @@ def end_all(workers: Iterable[WorkerSlot], *, lost: bool = False) -> None:
 
 
 def _fail(worker: WorkerSlot, error: Exception, text: str = "") -> None:
+    if isinstance(error, InputError):  # another process would meet it again
+        raise error
     if worker.restart is None:
         raise WorkerError(text or f"{worker.name} worker failed for good:\n{error}") from error
     worker.restart(error)

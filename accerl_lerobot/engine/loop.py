@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 import shutil
 import time
@@ -22,6 +23,7 @@ from accerl_lerobot.engine.stopping import Stopping
 from accerl_lerobot.evaluation import (
     before_after,
     evaluation_plans,
+    notes,
     success_by_task,
     success_curve,
     summarise,
@@ -30,11 +32,15 @@ from accerl_lerobot.metrics import MetricsLog, plain
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.timeline import CHECKPOINT, EVALUATION, TRAINING, Clock, NoClock
 
+logger = logging.getLogger(__name__)
+
 FILMED = ".before"  # name of the filmed episodes of the first evaluation, kept until the video is made
 RECORD_EVERY = 10  # updates between two records of the workers' counters when no episode ends
+HOPELESS = 50  # exploring episodes without a success after which the user is told
 RECENT = 100  # exploring episodes over which the training success of the curve is averaged
+COUNTERS = ("decisions", "episodes", "dropped_nonfinite", "dropped_episodes")  # of a runner, in the summary
 _STATE = (
-    "before", "evaluations", "curve", "recent", "explored", "won", "lags", "lag_max", "mismatch_max",
+    "before", "evaluations", "curve", "recent", "explored", "won", "note", "lags", "lag_max", "mismatch_max",
     "during", "base", "steps", "evaluated", "saved",
 )  # fmt: skip
 
@@ -115,6 +121,8 @@ def run_plans(
             results += [e for e in progress.episodes if e.plan.group == group]
             on_progress(progress)
             stage.update(len(results), f"{np.mean([r.success for r in results]):.0%}" if results else "")
+    for note in notes(results):
+        logger.warning("evaluation (%s), %s", group, note)
     return sorted(results, key=lambda r: r.plan.index)
 
 
@@ -153,6 +161,7 @@ class Loop:
         self.curve: list[tuple[float, float]] = []
         self.recent: list[bool] = []
         self.explored = self.won = 0  # exploring episodes that have ended, and successes among them
+        self.note = ""  # of the last of them that had one, see `EpisodeResult`
         self.lags: list[float] = []
         self.lag_max = self.mismatch_max = 0.0
         self.during: dict[str, list[EpisodeResult]] = {}
@@ -162,6 +171,7 @@ class Loop:
         self._began_at: str | None = None
         self._training_since: float | None = None
         self._saved_at = time.monotonic()
+        self._hopeless = False  # True once it has been said that no exploring episode succeeds
 
     def run(self, state: Path | None) -> dict[str, Any]:
         """Do the run, or the rest of it; returns the summary."""
@@ -182,11 +192,7 @@ class Loop:
         last = self._train()
         self.steps = self._steps(last)
         self._save()
-        if self.explored and not self.won:
-            self.console.say(
-                f"none of {self.explored} exploring episodes succeeded; where success is the only reward "
-                "there was nothing to learn from: see docs/troubleshooting.md"
-            )
+        self._check_hope(1)
         after, results = self._evaluate("after", self.steps)
         summary = plain(self._summary(after, last))
         layout.write_atomically(self.directory / layout.SUMMARY, json.dumps(summary, indent=2) + "\n")
@@ -231,7 +237,7 @@ class Loop:
             **{f"{name}_before": before.get(name) for name in ("success", "n", "ci95", "tasks")},
             **{f"{name}_after": after[name] for name in ("success", "n", "ci95", "tasks")},
             "env_steps": int(self.steps),
-            **{k: int(self._since(last, k)) for k in ("decisions", "episodes", "dropped_nonfinite")},
+            **{k: int(self._since(last, k)) for k in COUNTERS},
             "updates": last.version,
             **{k: int(last.replay.get(k, 0)) for k in ("trained_decisions", "unique_decisions")},
             "restarts": int(last.rollout.get("restarts", 0)),
@@ -242,6 +248,7 @@ class Loop:
             "warm_start_s": self.times.warm_s,
             "rl_s": self.times.rl_s,
             "episodes_explored": self.explored,
+            "note": self.note,
             "imagination": last.imagination,
             "algorithm": self.config.algorithm.type,
             "tasks": list(self.tasks),
@@ -274,6 +281,18 @@ class Loop:
                     self._save()
                 self.stop.check()
 
+    def _check_hope(self, episodes: int) -> None:
+        """Tells once if none of at least so many exploring episodes has succeeded."""
+        if self.won or self._hopeless or self.explored < episodes:
+            return
+        self._hopeless = True
+        note = f" ({self.note})" if self.note else ""
+        logger.warning(
+            "none of %d exploring episodes succeeded%s; where success is the only reward there is nothing to "
+            "learn from: see env.success, and docs/troubleshooting.md",
+            self.explored, note,
+        )  # fmt: skip
+
     @property
     def _rl_s(self) -> float:
         since = self._training_since
@@ -293,6 +312,8 @@ class Loop:
         explored = [e for e in progress.episodes if e.plan.explore]
         self.explored += len(explored)
         self.won += sum(e.success for e in explored)
+        self.note = next((e.note for e in reversed(explored) if e.note), self.note)
+        self._check_hope(HOPELESS)
         self.recent = (self.recent + [e.success for e in explored])[-RECENT:]
         share = float(np.mean(self.recent)) if self.recent else math.nan
         # The first episodes to end are the short ones, which are successes.
@@ -369,6 +390,8 @@ class Loop:
         lag = f"{self.lags[-1]:.0f}" if self.lags else "…"
         decisions = f"{self._since(progress, 'decisions'):.0f} decisions"
         words = f"exploring success {success} · lag {lag} · {decisions}"
+        if dropped := self._since(progress, "dropped_episodes"):
+            words += f" · {dropped:.0f} episodes dropped"
         if self.evaluations:
             newest = self.evaluations[-1]
             words += f" · evaluation {newest['success']:.0%} at update {newest['version_max']}"

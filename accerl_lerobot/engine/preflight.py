@@ -12,19 +12,29 @@ import difflib
 import logging
 import math
 import os
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Any
 
 import draccus
+import numpy as np
 import yaml
 
 from accerl_lerobot.algorithms import LossInputs, OffPolicyConfig, RatioConfig
 from accerl_lerobot.checkpoint.safety import brief
 from accerl_lerobot.config.ranges import Range, check
 from accerl_lerobot.engine.sizes import check_disk, check_memory
-from accerl_lerobot.envs import EnvConfig, JudgedWorld, RewardModelConfig, WorldSpec, make_world
+from accerl_lerobot.envs import (
+    EnvConfig,
+    JudgedWorld,
+    RewardModelConfig,
+    WorldSpec,
+    environment_error,
+    make_world,
+)
 from accerl_lerobot.errors import InputError, causes, check_absent, expanded
+from accerl_lerobot.experience import Observation
 from accerl_lerobot.policies.features import (
     ACTION,
     ENV_STATE,
@@ -37,6 +47,7 @@ from accerl_lerobot.policies.features import (
     policy_features,
     resizes,
 )
+from accerl_lerobot.rollout.runner import nonfinite
 
 if TYPE_CHECKING:
     from accerl_lerobot.algorithms import AlgorithmConfig
@@ -51,13 +62,51 @@ SIZES = ("chunk_size", "n_action_steps", "num_steps", "max_state_dim", "max_acti
 """Fields of policy configs that are at least 1; LeRobot itself checks the others."""
 
 
+SLOW_S = 30.0  # an environment that takes longer to reset, such as a robot, is reset only once to be checked
+VISIBLE = 25  # levels of a pixel that rendering alone does not change
+
+
 def check_world(env: EnvConfig, reward_model: RewardModelConfig | None = None) -> WorldSpec:
-    """Build and reset an environment once, so that what is wrong with it shows before anything long."""
+    """Build and reset an environment, so that what is wrong with it shows before anything long."""
     with contextlib.closing(make_world(env, reward_model=reward_model)) as world:
-        observation = world.reset(0, world.spec.tasks[0])
+        task, began = world.spec.tasks[0], time.monotonic()
+        try:
+            first = world.reset(0, task)
+            slow = time.monotonic() - began > SLOW_S
+            other, again = (first, first) if slow else (world.reset(1, task), world.reset(0, task))
+        except Exception as error:
+            raise environment_error(env, error) from error
+        if bad := nonfinite(first):
+            raise InputError("env", task, f"{bad} of the first observation is not finite")
         if isinstance(world, JudgedWorld):
-            world.succeeded(observation)
+            world.succeeded(first)
+        if not slow:
+            _compare_starts(first, other, again)
         return world.spec
+
+
+def _compare_starts(first: Observation, other: Observation, again: Observation) -> None:
+    """Warn if starts do not follow from their seeds: `again` has the seed of `first`, `other` another."""
+    if not all(_same(first[key], again[key]) for key in first):
+        logger.warning(
+            "the environment's reset ignores its seed: the same seed gives different first observations. No "
+            "episode can be repeated, and success before and after training is measured on different starts"
+        )
+    elif all(np.array_equal(first[key], other[key]) for key in first):
+        logger.warning(
+            "all episodes have the same start: the first observations of different seeds are equal. An "
+            "evaluation of any number of episodes measures one start (n=1); see if an option of the "
+            "environment (env.kwargs) varies it"
+        )
+
+
+def _same(one: np.ndarray | str, two: np.ndarray | str) -> bool:
+    """True if two values of an observation are equal but for rounding and noise of rendering."""
+    if isinstance(one, str) or isinstance(two, str):
+        return one == two
+    if one.dtype == np.uint8:
+        return one.shape == two.shape and bool((np.abs(one.astype(int) - two) <= VISIBLE).all())
+    return one.shape == two.shape and np.allclose(one, two, rtol=1e-4, atol=1e-5)
 
 
 def check_policy(config: RunConfig, spec: WorldSpec, *, own: bool = False) -> int:

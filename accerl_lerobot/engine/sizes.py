@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from accerl_lerobot.algorithms import RatioConfig
+from accerl_lerobot.envs.gym_env import MAX_STEPS
 from accerl_lerobot.errors import InputError, expanded
 
 if TYPE_CHECKING:
@@ -52,7 +53,8 @@ def memory_parts_gib(config: RunConfig, history: int = 1) -> dict[str, float]:
     loaded = 2 + config.trainer.ranks  # the driver, inference and the trainer each load torch
     imagination = config.imagination  # a second store, and one or two processes that load torch
     workers = 0.0 if local else (1 + imagination.learns) * POLICY_PROCESS_GIB
-    frames = min(films.videos, films.episodes) * config.env.max_steps / FILM[1]
+    longest = config.env.max_steps or MAX_STEPS
+    frames = min(films.videos, films.episodes) * longest / FILM[1]
     return {
         "trainer.ranks": POLICY_PROCESS_GIB if local else RAY_GIB + loaded * POLICY_PROCESS_GIB,
         "inference.workers": 0.0 if local else (config.inference.workers - 1) * POLICY_PROCESS_GIB,

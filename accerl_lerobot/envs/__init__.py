@@ -6,8 +6,13 @@ Importing this package loads no simulator; a world imports its own when it is ma
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from importlib.metadata import PackageNotFoundError, metadata
+
+from accerl_lerobot.checkpoint.safety import brief
 from accerl_lerobot.config.parsing import discover, imported
 from accerl_lerobot.envs.base import ChunkResult, EnvConfig, HistoryWorld, World, WorldSpec
+from accerl_lerobot.envs.graphics import drawing_error, start_graphics
 from accerl_lerobot.envs.gym_env import GymConfig
 from accerl_lerobot.envs.lerobot_env import LeRobotEnvConfig
 from accerl_lerobot.envs.libero import LiberoConfig
@@ -19,25 +24,48 @@ from accerl_lerobot.errors import InputError
 __all__ = [
     "ChunkResult", "EnvConfig", "GymConfig", "HistoryWorld", "JudgedWorld", "LeRobotEnvConfig",
     "LiberoConfig", "MetaWorldConfig", "RewardModelConfig", "SimulatedConfig", "World", "WorldSpec",
-    "make_world",
+    "environment_error", "make_world",
 ]  # fmt: skip
 
 
 def make_world(config: EnvConfig, history: int = 1, reward_model: RewardModelConfig | None = None) -> World:
-    """Builds the world that `config` describes.
+    """Build the world that `config` describes.
 
     An observation holds `history` env steps; above 1, arrays begin with that dimension. `reward_model` tells
     success, if it has a path.
     """
+    start_graphics()
     try:
         discover(config.discover_packages_path, "env")
         world: World = imported(config.world)(config)
-    except ModuleNotFoundError as error:
-        name = str(getattr(config, "name", config.type))
-        extra = f"{'accerl-' if name == config.type else ''}lerobot[{name}]"
-        missing = str(error.name or getattr(error.__cause__, "name", None)).partition(".")[0]
-        remedy = f"the package {missing} is not installed; pip install '{extra}'"
-        raise InputError("env.type" if name == config.type else "env.name", name, remedy) from error
+    except Exception as error:
+        raise environment_error(config, error) from error
     if reward_model is not None and reward_model.path is not None:
         world = JudgedWorld(world, load_judge(reward_model))
     return world if history == 1 else HistoryWorld(world, history)
+
+
+def environment_error(config: EnvConfig, error: Exception) -> InputError:
+    """The one line for an error of somebody's environment, which may be any."""
+    if isinstance(error, InputError):
+        return error
+    if (drawing := drawing_error(error)) is not None:
+        return drawing
+    field, name = f"env.{config.named_by}", str(getattr(config, config.named_by))
+    if isinstance(error, ModuleNotFoundError):
+        missing = str(error.name or getattr(error.__cause__, "name", None)).partition(".")[0]
+        package = "accerl-lerobot" if config.named_by == "type" else "lerobot"
+        extra = f"; pip install '{package}[{name}]'" if name in _extras(package) else ""
+        return InputError(field, name, f"the package {missing} is not installed{extra}")
+    why = f"the environment fails ({type(error).__name__}: {brief(error)}); ACCERL_LOG=DEBUG shows where"
+    if kwargs := getattr(config, "kwargs", None):
+        return InputError("env.kwargs", kwargs, f"{name}: {why}")
+    return InputError(field, name, why)
+
+
+def _extras(package: str) -> Sequence[str]:
+    """Names of the extras that a package can be installed with."""
+    try:
+        return metadata(package).get_all("Provides-Extra") or ()
+    except PackageNotFoundError:
+        return ()

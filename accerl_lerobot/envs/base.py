@@ -22,6 +22,7 @@ import draccus
 import numpy as np
 
 from accerl_lerobot.config.ranges import Range, Section, default_of, registered_name
+from accerl_lerobot.envs.graphics import start_graphics
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Observation
 from accerl_lerobot.seeds import EVAL_SEEDS
@@ -53,6 +54,7 @@ class ChunkResult:
     terminated: bool
     truncated: bool
     success: bool  # True if the task has been achieved at any step of the episode so far
+    note: str = ""  # at the end of an episode: why its success may not be what happened
     info: dict[str, float] = field(default_factory=dict)
 
     @property
@@ -128,7 +130,7 @@ class EpisodeWorld(World):
     @property
     def late(self) -> float:
         """Share of the time limit gone."""
-        return self._steps / self.spec.max_steps
+        return self._steps / self.spec.max_steps if self._steps else 0.0
 
     def reset(self, seed: int, task: str) -> Observation:
         if task not in self.spec.tasks:
@@ -183,11 +185,15 @@ class EnvConfig(Section, draccus.ChoiceRegistry, section="env"):
 
     world: ClassVar[str]
     """``module:class`` of the world, made from the config."""
+    named_by: ClassVar[str] = "type"
+    """The field that names the environment."""
     expert: ClassVar[str | None] = None
     """``module:function`` of the scripted expert for demonstrations: given a world and a task, it returns a
     function whose every call is the action (A,) for the state that the world is in."""
 
-    discover_packages_path: str | None = field(default=None, metadata={"registers": True})
+    discover_packages_path: str | None = field(
+        default=None, metadata={"registers": True, "prepares": start_graphics}
+    )
     """Package to import that registers ``env.type``, ``env.id`` or ``env.name``, where that is not one of
     ours, Gymnasium's or LeRobot's; every machine of the cluster needs it."""
     max_steps: Annotated[int, Range("[1, 1000000]")] = 500
@@ -203,6 +209,9 @@ class EnvConfig(Section, draccus.ChoiceRegistry, section="env"):
     def nominal(self) -> Self:
         """This config without deployment shift; an environment that has one overrides it."""
         return self
+
+
+IS_SUCCESS = "is_success"  # LeRobot's key of ``info``
 
 
 def names(text: str) -> tuple[str, ...]:
@@ -347,7 +356,11 @@ def lerobot_eval_arguments(env: Mapping[str, Any]) -> list[str]:
     """``--env.…`` and seed of stock ``lerobot-eval`` for an environment; none if LeRobot cannot have it."""
     kind = env.get("type")
     if kind == "lerobot":
+        if env.get("success", IS_SUCCESS) != IS_SUCCESS:  # the only key that LeRobot reads
+            return []
         fields: dict[str, Any] = {"type": env.get("name"), **(env.get("kwargs") or {})}
+        if env.get("max_steps"):
+            fields["episode_length"] = env["max_steps"]
     elif kind in EnvConfig.get_known_choices():
         # Only what differs from the defaults, as the run wrote them.
         owned = dataclasses.fields(EnvConfig.get_choice_class(str(kind)))

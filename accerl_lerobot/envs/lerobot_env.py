@@ -9,34 +9,36 @@ Importing this file loads no LeRobot; making the world does.
 
 from __future__ import annotations
 
+import dataclasses
 import io
-import math
 import re
 from contextlib import redirect_stdout
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
 
-from accerl_lerobot.config.ranges import Range
-from accerl_lerobot.envs.base import EnvConfig, EpisodeWorld, Step, WorldSpec
-from accerl_lerobot.envs.gym_env import finite_numbers, resized, unlimited
-from accerl_lerobot.envs.metaworld import close_at_exit, import_mujoco
+from accerl_lerobot.envs.base import EnvConfig, WorldSpec
+from accerl_lerobot.envs.gym_env import GymnasiumConfig, GymnasiumWorld
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK, Observation
 
 _STATE = "observation.state"
 _IMAGE = "observation.image"
 _PINNED = re.compile(r"[\w.-]+/[\w.-]+@[0-9a-f]{40}(:\w[\w./-]*\.py)?", re.ASCII)
-_NEEDS_MUJOCO = ("aloha", "metaworld", "robocasa")
+_LIMIT = "episode_length"
+_INTERNAL = {"features", "features_map", "max_parallel_tasks", "disable_env_checker", _LIMIT}
+"""Fields of LeRobot's configs that say how it works, and one that is ours."""
 
 
 @EnvConfig.register_subclass("lerobot")
 @dataclass(frozen=True, kw_only=True)
-class LeRobotEnvConfig(EnvConfig):
+class LeRobotEnvConfig(GymnasiumConfig):
     """Which of LeRobot's environments, those of installed packages ``lerobot_env_*`` included."""
 
     world = "accerl_lerobot.envs.lerobot_env:LeRobotWorld"
+    named_by = "name"
+    LIMIT = _LIMIT
 
     name: str = "pusht"
     """LeRobot's own name of the environment: what ``lerobot-eval --env.type`` takes."""
@@ -50,10 +52,6 @@ class LeRobotEnvConfig(EnvConfig):
     camera: str = "image"
     """Name of a lone camera: ``observation.images.<camera>``; if empty, LeRobot's ``observation.image``,
     which policies trained on LeRobot's PushT dataset expect."""
-    max_steps: Annotated[int, Range("[1, 1000000]")] = 300
-    """Episode limit in env steps; reaching it truncates."""
-    reward: Literal["success", "env"] = "success"
-    """``success`` (1.0 at the first success, else 0.0) or ``env`` (the environment's own)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -64,12 +62,13 @@ class LeRobotEnvConfig(EnvConfig):
             raise InputError("env.name", self.name, remedy)
 
 
-class LeRobotWorld(EpisodeWorld):
+class LeRobotWorld(GymnasiumWorld):
     """One of LeRobot's environments; a suite of several tasks has one simulator for each."""
 
+    config: LeRobotEnvConfig
+    ends_at_success = False
+
     def __init__(self, config: LeRobotEnvConfig) -> None:
-        if config.name in _NEEDS_MUJOCO:
-            import_mujoco()
         from lerobot.envs.configs import EnvConfig as LeRobotConfig
         from lerobot.envs.factory import make_env
         from lerobot.utils.import_utils import register_third_party_plugins
@@ -80,61 +79,47 @@ class LeRobotWorld(EpisodeWorld):
         known = LeRobotConfig.get_known_choices()
         if config.name not in known:
             raise InputError("env.name", config.name, f"LeRobot has: {', '.join(known)}")
+        fields = {own.name for own in dataclasses.fields(known[config.name])}
+        limit = {_LIMIT: config.max_steps} if config.max_steps and _LIMIT in fields else {}
+        self._fields = f"LeRobot's {config.name} has the fields {', '.join(sorted(fields - _INTERNAL))}"
         try:
-            self._lerobot_config = known[config.name](**config.kwargs)
+            self._lerobot_config = known[config.name](**limit, **config.kwargs)
         except (TypeError, ValueError) as error:
-            raise InputError("env.kwargs", config.kwargs, str(error)) from error
+            raise InputError("env.kwargs", config.kwargs, f"{error}; {self._fields}") from error
         _check_hub(config, getattr(self._lerobot_config, "hub_path", None))
         self._before, self._after = self._lerobot_config.get_env_processors()
         with redirect_stdout(io.StringIO()):  # LeRobot prints, and results go there
             trust = config.trust_remote_code
             self._vectors = make_env(self._lerobot_config, n_envs=1, trust_remote_code=trust)
-        self._envs = _single_envs(self._vectors)
-        self.spec = self._look()
-        close_at_exit(self)
+        super().__init__(_single_envs(self._vectors))
 
-    def _begin(self, seed: int, task: str) -> None:
-        self._raw, _ = self._envs[task].reset(seed=seed)
-
-    def _step(self, action: np.ndarray) -> Step:
+    def _processed(self, action: np.ndarray) -> np.ndarray:
         import torch
 
-        processed = self._after({"action": torch.from_numpy(action[None])})["action"].numpy()[0]
-        self._raw, reward, ended, cut, info = self._envs[self._task].step(processed)
-        return Step(
-            success=bool(info.get("is_success", False)),
-            ended=bool(ended),
-            reward=float(reward) if self.config.reward == "env" else None,
-            cut=bool(cut),
-            finite=math.isfinite(reward) and finite_numbers(self._raw),
-        )
-
-    def render(self, height: int, width: int) -> np.ndarray:
-        return resized(np.asarray(self._envs[self._task].render(), np.uint8), height, width)
+        processed: np.ndarray = self._after({"action": torch.from_numpy(action[None])})["action"].numpy()
+        return processed[0]
 
     def close(self) -> None:
         for suite in self._vectors.values():
             for vector in suite.values():
                 vector.close()
-        self._vectors, self._envs, self._done = {}, {}, True
+        self._vectors, self.environments, self._done = {}, {}, True
 
-    def _look(self) -> WorldSpec:
-        """Learns shapes from a first observation."""
-        task, env = next(iter(self._envs.items()))
-        self._task = task
-        self._raw, _ = env.reset(seed=0)
-        observation = self._observe()
+    def _look(self, observation: Observation) -> WorldSpec:
         images: dict[str, Any] = {k: np.shape(v) for k, v in observation.items() if k.startswith(_IMAGE)}
         if not images or _STATE not in observation:
             shown = ", ".join(k for k in observation if k != TASK) or "neither"
             remedy = f"a policy needs images and a state, {self.config.name} shows {shown}"
-            raise InputError("env.kwargs", self.config.kwargs, f"{remedy}; try obs_type=pixels_agent_pos")
-        space = env.action_space
+            hint = self._fields
+            if hasattr(self._lerobot_config, "obs_type"):
+                hint = "use obs_type=pixels_agent_pos"
+            raise InputError("env.kwargs", self.config.kwargs, f"{remedy}; {hint}")
+        space = self.environments[self._task].action_space
         return WorldSpec(
             images=images, state_dim=len(observation[_STATE]), action_dim=space.shape[0],
             action_low=np.asarray(space.low, np.float32), action_high=np.asarray(space.high, np.float32),
-            fps=int(self._lerobot_config.fps), max_steps=self.config.max_steps, tasks=tuple(self._envs),
-            instructions=tuple(filter(None, map(self._instruction, self._envs))),
+            fps=int(self._lerobot_config.fps), max_steps=self.max_steps, tasks=tuple(self.environments),
+            instructions=tuple(filter(None, map(self._instruction, self.environments))),
         )  # fmt: skip
 
     def _observe(self) -> Observation:
@@ -151,10 +136,11 @@ class LeRobotWorld(EpisodeWorld):
                 name = f"observation.images.{self.config.camera}" if renamed else key
                 # LeRobot has divided by 255; rounding brings every one of the 256 values back.
                 observation[name] = (value[0].permute(1, 2, 0) * 255).round().byte().numpy().copy()
+        self.pictures = {k: v for k, v in observation.items() if isinstance(v, np.ndarray) and k != _STATE}
         return observation
 
     def _instruction(self, task: str) -> str:
-        env = self._envs[task].unwrapped
+        env = self.environments[task].unwrapped
         for name in ("task_description", "task"):
             if isinstance(text := getattr(env, name, None), str) and text:
                 return text
@@ -181,12 +167,13 @@ def _single_envs(vectors: dict[str, dict[int, Any]]) -> dict[str, Any]:
     """Names each single environment ``suite`` or, where there are several, ``suite/number``."""
     flat = [(suite, number, vector) for suite, tasks in vectors.items() for number, vector in tasks.items()]
     if len(flat) == 1:
-        return {flat[0][0]: unlimited(flat[0][2].envs[0])}
-    return {f"{suite}/{number}": unlimited(vector.envs[0]) for suite, number, vector in flat}
+        return {flat[0][0]: flat[0][2].envs[0]}
+    return {f"{suite}/{number}": vector.envs[0] for suite, number, vector in flat}
 
 
 def _batched(raw: Any) -> Any:
-    """Adds the leading dimension a vector environment would have added."""
+    """Adds the leading dimension a vector environment would have added; text has none there, either."""
     if isinstance(raw, dict):
         return {key: _batched(value) for key, value in raw.items()}
-    return np.asarray(raw)[None]
+    array = np.asarray(raw)
+    return array[None] if array.dtype.kind in "fiub" else (raw,)

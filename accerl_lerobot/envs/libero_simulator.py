@@ -20,8 +20,9 @@ from unittest.mock import patch
 import numpy as np
 
 from accerl_lerobot.checkpoint.safety import brief
+from accerl_lerobot.envs.graphics import import_mujoco, new_renderer
 from accerl_lerobot.envs.libero_tasks import REMEDY, bddl_file, load_libero, recorded_states
-from accerl_lerobot.envs.metaworld import diverged, draw_fast, import_mujoco, new_renderer
+from accerl_lerobot.envs.metaworld import diverged, draw_fast
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.seeds import EVAL_SEEDS
 

@@ -4,34 +4,23 @@
 The same physics, state, camera and instruction as LeRobot's own wrapper, but the image has the size a small
 policy needs, lights are cheap to draw in software, and nothing is rendered that no policy looks at.
 Importing this file loads neither MuJoCo nor metaworld.
-Also the offscreen OpenGL of every MuJoCo world: MuJoCo reads ``MUJOCO_GL`` once, when it is imported, so call
-`import_mujoco` before importing what uses it.
 """
 
 from __future__ import annotations
 
-import atexit
-import contextlib
-import ctypes
 import functools
-import importlib
 import json
-import math
-import os
-import sys
-import weakref
 from collections import deque
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 
 from accerl_lerobot.config.ranges import Positive, Range, Section
 from accerl_lerobot.envs.base import EnvConfig, SuiteConfig, SuiteWorld, unit_spec
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.envs.graphics import import_mujoco, new_renderer
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -101,90 +90,6 @@ class ShiftConfig(Section, section="env.shift"):
             simulator._random_reset_space = Box(low, high, dtype=space.dtype)
 
 
-_LIBRARIES = {
-    "egl": ("libEGL.so.1", "libEGL.so"),
-    "osmesa": ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so"),
-}
-_GPU_NODES = ("/dev/nvidia0", "/dev/dri/renderD128")
-REMEDY = (
-    "install an offscreen OpenGL: apt-get install -y libosmesa6 (MUJOCO_GL=osmesa) "
-    "or apt-get install -y libegl1 libgl1-mesa-dri libgles2 (MUJOCO_GL=egl)"
-)
-_open: weakref.WeakSet[Any] = weakref.WeakSet()
-
-
-def choose_backend() -> str | None:
-    """The backend for a headless Linux machine: EGL where there is a GPU, else OSMesa, else EGL.
-
-    None where MuJoCo's own default is right (a display, or not Linux).
-    """
-    if not _headless():
-        return None
-    order = ("egl", "osmesa") if any(Path(node).exists() for node in _GPU_NODES) else ("osmesa", "egl")
-    for backend in order:
-        for library in _LIBRARIES[backend]:
-            with contextlib.suppress(OSError):
-                ctypes.CDLL(library)
-                return backend
-    raise InputError("MUJOCO_GL", "", REMEDY)
-
-
-def import_mujoco() -> ModuleType:
-    """Imports MuJoCo with a backend that works here; respects ``MUJOCO_GL`` if it is set."""
-    imported = "mujoco" in sys.modules
-    # One software-rendering thread per world: several worlds then share the cores without fighting.
-    os.environ.setdefault("LP_NUM_THREADS", "1")
-    given = os.environ.get("MUJOCO_GL", "").lower()
-    if given and given not in _LIBRARIES and _headless():
-        # GLFW without a display takes the whole process down, with no Python error to catch.
-        raise InputError("MUJOCO_GL", given, "there is no display: use egl or osmesa, or unset it")
-    chosen = None if given else choose_backend()
-    if chosen is not None:
-        os.environ["MUJOCO_GL"] = chosen
-    try:
-        mujoco = importlib.import_module("mujoco")
-        if imported and chosen is not None:
-            # Somebody imported MuJoCo before us, without a backend; only this module reads the variable.
-            importlib.reload(mujoco.gl_context)
-        return mujoco
-    except (ImportError, AttributeError, RuntimeError) as error:
-        if isinstance(error, ModuleNotFoundError) and error.name == "mujoco":
-            raise
-        raise InputError("MUJOCO_GL", os.environ.get("MUJOCO_GL", ""), REMEDY) from error
-
-
-def new_renderer(model: Any, height: int, width: int) -> Any:
-    """A `mujoco.Renderer` whose framebuffer is exactly (height, width)."""
-    mujoco = import_mujoco()
-    model.vis.global_.offheight, model.vis.global_.offwidth = height, width
-    try:
-        renderer = mujoco.Renderer(model, height, width)
-    except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
-        raise InputError("MUJOCO_GL", os.environ.get("MUJOCO_GL", ""), REMEDY) from error
-    close_at_exit(renderer)
-    return renderer
-
-
-def close_at_exit(drawing: Any) -> None:
-    """Has `drawing` closed when the interpreter ends, unless it is gone by then; call it once it has drawn.
-
-    MuJoCo registers EGL's end with its first context, and `atexit` calls the latest function first: ours has
-    to be registered after it, or contexts are destroyed in a display that is gone, which prints tracebacks.
-    """
-    _open.add(drawing)
-    atexit.unregister(_close_all)
-    atexit.register(_close_all)
-
-
-def _close_all() -> None:
-    for drawing in tuple(_open):
-        drawing.close()
-
-
-def _headless() -> bool:
-    return sys.platform == "linux" and not any(os.environ.get(k) for k in ("DISPLAY", "WAYLAND_DISPLAY"))
-
-
 STATE_DIM = 4
 ACTION_DIM = 4
 FPS = 80
@@ -224,8 +129,8 @@ class MetaWorldConfig(SuiteConfig):
 class MetaWorld(SuiteWorld):
     """One MetaWorld instance.
 
-    A simulator that diverges (non-finite state or reward, or MuJoCo had to reset it) ends the episode as
-    truncated, with ``info["nonfinite"] == 1.0``: such a segment must not be trained on.
+    A simulator that diverges, so that MuJoCo had to reset it, ends the episode as truncated, with
+    ``info["nonfinite"] == 1.0``: such a segment must not be trained on.
     """
 
     config: MetaWorldConfig
@@ -274,11 +179,10 @@ class Simulator:
         self._delayed = deque([np.zeros(ACTION_DIM, np.float32)] * self._delay)
 
     def step(self, action: np.ndarray) -> tuple[bool, bool]:
-        """One env step; True if it succeeded, and True if all numbers are finite."""
+        """One env step; True if it succeeded, and True if the simulator has not diverged."""
         self._delayed.append(action)
-        self._raw, reward, _, _, info = self.env.step(self._delayed.popleft())
-        finite = math.isfinite(reward) and np.isfinite(self._raw).all() and not diverged(self.env.data)
-        return bool(info["success"]), bool(finite)
+        self._raw, _, _, _, info = self.env.step(self._delayed.popleft())
+        return bool(info["success"]), not diverged(self.env.data)
 
     def state(self) -> np.ndarray:
         """``observation.state``, float32 (4,)."""

@@ -118,4 +118,6 @@ class JudgedWorld(WrappedWorld):
         rewards = np.zeros_like(result.rewards)
         rewards[-1] = success
         ended, out_of_time = result.terminated or success, result.truncated and not success
-        return replace(result, rewards=rewards, success=success, terminated=ended, truncated=out_of_time)
+        return replace(
+            result, rewards=rewards, success=success, terminated=ended, truncated=out_of_time, note=""
+        )

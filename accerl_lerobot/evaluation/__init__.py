@@ -7,6 +7,7 @@ A rate is never reported without n and an interval.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ import numpy as np
 from rich.table import Table
 
 from accerl_lerobot.config.ranges import Range, Section, Steps
+from accerl_lerobot.errors import for_viewing
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.seeds import eval_seed
 
@@ -69,7 +71,8 @@ class Rate:
 def summarise(results: Sequence[EpisodeResult]) -> dict[str, Any]:
     """Success with its 95 % Wilson interval, in all and per task, as plain JSON types.
 
-    Each task has the first and the last of its ``seeds``, and the ``failed_seeds`` among them.
+    Each task has the first and the last of its ``seeds``, and the ``failed_seeds`` among them. ``notes`` say
+    why the success of some episodes may not be what happened.
     """
     if not results:
         raise ValueError("nothing to summarise: no episodes")
@@ -86,7 +89,14 @@ def summarise(results: Sequence[EpisodeResult]) -> dict[str, Any]:
         "version_min": min(r.versions[0] for r in results),
         "version_max": max(r.versions[1] for r in results),
         "tasks": tasks,
+        "notes": notes(results),
     }
+
+
+def notes(results: Sequence[EpisodeResult]) -> list[str]:
+    """Each `EpisodeResult.note`, with the number of episodes that have it."""
+    counts = Counter(result.note for result in results if result.note)
+    return [f"{count} of {len(results)} episodes: {note}" for note, count in counts.items()]
 
 
 def table(summary: dict[str, Any], title: str) -> Table:
@@ -157,6 +167,7 @@ def drawing(path: Path) -> Iterator[Any]:
     figure.savefig(path)
 
 
+@for_viewing("success_curve.png")
 def success_curve(
     path: Path, evaluations: Sequence[dict[str, Any]], training: Sequence[tuple[float, float]]
 ) -> None:
@@ -185,6 +196,7 @@ def success_curve(
         axes.legend(loc="lower right")
 
 
+@for_viewing("success_by_task.png")
 def success_by_task(path: Path, arms: Mapping[str, Mapping[str, Sequence[float]]]) -> None:
     """Draws a group of bars per task, one bar per arm, the mean over policies; where several, they are dots.
 
@@ -207,6 +219,7 @@ def success_by_task(path: Path, arms: Mapping[str, Mapping[str, Sequence[float]]
         axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1), ncols=len(arms))
 
 
+@for_viewing("film")
 def write_video(path: Path, rows: Sequence[Sequence[Sequence[np.ndarray]]], fps: int) -> None:
     """Writes rows of clips, of equal width, as MP4; a clip that ends early holds its last frame.
 
@@ -226,6 +239,7 @@ def write_video(path: Path, rows: Sequence[Sequence[Sequence[np.ndarray]]], fps:
             writer.append_data(picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2])
 
 
+@for_viewing("film before and after training")
 def before_after(
     path: Path,
     before: tuple[Sequence[EpisodeResult], dict[str, Any] | None],

@@ -21,6 +21,7 @@ from accerl_lerobot.checkpoint.snapshot import kind
 from accerl_lerobot.config.ranges import NonNegative, Range, Section, Steps
 from accerl_lerobot.envs.base import ChunkResult, World
 from accerl_lerobot.envs.reward_model import JudgedWorld, RewardModelConfig
+from accerl_lerobot.errors import InputError, for_viewing, warn_once
 from accerl_lerobot.experience import REAL, TASK, Decision, Observation, Origin, Request, Segment
 from accerl_lerobot.seeds import noise_seed, train_seed
 
@@ -28,6 +29,7 @@ STARTS_PER_INCARNATION = 1000
 """By how much a restarted worker skips ahead in its training seeds, so as not to repeat its episodes."""
 LEAST_SHARE = 0.1  # how often a task that never fails is explored, compared with one that always does
 RECENT = 20  # episodes of a task that tell how often it fails now
+MOST_DROPPED = 20  # episodes in a row that may be dropped before the environment counts as broken
 
 
 @kind
@@ -227,6 +229,8 @@ class EpisodeResult:
     versions: tuple[int, int]  # oldest and newest weights that decided in it
     frames: list[np.ndarray] = field(default_factory=list)
     """uint8 (H, W, 3) each, when the plan asked for a film."""
+    note: str = ""
+    """Why its success may not be what happened; empty: nothing is known to be wrong."""
 
 
 @kind
@@ -238,6 +242,7 @@ class Counters:
     decisions: int = 0
     episodes: int = 0
     dropped_nonfinite: int = 0  # decisions thrown away because the world returned NaN or infinity
+    dropped_episodes: int = 0  # episodes that ended so
 
 
 @dataclass(eq=False)
@@ -260,6 +265,7 @@ class RolloutRunner:
         self.counters = Counters()
         self._episodes: list[ActiveEpisode | None] = [None] * len(self.worlds)
         self._sequence = 0
+        self._dropped = 0  # episodes in a row
 
     def __len__(self) -> int:
         return len(self.worlds)
@@ -275,12 +281,12 @@ class RolloutRunner:
             self._episodes[slot] = None
             return None
         observation = self.worlds[slot].reset(plan.seed, plan.task)
-        if not _finite(observation):
-            raise RuntimeError(f"{plan.task} with seed {plan.seed}: the first observation is not finite")
         origin = Origin(plan.task, plan.seed, decision=0)
         builder = SegmentBuilder([observation], self.config.segment_length, origin)
-        self._episodes[slot] = ActiveEpisode(plan, builder)
-        return self.request(slot)
+        episode = self._episodes[slot] = ActiveEpisode(plan, builder)
+        if bad := nonfinite(observation):
+            return self._drop(slot, episode, f"{bad} of the first observation")
+        return episode.request()
 
     def advance(self, slot: int, decision: Decision) -> Request | None:
         """Executes `decision`; the request is about the same episode, or the first of the next one."""
@@ -290,12 +296,10 @@ class RolloutRunner:
         episode.chunks.append(decision.chunk)
         self.counters.env_steps += result.steps
         self.counters.decisions += 1
-        sound = np.isfinite(result.rewards).all() and _finite(result.observation)
-        if result.info.get("nonfinite") or not sound:
+        bad = nonfinite({"the reward": result.rewards, **result.observation})
+        if bad or result.info.get("nonfinite"):
             self.counters.dropped_nonfinite += len(episode.builder.taken) + 1
-            if not episode.plan.explore:  # an evaluation counts every episode it planned
-                self._finish(episode, success=False)
-            return self.start(slot)
+            return self._drop(slot, episode, bad or "the state of the simulator")
         reward = float(result.rewards.sum())
         if episode.plan.explore:  # what is to be maximised; evaluation reports the environment's own return
             reward -= self.config.decision_cost
@@ -310,9 +314,24 @@ class RolloutRunner:
             if episode.plan.explore:
                 self.on_segment(segment)
         if result.done:
-            self._finish(episode, result.success)
+            self._dropped = 0
+            self._finish(episode, result.success, result.note)
             return self.start(slot)
         return episode.request()
+
+    def _drop(self, slot: int, episode: ActiveEpisode, bad: str) -> Request | None:
+        """Throws away the rest of an episode; the request of the next one."""
+        plan, note = episode.plan, f"an episode is dropped: {bad} is not finite"
+        self.counters.dropped_episodes += 1
+        self._dropped += 1
+        if self._dropped >= MOST_DROPPED:
+            remedy = f"{self._dropped} episodes in a row had to be dropped, as {bad} is not finite"
+            raise InputError("env", plan.task, f"{remedy}; mend the environment")
+        if plan.explore:
+            warn_once(note)
+        else:  # an evaluation counts every episode it planned
+            self._finish(episode, success=False, note=note)
+        return self.start(slot)
 
     def request(self, slot: int) -> Request | None:
         """Request of the episode in `slot`; None if it waits for nothing."""
@@ -345,8 +364,10 @@ class RolloutRunner:
         for world in self.worlds:
             world.close()
 
-    def _finish(self, episode: ActiveEpisode, success: bool) -> None:
+    def _finish(self, episode: ActiveEpisode, success: bool, note: str) -> None:
         self.counters.episodes += 1
+        if note:
+            warn_once(note)
         versions = episode.versions or [0]
         result = EpisodeResult(
             plan=episode.plan,
@@ -356,6 +377,7 @@ class RolloutRunner:
             decisions=len(episode.versions),
             versions=(min(versions), max(versions)),
             frames=episode.frames,
+            note=note,
         )
         self.on_episode(result)
 
@@ -371,12 +393,21 @@ def _execute(world: World, episode: ActiveEpisode, actions: np.ndarray) -> Chunk
     for i in range(0, len(actions), every):
         result = world.step_chunk(actions[i : i + every])
         rewards.append(result.rewards)
-        episode.frames.append(world.render(side, side))
+        with for_viewing("film"):
+            episode.frames.append(_frame(world, side))
         if result.done:
             break
     return replace(result, rewards=np.concatenate(rewards))
 
 
-def _finite(observation: Observation) -> bool:
-    arrays = [v for v in observation.values() if isinstance(v, np.ndarray) and v.dtype.kind == "f"]
-    return all(np.isfinite(v).all() for v in arrays)
+def _frame(world: World, side: int) -> np.ndarray:
+    frame = np.asarray(world.render(side, side))
+    if frame.shape != (side, side, 3) or frame.dtype != np.uint8:
+        raise ValueError(f"a frame is {frame.dtype} {frame.shape}, not uint8 ({side}, {side}, 3)")
+    return frame
+
+
+def nonfinite(observation: Observation) -> str:
+    """The first name in an observation whose numbers are not finite; empty: there is none."""
+    arrays = {k: v for k, v in observation.items() if isinstance(v, np.ndarray) and v.dtype.kind == "f"}
+    return next((name for name, array in arrays.items() if not np.isfinite(array).all()), "")

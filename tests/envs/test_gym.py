@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import importlib
+import os
 import shutil
 import subprocess
 import sys
@@ -14,10 +16,12 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium import spaces
 
 from accerl_lerobot.config.parsing import parse
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig
-from accerl_lerobot.envs import GymConfig, gym_env, make_world
+from accerl_lerobot.engine.preflight import check_world
+from accerl_lerobot.envs import GymConfig, graphics, make_world
 from accerl_lerobot.envs.gym_env import GymWorld
 from accerl_lerobot.errors import InputError
 from tests.runs import pip_installed, replacing, tiny_run, trained
@@ -45,7 +49,8 @@ def config(*more: str) -> GymConfig:
 def test_observations_are_mapped():
     world = make_world(config("--env.environment_state=[goal]", "--env.image_size=16"))
     assert isinstance(world, GymWorld)
-    seen, raw = world.reset(3, "reach/Reach-v0"), world._env.unwrapped.observation()
+    seen = world.reset(3, "reach/Reach-v0")
+    raw = world.environments["reach/Reach-v0"].unwrapped.observation()
     assert seen["observation.state"].tolist() == [*raw["agent_pos"], *raw["goal"]]
     assert seen["observation.environment_state"].tolist() == [*raw["goal"], 0.0]
     assert seen["observation.images.front"].shape == (16, 16, 3) and seen["task"] == "Reach the goal"
@@ -71,7 +76,7 @@ def test_the_first_success_ends_the_episode():
     world = make_world(config())
     world.reset(0, "reach/Reach-v0")
     for _ in range(16):
-        inner = world._env.unwrapped
+        inner = world.environments["reach/Reach-v0"].unwrapped
         way = (inner.goal - inner.agent) / inner.speed
         result = world.step_chunk(way[None])
         if result.done:
@@ -86,11 +91,10 @@ class Tilted(gymnasium.Wrapper):
         return self.env.step(action / 2)
 
 
-def test_the_environment_keeps_its_wrappers_but_not_its_time_limit(caplog: pytest.LogCaptureFixture):
+def test_the_environment_keeps_its_wrappers_but_not_its_time_limit():
     def tilted(**options: Any) -> gymnasium.Env:
         return Tilted(gymnasium.make("Pendulum-v1", max_episode_steps=3, **options))
 
-    gym_env._warn_of_missing.cache_clear()
     gymnasium.register("Tilted-v0", tilted, max_episode_steps=2)
     observed = []
     for name, torque in (("Tilted-v0", 2.0), ("Pendulum-v1", 1.0)):
@@ -101,8 +105,165 @@ def test_the_environment_keeps_its_wrappers_but_not_its_time_limit(caplog: pytes
             assert result.truncated and result.steps == 6
         observed.append(result.observation["observation.state"].tolist())
     assert observed[0] == observed[1]
-    (message,) = caplog.messages
-    assert message.startswith("env.success='is_success': the environment's info had no such key")
+
+
+class Odd(gymnasium.Env):
+    """A point that says more than is read of it, and succeeds at its third step."""
+
+    metadata = {"render_modes": ["rgb_array"]}
+    action_space = spaces.Box(-1, 1, (1,), np.float32)
+    observation_space = spaces.Dict(agent_pos=spaces.Box(-1, 1, (2,), np.float32))
+
+    def __init__(
+        self,
+        seeds: str = "follow",
+        told: dict[str, Any] | None = None,
+        views: Any = (),
+        fails: Exception | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        if fails is not None:
+            raise fails
+        self.seeds, self.told, self.views, self.render_mode = seeds, told, views, render_mode
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.steps = 0
+        number = {
+            "follow": self.np_random.uniform(),
+            "same": 0.5,
+            "ignore": np.random.default_rng().uniform(),
+        }
+        self.position = np.full(2, number[self.seeds], np.float32)
+        return self.seen(), {}
+
+    def step(self, action: np.ndarray) -> Any:
+        self.steps += 1
+        info = {} if self.told is None else {key: value(self.steps) for key, value in self.told.items()}
+        return self.seen(), float("nan"), self.steps == 5, False, info
+
+    def seen(self) -> dict[str, Any]:
+        depth, ragged = np.full((4, 4), np.inf, np.float32), [[1.0], [1.0, 2.0]]
+        return {"agent_pos": self.position, "depth": depth, "label": "a point", "ragged": ragged}
+
+    def render(self) -> Any:
+        return self.views
+
+
+gymnasium.register("Odd-v0", Odd, max_episode_steps=7)
+
+
+def odd(**fields: Any) -> GymConfig:
+    return GymConfig(**({"id": "Odd-v0", "images": {}, "state": ("agent_pos",)} | fields))
+
+
+def ended(config: GymConfig, steps: int = 9) -> Any:
+    world = make_world(config)
+    world.reset(0, config.id)
+    return world.step_chunk(np.zeros((steps, 1), np.float32))
+
+
+def test_only_what_is_read_is_judged():
+    result = ended(odd(success=""))
+    assert result.success and result.terminated and result.steps == 5 and result.info == {}
+    assert result.rewards.tolist() == [0, 0, 0, 0, 1], "its own reward is not a number, and not asked for"
+    assert np.isnan(ended(odd(success="", reward="env")).rewards).all()
+
+
+@pytest.mark.parametrize(
+    ("key", "told"),
+    [
+        ("succeed", {"succeed": lambda step: np.array([step >= 3])}),
+        ("metrics.success", {"metrics": lambda step: {"success": step >= 3}}),
+        ("won", {"final_info": lambda step: {"won": step >= 3}, "other": lambda step: True}),
+    ],
+)
+def test_success_is_read_by_its_key(key: str, told: dict[str, Any]):
+    result = ended(odd(success=key, kwargs={"told": told}))
+    assert result.success and result.terminated and result.steps == 3 and result.note == ""
+    missed = ended(odd(kwargs={"told": told}))
+    assert not missed.success and missed.terminated and missed.steps == 5
+    assert missed.note.startswith("env.success='is_success': the environment's info has no such key")
+    assert key in missed.note and "--env.success= to take terminated for success" in missed.note
+    assert ended(odd(kwargs={"told": told}), steps=2).note == "", "the episode goes on"
+    assert "it is empty" in ended(odd()).note
+
+
+def test_the_environment_has_its_own_limit():
+    assert make_world(odd()).spec.max_steps == 7
+    assert make_world(odd(max_steps=3)).spec.max_steps == 3
+    unlimited = GymConfig(id="reach/Reach-v0", images={}, state=("agent_pos",))
+    assert "reach/Reach-v0" in gymnasium.registry or make_world(config())
+    assert make_world(unlimited).spec.max_steps == 500
+    with pytest.raises(InputError, match=r"env\.kwargs\.max_episode_steps=9: .* use --env\.max_steps=9"):
+        odd(kwargs={"max_episode_steps": 9})
+
+
+VIEWS = [np.full((8, 6, 3), level, np.uint8) for level in (50, 200)]
+
+
+@pytest.mark.parametrize(
+    "views", [VIEWS, dict(enumerate(VIEWS)), np.stack(VIEWS)], ids=["list", "dict", "array"]
+)
+def test_several_views_stand_side_by_side(views: Any):
+    world = make_world(odd(images={"both": "render"}, kwargs={"views": views}))
+    seen = world.reset(0, "Odd-v0")["observation.images.both"]
+    film = world.render(16, 16)
+    assert seen.shape == (8, 12, 3) and film.shape == (16, 16, 3)
+    for picture in (seen, film):
+        assert picture[:, 1].mean() == 50 and picture[:, -1].mean() == 200
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        (
+            {"fails": ValueError("the arm is broken")},
+            r"env\.kwargs=.*Odd-v0.*\(ValueError: the arm is broken\)",
+        ),
+        ({"fails": TypeError("got an unexpected keyword argument 'x'")}, r"the environment fails \(TypeError: "),
+        (
+            {"fails": RuntimeError("gladLoadGL error")},
+            r"MUJOCO_GL='.*': the environment cannot draw \(gladLoad",
+        ),
+        (
+            {"fails": ModuleNotFoundError("x", name="arms.left")},
+            r"env\.id='Odd-v0': the package arms is not inst",
+        ),
+        ({"fast": True}, r"env\.kwargs={'fast': True}: it takes seeds, told, views, fails, render_mode "),
+    ],
+)
+def test_an_environment_that_fails_is_one_line_without_a_question(fields: dict[str, Any], message: str):
+    with pytest.raises(InputError, match=message) as caught:
+        make_world(odd(kwargs=fields))
+    assert "discover_packages_path" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("seeds", "warning"),
+    [
+        ("follow", ""),
+        ("same", "all episodes have the same start: the first observations of different seeds are equal"),
+        ("ignore", "the environment's reset ignores its seed"),
+    ],
+)
+def test_starts_that_do_not_follow_from_the_seed_are_told(
+    seeds: str, warning: str, caplog: pytest.LogCaptureFixture
+):
+    check_world(odd(kwargs={"seeds": seeds}))
+    assert len(caplog.messages) == bool(warning) and "".join(caplog.messages).startswith(warning)
+
+
+def test_opengl_is_chosen_before_the_package_is_imported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "drawing_env.py").write_text("import os\nSEEN = os.environ.get('MUJOCO_GL')\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv("MUJOCO_GL", "")
+    monkeypatch.setattr(graphics, "choose_backend", lambda: "egl")
+    config("--env.discover_packages_path=drawing_env")
+    assert importlib.import_module("drawing_env").SEEN == "egl"
+    monkeypatch.setenv("MUJOCO_GL", "")
+    make_world(odd())
+    assert os.environ["MUJOCO_GL"] == "egl"
 
 
 @pytest.mark.parametrize(
@@ -111,7 +272,7 @@ def test_the_environment_keeps_its_wrappers_but_not_its_time_limit(caplog: pytes
         ("--env.id=reach/Nothing-v0", r"env\.id='reach/Nothing-v0': .*env\.discover_packages_path"),
         ("--env.id=os:reach/Reach-v0", r"env\.id='os:reach/Reach-v0': .*env\.discover_packages_path"),
         ("--env.id=CartPole-v1", r"env\.id='CartPole-v1': actions must be a bounded vector"),
-        ("--env.kwargs={colour: 1}", r"env\.id=.*colour"),
+        ("--env.kwargs={colour: 1}", r"env\.kwargs=.*colour"),
         ("--env.images={front: frames}", r"env\.images='frames': the observation has agent_pos"),
         ("--env.images={front: goal}", r"env\.images=.*uint8 \(H, W, 3\)"),
         ("--env.state=[]", r"env\.state='': the observation has agent_pos"),

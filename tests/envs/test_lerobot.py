@@ -45,16 +45,27 @@ def pusht():
 
 
 def test_success_terminates_with_one_reward(pusht: LeRobotWorld):
-    pusht._envs["pusht"] = Scripted(pusht._envs["pusht"])
+    pusht.environments["pusht"] = Scripted(pusht.environments["pusht"])
     pusht.reset(0, "pusht")
     result = pusht.step_chunk(np.full((5, 2), 256, np.float32))
     assert result.terminated and result.success and "observation.state" in result.observation
     assert result.rewards.tolist() == [0, 0, 1]
 
 
+def test_lerobots_limit_is_the_default(pusht: LeRobotWorld):
+    assert pusht.spec.max_steps == 300
+    shorter = LeRobotWorld(LeRobotEnvConfig(name="pusht", max_steps=9, success="succeed"))
+    shorter.reset(0, "pusht")
+    result = shorter.step_chunk(np.full((20, 2), 256, np.float32))
+    shorter.close()
+    assert result.truncated and result.steps == 9
+    assert "env.success='succeed': the environment's info has no such key" in result.note
+    assert "is_success" in result.note
+
+
 def test_images_are_what_the_environment_drew(pusht: LeRobotWorld):
     ours = pusht.reset(7, "pusht")
-    raw, _ = pusht._envs["pusht"].reset(seed=7)
+    raw, _ = pusht.environments["pusht"].reset(seed=7)
     assert np.array_equal(ours["observation.images.top"], raw["pixels"])
     assert np.array_equal(ours["observation.state"], raw["agent_pos"].astype(np.float32))
 
@@ -63,7 +74,12 @@ def test_images_are_what_the_environment_drew(pusht: LeRobotWorld):
     ("values", "message"),
     [
         ({"name": "nope"}, "env.name='nope': LeRobot has: .*pusht"),
-        ({"kwargs": {"colour": 1}}, "env.kwargs=.*colour"),
+        (
+            {"kwargs": {"colour": 1}},
+            "env.kwargs=.*colour.*pusht has the fields fps, obs_type, observation_height",
+        ),
+        ({"kwargs": {"obs_type": "colours"}}, "env.kwargs=.*pusht: the environment fails .*colours"),
+        ({"kwargs": {"episode_length": 9}}, "env.kwargs.episode_length=9: .*--env.max_steps=9"),
         ({"kwargs": {"obs_type": "environment_state_agent_pos"}}, "pixels_agent_pos"),
     ],
 )
@@ -187,6 +203,6 @@ def test_environments_on_the_hub_are_not_run_unasked(arena, hub_path: str, trust
 
 def test_an_environment_is_run_at_its_commit(arena):
     kwargs = {"hub_path": f"them/arena@{COMMIT}:env.py"}
-    with pytest.raises(OSError, match="ran"):
+    with pytest.raises(InputError, match=r"env\.kwargs=.*\(OSError: ran\)"):
         make_world(LeRobotEnvConfig(name="isaaclab_arena", kwargs=kwargs, trust_remote_code=True))
     assert arena.exists()

@@ -15,6 +15,7 @@ import pytest
 
 from accerl_lerobot.demos.record import disturbed, make_expert, played
 from accerl_lerobot.envs import LiberoConfig, libero_tasks, make_world
+from accerl_lerobot.envs.graphics import import_mujoco
 from accerl_lerobot.envs.libero import LiberoWorld
 from accerl_lerobot.envs.libero_simulator import (
     FPS,
@@ -28,7 +29,6 @@ from accerl_lerobot.envs.libero_simulator import (
     operational_space_torques,
 )
 from accerl_lerobot.envs.libero_tasks import bddl_file, instruction, recorded_states, task_name
-from accerl_lerobot.envs.metaworld import import_mujoco
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.seeds import EVAL_SEEDS, demo_seed, eval_seed, train_seed
 from tests.envs.libero_assets import ASSETS, needs_assets

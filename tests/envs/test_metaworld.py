@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from accerl_lerobot.demos.record import make_expert
-from accerl_lerobot.envs import MetaWorldConfig, make_world
+from accerl_lerobot.envs import MetaWorldConfig, graphics, make_world
 from accerl_lerobot.envs import metaworld as gl
 from accerl_lerobot.envs.metaworld import MetaWorld, description, expert_name, groups
 from accerl_lerobot.errors import InputError
@@ -80,7 +80,7 @@ def test_touch_is_told_as_metaworld_tells_it(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_same_states_and_frames_as_lerobot():
-    gl.import_mujoco()
+    graphics.import_mujoco()
     stock_module = pytest.importorskip("lerobot.envs.metaworld")
     stock = stock_module.MetaworldEnv("push-v3", obs_type="pixels_agent_pos")
     actions = np.random.default_rng(0).uniform(-1, 1, (3, 4)).astype(np.float32)
@@ -193,6 +193,7 @@ def test_a_backend_that_needs_a_display_is_refused_without_one(headless: pytest.
 
 
 def test_a_missing_opengl_names_the_package(headless: pytest.MonkeyPatch):
-    headless.setattr(gl, "_LIBRARIES", {"egl": ("libNoEGL.so",), "osmesa": ("libNoMesa.so",)})
-    with pytest.raises(InputError, match="apt-get install -y libosmesa6"):
-        gl.choose_backend()
+    headless.delenv("MUJOCO_GL", raising=False)
+    headless.setattr(graphics, "_LIBRARIES", {"egl": ("libNoEGL.so",), "osmesa": ("libNoMesa.so",)})
+    with pytest.raises(InputError, match="MUJOCO_GL='': .*apt-get install -y libosmesa6"):
+        make_world(MetaWorldConfig(task=TASK)).reset(0, TASK)

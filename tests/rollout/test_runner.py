@@ -13,6 +13,8 @@ import pytest
 
 from accerl_lerobot.envs import SimulatedConfig, World, make_world
 from accerl_lerobot.envs.reward_model import JudgedWorld
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.evaluation import summarise
 from accerl_lerobot.experience import TASK, Decision, Observation, Origin, Request, Segment
 from accerl_lerobot.rollout.runner import (
     EpisodePlan,
@@ -145,16 +147,45 @@ def test_an_evaluation_that_meets_a_nan_still_has_a_result():
     assert [(r.plan.index, r.success) for r in recorder.results] == [(0, False), (1, False)]
     assert recorder.segments == []
 
+    assert all(r.note == "an episode is dropped: the reward is not finite" for r in recorder.results)
+    assert recorder.runner.counters.dropped_episodes == 2
+    assert summarise(recorder.results)["notes"] == [f"2 of 2 episodes: {recorder.results[0].note}"]
 
-def test_a_first_observation_that_is_not_finite_is_an_error():
-    class Broken(ScriptedWorld):
-        def reset(self, seed, task):
-            observation = super().reset(seed, task)
+
+class Unlucky(ScriptedWorld):
+    """A world whose first observation is not finite where the seed is odd."""
+
+    def reset(self, seed, task):
+        observation = super().reset(seed, task)
+        if seed % 2:
             observation["observation.state"] = np.array([np.inf, 0], np.float32)
-            return observation
+        return observation
 
-    with pytest.raises(RuntimeError, match="push with seed 3"):
-        Recorder([Broken()], [explore(3)], CONFIG).runner.start(0)
+
+def test_nothing_but_dropped_episodes_ends_the_rollout_with_one_line():
+    again_and_again = [explore(seed) for seed in (*range(1, 37, 2), 2, *range(1, 37, 2), 4)]
+    recorder = Recorder([Unlucky()], again_and_again, CONFIG)
+    recorder.play()
+    assert [r.plan.seed for r in recorder.results] == [2, 4]
+    assert recorder.runner.counters.dropped_episodes == 36
+    recorder = Recorder([Unlucky()], [explore(seed) for seed in range(1, 99, 2)], CONFIG)
+    message = r"env='push': 20 episodes in a row .* observation\.state of the first observation is not finite"
+    with pytest.raises(InputError, match=message):
+        recorder.play()
+
+
+def test_a_film_that_cannot_be_made_ends_nothing(caplog: pytest.LogCaptureFixture):
+    class Unseen(ScriptedWorld):
+        def render(self, height, width):
+            if height == 16:
+                raise AttributeError("no display")
+            return super().render(height, width)
+
+    plans = [replace(evaluate(seed, seed), film=(16, 1)) for seed in range(3)]
+    recorder = Recorder([Unseen()], plans, CONFIG)
+    recorder.play()
+    assert [(r.success, r.frames) for r in recorder.results] == [(True, [])] * 3
+    assert [m for m in caplog.messages if "no display" in m] == caplog.messages[:1]
 
 
 def test_evaluation_asks_for_the_stock_sampler_and_makes_no_segment():

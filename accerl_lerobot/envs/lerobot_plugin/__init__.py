@@ -19,10 +19,10 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
 
-from accerl_lerobot.config.parsing import DISCOVER, decode, discover
+from accerl_lerobot.config.parsing import DISCOVER, decode
 from accerl_lerobot.envs import EnvConfig as WorldConfig
 from accerl_lerobot.envs import make_world
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.errors import InputError, warn_once
 from accerl_lerobot.experience import Observation
 
 VIDEO_SIZE = 256
@@ -35,13 +35,12 @@ class AccerlEnv(gym.Env):
     render_mode = "rgb_array"
 
     def __init__(self, config: WorldConfig, task: str) -> None:
-        discover(config.discover_packages_path, "env")
         self._world = make_world(config)  # its simulator is built at the first reset
         spec = self._world.spec
         self.task = task
         self.task_description = dict(zip(spec.tasks, spec.instructions, strict=False)).get(task, "")
         self.metadata = self.metadata | {"render_fps": spec.fps}
-        self._max_episode_steps = config.max_steps  # LeRobot's rollout asks for it under this name
+        self._max_episode_steps = spec.max_steps  # LeRobot's rollout asks for it under this name
         images = {_camera(key): gym.spaces.Box(0, 255, size, np.uint8) for key, size in spec.images.items()}
         state = gym.spaces.Box(-np.inf, np.inf, (spec.state_dim,), np.float32)
         self.observation_space = gym.spaces.Dict({"pixels": gym.spaces.Dict(images), "agent_pos": state})
@@ -57,6 +56,8 @@ class AccerlEnv(gym.Env):
 
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         result = self._world.step_chunk(np.asarray(action, np.float32)[None])
+        if result.note:
+            warn_once(result.note)
         info = {"is_success": result.success, **result.info}
         observation = self._format(result.observation)
         return observation, float(result.rewards[0]), result.terminated, result.truncated, info

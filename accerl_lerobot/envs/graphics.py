@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The OpenGL that environments draw with where there is no display.
+
+MuJoCo and dm_control read ``MUJOCO_GL`` once, when they are imported, so `start_graphics` is called before an
+environment's package is imported.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import ctypes
+import importlib
+import os
+import re
+import sys
+import weakref
+from importlib.util import find_spec
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from accerl_lerobot.checkpoint.safety import brief
+from accerl_lerobot.errors import InputError, causes
+
+_LIBRARIES = {
+    "egl": ("libEGL.so.1", "libEGL.so"),
+    "osmesa": ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so"),
+}
+_GPU_NODES = ("/dev/nvidia0", "/dev/dri/renderD128")
+REMEDY = (
+    "install an offscreen OpenGL: apt-get install -y libosmesa6 (MUJOCO_GL=osmesa) "
+    "or apt-get install -y libegl1 libgl1-mesa-dri libgles2 (MUJOCO_GL=egl)"
+)
+_NO_DISPLAY = "there is no display: use egl or osmesa, or unset it"
+_ABOUT_DRAWING = re.compile("OpenGL|gladLoad|glGetError|EGL|(?i:osmesa|glfw|framebuffer)|X11|DISPLAY")
+_open: weakref.WeakSet[Any] = weakref.WeakSet()
+
+
+def choose_backend() -> str | None:
+    """The backend for a headless Linux machine: EGL where there is a GPU, else OSMesa, else EGL.
+
+    None where MuJoCo's own default is right (a display, or not Linux), and where neither is installed.
+    """
+    if not _headless():
+        return None
+    order = ("egl", "osmesa") if any(Path(node).exists() for node in _GPU_NODES) else ("osmesa", "egl")
+    for backend in order:
+        for library in _LIBRARIES[backend]:
+            with contextlib.suppress(OSError):
+                ctypes.CDLL(library)
+                return backend
+    return None
+
+
+def start_graphics() -> None:
+    """Set ``MUJOCO_GL`` to a backend that works here, unless it is set."""
+    # One software-rendering thread per world: several worlds then share the cores without fighting.
+    os.environ.setdefault("LP_NUM_THREADS", "1")
+    if os.environ.get("MUJOCO_GL") or find_spec("mujoco") is None:
+        return
+    if (chosen := choose_backend()) is None:
+        return
+    os.environ["MUJOCO_GL"] = chosen
+    if "mujoco" in sys.modules:
+        # Somebody imported MuJoCo before us, without a backend; only this module reads the variable.
+        importlib.reload(sys.modules["mujoco"].gl_context)
+
+
+def import_mujoco() -> ModuleType:
+    """Import MuJoCo with a backend that works here; respects ``MUJOCO_GL`` if it is set."""
+    start_graphics()
+    given = os.environ.get("MUJOCO_GL", "").lower()
+    if given not in _LIBRARIES and _headless():
+        raise InputError("MUJOCO_GL", given, _NO_DISPLAY if given else REMEDY)
+    try:
+        return importlib.import_module("mujoco")
+    except (ImportError, AttributeError, RuntimeError) as error:
+        if isinstance(error, ModuleNotFoundError) and error.name == "mujoco":
+            raise
+        raise InputError("MUJOCO_GL", given, REMEDY) from error
+
+
+def drawing_error(error: BaseException) -> InputError | None:
+    """The one line for an error that says that nothing can be drawn here; None for other errors."""
+    about = next((link for link in causes(error) if _ABOUT_DRAWING.search(str(link))), None)
+    if about is None:
+        return None
+    given = os.environ.get("MUJOCO_GL", "")
+    wrong = given and given.lower() not in _LIBRARIES and _headless()
+    remedy = _NO_DISPLAY if wrong else REMEDY
+    return InputError("MUJOCO_GL", given, f"the environment cannot draw ({brief(about)}); {remedy}")
+
+
+def new_renderer(model: Any, height: int, width: int) -> Any:
+    """A `mujoco.Renderer` whose framebuffer is exactly (height, width)."""
+    mujoco = import_mujoco()
+    model.vis.global_.offheight, model.vis.global_.offwidth = height, width
+    try:
+        renderer = mujoco.Renderer(model, height, width)
+    except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
+        raise InputError("MUJOCO_GL", os.environ.get("MUJOCO_GL", ""), REMEDY) from error
+    close_at_exit(renderer)
+    return renderer
+
+
+def close_at_exit(drawing: Any) -> None:
+    """Have `drawing` closed when the interpreter ends, unless it is gone by then; call it once it has drawn.
+
+    MuJoCo registers EGL's end with its first context, and `atexit` calls the latest function first: ours has
+    to be registered after it, or contexts are destroyed in a display that is gone, which prints tracebacks.
+    """
+    _open.add(drawing)
+    atexit.unregister(_close_all)
+    atexit.register(_close_all)
+
+
+def _close_all() -> None:
+    for drawing in tuple(_open):
+        drawing.close()
+
+
+def _headless() -> bool:
+    return sys.platform == "linux" and not any(os.environ.get(k) for k in ("DISPLAY", "WAYLAND_DISPLAY"))
