@@ -221,7 +221,10 @@ def test_several_views_stand_side_by_side(views: Any):
             {"fails": ValueError("the arm is broken")},
             r"env\.kwargs=.*Odd-v0.*\(ValueError: the arm is broken\)",
         ),
-        ({"fails": TypeError("got an unexpected keyword argument 'x'")}, r"the environment fails \(TypeError: "),
+        (
+            {"fails": TypeError("got an unexpected keyword argument 'x'")},
+            r"the environment fails \(TypeError: ",
+        ),
         (
             {"fails": RuntimeError("gladLoadGL error")},
             r"MUJOCO_GL='.*': the environment cannot draw \(gladLoad",
