@@ -15,6 +15,7 @@ from gymnasium import spaces
 
 from accerl_lerobot.engine.config import RunConfig, parse
 from accerl_lerobot.envs import GymConfig, make_world
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.seeds import demo_seed, eval_seed, train_seed
 from tests.policies.checkpoints import edit_config
 from tests.policies.tiny import adapter_at, requests
@@ -76,6 +77,11 @@ def test_a_recipe_from_windows_names_a_policy(tiny_checkpoint: Path, tmp_path: P
     recipe.write_bytes(text.encode())
     config = parse(RunConfig, [f"--config_path={recipe}"])
     assert config.policy.path == str(tiny_checkpoint) and config.env.tasks == ("match",)
+
+
+def test_a_run_is_not_resumed_from_lerobot_s_own_file(tiny_checkpoint: Path):
+    with pytest.raises(InputError, match="^config_path='.*config.json': LeRobot wrote it; resume a run with"):
+        parse(RunConfig, [f"--config_path={tiny_checkpoint / 'config.json'}", "--resume=true"])
 
 
 @pytest.mark.parametrize(

@@ -67,6 +67,7 @@ def discover(package: str | None, section: str = "") -> None:
 
 
 LARGEST_RECIPE = 2**18  # bytes of a recipe at most
+LEROBOTS_FILES = ("config.json", "train_config.json")  # of a policy's folder, taken for recipes by mistake
 RECIPES = "recipes"
 TYPE = "type"  # the key that picks one config of several, as in ``env.type``
 LONGEST_KEY = 80
@@ -212,6 +213,11 @@ def read_recipe(path: Path) -> dict[str, Any]:
         near = difflib.get_close_matches(str(path), names, n=3)
         hint = f"did you mean {' or '.join(near)}" if near else f"this package has {', '.join(shipped)}"
         raise InputError("config_path", str(path), f"no such file; {hint}")
+    if path.name in LEROBOTS_FILES:
+        hint = (
+            "LeRobot wrote it; resume a run with RUN/config.yaml, and name a policy's folder by policy.path"
+        )
+        raise InputError("config_path", str(path), hint)
     if (size := path.stat().st_size) > LARGEST_RECIPE:
         raise InputError("config_path", str(path), f"{size:,} bytes; a recipe has a few thousand")
     try:
