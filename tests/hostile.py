@@ -8,6 +8,7 @@ crash in a library would take the whole session along.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import random
@@ -235,7 +236,7 @@ def checks(trial: Trial, at: dict[str, Path], times: int) -> None:
     """Checks that are called before anything is loaded."""
     from accerl_lerobot.checkpoint.isolation import rehearse
     from accerl_lerobot.checkpoint.safety import Origin, read_json, tensor_shapes
-    from accerl_lerobot.demos.dataset_files import check_data, check_info, check_metadata, check_stats
+    from accerl_lerobot.demos.dataset_files import check_data, check_info, check_metadata
     from accerl_lerobot.policies import untrusted
 
     origin = Origin("path", "hostile")
@@ -245,7 +246,7 @@ def checks(trial: Trial, at: dict[str, Path], times: int) -> None:
         rehearse(lambda: check_metadata(dataset, origin), dataset, origin, "meta/**/*")
 
     def data_rows() -> None:
-        rehearse(lambda: check_data(dataset, info, origin), dataset, origin, "data/**/*")
+        rehearse(lambda: check_data(dataset, origin), dataset, origin, "data/**/*")
 
     weights = trial.scratch / "few.safetensors"
     weights.write_bytes((policy / "value_head.safetensors").read_bytes())
@@ -262,9 +263,7 @@ def checks(trial: Trial, at: dict[str, Path], times: int) -> None:
         "checkpoint", policy / "config.json", lambda: untrusted.check_checkpoint(policy, origin), 5 * times
     )
     info = json.loads((dataset / "meta/info.json").read_text())
-    trial.trees("info.json", info, lambda t: check_info(t, origin), 150 * times)
-    stats = {"action": json.loads((dataset / "meta/stats.json").read_text())["action"]}
-    trial.trees("stats.json", stats, lambda t: check_stats(t, info["features"], origin), 100 * times)
+    trial.trees("info.json", info, lambda t: check_info(t, origin), 250 * times)
     for part in ("meta/info.json", "meta/tasks.parquet", "meta/episodes/chunk-000/file-000.parquet"):
         trial.files(part, dataset / part, metadata, 3 * times)
     data = dataset / "data/chunk-000/file-000.parquet"
@@ -328,8 +327,9 @@ def rows(trial: Trial, dataset: Path, times: int) -> None:
     def load() -> None:
         with checked(Origin("dataset.root", str(dataset)), whole=True):
             loaded = LeRobotDataset("a/b", root=dataset, video_backend="pyav")
-            for index in range(0, len(loaded), 8):
-                loaded[index]
+            with contextlib.suppress(TypeError, ValueError, RuntimeError):  # LeRobot's, of what is no number
+                for index in range(0, len(loaded), 8):
+                    loaded[index]
 
     for number in range(times):
         try:

@@ -13,7 +13,7 @@ from lerobot.datasets.dataset_tools import add_features, delete_episodes, remove
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from accerl_lerobot.cli import main
-from accerl_lerobot.demos.dataset_files import frames_of
+from accerl_lerobot.demos.episodes import frames_of
 from accerl_lerobot.demos.record import DemosConfig, record_demos
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.metrics import METRICS

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import sys
 from collections import namedtuple
@@ -11,22 +12,33 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from accerl_lerobot import cli
 from accerl_lerobot.algorithms import AWRConfig, GIPOConfig, LossInputs, LossOutput, PPOConfig, RatioConfig
+from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos.sft import SFTConfig
-from accerl_lerobot.engine.preflight import _dataset_renames, check_imitates, check_loss
+from accerl_lerobot.engine.preflight import (
+    _dataset_renames,
+    check_imitates,
+    check_loss,
+    check_sft_policy,
+    check_training_data,
+)
 from accerl_lerobot.envs import SimulatedConfig, make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.features import (
     Features,
+    check_actions,
     check_features,
+    check_statistics,
     env_features,
     fine_tuned_features,
     policy_features,
 )
+from tests.datasets import IMAGE, write_dataset
 from tests.policies.checkpoints import write_act, write_diffusion
 
 ROOT = Path(__file__).parents[1]
@@ -294,3 +306,135 @@ def test_an_objective_that_cannot_be_learnt_from_is_refused(loss: Any, why: str,
     monkeypatch.setattr(GIPOConfig, "loss", loss)
     with pytest.raises(InputError, match=f"^algorithm.type='gipo': its loss fails on a small batch .*{why}"):
         check_loss(GIPOConfig())
+
+
+STATS = {
+    STATE: {k: np.full(4, v) for k, v in {"min": -1.0, "max": 1.0, "mean": 0.0, "std": 0.5}.items()},
+    "action": {k: np.full(2, v) for k, v in {"min": -1.0, "max": 1.0, "mean": 0.0, "std": 0.5}.items()},
+    FRONT: {"mean": np.zeros((3, 1, 1)), "std": np.ones((3, 1, 1))},
+}
+
+
+def normalised(mode: str = "MEAN_STD", images: str = "IDENTITY") -> Any:
+    return SimpleNamespace(normalization_mapping={"STATE": mode, "ACTION": mode, "VISUAL": images})
+
+
+def changed(name: str, **statistics: Any) -> dict[str, Any]:
+    return STATS | {name: STATS[name] | statistics}
+
+
+@pytest.mark.parametrize(
+    ("policy", "stats", "why"),
+    [
+        (normalised("QUANTILES"), STATS, "no q01 and q99 of observation.state in its .*; do this"),
+        (normalised("QUANTILE10"), STATS, "no q10 and q90 of observation.state"),
+        (normalised(images="MEAN_STD"), STATS | {FRONT: {}}, f"no mean and std of {FRONT}.*use ImageNet's"),
+        (normalised(images="MEAN_STD"), changed(FRONT, std=np.zeros((3, 1, 1))), "by 0; use ImageNet"),
+        (normalised(), changed(STATE, mean=np.array([0, 0, 0, np.nan])), "not 4 finite numbers; do this"),
+        (normalised(), changed("action", std=np.ones(5)), "of action in its statistics are not 2 finite"),
+        (normalised(), changed("action", std=np.array(["x", "y"])), "are not 2 finite"),
+        (normalised(), {STATE: STATS[STATE]}, "no mean and std of action"),
+        (
+            normalised("QUANTILES"),
+            {
+                name: own | {"q01": own["min"], "q99": own["min"]}
+                for name, own in STATS.items()
+                if name != FRONT
+            },
+            "by q01 and q99 of observation.state in its statistics it never changes, and is divided by 0",
+        ),
+    ],
+)
+def test_statistics_that_normalisation_cannot_use(policy: Any, stats: dict[str, Any], why: str):
+    with pytest.raises(InputError, match=f"^dataset.repo_id='x': .*{why}"):
+        check_statistics(policy, OFFERED, stats, "dataset.repo_id", "x", "do this")
+
+
+def test_statistics_that_are_not_read_are_not_judged(caplog: pytest.LogCaptureFixture):
+    broken = {"observation.effort": {"mean": np.array([np.nan])}, FRONT: {"std": np.zeros(3)}}
+    check_statistics(normalised(), OFFERED, STATS | broken, "dataset.repo_id", "x", "")
+    check_statistics(normalised("MIN_MAX"), OFFERED, STATS, "dataset.repo_id", "x", "")
+    assert not caplog.text
+    still = {"std": np.array([0.5, 0, 0.5, 0]), "max": np.array([1.0, -1, 1, -1])}
+    check_statistics(normalised(), OFFERED, changed(STATE, **still), "dataset.repo_id", "x", "")
+    assert "numbers [1, 3] of observation.state never change" in caplog.text
+
+
+def test_actions_in_another_unit_than_the_environment_s(caplog: pytest.LogCaptureFixture):
+    spec = make_world(SimulatedConfig()).spec
+    actions = np.array([[0.5, 0.5], [1.001, -1.0]] * 20, np.float32)
+    check_actions(actions, spec, "dataset.repo_id", "x")
+    assert not caplog.text
+    check_actions(actions * [1, 90], spec, "dataset.repo_id", "x")
+    assert "100% of its actions lie outside" in caplog.text
+    assert "number 1 is from -90 to 45 in the dataset, and -1 to 1 in the environment" in caplog.text
+
+
+def test_instructions_are_compared_letter_by_letter(caplog: pytest.LogCaptureFixture):
+    check_features(replace(OFFERED, tasks=("match the target.",)), OFFERED, {}, "dataset.repo_id", "x")
+    assert (
+        "the environment's instruction is 'Match the target', and the dataset's 'match the t" in caplog.text
+    )
+    caplog.clear()
+    check_features(OFFERED, replace(OFFERED, tasks=()), {}, "dataset.repo_id", "x")
+    assert "its instructions are 'Match the target', and the environment gives none" in caplog.text
+    caplog.clear()
+    check_features(
+        replace(OFFERED, tasks=("Open it", "open it.")), replace(OFFERED, tasks=("Open it",)), {}, "", ""
+    )
+    assert "instructions that differ in spelling only: 'Open it', 'open it.'" in caplog.text
+
+
+SMALL_ACT = {
+    "type": "act", "chunk_size": 4, "n_action_steps": 4, "pretrained_backbone_weights": None,
+    "dim_model": 8, "n_heads": 1, "n_encoder_layers": 1, "dim_feedforward": 8,
+}  # fmt: skip
+DEPTH = {"dtype": "image", "shape": (8, 8, 1), "names": None, "info": {"is_depth_map": True}}
+VECTOR = {"dtype": "float32", "shape": (2,), "names": None}
+
+
+def check_data(dataset: DatasetConfig, env: bool = True, **policy: Any) -> None:
+    """The check that `accerl sft` makes before it makes a folder."""
+    sft = SFTConfig(steps=1, policy=SMALL_ACT | policy)
+    spec = make_world(SimulatedConfig()).spec if env else None
+    check_training_data(sft, dataset, check_sft_policy(sft), spec, {})
+
+
+@pytest.mark.parametrize("camera", [IMAGE, DEPTH])
+def test_a_camera_that_the_policy_does_not_read_is_not_judged(camera: Any, tmp_path: Path):
+    """A third camera, or one of depth; the message's own remedy is applied."""
+    more = {FRONT: IMAGE, "observation.images.top.left": camera}
+    dataset = write_dataset(tmp_path / "data", more=more)
+    with pytest.raises(InputError, match="no observation.images.top.left in the environment") as caught:
+        check_data(dataset)
+    inputs = json.loads(caught.value.remedy.partition("--sft.policy.input_features='")[2].rstrip("'"))
+    assert inputs.keys() == {FRONT, STATE}
+    check_data(dataset, input_features=inputs)
+    if camera is DEPTH:
+        with pytest.raises(InputError, match="top.left has 1 channels, and policies read pictures of 3"):
+            check_data(dataset, env=False)
+
+
+def test_what_a_policy_reads_of_a_dataset_is_looked_at_before_any_work(tmp_path: Path):
+    parts = {"observation.state.joints": VECTOR, "observation.state.gripper": VECTOR}
+    text = {"action": {"dtype": "string", "shape": (1,), "names": None}}
+
+    bad = {"observation.state": [0, 0, 0, np.nan], "action": "left", "observation.effort": [np.inf, 0]}
+    cases: list[tuple[dict[str, Any], list[str], str, str | None]] = [
+        (parts, [STATE], "", r"it is in parts \(observation.state.joints, observation.state.gripper\)"),
+        (text, [], "action", "no action for a policy: it is string, and policies read numbers"),
+        ({}, ["action"], "", "no action, so that there is nothing to imitate"),
+        ({}, [], STATE, "observation.state: a number that is not finite in episode 0"),
+        ({"observation.effort": VECTOR}, [], "observation.effort", None),  # nobody reads it
+    ]
+    for number, (features, without, wrong, why) in enumerate(cases):
+        values = {wrong: bad.get(wrong)}
+        dataset = write_dataset(
+            tmp_path / str(number), more={FRONT: IMAGE, **features}, without=without,
+            values=lambda name, episode, step, values=values: values.get(name),
+        )  # fmt: skip
+        if why is None:
+            check_data(dataset)
+            continue
+        with pytest.raises(InputError, match=why):
+            check_data(dataset)

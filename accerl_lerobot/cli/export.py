@@ -92,6 +92,7 @@ def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
 def _write(config: ExportConfig, chosen: list[list[Done]], root: Path, console: Console) -> dict[str, int]:
     with closing(make_world(config.env)) as world:
         spec = world.spec
+    record.check_instruction(spec, config.env)
     tally = {"episodes": 0, "frames": 0, "successes": 0, "left_out": 0}
     version = {VERSION: {"dtype": "int64", "shape": (1,), "names": None}}
     stored = read_recipe(Path(str(config.path)).expanduser() / CONFIG).get("rollout")

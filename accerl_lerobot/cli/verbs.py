@@ -92,7 +92,7 @@ class OfflineRun(NewFolderRun):
     job_name: str = "offline"
     policy: PolicyConfig = field(default_factory=PolicyConfig)
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
-    """Successes and failures, told apart by ``next.success``, or by a ``next.reward`` above 0."""
+    """Successes and failures, told apart by ``next.success``, or by sparse ``next.reward``."""
     algorithm: AlgorithmConfig = field(default_factory=AWRConfig)
     trainer: TrainerConfig = field(default_factory=TrainerConfig)
     wandb: WandBConfig = field(default_factory=WandBConfig)

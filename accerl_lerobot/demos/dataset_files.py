@@ -6,6 +6,9 @@ Where an image's ``bytes`` are missing, Hugging Face's `datasets` opens the file
 names, and Pillow has Ghostscript draw PostScript. In the context of `checked`, LeRobot's own classes have
 files checked first, wherever they come from. A child process does it, and then loads them with LeRobot,
 within limits of memory and time.
+
+LeRobot looks up tasks and episodes by their rows; `put_in_order` sorts the rows by the index that names them.
+Statistics and columns are checked in `policies.features` and `demos.episodes`, which know what is read.
 """
 
 from __future__ import annotations
@@ -22,7 +25,6 @@ import numpy as np
 
 from accerl_lerobot.checkpoint.isolation import rehearse
 from accerl_lerobot.checkpoint.safety import (
-    MIB,
     Origin,
     brief,
     check_name,
@@ -41,12 +43,14 @@ if TYPE_CHECKING:
 INFO, STATS, TASKS, EPISODES, DATA = (
     "meta/info.json", "meta/stats.json", "meta/tasks.parquet", "meta/episodes", "data",
 )  # fmt: skip
-STATS_MOST = 32 * MIB
 SIDE_MOST = 8192
+IMAGES = ("PNG", "JPEG", "TIFF")
+"""Pillow's names of the formats that are decoded; LeRobot stores depth as TIFF."""
 INDEX = r"\{(chunk_index|file_index)(:0?[1-9]?d)?\}"
 PLACES = {"data_path": INDEX, "video_path": rf"{INDEX}|\{{video_key\}}"}
-LEARNED = ("action", "observation", "next.reward", "timestamp")
-"""Prefixes of features in which a non-finite number would be learned from."""
+OLD_VERSION = re.compile(r"v?[0-2](\.|$)")
+"""Versions of the format that LeRobot refuses by itself; their ``info.json`` has other fields."""
+CHANNELS = (1, 3, 4)
 PLAIN = {"Value", "Sequence", "List", "LargeList"}
 """Kinds of columns that `datasets` reads without opening other files."""
 AGAIN = "get the dataset again"
@@ -68,11 +72,12 @@ def open_metadata(dataset: DatasetConfig) -> Any:
             raise InputError("dataset.root", root, f"no {INFO} there; give the folder of a LeRobotDataset v3")
     try:
         with checked(origin_of(dataset), whole=root is not None):
-            return LeRobotDatasetMetadata(name, root=root, revision=dataset.revision)
+            meta = LeRobotDatasetMetadata(name, root=root, revision=dataset.revision)
     except InputError:
         raise
     except (CompatibilityError, NotImplementedError) as error:
         tool = f"python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id={name}"
+        tool += f" --root={root}" * (root is not None) + " --push-to-hub=false"
         remedy = (
             f"its format is not {CODEBASE_VERSION}, which this LeRobot reads; from v2.1 convert with: {tool}"
         )
@@ -82,6 +87,9 @@ def open_metadata(dataset: DatasetConfig) -> Any:
             remedy = f"not found locally nor on the Hub ({brief(error)})"
             raise InputError("dataset.repo_id", name, remedy) from error
         raise origin_of(dataset).refuse("meta", f"LeRobot cannot read it ({brief(error)})") from error
+    if meta.episodes is None or meta.tasks is None:
+        raise origin_of(dataset).refuse(INFO, "it has no episodes, or no tasks; name a dataset that has some")
+    return meta
 
 
 @contextlib.contextmanager
@@ -93,23 +101,11 @@ def opened(dataset: DatasetConfig, meta: Any, episodes: Sequence[int] | None = N
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     chosen = None if episodes is None else list(episodes)
-    with checked(origin_of(dataset)):
+    with checked(origin_of(dataset), whole=dataset.root is not None):
         # The default backend probes for FFmpeg's libraries, and prints their tracebacks where there are none.
         yield LeRobotDataset(
             meta.repo_id, root=meta.root, revision=meta.revision, episodes=chosen, video_backend="pyav"
         )
-
-
-def frames_of(data: Any, index: int) -> Iterator[dict[str, Any]]:
-    """The items of an episode, one per env step, of a dataset that holds all episodes up to it."""
-    first, last = (int(data.meta.episodes[index][f"dataset_{end}_index"]) for end in ("from", "to"))
-    return (data[i] for i in range(first, last))
-
-
-def pixels_of(image: Any) -> np.ndarray:
-    """uint8 (h, w, 3) from LeRobot's float (3, h, w) in [0, 1]."""
-    pixels: np.ndarray = (image * 255).round().clamp(0, 255).byte().permute(1, 2, 0).numpy()
-    return pixels
 
 
 def origin_of(dataset: DatasetConfig) -> Origin:
@@ -138,6 +134,7 @@ def checked(origin: Origin, whole: bool = False) -> Iterator[None]:
 
     decode = Image.decode_example
     load_metadata, load_data = LeRobotDatasetMetadata._load_metadata, DatasetReader._load_hf_dataset
+    try_load = DatasetReader.try_load
 
     def checked_metadata(self: Any) -> None:
         root = Path(self.root)
@@ -152,43 +149,94 @@ def checked(origin: Origin, whole: bool = False) -> Iterator[None]:
                 pass  # the caller meets it as well, and LeRobot fetches what is missing
 
         rehearse(check, root, origin, "meta/**/*")
-        load_metadata(self)
+        try:
+            load_metadata(self)
+        except (FileNotFoundError, NotADirectoryError) as error:
+            if whole:
+                raise origin.refuse("meta", f"{brief(error)}; give the whole folder") from error
+            raise
+        put_in_order(self, origin)
 
     def checked_data(self: Any) -> Any:
         root = Path(self.root)
-        info = read_json(root / INFO, origin)
 
         def check() -> None:
-            check_data(root, info, origin)
+            check_data(root, origin)
             try:
                 rows = load_data(self)
             except MemoryError:
                 raise
             except (FileNotFoundError, NotADirectoryError):
-                return  # LeRobot fetches them
+                return  # see `try_load`
             except Exception as error:
                 raise origin.refuse(DATA, f"LeRobot cannot load it ({_cause(error)}); {AGAIN}") from error
-            check_rows(rows, info, origin, whole and self.episodes is None)
+            check_rows(rows, self._meta, origin, self.episodes is None, whole)
 
         rehearse(check, root, origin, "data/**/*")
         return load_data(self)
 
+    def checked_try(self: Any) -> bool:
+        found = bool(try_load(self))
+        if whole and not found:
+            files = (self.root / name for name in map(str, self.get_episodes_file_paths()))
+            missing = sorted(str(file.relative_to(self.root)) for file in files if not file.is_file())
+            what = f"{missing[0]} is missing" if missing else "rows of some episodes are missing"
+            raise origin.refuse(DATA, f"{what}; give the whole folder")
+        return found
+
     def checked_decode(self: Any, value: Any, token_per_repo_id: Any = None) -> Any:
+        from PIL import Image as Pillow
+
+        content = value.get("bytes")
+        if content is None:
+            raise origin.refuse(DATA, "an image without its bytes; record it again")
         try:
-            return decode(self, value, token_per_repo_id)
-        except Exception as error:
-            raise _undecodable(error, DATA, origin) from error
+            Pillow.open(io.BytesIO(content), formats=IMAGES).close()
+            return decode(self, {"bytes": content, "path": None}, token_per_repo_id)
+        except Exception as error:  # Pillow's plugins raise what they like
+            remedy = "an image that is no PNG, JPEG or TIFF, or broken; record it again"
+            raise origin.refuse(DATA, remedy) from error
 
     guard_client()
     Image.decode_example = checked_decode
     LeRobotDatasetMetadata._load_metadata = checked_metadata
     DatasetReader._load_hf_dataset = checked_data
+    DatasetReader.try_load = checked_try
     try:
         yield
     finally:
         LeRobotDatasetMetadata._load_metadata = load_metadata
         DatasetReader._load_hf_dataset = load_data
+        DatasetReader.try_load = try_load
         Image.decode_example = decode
+
+
+def put_in_order(meta: Any, origin: Origin) -> None:
+    """Make good what LeRobot takes for granted: tasks and episodes in the order of their indices, names of an
+    image's axes, and statistics of each camera, into which it writes those of ImageNet."""
+    if meta.tasks is not None:
+        table = meta.tasks.set_index("task") if "task" in meta.tasks.columns else meta.tasks
+        meta.tasks = table.sort_values("task_index")
+        _check_numbers(meta.tasks["task_index"].tolist(), TASKS, "task_index", origin)
+    if meta.episodes is not None:
+        numbers = np.asarray(meta.episodes["episode_index"])
+        if (order := np.argsort(numbers)).tolist() != list(range(len(numbers))):
+            meta.episodes = meta.episodes.select(order)
+        _check_numbers(numbers[order].tolist(), EPISODES, "episode_index", origin)
+    for camera in meta.camera_keys:
+        feature = meta.features[camera]
+        names = feature.get("names")
+        if not (isinstance(names, (list, tuple)) and {"channel", "channels"} & set(names)):
+            last = feature["shape"][-1] in CHANNELS
+            feature["names"] = ["height", "width", "channels"] if last else ["channels", "height", "width"]
+    seen = set(meta.camera_keys) - set(meta.depth_keys)
+    meta.stats = {camera: {} for camera in seen} | (meta.stats or {})
+
+
+def _check_numbers(numbers: list[int], where: str, name: str, origin: Origin) -> None:
+    if numbers != list(range(len(numbers))):
+        remedy = f"its {name} are not 0 to {len(numbers) - 1}, as LeRobot wants them; number them anew"
+        raise origin.refuse(where, remedy)
 
 
 def _cause(error: BaseException) -> str:
@@ -201,15 +249,13 @@ def check_metadata(root: Path, origin: Origin, whole: bool = False) -> None:
     if not safe_join(root, INFO, origin).exists():
         return
     info = read_json(root / INFO, origin)
+    if OLD_VERSION.match(str(info.get("codebase_version"))):
+        return  # LeRobot looks at it next, and reads nothing more
     check_info(info, origin)
-    if safe_join(root, STATS, origin).exists():
-        check_stats(read_json(root / STATS, origin, STATS_MOST), info["features"], origin)
+    safe_join(root, STATS, origin)
     if safe_join(root, TASKS, origin).exists() or (whole and info.get("total_tasks", 0)):
         with _parquet(root / TASKS, origin) as tasks:
             _check_plain(tasks, TASKS, origin)
-            if (count := tasks.metadata.num_rows) != info.get("total_tasks", 0):
-                remedy = f"{count} tasks, and {INFO} says {info.get('total_tasks', 0)}; {AGAIN}"
-                raise origin.refuse(TASKS, remedy)
     rows = 0
     files = _files(root, EPISODES, origin)
     for path in files:
@@ -248,56 +294,33 @@ def check_info(info: dict[str, Any], origin: Origin) -> None:
             raise origin.refuse(where, f"shape {str(shape)[:80]}; {wanted}")
 
 
-def check_stats(stats: dict[str, Any], features: dict[str, Any], origin: Origin) -> None:
-    """Refuses a ``stats.json`` (feature → statistic → numbers) that no policy can be normalised by."""
-    for name in (name for name in stats if name.startswith(LEARNED)):
-        if not isinstance(stats[name], dict):
-            raise origin.refuse(f"{STATS}: {name}", "a mapping from statistics to numbers is wanted")
-        feature = features.get(name, {"dtype": "image"})
-        for statistic, values in stats[name].items():
-            where, again = f"{STATS}: {name}.{statistic}", "compute the statistics again"
-            try:
-                array = np.asarray(values)
-            except ValueError:
-                array = np.asarray(None)
-            if array.dtype.kind not in "biuf":
-                raise origin.refuse(where, f"numbers in lists of equal lengths are wanted; {again}")
-            plain = feature["dtype"] not in ("image", "video") and statistic != "count"
-            if plain and array.shape and list(array.shape) != list(feature["shape"]):
-                remedy = f"shape {list(array.shape)}, and the feature has {list(feature['shape'])}; {again}"
-                raise origin.refuse(where, remedy)
-            if not np.isfinite(array).all():
-                raise origin.refuse(where, f"a number that is not finite; {again}")
-
-
-def check_data(root: Path, info: dict[str, Any], origin: Origin) -> None:
-    """Refuses files of rows, images and videos that name other files, before LeRobot reads them."""
-    images = {name: feature for name, feature in info["features"].items() if feature["dtype"] == "image"}
-    for path in _files(root, DATA, origin):
-        name = f"{DATA}/{path.parent.name}/{path.name}"
-        with _parquet(path, origin) as file:
-            for image in images.keys() & set(file.schema_arrow.names):
-                _check_images(file, image, list(images[image]["shape"]), name, origin)
+def check_data(root: Path, origin: Origin) -> None:
+    """Refuses files of rows and videos that lie elsewhere, before LeRobot reads them."""
+    _files(root, DATA, origin)
     videos = safe_join(root, "videos", origin)
     for path in videos.rglob("*") if videos.is_dir() else ():
         safe_join(root, path.relative_to(root).as_posix(), origin)
 
 
-def check_rows(rows: Any, info: dict[str, Any], origin: Origin, whole: bool = False) -> None:
-    """Refuses rows that LeRobot has loaded and nobody can learn from; with `whole`, missing ones too."""
-    frames = info.get("total_frames", 0)
-    if len(rows) > frames or (whole and len(rows) < frames):
+def check_rows(rows: Any, meta: Any, origin: Origin, every: bool, whole: bool) -> None:
+    """Refuses rows whose indices do not say where they belong; `every`: those of all episodes were loaded."""
+    frames = meta.total_frames
+    if len(rows) > frames or (whole and every and len(rows) < frames):
         raise origin.refuse(DATA, f"{len(rows)} rows, and {INFO} says {frames} frames; {AGAIN}")
-    below = {"task_index": info.get("total_tasks", 0), "episode_index": info.get("total_episodes", 0)}
-    for name, feature in info["features"].items():
-        whole_numbers = feature["dtype"].startswith(("int", "uint"))
-        if not whole_numbers and not (feature["dtype"].startswith("float") and name.startswith(LEARNED)):
-            continue
+    below = {
+        "index": frames,
+        "frame_index": frames,
+        "task_index": len(meta.tasks),
+        "episode_index": len(meta.episodes),
+    }
+    for name, most in below.items():
         values = np.asarray(rows.with_format("numpy", columns=[name])[:][name])
-        if values.dtype.kind not in "biuf" or not np.isfinite(values).all():
-            raise origin.refuse(DATA, f"{name[:60]} has a number that is not finite; record it again")
-        if name in below and len(wrong := values[(values < 0) | (values >= below[name])]):
-            raise origin.refuse(DATA, f"{name}={wrong[0]}, and there are {below[name]}; {AGAIN}")
+        if values.dtype.kind not in "iuf" or not np.isfinite(values).all():
+            raise origin.refuse(DATA, f"{name} has a number that is not finite; record it again")
+        if len(wrong := values[(values < 0) | (values >= most)]):
+            raise origin.refuse(DATA, f"{name}={wrong[0]}, and there are {most}; {AGAIN}")
+        if name == "index" and len(values) == frames and (np.diff(values) != 1).any():
+            raise origin.refuse(DATA, "its rows are not in the order of their index; sort its files by it")
 
 
 def _files(root: Path, folder: str, origin: Origin) -> list[Path]:
@@ -353,37 +376,3 @@ def _check_episodes(file: pq.ParquetFile, frames: int, name: str, origin: Origin
     if len(wrong := np.flatnonzero((last <= first) | (last > frames))):
         span_text = f"from frame {first[wrong[0]]} to {last[wrong[0]]} of {frames}"
         raise origin.refuse(name, f"an episode {span_text}; {AGAIN}")
-
-
-def _undecodable(error: Exception, where: str, origin: Origin) -> InputError:
-    return origin.refuse(
-        where, f"an image that is no PNG or JPEG, or broken ({brief(error)}); record it again"
-    )
-
-
-def _check_images(file: pq.ParquetFile, image: str, shape: list[int], name: str, origin: Origin) -> None:
-    """Refuses images that are not PNG or JPEG of the right size in their rows, or that name other files."""
-    import pyarrow as pa
-    from PIL import Image
-
-    where = f"{name}: {image[:60]}"
-    kind = file.schema_arrow.field(image).type
-    if not pa.types.is_struct(kind) or {f.name for f in kind} != {"bytes", "path"}:
-        raise origin.refuse(where, "no column of images with their bytes; record it again")
-    for batch in file.iter_batches(batch_size=32, columns=[image]):
-        column = batch.column(0)
-        if column.null_count or column.field("bytes").null_count:
-            raise origin.refuse(where, "an image without its bytes; record it again")
-        for path in filter(None, column.field("path").to_pylist()):
-            check_name(path, f"{where}.path", origin)
-        for cell in column.field("bytes").to_pylist():
-            try:
-                with Image.open(io.BytesIO(cell), formats=("PNG", "JPEG")) as opened:  # reads the header
-                    size = list(opened.size)
-            except Exception as error:  # Pillow's plugins raise what they like
-                raise _undecodable(error, where, origin) from error
-            if size not in (shape[1::-1], shape[:0:-1]):
-                remedy = (
-                    f"an image of {size[0]} x {size[1]} pixels, and its shape is {shape}; record it again"
-                )
-                raise origin.refuse(where, remedy)

@@ -93,11 +93,14 @@ class CachedDataset(Dataset[Any]):
 def _adapted(stock: Any) -> Any:
     """LeRobot's function that makes datasets, without a simulator's state beside the images to train on, and
     with a `CachedDataset` where that is possible."""
+    from lerobot.processor import rename_stats
 
     def make(cfg: Any) -> tuple[Any, Any]:
         train, evaluation = stock(cfg)
         if train.meta.camera_keys:
             train.meta.features.pop(ENVIRONMENT_STATE, None)
+        # LeRobot 0.6.1 renames the dataset's features and not their statistics.
+        train.meta.stats = rename_stats(train.meta.stats, cfg.rename_map)
         fixed = not cfg.dataset.image_transforms.enable and not cfg.dataset.streaming
         # Depth stays float; see `_small`.
         item = sum(

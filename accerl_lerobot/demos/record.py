@@ -149,6 +149,13 @@ def simulated_expert(world: World, task: str) -> Expert:
     return lambda: world.solution
 
 
+def check_instruction(spec: WorldSpec, env_config: EnvConfig) -> None:
+    """Refuses to record without an instruction where ``env.task`` is its text."""
+    if not any(spec.instructions) and getattr(env_config, "task", None) == "":
+        remedy = "each frame of a dataset has an instruction, and the environment names none; give its text"
+        raise InputError("env.task", "", f"{remedy}, such as --env.task='Reach the goal'")
+
+
 def check_free(root: str) -> Path:
     """The folder of a dataset that is to be written; an existing one is refused."""
     folder = expanded(root, "root")
@@ -294,6 +301,7 @@ def record_demos(
         env_config = env_config.nominal()
     world = make_world(env_config)
     spec = world.spec
+    check_instruction(spec, env_config)
     for task in spec.tasks:
         make_expert(env_config, world, task)  # refuses a task without an expert before any work
     world.close()

@@ -26,7 +26,7 @@ from accerl_lerobot.config.parsing import as_text
 from accerl_lerobot.config.ranges import Commit, DatasetConfig, LearningRate, Range, Section, Steps, Threads
 from accerl_lerobot.demos.backbone import BackboneConfig, Sizes, write_backbone
 from accerl_lerobot.errors import InputError, check_absent, expanded
-from accerl_lerobot.experience import SUCCESS
+from accerl_lerobot.experience import REWARD, SUCCESS
 from accerl_lerobot.policies.config import discovery, register_policies
 
 logger = logging.getLogger(__name__)
@@ -51,7 +51,8 @@ class SFTConfig(Section, section="sft"):
     lr: LearningRate = 1e-3
     """Peak learning rate; LeRobot's preset warms up and decays it over `steps`, if the policy type's does."""
     pick: Literal["all", "successes", "failures"] = "all"
-    """Episodes that are imitated, by their ``next.success``; the others stay in the dataset."""
+    """Episodes that are imitated, by ``next.success``, or ``next.reward`` without it; the others stay in the
+    dataset."""
     num_threads: Threads = 2
     """CPU threads of the trainer."""
     init_path: str | None = None
@@ -199,14 +200,15 @@ def picked(dataset: DatasetConfig, pick: str) -> list[int] | None:
     if pick == "all":
         return None
     from accerl_lerobot.demos.dataset_files import open_metadata, opened
+    from accerl_lerobot.demos.episodes import read_labels
 
     meta = open_metadata(dataset)
-    if SUCCESS not in meta.features:
-        raise InputError("sft.pick", pick, f"the dataset's episodes are not labelled by {SUCCESS}; use all")
+    if not {SUCCESS, REWARD} & set(meta.features):
+        remedy = f"the dataset's episodes are not labelled by {SUCCESS} or {REWARD}; use all"
+        raise InputError("sft.pick", pick, remedy)
     with opened(dataset, meta) as data:
-        columns = data.hf_dataset.with_format("numpy", columns=["episode_index", SUCCESS])[:]
-    succeeded = set(columns["episode_index"][columns[SUCCESS].astype(bool).reshape(-1)].tolist())
-    wanted = [i for i in range(meta.total_episodes) if (i in succeeded) is (pick == "successes")]
+        labels = read_labels(data, dataset, one_task=False)
+    wanted = [episode.index for episode in labels if episode.success is (pick == "successes")]
     if not wanted:
         raise InputError("sft.pick", pick, f"none of the dataset's {meta.total_episodes} episodes; use all")
     return wanted

@@ -9,11 +9,12 @@ from __future__ import annotations
 import contextlib
 import copy
 import difflib
+import json
 import logging
 import math
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -40,7 +41,9 @@ from accerl_lerobot.policies.features import (
     ENV_STATE,
     STATE,
     Features,
+    check_actions,
     check_features,
+    check_statistics,
     dataset_features,
     env_features,
     fine_tuned_features,
@@ -58,6 +61,12 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+MEANINGS = {
+    "rename_map": "a mapping from the dataset's names to the policy's",
+    "dataset.use_imagenet_stats": "true or false",
+    "dataset.episodes": "a list of numbers such as [0, 1]",
+}
+"""Arguments of ``lerobot-train`` that are looked at here → their values, in words."""
 SIZES = ("chunk_size", "n_action_steps", "num_steps", "max_state_dim", "max_action_dim")
 """Fields of policy configs that are at least 1; LeRobot itself checks the others."""
 
@@ -189,13 +198,26 @@ def check_start(config: RunConfig, say: Callable[[str], object] = str) -> tuple[
         trained = policy if config.sft.init_path is None else sft_policy(config.sft)
         meta = check_training_data(config.sft, config.dataset, trained, spec, renames)
     history = int(policy.n_obs_steps)
-    if off_policy and meta is not None:  # one that cannot be remembered is left out
-        _say_if_unlike(config, spec, meta, history)
+    if off_policy and meta is not None and not _say_if_unlike(config, spec, meta, history):
+        _check_remembered(config.dataset, spec, meta)
     check_disk(config.output_dir)
     return spec, history
 
 
-def _say_if_unlike(config: RunConfig, spec: WorldSpec, meta: Any, history: int) -> None:
+def _check_remembered(dataset: DatasetConfig, spec: WorldSpec, meta: Any) -> None:
+    """Compare a dataset that joins the memory with the environment, and read its labels."""
+    from accerl_lerobot.demos.dataset_files import opened
+    from accerl_lerobot.demos.episodes import numbers, read_labels
+
+    about = "dataset.repo_id", dataset.repo_id
+    check_features(replace(dataset_features(meta), shapes={}), env_features(spec), {}, *about)
+    with opened(dataset, meta) as data:
+        read_labels(data, dataset)
+        check_actions(numbers(data, ACTION, dataset), spec, *about)
+
+
+def _say_if_unlike(config: RunConfig, spec: WorldSpec, meta: Any, history: int) -> bool:
+    """Warn of a dataset that cannot be remembered, which is left out."""
     from accerl_lerobot.trainer.demonstrations import unlike
 
     wanted: dict[str, tuple[int, ...]] = {STATE: (spec.state_dim,), **spec.images}
@@ -205,6 +227,7 @@ def _say_if_unlike(config: RunConfig, spec: WorldSpec, meta: Any, history: int) 
         wanted = {name: (history, *shape) for name, shape in wanted.items()}
     if (why := unlike(meta, wanted | {ACTION: (spec.action_dim,)})) is not None:
         logger.warning("%s does not join the memory: %s", config.dataset.repo_id, why)
+    return why is not None
 
 
 def check_training_data(
@@ -215,43 +238,123 @@ def check_training_data(
 
     meta = None if dataset.repo_id is None else open_metadata(dataset)
     offered = None if spec is None else env_features(spec)
-    about = "dataset.repo_id", dataset.repo_id
+    about: tuple[str, Any] = "dataset.repo_id", dataset.repo_id
     data = None if meta is None else replace(dataset_features(meta), any_size=resizes(policy))
     source = data or offered  # without a dataset, demonstrations of the environment
+    if source is None:
+        return None
+    renames = _dataset_renames(sft)
     if sft.init_path is not None:
-        renames = _dataset_renames(sft)
-        needs = policy_features(policy) if source is None else fine_tuned_features(policy, source, renames)
-        if offered is not None:
-            check_features(needs, offered, rename_map, "sft.init_path", sft.init_path)
-        if data is not None:
-            known = {name: new for name, new in renames.items() if name in data.shapes}
-            check_features(needs, data, known, "sft.init_path", sft.init_path, "dataset")
-            # Its cameras may have names of their own.
-            vectors = {k: shape for k, shape in data.shapes.items() if k in (STATE, ACTION)}
-            data = replace(data, shapes=vectors)
-    if offered is not None and data is not None:
-        check_features(data, offered, rename_map if sft.init_path is None else {}, *about)
+        reader: tuple[str, Any] = "sft.init_path", sft.init_path
+        needs = fine_tuned_features(policy, source, renames)
+    else:
+        reader, renames = ("sft.policy.input_features", list(policy.input_features or ())), {}
+        needs = _new_policy_features(policy, source, about)
+    if offered is not None and (sft.init_path is not None or data is not None):
+        at = about if sft.init_path is None else reader
+        hint = _inputs_hint(data, offered.shapes) if data is not None and sft.init_path is None else ""
+        check_features(needs, offered, rename_map, *at, hint=hint)
+    if data is not None:
+        known = {name: new for name, new in renames.items() if name in data.shapes}
+        check_features(replace(needs, tasks=()), data, known, *reader, "dataset")
+    if offered is not None and data is not None and sft.init_path is not None:
+        # Its cameras may have names of their own.
+        vectors = {k: shape for k, shape in data.shapes.items() if k in (STATE, ACTION)}
+        check_features(replace(data, shapes=vectors), offered, {}, *about)
     for name, most in ((STATE, "max_state_dim"), (ACTION, "max_action_dim")):
-        limit, size = getattr(policy, most, None), 0 if source is None else source.shapes.get(name, (0,))[0]
+        limit, size = getattr(policy, most, None), needs.shapes.get(name, (0,))[0]
         if limit is not None and limit < size:
             raise InputError(f"sft.policy.{most}", limit, f"{name} has {size} numbers; use at least that")
-    if sft.init_path is None and source is not None:
-        _check_new_policy(policy, source, sft)
+    if sft.init_path is None:
+        _check_new_policy(policy, needs, sft)
+    if meta is not None:
+        _check_values(sft, dataset, policy, meta, needs, renames, spec)
     return meta
+
+
+def _new_policy_features(policy: Any, source: Features, about: tuple[str, Any]) -> Features:
+    """Features of the source that a new policy reads: those that it names, or all of them."""
+    named = policy_features(policy).shapes.keys()
+    if ACTION in source.unusable or (STATE in source.unusable and (not named or STATE in named)):
+        name = ACTION if ACTION in source.unusable else STATE
+        raise InputError(*about, f"no {name} for a policy: {source.unusable[name]}")
+    if ACTION not in source.shapes:
+        raise InputError(*about, f"no {ACTION}, so that there is nothing to imitate; name another dataset")
+    shapes = policy_features(policy).shapes if named else source.shapes
+    gray = [name for name, shape in shapes.items() if len(shape) == 3 and shape[0] != 3]
+    if gray and not named:
+        why = f"{gray[0]} has {shapes[gray[0]][0]} channels, and policies read pictures of 3"
+        raise InputError(*about, why + _inputs_hint(source, shapes.keys() - set(gray)))
+    return replace(source, shapes=shapes | {ACTION: source.shapes[ACTION]})
+
+
+def _inputs_hint(data: Features, names: Collection[str]) -> str:
+    """How a new policy reads only those of a dataset's features that have these names."""
+    kinds = {STATE: "STATE", ENV_STATE: "ENV"}
+    inputs = {
+        name: {"type": kinds.get(name, "VISUAL"), "shape": list(shape)}
+        for name, shape in data.shapes.items()
+        if name in names and name != ACTION
+    }
+    text = f"; or have the policy read less: --sft.policy.input_features='{json.dumps(inputs)}'"
+    return text if inputs else ""
+
+
+def _check_values(
+    sft: SFTConfig,
+    dataset: DatasetConfig,
+    policy: Any,
+    meta: Any,
+    needs: Features,
+    renames: dict[str, str],
+    spec: WorldSpec | None,
+) -> None:
+    """Check statistics and numbers that a policy is trained on."""
+    from lerobot.datasets.factory import IMAGENET_STATS
+
+    from accerl_lerobot.demos.dataset_files import opened
+    from accerl_lerobot.demos.episodes import check_images, numbers
+    from accerl_lerobot.demos.sft import picked
+
+    about = "dataset.repo_id", dataset.repo_id
+    originals = {new: name for name, new in renames.items()}
+    episodes = _extra_argument(sft, "dataset.episodes", []) or picked(dataset, sft.pick)
+    read = {originals.get(name, name) for name in needs.shapes}
+    shapes = {name: shape for name, shape in dataset_features(meta).shapes.items() if name in read}
+    images = {name: shape for name, shape in shapes.items() if len(shape) == 3}
+    with opened(dataset, meta, episodes) as data:
+        check_images(data, images, dataset)
+        for name in shapes.keys() - images.keys():
+            values = numbers(data, name, dataset)
+            if name == ACTION and spec is not None:
+                check_actions(values, spec, *about)
+    stats = {renames.get(name, name): dict(own) for name, own in meta.stats.items()}
+    if _extra_argument(sft, "dataset.use_imagenet_stats", True):
+        for camera in set(meta.camera_keys) - set(meta.depth_keys):
+            stats[renames.get(camera, camera)] |= IMAGENET_STATS
+    root = "" if dataset.root is None else f" --root={dataset.root}"
+    tool = f"lerobot-edit-dataset --repo_id={dataset.repo_id}{root} --new_root=NEW --new_repo_id=NEW/NEW"
+    recompute = f"compute them: {tool} --operation.type=recompute_stats"
+    check_statistics(policy, needs, stats, *about, recompute)
+
+
+def _extra_argument(sft: SFTConfig, name: str, default: Any) -> Any:
+    """The value of an argument of ``lerobot-train`` in ``sft.extra_args``; it has the type of `default`."""
+    flags = " ".join(sft.extra_args).split(f"--{name}")[1:]
+    given = [flag[1:].partition(" --")[0] for flag in flags]
+    try:
+        found = yaml.safe_load(given[-1]) if given else default
+    except yaml.YAMLError:
+        found = None
+    if not isinstance(found, type(default)):
+        remedy = f"--{name} is {MEANINGS[name]}"
+        raise InputError("sft.extra_args", given[-1], remedy)
+    return found
 
 
 def _dataset_renames(sft: SFTConfig) -> dict[str, str]:
     """``lerobot-train``'s ``--rename_map``: the dataset's names → the policy's."""
-    flags = " ".join(sft.extra_args).split("--rename_map")[1:]
-    given = [flag[1:].partition(" --")[0] for flag in flags]
-    try:
-        found = yaml.safe_load(given[-1]) if given else {}
-    except yaml.YAMLError:
-        found = None
-    if not isinstance(found, dict):
-        remedy = "--rename_map is a mapping from the dataset's names to the policy's"
-        raise InputError("sft.extra_args", given[-1], remedy)
-    return found
+    return dict(_extra_argument(sft, "rename_map", {}))
 
 
 def _check_new_policy(policy: Any, source: Features, sft: SFTConfig) -> None:

@@ -5,8 +5,10 @@ from __future__ import annotations
 
 import logging
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from accerl_lerobot.errors import InputError
 
@@ -16,6 +18,23 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 STATE, ENV_STATE, ACTION = "observation.state", "observation.environment_state", "action"
+NUMERIC = ("float", "int", "uint", "bool")
+"""Beginnings of the types of a dataset's features that are numbers."""
+STATISTICS = {
+    "MEAN_STD": ("mean", "std"),
+    "MIN_MAX": ("min", "max"),
+    "QUANTILES": ("q01", "q99"),
+    "QUANTILE10": ("q10", "q90"),
+}
+"""LeRobot's modes of normalisation → the statistics that they read."""
+IMAGENET = (
+    "use ImageNet's: VISUAL: MEAN_STD in the policy's normalization_mapping, and no "
+    "--dataset.use_imagenet_stats=false in sft.extra_args"
+)
+EPSILON = 1e-8
+"""Number that LeRobot adds to a width that it divides by."""
+OUTSIDE_SHARE, OUTSIDE_SLACK = 0.05, 0.01
+"""Share of a dataset's actions to be warned of that lie outside the bounds by this part of their width."""
 RESIZERS = ("resize_imgs_with_padding", "image_resolution", "resize_shape")
 """Fields of LeRobot's policy configs: where one is set, the policy resizes its images by itself."""
 
@@ -29,6 +48,7 @@ class Features:
     fps: float | None = None  # control rate in Hz; None: not known
     labelled_fps: tuple[float, ...] = ()  # see `WorldSpec.labelled_fps`
     tasks: tuple[str, ...] = ()  # instructions; empty: not known
+    unusable: dict[str, str] = field(default_factory=dict)  # name → why no policy can read it
 
 
 def env_features(spec: WorldSpec) -> Features:
@@ -71,12 +91,28 @@ def fine_tuned_features(policy: Any, dataset: Features, renames: dict[str, str])
 
 def dataset_features(meta: Any) -> Features:
     """Features of a LeRobotDataset, which a policy trained on it needs."""
-    from lerobot.utils.feature_utils import dataset_to_policy_features
-
-    shapes = _shapes(dataset_to_policy_features(meta.features))
+    shapes, unusable = dataset_shapes(meta), {}
     if meta.camera_keys:
         shapes.pop(ENV_STATE, None)  # see `demos.guarded_train`
-    return Features(shapes=shapes, fps=meta.fps, tasks=tuple(map(str, meta.tasks.index)))
+    for name in (STATE, ACTION):
+        parts = ", ".join(key for key in meta.features if key.startswith(f"{name}."))
+        kind = meta.features[name]["dtype"] if name in meta.features else None
+        if kind is None and parts:
+            unusable[name] = (
+                f"it is in parts ({parts}); join them into one {name} with LeRobot's add_features"
+            )
+        elif kind is not None and not kind.startswith(NUMERIC):
+            unusable[name] = f"it is {kind}, and policies read numbers; record it as float32"
+            del shapes[name]
+    tasks = tuple(map(str, meta.tasks.index))
+    return Features(shapes=shapes, fps=meta.fps, tasks=tasks, unusable=unusable)
+
+
+def dataset_shapes(meta: Any) -> dict[str, tuple[int, ...]]:
+    """Shapes of a LeRobotDataset's features; images are (channels, height, width)."""
+    from lerobot.utils.feature_utils import dataset_to_policy_features
+
+    return _shapes(dataset_to_policy_features(meta.features))
 
 
 def _shapes(features: dict[str, Any]) -> dict[str, tuple[int, ...]]:
@@ -92,10 +128,12 @@ def check_features(
     field: str,
     value: object,
     offerer: str = "environment",
+    hint: str = "",
 ) -> None:
     """Compares what a policy, or the policy that a dataset makes, needs with what is offered to it.
 
-    `rename_map` is offered name → needed name; the error names `field` and its `value`.
+    `rename_map` is offered name → needed name; the error names `field` and its `value`, and ends with `hint`
+    where an image is missing.
     """
     renames = "policy.rename_map"
     sources = {name for name in offered.shapes if name != ACTION}
@@ -110,10 +148,13 @@ def check_features(
         shapes[new] = shape
     for name, shape in needed.shapes.items():
         image = len(shape) == 3
+        if name not in shapes and name in offered.unusable:
+            raise InputError(field, value, f"no {name} in the {offerer}: {offered.unusable[name]}")
         if name not in shapes:
             same = [k for k, other in shapes.items() if len(other) == len(shape) and k != ACTION]
             offers = ", ".join(same) or "none"
             remedy = "; choose env.camera (env.images of gym), or map names with policy.rename_map" * image
+            remedy += hint * image
             raise InputError(field, value, f"no {name} in the {offerer}, which offers {offers}{remedy}")
         skip = 1 if image and needed.any_size else len(shape)
         if shapes[name][:skip] != shape[:skip]:
@@ -125,14 +166,83 @@ def check_features(
         why = f"recorded at {needed.fps:g} Hz, but the environment runs at {offered.fps:g} Hz"
         remedy = "its actions would be executed at another rate; use a dataset of this rate"
         raise InputError(field, value, f"{why}: {remedy}, or with env.type=gym set env.fps")
-    known = {_plain(text) for text in needed.tasks}
-    missing = [text for text in offered.tasks if _plain(text) not in known]
+    _check_tasks(needed.tasks, offered.tasks, field, value)
+
+
+def _check_tasks(needed: tuple[str, ...], offered: tuple[str, ...], field: str, value: object) -> None:
+    """Compares a dataset's instructions with an environment's."""
+    known = {_plain(text): text for text in needed}
+    has = ", ".join(map(repr, needed[:4])) + (" …" if len(needed) > 4 else "")
+    missing = [text for text in offered if _plain(text) not in known]
     if known and missing:
-        has = ", ".join(map(repr, needed.tasks[:4])) + (" …" if len(needed.tasks) > 4 else "")
         message = f"no episode of {', '.join(map(repr, missing[:4]))}, the environment's task: it has {has}"
-        if len(missing) == len(offered.tasks):
+        if len(missing) == len(offered):
             raise InputError(field, value, f"{message}; choose env.task accordingly")
         logger.warning("%s=%r: %s", field, value, message)
+    for text in offered:
+        if known and text not in needed and text not in missing:
+            logger.warning(
+                "%s=%r: the environment's instruction is %r, and the dataset's %r; policies tell them apart",
+                field, value, text, known[_plain(text)],
+            )  # fmt: skip
+    if any(needed) and not offered:
+        logger.warning("%s=%r: its instructions are %s, and the environment gives none", field, value, has)
+    if len(known) < len(needed):
+        logger.warning("%s=%r: instructions that differ in spelling only: %s", field, value, has)
+
+
+def check_statistics(
+    policy: Any, needed: Features, stats: dict[str, Any], field: str, value: object, recompute: str
+) -> None:
+    """Refuses statistics of a dataset, by the policy's names, that its normalisation cannot use.
+
+    `recompute` says how to compute those of numbers again.
+    """
+    for name, shape in needed.shapes.items():
+        kind = {STATE: "STATE", ENV_STATE: "ENV", ACTION: "ACTION"}.get(name, "VISUAL")
+        mode = policy.normalization_mapping.get(kind)
+        mode = str(getattr(mode, "value", mode))
+        wanted = STATISTICS.get(mode, ())
+        own = {key: np.asarray(numbers) for key, numbers in (stats.get(name) or {}).items()}
+        if not wanted:
+            continue
+        hint = IMAGENET if kind == "VISUAL" else recompute
+        about = f"{' and '.join(wanted)} of {name} in its statistics"
+        if not own.keys() >= set(wanted):
+            raise InputError(field, value, f"no {about}, which normalisation by {mode} reads; {hint}")
+        first, second = (own[statistic] for statistic in wanted)
+        for array in (first, second):
+            fits = kind == "VISUAL" or array.shape == shape
+            if array.dtype.kind not in "biuf" or not fits or not np.isfinite(array).all():
+                raise InputError(field, value, f"{about} are not {math.prod(shape)} finite numbers; {hint}")
+        width = second if wanted == STATISTICS["MEAN_STD"] else second - first
+        flat = width <= EPSILON
+        if not flat.any():
+            continue
+        changes = kind == "VISUAL" or bool((own.get("max", second) - own.get("min", second))[flat].any())
+        if changes:
+            raise InputError(field, value, f"by {about} it never changes, and is divided by 0; {hint}")
+        if kind != "ACTION":
+            text = (
+                "%s=%r: numbers %s of %s never change, and any other value is some 1e8 once it is normalised"
+            )
+            logger.warning(text, field, value, np.flatnonzero(flat).tolist(), name)
+
+
+def check_actions(actions: np.ndarray, spec: WorldSpec, field: str, value: object) -> None:
+    """Warns where many of a dataset's actions (N, A) lie outside what the environment executes."""
+    slack = OUTSIDE_SLACK * (spec.action_high - spec.action_low)
+    outside = (actions < spec.action_low - slack) | (actions > spec.action_high + slack)
+    share = outside.mean(0)
+    worst = int(share.argmax())
+    if share[worst] < OUTSIDE_SHARE:
+        return
+    logger.warning(
+        "%s=%r: %.0f%% of its actions lie outside the environment's bounds, which cut them off: number %d is "
+        "from %.4g to %.4g in the dataset, and %.4g to %.4g in the environment; are both in the same unit?",
+        field, value, 100 * share[worst], worst, actions[:, worst].min(), actions[:, worst].max(),
+        spec.action_low[worst], spec.action_high[worst],
+    )  # fmt: skip
 
 
 def _plain(text: str) -> str:

@@ -12,9 +12,11 @@ from typing import Any
 import numpy as np
 
 from accerl_lerobot.config.ranges import DatasetConfig
-from accerl_lerobot.demos.dataset_files import frames_of, open_metadata, opened, pixels_of
-from accerl_lerobot.experience import REWARD, SUCCESS, Origin, Segment
+from accerl_lerobot.demos.dataset_files import open_metadata, opened
+from accerl_lerobot.demos.episodes import check_images, numbers, pixels_of, read_labels
+from accerl_lerobot.experience import Origin, Segment
 from accerl_lerobot.policies.config import Load, PolicyConfig
+from accerl_lerobot.policies.features import dataset_shapes
 
 logger = logging.getLogger(__name__)
 
@@ -33,8 +35,11 @@ def with_demonstrations(
 
 def unlike(meta: Any, wanted: dict[str, tuple[int, ...]]) -> str | None:
     """How a dataset's features differ from an environment's names and shapes; None: they do not."""
+    shapes = dataset_shapes(meta)
     for name, shape in wanted.items():
-        offered = tuple(meta.features[name]["shape"]) if name in meta.features else None
+        offered = shapes.get(name)
+        if offered is not None and len(offered) == 3:
+            offered = offered[1:] + offered[:1]  # environments have (height, width, channels)
         if offered != shape:
             return f"the dataset's {name} has shape {offered}, the environment's {shape}"
     return None
@@ -43,9 +48,9 @@ def unlike(meta: Any, wanted: dict[str, tuple[int, ...]]) -> str | None:
 def demonstrations(dataset: DatasetConfig, decision_cost: float, like: Segment) -> Iterator[Segment]:
     """Reads whole episodes, each up to ``like.actions.shape[1]`` times: from its first step, its second, ….
 
-    Rewards are ``next.reward``, or 1 for success, less `decision_cost` for each decision; ends and success
-    are those of `_episode`. Names and shapes are those of `like`, an explored episode; a dataset of others is
-    not read, which is logged.
+    Rewards are ``next.reward``, or 1 for success, less `decision_cost` for each decision. An episode ends
+    with its success; one without labels is a success as a whole. Names and shapes are those of `like`, an
+    explored episode; a dataset of others is not read, which is logged.
     """
     meta = open_metadata(dataset)
     wanted = {name: rows.shape[1:] for name, rows in like.observations.items()}
@@ -75,15 +80,26 @@ def recorded(
     share = min(1.0, most * chunk / meta.total_frames)
     episodes = range(math.ceil(share * meta.total_episodes))
     with opened(dataset, meta, episodes) as data:
-        for index in episodes:
-            columns, rewards, success, task = _episode(frames_of(data, index), wanted)
-            end, actions = len(rewards), columns.pop("action")
+        plain = [name for name, shape in wanted.items() if len(shape) < 3]
+        vectors = {name: numbers(data, name, dataset).astype(np.float32) for name in plain}
+        shapes = dataset_shapes(meta)
+        check_images(data, {name: shapes[name] for name in wanted.keys() - vectors.keys()}, dataset)
+        for episode in read_labels(data, dataset):
+            success = episode.success or episode.success_at is None
+            end = len(episode.rows)
+            if episode.success_at is not None and episode.success_at >= 0:
+                end = episode.success_at + 1
+            only_success = np.zeros(end, np.float32)
+            only_success[-1] = success
+            rewards = only_success if episode.rewards is None else episode.rewards[:end]
+            columns = _observations(data, episode.rows[:end], wanted, vectors)
+            actions = columns.pop("action")
             for phase in range(min(phases, end)):
                 starts = np.arange(phase, end, chunk)
                 t, reward = len(starts), np.add.reduceat(rewards, starts)
                 yield Segment(
                     observations={name: rows[[*starts, end - 1]] for name, rows in columns.items()},
-                    task=task,
+                    task=episode.tasks[0],
                     latent={},
                     log_prob=np.zeros((t, 0), np.float32),
                     actions=actions[np.minimum(starts[:, None] + np.arange(chunk), end - 1)],
@@ -93,36 +109,15 @@ def recorded(
                     terminated=True,
                     success=success,
                     key="demonstration",
-                    origin=Origin(task="", seed=index, decision=0),
+                    origin=Origin(task="", seed=episode.index, decision=0),
                 )
 
 
-def _episode(
-    frames: Iterator[dict[str, Any]], wanted: dict[str, tuple[int, ...]]
-) -> tuple[dict[str, np.ndarray], np.ndarray, bool, str]:
-    """Observations and actions, each (T, ...), and rewards (T,) of an episode; its success, and its task.
-
-    It ends with the first ``next.success``, unless its first frame has that already: then all of them are
-    labelled, and it ends with the last one. Without the feature a reward above 0 is success, and without
-    rewards too each episode is one.
-    """
-    rows: list[dict[str, np.ndarray]] = []
-    rewards: list[float] = []
-    labelled = False
-    for frame in frames:
-        rows.append({name: _numbers(frame[name], shape) for name, shape in wanted.items()})
-        rewards.append(float(frame.get(REWARD, 0.0)))
-        task, success = str(frame["task"]), bool(frame.get(SUCCESS, False))
-        labelled |= success and len(rows) == 1
-        if success and not labelled:
-            break
-    if SUCCESS not in frame:
-        success = REWARD not in frame or max(rewards) > 0
-    if REWARD not in frame:
-        rewards[-1] = float(success)
-    columns = {name: np.stack([row[name] for row in rows]) for name in wanted}
-    return columns, np.array(rewards, np.float32), success, task
-
-
-def _numbers(value: Any, shape: tuple[int, ...]) -> np.ndarray:
-    return pixels_of(value) if len(shape) > 2 else np.asarray(value.numpy(), np.float32).reshape(shape)
+def _observations(
+    data: Any, rows: np.ndarray, wanted: dict[str, tuple[int, ...]], vectors: dict[str, np.ndarray]
+) -> dict[str, np.ndarray]:
+    """Observations and actions, each (T, ...), of some rows; frames are decoded if images are wanted."""
+    found = {name: columns[rows].reshape(-1, *wanted[name]) for name, columns in vectors.items()}
+    cameras = wanted.keys() - vectors.keys()
+    frames = [data[int(row)] for row in rows] if cameras else []
+    return found | {camera: np.stack([pixels_of(frame[camera]) for frame in frames]) for camera in cameras}

@@ -21,9 +21,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from accerl_lerobot.checkpoint.snapshot import kind
-from accerl_lerobot.demos.dataset_files import frames_of, open_metadata, opened, pixels_of
+from accerl_lerobot.demos.dataset_files import open_metadata, opened
+from accerl_lerobot.demos.episodes import EpisodeLabels, frames_of, pixels_of, read_labels
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import SUCCESS
+from accerl_lerobot.experience import REWARD, SUCCESS
 
 if TYPE_CHECKING:
     from accerl_lerobot.config.ranges import DatasetConfig
@@ -260,7 +261,8 @@ def load_datasets(sections: dict[str, DatasetConfig], spec: WorldModelSpec) -> d
     for section, meta in open_datasets(sections, spec).items():
         dataset = sections[section]
         with name_section(section), opened(dataset, meta) as data:
-            episodes = [_episode(data, i, spec, section == ONLINE) for i in range(meta.total_episodes)]
+            labels = read_labels(data, dataset)
+            episodes = [_episode(data, episode, spec, section == ONLINE) for episode in labels]
             once = {episode.key: episode for episode in episodes}
             if len(once) < len(episodes):
                 text = "%s: %d episodes are in it more than once, and are used once"
@@ -295,7 +297,7 @@ def check_metadata(meta: Any, name: str, spec: WorldModelSpec) -> None:
     elif others:
         key, shape = next(iter(others.items()))
         why = f"{key} has shape {shape}, the world's has ({sizes[key]},): it is another robot's"
-    elif SUCCESS not in shapes:
+    elif not {SUCCESS, REWARD} & shapes.keys():
         why = f"no {SUCCESS}: record it, as accerl demos does, or add it to the dataset"
     elif meta.fps != spec.fps:
         why = f"{meta.fps} frames a second, and the world makes {spec.fps} steps; record at the world's rate"
@@ -306,9 +308,9 @@ def check_metadata(meta: Any, name: str, spec: WorldModelSpec) -> None:
     raise InputError("dataset.repo_id", name, why)
 
 
-def _episode(data: Any, index: int, spec: WorldModelSpec, own: bool) -> Episode:
-    items = list(frames_of(data, index))
-    success = np.array([bool(item[SUCCESS]) for item in items])
+def _episode(data: Any, labels: EpisodeLabels, spec: WorldModelSpec, own: bool) -> Episode:
+    items = list(frames_of(data, labels))
+    assert labels.success_at is not None  # `check_metadata` refuses a dataset without labels
     arrays = {camera: np.stack([pixels_of(item[camera]) for item in items]) for camera in spec.cameras}
     if spec.state_dim:
         arrays["observation.state"] = np.stack([item["observation.state"].numpy() for item in items])
@@ -318,7 +320,7 @@ def _episode(data: Any, index: int, spec: WorldModelSpec, own: bool) -> Episode:
         times=np.arange(len(items)),
         state=state.astype(np.float32),
         actions=np.stack([item["action"].numpy() for item in items]).astype(np.float32),
-        success_at=int(success.argmax()) if success.any() else -1,
-        task=str(items[0]["task"]),
+        success_at=labels.success_at,
+        task=labels.tasks[0],
         own=own,
     )

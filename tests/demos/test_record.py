@@ -6,6 +6,7 @@ from __future__ import annotations
 import concurrent.futures
 import contextlib
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,12 +17,14 @@ from accerl_lerobot.demos.record import (
     SIDECAR,
     DemosConfig,
     Episode,
+    check_instruction,
     disturbed,
     make_expert,
     played,
     record_demos,
 )
 from accerl_lerobot.envs import EnvConfig, MetaWorldConfig, SimulatedConfig, make_world
+from accerl_lerobot.envs.gym_env import GymConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.seeds import demo_seed
 from tests.rounding import assert_close
@@ -193,3 +196,14 @@ def test_no_more_simulators_than_memory_for_them(
     with record.simulated(config, abs, [-1, 2, -3]) as results:
         assert list(results) == [1, 2, 3]
     assert began == [processes]
+
+
+def test_an_instruction_is_asked_for_where_the_environment_has_none():
+    """`export` calls it as well, before an episode is repeated."""
+    config = GymConfig(id="reach/Reach-v0")
+    spec = make_world(SimulatedConfig()).spec
+    check_instruction(spec, config)
+    silent = replace(spec, instructions=())
+    with pytest.raises(InputError, match="^env.task='': each frame of a dataset has an .*--env.task="):
+        check_instruction(silent, config)
+    check_instruction(silent, replace(config, task="Reach the goal"))

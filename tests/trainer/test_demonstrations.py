@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from accerl_lerobot.algorithms import AlgorithmConfig, ChunkCriticConfig, SelfImitationConfig
@@ -29,7 +28,8 @@ from accerl_lerobot.policies.teacher import with_teacher
 from accerl_lerobot.trainer import demonstrations as module
 from accerl_lerobot.trainer.chunk_critic import ChunkCriticUpdate
 from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.trainer.demonstrations import demonstrations, with_demonstrations
+from accerl_lerobot.trainer.demonstrations import demonstrations, recorded, with_demonstrations
+from tests.datasets import labels, write_dataset
 from tests.replay.segments import make_segment
 from tests.runs import tiny_run
 from tests.trainer.test_chunk_critic import SECTIONS
@@ -91,23 +91,28 @@ def test_decisions_are_the_frames_from_every_step_on(dataset: DatasetConfig, lik
 
 
 @pytest.mark.parametrize(
-    ("labels", "length", "rewards", "success"),
+    ("label", "length", "rewards", "success"),
     [
-        ({"next.success": [0, 0, 1, 1]}, 3, [0, 0, 1], True),
-        ({"next.success": [1, 1, 1, 1]}, 4, [0, 0, 0, 1], True),  # the episode's label, at every frame
-        ({"next.success": [0, 0, 0, 0]}, 4, [0, 0, 0, 0], False),
-        ({"next.success": [0, 1, 1, 1], "next.reward": [-1, -2, 0, 0]}, 2, [-1, -2], True),
-        ({"next.reward": [0, 0, 0, 1]}, 4, [0, 0, 0, 1], True),
-        ({"next.reward": [0, 0, 0, 0]}, 4, [0, 0, 0, 0], False),
-        ({}, 4, [0, 0, 0, 1], True),
+        ({"next.success": [0, 0, 1, 1, 1, 1]}, 3, [0, 0, 1], True),
+        ({"next.success": [1] * 6}, 6, [0, 0, 0, 0, 0, 1], True),  # the episode's label, at every frame
+        ({"next.success": [0] * 6}, 6, [0] * 6, False),
+        ({"next.success": [0, 1, 1, 1, 1, 1], "next.reward": [-1, -2, 0, 0, 0, 0]}, 2, [-1, -2], True),
+        ({"next.reward": [0, 0, 0, 1, 1, 1]}, 4, [0, 0, 0, 1], True),
+        ({"next.reward": [0] * 6}, 6, [0] * 6, False),
+        ({}, 6, [0, 0, 0, 0, 0, 1], True),
     ],
 )
-def test_labels_of_an_episode(labels: dict, length: int, rewards: list[float], success: bool):
-    frames = [{k: torch.tensor(v[i]) for k, v in labels.items()} for i in range(4)]
-    frames = [{"action": torch.tensor([float(i)]), "task": "go"} | frame for i, frame in enumerate(frames)]
-    columns, found, won, task = module._episode(iter(frames), {"action": (1,)})
-    assert columns["action"].tolist() == [[float(i)] for i in range(length)]
-    assert (found.tolist(), won, task) == (rewards, success, "go")
+def test_labels_of_an_episode(
+    label: dict[str, list[int]], length: int, rewards: list[float], success: bool, tmp_path: Path
+):
+    dataset = write_dataset(
+        tmp_path / "data", ("go",), {name: labels("float32") for name in label},
+        lambda name, episode, step: [label[name][step]] if name in label else None,
+    )  # fmt: skip
+    shapes = {"observation.state": (4,), "action": (2,)}
+    (segment,) = recorded(dataset, open_metadata(dataset), shapes, 1, 100, 1)
+    assert (segment.reward.tolist(), segment.success, segment.task) == (rewards, success, "go")
+    assert len(segment) == length and segment.observations["observation.state"].shape == (length + 1, 4)
 
 
 def test_of_a_long_dataset_only_a_part_is_read(
