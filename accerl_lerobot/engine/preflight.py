@@ -283,7 +283,7 @@ def _new_policy_features(policy: Any, source: Features, about: tuple[str, Any]) 
     shapes = policy_features(policy).shapes if named else source.shapes
     gray = [name for name, shape in shapes.items() if len(shape) == 3 and shape[0] != 3]
     if gray and not named:
-        why = f"{gray[0]} has {shapes[gray[0]][0]} channels, and policies read pictures of 3"
+        why = f"{gray[0]} has {shapes[gray[0]][0]} channels, and policies read pictures of 3 channels"
         raise InputError(*about, why + _inputs_hint(source, shapes.keys() - set(gray)))
     return replace(source, shapes=shapes | {ACTION: source.shapes[ACTION]})
 

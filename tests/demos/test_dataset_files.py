@@ -30,7 +30,7 @@ from accerl_lerobot.demos.dataset_files import (
 )
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.features import dataset_features
-from tests.datasets import FRONT, IMAGE, STEPS, edit_json, rewrite, write_dataset, write_old
+from tests.tiny_datasets import FRONT, IMAGE, STEPS, edit_json, rewrite, write_dataset, write_old
 
 ROOT = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
 CAMERA = "observation.images.corner2"

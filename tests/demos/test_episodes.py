@@ -17,7 +17,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.trainer.demonstrations import recorded
 from accerl_lerobot.world_model.contract import WorldModelSpec
 from accerl_lerobot.world_model.data import load_datasets
-from tests.datasets import ACTION, FPS, FRONT, IMAGE, STATE, STEPS, labels, rewrite, write_dataset
+from tests.tiny_datasets import ACTION, FPS, FRONT, IMAGE, STATE, STEPS, labels, rewrite, write_dataset
 
 SUCCESS, REWARD = "next.success", "next.reward"
 DATA = "data/chunk-000/file-000.parquet"

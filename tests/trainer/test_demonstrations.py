@@ -29,9 +29,9 @@ from accerl_lerobot.trainer import demonstrations as module
 from accerl_lerobot.trainer.chunk_critic import ChunkCriticUpdate
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.demonstrations import demonstrations, recorded, with_demonstrations
-from tests.datasets import labels, write_dataset
 from tests.replay.segments import make_segment
 from tests.runs import tiny_run
+from tests.tiny_datasets import labels, write_dataset
 from tests.trainer.test_chunk_critic import SECTIONS
 
 ENV = SimulatedConfig(max_steps=16, environment_state=True)
