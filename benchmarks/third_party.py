@@ -40,7 +40,7 @@ class BenchThirdPartyConfig(Section):
 
     packages: tuple[str, ...] = ()
     """Distributions to try; empty: all."""
-    timeout_s: Annotated[float, Range("[10, 3600]")] = 300.0
+    timeout_s: Annotated[float, Range("[10, 7200]")] = 900.0
     """Longest time that one command may take."""
     output_dir: str = "outputs/third_party"
     """Folder of the policies, logs and results; must be empty or absent."""
@@ -54,7 +54,7 @@ def bench_third_party(config: BenchThirdPartyConfig) -> dict[str, Any]:
     """
     console, root = Console(), output_folder(config.output_dir).resolve()
     wanted = yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text())
-    versions = {one.name.lower(): one.version for one in distributions()}
+    versions = {one.name.lower().replace("_", "-"): one.version for one in distributions()}
     rows: list[dict[str, Any]] = []
     skipped: list[str] = []
     for situation in wanted["situations"]:

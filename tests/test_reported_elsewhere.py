@@ -64,6 +64,24 @@ def test_success_reward_and_end_may_be_arrays_of_one(registered: Any):
     assert result.rewards.sum() == 1.0
 
 
+@pytest.mark.parametrize(
+    ("method", "given", "message"),
+    [
+        ("reset", lambda full: full[0], r"its reset returns a dict; let it return \(observation, info\)"),
+        ("step", lambda full: (*full[:3], full[4]), "its step returns 4 values; let it return"),
+    ],
+)
+def test_an_environment_of_the_older_interface_is_told_what_to_return(
+    method: str, given: Any, message: str, registered: Any
+):
+    full = getattr(Arm, method)
+    older = type("Older", (Arm,), {method: lambda *args, **kw: given(full(*args, **kw))})
+    with pytest.raises(InputError, match=f"^env.id='reported/Arm-v0': {message}"):
+        world = make_world(registered(older))
+        world.reset(0, "reported/Arm-v0")
+        world.step_chunk(np.zeros((4, 2), np.float32))
+
+
 @pytest.mark.parametrize("run_seed", [0, 2**32 - 1, 2**63 - 1])
 def test_every_seed_of_an_episode_is_one_that_numpy_s_old_generator_takes(registered: Any, run_seed: int):
     world = make_world(registered(Arm))

@@ -26,6 +26,11 @@ from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Observation
 FPS = 20  # control rate of environments that name none
 MAX_STEPS = 500  # episode limit of environments that have none
 RENDER = "render"  # in `GymConfig.images`: the picture that the environment renders
+RETURNS = {
+    "reset": ("observation", "info"),
+    "step": ("observation", "reward", "terminated", "truncated", "info"),
+}
+"""What Gymnasium's methods return; those of the older gym returned less."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,12 +83,12 @@ class GymnasiumWorld(EpisodeWorld):
         return action
 
     def _begin(self, seed: int, task: str) -> None:
-        self._raw, _ = self.environments[task].reset(seed=seed)
+        self._raw, _ = self._returned(task, "reset", seed=seed)
         self._info_keys: set[str] = set()
 
     def _step(self, action: np.ndarray) -> Step:
-        env, key = self.environments[self._task], self.config.success
-        self._raw, reward, ended, cut, info = env.step(self._processed(action))
+        key, chosen = self.config.success, self._processed(action)
+        self._raw, reward, ended, cut, info = self._returned(self._task, "step", chosen)
         success = bool(ended)
         if key:
             told = flattened(info)
@@ -96,6 +101,15 @@ class GymnasiumWorld(EpisodeWorld):
             reward=float(reward) if self.config.reward == "env" else None,
             cut=bool(cut),
         )
+
+    def _returned(self, task: str, method: str, *arguments: Any, **named: Any) -> tuple[Any, ...]:
+        """The values that a method of the environment returns, if they are Gymnasium's."""
+        values = getattr(self.environments[task], method)(*arguments, **named)
+        if isinstance(values, tuple) and len(values) == len(RETURNS[method]):
+            return values
+        found = f"{len(values)} values" if isinstance(values, tuple) else f"a {type(values).__name__}"
+        hint = f"its {method} returns {found}; let it return ({', '.join(RETURNS[method])}), as in Gymnasium"
+        raise InputError(f"env.{self.config.named_by}", getattr(self.config, self.config.named_by), hint)
 
     def step_chunk(self, actions: np.ndarray) -> ChunkResult:
         result, key = super().step_chunk(actions), self.config.success

@@ -47,7 +47,7 @@ def test_right_is_the_exit_code_and_what_is_printed(
     assert bench_third_party(config)["skipped"] == ["lerobot-doctor"]
 
     class Doctor:
-        name, version = "lerobot-doctor", "0.2.0"
+        name, version = "lerobot_Doctor", "0.2.0"
 
     monkeypatch.setattr(third_party, "distributions", lambda: [Doctor])
     config = BenchThirdPartyConfig(packages=("lerobot-doctor",), output_dir=str(tmp_path / "b"))
