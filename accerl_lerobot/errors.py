@@ -1,5 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The error for bad input: a field, its value and the remedy, on one line; and other errors on one line."""
+"""Messages to people: bad input and other errors, each on one line, and those of other processes.
+
+People do not look into the files of workers and child processes. So such a process keeps its warnings
+(`collect_warnings`) and hands them over with its answers (`collected_warnings`), and the run's process shows
+each of them once (`show_warnings`). The exception that ends a child is handed over as JSON (`error_as_json`).
+"""
 
 from __future__ import annotations
 
@@ -11,14 +16,17 @@ import os
 import re
 import traceback
 import unicodedata
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any, NamedTuple
 
 logger = logging.getLogger(__name__)
 
 ERROR_LOG = "error.log"  # file of a run's folder with the tracebacks of unexpected errors
 TOKEN = re.compile(r"\bhf_\w{6,}")  # of the Hub, which somebody may have typed where it does not belong
+BAR = re.compile(r"[^\r\n]*?\d%\|[^\]\r\n]*\]|\r")  # of progress, which no line end follows
 LONGEST, LONGEST_REMEDY, MOST_SHOWN = 200, 1200, 600
 """Characters that are shown of a value, of a remedy and of an unexpected error; a whole section may have been
 given where a number belongs, and some remedies repeat a part of it."""
@@ -147,13 +155,90 @@ def kept_traceback(directory: Path) -> Iterator[None]:
         raise
 
 
-def one_line(error: BaseException) -> str:
-    """An unexpected error in one line, with its traceback's place or how to see it."""
+def last_exception(text: str) -> str:
+    """The exception at the end of a traceback, on one line; of any other text its last line."""
+    lines = [line for line in BAR.sub("", text).splitlines() if line.strip()]
+    inside = [number for number, line in enumerate(lines) if line.startswith(("  ", "Traceback"))]
+    end = lines[inside[-1] + 1 :] if inside else []
+    return " ".join(" ".join(end or lines[-1:]).split())
+
+
+def in_one_line(error: BaseException) -> str:
+    """Type and text of an error in one line: of a long text its beginning, and the exception at its end."""
     cause = getattr(error, "cause", error)  # Ray's errors carry a traceback as their text
     cause = cause if isinstance(cause, BaseException) else error
     lines = [line.strip() for line in str(cause).splitlines() if line.strip()]
-    words = " … ".join(lines if len(lines) < 2 else [lines[0], lines[-1]])
-    text = f"{type(cause).__name__}: {words}" if words else type(cause).__name__
+    words = " … ".join(lines if len(lines) < 2 else [lines[0], last_exception(str(cause))])
+    return f"{type(cause).__name__}: {words}" if words else type(cause).__name__
+
+
+def one_line(error: BaseException) -> str:
+    """An unexpected error in one line, with its traceback's place or how to see it."""
+    text = in_one_line(error)
     notes = getattr(error, "__notes__", ()) or ("ACCERL_LOG=DEBUG shows the traceback",)
     line = " ".join("; ".join([TOKEN.sub("<token>", text[:MOST_SHOWN]), *notes]).split())
     return printable(line)
+
+
+PACKAGE = "accerl_lerobot"
+LONGEST_HANDED = 1000  # characters of a message of another process
+
+
+class ChildWarning(NamedTuple):
+    """A warning of another process: the name of its logger, and its text."""
+
+    logger: str
+    text: str
+
+
+class _Collector(logging.Handler):
+    """Keeps each distinct warning of this package until it is handed over."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.known: set[ChildWarning] = set()
+        self.new: deque[ChildWarning] = deque()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        warning = ChildWarning(record.name, record.getMessage()[:LONGEST_HANDED])
+        if warning not in self.known:
+            self.known.add(warning)
+            self.new.append(warning)
+
+
+_collector = _Collector()
+_shown: set[ChildWarning] = set()
+
+
+def collect_warnings() -> None:
+    """Keep the warnings of this process from now on."""
+    _collector.new.clear()  # of the parent, where this process was forked
+    logging.getLogger(PACKAGE).addHandler(_collector)
+
+
+def collected_warnings(worker: object = None) -> list[ChildWarning]:
+    """Warnings of this process since the last call; `worker` is not used, Ray hands it over."""
+    return [_collector.new.popleft() for _ in range(len(_collector.new))]
+
+
+def show_warnings(warnings: Iterable[Any]) -> None:
+    """Log warnings of other processes, each once."""
+    for warning in map(ChildWarning._make, warnings):
+        if warning not in _shown:
+            _shown.add(warning)
+            logging.getLogger(warning.logger).warning("%s", warning.text)
+
+
+def error_as_json(error: BaseException) -> dict[str, Any]:
+    """An exception as plain values: the `InputError` in its chain, or its type and text in one line."""
+    refused = next((link for link in causes(error) if isinstance(link, InputError)), None)
+    if refused is None:
+        return {"error": in_one_line(error)[:LONGEST_HANDED]}
+    value = None if refused.value is None else str(refused.value)[:LONGEST_HANDED]
+    return {"field": refused.field, "value": value, "why": refused.remedy[:LONGEST_HANDED]}
+
+
+def raise_refusal(answer: dict[str, Any]) -> None:
+    """Raise the `InputError` that `error_as_json` has described, if it was one."""
+    if "field" in answer:
+        raise InputError(answer["field"], answer["value"], answer["why"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import logging
 import os
 import signal
 import threading
@@ -84,6 +85,19 @@ class FalteringRollout(RolloutWorker):
         self._left -= 1
         if self._left < 0:
             raise OSError("no space left for the timeline")
+        return super().report(*arguments)
+
+
+class WarningRollout(RolloutWorker):
+    """Warns when it begins and at each report, in equal words."""
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        logging.getLogger("accerl_lerobot.envs").warning("info has no %s", "is_success")
+
+    def report(self, *arguments: Any) -> Report:
+        logging.getLogger("accerl_lerobot.envs").warning("info has no is_success")
+        logging.getLogger("somebody.else").warning("noise")
         return super().report(*arguments)
 
 

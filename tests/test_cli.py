@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+import traceback
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from accerl_lerobot.cli import verbs
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import RunConfig, encode
 from accerl_lerobot.engine.stopping import WorkerError
-from accerl_lerobot.errors import InputError, kept_traceback, one_line
+from accerl_lerobot.errors import InputError, kept_traceback, last_exception, one_line
 
 ROOT = Path(__file__).parents[1]
 QUICKSTART = ROOT / "recipes" / "quickstart.yaml"
@@ -137,6 +138,18 @@ def test_control_characters_are_escaped_where_a_message_becomes_a_line(error, mo
     err = capsys.readouterr().err
     assert all(character.isprintable() or character == "\n" for character in err)
     assert err.count("\\x1b[2J") == 5 + isinstance(error, InputError) and "\\u202e" in err
+
+
+def test_the_reason_is_the_exception_at_the_end_of_a_traceback() -> None:
+    try:
+        raise ValueError("no q01,\nno q99") from KeyError("stats")
+    except ValueError as error:
+        text = "".join(traceback.format_exception(error))
+    assert last_exception(f"10%|\r{text}") == "ValueError: no q01, no q99"
+    assert last_exception("usage: x\n\nerror: no such flag\n") == "error: no such flag"
+    assert one_line(RuntimeError(f"rollout 0 worker failed:\n{text}")).startswith(
+        "RuntimeError: rollout 0 worker failed: … ValueError: no q01, no q99; "
+    )
 
 
 def test_an_error_in_a_run_leaves_its_traceback_in_the_folder(tmp_path: Path) -> None:

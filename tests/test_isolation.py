@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import resource
 import shutil
@@ -63,7 +64,7 @@ def refuse() -> None:
         (lambda: exec("while True: pass"), "takes more than 3 s of processor time"),
         (lambda: b"x" * 2**33, f"takes more than {isolation.SLACK // MIB} MiB beside the libraries"),
         (lambda: np.ones(2**33), "takes more than .* MiB"),
-        (panic, "fails with Panic: regex backtracked too often"),
+        (panic, "fails with Panic: regex backtracked … too often"),
     ],
 )
 def test_however_a_child_ends_its_parent_gets_a_line(tmp_path: Path, task: Callable[[], object], why: str):
@@ -74,6 +75,15 @@ def test_the_line_of_a_check_is_passed_on(tmp_path: Path):
     with pytest.raises(InputError) as caught:
         rehearse(refuse, tmp_path, ORIGIN)
     assert str(caught.value) == "policy.path='7': use another"
+
+
+def test_its_warnings_are_passed_on(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    def warn() -> int:
+        logging.getLogger("accerl_lerobot.x").warning("it %s", "is odd")
+        return 3
+
+    assert rehearse(warn, tmp_path, ORIGIN) == 3
+    assert [(r.name, r.getMessage()) for r in caplog.records] == [("accerl_lerobot.x", "it is odd")]
 
 
 def test_a_child_that_waits_for_ever_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -20,6 +20,7 @@ import psutil
 import pytest
 import ray
 
+from accerl_lerobot import errors
 from accerl_lerobot.engine import launch, replicas
 from accerl_lerobot.engine.config import LaunchConfig
 from accerl_lerobot.engine.launch import RayEngine, end_all
@@ -36,7 +37,7 @@ from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.transport.shared_memory import available
 from benchmarks.simulated_world import LatencyConfig
 from benchmarks.victims import alive
-from tests.light_workers import FULL, HANGS, NO_WEIGHTS, FalteringRollout, LightInference
+from tests.light_workers import FULL, HANGS, NO_WEIGHTS, FalteringRollout, LightInference, WarningRollout
 from tests.runs import collect, drive, polls, until
 
 SLOW = LatencyConfig(max_steps=16, frame_ms=4.0)
@@ -88,6 +89,17 @@ def test_a_run_ends_by_itself_and_closing_leaves_no_process(engine):
     one.close()
     one.close()
     assert [name for name, pid in pids.items() if not gone(pid)] == []
+
+
+def test_a_warning_of_workers_is_shown_once_also_in_a_short_evaluation(engine, monkeypatch, caplog):
+    monkeypatch.setattr(rollout_worker, "RolloutWorker", WarningRollout)
+    monkeypatch.setattr(errors, "_shown", set())
+    one = engine(rollout=TWO)
+    one.plan(evaluation_plans(("match",), 2, "eval"))
+    collect(one, "eval", 2)
+    one.close()
+    said = [(r.name, r.getMessage()) for r in caplog.records if r.levelname == "WARNING"]
+    assert said == [("accerl_lerobot.envs", "info has no is_success")]
 
 
 def test_a_full_disk_is_survived_and_an_exception_in_the_trainer_ends_the_run(engine, tmp_path: Path):

@@ -23,7 +23,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import cast
 
-from accerl_lerobot.checkpoint.safety import MIB, Origin, brief
+from accerl_lerobot import errors
+from accerl_lerobot.checkpoint.safety import MIB, Origin
 from accerl_lerobot.errors import InputError
 
 SLACK, PER_BYTE = 1536 * MIB, 4
@@ -36,7 +37,6 @@ PATIENCE = 20  # times its processor time after which a child is given up, whate
 IDLE_S = 10.0
 """Seconds without processor time after which a child is replaced: it may wait for a lock that another thread
 of this process held at the fork and that nobody in the child can release."""
-LONGEST = 1000  # characters of a child's message
 NO_MEMORY = (
     "MemoryError", "can't allocate", "Cannot allocate", "bad_alloc", "Unable to allocate", "malloc of",
 )  # fmt: skip
@@ -58,14 +58,15 @@ def rehearse[T](task: Callable[[], T], folder: Path, origin: Origin, pattern: st
     message, status = b"", None
     while status is None and time.monotonic() < deadline:
         message, status = _try(task, memory, cpu_s, deadline)
-    answer = json.loads(message) if message else {"why": _cause(status, cpu_s)}
+    answer = json.loads(message) if message else {}
+    errors.show_warnings(answer.get("warnings", ()))
     if "result" in answer:
         return cast(T, answer["result"])
-    why = answer["why"]
-    if any(words in why for words in NO_MEMORY):
+    why = f"fails with {answer['error']}" if "error" in answer else _cause(status, cpu_s)
+    if any(words in answer.get("why", why) for words in NO_MEMORY):
         why = f"takes more than {memory // MIB} MiB beside the libraries"
-    elif "field" in answer:
-        raise InputError(answer["field"], answer["value"], why)
+    else:
+        errors.raise_refusal(answer)
     remedy = "the size of its files does not account for that; get it again, or another one"
     raise InputError(origin.field, origin.value, f"loading it, tried in a process apart, {why}; {remedy}")
 
@@ -104,17 +105,16 @@ def _cause(status: int | None, cpu_s: int) -> str:
 def _run(task: Callable[[], object], writer: int, parent: int, memory: int, cpu_s: int) -> None:
     """Runs in the child, and ends it."""
     answer: dict[str, object] = {}
+    errors.collect_warnings()
     try:
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
         if os.getppid() != parent:
             os._exit(1)
         _confine(memory, cpu_s)
         answer = {"result": task()}
-    except InputError as error:
-        value = None if error.value is None else str(error.value)[:LONGEST]
-        answer = {"field": error.field, "value": value, "why": error.remedy[:LONGEST]}
     except BaseException as error:  # Rust's panics are no `Exception`
-        answer = {"why": f"fails with {type(error).__name__}: {brief(error)}"}
+        answer = errors.error_as_json(error)
+    answer["warnings"] = errors.collected_warnings()
     with contextlib.suppress(BaseException):
         os.write(writer, json.dumps(answer).encode())
     os._exit(0)

@@ -15,17 +15,19 @@ import functools
 import json
 import math
 import sys
+import traceback
 from typing import Any, NamedTuple
 
 import torch
 from torch.utils.data import Dataset
 
+from accerl_lerobot import errors
 from accerl_lerobot.checkpoint.safety import Origin
 from accerl_lerobot.config.parsing import DISCOVER, discover
 from accerl_lerobot.demos.dataset_files import checked
-from accerl_lerobot.demos.sft import REFUSED, TRUST
+from accerl_lerobot.demos.sft import ANSWER, TRUST
 from accerl_lerobot.experience import ENVIRONMENT_STATE
-from accerl_lerobot.policies.untrusted import guarded, input_error
+from accerl_lerobot.policies.untrusted import guarded
 
 PACKAGE = f"--policy.{DISCOVER}="
 MAX_BYTES = 4 * 1024**3
@@ -130,6 +132,8 @@ def main() -> None:
     DatasetReader._query_hf_dataset = query_rows
     discover(given(PACKAGE), "policy")
     sys.argv[1:] = [a for a in sys.argv[1:] if not a.startswith((TRUST, PACKAGE))]
+    answer: dict[str, Any] = {}
+    errors.collect_warnings()
     try:
         with contextlib.ExitStack() as guards:
             guards.enter_context(guarded("sft", code))
@@ -138,11 +142,13 @@ def main() -> None:
                 guards.enter_context(data_only())
             lerobot_train.main()
     except Exception as error:
-        if (refused := input_error(error)) is None:
-            raise
-        said = json.dumps([refused.field, str(refused.value), refused.remedy])
-        sys.stdout.write(f"{REFUSED}{said}\n")
-        sys.exit(2)
+        answer = errors.error_as_json(error)
+        traceback.print_exception(error)
+        sys.exit(1)
+    finally:
+        sys.stderr.flush()
+        answer["warnings"] = errors.collected_warnings()
+        sys.stdout.write(f"\n{ANSWER}{json.dumps(answer)}\n")
 
 
 if __name__ == "__main__":

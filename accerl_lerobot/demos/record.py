@@ -29,7 +29,7 @@ from typing import Annotated, Any
 import draccus
 import numpy as np
 
-from accerl_lerobot import guardian
+from accerl_lerobot import errors, guardian
 from accerl_lerobot.config.parsing import imported
 from accerl_lerobot.config.ranges import Range, Section, Share
 from accerl_lerobot.console import Console
@@ -184,9 +184,7 @@ def simulators(
     """So many processes, each made ready by `start`; an error inside ends them at once."""
     context = multiprocessing.get_context("spawn")
     before = set(multiprocessing.active_children())
-    with concurrent.futures.ProcessPoolExecutor(
-        processes, context, initializer=_ready, initargs=(start, *arguments)
-    ) as pool:
+    with _Pool(processes, context, initializer=_ready, initargs=(start, *arguments)) as pool:
         try:
             yield pool
         except BaseException:
@@ -197,8 +195,35 @@ def simulators(
 
 def _ready(start: Callable[..., None], *arguments: Any) -> None:
     """Makes a process ready; Ctrl-C on the terminal is for its parent, which ends it."""
+    global _broken
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    start(*arguments)
+    errors.collect_warnings()
+    try:
+        start(*arguments)
+    except Exception as error:  # the pool would lose it
+        _broken = error
+
+
+_broken: Exception | None = None  # why this process could not be made ready
+
+
+class _Pool(concurrent.futures.ProcessPoolExecutor):
+    """Processes whose work raises what kept them from being made ready."""
+
+    def submit(self, work: Any, /, *arguments: Any) -> Any:  # type: ignore[override]
+        return super().submit(_checked, work, *arguments)
+
+
+def _checked(work: Callable[..., Any], *arguments: Any) -> Any:
+    if _broken is not None:
+        raise _broken
+    return work(*arguments)
+
+
+def _with_warnings[Item, Result](
+    work: Callable[[Item], Result], item: Item
+) -> tuple[Result, list[errors.ChildWarning]]:
+    return work(item), errors.collected_warnings()
 
 
 @contextmanager
@@ -216,12 +241,15 @@ def simulated[Item, Result](
     cores, fitting = len(os.sched_getaffinity(0)), (memory_gib("MemAvailable") or math.inf) / each
     processes, left = max(1, int(min(cores, MOST_PROCESSES, len(items), fitting))), iter(items)
     with simulators(processes, _open_world, env_config) as pool:
-        waiting = collections.deque(pool.submit(work, item) for item in itertools.islice(left, 2 * processes))
+        first = itertools.islice(left, 2 * processes)
+        waiting = collections.deque(pool.submit(_with_warnings, work, item) for item in first)
 
         def results() -> Iterator[Result]:
             while waiting:
-                result = waiting.popleft().result()
-                waiting.extend(pool.submit(work, item) for item in itertools.islice(left, 1))
+                result, warned = waiting.popleft().result()
+                errors.show_warnings(warned)
+                more = itertools.islice(left, 1)
+                waiting.extend(pool.submit(_with_warnings, work, item) for item in more)
                 yield result
 
         yield results()

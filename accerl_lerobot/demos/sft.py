@@ -13,6 +13,7 @@ import os
 import re
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -20,12 +21,13 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+from accerl_lerobot import errors
 from accerl_lerobot.checkpoint.layout import CHECKPOINTS, LAST, PRETRAINED, displaced, relocate
 from accerl_lerobot.checkpoint.safety import Origin, read_json
 from accerl_lerobot.config.parsing import as_text
 from accerl_lerobot.config.ranges import Commit, DatasetConfig, LearningRate, Range, Section, Steps, Threads
 from accerl_lerobot.demos.backbone import BackboneConfig, Sizes, write_backbone
-from accerl_lerobot.errors import InputError, check_absent, expanded
+from accerl_lerobot.errors import InputError, check_absent, expanded, last_exception
 from accerl_lerobot.experience import REWARD, SUCCESS
 from accerl_lerobot.policies.config import discovery, register_policies
 
@@ -33,8 +35,8 @@ logger = logging.getLogger(__name__)
 
 TRUST = "--trust_remote_code="
 PROGRESS = re.compile(r"(?:\| (\d+)/\d+ \[.*)?\bstep:(\d+\.?\d*)([KM]?) .*\bloss:(nan|inf|\d+\.?\d*)\b")
-REFUSED = "accerl refuses: "
-"""Begins the last line of a trainer that met something it must not use; JSON follows."""
+ANSWER = "accerl hands over: "
+"""Begins the last line of a trainer; warnings and the last exception follow, as JSON."""
 LOG_EVERY, WARMUP_STEPS = 25, 20
 NO_SFT = {"gaussian_actor": "only LeRobot's SAC trains it, lerobot-train does not; use act"}
 """LeRobot policy types that ``lerobot-train`` cannot fine-tune → why, and what to do."""
@@ -141,7 +143,7 @@ def run_sft(
 
     Raises:
         InputError: `output_dir` exists; the checkpoint to start from, or the dataset, is not to be trusted.
-        RuntimeError: the trainer failed; carries the end of its log.
+        RuntimeError: the trainer failed; carries its last exception and the place of its log.
     """
     check_absent(output_dir)
     if config.init_path is not None:
@@ -181,14 +183,21 @@ def run_sft(
         except BaseException:
             process.terminate()  # nobody reads on: it must not train alone
             raise
-    code = process.returncode
-    if code != 0:
-        last = log.read_text().rstrip().rpartition("\n")[2]
-        if last.startswith(REFUSED):
-            raise InputError(*json.loads(last.removeprefix(REFUSED)))
-        tail = "".join(log.read_text().splitlines(keepends=True)[-15:])
-        raise RuntimeError(f"lerobot-train ended with exit code {code}; the end of {log}:\n{tail}")
+    _check_end(process.returncode, log)
     return output_dir / CHECKPOINTS / LAST / PRETRAINED
+
+
+def _check_end(code: int, log: Path) -> None:
+    """Shows a trainer's warnings, and raises its last exception if it failed."""
+    text = log.read_text()
+    last = text.rstrip().rpartition("\n")[2]
+    answer = json.loads(last.removeprefix(ANSWER)) if last.startswith(ANSWER) else {}
+    errors.show_warnings(answer.get("warnings", ()))
+    if code == 0:
+        return
+    errors.raise_refusal(answer)
+    ended = f"was ended by {signal.Signals(-code).name}" if code < 0 else last_exception(text)
+    raise RuntimeError(f"lerobot-train failed, see {log}: {answer.get('error', ended)}")
 
 
 def picked(dataset: DatasetConfig, pick: str) -> list[int] | None:

@@ -20,6 +20,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
+from accerl_lerobot import errors
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE, WORLD_MODEL
 from accerl_lerobot.engine.config import RunConfig
@@ -171,6 +172,7 @@ class _Worker:
     step_name: str
 
     def __init__(self, config: RunConfig, state: Path | None = None, timeline: Path | None = None) -> None:
+        errors.collect_warnings()
         self._clock = open_clock(timeline, self.name)
         import torch
 

@@ -31,7 +31,13 @@ from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.loop import Engine, Progress, Saved
 from accerl_lerobot.engine.placement import actor_options, place_workers
 from accerl_lerobot.engine.ray_session import RaySession
-from accerl_lerobot.engine.replicas import InferenceReplicas, RolloutSlot, RolloutWorkers, WorkerSlot
+from accerl_lerobot.engine.replicas import (
+    InferenceReplicas,
+    RolloutSlot,
+    RolloutWorkers,
+    WorkerSlot,
+    show_last_warnings,
+)
 from accerl_lerobot.engine.stopping import WorkerError
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import Load
@@ -143,6 +149,8 @@ class RayEngine(Engine):
         self._rollouts.ask(self._training and not self._done)
         self._await_end()
         episodes = self._listen()
+        for worker in self._everyone():
+            worker.show_warnings()
         # Inference last, since others are not listened to during its restart.
         for worker in (*self._others, *self._rollouts.workers(), *self._inference.workers()):
             if why := worker.hung(self._limit):
@@ -188,6 +196,8 @@ class RayEngine(Engine):
             lost = bool(self._ray.lost)
             if lost:
                 self._ray.close()
+            else:
+                show_last_warnings(list(self._everyone()))
             end_all(self._everyone(), lost=lost)
             if not self._keeps_ray:
                 self._ray.close()

@@ -14,7 +14,7 @@ import math
 import time
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,12 +23,13 @@ import psutil
 import ray
 from ray.exceptions import ActorUnavailableError, GetTimeoutError, RayActorError, RayError, RayTaskError
 
+from accerl_lerobot import errors
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.placement import Node, Place, Plan, actor_options, is_alive
 from accerl_lerobot.engine.ray_session import NO_HUB_TOKEN
 from accerl_lerobot.engine.stopping import WorkerError, pause_s
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.errors import InputError, last_exception
 from accerl_lerobot.inference.batcher import merge_metrics
 from accerl_lerobot.metrics import numbered
 from accerl_lerobot.policies.config import Load
@@ -44,6 +45,8 @@ STEADY_S = 30.0  # a worker that has run for so long starts counting restarts an
 UNREACHABLE_S = 60.0
 """How long a process on another node may be out of reach before it is restarted, unless its node is found to
 have left, which Ray takes half of that to decide."""
+WARNINGS_S, LAST_WARNINGS_S = 5.0, 1.0
+"""Interval at which a worker hands over its warnings, and how long its last ones are waited for."""
 LOOK_S = 1.0  # interval at which a node out of reach is looked at
 ROLLOUT = "rollout"  # name of the rollout workers' part of a checkpoint
 
@@ -72,6 +75,8 @@ class WorkerSlot:
         self.since = math.inf  # when it was at work, on `time.monotonic`
         self._question: Any = None
         self._asked = 0.0
+        self.warnings: Any = None  # handed over at the next look
+        self._warnings_since = -math.inf
 
     def start_timeout(self, limit: float) -> float:
         """Seconds that a new process may take before it answers, where an answer may take `limit` later."""
@@ -105,6 +110,16 @@ class WorkerSlot:
         self.told = ray.get(question)
         return self.told
 
+    def show_warnings(self) -> None:
+        """Shows what its process has warned of, as far as it has handed that over."""
+        if self.warnings is not None and ray.wait([self.warnings], timeout=0)[0]:
+            warned, self.warnings = self.warnings, None
+            with contextlib.suppress(RayError):  # where it has died, others find that out
+                errors.show_warnings(ray.get(warned))
+        if self.warnings is None and time.monotonic() > self._warnings_since + WARNINGS_S:
+            self._warnings_since = time.monotonic()
+            self.warnings = self.actor.__ray_call__.remote(errors.collected_warnings)
+
     def silent_s(self) -> float:
         """Seconds for which an answer has been outstanding."""
         if self._question is None or ray.wait([self._question], timeout=0)[0]:
@@ -137,8 +152,19 @@ class WorkerSlot:
                 times = f" after {self.restarts} restarts" if self.restarts else ""
                 raise WorkerError(f"{self.name} worker failed for good{times}:\n{error}") from error
             self.restarts += 1
-        logger.warning("%s worker is restarted: %s", self.name, str(error).strip().splitlines()[-1][:200])
+        show_last_warnings([self])
+        number = f" ({self.restarts} of {max_restarts} times)" if max_restarts else ""
+        logger.warning("%s worker is restarted%s: %s", self.name, number, last_exception(str(error))[:200])
         ray.kill(self.actor)
+
+
+def show_last_warnings(workers: Sequence[WorkerSlot]) -> None:
+    """Shows what workers that are about to be ended have warned of."""
+    asked = [worker.actor.__ray_call__.remote(errors.collected_warnings) for worker in workers]
+    asked += [worker.warnings for worker in workers if worker.warnings is not None]
+    for warned in ray.wait(asked, num_returns=len(asked), timeout=LAST_WARNINGS_S)[0] if asked else ():
+        with contextlib.suppress(RayError):
+            errors.show_warnings(ray.get(warned))
 
 
 class Replicas[W: WorkerSlot](ABC):

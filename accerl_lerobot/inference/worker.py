@@ -21,6 +21,7 @@ from typing import Annotated
 
 import numpy as np
 
+from accerl_lerobot import errors
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import WEIGHTS
 from accerl_lerobot.config.ranges import Range, Section, Threads
@@ -63,6 +64,7 @@ class InferenceWorker:
         timeline: Path | None = None,
         name: str = "inference",
     ) -> None:
+        errors.collect_warnings()
         self._clock = open_clock(timeline, name)
         import torch
 

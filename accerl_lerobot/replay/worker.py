@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from accerl_lerobot import errors
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.experience import REAL, Segment
 from accerl_lerobot.fault_points import fault_point
@@ -54,6 +55,7 @@ class ReplayWorker:
         directory: Path | None = None,
         timeline: Path | None = None,
     ) -> None:
+        errors.collect_warnings()
         self._clock = open_clock(timeline, "replay")
         journal = None if directory is None else Journal(directory / EPISODES)
         self._replay = MixedReplay(config, imagined or ReplayConfig(), 0.0, patient, journal)

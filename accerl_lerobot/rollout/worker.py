@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from accerl_lerobot import errors
 from accerl_lerobot.envs import EnvConfig, make_world
 from accerl_lerobot.experience import Decision, Request, Segment
 from accerl_lerobot.fault_points import fault_point
@@ -62,6 +63,7 @@ class RolloutWorker:
         history: int = 1,
         timeline: Path | None = None,
     ) -> None:
+        errors.collect_warnings()
         self._clock = open_clock(timeline, f"rollout {plans.worker}")
         self._plans, self._spent = plans, False
         self._max_pending = MAX_PENDING

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import ray
 from ray.exceptions import RayActorError, RayError
 
+from accerl_lerobot import errors
 from accerl_lerobot.algorithms import AlgorithmConfig
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import WEIGHTS
@@ -76,6 +77,7 @@ class TrainerRank:
     """Any rank but the first; becomes a Ray actor of one thread, so that calls are done in their order."""
 
     def __init__(self, rank: int, settings: LearnerSettings) -> None:
+        errors.collect_warnings()
         self._rank, self._settings, self._adapter = rank, settings, settings.adapter()
 
     def ready(self) -> int:

@@ -20,6 +20,7 @@ from typing import Any
 
 import ray
 
+from accerl_lerobot import errors
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import PRETRAINED, TRAINING_STATE, WEIGHTS
 from accerl_lerobot.fault_points import fault_point
@@ -47,6 +48,7 @@ class TrainerWorker:
         peers: Sequence[Any] = (),
         directory: Path | None = None,
     ) -> None:
+        errors.collect_warnings()
         self._clock = open_clock(timeline, "trainer")
         self._policy, self._config, self._directory = settings.policy, settings.trainer, directory
         self._peers = Peers(peers, self._config, settings.timeout_s)

@@ -14,7 +14,7 @@ import pytest
 
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos import guarded_train, sft
-from accerl_lerobot.demos.sft import REFUSED, TRUST, SFTConfig, run_sft, sft_command
+from accerl_lerobot.demos.sft import ANSWER, TRUST, SFTConfig, run_sft, sft_command
 from accerl_lerobot.errors import InputError
 from tests.policies.checkpoints import write_act
 from tests.policies.test_loading import remote
@@ -68,8 +68,8 @@ def _refusing(work: Callable[[], Any]) -> Any:
 
 
 def test_a_refusal_is_one_line_of_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    said = json.dumps(["sft.trust_remote_code", "x.py", "read it"])
-    program = f"print('Traceback')\nprint({REFUSED + said!r})\nraise SystemExit(2)"
+    said = json.dumps({"field": "sft.trust_remote_code", "value": "x.py", "why": "read it"})
+    program = f"print('Traceback')\nprint({ANSWER + said!r})\nraise SystemExit(1)"
     monkeypatch.setattr(sft, "sft_command", lambda *_: [sys.executable, "-c", program])
     with pytest.raises(InputError) as caught:
         run_sft(SFTConfig(steps=1), HUB, tmp_path / "sft", seed=0)

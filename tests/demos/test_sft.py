@@ -182,14 +182,44 @@ def command_that(monkeypatch: pytest.MonkeyPatch, program: str) -> None:
     monkeypatch.setattr(sft, "sft_command", lambda *arguments: [sys.executable, "-u", "-c", program])
 
 
-def test_a_failing_trainer_raises_with_the_end_of_its_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    command_that(monkeypatch, "for i in range(40): print('line', i)\nraise SystemExit('out of disk')")
+BAR = r"print('\rTraining:   0%|          | 0/8 [00:00<?, ?step/s]', end='', flush=True)"
+TRAINER = f"""
+import sys
+from lerobot.scripts import lerobot_train
+from accerl_lerobot.demos import guarded_train
+def main():
+    {BAR}
+    {{}}
+lerobot_train.main = main
+sys.argv = ["lerobot-train"]
+guarded_train.main()
+"""
+
+
+@pytest.mark.parametrize(
+    ("program", "reason"),
+    [
+        (f"{BAR}\nraise SystemExit('out of disk')", "out of disk"),
+        (f"{BAR}\nraise ValueError('no q01,\\nno q99')", "ValueError: no q01, no q99"),
+        (f"{BAR}\nimport os; os.kill(os.getpid(), 9)", "was ended by SIGKILL"),
+        (TRAINER.format("raise KeyError('observation.state.joints')"), "KeyError: 'observation.st"),
+        (TRAINER.format("raise SystemExit('error: no such argument: --x')"), "error: no such argum"),
+    ],
+    ids=["exit", "exception", "killed", "trainer", "trainer's exit"],
+)
+def test_a_failing_trainer_s_last_exception_is_the_reason(program, reason, tmp_path, monkeypatch):
+    command_that(monkeypatch, program)
     with pytest.raises(RuntimeError) as caught:
         run_sft(TINY, HUB, tmp_path / "sft", seed=0)
-    message = str(caught.value)
-    assert "exit code 1" in message and str(tmp_path / "sft.log") in message
-    assert "line 39\n" in message and "line 20\n" not in message and "out of disk" in message
-    assert (tmp_path / "sft.log").read_text().startswith("line 0\n")
+    assert str(caught.value).startswith(f"lerobot-train failed, see {tmp_path / 'sft.log'}: {reason}")
+    assert "%|" not in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_trainer_s_warnings_are_shown(tmp_path, monkeypatch, caplog):
+    warn = "import logging; logging.getLogger('accerl_lerobot.x').warning('tasks differ')"
+    command_that(monkeypatch, TRAINER.format(warn))
+    run_sft(TINY, HUB, tmp_path / "sft", seed=0)
+    assert [r.getMessage() for r in caplog.records if r.levelname == "WARNING"] == ["tasks differ"]
 
 
 def test_progress_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
