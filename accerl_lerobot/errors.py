@@ -85,6 +85,19 @@ def check_output(path: Path) -> None:
         raise InputError("output", str(path), "name a file in a folder that exists")
 
 
+@contextmanager
+def reading(field: str, value: str, files: str) -> Iterator[None]:
+    """Refuses files of a run whose content is not what a run writes: damaged, half written or changed."""
+    try:
+        yield
+    except InputError:
+        raise
+    except (ArithmeticError, AttributeError, LookupError, OSError, TypeError, ValueError) as error:
+        logging.getLogger(__name__).debug("reading %s of %s failed", files, value, exc_info=error)
+        why = f"{files} is not as a run writes it ({in_one_line(error)[:LONGEST]}); restore it, or begin anew"
+        raise InputError(field, value, why) from error
+
+
 def causes(error: BaseException | None) -> Iterator[BaseException]:
     """An error and what it came from, newest first."""
     known: list[BaseException] = []

@@ -186,15 +186,29 @@ class TestTrain:
 
         def train(config: RunConfig, directory: Path, console: Any, *_: Any) -> dict[str, Any]:
             seen.update(config=config, directory=directory)
-            return {"success_before": 0.25, "success_after": 0.75, "wall_s": 3.0}
+            before = {"success_before": 0.25, "ci95_before": [0.2, 0.3], "tasks_before": {"a": 1}}
+            after = {"success_after": 0.75, "ci95_after": [0.7, 0.8], "n_after": 100, "seeds": [1, 2]}
+            counts = {"episodes": 412, "env_steps": 43210, "updates": 9, "wall_s": 279.0}
+            return before | after | counts
 
         monkeypatch.setattr("accerl_lerobot.engine.run.execute", train)
         assert cli.main([*arguments, "--trainer.lr=1e-5"]) == 0
         out, err = capsys.readouterr()
-        assert json.loads(out)["success_after"] == 0.75
-        assert "success 25.0% → 75.0% in 3 s" in err
+        policy = tmp_path / "run/checkpoints/last/pretrained_model"
+        told = json.loads(out)
+        assert (told["success_after"], told["ci95_after"], told["env_steps"]) == (0.75, [0.7, 0.8], 43210)
+        assert told["policy"] == str(policy) and told["summary"] == str(tmp_path / "run/summary.json")
+        assert "seeds" not in told and "tasks_before" not in told
+        said = err.replace("\N{NO-BREAK SPACE}", " ")
+        counts = "412 episodes, 43,210 env steps; 4 min 39 s"
+        assert f"success 25 % [20, 30] → 75 % [70, 80] of 100; {counts}\n" in said
+        assert f"policy {policy}\n" in err and f"the rest {told['summary']}; accerl report " in err
         assert seen["directory"] == tmp_path / "run" and seen["directory"].is_dir()
         assert seen["config"].trainer.lr == 1e-5
+        monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+        arguments[-1] += "2"
+        assert cli.main(arguments) == 0
+        assert capsys.readouterr().out == "", "on a terminal there is no JSON"
 
     @pytest.mark.parametrize("work", [False, True])
     def test_a_refused_run_leaves_no_folder_unless_work_was_done(

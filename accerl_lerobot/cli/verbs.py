@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """The verbs of ``accerl``.
 
-Results go to the standard output, everything else to the standard error: LeRobot prints while it loads, and
-results should stay readable for programs.
+Results go to the standard output, as a path or one JSON object for programs; everything else goes to the
+standard error, since LeRobot prints while it loads. On a terminal there is no JSON: what people want of it is
+among the lines before.
 """
 
 from __future__ import annotations
 
 import importlib
 import json
+import shlex
 import sys
 from collections.abc import Callable
 from contextlib import redirect_stdout
@@ -22,11 +24,11 @@ from accerl_lerobot.algorithms import AlgorithmConfig, AWRConfig, ChunkCriticCon
 from accerl_lerobot.bench.policy import BenchPolicyConfig
 from accerl_lerobot.bench.throughput import BenchThroughputConfig
 from accerl_lerobot.bench.world import BenchWorldConfig
-from accerl_lerobot.checkpoint.layout import CHECKPOINTS, CONFIG, LAST, PRETRAINED, write_atomically
+from accerl_lerobot.checkpoint.layout import CHECKPOINTS, CONFIG, LAST, PRETRAINED, SUMMARY, write_atomically
 from accerl_lerobot.cli.export import ExportConfig, export_config, export_episodes
 from accerl_lerobot.config.parsing import read_arguments
 from accerl_lerobot.config.ranges import Device, NewFolder, Section, Seed
-from accerl_lerobot.console import Console
+from accerl_lerobot.console import Console, count, duration, number, rate
 from accerl_lerobot.demos.record import DemosConfig
 from accerl_lerobot.demos.sft import SFTConfig
 from accerl_lerobot.engine.config import DatasetConfig, LaunchConfig, RunConfig, encode, parse
@@ -43,6 +45,11 @@ from accerl_lerobot.timeline.read import TimelineConfig, show_timelines, timelin
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.world_model.config import ValidationConfig, WorldModelConfig
 
+OUTCOME = (
+    "success_before", "ci95_before", "success_after", "ci95_after", "n_after", "episodes", "env_steps",
+    "updates", "wall_s",
+)  # fmt: skip
+"""Numbers of a run's summary that ``accerl train`` prints."""
 NO_DATASET = "name a LeRobotDataset, on the Hub or with dataset.root"
 
 
@@ -182,13 +189,11 @@ def train(arguments: list[str], load: Load | None = None) -> int:
         if is_full(error) or (isinstance(error, WorkerError) and error.brief):
             return 1  # `start` has said it
         raise
-    before = summary["success_before"]
-    console.say(
-        f"success {'' if before is None else f'{before:.1%} → '}{summary['success_after']:.1%} "
-        f"in {summary['wall_s']:.0f} s; see {directory / 'success_curve.png'}"
-    )
-    console.say(f"policy {directory / CHECKPOINTS / LAST / PRETRAINED}; accerl report {directory} says more")
-    return 0 if sys.stdout.isatty() else _told(summary)
+    ends = ["after"] if summary["success_before"] is None else ["before", "after"]
+    success = " → ".join(rate(summary[f"success_{end}"], summary[f"ci95_{end}"]) for end in ends)
+    practice = f"{count(summary['episodes'], 'episode')}, {count(summary['env_steps'], 'env step')}"
+    console.say(f"success {success} of {summary['n_after']}; {practice}; {duration(summary['wall_s'])}")
+    return _told({name: summary[name] for name in OUTCOME} | _say_places(directory, console))
 
 
 def demos(arguments: list[str]) -> int:
@@ -235,7 +240,25 @@ def offline(arguments: list[str]) -> int:
     config: OfflineRun = parse(OfflineRun, arguments, recipe_class=RunConfig)
     from accerl_lerobot.engine.offline import learn_offline
 
-    return _told(_in_new_folder(config, lambda *place: learn_offline(config, *place))[0])
+    summary, directory, console = _in_new_folder(config, lambda *place: learn_offline(config, *place))
+    losses = {
+        outcome: f"{number(summary['imitation_loss']['before'][outcome])} → {number(loss)}"
+        for outcome, loss in summary["imitation_loss"]["after"].items()
+    }
+    console.say(
+        f"imitation loss of successes {losses['successes']}, of failures {losses['failures']}; "
+        f"{count(summary['episodes'], 'episode')}; {duration(summary['wall_s'])}"
+    )
+    _say_places(directory, console)
+    return _told(summary)
+
+
+def _say_places(directory: Path, console: Console) -> dict[str, str]:
+    """Says where a run's policy and everything else is; both as values."""
+    policy = directory / CHECKPOINTS / LAST / PRETRAINED
+    console.say(f"policy {policy}")
+    console.say(f"the rest {directory / SUMMARY}; accerl report {shlex.quote(str(directory))} makes a page")
+    return {"policy": str(policy), "summary": str(directory / SUMMARY)}
 
 
 def _in_new_folder[Result](
@@ -272,7 +295,6 @@ def evaluate(arguments: list[str]) -> int:
     summary: dict[str, Any] = summarise(results) | {"policy": config.policy.path}
     console.say(f"{config.policy.path}, LeRobot's sampler")
     console.rich.print(table(summary, "evaluation"))
-    sys.stdout.write(json.dumps(summary) + "\n")
     if out is not None:
         make_folder(out, "output_dir")
         (out / "evaluation.json").write_text(json.dumps(summary, indent=2) + "\n")
@@ -280,7 +302,7 @@ def evaluate(arguments: list[str]) -> int:
             outcome = "success" if result.success else "failure"
             name = f"{result.plan.task.replace('/', '-')}_{result.plan.seed}_{outcome}.mp4"
             write_video(out / name, [[result.frames]], fps=20)
-    return 0
+    return _told(summary)
 
 
 def world_model(arguments: list[str]) -> int:
@@ -347,16 +369,19 @@ def report(arguments: list[str]) -> int:
 def timeline(arguments: list[str]) -> int:
     """``accerl timeline``."""
     config: TimelineConfig = parse(TimelineConfig, arguments)
-    found = show_timelines(config)
-    Console().rich.print(timeline_table(found))
+    found, console = show_timelines(config), Console()
+    console.rich.print(timeline_table(found))
+    console.say(f"picture {found['picture']}")
     return _told(found)
 
 
 def export(arguments: list[str]) -> int:
     """``accerl export``."""
     config = export_config(arguments)
+    console = Console()
     with redirect_stdout(sys.stderr):
-        found = export_episodes(config, Console())
+        found = export_episodes(config, console)
+    console.say(f"{count(found['episodes'], 'episode')}, {found['successes']} successes, in {config.root}")
     return _told(found)
 
 
@@ -380,7 +405,9 @@ def measure(module_name: str, config: Any) -> int:
 
 
 def _told(result: dict[str, Any], code: int = 0) -> int:
-    sys.stdout.write(json.dumps(plain(result), indent=2) + "\n")
+    """Gives a result to programs: as JSON, unless people see what has been said of it on a terminal."""
+    if not sys.stdout.isatty():
+        sys.stdout.write(json.dumps(plain(result), indent=2) + "\n")
     return code
 
 

@@ -317,7 +317,7 @@ class Loop:
         self.recent = (self.recent + [e.success for e in explored])[-RECENT:]
         share = float(np.mean(self.recent)) if self.recent else math.nan
         # The first episodes to end are the short ones, which are successes.
-        if explored and len(self.recent) >= RECENT // 4:
+        if explored and len(self.recent) >= RECENT // 4 and math.isinf(self.steps):  # it is training
             self.curve.append((self._steps(progress), share))
         # Imagination and learning go on once all real episodes have been played.
         if explored or any(metrics["update"] % RECORD_EVERY == 0 for metrics in progress.updates):

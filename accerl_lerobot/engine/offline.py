@@ -73,12 +73,13 @@ def learn_offline(config: OfflineRun, directory: Path, console: Console) -> dict
         shutil.copyfile(directory / layout.CONFIG, folder / layout.CONFIG)
         return int(update.version)
 
-    path = layout.save_checkpoint(directory / layout.CHECKPOINTS, write)
+    layout.save_checkpoint(directory / layout.CHECKPOINTS, write)
+    policy_folder = directory / layout.CHECKPOINTS / layout.LAST / layout.PRETRAINED
     losses = {"before": before, "after": _imitation(update)}
     summary: dict[str, Any] = plain(
         counts
         | {"algorithm": algorithm.type, "updates": update.version, "imitation_loss": losses}
-        | {"wall_s": time.monotonic() - started, "policy": str(path / layout.PRETRAINED)}
+        | {"wall_s": time.monotonic() - started, "policy": str(policy_folder)}
     )
     layout.write_atomically(directory / layout.SUMMARY, json.dumps(summary, indent=2) + "\n")
     return summary

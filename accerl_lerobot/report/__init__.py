@@ -12,12 +12,14 @@ import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 from urllib.parse import quote
 
 from accerl_lerobot import __version__
+from accerl_lerobot.checkpoint.layout import CONFIG, SUMMARY
 from accerl_lerobot.config.ranges import Section
-from accerl_lerobot.errors import InputError, check_output, expanded
+from accerl_lerobot.errors import InputError, check_output, expanded, reading
+from accerl_lerobot.metrics import METRICS
 
 NAME = "report.html"
 VIDEO_MB = 20
@@ -30,7 +32,8 @@ class ReportConfig(Section):
     BARE: ClassVar[str] = "runs"
 
     runs: tuple[str, ...] = ()
-    """Folders of runs of ``accerl train``; several make a page that compares them. Bare ones are runs."""
+    """Folders of runs of ``accerl train`` or ``accerl offline``; several make a page that compares them. Bare
+    ones are runs."""
     output: str | None = None
     """The page. None: ``report.html`` in the run's folder, or here if there are several."""
 
@@ -42,27 +45,37 @@ class ReportConfig(Section):
 
 def write_report(config: ReportConfig) -> Path:
     """Reads the runs and writes the page."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    from accerl_lerobot.report.charts import POINTS
     from accerl_lerobot.report.content import comparison_page, run_page
     from accerl_lerobot.report.read import read_run
 
     output = None if config.output is None else expanded(config.output, "output")
-    runs = [read_run(Path(name).expanduser()) for name in config.runs]
+    runs = [read_run(expanded(name, "runs")) for name in config.runs]
     if len({run.path.resolve() for run in runs}) < len(runs):
         raise InputError("runs", ",".join(config.runs), "name each run once")
     if output is None:
         output = runs[0].path / NAME if len(runs) == 1 else Path(NAME)
     check_output(output)
     now = time.time()
-    page = comparison_page(runs, now) if len(runs) > 1 else run_page(runs[0], now)
-    folder = output.resolve().parent
+    with reading("runs", ",".join(config.runs), f"{CONFIG}, {METRICS} or {SUMMARY}"):
+        page = comparison_page(runs, now) if len(runs) > 1 else run_page(runs[0], now)
+        html = _html(page, output.resolve().parent)
+    try:
+        output.write_text(html, encoding="utf-8")
+    except OSError as error:
+        raise InputError("output", str(output), f"cannot be written: {error.strerror}") from error
+    return output
+
+
+def _html(page: dict[str, Any], folder: Path) -> str:
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    from accerl_lerobot.report.charts import POINTS
+
     template = Environment(
         loader=PackageLoader("accerl_lerobot", "report"), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     ).get_template("page.html")  # fmt: skip
-    html = template.render(
+    return template.render(
         **page,
         version=__version__,
         points=POINTS,
@@ -70,8 +83,3 @@ def write_report(config: ReportConfig) -> Path:
         base64=lambda path: base64.b64encode(path.read_bytes()).decode(),
         address=lambda path: quote(os.path.relpath(path.resolve(), folder)),
     )
-    try:
-        output.write_text(html, encoding="utf-8")
-    except OSError as error:
-        raise InputError("output", str(output), f"cannot be written: {error.strerror}") from error
-    return output

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from accerl_lerobot.checkpoint.layout import CHECKPOINTS, LAST, PRETRAINED, SUMMARY
+from accerl_lerobot.checkpoint.layout import CHECKPOINTS, CONFIG, LAST, PRETRAINED, SUMMARY
 from accerl_lerobot.config.help import shown
 from accerl_lerobot.config.parsing import decode
-from accerl_lerobot.console import count, duration, number, percent, rate
+from accerl_lerobot.console import ABSENT, count, duration, number, percent, rate
 from accerl_lerobot.engine.config import RunConfig
-from accerl_lerobot.errors import ERROR_LOG, InputError
+from accerl_lerobot.errors import ERROR_LOG, InputError, reading
 from accerl_lerobot.hub.card import lerobot_eval_command, read_json
 from accerl_lerobot.replay.pacing import lag_limits
 from accerl_lerobot.report.charts import COLOURS, Chart, Series, line, rates
@@ -56,6 +56,7 @@ WORRIES: dict[str, tuple[Callable[[float], bool], str]] = {
 Spec = tuple[str, str, dict[str, str], dict[str, Any]]  # title, note, metric → label, and options of a chart
 LEARNING: tuple[Spec, ...] = (
     ("Policy loss", "The algorithm's own term.", {"policy_loss": "policy loss"}, {}),
+    ("Imitation loss", "LeRobot's training loss.", {"imitation_loss": "imitation loss"}, {}),
     ("Value loss", "Squared error of the critic against the returns.", {"value_loss": "value loss"}, {}),
     ("KL divergence", "How far the policy has left its samples; in the loss, far samples are bounded.",
      {"approx_kl": "unbounded", "kl": "in the loss"}, {"unit": "nats"}),
@@ -116,7 +117,7 @@ def run_page(run: Run, now: float) -> dict[str, Any]:
     """Values for the template: the page of one run, at `now`, in seconds since 1970."""
     text, bound = "", None
     try:
-        bound = lag_limits(decode(RunConfig, run.config))[0]
+        bound = None if run.offline else lag_limits(decode(RunConfig, run.config))[0]
     except InputError as error:  # another version, or a package of the user's, wrote it
         text = f"This accerl does not know all of the recipe's types or fields: {error}."
     rows = [(name, shown(value), shown(default)) for name, value, default in differences(run.config)]
@@ -131,6 +132,7 @@ def run_page(run: Run, now: float) -> dict[str, Any]:
         Section("Recipe", text, tables=tables, details=run.config_text),
     ]
     return {
+        "verb": "offline" if run.offline else "train",
         "title": run.name,
         "status": status(run, now),
         "headline": _headline(run),
@@ -145,7 +147,9 @@ def _uses(run: Run) -> list[Table]:
     if not policy.is_dir():
         return []
     rows = [("publish it", f"accerl push --path={policy} --repo_id=USER/NAME")]
-    if stock := lerobot_eval_command(str(policy), read_json(policy / "config.json"), run.section("env")):
+    with reading("runs", str(run.path), f"{CHECKPOINTS}/{LAST}/{PRETRAINED}/config.json or {CONFIG}"):
+        stock = lerobot_eval_command(str(policy), read_json(policy / "config.json"), run.section("env"))
+    if stock:
         rows.insert(0, ("evaluate it with LeRobot alone", stock))
     return [(f"{policy}, a LeRobot checkpoint", ("", "command"), rows)]
 
@@ -163,6 +167,7 @@ def comparison_page(runs: Sequence[Run], now: float) -> dict[str, Any]:
         Section("Differences", "" if rows else "Their recipes are the same.", tables=tables),
     ]
     return {
+        "verb": "train",
         "title": f"{len(runs)} runs",
         "status": f"{sum(run.result is not None for run in runs)} of {len(runs)} finished",
         "headline": count(len(runs), "training run"),
@@ -269,7 +274,7 @@ def exploring(run: Run) -> tuple[np.ndarray, np.ndarray]:
     steps = column(run.rollout, "env_steps") - sum(e["steps_mean"] * e["n"] for e in before)
     episodes = column(run.rollout, "episodes") - sum(e["n"] for e in before)
     if run.result is not None:  # workers go on during the final evaluation
-        steps = np.minimum(steps, run.result["env_steps"])
+        steps = np.where(steps <= run.result.get("env_steps", np.inf), steps, np.nan)
     return steps, np.where(episodes >= FEW, column(run.rollout, "success_exploring"), np.nan)
 
 
@@ -332,6 +337,12 @@ def _speed(run: Run) -> Section:
 
 
 def _headline(run: Run) -> str:
+    if run.offline:
+        losses = column(run.train, "imitation_loss")
+        losses = losses[np.isfinite(losses)]
+        change = f": imitation loss {number(losses[0])} → {number(losses[-1])}" if len(losses) else ""
+        made = int(newest(run.train, "update") or 0)
+        return f"{count(made, 'update')} on recorded episodes{change}"
     last, env = run.evaluations[-1:], run.section("env")
     names = (run.result or {}).get("tasks") or sorted((last[0].get("tasks") if last else None) or ())
     names = names or [env.get("task") or env.get("name") or env.get("type")]
@@ -365,12 +376,15 @@ def _tiles(run: Run, bound: int | None) -> list[tuple[str, str, str]]:
     episodes = number(result.get("episodes", newest(run.rollout, "episodes")))
     spent = ", ".join(f"{name} {duration(seconds)}" for name, seconds in parts.items() if seconds >= 1)
     updates = number(result.get("updates", len(run.train)))
+    if run.offline:
+        tiles.append(("episodes", episodes, f"{number(result.get('successes'))} successes"))
+    else:
+        tiles.append(("env steps", number(steps), f"{episodes} episodes"))
+        tiles.append(("lag", number(mean, 2), f"largest {number(largest)}, bound {number(bound)}"))
     return [
         *tiles,
-        ("env steps", number(steps), f"{episodes} episodes"),
         ("wall time", duration(run.wall_s), spent),
         ("updates", updates, f"of {run.section('trainer').get('updates')}"),
-        ("lag", number(mean, 2), f"largest {number(largest)}, bound {number(bound)}"),
         ("algorithm", str(run.section("algorithm").get("type")), ""),
         ("seed", str(run.config.get("seed")), ""),
     ]
@@ -383,7 +397,7 @@ def _run_table(runs: Mapping[str, Run], now: float) -> Table:
         ends = [*(before[:1] or [{}]), *(run.outcomes[-1:] or [{}])]
         success = (rate(e.get("success"), e.get("ci95")) for e in ends)
         tiles = {key: value for key, value, _ in _tiles(run, None)}
-        numbers = (tiles[key] for key in ("algorithm", "seed", "env steps", "lag", "wall time"))
+        numbers = (tiles.get(key, ABSENT) for key in ("algorithm", "seed", "env steps", "lag", "wall time"))
         rows.append((name, *success, *numbers, status(run, now)))
     columns = ("run", "before", "newest", "algorithm", "seed", "env steps", "mean lag", "wall time", "")
     return "Success before training and in the newest evaluation, with 95 % Wilson intervals", columns, rows

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The folder of a run of ``accerl train`` as plain data.
+"""The folder of a run of ``accerl train`` or ``accerl offline`` as plain data.
 
 A run that is still going or has crashed has no result file, and the last line of its ``metrics.jsonl`` may be
 incomplete. Both are common and no error; any other damage is an error that names the file.
@@ -23,7 +23,7 @@ from accerl_lerobot.checkpoint.safety import Origin, check_folder, read_json
 from accerl_lerobot.config.parsing import encode, read_recipe
 from accerl_lerobot.console import ABSENT
 from accerl_lerobot.engine.config import RunConfig
-from accerl_lerobot.errors import ERROR_LOG, InputError
+from accerl_lerobot.errors import ERROR_LOG, InputError, reading
 from accerl_lerobot.metrics import METRICS
 
 Record = dict[str, Any]
@@ -31,7 +31,7 @@ Record = dict[str, Any]
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """Contents of a run's folder."""
+    """Contents of a run's folder; one of ``accerl offline`` has neither rollouts nor evaluations."""
 
     path: Path
     config: Record
@@ -46,6 +46,11 @@ class Run:
     @property
     def name(self) -> str:
         return self.path.resolve().name
+
+    @property
+    def offline(self) -> bool:
+        """True if it learned from recorded episodes alone."""
+        return "rollout" not in self.config and "env" not in self.config
 
     @property
     def train(self) -> list[Record]:
@@ -92,22 +97,52 @@ def read_run(path: Path) -> Run:
         raise InputError("runs", str(path), f"no run in it: its {CONFIG} is not one of accerl train")
     lines, truncated = _lines(path / METRICS)
     records: dict[str, list[Record]] = {}
-    for line in lines:
+    for number, line in enumerate(lines, 1):
+        with reading("runs", str(path), f"line {number} of {METRICS}"):
+            _check_numbers(line)
+            if line["kind"] == "evaluation":
+                _check_evaluation(line)
         records.setdefault(line["kind"], []).append(line)
     written = max(_modified(file) for file in path.iterdir() if file.suffix != ".html")
-    result, log = path / SUMMARY, path / ERROR_LOG
+    summary, log = path / SUMMARY, path / ERROR_LOG
+    result = read_json(summary, origin) if summary.is_file() else None
+    with reading("runs", str(path), SUMMARY):
+        _check_numbers(result or {})
+        if result is not None and {*map(type, result.get("tasks", ()))} - {str}:
+            raise TypeError("tasks")
     failed = log.is_file() and _modified(log) >= written
     return Run(
         path=path,
         config=config,
         config_text=config_path.read_text(),
         records=records,
-        result=read_json(result, origin) if result.is_file() else None,
+        result=result,
         truncated=truncated,
         written=written,
         error=(log.read_text(errors="replace").splitlines() or ["?"])[-1] if failed else "",
         videos=tuple(sorted(path.glob("*.mp4"))),
     )
+
+
+COUNTS = ("wall_s", "env_steps", "episodes", "updates", "rl_s", "warm_start_s", "success", "n", "steps_mean")
+"""Numbers of records and summaries that are computed with."""
+
+
+def _check_numbers(record: Record) -> None:
+    for name, value in record.items():
+        if isinstance(value, int):
+            float(value)  # or it is too large
+        if name in COUNTS and not isinstance(value, int | float | None):
+            raise TypeError(f"{name} is {type(value).__name__}")
+
+
+def _check_evaluation(record: Record) -> None:
+    numbers = [record["env_steps"], record["steps_mean"]]
+    for measured in (record, *(record.get("tasks") or {}).values()):
+        low, high = measured["ci95"]
+        numbers += [measured["success"], measured["n"], low, high]
+    if not np.isfinite(np.array(numbers, dtype=np.float64)).all():
+        raise ValueError("a number is missing")
 
 
 def _modified(path: Path) -> float:
@@ -158,10 +193,19 @@ def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def differences(tree: dict[str, Any]) -> list[tuple[str, Any, Any]]:
-    """Dotted field, value and default, where the two differ; a dash for a field of another type."""
-    usual = flat(encode(RunConfig()))
-    rows = ((name, value, usual.get(name, ABSENT)) for name, value in flat(tree).items())
-    return [row for row in rows if row[0] not in PLACES and row[1] != row[2]]
+    """Dotted field, value and default, where the two differ; a dash for a field of another type.
+
+    Fields of stages that the run skips are left out.
+    """
+    usual, fields = flat(encode(RunConfig())), flat(tree)
+    skipped: tuple[str, ...] = ()
+    if fields.get("dataset.repo_id"):
+        skipped = ("demos.",)
+    if not fields.get("sft.steps"):
+        skipped = ("demos.", "sft.")
+    rows = ((name, value, usual.get(name, ABSENT)) for name, value in fields.items())
+    shown = (row for row in rows if row[0] not in PLACES and not row[0].startswith(skipped))
+    return [row for row in shown if row[1] != row[2]]
 
 
 def apart(trees: list[dict[str, Any]]) -> list[tuple[str, list[Any]]]:

@@ -20,7 +20,7 @@ from rich.table import Table
 
 from accerl_lerobot.checkpoint.safety import Origin, brief, check_folder
 from accerl_lerobot.config.ranges import NonNegative, Positive, Section
-from accerl_lerobot.errors import InputError, check_output, expanded
+from accerl_lerobot.errors import InputError, check_output, expanded, reading
 from accerl_lerobot.timeline import (
     BITS,
     CHECKPOINT,
@@ -118,12 +118,21 @@ def read_timeline(run_directory: Path) -> Timeline:
 
     Clocks of one machine agree to the nanosecond, so all its processes are placed on the calendar together,
     by the moment that the first of them noted.
+
+    Raises:
+        InputError: there is none, or a file of it is damaged.
     """
     check_folder(run_directory, Origin("runs", str(run_directory)))
     parts = read_parts(run_directory / TIMELINE)
     if not parts:
-        remedy = "no timeline in it: it is no run, or no worker has begun"
+        remedy = "no timeline in it: it is no run of accerl train, or no worker has begun"
         raise InputError("runs", str(run_directory), remedy)
+    with reading("runs", str(run_directory), f"a file of {TIMELINE}/"):
+        return Timeline(run=run_directory, rows=_rows(parts))
+
+
+def _rows(parts: list[Part]) -> tuple[Row, ...]:
+    """All workers on a common axis."""
     offsets: dict[str, int] = {}
     for begins in sorted((part.begins for part in parts), key=lambda moment: moment.wall_ns):
         offsets.setdefault(begins.node, begins.wall_ns - begins.clock_ns)
@@ -133,7 +142,7 @@ def read_timeline(run_directory: Path) -> Timeline:
         moved = part.times + part.begins.clock_ns + offsets[part.begins.node] - first
         workers.setdefault(part.worker, []).append(part._replace(times=moved))
     rows = [_row(worker, own) for worker, own in workers.items()]
-    return Timeline(run=run_directory, rows=tuple(sorted(rows, key=_place)))
+    return tuple(sorted(rows, key=_place))
 
 
 def read_parts(folder: Path) -> list[Part]:
@@ -219,7 +228,7 @@ class TimelineConfig(Section):
 def show_timelines(config: TimelineConfig) -> dict[str, Any]:
     """Writes the ``picture``; of the ``runs``, what is drawn, when each trained and its roles' shares."""
     picture = None if config.output is None else expanded(config.output, "output")
-    timelines = [read_timeline(Path(name).expanduser()) for name in config.runs]
+    timelines = [read_timeline(expanded(name, "runs")) for name in config.runs]
     if picture is None:
         picture = timelines[0].run / PICTURE if len(timelines) == 1 else Path(PICTURE)
     if picture.suffix != ".png":
