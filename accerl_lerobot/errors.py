@@ -93,7 +93,7 @@ def reading(field: str, value: str, files: str) -> Iterator[None]:
     except InputError:
         raise
     except (ArithmeticError, AttributeError, LookupError, OSError, TypeError, ValueError) as error:
-        logging.getLogger(__name__).debug("reading %s of %s failed", files, value, exc_info=error)
+        logger.debug("reading %s of %s failed", files, value, exc_info=error)
         why = f"{files} is not as a run writes it ({in_one_line(error)[:LONGEST]}); restore it, or begin anew"
         raise InputError(field, value, why) from error
 
