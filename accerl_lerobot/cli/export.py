@@ -92,6 +92,8 @@ def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
 def _write(config: ExportConfig, chosen: list[list[Done]], root: Path, console: Console) -> dict[str, int]:
     with closing(make_world(config.env)) as world:
         spec = world.spec
+    if others := {parts[0].origin.task for parts in chosen} - {*spec.tasks}:
+        raise InputError("env.task", sorted(others)[0], f"{EPISODES} has this task, and env has {spec.tasks}")
     record.check_instruction(spec, config.env)
     tally = {"episodes": 0, "frames": 0, "successes": 0, "left_out": 0}
     version = {VERSION: {"dtype": "int64", "shape": (1,), "names": None}}

@@ -21,7 +21,7 @@ from accerl_lerobot.config.ranges import Steps, check
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import RunConfig, decode, encode
 from accerl_lerobot.engine.stopping import WorkerError, pause_s
-from accerl_lerobot.errors import InputError, is_full, make_folder
+from accerl_lerobot.errors import InputError, is_full, make_folder, reading
 from accerl_lerobot.metrics import METRICS
 from accerl_lerobot.replay.journal import EPISODES
 
@@ -34,6 +34,15 @@ CHANGEABLE = (
 """Fields and sections that may change when a run is resumed: what is learned, and from what, stays."""
 WARM_START = "warm_start.json"
 """File with the path of the policy that came of a run's own demonstrations and SFT."""
+
+
+def warm_started(directory: Path) -> Path | None:
+    """The policy that came of a run's own demonstrations and SFT; None: there is none yet."""
+    note = directory / WARM_START
+    if not note.is_file():
+        return None
+    with reading("config_path", str(directory), WARM_START):
+        return directory / str(json.loads(note.read_text())["policy"])
 
 
 def resume_command(directory: Path, config: RunConfig) -> str:
@@ -128,9 +137,9 @@ def continued(config: RunConfig, directory: Path, checkpoint: Path) -> RunConfig
     if config.policy.tuning.mode != "lora":
         return improving(config, checkpoint / layout.PRETRAINED)
     # A checkpoint has low-rank adapters merged; apart from what they adapt they are in the training state.
-    path, note = config.policy.path, directory / WARM_START
-    if path is None and note.is_file():
-        path = str(directory / json.loads(note.read_text())["policy"])
+    path = config.policy.path
+    if path is None and (warm := warm_started(directory)) is not None:
+        path = str(warm)
     # A folder of this machine has to be there; a Hub id is taken at its word.
     on_the_hub = path and not path.startswith((".", "/", "~", f"{layout.AWAY}/")) and path.count("/") <= 1
     if path is None or not (on_the_hub or Path(path).expanduser().is_dir()):

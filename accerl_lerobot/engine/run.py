@@ -196,8 +196,8 @@ def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfi
     note = directory / resuming.WARM_START
     if config.policy.path is not None:
         return config
-    if note.is_file():
-        return resuming.improving(config, directory / json.loads(note.read_text())["policy"])
+    if (warm := resuming.warm_started(directory)) is not None:
+        return resuming.improving(config, warm)
     for name in (f"{layout.DEMOS}.partial", "sft"):
         shutil.rmtree(directory / name, ignore_errors=True)
     dataset = config.dataset

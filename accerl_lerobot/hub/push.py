@@ -20,7 +20,7 @@ from huggingface_hub.errors import RepositoryNotFoundError
 
 from accerl_lerobot.checkpoint import layout
 from accerl_lerobot.checkpoint.safety import Origin, matching_files
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.errors import InputError, reading
 from accerl_lerobot.hub import card
 from accerl_lerobot.hub.errors import LOGIN, check_commit, hub_errors
 
@@ -49,7 +49,8 @@ def push(config: card.PushConfig) -> dict[str, Any]:
     """
     folder, repo_id = Path(config.path).expanduser(), config.repo_id
     artifact = card.recognise(folder)
-    files, own_card = stage(config, folder, artifact)
+    with reading("path", config.path, "a file of it, or of its run,"):
+        files, own_card = stage(config, folder, artifact)
     if get_token() is None:
         raise InputError("repo_id", repo_id, f"pushing needs a token; {LOGIN} that may write")
     with hub_errors(repo_id, BRANCH, writing=True):

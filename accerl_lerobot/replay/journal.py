@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.errors import InputError, reading
 from accerl_lerobot.experience import Origin, Segment
 from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.metrics import cut_back
@@ -81,18 +81,20 @@ def read_journal(path: Path) -> Iterator[Done]:
     with path.open("rb") as file:
         for number, line in enumerate(file, start=1):
             if line.endswith(b"\n"):
-                try:
-                    yield _done(json.loads(line))
-                except (ValueError, KeyError, TypeError, AttributeError) as error:
-                    said = " ".join(str(error).split())[:80]
-                    raise InputError("path", str(path), f"line {number} is broken ({said})") from error
+                with reading("path", str(path), f"line {number}"):
+                    done = _done(json.loads(line))
+                yield done
 
 
 def _done(line: dict[str, Any]) -> Done:
     actions = np.frombuffer(base64.b64decode(line["actions"], validate=True), "<f4")
     actions = actions.reshape(-1, int(line["action_dim"]))
     steps = tuple(int(n) for n in line["steps"])
-    if sum(steps) != len(actions) or not len(steps) == len(line["versions"]) == len(line["rewards"]):
+    if (
+        min(steps) < 1
+        or sum(steps) != len(actions)
+        or not len(steps) == len(line["versions"]) == len(line["rewards"])
+    ):
         raise ValueError("its parts are of different lengths")
     return Done(
         key=str(line["key"]),

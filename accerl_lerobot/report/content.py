@@ -385,8 +385,7 @@ def _tiles(run: Run, bound: int | None) -> list[tuple[str, str, str]]:
         *tiles,
         ("wall time", duration(run.wall_s), spent),
         ("updates", updates, f"of {run.section('trainer').get('updates')}"),
-        ("algorithm", str(run.section("algorithm").get("type")), ""),
-        ("seed", str(run.config.get("seed")), ""),
+        ("algorithm", str(run.section("algorithm").get("type")), f"seed {run.config.get('seed')}"),
     ]
 
 
@@ -397,8 +396,9 @@ def _run_table(runs: Mapping[str, Run], now: float) -> Table:
         ends = [*(before[:1] or [{}]), *(run.outcomes[-1:] or [{}])]
         success = (rate(e.get("success"), e.get("ci95")) for e in ends)
         tiles = {key: value for key, value, _ in _tiles(run, None)}
-        numbers = (tiles.get(key, ABSENT) for key in ("algorithm", "seed", "env steps", "lag", "wall time"))
-        rows.append((name, *success, *numbers, status(run, now)))
+        numbers = (tiles.get(key, ABSENT) for key in ("env steps", "lag", "wall time"))
+        kind = tiles["algorithm"], str(run.config.get("seed"))
+        rows.append((name, *success, *kind, *numbers, status(run, now)))
     columns = ("run", "before", "newest", "algorithm", "seed", "env steps", "mean lag", "wall time", "")
     return "Success before training and in the newest evaluation, with 95 % Wilson intervals", columns, rows
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -99,10 +100,10 @@ def test_a_torn_last_line_is_left_out_and_a_broken_one_is_named(tmp_path: Path):
     line = json.loads(whole.splitlines()[0])
     for change in (
         {"actions": "####"}, {"action_dim": 0}, {"steps": [1]}, {"versions": []}, {"seed": None},
-        {"rewards": 3},
+        {"rewards": 3}, {"seed": math.inf}, {"decision": math.nan},
     ):  # fmt: skip
         path.write_bytes(json.dumps(line | change).encode() + b"\n" + whole)
-        with pytest.raises(InputError, match="line 1 is broken"):
+        with pytest.raises(InputError, match="line 1 is not as a run writes it"):
             list(read_journal(path))
     with pytest.raises(InputError, match=r"no episodes.jsonl there; name the folder of an accerl train run"):
         list(read_journal(tmp_path / "nowhere" / "episodes.jsonl"))
