@@ -13,7 +13,8 @@ from lerobot.datasets.dataset_tools import add_features, delete_episodes, remove
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from accerl_lerobot.cli import main
-from accerl_lerobot.demos.episodes import frames_of
+from accerl_lerobot.config.ranges import DatasetConfig
+from accerl_lerobot.demos.episodes import read_labels
 from accerl_lerobot.demos.record import DemosConfig, record_demos
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.metrics import METRICS
@@ -94,7 +95,7 @@ def test_episodes_without_labels_are_refused(tiny_checkpoint, recorded, tmp_path
     remove_feature(data, ["next.success", "next.reward"], output_dir=tmp_path / "bare", repo_id="me/robot")
     assert main(arguments(tiny_checkpoint, tmp_path / "bare", tmp_path / "out")) == 2
     assert "labelled neither by next.success nor next.reward" in capsys.readouterr().err
-    won = [i for i in range(8) if any(bool(frame["next.success"]) for frame in frames_of(data, i))]
+    won = [e.index for e in read_labels(data, DatasetConfig()) if e.success]
     delete_episodes(data, won, output_dir=tmp_path / "lost", repo_id="me/robot")
     assert main(arguments(tiny_checkpoint, tmp_path / "lost", tmp_path / "out")) == 2
     assert "none of its episodes is a success" in capsys.readouterr().err

@@ -7,7 +7,7 @@ says when an episode counts as a success.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -128,12 +128,16 @@ def check_images(data: Any, shapes: Mapping[str, tuple[int, ...]], dataset: Data
             raise origin_of(dataset).refuse(name, remedy)
 
 
-def frames_of(data: Any, labels: EpisodeLabels) -> Iterator[dict[str, Any]]:
-    """LeRobot's items of an episode, one per env step."""
-    return (data[int(row)] for row in labels.rows)
+def observations(
+    data: Any, rows: np.ndarray, vectors: dict[str, np.ndarray], cameras: Collection[str]
+) -> dict[str, np.ndarray]:
+    """What some rows hold: those of `vectors`, columns of the dataset, and images uint8 (T, h, w, 3)."""
+    found = {name: values[rows] for name, values in vectors.items()}
+    frames = [data[int(row)] for row in rows] if cameras else []
+    return found | {camera: np.stack([_pixels(frame[camera]) for frame in frames]) for camera in cameras}
 
 
-def pixels_of(image: Any) -> np.ndarray:
+def _pixels(image: Any) -> np.ndarray:
     """uint8 (h, w, 3) from LeRobot's float (3, h, w) in [0, 1]."""
     pixels: np.ndarray = (image * 255).round().clamp(0, 255).byte().permute(1, 2, 0).numpy()
     return pixels

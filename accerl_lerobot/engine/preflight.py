@@ -250,7 +250,7 @@ def check_training_data(
     else:
         reader, renames = ("sft.policy.input_features", list(policy.input_features or ())), {}
         needs = _new_policy_features(policy, source, about)
-    if offered is not None and (sft.init_path is not None or data is not None):
+    if offered is not None and (sft.init_path is not None or data is not None or policy.input_features):
         at = about if sft.init_path is None else reader
         hint = _inputs_hint(data, offered.shapes) if data is not None and sft.init_path is None else ""
         check_features(needs, offered, rename_map, *at, hint=hint)
@@ -318,7 +318,14 @@ def _check_values(
 
     about = "dataset.repo_id", dataset.repo_id
     originals = {new: name for name, new in renames.items()}
-    episodes = _extra_argument(sft, "dataset.episodes", []) or picked(dataset, sft.pick)
+    episodes = _extra_argument(sft, "dataset.episodes", [])
+    if episodes and sft.pick != "all":
+        remedy = "--dataset.episodes in sft.extra_args names the episodes already; use sft.pick=all"
+        raise InputError("sft.pick", sft.pick, remedy)
+    if missing := [index for index in episodes if index not in range(meta.total_episodes)]:
+        remedy = f"--dataset.episodes: no episode {missing[0]}; the dataset has {meta.total_episodes} from 0"
+        raise InputError("sft.extra_args", sft.extra_args, remedy)
+    episodes = episodes or picked(dataset, sft.pick)
     read = {originals.get(name, name) for name in needs.shapes}
     shapes = {name: shape for name, shape in dataset_features(meta).shapes.items() if name in read}
     images = {name: shape for name, shape in shapes.items() if len(shape) == 3}

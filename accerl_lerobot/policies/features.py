@@ -174,6 +174,10 @@ def _check_tasks(needed: tuple[str, ...], offered: tuple[str, ...], field: str, 
     known = {_plain(text): text for text in needed}
     has = ", ".join(map(repr, needed[:4])) + (" …" if len(needed) > 4 else "")
     missing = [text for text in offered if _plain(text) not in known]
+    if needed and missing and not any(needed):
+        why = f"its episodes have no instruction, and the environment's is {missing[0]!r}"
+        tool = f"lerobot-edit-dataset --operation.type=modify_tasks --operation.new_task={missing[0]!r}"
+        raise InputError(field, value, f"{why}; set it with {tool}, --repo_id and --root")
     if known and missing:
         message = f"no episode of {', '.join(map(repr, missing[:4]))}, the environment's task: it has {has}"
         if len(missing) == len(offered):

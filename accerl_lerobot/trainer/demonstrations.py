@@ -13,7 +13,7 @@ import numpy as np
 
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos.dataset_files import open_metadata, opened
-from accerl_lerobot.demos.episodes import check_images, numbers, pixels_of, read_labels
+from accerl_lerobot.demos.episodes import check_images, numbers, observations, read_labels
 from accerl_lerobot.experience import Origin, Segment
 from accerl_lerobot.policies.config import Load, PolicyConfig
 from accerl_lerobot.policies.features import dataset_shapes
@@ -80,10 +80,14 @@ def recorded(
     share = min(1.0, most * chunk / meta.total_frames)
     episodes = range(math.ceil(share * meta.total_episodes))
     with opened(dataset, meta, episodes) as data:
-        plain = [name for name, shape in wanted.items() if len(shape) < 3]
-        vectors = {name: numbers(data, name, dataset).astype(np.float32) for name in plain}
         shapes = dataset_shapes(meta)
-        check_images(data, {name: shapes[name] for name in wanted.keys() - vectors.keys()}, dataset)
+        images = {name: shapes[name] for name, shape in wanted.items() if len(shape) > 2}
+        check_images(data, images, dataset)
+        vectors = {
+            name: numbers(data, name, dataset).astype(np.float32).reshape(-1, *shape)
+            for name, shape in wanted.items()
+            if name not in images
+        }
         for episode in read_labels(data, dataset):
             success = episode.success or episode.success_at is None
             end = len(episode.rows)
@@ -92,7 +96,7 @@ def recorded(
             only_success = np.zeros(end, np.float32)
             only_success[-1] = success
             rewards = only_success if episode.rewards is None else episode.rewards[:end]
-            columns = _observations(data, episode.rows[:end], wanted, vectors)
+            columns = observations(data, episode.rows[:end], vectors, images)
             actions = columns.pop("action")
             for phase in range(min(phases, end)):
                 starts = np.arange(phase, end, chunk)
@@ -111,13 +115,3 @@ def recorded(
                     key="demonstration",
                     origin=Origin(task="", seed=episode.index, decision=0),
                 )
-
-
-def _observations(
-    data: Any, rows: np.ndarray, wanted: dict[str, tuple[int, ...]], vectors: dict[str, np.ndarray]
-) -> dict[str, np.ndarray]:
-    """Observations and actions, each (T, ...), of some rows; frames are decoded if images are wanted."""
-    found = {name: columns[rows].reshape(-1, *wanted[name]) for name, columns in vectors.items()}
-    cameras = wanted.keys() - vectors.keys()
-    frames = [data[int(row)] for row in rows] if cameras else []
-    return found | {camera: np.stack([pixels_of(frame[camera]) for frame in frames]) for camera in cameras}

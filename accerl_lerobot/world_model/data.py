@@ -22,7 +22,7 @@ import numpy as np
 
 from accerl_lerobot.checkpoint.snapshot import kind
 from accerl_lerobot.demos.dataset_files import open_metadata, opened
-from accerl_lerobot.demos.episodes import EpisodeLabels, frames_of, pixels_of, read_labels
+from accerl_lerobot.demos.episodes import EpisodeLabels, numbers, observations, read_labels
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import REWARD, SUCCESS
 
@@ -261,8 +261,10 @@ def load_datasets(sections: dict[str, DatasetConfig], spec: WorldModelSpec) -> d
     for section, meta in open_datasets(sections, spec).items():
         dataset = sections[section]
         with name_section(section), opened(dataset, meta) as data:
-            labels = read_labels(data, dataset)
-            episodes = [_episode(data, episode, spec, section == ONLINE) for episode in labels]
+            names = ["action", "observation.state"] if spec.state_dim else ["action"]
+            vectors = {name: numbers(data, name, dataset) for name in names}
+            own = section == ONLINE
+            episodes = [_episode(data, one, vectors, spec, own) for one in read_labels(data, dataset)]
             once = {episode.key: episode for episode in episodes}
             if len(once) < len(episodes):
                 text = "%s: %d episodes are in it more than once, and are used once"
@@ -308,18 +310,17 @@ def check_metadata(meta: Any, name: str, spec: WorldModelSpec) -> None:
     raise InputError("dataset.repo_id", name, why)
 
 
-def _episode(data: Any, labels: EpisodeLabels, spec: WorldModelSpec, own: bool) -> Episode:
-    items = list(frames_of(data, labels))
+def _episode(
+    data: Any, labels: EpisodeLabels, vectors: dict[str, np.ndarray], spec: WorldModelSpec, own: bool
+) -> Episode:
     assert labels.success_at is not None  # `check_metadata` refuses a dataset without labels
-    arrays = {camera: np.stack([pixels_of(item[camera]) for item in items]) for camera in spec.cameras}
-    if spec.state_dim:
-        arrays["observation.state"] = np.stack([item["observation.state"].numpy() for item in items])
+    arrays = observations(data, labels.rows, vectors, spec.cameras)
     frames, state = model_arrays(arrays, spec)
     return Episode(
         frames=frames,
-        times=np.arange(len(items)),
+        times=np.arange(len(frames)),
         state=state.astype(np.float32),
-        actions=np.stack([item["action"].numpy() for item in items]).astype(np.float32),
+        actions=arrays["action"].astype(np.float32),
         success_at=labels.success_at,
         task=labels.tasks[0],
         own=own,
