@@ -131,7 +131,7 @@ def check_images(data: Any, shapes: Mapping[str, tuple[int, ...]], dataset: Data
 def observations(
     data: Any, rows: np.ndarray, vectors: dict[str, np.ndarray], cameras: Collection[str]
 ) -> dict[str, np.ndarray]:
-    """What some rows hold: those of `vectors`, columns of the dataset, and images uint8 (T, h, w, 3)."""
+    """Contents of some rows: of `vectors`, columns of the dataset, and images uint8 (T, h, w, 3)."""
     found = {name: values[rows] for name, values in vectors.items()}
     frames = [data[int(row)] for row in rows] if cameras else []
     return found | {camera: np.stack([_pixels(frame[camera]) for frame in frames]) for camera in cameras}
