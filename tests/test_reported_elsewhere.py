@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -10,15 +11,22 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+import pyarrow as pa
 import pytest
 from gymnasium import spaces
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from accerl_lerobot.cli import main
+from accerl_lerobot.config.ranges import DatasetConfig
+from accerl_lerobot.demos.dataset_files import open_metadata, opened
+from accerl_lerobot.demos.episodes import pixels_of
 from accerl_lerobot.engine.config import RunConfig, parse
 from accerl_lerobot.envs import GymConfig, make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.seeds import demo_seed, eval_seed, train_seed
-from tests.policies.checkpoints import edit_config
+from tests.policies.checkpoints import edit_config, write_smolvla
 from tests.policies.tiny import adapter_at, requests
+from tests.tiny_datasets import ACTION, FEATURES, FPS, FRONT, IMAGE, STATE, labels, rewrite, write_dataset
 
 
 class Arm(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
@@ -111,3 +119,78 @@ def test_the_device_in_the_checkpoint_is_replaced(changes: dict, tiny_checkpoint
     asked = requests(1, explore=False)
     chunks = [adapter_at(path).decide(asked, 0)[0].chunk for path in (tiny_checkpoint, copied)]
     np.testing.assert_array_equal(*chunks)
+
+
+def test_episodes_whose_borders_contradict_the_rows_are_refused(tmp_path: Path):
+    dataset = write_dataset(tmp_path / "data")
+
+    def move_border(table: pa.Table) -> pa.Table:
+        for name, values in (("dataset_to_index", [8, 12]), ("dataset_from_index", [0, 8])):
+            table = table.set_column(table.schema.get_field_index(name), name, pa.array(values))
+        return table
+
+    rewrite(tmp_path / "data/meta/episodes/chunk-000/file-000.parquet", move_border)
+    message = "data: row 6 is of episode 1, and meta/episodes says that it has rows 8 to 11; get"
+    with pytest.raises(InputError, match=message), opened(dataset, open_metadata(dataset)):
+        pass
+
+
+def write_videos(root: Path) -> DatasetConfig:
+    """Two episodes of six frames of one grey each, with a file of videos for each episode."""
+    data = LeRobotDataset.create(
+        "a/b",
+        fps=FPS,
+        root=root,
+        features=FEATURES | {FRONT: IMAGE | {"dtype": "video"}},
+        video_files_size_in_mb=0.0001,  # type: ignore[arg-type]
+    )
+    for episode in range(2):
+        for step in range(6):
+            grey = np.full((32, 32, 3), 100 * episode + 15 * step + 10, np.uint8)
+            numbers = {STATE: np.zeros(4, np.float32), ACTION: np.zeros(2, np.float32)}
+            data.add_frame({FRONT: grey, "task": "Match the target", **numbers})
+        data.save_episode()
+    data.finalize()
+    return DatasetConfig(repo_id="a/b", root=str(root))
+
+
+def test_videos_in_several_files_and_timestamps_off_the_rate(tmp_path: Path):
+    dataset = write_videos(tmp_path / "data")
+    assert len(list((tmp_path / "data/videos").rglob("*.mp4"))) == 2
+    with opened(dataset, open_metadata(dataset)) as data:
+        greys = [float(pixels_of(data[row][FRONT]).mean()) for row in range(12)]
+    np.testing.assert_allclose(greys, [100 * (row // 6) + 15 * (row % 6) + 10 for row in range(12)], atol=6)
+
+    def delay(table: pa.Table) -> pa.Table:
+        stamps = table.column("timestamp").to_numpy().copy()
+        stamps[2] += 1 / FPS  # where the video has a frame, another one
+        column = table.schema.get_field_index("timestamp")
+        return table.set_column(column, "timestamp", pa.array(stamps))
+
+    rewrite(tmp_path / "data/data/chunk-000/file-000.parquet", delay)
+    message = "frame 2 of episode 0 has the timestamp 0.0375, and at 80 Hz it is 0.0250; set timestamps to"
+    with pytest.raises(InputError, match=message), opened(dataset, open_metadata(dataset)):
+        pass
+
+
+@pytest.mark.parametrize("size", [1, 2], ids=["one joint", "one of two joints never moves"])
+def test_a_policy_learns_from(size: int, tiny_checkpoint: Path, tmp_path: Path):
+    checkpoint = tiny_checkpoint
+    if size == 1:
+        checkpoint = write_smolvla(tmp_path / "policy", state_dim=1, action_dim=1, padded_dim=1)
+    shapes = {STATE: (1 if size == 1 else 4,), ACTION: (size,)}
+    more = {name: {"dtype": "float32", "shape": shape, "names": None} for name, shape in shapes.items()}
+
+    def value(name: str, episode: int, step: int) -> Any:
+        still = np.array([0.1 * step - 0.3, 0.25]) if name == ACTION and size == 2 else None
+        return [step == 5] if name == "next.success" else still
+
+    write_dataset(tmp_path / "data", more=more | {FRONT: IMAGE, "next.success": labels()}, values=value)
+    arguments = {
+        "policy.path": checkpoint, "policy.device": "cpu", "dataset.repo_id": "a/b",
+        "dataset.root": tmp_path / "data", "output_dir": tmp_path / "out", "trainer.updates": 1,
+        "trainer.value_warmup_updates": 0, "algorithm.type": "self_imitation",
+    }  # fmt: skip
+    assert main(["offline", *(f"--{name}={given}" for name, given in arguments.items())]) == 0
+    loss = json.loads((tmp_path / "out/summary.json").read_text())["imitation_loss"]
+    assert 0 < loss["after"]["successes"] < loss["before"]["successes"] < 10

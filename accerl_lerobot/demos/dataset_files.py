@@ -307,20 +307,41 @@ def check_rows(rows: Any, meta: Any, origin: Origin, every: bool, whole: bool) -
     frames = meta.total_frames
     if len(rows) > frames or (whole and every and len(rows) < frames):
         raise origin.refuse(DATA, f"{len(rows)} rows, and {INFO} says {frames} frames; {AGAIN}")
-    below = {
+    most = {
         "index": frames,
         "frame_index": frames,
         "task_index": len(meta.tasks),
         "episode_index": len(meta.episodes),
     }
-    for name, most in below.items():
-        values = np.asarray(rows.with_format("numpy", columns=[name])[:][name])
-        if values.dtype.kind not in "iuf" or not np.isfinite(values).all():
-            raise origin.refuse(DATA, f"{name} has a number that is not finite; record it again")
-        if len(wrong := values[(values < 0) | (values >= most)]):
-            raise origin.refuse(DATA, f"{name}={wrong[0]}, and there are {most}; {AGAIN}")
-        if name == "index" and len(values) == frames and (np.diff(values) != 1).any():
-            raise origin.refuse(DATA, "its rows are not in the order of their index; sort its files by it")
+    columns = {name: _finite(rows, name, origin) for name in (*most, *["timestamp"] * bool(meta.video_keys))}
+    for name, limit in most.items():
+        if len(wrong := columns[name][(columns[name] < 0) | (columns[name] >= limit)]):
+            raise origin.refuse(DATA, f"{name}={wrong[0]}, and there are {limit}; {AGAIN}")
+    index, episode, step = (columns[name] for name in ("index", "episode_index", "frame_index"))
+    if len(index) == frames and (np.diff(index) != 1).any():
+        raise origin.refuse(DATA, "its rows are not in the order of their index; sort its files by it")
+    first, last = (np.asarray(meta.episodes[f"dataset_{end}_index"])[episode] for end in ("from", "to"))
+    if len(wrong := np.flatnonzero((index < first) | (index >= last))):
+        row = wrong[0]
+        span = f"{EPISODES} says that it has rows {first[row]} to {last[row] - 1}"
+        raise origin.refuse(DATA, f"row {index[row]} is of episode {episode[row]}, and {span}; {AGAIN}")
+    if not meta.video_keys:
+        return
+    # LeRobot looks up a video's frame by its timestamp, within 1e-4 s.
+    stamps, regular = columns["timestamp"], step / meta.fps
+    if len(wrong := np.flatnonzero(~np.isclose(stamps, regular, rtol=1e-6, atol=1e-4))):
+        row = wrong[0]
+        where = f"frame {step[row]} of episode {episode[row]} has the timestamp {stamps[row]:.4f}"
+        hint = f"at {meta.fps} Hz it is {regular[row]:.4f}; set timestamps to frame_index / fps"
+        raise origin.refuse(DATA, f"{where}, and {hint}")
+
+
+def _finite(rows: Any, name: str, origin: Origin) -> np.ndarray:
+    """A column of numbers, one for each row."""
+    values = np.asarray(rows.with_format("numpy", columns=[name])[:][name])
+    if values.dtype.kind not in "iuf" or not np.isfinite(values).all():
+        raise origin.refuse(DATA, f"{name} has a number that is not finite; record it again")
+    return values.reshape(-1)
 
 
 def _files(root: Path, folder: str, origin: Origin) -> list[Path]:
