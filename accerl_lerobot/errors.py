@@ -149,6 +149,7 @@ def for_viewing(what: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:
+        logger.debug("no %s", what, exc_info=error)
         warn_once(f"there is no {what} ({one_line(error)})")
 
 

@@ -99,6 +99,20 @@ def test_wandb_only_when_enabled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert resumed["id"] == started["id"] and resumed["resume"] == "allow", "one run, gone on with"
 
 
+def test_a_tracker_that_fails_ends_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    fails = MagicMock(side_effect=ConnectionError("the server is away"))
+    client = SimpleNamespace(init=lambda **_: SimpleNamespace(log=fails, finish=fails))
+    monkeypatch.setitem(sys.modules, "wandb", client)
+    log = MetricsLog(tmp_path, WandBConfig(enable=True), {})
+    log.write("train", 1, {"loss": 1.0})
+    log.write("train", 2, {"loss": 0.5})
+    log.close()
+    assert [line["loss"] for line in lines(tmp_path)] == [1.0, 0.5] and fails.call_count == 3
+    assert [m for m in caplog.messages if "the server is away" in m] == caplog.messages[:1]
+
+
 def explained(section: str) -> set[str]:
     """Names in the first column of a table of docs/metrics.md."""
     text = (ROOT / "docs" / "metrics.md").read_text()

@@ -69,17 +69,23 @@ def test_the_summary_has_what_is_promised(finished: Finished):
     assert summary["wall_s"] >= summary["rl_s"] > 0 and summary["restarts"] == 0
 
 
-def test_the_evaluation_before_can_be_left_out(tiny_checkpoint: Path, tmp_path: Path):
+def test_the_evaluation_before_can_be_left_out_and_a_run_without_success_says_so_early(
+    tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    monkeypatch.setattr(loop, "HOPELESS", 4)
     config = local_run(
         tiny_checkpoint,
         tmp_path / "run",
-        env=SimulatedConfig(max_steps=12, tolerance=0.4, task="match,mirror"),
+        env=SimulatedConfig(max_steps=12, tolerance=1e-6, task="match,mirror"),
         evaluation=EvaluationConfig(episodes=4, before=False, videos=0),
     )
     directory = run.make_output_dir(config)
     summary = run.execute(config, directory, Console())
     assert [r["group"] for r in records(directory, "evaluation")] == ["after"]
     assert summary["success_before"] is summary["ci95_before"] is None and summary["n_after"] == 4
+    (told,) = [m for m in caplog.messages if "exploring episodes succeeded" in m]
+    count = int(told.removeprefix("none of ").split()[0])
+    assert 4 <= count < summary["episodes_explored"] and "see env.success" in told
     assert {"success_curve.png", "success_by_task.png"} <= {path.name for path in directory.iterdir()}
     assert not (directory / "before_after.mp4").exists()
 

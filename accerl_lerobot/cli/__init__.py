@@ -106,6 +106,7 @@ def exit_code(program: str, work: Callable[[], int]) -> int:
         code = work()
         sys.stdout.flush()
     except InputError as error:
+        logging.getLogger(__name__).debug("%s refuses", program, exc_info=error)
         # Ray raises a subclass whose text is a whole traceback; the error itself is inside.
         return _refuse(program, str(getattr(error, "cause", error)))
     except KeyboardInterrupt as stop:

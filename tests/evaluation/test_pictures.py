@@ -119,6 +119,19 @@ def test_captions_of_unequal_length_are_of_one_height(tmp_path: Path, side: int)
     assert read(tmp_path / "film.mp4").shape[1] > 4 * side
 
 
+def test_what_cannot_be_drawn_is_left_out_with_a_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    nowhere = tmp_path / "missing"
+    success_curve(nowhere / "curve.png", [evaluated(0, 1, 2)], [])
+    success_by_task(nowhere / "tasks.png", {"after": {"t": [1.0]}})
+    write_video(nowhere / "film.mp4", [[clip(1, (0, 0, 0))]], fps=4)
+    odd = [result(0, True, [np.zeros((2, 3), np.uint8)])]
+    before_after(tmp_path / "both.mp4", (odd, None), (odd, None), fps=4)
+    starts = ("success_curve.png", "success_by_task.png", "film (", "film before and after")
+    assert all(m.startswith(f"there is no {s}") for m, s in zip(caplog.messages, starts, strict=True))
+
+
 def test_without_frames_there_is_no_video(tmp_path: Path) -> None:
     before_after(tmp_path / "film.mp4", ([], None), ([], None), fps=4)
     assert list(tmp_path.iterdir()) == []
