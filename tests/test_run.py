@@ -12,7 +12,7 @@ import pytest
 
 from accerl_lerobot.checkpoint.layout import saved_version
 from accerl_lerobot.console import Console
-from accerl_lerobot.engine import resuming, run
+from accerl_lerobot.engine import loop, resuming, run
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig
 from accerl_lerobot.engine.loop import Engine, Progress, Saved
 from accerl_lerobot.engine.preflight import check_start

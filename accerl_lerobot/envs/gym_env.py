@@ -69,6 +69,7 @@ class GymnasiumWorld(EpisodeWorld):
         self.max_steps = self.config.max_steps or episode_limit(next(iter(environments.values())))
         self.environments = {task: unlimited(env) for task, env in environments.items()}
         self.pictures: dict[str, np.ndarray] = {}  # images of the last observation, by camera
+        self._info_keys: set[str] = set()  # seen so far: some environments have a key only when it is true
         self._task = next(iter(environments))
         self._begin(0, self._task)
         self.spec = self._look(self._observe())
@@ -84,7 +85,6 @@ class GymnasiumWorld(EpisodeWorld):
 
     def _begin(self, seed: int, task: str) -> None:
         self._raw, _ = self._returned(task, "reset", seed=seed)
-        self._info_keys: set[str] = set()
 
     def _step(self, action: np.ndarray) -> Step:
         key, chosen = self.config.success, self._processed(action)

@@ -239,7 +239,7 @@ def write_video(path: Path, rows: Sequence[Sequence[Sequence[np.ndarray]]], fps:
             writer.append_data(picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2])
 
 
-@for_viewing("film before and after training")
+@for_viewing("film")
 def before_after(
     path: Path,
     before: tuple[Sequence[EpisodeResult], dict[str, Any] | None],

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from accerl_lerobot.envs import GymConfig, LeRobotEnvConfig, MetaWorldConfig, make_world
+from accerl_lerobot.envs.base import lerobot_eval_arguments
 from accerl_lerobot.envs.lerobot_env import LeRobotWorld
 from accerl_lerobot.errors import InputError
 from tests.hub_cache import cached_repo
@@ -61,6 +62,14 @@ def test_lerobots_limit_is_the_default(pusht: LeRobotWorld):
     assert result.truncated and result.steps == 9
     assert "env.success='succeed': the environment's info has no such key" in result.note
     assert "is_success" in result.note
+
+
+def test_the_command_for_stock_lerobot_has_the_limit_and_needs_its_key():
+    env = {"type": "lerobot", "name": "pusht", "kwargs": {"obs_type": "pixels"}, "max_steps": 9}
+    assert {"--env.type=pusht", "--env.obs_type=pixels", "--env.episode_length=9"} < {
+        *lerobot_eval_arguments(env)
+    }
+    assert lerobot_eval_arguments(env | {"success": "succeed"}) == []
 
 
 def test_images_are_what_the_environment_drew(pusht: LeRobotWorld):

@@ -128,7 +128,7 @@ def test_what_cannot_be_drawn_is_left_out_with_a_warning(
     write_video(nowhere / "film.mp4", [[clip(1, (0, 0, 0))]], fps=4)
     odd = [result(0, True, [np.zeros((2, 3), np.uint8)])]
     before_after(tmp_path / "both.mp4", (odd, None), (odd, None), fps=4)
-    starts = ("success_curve.png", "success_by_task.png", "film (", "film before and after")
+    starts = ("success_curve.png", "success_by_task.png", "film (", "film (")
     assert all(m.startswith(f"there is no {s}") for m, s in zip(caplog.messages, starts, strict=True))
 
 
