@@ -30,7 +30,7 @@ RETURNS = {
     "reset": ("observation", "info"),
     "step": ("observation", "reward", "terminated", "truncated", "info"),
 }
-"""What Gymnasium's methods return; those of the older gym returned less."""
+"""Values that Gymnasium's methods return; those of the older gym returned fewer."""
 
 
 @dataclass(frozen=True, kw_only=True)
