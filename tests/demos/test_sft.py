@@ -152,10 +152,11 @@ class TestPick:
     def test_none_of_a_kind_or_no_labels_at_all_are_refused(self, dataset: DatasetConfig, tmp_path: Path):
         data = LeRobotDataset("a/b", root=dataset.root)
         delete_episodes(data, [0, 2], output_dir=tmp_path / "lost", repo_id="a/b")
-        remove_feature(data, ["next.success"], output_dir=tmp_path / "bare", repo_id="a/b")
+        labels = ["next.success", "next.reward"]
+        remove_feature(data, labels, output_dir=tmp_path / "bare", repo_id="a/b")
         with pytest.raises(InputError, match=r"^sft\.pick='successes': none of .* 2 episodes; use all"):
             picked(replace(dataset, root=str(tmp_path / "lost")), "successes")
-        with pytest.raises(InputError, match=r"^sft\.pick='failures': .*not labelled by next\.success"):
+        with pytest.raises(InputError, match=r"^sft\.pick='failures': .*not labelled by next\.success or"):
             picked(replace(dataset, root=str(tmp_path / "bare")), "failures")
 
 
