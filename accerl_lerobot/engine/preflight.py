@@ -16,7 +16,7 @@ import os
 import time
 from collections.abc import Callable, Collection
 from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import draccus
 import numpy as np
@@ -24,7 +24,6 @@ import yaml
 
 from accerl_lerobot.algorithms import LossInputs, OffPolicyConfig, RatioConfig
 from accerl_lerobot.checkpoint.safety import brief
-from accerl_lerobot.config.ranges import Range, check
 from accerl_lerobot.engine.sizes import check_disk, check_memory
 from accerl_lerobot.envs import (
     EnvConfig,
@@ -67,9 +66,6 @@ MEANINGS = {
     "dataset.episodes": "a list of numbers such as [0, 1]",
 }
 """Arguments of ``lerobot-train`` that are looked at here → their values, in words."""
-SIZES = ("chunk_size", "n_action_steps", "num_steps", "max_state_dim", "max_action_dim")
-"""Fields of policy configs that are at least 1; LeRobot itself checks the others."""
-
 
 SLOW_S = 30.0  # an environment that takes longer to reset, such as a robot, is reset only once to be checked
 VISIBLE = 25  # levels of a pixel that rendering alone does not change
@@ -416,7 +412,7 @@ def policy_to_be(config: RunConfig) -> Any:
     if config.sft.init_path is not None:  # fine-tuning changes its weights alone
         start = replace(config.policy, path=config.sft.init_path, revision=None)
         try:
-            return rehearsed_config(start)
+            return rehearsed_config(start, fine_tuned=True)
         except InputError as error:
             if error.field not in ("policy.path", "policy.type", "policy.n_obs_steps"):
                 raise
@@ -434,6 +430,7 @@ def check_sft_policy(config: SFTConfig) -> Any:
     from lerobot.configs.policies import PreTrainedConfig
 
     from accerl_lerobot.demos.sft import policy_fields
+    from accerl_lerobot.policies.config import check_size
 
     fields: dict[str, Any] = {k: v for k, v in config.policy.items() if k != "type"}
     kind = config.policy["type"]
@@ -446,9 +443,7 @@ def check_sft_policy(config: SFTConfig) -> Any:
             near = " or ".join(difflib.get_close_matches(key, names, n=3))
             remedy = f"LeRobot's {kind} has no such field{f'; did you mean {near}?' if near else ''}"
             raise InputError(f"sft.policy.{key}", value, remedy)
-        if isinstance(value, int):
-            span = Range("[1, 10000]" if key in SIZES else "[-1, 1000000]")
-            check(Annotated[int, span], int(value), f"sft.policy.{key}")
+        check_size(key, value, f"sft.policy.{key}")
     try:
         # Without a device LeRobot looks for one.
         return draccus.decode(PreTrainedConfig.get_choice_class(kind), {"device": "cpu"} | fields)
@@ -466,14 +461,16 @@ def sft_policy(config: SFTConfig) -> Any:
     from lerobot.configs.policies import PreTrainedConfig
 
     from accerl_lerobot.checkpoint.safety import Origin, read_json
-    from accerl_lerobot.policies.config import register_policies
-    from accerl_lerobot.policies.untrusted import CONFIG, fetched_checkpoint
+    from accerl_lerobot.policies.config import check_sizes, register_policies
+    from accerl_lerobot.policies.untrusted import CONFIG, fetched_checkpoint, reason
 
     folder = fetched_checkpoint(config.init_path, None, "sft.init_path")
-    kind = read_json(folder / CONFIG, Origin("sft.init_path", config.init_path)).get("type")
-    register_policies(str(kind))
+    origin = Origin("sft.init_path", config.init_path)
+    register_policies(str(read_json(folder / CONFIG, origin).get("type")))
     try:
-        return PreTrainedConfig.from_pretrained(folder)
+        policy = PreTrainedConfig.from_pretrained(folder)
     except Exception as error:  # LeRobot takes the file at its word, and may fail over any of it
-        remedy = f"its config.json is not one of this LeRobot's policies ({brief(error)})"
+        remedy = f"its config.json is not one of this LeRobot's policies ({reason(error)})"
         raise InputError("sft.init_path", config.init_path, remedy) from error
+    check_sizes(policy, origin)
+    return policy

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import draccus
 
+from accerl_lerobot.checkpoint.safety import Origin
 from accerl_lerobot.config.parsing import imported
-from accerl_lerobot.config.ranges import Commit, Device, Range, Section, registered_name
+from accerl_lerobot.config.ranges import Commit, Device, Range, Section, check, registered_name
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE
 from accerl_lerobot.policies.deferred import import_policies
@@ -160,6 +161,11 @@ POLICIES: dict[str, tuple[str, tuple[str, ...]]] = {
 }
 """LeRobot policy type → its model, and the families that suit it, the default one first."""
 PLUGINS: dict[str, str] = {}  # policy type that is not LeRobot's own → package that registers it with LeRobot
+SIZES = (
+    "chunk_size", "n_action_steps", "n_obs_steps", "horizon", "num_steps", "num_inference_steps",
+    "max_state_dim", "max_action_dim", "num_train_timesteps", "max_decoding_steps", "tokenizer_max_length",
+)  # fmt: skip
+"""Numbers of LeRobot's policy configs by which is divided or which are shapes: at least 1."""
 USES_HISTORY = ("diffusion",)  # types that read observations of ``n_obs_steps`` env steps; others read one
 
 
@@ -221,6 +227,34 @@ def sampler_config(
     return config.sampler
 
 
+def check_size(name: str, value: Any, field: str) -> None:
+    """Refuses a whole number of a LeRobot policy config that no policy can be built or can act with."""
+    if isinstance(value, int):
+        span = Range("[1, 10000]" if name in SIZES else "[-1, 1000000]")
+        check(Annotated[int, span], int(value), field)
+
+
+def check_sizes(policy_config: Any, origin: Origin) -> None:
+    """`check_size` of a checkpoint's config, which must not execute more rows than it predicts."""
+    for name in SIZES:
+        value = getattr(policy_config, name, None)
+        try:
+            check_size(name, value, name)
+        except InputError as error:
+            raise origin.refuse(f"config.json: {name}={value}", error.remedy) from error
+    steps, rows = getattr(policy_config, "n_action_steps", None), predicted_rows(policy_config)
+    if steps is not None and rows is not None and steps > rows:
+        raise origin.refuse(f"config.json: n_action_steps={steps}", f"use 1 to {rows}, the chunk it predicts")
+
+
+def predicted_rows(policy_config: Any) -> int | None:
+    """Rows of a predicted chunk that can be executed; None where LeRobot's config does not tell."""
+    rows = getattr(policy_config, "chunk_size", None) or getattr(policy_config, "horizon", None)
+    if rows is not None and policy_config.type in USES_HISTORY:
+        rows -= policy_config.n_obs_steps - 1  # rows that stand for the past
+    return rows
+
+
 def override(policy_config: Any, config: PolicyConfig) -> None:
     """Puts a run's choices of denoising steps, executed rows and precision into LeRobot's policy config."""
     if hasattr(policy_config, "pretrained_backbone_weights"):
@@ -234,14 +268,13 @@ def override(policy_config: Any, config: PolicyConfig) -> None:
             remedy = f"a {policy_config.type} policy does not denoise; leave the field out"
             raise InputError("policy.num_steps", config.num_steps, remedy)
         setattr(policy_config, name, config.num_steps)
+    policy_config.use_peft = False  # an adapter is merged into the weights
     if hasattr(policy_config, "dtype"):
         policy_config.dtype = "float32"  # see `PolicyConfig.precision`
     if hasattr(policy_config, "compile_model"):
         policy_config.compile_model = False  # a compiled sampler rounds unlike the re-scoring pass
     if config.n_action_steps is not None:
-        chunk = int(getattr(policy_config, "chunk_size", 0) or getattr(policy_config, "horizon", 1))
-        if policy_config.type in USES_HISTORY:
-            chunk -= policy_config.n_obs_steps - 1  # rows that stand for the past
+        chunk = predicted_rows(policy_config) or 1
         if config.n_action_steps > chunk:
             remedy = f"use 1 to {chunk}, the chunk the policy predicts"
             raise InputError("policy.n_action_steps", config.n_action_steps, remedy)

@@ -23,7 +23,7 @@ from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 
 from accerl_lerobot.checkpoint.isolation import rehearse
-from accerl_lerobot.checkpoint.layout import BACKBONE, CONFIG_FOLDERS, PREPROCESSOR, STEP_FOLDERS
+from accerl_lerobot.checkpoint.layout import BACKBONE, CONFIG_FOLDERS, STEP_FOLDERS
 from accerl_lerobot.checkpoint.safety import Origin, brief, read_json, read_tensors, tensor_shapes
 from accerl_lerobot.config.parsing import discover, imported
 from accerl_lerobot.errors import InputError
@@ -36,13 +36,15 @@ from accerl_lerobot.policies.config import (
     Precision,
     SamplerConfig,
     check_observations,
+    check_sizes,
     override,
     register_policies,
     sampler_config,
 )  # fmt: skip
 from accerl_lerobot.policies.family import Model
-from accerl_lerobot.policies.features import STATE, pads, policy_features
+from accerl_lerobot.policies.peft_adapters import merged, weights_folder
 from accerl_lerobot.policies.saving import tune
+from accerl_lerobot.policies.statistics import check_statistics, correct_inputs, stored_steps
 
 logger = logging.getLogger(__name__)
 
@@ -86,12 +88,13 @@ def load_lerobot_config(config: PolicyConfig) -> Any:
     Raises:
         InputError: no checkpoint there, or a policy type without a likelihood here.
     """
-    folder = _checkpoint_folder(config)
+    folder, origin = _checkpoint_folder(config), Origin("policy.path", config.path)
     kind = _registered_type(config, folder)
     with _refusing(config, "its config.json is not one of this LeRobot's policies"):
         sampler_config(config, kind, prefix=f"{config.path} is of this type: ")
         lerobot_config = PreTrainedConfig.from_pretrained(folder)
-        _correct_inputs(lerobot_config, folder, Origin("policy.path", config.path))
+        correct_inputs(lerobot_config, folder, origin)
+    check_sizes(lerobot_config, origin)
     lerobot_config.device = str(resolve_device(config.device))
     override(lerobot_config, config)
     check_observations(lerobot_config, "policy.n_obs_steps")
@@ -99,14 +102,16 @@ def load_lerobot_config(config: PolicyConfig) -> Any:
     return lerobot_config
 
 
-def rehearsed_config(config: PolicyConfig) -> Any:
+def rehearsed_config(config: PolicyConfig, *, fine_tuned: bool = False) -> Any:
     """`load_lerobot_config` of a checkpoint that has passed `policy_sizes`."""
-    policy_sizes(config)
+    policy_sizes(config, fine_tuned=fine_tuned)
     return load_lerobot_config(config)
 
 
-def policy_sizes(config: PolicyConfig) -> Sizes:
+def policy_sizes(config: PolicyConfig, *, fine_tuned: bool = False) -> Sizes:
     """`Sizes` of a checkpoint's policy, which has been loaded and has acted once in a child process.
+
+    If it is to be `fine_tuned`, statistics that it lacks are no reason to refuse it.
 
     The child has limits of memory and time (`isolation`), and it does not read the weights. Networks of more
     than `ACTS_MOST` numbers are built and do not act.
@@ -117,18 +122,24 @@ def policy_sizes(config: PolicyConfig) -> Sizes:
     folder = _checkpoint_folder(config)
     _registered_type(config, folder)  # before the fork: it imports the policy's code
     files = [(str(path), path.stat()) for path in sorted(folder.rglob("*")) if path.is_file()]
-    key = repr((config, [(path, stat.st_size, stat.st_mtime_ns) for path, stat in files]))
+    key = repr((config, fine_tuned, [(path, stat.st_size, stat.st_mtime_ns) for path, stat in files]))
     if key not in _rehearsed:
-        _rehearsed[key] = Sizes(*rehearsed(replace(config, precision="fp32"), sizes_of))
+        single = replace(config, precision="fp32")
+        _rehearsed[key] = Sizes(*rehearsed(single, sizes_of, fine_tuned=fine_tuned))
     return _rehearsed[key]
 
 
-def rehearsed[T](config: PolicyConfig, task: Callable[[LeRobotAdapter], T]) -> T:
+def rehearsed[T](config: PolicyConfig, task: Callable[[LeRobotAdapter], T], *, fine_tuned: bool = False) -> T:
     """Result, which JSON can hold, of `task` with the policy of `policy_sizes`, in a child process."""
     precision = precision_on(resolve_device(config.device), config.precision)
     there = replace(config, device="cpu", precision=precision)
     origin = Origin("policy.path", config.path)
-    return rehearse(lambda: task(load_adapter(there, rehearsal=True)), _checkpoint_folder(config), origin)
+    folder = weights_folder(_checkpoint_folder(config), origin)  # its size sets the limits
+
+    def act() -> T:
+        return task(load_adapter(there, rehearsal=True, fine_tuned=fine_tuned))
+
+    return rehearse(act, folder, origin)
 
 
 def sizes_of(adapter: LeRobotAdapter) -> Sizes:
@@ -136,10 +147,13 @@ def sizes_of(adapter: LeRobotAdapter) -> Sizes:
     return Sizes(*(sum(parameter.numel() for parameter in parameters) for parameters in of))
 
 
-def load_adapter(config: PolicyConfig, *, rehearsal: bool = False) -> LeRobotAdapter:
+def load_adapter(
+    config: PolicyConfig, *, rehearsal: bool = False, fine_tuned: bool = False
+) -> LeRobotAdapter:
     """Loads policy, processors and critic; proves that the sampler is LeRobot's.
 
-    In a `rehearsal` the weights are not read, and a decision is made in place of that proof.
+    In a `rehearsal` the weights are not read, and a decision is made in place of that proof. `policy_sizes`
+    explains `fine_tuned`.
 
     Raises:
         InputError: see `load_lerobot_config` and `LeRobotAdapter.self_check`; or a file did not load.
@@ -154,7 +168,11 @@ def load_adapter(config: PolicyConfig, *, rehearsal: bool = False) -> LeRobotAda
         untrusted.Unfilled(),
     ):
         policy = _built(lerobot_config)
-    load_weights(policy, model_class, folder / untrusted.WEIGHTS, config.path, read=not rehearsal)
+    base = weights_folder(folder, origin)
+    load_weights(policy, model_class, base / untrusted.WEIGHTS, config.path, read=not rehearsal)
+    if base != folder:
+        with _refusing(config, "its adapter did not load"), untrusted.guarded("policy"):
+            policy = merged(policy, folder, origin)
     device = torch.device(lerobot_config.device)
     policy.to(device).eval()
     model = model_class(policy)
@@ -164,7 +182,7 @@ def load_adapter(config: PolicyConfig, *, rehearsal: bool = False) -> LeRobotAda
         # algorithms; what they round differently is divided by the std of the noise in every log-prob.
         torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = False
     overrides = {"device_processor": {"device": str(device)}}
-    untrusted.check_statistics(folder, origin)
+    check_statistics(lerobot_config, folder, origin, replaced=fine_tuned)
     hint = f"a tokeniser that cannot be had from the Hub goes into {BACKBONE}/ beside {untrusted.CONFIG}"
     with _refusing(config, f"its LeRobot processors did not load; {hint}"):
         overrides |= _tokenizer_overrides(lerobot_config, folder)
@@ -215,7 +233,7 @@ def _refusing(config: PolicyConfig, what: str) -> Iterator[None]:
     except Exception as error:
         if (ours := untrusted.input_error(error)) is not None:
             raise ours from error
-        raise InputError("policy.path", config.path, f"{what} ({brief(error)})") from error
+        raise InputError("policy.path", config.path, f"{what} ({untrusted.reason(error)})") from error
 
 
 def _checkpoint_folder(config: PolicyConfig) -> Path:
@@ -264,32 +282,6 @@ def _load_ours(adapter: LeRobotAdapter, folder: Path, origin: Origin) -> None:
             raise origin.refuse(untrusted.VALUE_HEAD, remedy) from error
 
 
-def _correct_inputs(lerobot_config: Any, folder: Path, origin: Origin) -> None:
-    """Gives a policy that pads the inputs that it was trained on, by the statistics that it normalises by.
-
-    LeRobot's fine-tuning leaves those of the policy that it started from in ``config.json``, whatever states
-    and cameras the dataset had.
-    """
-    if not pads(lerobot_config) or not (folder / PREPROCESSOR).is_file():
-        return
-    seen: dict[str, tuple[int, ...]] = {}
-    renames: dict[str, str] = {}
-    for step in _stored_steps(folder):
-        renames |= step.get("config", {}).get("rename_map", {})
-        if step["registry_name"] == "normalizer_processor" and "state_file" in step:
-            stored = tensor_shapes(folder / step["state_file"], origin)
-            seen |= {
-                k.removesuffix(".mean"): shape for k, (_, shape) in stored.items() if k.endswith(".mean")
-            }
-    seen = {renames.get(name, name): shape for name, shape in seen.items()}
-    inputs = lerobot_config.input_features
-    cameras = {name for name, shape in policy_features(lerobot_config).shapes.items() if len(shape) == 3}
-    for name in cameras - seen.keys() if cameras & seen.keys() else ():
-        del inputs[name]
-    if STATE in inputs and STATE in seen:
-        inputs[STATE] = replace(inputs[STATE], shape=seen[STATE])
-
-
 def _use_backbone(lerobot_config: Any, folder: Path, path: str | None) -> None:
     """Points a LeRobot policy config at the checkpoint's own files, where it has them."""
     for field, own in CONFIG_FOLDERS.items():
@@ -307,7 +299,7 @@ def _use_backbone(lerobot_config: Any, folder: Path, path: str | None) -> None:
 def _tokenizer_overrides(lerobot_config: Any, folder: Path) -> dict[str, dict[str, Any]]:
     """Processor step → options, such that tokenisers are the checkpoint's own, where it has them."""
     overrides: dict[str, dict[str, Any]] = {}
-    for entry in _stored_steps(folder):
+    for entry in stored_steps(folder):
         step = entry.get("registry_name", "")
         if step in STEP_FOLDERS and (folder / STEP_FOLDERS[step][1]).is_dir():
             option, own = STEP_FOLDERS[step]
@@ -324,13 +316,9 @@ def _keep_names(lerobot_config: Any, preprocessor: Any, folder: Path) -> None:
     for field in CONFIG_FOLDERS.keys() - {"vlm_model_name"}:
         if hasattr(lerobot_config, field) and field in stored:
             setattr(lerobot_config, field, stored[field])
-    for step, entry in zip(preprocessor.steps, _stored_steps(folder), strict=True):
+    for step, entry in zip(preprocessor.steps, stored_steps(folder), strict=True):
         if (option := STEP_FOLDERS.get(entry.get("registry_name", ""))) is not None:
             setattr(step, option[0], entry["config"].get(option[0]))
-
-
-def _stored_steps(folder: Path) -> list[dict[str, Any]]:
-    return json.loads((folder / PREPROCESSOR).read_text())["steps"]
 
 
 class _Name(str):

@@ -12,12 +12,13 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections import deque
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+import draccus
 import numpy as np
 import torch
 from torch import nn
@@ -37,17 +38,20 @@ from accerl_lerobot.checkpoint.safety import (
     check_not_pickled,
     file_size,
     read_json,
-    read_tensors,
     safe_join,
     tensor_shapes,
 )  # fmt: skip
 from accerl_lerobot.errors import InputError, causes
 
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
+ADAPTER_CONFIG, ADAPTER = "adapter_config.json", "adapter_model.safetensors"
 OURS, VALUE_HEAD, FAMILY = "accerl.json", "value_head.safetensors", "family.safetensors"
-FILES = ("*.json", WEIGHTS, "*processor_step_*.safetensors", VALUE_HEAD, FAMILY, f"{BACKBONE}/*")
+FILES = ("*.json", WEIGHTS, ADAPTER, "*processor_step_*.safetensors", VALUE_HEAD, FAMILY, f"{BACKBONE}/*")
 """Files that are fetched of a checkpoint on the Hub."""
 PROCESSORS = (PREPROCESSOR, "policy_postprocessor.json")
+BEFORE_PROCESSORS = re.compile(r"(un)?normalize_\w+\.buffer_")
+"""Names of statistics among the weights of a policy that LeRobot saved before it had processors."""
+MIGRATION = "lerobot.processor.migrate_policy_normalization"
 LARGE = 2**16  # numbers of a tensor that is not filled, see `Unfilled`
 FILLS = frozenset((
     "normal_", "uniform_", "zero_", "fill_", "erfinv_", "trunc_normal_", "constant_", "ones_", "zeros_",
@@ -87,15 +91,28 @@ def check_checkpoint(folder: Path, origin: Origin, *, fetched: bool = False) -> 
     for name in PROCESSORS:
         if safe_join(folder, name, origin).exists():
             check_processor(folder, name, origin)
-    check_not_pickled(folder, WEIGHTS, origin)
-    for name in (WEIGHTS, VALUE_HEAD, FAMILY):
+    weights = ADAPTER if is_adapter(folder) else WEIGHTS
+    check_not_pickled(folder, weights, origin)
+    for name in (weights, VALUE_HEAD, FAMILY):
         if safe_join(folder, name, origin).exists():
-            tensor_shapes(folder / name, origin)
+            shapes = tensor_shapes(folder / name, origin)
+            if not (folder / PREPROCESSOR).exists() and any(map(BEFORE_PROCESSORS.match, shapes)):
+                convert = f"python -m {MIGRATION} --pretrained-path={origin.value} --output-dir=NEW"
+                why = "holds the statistics, as LeRobot saved them before it had processors"
+                raise origin.refuse(name, f"{why}; convert it, and use what {convert} writes")
     if safe_join(folder, OURS, origin).exists():
         check_ours(read_json(folder / OURS, origin), origin)
     _check_beside(folder, origin)
     if fetched:
         check_names(folder, origin)
+
+
+def is_adapter(folder: Path) -> bool:
+    """True for an adapter of LeRobot's PEFT training, which is loaded on top of another checkpoint."""
+    if not (folder / ADAPTER_CONFIG).is_file():
+        return False
+    config = read_json(folder / CONFIG, Origin("path", str(folder)))
+    return bool(config.get("use_peft")) or not (folder / WEIGHTS).is_file()
 
 
 def check_ours(ours: dict[str, Any], origin: Origin) -> None:
@@ -122,15 +139,6 @@ def check_processor(folder: Path, name: str, origin: Origin) -> None:
             option, own = STEP_FOLDERS[kind]
             named = step.get("config", {}).get(option)
             check_name(named, folder / own, f"{name}: {option}", origin)
-
-
-def check_statistics(folder: Path, origin: Origin) -> None:
-    """Checks the numbers that a checkpoint's processors normalise by."""
-    for name in PROCESSORS:
-        steps = read_json(folder / name, origin)["steps"] if (folder / name).is_file() else ()
-        for step in steps:
-            if "state_file" in step:
-                deque(read_tensors(folder / step["state_file"], origin), maxlen=0)
 
 
 def check_name(name: Any, own: Path, what: str, origin: Origin) -> None:
@@ -231,3 +239,9 @@ class Unfilled(TorchFunctionMode):
 def input_error(error: BaseException) -> InputError | None:
     """The `InputError` that another error wraps, if there is one."""
     return next((link for link in causes(error) if isinstance(link, InputError)), None)
+
+
+def reason(error: BaseException) -> str:
+    """An error's words; of one that draccus wraps, those of the error itself."""
+    wrapped = isinstance(error, draccus.utils.DraccusException)
+    return brief(list(causes(error))[-1] if wrapped else error)

@@ -50,6 +50,7 @@ def write_policy(
         key: {name: torch.full((size,), value) for name, value in values.items()}
         for key, size in sizes.items()
     }
+    statistics[camera] = {"mean": torch.zeros(3, 1, 1), "std": torch.ones(3, 1, 1)}
     processors = make_pre_post_processors(config, dataset_stats=statistics | (stats or {}))
     prepare(policy)
     for part in (policy, *processors):

@@ -19,13 +19,16 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from accerl_lerobot.checkpoint.layout import BACKBONE, FAST, PRETRAINED, displaced, relocate, save_checkpoint
+from accerl_lerobot.demos.sft import SFTConfig
 from accerl_lerobot.engine.config import RunConfig, parse
+from accerl_lerobot.engine.preflight import sft_policy
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE
 from accerl_lerobot.policies.adapter import stack_observations
 from accerl_lerobot.policies.config import FlowSamplerConfig, PolicyConfig, SamplerConfig
 from accerl_lerobot.policies.loading import load_adapter, load_lerobot_config, precision_on, resolve_device
 from accerl_lerobot.policies.saving import save_pretrained
+from accerl_lerobot.policies.untrusted import MIGRATION
 from accerl_lerobot.testing import perturb
 from tests.hub_cache import cached_repo
 from tests.policies.cases import CASES
@@ -251,6 +254,42 @@ def test_a_shared_embedding_is_read_as_lerobot_reads_it(damaged: Any):
     expected = decided(path)
     edit_weights(path, lambda t: t.pop(EMBEDDING))
     assert decided(path) == expected
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "sentence"),
+    [
+        ("act", {"n_action_steps": 0}, "n_action_steps=0: use a whole number in"),
+        ("act", {"n_action_steps": -3}, "n_action_steps=-3: use a whole number in"),
+        ("act", {"chunk_size": 10**9}, "chunk_size=1000000000: use a whole number in"),
+        ("act", {"n_obs_steps": 0}, "n_obs_steps=0|Multiple observation steps not handled"),
+        ("act", {"n_action_steps": 6}, "The chunk size is the upper bound"),
+        ("smolvla", {"num_steps": 0}, "num_steps=0: use a whole number in"),
+        ("smolvla", {"max_action_dim": 0}, "max_action_dim=0: use a whole number in"),
+        ("pi05", {"num_inference_steps": 0}, "num_inference_steps=0: use a whole number in"),
+        ("diffusion", {"n_obs_steps": 0}, "n_obs_steps=0: use a whole number in"),
+        ("diffusion", {"n_action_steps": 8}, "n_action_steps=8: use 1 to 7, the chunk it predicts"),
+    ],
+)
+def test_numbers_that_divide_or_shape_are_refused(damaged: Any, name: str, changes: dict, sentence: str):
+    path = damaged(name)
+    edit_config(path, **changes)
+    for field in ("policy.path", "sft.init_path"):
+        with pytest.raises(InputError, match=f"^{field}='.*': .*({sentence})"):
+            if field == "policy.path":
+                load_lerobot_config(PolicyConfig(path=str(path), device="cpu"))
+            else:
+                sft_policy(SFTConfig(init_path=str(path)))
+
+
+def test_a_checkpoint_from_before_the_processors_is_to_be_converted(damaged: Any):
+    path = damaged("act")
+    edit_weights(path, lambda t: t.update({"normalize_inputs.buffer_observation_state.mean": torch.zeros(4)}))
+    refused(path, ".*1 unexpected")  # with processors it is another mistake
+    (path / PROCESSOR).unlink()
+    convert = f"python -m {MIGRATION} --pretrained-path={path} --output-dir=NEW"
+    refused(path, f"policy.path=.*holds the statistics, as LeRobot saved them before .*{convert}")
+    assert locate(MIGRATION) is not None
 
 
 def test_statistics_are_numbers(damaged: Any):

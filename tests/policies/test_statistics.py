@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A policy whose statistics are missing, or do not fit what it reads, is refused before it acts."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.policies.loading import load_adapter, rehearsed_config
+from tests.policies.checkpoints import write_act, write_smolvla
+
+Tensors = dict[str, torch.Tensor]
+CAMERA = "observation.images.front"
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("statistics")
+    return {"act": write_act(folder / "act"), "smolvla": write_smolvla(folder / "smolvla")}
+
+
+@pytest.fixture
+def edited(written: dict[str, Path], tmp_path: Path) -> Callable[..., PolicyConfig]:
+    """A copy of a checkpoint whose statistics of one kind, or both, are changed in place."""
+
+    def edit(kind: str, change: Callable[[Tensors], Any], which: str = "normalizer") -> PolicyConfig:
+        copy = Path(shutil.copytree(written[kind], tmp_path / "copy"))
+        for file in copy.glob(f"*_{which}_processor.safetensors"):
+            state = load_file(file)
+            changed = change(state)
+            save_file(state if changed is None else changed, file)
+        return PolicyConfig(path=str(copy), device="cpu")
+
+    return edit
+
+
+def under(prefix: str) -> Callable[[Tensors], Tensors]:
+    return lambda state: {prefix + name: value for name, value in state.items()}
+
+
+def put(name: str, value: torch.Tensor) -> Callable[[Tensors], Tensors]:
+    return lambda state: state | ({name: value} if name in state else {})
+
+
+def without(part: str) -> Callable[[Tensors], Tensors]:
+    return lambda state: {name: value for name, value in state.items() if part not in name}
+
+
+@pytest.mark.parametrize(
+    ("kind", "change", "which", "why"),
+    [
+        ("smolvla", under("so100.buffer."), "*normalizer",
+         "no mean and std of observation.state, .* it has so100.buffer.action, so100.buffer.observation"),
+        ("smolvla", under("so100.buffer."), "unnormalizer", "no mean and std of action, .*has so100.buffer"),
+        ("smolvla", lambda state: {"x.mean": torch.zeros(1)}, "normalizer", "observation.state.*it has x;"),
+        ("act", without("observation.state.std"), "normalizer", "no mean and std of observation.state"),
+        ("act", lambda s: {k.replace("front", "top"): v for k, v in s.items()}, "normalizer",
+         f"no mean and std of {CAMERA}, .*has action, observation.images.top"),
+        ("act", put(f"{CAMERA}.std", torch.zeros(3, 1, 1)), "normalizer", f"std of {CAMERA} is not above 0"),
+        ("act", put("action.std", torch.tensor([0.5, -0.5])), "unnormalizer", "std of action is not above 0"),
+        ("act", put("action.mean", torch.zeros(3)), "unnormalizer",
+         r"action.mean is of shape \(3,\), where the policy has \(2,\)"),
+        ("act", put("observation.state.mean", torch.zeros(9)), "normalizer", r"of shape \(9,\), .* \(4,\)"),
+        ("act", put("observation.state.std", torch.full((4,), torch.inf)), "normalizer", "NaN or infinity"),
+    ],
+)  # fmt: skip
+def test_statistics_that_do_not_fit_are_refused(edited: Any, kind: str, change: Any, which: str, why: str):
+    config = edited(kind, change, which)
+    for load in (load_adapter, rehearsed_config):
+        with pytest.raises(InputError, match=rf"policy.path='.*processor.safetensors: ?.*{why}") as caught:
+            load(config)
+        assert "\n" not in str(caught.value)
+
+
+def test_a_policy_that_is_to_be_fine_tuned_gets_new_statistics(edited: Any):
+    config = edited("smolvla", under("so100.buffer."), "*normalizer")
+    assert rehearsed_config(config, fine_tuned=True).type == "smolvla"
+    with pytest.raises(InputError, match="sft.init_path"):
+        rehearsed_config(config)
+
+
+def test_pictures_that_were_never_normalised_are_accepted_with_a_warning(edited: Any, caplog: Any):
+    config = edited("act", without("observation.images"), "*normalizer")
+    load_adapter(config)
+    (warning,) = [record.getMessage() for record in caplog.records]
+    assert f"no mean and std of {CAMERA}" in warning and "pictures go in as they are" in warning
+
+
+def test_an_input_that_lerobot_s_training_renamed_has_no_statistics_of_its_own(edited: Any, caplog: Any):
+    """Its trainer looks for them under the new name, so the policy has learned from it as it is."""
+    config = edited("act", lambda s: {k.replace("front", "top"): v for k, v in s.items()}, "*normalizer")
+    file = Path(str(config.path)) / "policy_preprocessor.json"
+    content = json.loads(file.read_text())
+    content["steps"][0]["config"]["rename_map"] = {CAMERA.replace("front", "top"): CAMERA}
+    file.write_text(json.dumps(content))
+    load_adapter(config)
+    assert not caplog.records
