@@ -199,7 +199,7 @@ def placement(config: RunConfig) -> Iterator[Check]:
 def policy_fits(config: RunConfig) -> Iterator[Check]:
     """The memory of a given policy where it learns and acts, against that of its device."""
     from accerl_lerobot.algorithms import RatioConfig
-    from accerl_lerobot.policies.loading import rehearsed, resolve_device
+    from accerl_lerobot.policies.loading import learning_config, rehearsed, resolve_device
     from accerl_lerobot.trainer.footprint import PolicyMemory, policy_memory
     from accerl_lerobot.trainer.off_policy import POLICY_BATCH
 
@@ -208,6 +208,7 @@ def policy_fits(config: RunConfig) -> Iterator[Check]:
     trainer, ratio = config.trainer, isinstance(config.algorithm, RatioConfig)
     device = resolve_device(config.policy.device)
     measure = partial(policy_memory, imitates=not ratio, checkpointing=trainer.activation_checkpointing)
+    learning_config(config.policy)
     memory = PolicyMemory(*rehearsed(config.policy, measure))
     batch = math.ceil(trainer.batch_decisions / trainer.ranks) if ratio else POLICY_BATCH
     decisions = min(batch, trainer.micro_batch)

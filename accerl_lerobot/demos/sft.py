@@ -29,7 +29,7 @@ from accerl_lerobot.config.ranges import Commit, DatasetConfig, LearningRate, Ra
 from accerl_lerobot.demos.backbone import BackboneConfig, Sizes, write_backbone
 from accerl_lerobot.errors import InputError, check_absent, expanded, last_exception
 from accerl_lerobot.experience import REWARD, SUCCESS
-from accerl_lerobot.policies.config import discovery, register_policies
+from accerl_lerobot.policies.config import check_registered, discovery, register_policies
 
 logger = logging.getLogger(__name__)
 
@@ -238,9 +238,8 @@ def policy_fields(kind: str, field: str) -> set[str]:
     from lerobot.configs.policies import PreTrainedConfig
 
     register_policies(kind)
+    check_registered(kind, field)
     choices = PreTrainedConfig.get_known_choices()
-    if kind not in choices:
-        raise InputError(field, kind, f"LeRobot has {', '.join(sorted(choices))}")
     if kind in NO_SFT:
         raise InputError(field, kind, NO_SFT[kind])
     return {f.name for f in fields(choices[kind])}

@@ -39,13 +39,13 @@ COMPARED = 256  # decisions of successes, and of failures, whose imitation loss 
 def learn_offline(config: OfflineRun, directory: Path, console: Console) -> dict[str, Any]:
     """Learns, writes ``checkpoints/NNNNNN`` and ``summary.json`` into `directory`; returns the summary."""
     from accerl_lerobot.demos.dataset_files import open_metadata
-    from accerl_lerobot.policies.loading import load_adapter, rehearsed_config
+    from accerl_lerobot.policies.loading import learning_config, load_adapter
     from accerl_lerobot.trainer.update import make_update
 
     started = time.monotonic()
     torch.manual_seed(config.seed)
     torch.set_num_threads(config.trainer.num_threads)
-    policy, meta = rehearsed_config(config.policy), open_metadata(config.dataset)
+    policy, meta = learning_config(config.policy), open_metadata(config.dataset)
     wanted = _check(config, policy, meta)
     adapter = load_adapter(config.policy)
     # One step for each update, instead of so many for each new decision.

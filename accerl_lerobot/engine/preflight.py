@@ -115,16 +115,17 @@ def _same(one: np.ndarray | str, two: np.ndarray | str) -> bool:
 
 
 def check_policy(config: RunConfig, spec: WorldSpec, *, own: bool = False) -> int:
-    """Refuse a checkpoint that does not fit the environment; returns its ``n_obs_steps``.
+    """Refuse a checkpoint that does not fit the environment; returns how many env steps it is shown.
 
     Its files are not tried first if the run has done so, or written them itself (`own`).
     """
+    from accerl_lerobot.policies.config import env_steps_seen
     from accerl_lerobot.policies.loading import load_lerobot_config, rehearsed_config
 
     policy = (load_lerobot_config if own else rehearsed_config)(config.policy)
     needed, offered, renames = policy_features(policy), env_features(spec), config.policy.rename_map
     check_features(needed, offered, renames, "policy.path", config.policy.path)
-    return int(policy.n_obs_steps)
+    return env_steps_seen(policy)
 
 
 def check_device(config: RunConfig) -> None:
@@ -405,14 +406,14 @@ def check_imitates(algorithm: AlgorithmConfig, config: PolicyConfig, policy: Any
 def policy_to_be(config: RunConfig) -> Any:
     """LeRobot's config of the policy that a run will act with, as far as it is known before an SFT."""
     from accerl_lerobot.policies.config import check_observations, override, sampler_config
-    from accerl_lerobot.policies.loading import rehearsed_config
+    from accerl_lerobot.policies.loading import learning_config
 
     if config.policy.path is not None:
-        return rehearsed_config(config.policy)
+        return learning_config(config.policy)
     if config.sft.init_path is not None:  # fine-tuning changes its weights alone
         start = replace(config.policy, path=config.sft.init_path, revision=None)
         try:
-            return rehearsed_config(start, fine_tuned=True)
+            return learning_config(start, fine_tuned=True)
         except InputError as error:
             if error.field not in ("policy.path", "policy.type", "policy.n_obs_steps"):
                 raise

@@ -29,7 +29,7 @@ import numpy as np
 import yaml
 
 from accerl_lerobot import guardian
-from accerl_lerobot.algorithms import ChunkCriticConfig, OffPolicyConfig
+from accerl_lerobot.algorithms import ChunkCriticConfig, GIPOConfig, OffPolicyConfig
 from accerl_lerobot.checkpoint import layout
 from accerl_lerobot.config.parsing import as_text
 from accerl_lerobot.config.ranges import DatasetConfig
@@ -46,8 +46,9 @@ from accerl_lerobot.errors import InputError, check_absent, expanded, is_full, k
 from accerl_lerobot.evaluation import Rate, evaluation_plans
 from accerl_lerobot.experience import Observation, Request
 from accerl_lerobot.metrics import MetricsLog
-from accerl_lerobot.policies.config import Load, PolicyConfig, loader
+from accerl_lerobot.policies.config import Load, PolicyConfig, env_steps_seen, loader
 from accerl_lerobot.rollout.runner import EpisodeResult
+from accerl_lerobot.seeds import noise_seed
 from accerl_lerobot.timeline import RECOVERY, open_clock
 
 if TYPE_CHECKING:
@@ -55,6 +56,7 @@ if TYPE_CHECKING:
     from accerl_lerobot.engine.ray_session import RaySession
     from accerl_lerobot.envs import WorldSpec
     from accerl_lerobot.policies.adapter import LeRobotAdapter
+    from accerl_lerobot.policies.stock import StockAdapter
 
 logger = logging.getLogger(__name__)
 
@@ -119,14 +121,17 @@ def start(
 
 def play_evaluation(config: RunConfig, console: Console, filmed: int = 0) -> list[EpisodeResult]:
     """Play the evaluation episodes of a run with LeRobot's sampler, on seeds that are never trained on."""
-    from accerl_lerobot.policies.loading import pinned
+    from accerl_lerobot.policies.loading import load_acting, pinned
 
     with ray_session.opened(config.launch, now=True) as session:
         check_device(config)
         check_memory(config)
         spec = check_world(config.env, config.rollout.reward_model)
         config = replace(config, policy=pinned(config.policy))
-        engine = make_engine(config, spec.tasks, check_policy(config, spec), session=session)
+        history = check_policy(config, spec)
+        # Nothing is learnt, whatever the recipe says.
+        config = replace(config, algorithm=GIPOConfig())
+        engine = make_engine(config, spec.tasks, history, load=load_acting, session=session)
         with contextlib.closing(engine):
             count = config.evaluation.episodes
             engine.plan(evaluation_plans(spec.tasks, count, "eval", seed=config.seed, filmed=filmed))
@@ -302,10 +307,14 @@ class EvaluationResult:
 class ActingPolicy:
     """A LeRobot policy with its processors."""
 
-    def __init__(self, adapter: LeRobotAdapter) -> None:
+    def __init__(self, adapter: LeRobotAdapter | StockAdapter) -> None:
         self.adapter = adapter
-        self.history: int = adapter.policy.config.n_obs_steps
-        self._decisions = 0
+        self.history = env_steps_seen(adapter.policy.config)
+        self._episode = self._decisions = 0
+
+    def reset(self) -> None:
+        """Begins another episode, for policies that remember former observations or actions."""
+        self._episode, self._decisions = self._episode + 1, 0
 
     def act(self, observation: Observation) -> np.ndarray:
         """The next K actions by LeRobot's own sampler, float32 (K, A), in the environment's units.
@@ -315,7 +324,8 @@ class ActingPolicy:
         dimension, oldest first, as ``make_world(config, policy.history)`` gives them.
         """
         self._decisions += 1
-        request = Request(observation=observation, noise_seed=self._decisions, explore=False)
+        seed = noise_seed(self._episode, self._decisions)
+        request = Request(observation=observation, noise_seed=seed, explore=False)
         return self.adapter.decide([request], version=0)[0].chunk
 
 
@@ -386,13 +396,13 @@ def load_policy(
     `discover_packages_path` names the package of its policy type, where that is not ours and not installed
     as ``lerobot_policy_*``.
     """
-    from accerl_lerobot.policies.loading import load_adapter
+    from accerl_lerobot.policies.loading import load_acting
 
     config = PolicyConfig(
         path=str(path), revision=revision, device=device, discover_packages_path=discover_packages_path
     )
     with redirect_stdout(sys.stderr):
-        return ActingPolicy(load_adapter(config))
+        return ActingPolicy(load_acting(config))
 
 
 def _result(directory: Path, summary: dict[str, Any]) -> TrainResult:

@@ -141,6 +141,36 @@ def stack_observations(requests: Sequence[Request]) -> tuple[dict[str, np.ndarra
     return arrays, [str(r.observation[TASK]) for r in requests]
 
 
+def example_requests(config: Any, rename_map: dict[str, str], *, explore: bool = True) -> list[Request]:
+    """Two requests with random observations for a policy, and instructions of unequal length.
+
+    `config` is LeRobot's; `rename_map` is environment name → the policy's. A policy that looks back gets as
+    many env steps as it wants, unless it keeps them itself, without exploration.
+    """
+    rng, env_names = np.random.default_rng(0), {policy: env for env, policy in rename_map.items()}
+    batch = (2,) if config.n_obs_steps == 1 or not explore else (2, config.n_obs_steps)
+    arrays: dict[str, np.ndarray] = {}
+    for key, feature in config.input_features.items():
+        name, shape = env_names.get(key, key), tuple(feature.shape)
+        if key.startswith(IMAGES) and ".empty_camera_" not in key:
+            arrays[name] = rng.integers(0, 256, (*batch, *shape[1:], shape[0]), dtype=np.uint8)
+        elif key == OBS_STATE:
+            arrays[name] = rng.standard_normal((*batch, *shape), dtype=np.float32)
+    return [
+        Request(
+            observation={k: v[i] for k, v in arrays.items()} | {TASK: task}, noise_seed=i, explore=explore
+        )
+        for i, task in enumerate(("Go", "Put the red cube on the plate"))
+    ]
+
+
+def autocast_on(device: torch.device, precision: str) -> contextlib.AbstractContextManager[Any]:
+    """Surrounds whatever runs a network in this precision."""
+    if precision == "fp32":
+        return contextlib.nullcontext()
+    return torch.autocast(device.type, torch.bfloat16)
+
+
 @dataclass
 class Processing:
     """LeRobot's pre- and post-processor, which tokenise and normalise, fed with raw observations."""
@@ -208,9 +238,7 @@ class LeRobotAdapter(PolicyAdapter):
 
     def autocast(self) -> contextlib.AbstractContextManager[Any]:
         """Surrounds whatever runs the network."""
-        if self.precision == "fp32":
-            return contextlib.nullcontext()
-        return torch.autocast(self.device.type, torch.bfloat16)
+        return autocast_on(self.device, self.precision)
 
     def factors(self, latent: dict[str, Tensor]) -> Tensor | None:
         return self.family.factors(latent)
@@ -264,20 +292,7 @@ class LeRobotAdapter(PolicyAdapter):
 
     def example_requests(self) -> list[Request]:
         """Two requests with random observations for this policy, and instructions of unequal length."""
-        config, rng = self.policy.config, np.random.default_rng(0)
-        env_names = {policy: env for env, policy in self.processing.rename_map.items()}
-        batch = (2,) if config.n_obs_steps == 1 else (2, config.n_obs_steps)
-        arrays: dict[str, np.ndarray] = {}
-        for key, feature in config.input_features.items():
-            name, shape = env_names.get(key, key), tuple(feature.shape)
-            if key.startswith(IMAGES) and ".empty_camera_" not in key:
-                arrays[name] = rng.integers(0, 256, (*batch, *shape[1:], shape[0]), dtype=np.uint8)
-            elif key == OBS_STATE:
-                arrays[name] = rng.standard_normal((*batch, *shape), dtype=np.float32)
-        return [
-            Request(observation={k: v[i] for k, v in arrays.items()} | {TASK: task}, noise_seed=i)
-            for i, task in enumerate(("Go", "Put the red cube on the plate"))
-        ]
+        return example_requests(self.policy.config, self.processing.rename_map)
 
     def example(self) -> tuple[dict[str, np.ndarray], Sequence[str], dict[str, Tensor]]:
         requests = self.example_requests()

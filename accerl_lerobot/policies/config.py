@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import importlib
+import importlib.metadata
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -10,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import draccus
 
-from accerl_lerobot.checkpoint.safety import Origin
+from accerl_lerobot.checkpoint.safety import Origin, brief
 from accerl_lerobot.config.parsing import imported
 from accerl_lerobot.config.ranges import Commit, Device, Range, Section, check, registered_name
 from accerl_lerobot.errors import InputError
@@ -160,6 +162,7 @@ POLICIES: dict[str, tuple[str, tuple[str, ...]]] = {
     "pi0_fast": ("accerl_lerobot.policies.vla:Pi0Fast", ("tokens",)),
 }
 """LeRobot policy type → its model, and the families that suit it, the default one first."""
+NOT_IMPORTED: dict[str, str] = {}  # installed ``lerobot_policy_*`` → why it cannot be imported
 PLUGINS: dict[str, str] = {}  # policy type that is not LeRobot's own → package that registers it with LeRobot
 SIZES = (
     "chunk_size", "n_action_steps", "n_obs_steps", "horizon", "num_steps", "num_inference_steps",
@@ -186,10 +189,31 @@ def register_policies(wanted: str | None = None) -> None:
     Of LeRobot's own types, the code of `wanted` alone is imported; of all if it is None or another's."""
     import_policies(wanted if wanted in POLICIES.keys() - PLUGINS.keys() else None)
     from lerobot.configs.policies import PreTrainedConfig
-    from lerobot.utils.import_utils import register_third_party_plugins
 
-    if wanted is not None and wanted not in PreTrainedConfig.get_known_choices():
-        register_third_party_plugins()
+    if wanted is None or wanted in PreTrainedConfig.get_known_choices():
+        return
+    for distribution in importlib.metadata.distributions():
+        package = re.sub(r"[-.]", "_", distribution.metadata["Name"] or "").lower()
+        if package.startswith("lerobot_policy_"):
+            try:
+                importlib.import_module(package)
+            except (Exception, SystemExit) as error:  # it is somebody's code, which may do anything
+                NOT_IMPORTED[package] = f"{type(error).__name__}: {brief(error)}"
+
+
+def check_registered(policy_type: Any, field: str, prefix: str = "") -> None:
+    """Refuses a policy type that neither LeRobot nor an installed package has, after `register_policies`."""
+    from lerobot.configs.policies import PreTrainedConfig
+
+    known = sorted(PreTrainedConfig.get_known_choices())
+    if policy_type in known:
+        return
+    broken = [
+        f"{package} is installed and cannot be imported ({why})" for package, why in NOT_IMPORTED.items()
+    ]
+    install = "install the package that has it, or name it: policy.discover_packages_path"
+    why = f"no such policy type here; {'; '.join(broken) or install}; there are {', '.join(known)}"
+    raise InputError(field, policy_type, prefix + why)
 
 
 def discovery(policy_type: str | None) -> list[str]:
@@ -202,7 +226,7 @@ def check_observations(policy_config: Any, field: str) -> None:
     if ENVIRONMENT_STATE in (policy_config.input_features or {}):
         remedy = "no policy is given the simulator's state; train it without, as accerl sft does"
         raise InputError("policy.input_features", ENVIRONMENT_STATE, remedy)
-    if policy_config.n_obs_steps != 1 and policy_config.type not in USES_HISTORY:
+    if env_steps_seen(policy_config) != 1 and policy_config.type not in USES_HISTORY:
         remedy = f"only {', '.join(USES_HISTORY)} looks back; a {policy_config.type} policy takes 1"
         raise InputError(field, policy_config.n_obs_steps, remedy)
 
@@ -215,9 +239,9 @@ def sampler_config(
     Refuses a type without a likelihood here, naming `field`, in a remedy that begins with `prefix`; and a
     sampler of another family.
     """
+    check_registered(policy_type, field, prefix)
     if policy_type not in POLICIES:
-        known = f"use one of {', '.join(POLICIES)}, or name its package: policy.discover_packages_path"
-        raise InputError(field, policy_type, f"{prefix}no likelihood for it here; {known}")
+        raise no_likelihood(policy_type, field, prefix)
     families = POLICIES[policy_type][1]
     if config.sampler is None:
         return SamplerConfig.get_choice_class(families[0])()
@@ -225,6 +249,17 @@ def sampler_config(
         remedy = f"use {' or '.join(families)}: the policy is of type {policy_type}"
         raise InputError("policy.sampler.type", config.sampler.type, remedy)
     return config.sampler
+
+
+def no_likelihood(policy_type: str, field: str = "policy.type", prefix: str = "") -> InputError:
+    """The error of a policy type that acts and cannot learn."""
+    why = "no likelihood for it here, so it can be evaluated (accerl eval, load_policy) and cannot learn"
+    return InputError(field, policy_type, f"{prefix}{why}; {', '.join(POLICIES)} can")
+
+
+def env_steps_seen(policy_config: Any) -> int:
+    """Env steps that an observation holds. A policy that only acts keeps former ones itself."""
+    return int(policy_config.n_obs_steps) if policy_config.type in POLICIES else 1
 
 
 def check_size(name: str, value: Any, field: str) -> None:
@@ -269,11 +304,14 @@ def override(policy_config: Any, config: PolicyConfig) -> None:
             raise InputError("policy.num_steps", config.num_steps, remedy)
         setattr(policy_config, name, config.num_steps)
     policy_config.use_peft = False  # an adapter is merged into the weights
-    if hasattr(policy_config, "dtype"):
+    if hasattr(policy_config, "dtype") and policy_config.type in POLICIES:
         policy_config.dtype = "float32"  # see `PolicyConfig.precision`
     if hasattr(policy_config, "compile_model"):
         policy_config.compile_model = False  # a compiled sampler rounds unlike the re-scoring pass
     if config.n_action_steps is not None:
+        if not hasattr(policy_config, "n_action_steps"):
+            remedy = f"a {policy_config.type} policy has no such field; leave it out"
+            raise InputError("policy.n_action_steps", config.n_action_steps, remedy)
         chunk = predicted_rows(policy_config) or 1
         if config.n_action_steps > chunk:
             remedy = f"use 1 to {chunk}, the chunk the policy predicts"

@@ -12,7 +12,7 @@ import contextlib
 import json
 import logging
 import string
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -36,6 +36,7 @@ from accerl_lerobot.policies.config import (
     Precision,
     SamplerConfig,
     check_observations,
+    check_registered,
     check_sizes,
     override,
     register_policies,
@@ -45,6 +46,7 @@ from accerl_lerobot.policies.family import Model
 from accerl_lerobot.policies.peft_adapters import merged, weights_folder
 from accerl_lerobot.policies.saving import tune
 from accerl_lerobot.policies.statistics import check_statistics, correct_inputs, stored_steps
+from accerl_lerobot.policies.stock import StockAdapter
 
 logger = logging.getLogger(__name__)
 
@@ -86,12 +88,11 @@ def load_lerobot_config(config: PolicyConfig) -> Any:
     """The checkpoint's LeRobot policy config, without its weights.
 
     Raises:
-        InputError: no checkpoint there, or a policy type without a likelihood here.
+        InputError: no checkpoint there, or one of a policy type that is not installed.
     """
     folder, origin = _checkpoint_folder(config), Origin("policy.path", config.path)
-    kind = _registered_type(config, folder)
+    _registered_type(config, folder)
     with _refusing(config, "its config.json is not one of this LeRobot's policies"):
-        sampler_config(config, kind, prefix=f"{config.path} is of this type: ")
         lerobot_config = PreTrainedConfig.from_pretrained(folder)
         correct_inputs(lerobot_config, folder, origin)
     check_sizes(lerobot_config, origin)
@@ -106,6 +107,13 @@ def rehearsed_config(config: PolicyConfig, *, fine_tuned: bool = False) -> Any:
     """`load_lerobot_config` of a checkpoint that has passed `policy_sizes`."""
     policy_sizes(config, fine_tuned=fine_tuned)
     return load_lerobot_config(config)
+
+
+def learning_config(config: PolicyConfig, *, fine_tuned: bool = False) -> Any:
+    """`rehearsed_config` of a policy that can learn."""
+    lerobot_config = rehearsed_config(config, fine_tuned=fine_tuned)
+    sampler_config(config, lerobot_config.type, prefix=f"{config.path} is of this type: ")
+    return lerobot_config
 
 
 def policy_sizes(config: PolicyConfig, *, fine_tuned: bool = False) -> Sizes:
@@ -137,18 +145,32 @@ def rehearsed[T](config: PolicyConfig, task: Callable[[LeRobotAdapter], T], *, f
     folder = weights_folder(_checkpoint_folder(config), origin)  # its size sets the limits
 
     def act() -> T:
-        return task(load_adapter(there, rehearsal=True, fine_tuned=fine_tuned))
+        return task(load_acting(there, rehearsal=True, fine_tuned=fine_tuned))
 
     return rehearse(act, folder, origin)
 
 
-def sizes_of(adapter: LeRobotAdapter) -> Sizes:
+def sizes_of(adapter: Any) -> Sizes:
     of = (adapter.policy.parameters(), adapter.trainable().values())
     return Sizes(*(sum(parameter.numel() for parameter in parameters) for parameters in of))
 
 
-def load_adapter(
+def load_acting(
     config: PolicyConfig, *, rehearsal: bool = False, fine_tuned: bool = False
+) -> LeRobotAdapter | StockAdapter:
+    """A policy of any of LeRobot's types: one that can learn by `load_adapter`, another one to act only."""
+    lerobot_config = load_lerobot_config(config)
+    if lerobot_config.type in POLICIES:
+        return load_adapter(config, rehearsal=rehearsal, fine_tuned=fine_tuned, explores=False)
+    parts = _load_parts(config, lerobot_config, None, rehearsal, fine_tuned)
+    adapter = StockAdapter(*parts)
+    with _refusing(config, "it cannot act here"):
+        adapter.decide(adapter.example_requests(), 0)
+    return adapter
+
+
+def load_adapter(
+    config: PolicyConfig, *, rehearsal: bool = False, fine_tuned: bool = False, explores: bool = True
 ) -> LeRobotAdapter:
     """Loads policy, processors and critic; proves that the sampler is LeRobot's.
 
@@ -159,46 +181,17 @@ def load_adapter(
         InputError: see `load_lerobot_config` and `LeRobotAdapter.self_check`; or a file did not load.
     """
     lerobot_config = load_lerobot_config(config)
-    folder, origin = _checkpoint_folder(config), Origin("policy.path", config.path)
+    sampler = sampler_config(config, lerobot_config.type, prefix=f"{config.path} is of this type: ")
     model_class: type[Model] = imported(POLICIES[lerobot_config.type][0])
-    with (
-        _refusing(config, "its network cannot be built as its config.json says"),
-        untrusted.guarded("policy", config.trust_remote_code),
-        model_class.loading(),
-        untrusted.Unfilled(),
-    ):
-        policy = _built(lerobot_config)
-    base = weights_folder(folder, origin)
-    load_weights(policy, model_class, base / untrusted.WEIGHTS, config.path, read=not rehearsal)
-    if base != folder:
-        with _refusing(config, "its adapter did not load"), untrusted.guarded("policy"):
-            policy = merged(policy, folder, origin)
-    device = torch.device(lerobot_config.device)
-    policy.to(device).eval()
-    model = model_class(policy)
-    precision = precision_on(device, config.precision)
-    if precision == "fp32" and device.type == "cuda":
-        # torch convolves with 10 bits of mantissa there. For batches of different sizes cuDNN chooses other
-        # algorithms; what they round differently is divided by the std of the noise in every log-prob.
-        torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = False
-    overrides = {"device_processor": {"device": str(device)}}
-    check_statistics(lerobot_config, folder, origin, replaced=fine_tuned)
-    hint = f"a tokeniser that cannot be had from the Hub goes into {BACKBONE}/ beside {untrusted.CONFIG}"
-    with _refusing(config, f"its LeRobot processors did not load; {hint}"):
-        overrides |= _tokenizer_overrides(lerobot_config, folder)
-        with untrusted.guarded("policy", config.trust_remote_code), model.loading():
-            pre, post = make_pre_post_processors(
-                lerobot_config, pretrained_path=str(folder), preprocessor_overrides=overrides
-            )
-        _keep_names(lerobot_config, pre, folder)
+    policy, processing, precision = _load_parts(config, lerobot_config, model_class, rehearsal, fine_tuned)
+    folder, origin = _checkpoint_folder(config), Origin("policy.path", config.path)
     with _refusing(config, "it cannot act here"):
-        processing = Processing(pre, post, device, config.rename_map)
-        sampler = sampler_config(config, lerobot_config.type)
+        model = model_class(policy)
         family = imported(sampler.family)(model, sampler)
         critic = ValueHead(model.width)
         adapter = LeRobotAdapter(policy, processing, model, family, critic, precision)
         if (folder / untrusted.OURS).is_file():
-            _load_ours(adapter, folder, origin)
+            _load_ours(adapter, folder, origin, explores)
         requests = adapter.example_requests()
         if not rehearsal:
             adapter.self_check(*stack_observations(requests))
@@ -209,15 +202,58 @@ def load_adapter(
     return adapter
 
 
-def _built(lerobot_config: Any) -> Any:
-    """LeRobot's policy in float32, without the backbone's weights, which its own file has, too.
+def _load_parts(
+    config: PolicyConfig,
+    lerobot_config: Any,
+    model_class: type[Model] | None,
+    rehearsal: bool,
+    fine_tuned: bool,
+) -> tuple[Any, Processing, Precision]:
+    """LeRobot's policy with the checkpoint's weights, its processors, and the precision it computes in."""
+    folder, origin = _checkpoint_folder(config), Origin("policy.path", config.path)
+    loading = contextlib.nullcontext if model_class is None else model_class.loading
+    with (
+        _refusing(config, "its network cannot be built as its config.json says"),
+        untrusted.guarded("policy", config.trust_remote_code),
+        loading(),
+        untrusted.Unfilled(),
+    ):
+        policy = _built(lerobot_config)
+        if model_class is not None:
+            # LeRobot builds SmolVLA's backbone and expert in the backbone's bfloat16, in which small steps of
+            # a gradient are lost.
+            policy = policy.float()
+    base = weights_folder(folder, origin)
+    unread = () if model_class is None else model_class.unread
+    load_weights(policy, unread, base / untrusted.WEIGHTS, config.path, read=not rehearsal)
+    if base != folder:
+        with _refusing(config, "its adapter did not load"), untrusted.guarded("policy"):
+            policy = merged(policy, folder, origin)
+    device = torch.device(lerobot_config.device)
+    policy.to(device).eval()
+    precision = precision_on(device, config.precision)
+    if precision == "fp32" and device.type == "cuda":
+        # torch convolves with 10 bits of mantissa there. For batches of different sizes cuDNN chooses other
+        # algorithms; what they round differently is divided by the std of the noise in every log-prob.
+        torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = False
+    overrides = {"device_processor": {"device": str(device)}}
+    check_statistics(lerobot_config, folder, origin, replaced=fine_tuned)
+    hint = f"a tokeniser that cannot be had from the Hub goes into {BACKBONE}/ beside {untrusted.CONFIG}"
+    with _refusing(config, f"its LeRobot processors did not load; {hint}"):
+        overrides |= _tokenizer_overrides(lerobot_config, folder)
+        with untrusted.guarded("policy", config.trust_remote_code), loading():
+            pre, post = make_pre_post_processors(
+                lerobot_config, pretrained_path=str(folder), preprocessor_overrides=overrides
+            )
+        _keep_names(lerobot_config, pre, folder)
+    return policy, Processing(pre, post, device, config.rename_map), precision
 
-    LeRobot builds SmolVLA's backbone and expert in the backbone's bfloat16, in which small steps of a
-    gradient are lost.
-    """
+
+def _built(lerobot_config: Any) -> Any:
+    """LeRobot's policy, without the backbone's weights, which its own file has, too."""
     if asked := getattr(lerobot_config, "load_vlm_weights", False):
         lerobot_config.load_vlm_weights = False
-    policy = get_policy_class(lerobot_config.type)(lerobot_config).float()
+    policy = get_policy_class(lerobot_config.type)(lerobot_config)
     if asked:
         policy.config.load_vlm_weights = True
     return policy
@@ -254,16 +290,18 @@ def _registered_type(config: PolicyConfig, folder: Path) -> Any:
     discover(config.discover_packages_path, "policy")
     kind = read_json(folder / untrusted.CONFIG, Origin("policy.path", config.path)).get("type")
     register_policies(str(kind))
+    check_registered(kind, "policy.type", f"{config.path} is of this type: ")
     return kind
 
 
-def _load_ours(adapter: LeRobotAdapter, folder: Path, origin: Origin) -> None:
-    """Loads critic and family, and says where this run's options differ from those they were made with."""
+def _load_ours(adapter: LeRobotAdapter, folder: Path, origin: Origin, explores: bool) -> None:
+    """Loads critic and family, and says where a run explores with other options than they were made with."""
     there = json.loads((folder / untrusted.OURS).read_text()).get("sampler", {})
     here = draccus.encode(adapter.family.sampler, SamplerConfig)
-    if differing := [k for k in here if k in there and there[k] != here[k]]:
+    differing = [k for k in here if k in there and there[k] != here[k]]
+    if explores and differing:
         logger.warning(
-            "this run explores unlike the one that made the checkpoint (evaluation is not affected): %s",
+            "this run explores unlike the one that made the checkpoint: %s",
             ", ".join(f"policy.sampler.{k}={here[k]}, there {there[k]}" for k in differing),
         )
     file = folder / untrusted.FAMILY
@@ -329,14 +367,19 @@ class _Name(str):
 
 
 @torch.no_grad()
-def load_weights(policy: Any, model: type[Model], file: Path, path: str | None, *, read: bool = True) -> None:
-    """Fills a policy from a file with the same tensors, or only compares names and shapes if not `read`."""
+def load_weights(
+    policy: Any, unread: Sequence[str], file: Path, path: str | None, *, read: bool = True
+) -> None:
+    """Fills a policy from a file with the same tensors, or only compares names and shapes if not `read`.
+
+    Those named in `unread` may be missing.
+    """
     origin = Origin("policy.path", path)
     shapes = {name: shape for name, (_, shape) in tensor_shapes(file, origin).items()}
     mine, stored = policy.state_dict(), _names(shapes, policy)
     # Nor is a tensor missing that a policy holds under several names: savers keep one of them.
     held = {mine[k].data_ptr() for k in stored.keys() & mine.keys()}
-    absent = mine.keys() - stored.keys() - set(model.unread)
+    absent = mine.keys() - stored.keys() - set(unread)
     missing = sorted(k for k in absent if mine[k].data_ptr() not in held)
     unexpected = sorted(stored.keys() - mine.keys())
     if missing or unexpected:

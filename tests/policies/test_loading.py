@@ -18,6 +18,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from accerl_lerobot import load_policy
 from accerl_lerobot.checkpoint.layout import BACKBONE, FAST, PRETRAINED, displaced, relocate, save_checkpoint
 from accerl_lerobot.demos.sft import SFTConfig
 from accerl_lerobot.engine.config import RunConfig, parse
@@ -87,12 +88,11 @@ def test_a_path_to_nothing(path: str | None, sentence: str):
     assert str(caught.value).startswith(sentence) and "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("kind", ["tdmpc", "my_policy"])
-def test_a_policy_without_a_likelihood(damaged: Any, kind: str):
+def test_a_policy_of_an_unknown_type(damaged: Any):
     path = damaged("act")
-    edit_config(path, type=kind)
-    why = f"{path} is of this type: no likelihood for it here; use one of smolvla, "
-    refused(path, f"policy.type='{kind}': {why}")
+    edit_config(path, type="my_policy")
+    why = f"{path} is of this type: no such policy type here; install the package that has it"
+    refused(path, f"policy.type='my_policy': {why}")
 
 
 @pytest.mark.parametrize(
@@ -466,7 +466,10 @@ def test_another_sampler_is_pointed_out(written: Any, tmp_path: Path, caplog: py
         adapter_at(path, sampler)
         assert caplog.text == ""
         adapter_at(path, FlowSamplerConfig(noise_level=0.2))
-    assert "policy.sampler.noise_level=0.2, there 0.4" in caplog.text
+        assert "policy.sampler.noise_level=0.2, there 0.4" in caplog.text
+        caplog.clear()
+        load_policy(path, device="cpu")  # it does not explore
+    assert caplog.text == ""
 
 
 REMOTE_CODE = """
