@@ -100,8 +100,8 @@ def test_it_is_evaluated_and_not_trained(written: Any, kind: str, tmp_path: Path
     path = written(kind)
     fields = [f"--policy.path={path}", "--env.type=simulated", "--env.image_size=64", "--launch.engine=local"]
     fields += [f"--policy.rename_map={json.dumps({FRONT: CAMERAS[kind]})}"] if kind == "tdmpc" else []
-    assert cli.main(["eval", *fields, "--evaluation.episodes=2"]) == 0
-    found = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert cli.main(["eval", *fields, "--evaluation.episodes=2", f"--output_dir={tmp_path / 'eval'}"]) == 0
+    found = json.loads((tmp_path / "eval" / "evaluation.json").read_text())
     assert found["n"] == 2 and found["steps_mean"] > 1
     why = f"policy.type='{kind}': {path} is of this type: no likelihood for it here, so it can be evaluated"
     for verb in (["train", "--sft.steps=0"], ["offline", "--dataset.repo_id=a/b"]):
