@@ -107,7 +107,7 @@ def no_gradient(policy: Any) -> None:
 @pytest.mark.parametrize(
     ("mistake", "message"),
     [
-        (another_velocity, "the adapter of mlp_flow does not fit LeRobot .*: it differs from its sampler"),
+        (another_velocity, "policy.type='mlp_flow': .*lerobot_policy_mlp_flow.*correct .*encode or stock"),
         (mixed_batch, "of two decisions on one request, .* is off by"),
         (
             no_gradient,
@@ -125,6 +125,19 @@ def test_mistakes_are_found(mistake, message, checkpoint, observations, monkeypa
 
     monkeypatch.setattr(module.MLPFlowPolicy, "__init__", build)
     with pytest.raises((AssertionError, InputError), match=message):
+        check_policy(named(checkpoint), observations)
+
+
+def test_an_adapter_that_executes_other_rows_is_found(checkpoint, observations, monkeypatch):
+    adapter = importlib.import_module(f"{PACKAGE}.adapter").MLPFlow
+    built = adapter.__init__
+
+    def build(self: Any, policy: Any) -> None:
+        built(self, policy)
+        self.shape = replace(self.shape, executed=self.shape.executed - 1)
+
+    monkeypatch.setattr(adapter, "__init__", build)
+    with pytest.raises(AssertionError, match="executes 3 rows, not n_action_steps=4"):
         check_policy(named(checkpoint), observations)
 
 

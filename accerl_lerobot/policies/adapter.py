@@ -23,7 +23,7 @@ from accerl_lerobot.checkpoint.tensors import in_parts, part_of, whole
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK, Decision, Request, Segment
 from accerl_lerobot.policies import saving
-from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.policies.config import PLUGINS, PolicyConfig
 from accerl_lerobot.policies.family import Encoded, Family, Model, pooled
 from accerl_lerobot.policies.teacher import TEACHER_PREFIX, Teacher
 
@@ -320,6 +320,10 @@ class LeRobotAdapter(PolicyAdapter):
         self.policy.reset()
         if difference <= SELF_CHECK_TOLERANCE:
             return difference
+        if (package := PLUGINS.get(self.policy.config.type)) is not None:
+            why = f"its adapter in {package} acts unlike the policy without exploration"
+            remedy = f"{why}, by {difference:.2e}; correct the adapter's encode or stock"
+            raise InputError("policy.type", self.policy.config.type, remedy)
         fits = f"the adapter of {self.policy.name} does not fit LeRobot {lerobot.__version__}"
         remedy = f"{fits}: it differs from its sampler by {difference:.2e}; install the pinned version"
         raise InputError("lerobot", lerobot.__version__, remedy)

@@ -101,6 +101,8 @@ def check_stock_sampler(adapter: LeRobotAdapter, asked: Sequence[Request]) -> No
     """Without exploration: LeRobot's own sampler on equal noise, and nothing that could be scored."""
     adapter.self_check(*stack_observations(asked))
     decisions = adapter.decide([replace(request, explore=False) for request in asked], 0)
+    rows, expected = len(decisions[0].chunk), adapter.policy.config.n_action_steps
+    assert rows == expected, f"the adapter executes {rows} rows, not n_action_steps={expected} of its policy"
     assert not any(d.log_prob.any() for d in decisions), "without exploration, log-probs must be 0"
 
 
