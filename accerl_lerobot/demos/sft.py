@@ -189,9 +189,11 @@ def run_sft(
 
 def _check_end(code: int, log: Path) -> None:
     """Shows a trainer's warnings, and raises its last exception if it failed."""
-    text = log.read_text()
-    last = text.rstrip().rpartition("\n")[2]
-    answer = json.loads(last.removeprefix(ANSWER)) if last.startswith(ANSWER) else {}
+    text, found, rest = log.read_text().rpartition(f"\n{ANSWER}")
+    if not found:  # it was ended before it could hand anything over
+        text, rest = rest, "{}"
+    line, _, after = rest.partition("\n")
+    answer, text = json.loads(line), f"{text}\n{after}"
     errors.show_warnings(answer.get("warnings", ()))
     if code == 0:
         return

@@ -42,7 +42,15 @@ from accerl_lerobot.engine.placement import check_placement
 from accerl_lerobot.engine.preflight import check_device, check_policy, check_start, check_world
 from accerl_lerobot.engine.sizes import check_memory
 from accerl_lerobot.engine.stopping import StoppedError, Stopping, WorkerError
-from accerl_lerobot.errors import InputError, check_absent, expanded, is_full, kept_traceback, make_folder
+from accerl_lerobot.errors import (
+    InputError,
+    check_absent,
+    expanded,
+    is_full,
+    kept_traceback,
+    make_folder,
+    printable,
+)
 from accerl_lerobot.evaluation import Rate, evaluation_plans
 from accerl_lerobot.experience import Observation, Request
 from accerl_lerobot.metrics import MetricsLog
@@ -96,7 +104,7 @@ def start(
             directory = make_output_dir(config)
         console.say(f"run {directory}")
         how = resuming.resume_command(directory, config)
-        guardian.explain(remedy=f"to resume: {how}")
+        guardian.explain(remedy=printable(f"to resume: {how}"))
         try:
             with (
                 redirect_stdout(sys.stderr),
