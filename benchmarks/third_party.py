@@ -32,6 +32,8 @@ from benchmarks.records import as_markdown, output_folder, write
 COLUMNS = ("package", "version", "tried", "came out", "right")
 HIDDEN = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "DISPLAY")
 """Environment variables that the commands do not see."""
+PYTHON_ERROR = r"accerl: [A-Z]\w*(Error|Exception)\b"
+"""What no output has, unless a situation names another pattern."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +45,7 @@ class BenchThirdPartyConfig(Section):
     timeout_s: Annotated[float, Range("[10, 7200]")] = 900.0
     """Longest time that one command may take."""
     output_dir: str = "outputs/third_party"
-    """Folder of the policies, logs and results; must be empty or absent."""
+    """Folder of policies, logs and results; empty or absent."""
 
 
 def bench_third_party(config: BenchThirdPartyConfig) -> dict[str, Any]:
@@ -62,8 +64,8 @@ def bench_third_party(config: BenchThirdPartyConfig) -> dict[str, Any]:
         if package in skipped or (config.packages and package not in config.packages):
             continue
         if package not in versions:
-            skipped.append(package)
             console.say(f"{package}: not installed, skipped")
+            skipped.append(package)
             continue
         outcome = attempt(situation, wanted, root / f"{len(rows):02}", config.timeout_s)
         rows.append(
@@ -99,7 +101,7 @@ def attempt(
     (folder / "log.txt").write_text(printed)
     right = code == situation.get("exit", 0)
     right = right and re.search(situation.get("prints", ""), printed) is not None
-    right = right and re.search(situation.get("not_prints", "Traceback"), printed) is None
+    right = right and re.search(situation.get("not_prints", PYTHON_ERROR), printed) is None
     return {"came_out": came_out(code, printed), "right": right}
 
 
