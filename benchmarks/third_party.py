@@ -33,7 +33,7 @@ COLUMNS = ("package", "version", "tried", "came out", "right")
 HIDDEN = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "DISPLAY")
 """Environment variables that the commands do not see."""
 PYTHON_ERROR = r"accerl: [A-Z]\w*(Error|Exception)\b"
-"""What no output has, unless a situation names another pattern."""
+"""Pattern that no output has, unless a situation names another."""
 
 
 @dataclass(frozen=True, kw_only=True)
