@@ -43,6 +43,7 @@ class Request:
 
     observation: Observation
     noise_seed: int
+    elapsed: float = 0.0  # share of the episode's time limit that is gone
     explore: bool = True  # False asks for LeRobot's stock sampler, the one evaluation uses
 
 
@@ -85,6 +86,8 @@ class Segment:
     reward: np.ndarray  # float32 (T,), summed over the steps of each chunk
     version: np.ndarray  # int64 (T,), the weights behind each decision
     steps: np.ndarray  # int64 (T,), env steps each decision executed
+    time_limit: int  # env steps of an episode at most
+    before: int = 0  # env steps of the episode before the first of these decisions
     terminated: bool
     success: bool  # True if the episode had succeeded when the segment ended
     key: str  # worker, incarnation, sequence number
@@ -94,6 +97,19 @@ class Segment:
 
     def __len__(self) -> int:
         return len(self.reward)
+
+    @property
+    def elapsed(self) -> np.ndarray:
+        """float32 (T,), share of the episode's time limit that was gone at each decision."""
+        ends = self.before + np.cumsum(self.steps)
+        return ((ends - self.steps) / self.time_limit).astype(np.float32)
+
+
+def stack_observations(requests: Sequence[Request]) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Batches raw observations: each array (B, ...), and the B task texts."""
+    keys = [k for k in requests[0].observation if k != TASK]
+    arrays = {k: np.stack([r.observation[k] for r in requests]) for k in keys}
+    return arrays, [str(r.observation[TASK]) for r in requests]
 
 
 def task_codes(tasks: Sequence[str]) -> np.ndarray:

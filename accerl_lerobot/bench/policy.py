@@ -68,8 +68,7 @@ def bench_policy(config: BenchPolicyConfig) -> dict[str, Any]:
     import numpy as np
     import torch
 
-    from accerl_lerobot.experience import TASK, Request
-    from accerl_lerobot.policies.adapter import stack_observations
+    from accerl_lerobot.experience import TASK, Request, stack_observations
     from accerl_lerobot.policies.loading import resolve_device, sizes_of
     from accerl_lerobot.policies.untrusted import Unfilled
     from accerl_lerobot.testing import stored

@@ -26,7 +26,12 @@ from accerl_lerobot.replay.pacing import ASYNCHRONOUS, ReplayConfig, Schedule
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.timeline import TIMELINE
 from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.world_model.config import ImaginationConfig
+from accerl_lerobot.world_model.config import (
+    ImaginationConfig,
+    LatentConfig,
+    SimulatorStateConfig,
+    StateModelConfig,
+)
 
 __all__ = ["DatasetConfig", "LaunchConfig", "RunConfig", "decode", "encode", "parse"]
 
@@ -106,6 +111,9 @@ class RunConfig(Section):
     inference: InferenceConfig = field(default_factory=InferenceConfig)
     replay: ReplayConfig = field(default_factory=ReplayConfig)
     algorithm: AlgorithmConfig = field(default_factory=GIPOConfig)
+    world_model: StateModelConfig | None = None
+    """What chunk_critic's critic and teacher see. None: simulator where the environment tells its state, else
+    latent."""
     trainer: TrainerConfig = field(default_factory=TrainerConfig)
     imagination: ImaginationConfig = field(default_factory=ImaginationConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
@@ -131,6 +139,13 @@ class RunConfig(Section):
         return None if self.folder is None else self.folder / TIMELINE
 
     @property
+    def state_model(self) -> StateModelConfig:
+        """`world_model`, or the type that is used where none is given."""
+        if self.world_model is not None:
+            return self.world_model
+        return SimulatorStateConfig() if self.env.state_size else LatentConfig()
+
+    @property
     def remembered(self) -> int:
         """Decisions in the trainer's own memory at the end."""
         if not isinstance(self.algorithm, OffPolicyConfig):
@@ -142,6 +157,11 @@ class RunConfig(Section):
         if self.policy.path is not None and self.sft.steps:
             remedy = "add --sft.steps=0 to improve this checkpoint, or fine-tune it first with sft.init_path"
             raise InputError("policy.path", self.policy.path, remedy)
+        if self.world_model is not None and not isinstance(self.algorithm, ChunkCriticConfig):
+            remedy = (
+                f"algorithm.type={self.algorithm.type} has no use for it; use chunk_critic, or leave it out"
+            )
+            raise InputError("world_model.type", self.world_model.type, remedy)
         if isinstance(self.algorithm, OffPolicyConfig):
             self._check_off_policy()
         if (held := self.trainer.hold_back) >= self.replay.max_lag:
@@ -169,14 +189,13 @@ class RunConfig(Section):
 
     def _check_off_policy(self) -> None:
         """A memory of its own stands for replay's reuse, and holds whole real episodes."""
-        offered = getattr(self.env, "environment_state", None)
-        if isinstance(self.algorithm, ChunkCriticConfig) and not offered:
-            remedy = "its critic reads the simulator's state: " + (
-                f"env.type={self.env.type} does not offer it, use gipo"
-                if offered is None
-                else "add --env.environment_state=" + ("true" if offered is False else "'[KEY, …]'")
-            )
-            raise InputError("algorithm.type", self.algorithm.type, remedy)
+        if isinstance(self.world_model, SimulatorStateConfig) and not self.env.state_size:
+            offered = getattr(self.env, "environment_state", None)
+            remedy = "use latent"
+            if offered is not None:
+                remedy = "add --env.environment_state=" + ("true" if offered is False else "'[KEY, …]'")
+            why = f"env.type={self.env.type} tells no state here; {remedy}"
+            raise InputError("world_model.type", "simulator", why)
         only = f"algorithm.type={self.algorithm.type}"
         for name, value, wanted, why in (
             ("replay.samples_per_insert", self.replay.samples_per_insert, 1.0, "draws from its own memory"),

@@ -115,11 +115,12 @@ def _remember(
     chunk = update.adapter.policy.config.n_action_steps
     size = sum(math.prod(shape) * (1 if len(shape) == 3 else 4) for shape in wanted.values())
     most = max(1, min(algorithm.memory, BYTES // size))
+    longest = int(max(meta.episodes["length"]))
     outcomes: dict[int, bool] = {}
     totals: dict[int, float] = {}
     with console.stage("reading the dataset", total=meta.total_frames) as stage:
         frames = 0
-        for segment in recorded(config.dataset, meta, wanted, chunk, most, most):
+        for segment in recorded(config.dataset, meta, wanted, chunk, most, most, longest):
             update.remember(segment)
             outcomes[segment.origin.seed] = segment.success
             totals.setdefault(segment.origin.seed, float(segment.reward.sum()))

@@ -158,8 +158,8 @@ def make_engine(
     if isinstance(config.algorithm, ChunkCriticConfig):
         from accerl_lerobot.policies.teacher import with_teacher
 
-        size, algorithm = history * config.env.state_size, config.algorithm
-        load = functools.partial(with_teacher, loader(load), size, algorithm.teacher_episodes)
+        size, share = history * config.env.state_size, config.algorithm.teacher_episodes
+        load = functools.partial(with_teacher, loader(load), config.state_model, size, share)
     if isinstance(config.algorithm, OffPolicyConfig) and (dataset := demonstrations_of(config)) is not None:
         from accerl_lerobot.trainer.demonstrations import with_demonstrations
 

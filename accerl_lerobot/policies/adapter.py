@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from accerl_lerobot.checkpoint.tensors import in_parts, part_of, whole
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import TASK, Decision, Request, Segment
+from accerl_lerobot.experience import TASK, Decision, Request, Segment, stack_observations
 from accerl_lerobot.policies import saving
 from accerl_lerobot.policies.config import PLUGINS, PolicyConfig
 from accerl_lerobot.policies.family import Encoded, Family, Model, pooled
@@ -132,13 +132,6 @@ class PolicyAdapter(nn.Module, ABC):
     def export_trainable(self) -> dict[str, np.ndarray]:
         """A copy of `trainable` as NumPy arrays, safe to hand to another thread."""
         return {name: view.copy() for name, view in self.view_trainable().items()}
-
-
-def stack_observations(requests: Sequence[Request]) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Batches raw observations: each array (B, ...), and the B task texts."""
-    keys = [k for k in requests[0].observation if k != TASK]
-    arrays = {k: np.stack([r.observation[k] for r in requests]) for k in keys}
-    return arrays, [str(r.observation[TASK]) for r in requests]
 
 
 def example_requests(config: Any, rename_map: dict[str, str], *, explore: bool = True) -> list[Request]:

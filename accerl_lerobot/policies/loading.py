@@ -27,9 +27,9 @@ from accerl_lerobot.checkpoint.layout import BACKBONE, CONFIG_FOLDERS, STEP_FOLD
 from accerl_lerobot.checkpoint.safety import Origin, brief, read_json, read_tensors, tensor_shapes
 from accerl_lerobot.config.parsing import discover, imported
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import TASK
+from accerl_lerobot.experience import TASK, stack_observations
 from accerl_lerobot.policies import untrusted
-from accerl_lerobot.policies.adapter import LeRobotAdapter, Processing, ValueHead, stack_observations
+from accerl_lerobot.policies.adapter import LeRobotAdapter, Processing, ValueHead
 from accerl_lerobot.policies.config import (
     POLICIES,
     PolicyConfig,

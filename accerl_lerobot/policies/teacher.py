@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A teacher that sees the simulator's state and acts in part of the exploring episodes.
+"""A teacher that acts in part of the exploring episodes, on the states of a world model.
 
-It is learnt off-policy by `trainer.chunk_critic`, imitated by the policy, which sees images, and never part
-of a checkpoint that LeRobot loads.
+It is learnt off-policy by `trainer.chunk_critic`, imitated by the policy, and never part of a checkpoint that
+LeRobot loads. `world_model.states` has the interface of the model.
 
 Shapes: M networks side by side, B rows, S numbers of a state, K actions of A dims.
 """
@@ -10,16 +10,21 @@ Shapes: M networks side by side, B rows, S numbers of a state, K actions of A di
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, TASK_BITS, Observation, Request, task_codes
+from accerl_lerobot.experience import TASK_BITS, Request, stack_observations, task_codes
 from accerl_lerobot.policies.config import Load, PolicyConfig
+from accerl_lerobot.policies.features import STATE, policy_features
 from accerl_lerobot.seeds import episode_of
+
+if TYPE_CHECKING:
+    from accerl_lerobot.world_model.config import StateModelConfig
+    from accerl_lerobot.world_model.states import Observations, StateModel
 
 WIDTH = 256
 NOISE = 0.25  # standard deviation of its exploration, in normalised action units
@@ -47,15 +52,18 @@ class Ensemble(nn.Module):
 
 
 class Teacher(nn.Module):
-    """Chunks from the simulator's state; once `ready`, it acts in a `share` of exploring episodes.
+    """Chunks from states; once `ready`, it acts in a `share` of exploring episodes.
+
+    A state is what `model` makes of observations, and the code of the task.
 
     All its tensors are parameters, so that they are published with the policy's weights; those that no
     gradient reaches are set by the trainer.
     """
 
-    def __init__(self, state: int, chunk: tuple[int, int], share: float, noise: float = NOISE) -> None:
+    def __init__(self, model: StateModel, chunk: tuple[int, int], share: float, noise: float = NOISE) -> None:
         super().__init__()
-        self.chunk, self.share, self.noise = chunk, share, noise
+        self.model, self.chunk, self.share, self.noise = model, chunk, share, noise
+        state = model.size + TASK_BITS
         self.network = Ensemble(state, chunk[0] * chunk[1], 1)
         self.mean = nn.Parameter(torch.zeros(state), requires_grad=False)
         self.std = nn.Parameter(torch.ones(state), requires_grad=False)
@@ -64,6 +72,12 @@ class Teacher(nn.Module):
         beyond it the critic knows nothing."""
         self.high = nn.Parameter(torch.ones(chunk[1]), requires_grad=False)
         self.ready = nn.Parameter(torch.zeros(()), requires_grad=False)  # 1 once it may act
+
+    @torch.no_grad()
+    def states(self, observations: Observations, tasks: Sequence[str], elapsed: np.ndarray) -> Tensor:
+        """States (B, S) of observations, each (B, ...), at shares `elapsed` (B,) of the time limit."""
+        seen = self.model.encode(observations, tasks, elapsed).to(self.mean)
+        return torch.cat([seen, torch.from_numpy(task_codes(tasks)).to(seen)], 1)
 
     def scaled(self, state: Tensor) -> Tensor:
         """States (B, S) in units of what has been seen."""
@@ -89,25 +103,43 @@ class Teacher(nn.Module):
         rows = [i for i, request in enumerate(requests) if self.acts(request)]
         if not rows:
             return chunk
-        states = np.stack([state_of(requests[i].observation) for i in rows])
-        noise = [np.random.default_rng((requests[i].noise_seed, 5)).standard_normal(self.chunk) for i in rows]
-        own = self(torch.from_numpy(states).to(chunk.device)).cpu()
+        asked = [requests[i] for i in rows]
+        noise = [
+            np.random.default_rng((request.noise_seed, 5)).standard_normal(self.chunk) for request in asked
+        ]
+        observations, tasks = stack_observations(asked)
+        elapsed = np.array([request.elapsed for request in asked], np.float32)
+        own = self(self.states(observations, tasks, elapsed)).cpu()
         own = own + self.noise * torch.from_numpy(np.stack(noise).astype(np.float32))
         chunk = chunk.clone()
         chunk[rows] = own.to(chunk)
         return chunk
 
 
-def state_of(observation: Observation) -> np.ndarray:
-    """float32 (S,): what the simulator says of itself, and what stands for the task."""
-    environment = np.asarray(observation[ENVIRONMENT_STATE], np.float32).reshape(-1)
-    return np.concatenate([environment, task_codes([str(observation[TASK])])[0]])
+def with_teacher(
+    load: Load,
+    model: StateModelConfig,
+    environment_state: int,
+    share: float,
+    config: PolicyConfig,
+    noise: float = NOISE,
+) -> Any:
+    """Load a policy and give it an untrained teacher on states of an untrained `model`.
 
+    `environment_state` is the number of numbers that the simulator tells; 0: it tells none.
+    """
+    from accerl_lerobot.world_model.states import StateSpec, new_state_model
 
-def with_teacher(load: Load, state: int, share: float, config: PolicyConfig, noise: float = NOISE) -> Any:
-    """Loads a policy and gives it an untrained teacher that reads `state` numbers of the simulator."""
     adapter: Any = load(config)
     policy = adapter.policy.config
     chunk = policy.n_action_steps, policy.action_feature.shape[0]
-    adapter.teacher = Teacher(state + TASK_BITS, chunk, share, noise).to(adapter.device)
+    env_names = {new: name for name, new in config.rename_map.items()}
+    shapes = policy_features(policy).shapes
+    spec = StateSpec(
+        cameras=tuple(env_names.get(name, name) for name, shape in shapes.items() if len(shape) == 3),
+        state=policy.n_obs_steps * shapes[STATE][0],
+        environment_state=environment_state,
+        chunk=chunk,
+    )
+    adapter.teacher = Teacher(new_state_model(spec, model), chunk, share, noise).to(adapter.device)
     return adapter

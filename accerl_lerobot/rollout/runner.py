@@ -40,7 +40,9 @@ class SegmentBuilder:
     observations: list[Observation]
     length: int
     origin: Origin
+    time_limit: int  # env steps of an episode at most
     source: str = REAL
+    before: int = 0  # env steps of the episode before the first of `taken`
     taken: list[tuple[Decision, np.ndarray, float, int]] = field(default_factory=list)
     """Decisions, each with its actions, reward and env steps."""
 
@@ -52,6 +54,11 @@ class SegmentBuilder:
     @property
     def full(self) -> bool:
         return len(self.taken) >= self.length
+
+    @property
+    def elapsed(self) -> float:
+        """Share of the time limit that is gone at the next decision."""
+        return (self.before + sum(steps for *_, steps in self.taken)) / self.time_limit
 
     def add(
         self, decision: Decision, actions: np.ndarray, reward: float, steps: int, following: Observation
@@ -72,6 +79,8 @@ class SegmentBuilder:
             reward=np.array(rewards, np.float32),
             version=np.array([d.version for d in decisions], np.int64),
             steps=np.array(steps, np.int64),
+            before=self.before,
+            time_limit=self.time_limit,
             terminated=terminated,
             success=success,
             key=key,
@@ -80,6 +89,7 @@ class SegmentBuilder:
         )
         self.origin = self.origin._replace(decision=self.origin.decision + len(decisions))
         self.observations, self.taken = [self.latest], []
+        self.before += int(segment.steps.sum())
         return segment
 
 
@@ -99,7 +109,10 @@ class ActiveEpisode:
 
     def request(self) -> Request:
         seed = noise_seed(self.plan.seed, len(self.versions))
-        return Request(observation=self.builder.latest, noise_seed=seed, explore=self.plan.explore)
+        builder = self.builder
+        return Request(
+            observation=builder.latest, noise_seed=seed, elapsed=builder.elapsed, explore=self.plan.explore
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -282,7 +295,8 @@ class RolloutRunner:
             return None
         observation = self.worlds[slot].reset(plan.seed, plan.task)
         origin = Origin(plan.task, plan.seed, decision=0)
-        builder = SegmentBuilder([observation], self.config.segment_length, origin)
+        limit = self.worlds[slot].spec.max_steps
+        builder = SegmentBuilder([observation], self.config.segment_length, origin, limit)
         episode = self._episodes[slot] = ActiveEpisode(plan, builder)
         if bad := nonfinite(observation):
             return self._drop(slot, episode, f"{bad} of the first observation")

@@ -25,8 +25,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from accerl_lerobot.experience import Decision, Observation, Request
-from accerl_lerobot.policies.adapter import LeRobotAdapter, PolicyAdapter, stack_observations
+from accerl_lerobot.experience import Decision, Observation, Request, stack_observations
+from accerl_lerobot.policies.adapter import LeRobotAdapter, PolicyAdapter
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.loading import load_adapter
 from accerl_lerobot.policies.saving import save_pretrained

@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Updates from an off-policy critic and a teacher that see the simulator's state.
+"""Updates from an off-policy critic and a teacher on the states of a world model.
 
-    new episodes → memory → steps of critic and teacher → steps of the policy, so many for each new decision
+    new episodes → memory → steps of the world model → steps of critic and teacher → steps of the policy,
+    so many of each for each new decision
 
-`ChunkCriticConfig` has the formulas. Until ``trainer.value_warmup_updates`` the policy explores alone.
+`ChunkCriticConfig` has the formulas, `world_model.states` what a state is. A world model that learns does so
+on a copy; every `REFRESH` updates the one that acts takes over its weights, and all remembered states are
+computed anew. Until ``trainer.value_warmup_updates`` the policy explores alone.
 Then the teacher first learns to do what has been done so far, and from there what the critic says.
 
 Shapes: M members of the ensemble, B rows, S numbers of a state, (K, A) of a chunk.
@@ -29,6 +32,9 @@ from accerl_lerobot.policies.family import Encoded, pooled
 from accerl_lerobot.policies.teacher import Ensemble, Teacher
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.off_policy import OffPolicyUpdate, drawn, mean
+from accerl_lerobot.world_model import state_learner
+from accerl_lerobot.world_model.state_learner import StateLearner
+from accerl_lerobot.world_model.states import Transitions
 
 MEMBERS = 6
 MONTE_CARLO = 0.25  # share of the observed return in the critic's target
@@ -37,7 +43,7 @@ TAU = 0.01  # share of the critic's weights that its slow copy takes over in a s
 SMOOTHING = 0.1  # std of the noise on the teacher's chunks within the critic's target, as in TD3
 DISTANCE, IMITATION = 0.3, 0.5
 """Normalised action units in which the teacher's distance from successes is measured, and its weight."""
-PERCEPTION = 0.5  # weight of reading the simulator's state off the policy's features
+PERCEPTION = 0.5  # weight of reading the state off the policy's features
 TEACHER_LR = 3e-4
 READER_LR = 1e-3
 LAST = 50  # exploring episodes that ``teacher_success`` and ``policy_success`` are of
@@ -45,6 +51,10 @@ FIRST_STEPS = 2000  # steps in which the teacher learns what was done before it 
 MOST_FIRST = 5000  # most steps of the critic before the teacher's first along it
 MARGIN = 0.05  # share of the explored range of actions that the teacher may go beyond it
 SMALLEST_SCALE = 0.02  # smallest mean |Q| that Q is divided by
+FIRST_STATE_STEPS, STATE_STEPS = 1000, 0.5  # steps of the world model at first, and for each new decision
+LEAST_TRANSITIONS = 100  # with fewer, the world model does not begin
+REFRESH = 5  # updates after which the acting world model takes over what was learned
+ENCODED = 512  # observations whose states are computed at once
 
 
 class Critic(nn.Module):
@@ -70,6 +80,8 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         device = adapter.device
         self.critic = Critic(self.teacher).to(device)
         self.slow = copy.deepcopy(self.critic).requires_grad_(False)
+        model = self.teacher.model
+        self.states = StateLearner(model) if model.learns else None
         # Reads the scaled state off the policy's features.
         self.reader = nn.Linear(adapter.model.width, len(self.teacher.mean)).to(device)
         # The teacher lies beside the policy's weights.
@@ -89,7 +101,56 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         outcomes = {name: sum(last) / max(1, len(last)) for name, last in self._outcomes.items()}
         return super().step(segments) | outcomes
 
+    def remember(self, segment: Segment) -> None:
+        executed = self.adapter.processing.normalise(torch.from_numpy(segment.actions))
+        seen = {name: rows[:-1] for name, rows in segment.observations.items()}
+        states = self.teacher.states(seen, [segment.task] * len(segment), segment.elapsed)
+        self.memory.add(segment, executed.numpy(), state=states.cpu().numpy())
+
     def learn(self, new: int) -> dict[str, float]:
+        metrics = self._learn_states(new)
+        return metrics | self._learn_to_act(new)
+
+    def _learn_states(self, new: int) -> dict[str, float]:
+        """Steps of the world model, where it learns; now and then the one that acts takes them over."""
+        transitions = np.flatnonzero(~self.memory["last"])
+        if self.states is None or len(transitions) < LEAST_TRANSITIONS:
+            return {}
+        self.states.model.fit(self.memory.seen())
+        first = 0 if self.states.count else FIRST_STATE_STEPS
+        due = first + len(self.steps("world_model", STATE_STEPS, new))
+        metrics = mean(self._state_step(transitions) for _ in range(due))
+        if first or self.version % REFRESH == 0:
+            self.states.publish(self.teacher.model)
+            self._encode_memory()
+        return {f"world_model_{name}": value for name, value in metrics.items()}
+
+    def _state_step(self, transitions: np.ndarray) -> dict[str, float]:
+        assert self.states is not None
+        rows = drawn(transitions, state_learner.BATCH)
+        observations, tasks = self.memory.observations(rows)
+        following, _ = self.memory.observations((rows + 1) % self.memory.capacity)
+        return self.states.step(
+            Transitions(
+                observations=observations,
+                following=following,
+                tasks=tasks,
+                elapsed=self.tensor("elapsed", rows),
+                chunk=self.tensor("chunk", rows),
+                returns=self.tensor("return", rows),
+                success=self.tensor("success", rows),
+            )
+        )
+
+    def _encode_memory(self) -> None:
+        states = self.memory["state"]
+        for rows in np.array_split(np.arange(len(states)), math.ceil(len(states) / ENCODED)):
+            observations, tasks = self.memory.observations(rows)
+            states[rows] = (
+                self.teacher.states(observations, tasks, self.memory["elapsed"][rows]).cpu().numpy()
+            )
+
+    def _learn_to_act(self, new: int) -> dict[str, float]:
         won = np.flatnonzero(self.memory["success"])
         # Without a success there is nothing to learn: the teacher would follow the critic's noise.
         if self.version < self.config.value_warmup_updates or not len(won):
@@ -122,6 +183,7 @@ class ChunkCriticUpdate(OffPolicyUpdate):
             "networks": {name: copied(module) for name, module in self.networks.items()},
             "optimizers": {name: optimizer_state(optimizer) for name, optimizer in self.optimizers.items()},
             "outcomes": {name: list(last) for name, last in self._outcomes.items()},
+            "states": None if self.states is None else self.states.state(),
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -132,6 +194,8 @@ class ChunkCriticUpdate(OffPolicyUpdate):
             restore_optimizer(optimizer, state["optimizers"][name])
         for name, last in self._outcomes.items():
             last.extend(state["outcomes"][name])
+        if self.states is not None:
+            self.states.restore(state["states"])
 
     @torch.no_grad()
     def _scale_states(self) -> None:

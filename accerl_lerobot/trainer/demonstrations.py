@@ -59,7 +59,8 @@ def demonstrations(dataset: DatasetConfig, decision_cost: float, like: Segment) 
         logger.warning("%s does not join the memory: %s", dataset.repo_id, why)
         return
     chunk = like.actions.shape[1]
-    yield from recorded(dataset, meta, wanted, chunk, min(ROWS, FRAMES // chunk), ROWS, decision_cost)
+    most = min(ROWS, FRAMES // chunk)
+    yield from recorded(dataset, meta, wanted, chunk, most, ROWS, like.time_limit, decision_cost)
 
 
 def recorded(
@@ -69,6 +70,7 @@ def recorded(
     chunk: int,
     most: int,
     enough: int,
+    time_limit: int,
     decision_cost: float = 0.0,
 ) -> Iterator[Segment]:
     """Reads whole episodes as `demonstrations` does, in decisions of `chunk` env steps.
@@ -110,6 +112,8 @@ def recorded(
                     reward=reward - np.float32(decision_cost),
                     version=np.zeros(t, np.int64),
                     steps=np.minimum(chunk, end - starts),
+                    before=phase,
+                    time_limit=time_limit,
                     terminated=True,
                     success=success,
                     key="demonstration",

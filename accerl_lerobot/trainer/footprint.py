@@ -20,7 +20,8 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map_only
 
-from accerl_lerobot.policies.adapter import LeRobotAdapter, stack_observations
+from accerl_lerobot.experience import stack_observations
+from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.family import Action
 from accerl_lerobot.policies.loading import sizes_of
 from accerl_lerobot.trainer.sharding import Watch, forget

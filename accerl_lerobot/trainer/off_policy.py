@@ -3,7 +3,7 @@
 
 demonstrations, then new episodes → memory → gradient steps of the policy, so many for each new decision
 
-Shapes: B rows, E numbers of the environment state, K executed actions of A dims.
+Shapes: B rows, K executed actions of A dims.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from accerl_lerobot.algorithms import AWRConfig, OffPolicyConfig
 from accerl_lerobot.algorithms.advantages import STD_EPSILON
 from accerl_lerobot.algorithms.objective import lag_metrics
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import ENVIRONMENT_STATE, Segment, task_codes
+from accerl_lerobot.experience import ENVIRONMENT_STATE, Segment
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.family import Encoded
 from accerl_lerobot.trainer.config import TrainerConfig
@@ -47,16 +47,19 @@ class Memory:
     def __getitem__(self, name: str) -> np.ndarray:
         """A column, (len, ...).
 
-        ``state`` float32 (E + 16), the environment's, if it offers any, and what stands for the task;
-        ``chunk`` float32 (K, A); ``following``, the row `n_step` decisions on; ``reward``, discounted, of
+        ``chunk`` float32 (K, A); ``elapsed``, share of the time limit gone; ``last``, True for an episode's
+        last decision; ``following``, the row `n_step` decisions on; ``reward``, discounted, of
         the decisions before that; ``discount``, of what follows, 0 where the episode ends before;
         ``return``, discounted, of the episode from here on; ``success``, of the episode; ``task``, a place
         in `tasks`; ``observation.*``.
         """
         return self._columns[name][: len(self)]
 
-    def add(self, segment: Segment, chunk: np.ndarray) -> np.ndarray:
-        """Adds a whole episode, whose T rows it returns; `chunk`, (T, K, A), was executed, normalised."""
+    def add(self, segment: Segment, chunk: np.ndarray, **more: np.ndarray) -> np.ndarray:
+        """Add a whole episode, with `more` columns (T, ...); returns its T rows.
+
+        `chunk`, (T, K, A), was executed, normalised.
+        """
         t = len(segment)
         if segment.origin.decision or not segment.terminated or t > self.capacity:
             remedy = f"the memory holds whole episodes of at most algorithm.memory={self.capacity} decisions"
@@ -69,13 +72,13 @@ class Memory:
         ends = np.arange(t) + ahead == t
         discount = self.gamma**ahead
         seen = {name: values[:-1] for name, values in segment.observations.items()}
-        environment = seen.pop(ENVIRONMENT_STATE, np.empty((t, 0))).reshape(t, -1)
+        seen.pop(ENVIRONMENT_STATE, None)  # no policy reads it
         if segment.task not in self.tasks:
             self.tasks.append(segment.task)
-        code = task_codes([segment.task]).repeat(t, axis=0)
         columns: dict[str, Any] = {
-            "state": np.concatenate([environment, code], 1).astype(np.float32),
             "chunk": chunk,
+            "elapsed": segment.elapsed,
+            "last": np.arange(t) == t - 1,
             "reward": (returns[:-1] - discount * returns[np.arange(t) + ahead]).astype(np.float32),
             "discount": np.where(ends, 0.0, discount).astype(np.float32),
             "following": np.where(ends, rows, rows[0] + np.arange(t) + ahead) % self.capacity,
@@ -84,18 +87,23 @@ class Memory:
             "task": np.full(t, self.tasks.index(segment.task)),
         }
         self.total += t
-        for name, values in (columns | seen).items():
+        for name, values in (columns | seen | more).items():
             column = self._columns.get(name, values[:0])
             if len(column) < len(self):
-                more = min(max(FIRST, len(self), 2 * len(column)), self.capacity) - len(column)
-                column = np.concatenate([column, np.zeros((more, *values.shape[1:]), values.dtype)])
+                size = min(max(FIRST, len(self), 2 * len(column)), self.capacity)
+                space = np.zeros((size - len(column), *values.shape[1:]), values.dtype)
+                column = np.concatenate([column, space])
                 self._columns[name] = column
             column[rows] = values
         return rows
 
+    def seen(self) -> dict[str, np.ndarray]:
+        """The policy's observations of all rows, each (len, ...); not a copy."""
+        return {name: self[name] for name in self._columns if name.startswith("observation.")}
+
     def observations(self, rows: np.ndarray) -> tuple[dict[str, np.ndarray], list[str]]:
         """The policy's observations, each (B, ...), and its instructions."""
-        seen = {k: v[rows] for k, v in self._columns.items() if k.startswith("observation.")}
+        seen = {name: column[rows] for name, column in self.seen().items()}
         return seen, [self.tasks[i] for i in self._columns["task"][rows]]
 
     def state(self) -> dict[str, Any]:

@@ -20,6 +20,45 @@ WORLD_LEARNING = "world learning"  # name of the worker that trains the world mo
 
 
 @dataclass(frozen=True, kw_only=True)
+class StateModelConfig(Section, draccus.ChoiceRegistry, section="world_model"):
+    """Base config of a type of world model that critic and teacher stand on, which is a `states.StateModel`.
+
+    Example:
+        >>> @StateModelConfig.register_subclass("mine")
+        ... @dataclass(frozen=True, kw_only=True)
+        ... class MyModelConfig(StateModelConfig):
+        ...     make = "my_package.model:MyStateModel"
+    """
+
+    make: ClassVar[str]
+    """``module:name`` of the class, which is built from a `states.StateSpec` and this config."""
+
+    discover_packages_path: str | None = field(default=None, metadata={"registers": True})
+    """Package to import that registers ``world_model.type``, where that is not one of ours."""
+
+    type = registered_name
+
+
+@StateModelConfig.register_subclass("simulator")
+@dataclass(frozen=True, kw_only=True)
+class SimulatorStateConfig(StateModelConfig):
+    """The simulator's own state, where the environment tells it; nothing is learned."""
+
+    make = "accerl_lerobot.world_model.states:SimulatorState"
+
+
+@StateModelConfig.register_subclass("latent")
+@dataclass(frozen=True, kw_only=True)
+class LatentConfig(StateModelConfig):
+    """A latent state that is learned from images and proprioception during the run."""
+
+    make = "accerl_lerobot.world_model.latent:LatentModel"
+
+    latents: Annotated[int, Range("[1, 4096]")] = 64
+    """Numbers of the latent state."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class LearnableModelConfig(Section, draccus.ChoiceRegistry, section="world_model.model"):
     """Base config of a class of learned world models, which is a `contract.LearnableWorldModel`.
 

@@ -168,6 +168,7 @@ class Imagination:
         frames = (config.rollouts, len(model.spec.cameras), *model.spec.image_size, 3)
         self._frames = np.zeros(frames, np.uint8)  # the newest of each row
         self._sequence = self._uncertain_in_a_row = 0
+        self._max_steps = world.max_steps
         self._limit = math.ceil(world.max_steps / model.spec.chunk)
 
     def remember(self, segment: Segment) -> None:
@@ -322,7 +323,9 @@ class Imagination:
         self._state = state if self._state is None else replace_rows(self._state, rows, state)
         for i, start in zip(rows, starts, strict=True):
             observation = self._observation(start.frames, start.robot, start.task)
-            self._rows[i] = SegmentBuilder([observation], self._limit, start.origin, IMAGINED)
+            self._rows[i] = SegmentBuilder(
+                [observation], self._limit, start.origin, self._max_steps, IMAGINED
+            )
             self._frames[i] = start.frames
 
     @property

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot.policies.adapter import ValueHead, stack_observations
+from accerl_lerobot.experience import stack_observations
+from accerl_lerobot.policies.adapter import ValueHead
 from accerl_lerobot.policies.config import GaussianSamplerConfig
 from tests.policies.checkpoints import write_act
 from tests.policies.tiny import adapter_at, requests

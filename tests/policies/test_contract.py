@@ -16,8 +16,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from accerl_lerobot.experience import Observation, Request
-from accerl_lerobot.policies.adapter import LeRobotAdapter, Processing, stack_observations
+from accerl_lerobot.experience import Observation, Request, stack_observations
+from accerl_lerobot.policies.adapter import LeRobotAdapter, Processing
 from accerl_lerobot.policies.config import POLICIES, PolicyConfig, SamplerConfig
 from accerl_lerobot.policies.saving import save_pretrained
 from accerl_lerobot.testing import check_batches, check_gradient, check_saved, log_ratio, perturb, stored

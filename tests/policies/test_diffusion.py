@@ -14,8 +14,7 @@ from accerl_lerobot.engine import run
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig
 from accerl_lerobot.envs import SimulatedConfig, make_world
 from accerl_lerobot.evaluation import EvaluationConfig
-from accerl_lerobot.experience import TASK, Request
-from accerl_lerobot.policies.adapter import stack_observations
+from accerl_lerobot.experience import TASK, Request, stack_observations
 from accerl_lerobot.policies.config import DiffusionSamplerConfig, PolicyConfig
 from accerl_lerobot.policies.family import Family
 from accerl_lerobot.rollout.runner import EpisodePlans, RolloutConfig

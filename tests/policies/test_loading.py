@@ -24,8 +24,7 @@ from accerl_lerobot.demos.sft import SFTConfig
 from accerl_lerobot.engine.config import RunConfig, parse
 from accerl_lerobot.engine.preflight import sft_policy
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import ENVIRONMENT_STATE
-from accerl_lerobot.policies.adapter import stack_observations
+from accerl_lerobot.experience import ENVIRONMENT_STATE, stack_observations
 from accerl_lerobot.policies.config import FlowSamplerConfig, PolicyConfig, SamplerConfig
 from accerl_lerobot.policies.loading import load_adapter, load_lerobot_config, precision_on, resolve_device
 from accerl_lerobot.policies.saving import save_pretrained

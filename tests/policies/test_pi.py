@@ -12,7 +12,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from accerl_lerobot.policies.adapter import LeRobotAdapter, stack_observations
+from accerl_lerobot.experience import stack_observations
+from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.config import FlowSamplerConfig, PolicyConfig, TokenSamplerConfig
 from accerl_lerobot.policies.flow import FlowFamily
 from accerl_lerobot.policies.saving import save_pretrained

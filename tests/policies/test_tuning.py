@@ -11,7 +11,8 @@ import pytest
 import torch
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.policies.adapter import LeRobotAdapter, stack_observations
+from accerl_lerobot.experience import stack_observations
+from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.config import PolicyConfig, TuningConfig
 from accerl_lerobot.policies.saving import save_pretrained
 from accerl_lerobot.testing import check_ratio_one, log_ratio, perturb, stored

@@ -24,6 +24,7 @@ def make_segment(key: str, n: int = 4, version: int | list[int] = 0, **replace: 
         "version": versions,
         "actions": np.zeros((n, 1, 1), np.float32),
         "steps": np.ones(n, np.int64),
+        "time_limit": 100,
         "origin": Origin("push-v3", seed=0, decision=0),
         "terminated": False,
         "success": False,

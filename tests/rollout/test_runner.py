@@ -261,7 +261,7 @@ def decision(step: int, version: int = 0) -> Decision:
 
 
 def collected(count: int) -> SegmentBuilder:
-    builder = SegmentBuilder([observation(0)], 4, Origin("push-v3", seed=7, decision=0))
+    builder = SegmentBuilder([observation(0)], 4, Origin("push-v3", seed=7, decision=0), 100)
     for step in range(count):
         add(builder, step, float(step), step + 1)
     return builder
@@ -285,6 +285,8 @@ def test_everything_about_a_decision_stays_together():
     assert segment.reward.tolist() == [0, 1, 2] and segment.origin == ("push-v3", 7, 0)
     assert segment.version.tolist() == [0, 1, 2] and segment.steps.tolist() == [1, 2, 3]
     assert segment.log_prob.dtype == segment.reward.dtype == np.float32
+    np.testing.assert_allclose(segment.elapsed, [0, 0.01, 0.03], rtol=1e-6)
+    assert segment.elapsed.dtype == np.float32
     assert segment.version.dtype == segment.steps.dtype == np.int64
     assert segment.task == "push" and TASK not in segment.observations
 

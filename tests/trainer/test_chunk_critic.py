@@ -16,13 +16,22 @@ from accerl_lerobot.algorithms import AWRConfig, ChunkCriticConfig, SelfImitatio
 from accerl_lerobot.engine.preflight import check_start
 from accerl_lerobot.envs import SimulatedConfig, make_world
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, TASK_BITS, Origin, Request, Segment
+from accerl_lerobot.experience import (
+    ENVIRONMENT_STATE,
+    TASK,
+    TASK_BITS,
+    Observation,
+    Origin,
+    Request,
+    Segment,
+    stack_observations,
+)
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.config import FlowSamplerConfig, PolicyConfig
 from accerl_lerobot.policies.family import Encoded
 from accerl_lerobot.policies.flow import FlowFamily, FlowShape
 from accerl_lerobot.policies.loading import load_adapter
-from accerl_lerobot.policies.teacher import Ensemble, Teacher, state_of, with_teacher
+from accerl_lerobot.policies.teacher import Ensemble, Teacher, with_teacher
 from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.seeds import noise_seed
@@ -32,6 +41,8 @@ from accerl_lerobot.trainer.chunk_critic import ChunkCriticUpdate
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.off_policy import AWRUpdate, Memory, OffPolicyUpdate
 from accerl_lerobot.trainer.update import make_update
+from accerl_lerobot.world_model.config import LatentConfig, SimulatorStateConfig
+from accerl_lerobot.world_model.states import SimulatorState, StateSpec
 from tests.replay.segments import make_segment
 from tests.rounding import assert_close
 from tests.runs import tiny_run
@@ -69,7 +80,19 @@ def chunks(segment: Segment) -> np.ndarray:
 
 def taught(checkpoint: Path) -> LeRobotAdapter:
     """A policy and a teacher that sees one number and the task."""
-    return with_teacher(load_adapter, 1, 0.5, PolicyConfig(path=str(checkpoint), device="cpu"), noise=0.1)
+    config = PolicyConfig(path=str(checkpoint), device="cpu")
+    return with_teacher(load_adapter, SimulatorStateConfig(), 1, 0.5, config, noise=0.1)
+
+
+def simulator(numbers: int) -> SimulatorState:
+    """The state of a simulator that tells so many numbers."""
+    return SimulatorState(StateSpec((), 4, numbers, (4, 2)), SimulatorStateConfig())
+
+
+def state_of(teacher: Teacher, observation: Observation) -> torch.Tensor:
+    """(1, S), at the beginning of an episode."""
+    observations, tasks = stack_observations([Request(observation=observation, noise_seed=0)])
+    return teacher.states(observations, tasks, np.zeros(1, np.float32))
 
 
 def learner(path: Path, algorithm: ChunkCriticConfig | None = None, **trainer: Any) -> ChunkCriticUpdate:
@@ -91,7 +114,7 @@ class TestMemory:
         memory = Memory(10, GAMMA, n_step=2)
         for first in range(0, 100, 10):
             segment = episode([0.0] * 4, first=first)
-            memory.add(segment, chunks(segment))
+            memory.add(segment, chunks(segment), state=segment.observations[ENVIRONMENT_STATE][:-1])
             bootstraps = np.flatnonzero(memory["discount"])
             now = memory["state"][bootstraps, 0]
             then = memory["state"][memory["following"][bootstraps], 0]
@@ -105,8 +128,7 @@ class TestMemory:
             segment = episode([0.0, 1.0])
             segment.task = name
             memory.add(segment, chunks(segment))
-        assert memory["state"].shape == (4, 1 + TASK_BITS)
-        assert (memory["state"][0, 1:] != memory["state"][2, 1:]).any()
+        assert memory["last"].tolist() == [False, True, False, True]
         again = Memory(1000, GAMMA, n_step=2)
         again.restore(memory.state())
         for each in (memory, again):
@@ -114,7 +136,7 @@ class TestMemory:
         seen, tasks = again.observations(np.array([0, 3, 4]))
         assert tasks == ["open the door", "close the door", "Match the target"]
         assert ENVIRONMENT_STATE not in seen and seen["observation.state"].shape == (3, 4)
-        np.testing.assert_array_equal(again["state"], memory["state"])
+        np.testing.assert_array_equal(again["return"], memory["return"])
 
     def test_a_part_of_an_episode_is_refused(self):
         segment = episode([0.0, 0.0])
@@ -150,16 +172,18 @@ def test_the_ensemble_equals_a_slow_one():
 
 def test_a_teacher_keeps_to_its_range_and_scales_what_it_sees():
     torch.manual_seed(0)
-    teacher = Teacher(state=2, chunk=(3, 2), share=1.0, noise=0.0)
+    teacher = Teacher(simulator(2), chunk=(3, 2), share=1.0, noise=0.0)
     with torch.no_grad():
         teacher.low.copy_(torch.tensor([-1.0, 2.0]))
         teacher.high.copy_(torch.tensor([0.0, 4.0]))
-        teacher.mean.copy_(torch.tensor([1.0, 2.0]))
-        teacher.std.copy_(torch.tensor([0.5, 4.0]))
+        teacher.mean[:2] = torch.tensor([1.0, 2.0])
+        teacher.std[:2] = torch.tensor([0.5, 4.0])
         teacher.network.weights[-1].mul_(1000)
-    scaled = teacher.scaled(torch.tensor([[2.0, 2.0], [1.0, 99.0]]))
-    np.testing.assert_allclose(scaled.detach(), [[2, 0], [0, 10]])
-    chunk = teacher(100 * torch.randn(50, 2)).detach()
+    states = torch.zeros(2, 2 + TASK_BITS)
+    states[:, :2] = torch.tensor([[2.0, 2.0], [1.0, 99.0]])
+    scaled = teacher.scaled(states)
+    np.testing.assert_allclose(scaled[:, :2].detach(), [[2, 0], [0, 10]])
+    chunk = teacher(100 * torch.randn(50, 2 + TASK_BITS)).detach()
     assert chunk.shape == (50, 3, 2)
     assert (chunk.amin((0, 1)) >= teacher.low).all() and (chunk.amax((0, 1)) <= teacher.high).all()
     assert chunk[..., 1].max() > 3.9 and chunk[..., 0].min() < -0.9
@@ -168,7 +192,8 @@ def test_a_teacher_keeps_to_its_range_and_scales_what_it_sees():
 class TestActing:
     def test_whole_episodes_are_the_teachers_once_it_is_ready(self, tiny_checkpoint: Path):
         config = PolicyConfig(path=str(tiny_checkpoint), device="cpu")
-        adapter = with_teacher(load_adapter, ENV.state_size, share=0.5, config=config, noise=0.0)
+        model = SimulatorStateConfig()
+        adapter = with_teacher(load_adapter, model, ENV.state_size, share=0.5, config=config, noise=0.0)
         assert adapter.teacher is not None
         observation = make_world(ENV).reset(0, "match")
         asked = [
@@ -185,21 +210,22 @@ class TestActing:
         assert not acts[..., 1].any(), "evaluation is the policy's"
         np.testing.assert_array_equal(acts[:, 0, 0], acts[:, 1, 0])
         assert 70 < acts[:, 0, 0].sum() < 130
-        state = torch.from_numpy(state_of(observation))[None]
+        state = state_of(adapter.teacher, observation)
+        assert state.shape == (1, ENV.state_size + TASK_BITS)
         wanted = adapter.processing.unnormalise(adapter.teacher(state).detach())[0].numpy()
         for i, (decision, before) in enumerate(zip(adapter.decide(asked[:8], 0), own, strict=True)):
             expected = wanted if acts.reshape(-1)[i] else before.chunk
             np.testing.assert_allclose(decision.chunk, expected, atol=1e-6)
 
     def test_its_noise_belongs_to_the_request(self):
-        teacher = Teacher(state=ENV.state_size + TASK_BITS, chunk=(4, 2), share=1.0, noise=0.5)
+        teacher = Teacher(simulator(ENV.state_size), chunk=(4, 2), share=1.0, noise=0.5)
         with torch.no_grad():
             teacher.ready.fill_(1)
         observation = make_world(ENV).reset(0, "match")
         asked = [Request(observation=observation, noise_seed=i) for i in range(400)]
         chunk = teacher.replace(torch.zeros(400, 4, 2), asked)
         torch.testing.assert_close(teacher.replace(torch.zeros(3, 4, 2), asked[7:10]), chunk[7:10])
-        noise = chunk - teacher(torch.from_numpy(state_of(observation))[None]).detach()
+        noise = chunk - teacher(state_of(teacher, observation)).detach()
         assert abs(float(noise.std()) - 0.5) < 0.03
 
 
@@ -477,7 +503,14 @@ SECTIONS: dict[str, Any] = {
 @pytest.mark.parametrize(
     ("sections", "message"),
     [
-        ({"env": SimulatedConfig()}, r"algorithm\.type='chunk_critic': .*add --env\.environment_state=true"),
+        (
+            {"env": SimulatedConfig(), "world_model": SimulatorStateConfig()},
+            r"world_model\.type='simulator': .*add --env\.environment_state=true",
+        ),
+        (
+            {"algorithm": SelfImitationConfig(), "world_model": LatentConfig()},
+            r"world_model\.type='latent': .*use chunk_critic",
+        ),
         ({"replay": ReplayConfig(samples_per_insert=2.0)}, r"replay\.samples_per_insert=2\.0: .*use 1\.0"),
         ({"trainer": TrainerConfig(ranks=2)}, r"trainer\.ranks=2: .*use 1"),
         ({"rollout": RolloutConfig(segment_length=3)}, r"rollout\.segment_length=3: .*use at least 4"),

@@ -29,6 +29,7 @@ from accerl_lerobot.trainer import demonstrations as module
 from accerl_lerobot.trainer.chunk_critic import ChunkCriticUpdate
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.demonstrations import demonstrations, recorded, with_demonstrations
+from accerl_lerobot.world_model.config import SimulatorStateConfig
 from tests.replay.segments import make_segment
 from tests.runs import tiny_run
 from tests.tiny_datasets import labels, write_dataset
@@ -136,7 +137,7 @@ def test_a_dataset_of_something_else_is_left_out(
 def test_the_memory_begins_with_them_and_is_restored_without(
     dataset: DatasetConfig, like: Segment, tiny_checkpoint: Path
 ):
-    load = partial(with_teacher, load_adapter, ENV.state_size, 0.5)
+    load = partial(with_teacher, load_adapter, SimulatorStateConfig(), ENV.state_size, 0.5)
     policy = PolicyConfig(path=str(tiny_checkpoint), device="cpu")
     adapter = with_demonstrations(load, dataset, COST, policy)
     config = TrainerConfig(value_warmup_updates=100)

@@ -100,8 +100,7 @@ def published(folder: Path) -> tuple[LeRobotAdapter, tuple, dict]:
     import numpy as np
 
     from accerl_lerobot.bench.policy import STATE, BenchPolicyConfig, _adapter
-    from accerl_lerobot.experience import TASK, Request
-    from accerl_lerobot.policies.adapter import stack_observations
+    from accerl_lerobot.experience import TASK, Request, stack_observations
 
     adapter = _adapter(BenchPolicyConfig(), torch.device("cpu"), folder)
     requests = [

@@ -36,7 +36,8 @@ def real_episode(seed: int, *, length: int = 8, solve_at: int = 99) -> list[Segm
     """An episode of random chunks, which are right from decision `solve_at` on."""
     world = make_world(WORLD)
     rng = np.random.default_rng(seed)
-    builder = SegmentBuilder([world.reset(seed, "match")], length, Origin("match", seed, 0))
+    origin = Origin("match", seed, 0)
+    builder = SegmentBuilder([world.reset(seed, "match")], length, origin, world.spec.max_steps)
     segments: list[Segment] = []
     for t in range(99):
         chunk = rng.uniform(-0.2, 0.2, (K, 2)).astype(np.float32)

@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A latent state of images, learned by predicting itself: it takes the place of the simulator's state.
+
+    images o ──random shift──► encoder ──► z ──with chunk──► predicted z', proprioception'
+    images o'──random shift──► slow encoder ──► z'           InfoNCE against the batch's others
+
+A convolutional encoder as in TD-MPC2 (arXiv 2310.16828), contrasted with a slow copy of itself one decision
+later (InfoNCE, arXiv 1807.03748; the slow copy as in SPR, arXiv 2007.05929). Return, executed chunk and the
+chunks of successes are read off the state too, so that it holds what decides them. Without the random shift
+(DrQ-v2, arXiv 2107.09645) it recognises episodes by their pixels, and a critic on it judges no action.
+
+Shapes: B rows, Z latent numbers, S numbers of proprioception, K executed actions of A dims.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from accerl_lerobot.experience import TASK_BITS, task_codes
+from accerl_lerobot.world_model.config import LatentConfig
+from accerl_lerobot.world_model.states import Observations, StateModel, StateSpec, Transitions
+
+PROPRIOCEPTION = "observation.state"
+SIDE = 64  # pixels of the square that every image is resized to
+SHIFT = 3  # pixels of the random shift at most, in each direction
+CHANNELS, KERNELS, STRIDES = 32, (7, 5, 3, 3), (2, 2, 2, 1)
+WIDTH = 256
+FOLLOW = 0.02  # share of the encoder that its slow copy takes over in a step
+TEMPERATURE = 0.1  # of the contrast
+CONTRAST, RETURN, INVERSE, CLONING = 0.1, 4.0, 0.3, 0.5  # weights of the losses; proprioception's is 1
+SMALLEST_STD = 1e-3
+
+
+class Encoder(nn.Module):
+    """Images, float (B, C, 64, 64) in [−½, ½], to latents (B, Z) of mean 0 and variance 1."""
+
+    def __init__(self, channels: int, size: int) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        side = SIDE
+        for kernel, stride in zip(KERNELS, STRIDES, strict=True):
+            layers += [nn.Conv2d(channels, CHANNELS, kernel, stride), nn.SiLU()]
+            channels, side = CHANNELS, (side - kernel) // stride + 1
+        layers[-1] = nn.Flatten()
+        self.images = nn.Sequential(*layers)
+        self.latent = network(CHANNELS * side**2, size, hidden=1)
+
+    def forward(self, images: Tensor) -> Tensor:
+        latent = self.latent(self.images(images))
+        return functional.layer_norm(latent, latent.shape[-1:])
+
+
+class LatentModel(StateModel):
+    """Its states are z, proprioception, and the share of the time limit gone."""
+
+    def __init__(self, spec: StateSpec, config: LatentConfig) -> None:
+        super().__init__()
+        self.cameras, self.latents = spec.cameras, config.latents
+        self.size = config.latents + spec.state + 1
+        self.encoder = Encoder(3 * len(spec.cameras), config.latents)
+        self.slow = copy.deepcopy(self.encoder).requires_grad_(False)
+        seen, chunk = config.latents + spec.state, spec.chunk[0] * spec.chunk[1]
+        self.dynamics = network(seen + chunk + TASK_BITS, seen, hidden=2)
+        self.value = network(seen + 1 + TASK_BITS, 1, hidden=1)
+        self.inverse = network(2 * seen, chunk, hidden=1)
+        self.cloned = network(seen + TASK_BITS, chunk, hidden=1)
+        self.mean = nn.Parameter(torch.zeros(spec.state), requires_grad=False)
+        self.std = nn.Parameter(torch.ones(spec.state), requires_grad=False)
+
+    def encode(self, observations: Observations, tasks: Sequence[str], elapsed: np.ndarray) -> Tensor:
+        latent = self.encoder(self._images(observations))
+        late = torch.from_numpy(elapsed.astype(np.float32))[:, None].to(latent)
+        return torch.cat([latent, self._proprioception(observations), late], 1)
+
+    @torch.no_grad()
+    def fit(self, observations: Observations) -> None:
+        numbers = observations[PROPRIOCEPTION]
+        numbers = numbers.reshape(len(numbers), -1)
+        # In float64, or the rounding of a long sum would look like a spread.
+        self.mean.copy_(torch.from_numpy(numbers.mean(0, dtype=np.float64)))
+        self.std.copy_(torch.from_numpy(numbers.std(0, dtype=np.float64).clip(SMALLEST_STD)))
+
+    def loss(self, transitions: Transitions) -> tuple[Tensor, dict[str, float]]:
+        self._follow()
+        now, following = self._images(transitions.observations), self._images(transitions.following)
+        robot, robot_then = (
+            (self._proprioception(seen) - self.mean) / self.std
+            for seen in (transitions.observations, transitions.following)
+        )
+        code = torch.from_numpy(task_codes(transitions.tasks)).to(robot)
+        chunk = transitions.chunk.flatten(1)
+
+        seen = torch.cat([self.encoder(shifted(now)), robot], 1)
+        seen_then = torch.cat([self.encoder(shifted(following)), robot_then], 1)
+        with torch.no_grad():
+            latent_then = self.slow(shifted(following))
+
+        predicted = seen + self.dynamics(torch.cat([seen, chunk, code], 1))
+        contrast = info_nce(predicted[:, : self.latents], latent_then)
+        proprioception = (predicted[:, self.latents :] - robot_then).square().mean()
+        value = self.value(torch.cat([seen, transitions.elapsed[:, None], code], 1))[:, 0]
+        returns = (value - transitions.returns).square().mean()
+        inverse = (self.inverse(torch.cat([seen, seen_then], 1)) - chunk).square().mean()
+        distance = (self.cloned(torch.cat([seen, code], 1)) - chunk).square().mean(1)
+        cloning = (distance * transitions.success).mean()
+
+        loss = CONTRAST * contrast + proprioception + RETURN * returns + INVERSE * inverse + CLONING * cloning
+        metrics = {
+            "contrast": contrast, "proprioception": proprioception, "return": returns, "inverse": inverse,
+            "cloning": cloning,
+        }  # fmt: skip
+        return loss, {name: float(part.detach()) for name, part in metrics.items()}
+
+    @torch.no_grad()
+    def _follow(self) -> None:
+        for slow, fast in zip(self.slow.parameters(), self.encoder.parameters(), strict=True):
+            slow.lerp_(fast, FOLLOW)
+
+    def _images(self, observations: Observations) -> Tensor:
+        """Float (B, 3 · cameras, 64, 64) in [−½, ½]; of several env steps the newest."""
+        cameras = []
+        for name in self.cameras:
+            pixels = observations[name]
+            newest = pixels if pixels.ndim == 4 else pixels[:, -1]
+            image = torch.from_numpy(np.ascontiguousarray(newest)).to(self.mean.device)
+            image = image.permute(0, 3, 1, 2).float() / 255 - 0.5
+            if image.shape[-2:] != (SIDE, SIDE):
+                image = functional.interpolate(image, (SIDE, SIDE), mode="area")
+            cameras.append(image)
+        return torch.cat(cameras, 1)
+
+    def _proprioception(self, observations: Observations) -> Tensor:
+        numbers = observations[PROPRIOCEPTION]
+        return torch.from_numpy(numbers.reshape(len(numbers), -1)).to(self.mean)
+
+
+def network(inputs: int, outputs: int, hidden: int) -> nn.Sequential:
+    """Linear layers with LayerNorm and SiLU between them."""
+    sizes = [inputs, *[WIDTH] * hidden]
+    layers: list[nn.Module] = []
+    for before, after in pairwise(sizes):
+        layers += [nn.Linear(before, after), nn.LayerNorm(after), nn.SiLU()]
+    return nn.Sequential(*layers, nn.Linear(sizes[-1], outputs))
+
+
+def info_nce(predicted: Tensor, observed: Tensor) -> Tensor:
+    """Cross-entropy of telling each prediction's own observation (B, Z) from the others of the batch."""
+    similarity = functional.normalize(predicted, dim=1) @ functional.normalize(observed, dim=1).T
+    own = torch.arange(len(predicted), device=predicted.device)
+    return functional.cross_entropy(similarity / TEMPERATURE, own)
+
+
+def shifted(images: Tensor) -> Tensor:
+    """Images (B, C, H, W), each moved by up to `SHIFT` pixels at random; edges are repeated."""
+    count, channels, height, width = images.shape
+    padded = functional.pad(images, (SHIFT,) * 4, mode="replicate")
+    offsets = torch.randint(0, 2 * SHIFT + 1, (2, count, 1))
+    rows = (offsets[0] + torch.arange(height)).to(images.device)
+    columns = (offsets[1] + torch.arange(width)).to(images.device)
+    image = torch.arange(count, device=images.device)[:, None, None, None]
+    channel = torch.arange(channels, device=images.device)[None, :, None, None]
+    return padded[image, channel, rows[:, None, :, None], columns[:, None, None, :]]

@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Training of a state model beside the one that acts.
+
+Critic, teacher and memory use a model that stands still; its copy here learns. `publish` hands the copy's
+weights over, after which remembered states are to be computed anew.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from typing import Any
+
+import torch
+
+from accerl_lerobot.checkpoint.tensors import copied, optimizer_state, restore_optimizer
+from accerl_lerobot.world_model.states import StateModel, Transitions
+
+BATCH = 64  # transitions of a step
+LEARNING_RATE, WEIGHT_DECAY, CLIP = 1e-3, 1e-4, 10.0
+
+
+class StateLearner:
+    """Gradient steps on a copy of `model`."""
+
+    def __init__(self, model: StateModel) -> None:
+        self.model = copy.deepcopy(model)
+        learned = [parameter for parameter in self.model.parameters() if parameter.requires_grad]
+        self.optimizer = torch.optim.AdamW(learned, lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY)
+        self.count = self.skipped = 0  # gradient steps made, and those left out for not being finite
+
+    def step(self, transitions: Transitions) -> dict[str, float]:
+        """Make a gradient step; returns the loss's parts."""
+        loss, metrics = self.model.loss(transitions)
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        norm = torch.nn.utils.clip_grad_norm_(self.optimizer.param_groups[0]["params"], CLIP)
+        if math.isfinite(float(loss.detach()) + float(norm)):
+            self.optimizer.step()
+        else:
+            self.skipped += 1
+        self.count += 1
+        return metrics
+
+    def publish(self, model: StateModel) -> None:
+        """Copy the weights of now into the model that acts."""
+        model.load_state_dict(self.model.state_dict())
+
+    def state(self) -> dict[str, Any]:
+        """A copy of all that `restore` needs."""
+        counts = {"count": self.count, "skipped": self.skipped}
+        return counts | {"model": copied(self.model), "optimizer": optimizer_state(self.optimizer)}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Resume from `state`."""
+        self.count, self.skipped = state["count"], state["skipped"]
+        self.model.load_state_dict(state["model"])
+        restore_optimizer(self.optimizer, state["optimizer"])
