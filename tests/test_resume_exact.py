@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
+from accerl_lerobot.trainer import chunk_critic
 from accerl_lerobot.trainer.config import TrainerConfig
 from tests.runs import drive, tiny_run, until
 
@@ -31,6 +32,11 @@ CASES: dict[str, dict[str, Any]] = {
     "weights held back": {"trainer": {"hold_back": 3, "probe_every": 4}},
     "chunk critic": {
         "env": SimulatedConfig(max_steps=16, environment_state=True),
+        "rollout": RolloutConfig(worlds=4, segment_length=4),
+        "replay": ReplayConfig(capacity=64, min_decisions=16, ahead=32, samples_per_insert=1),
+        "algorithm": ChunkCriticConfig(),
+    },
+    "latent world model": {
         "rollout": RolloutConfig(worlds=4, segment_length=4),
         "replay": ReplayConfig(capacity=64, min_decisions=16, ahead=32, samples_per_insert=1),
         "algorithm": ChunkCriticConfig(),
@@ -51,6 +57,14 @@ def config_of(checkpoint: Path, case: str) -> RunConfig:
     sections["trainer"] = TrainerConfig(**trainer | {"warmup_updates": 2} | sections.pop("trainer", {}))
     config = tiny_run(checkpoint, seed=3, **sections)
     return replace(config, launch=replace(config.launch, engine="local"))
+
+
+@pytest.fixture(autouse=True, scope="module")
+def few_first_steps() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(chunk_critic, "FIRST_STATE_STEPS", 5)
+        patch.setattr(chunk_critic, "LEAST_TRANSITIONS", 40)
+        yield
 
 
 def begin(checkpoint: Path, case: str, state: Path | None = None) -> LocalEngine:

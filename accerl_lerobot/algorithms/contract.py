@@ -100,16 +100,17 @@ class AWRConfig(OffPolicyConfig):
 @AlgorithmConfig.register_subclass("chunk_critic")
 @dataclass(frozen=True, kw_only=True)
 class ChunkCriticConfig(OffPolicyConfig):
-    """Settings of off-policy learning from a critic over (simulator state, executed chunk) and a teacher.
+    """Settings of off-policy learning from a critic over (state, executed chunk) and a teacher.
 
         critic   y = (1 − m)·[Σ_{j<n} γ^j r_j + γ^n (mean Q' − std Q')(s_n, μ(s_n))] + m·R  for each Q_i(s, c)
         teacher  L = E[(std Q − mean Q)(s, μ(s))] / E|Q| + ½·E_successes ‖μ(s) − c‖² / 0.3²
         policy   L = E[imitation loss of π(o) on μ(s)] + ½·E‖h(features(o)) − s‖²
 
-    n is 4 decisions, m is ¼, s is ``observation.environment_state``, which the policy never reads (asymmetric
-    actor-critic, arXiv 1710.06542). The teacher μ is a small network of s, acts in part of the exploring
-    episodes and labels every observation in memory (DAgger, arXiv 1011.0686); h is a linear map that exists
-    only while training. Related: TD3+BC (arXiv 2106.06860), RLPD (2302.02948), Q-chunking (2507.07969).
+    n is 4 decisions, m is ¼, s is the state of ``world_model.type``: the simulator's, which the policy never
+    reads (asymmetric actor-critic, arXiv 1710.06542), or a latent one that is learned. The teacher μ is a
+    small network of s, acts in part of the exploring episodes and labels every observation in memory (DAgger,
+    arXiv 1011.0686); h is a linear map that exists only while training. Related: TD3+BC (arXiv 2106.06860),
+    RLPD (2302.02948), Q-chunking (2507.07969).
     """
 
     update = "accerl_lerobot.trainer.chunk_critic:ChunkCriticUpdate"

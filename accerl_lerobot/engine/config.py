@@ -112,7 +112,7 @@ class RunConfig(Section):
     replay: ReplayConfig = field(default_factory=ReplayConfig)
     algorithm: AlgorithmConfig = field(default_factory=GIPOConfig)
     world_model: StateModelConfig | None = None
-    """What chunk_critic's critic and teacher see. None: simulator where the environment tells its state, else
+    """State that chunk_critic's critic and teacher see. None: simulator where the environment tells it, else
     latent."""
     trainer: TrainerConfig = field(default_factory=TrainerConfig)
     imagination: ImaginationConfig = field(default_factory=ImaginationConfig)

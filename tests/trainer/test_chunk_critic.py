@@ -95,6 +95,15 @@ def state_of(teacher: Teacher, observation: Observation) -> torch.Tensor:
     return teacher.states(observations, tasks, np.zeros(1, np.float32))
 
 
+def latent_learner(path: Path) -> ChunkCriticUpdate:
+    """A learner on a latent state, of which the environment tells nothing."""
+    config = PolicyConfig(path=str(path), device="cpu")
+    adapter = with_teacher(load_adapter, LatentConfig(latents=4), 0, 0.5, config, noise=0.1)
+    return ChunkCriticUpdate(
+        adapter, ChunkCriticConfig(), TrainerConfig(warmup_updates=0, value_warmup_updates=0)
+    )
+
+
 def learner(path: Path, algorithm: ChunkCriticConfig | None = None, **trainer: Any) -> ChunkCriticUpdate:
     config = TrainerConfig(**{"warmup_updates": 0, "value_warmup_updates": 0} | trainer)
     return ChunkCriticUpdate(taught(path), algorithm or ChunkCriticConfig(), config)
@@ -306,6 +315,39 @@ def test_a_step_of_critic_and_teacher_by_hand(tiny_checkpoint: Path, monkeypatch
     assert float(found.detach()) == pytest.approx(0.5 * np.square(read - scaled(every)).mean(), rel=1e-3)
 
 
+def test_a_latent_state_is_computed_anew_when_the_model_that_acts_changes(
+    tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(chunk_critic, "FIRST_STATE_STEPS", 2)
+    monkeypatch.setattr(chunk_critic, "LEAST_TRANSITIONS", 4)
+    torch.manual_seed(0)
+    update, rng = latent_learner(tiny_checkpoint), np.random.default_rng(0)
+
+    def played() -> Segment:
+        segment = episode([0.0, 0.0, 1.0], actions=rng.uniform(-1, 1, (3, 4, 2)).astype(np.float32))
+        del segment.observations[ENVIRONMENT_STATE]
+        segment.observations["observation.images.front"] = rng.integers(0, 256, (4, 32, 32, 3), np.uint8)
+        segment.elapsed = np.array([0, 0.25, 0.5], np.float32)
+        return segment
+
+    def states_of_now() -> torch.Tensor:
+        observations = update.memory.observations(np.arange(len(update.memory)))
+        return update.teacher.states(*observations, update.memory["elapsed"])
+
+    metrics = update.step([played()])
+    assert not any(name.startswith("world_model") for name in metrics), "two transitions are too few"
+    for _ in range(6):
+        acting = [parameter.detach().clone() for parameter in update.teacher.model.parameters()]
+        metrics = update.step([played(), played()])
+        now = list(update.teacher.model.parameters())
+        changed = any(not torch.equal(old, new) for old, new in zip(acting, now, strict=True))
+        assert changed == (update.version - 1 in (1, 5))
+        assert np.isfinite(metrics["world_model_contrast"])
+        torch.testing.assert_close(torch.from_numpy(update.memory["state"]), states_of_now())
+    assert update.memory["state"][:3, 4 + 4].tolist() == [0, 0.25, 0.5]
+    assert update.states is not None and update.states.count == 2 + 6 * 3
+
+
 def test_success_is_told_by_who_acted(tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch):
     update = learner(tiny_checkpoint, value_warmup_updates=9)
     segments = [episode([float(won)]) for won in (1, 1, 0, 0)]
@@ -416,10 +458,13 @@ def awr(checkpoint: Path, algorithm: AWRConfig | None = None, **trainer: Any) ->
     return update
 
 
-@pytest.mark.parametrize("make", [learner, awr])
+@pytest.mark.parametrize("make", [learner, latent_learner, awr])
 def test_what_was_learnt_is_restored_to_the_last_bit(
-    make: Callable[[Path], OffPolicyUpdate], tiny_checkpoint: Path
+    make: Callable[[Path], OffPolicyUpdate], tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
 ):
+    monkeypatch.setattr(chunk_critic, "FIRST_STATE_STEPS", 3)
+    monkeypatch.setattr(chunk_critic, "LEAST_TRANSITIONS", 8)
+
     def steps(update: OffPolicyUpdate, seed: int) -> dict[str, float]:
         torch.manual_seed(seed)
         actions = np.random.default_rng(seed).uniform(-1, 1, (8, 3, 4, 2)).astype(np.float32)

@@ -1,0 +1,199 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The latent state: its loss against a slow one by hand, what it reads, how it learns and is restored."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from accerl_lerobot.experience import task_codes
+from accerl_lerobot.world_model import latent
+from accerl_lerobot.world_model.config import LatentConfig
+from accerl_lerobot.world_model.latent import LatentModel, info_nce, shifted
+from accerl_lerobot.world_model.state_learner import StateLearner
+from accerl_lerobot.world_model.states import Observations, StateSpec, Transitions
+
+FRONT, WRIST, ROBOT = "observation.images.front", "observation.images.wrist", "observation.state"
+SPEC = StateSpec(cameras=(FRONT,), state=3, environment_state=0, chunk=(2, 2))
+
+
+def model(spec: StateSpec = SPEC, latents: int = 8) -> LatentModel:
+    torch.manual_seed(0)
+    return LatentModel(spec, LatentConfig(latents=latents))
+
+
+def dots(places: np.ndarray, robot: np.ndarray | None = None) -> Observations:
+    """Black images (B, 64, 64, 3) with a white square at each place (B, 2), in pixels."""
+    images = np.zeros((len(places), 64, 64, 3), np.uint8)
+    for image, (row, column) in zip(images, places, strict=True):
+        image[row : row + 12, column : column + 12] = 255
+    numbers = np.zeros((len(places), 3), np.float32) if robot is None else robot
+    return {FRONT: images, ROBOT: numbers}
+
+
+def transitions(count: int, seed: int) -> Transitions:
+    """A square that moves by the chunk; the return is how far down it is at first."""
+    rng = np.random.default_rng(seed)
+    places = rng.integers(10, 40, (count, 2))
+    moves = rng.integers(-10, 11, (count, 2))
+    robot = rng.standard_normal((2, count, 3)).astype(np.float32)
+    chunk = np.stack([moves / 10, moves / 10], 1).astype(np.float32)
+    return Transitions(
+        observations=dots(places, robot[0]),
+        following=dots(places + moves, robot[1]),
+        tasks=["a", "b"] * (count // 2),
+        elapsed=torch.from_numpy(rng.random(count, dtype=np.float32)),
+        chunk=torch.from_numpy(chunk),
+        returns=torch.from_numpy((places[:, 0] / 40).astype(np.float32)),
+        success=torch.from_numpy(rng.random(count) < 0.5),
+    )
+
+
+def slowly(net: torch.nn.Sequential, x: np.ndarray) -> np.ndarray:
+    """A network of linear layers, LayerNorm and SiLU in NumPy and float64."""
+    for layer in net:
+        if isinstance(layer, torch.nn.Linear):
+            x = x @ layer.weight.detach().double().numpy().T + layer.bias.detach().double().numpy()
+        elif isinstance(layer, torch.nn.LayerNorm):
+            x = (x - x.mean(1, keepdims=True)) / np.sqrt(x.var(1, keepdims=True) + 1e-5)
+        else:
+            x = x / (1 + np.exp(-x))
+    return x
+
+
+def test_the_loss_by_hand(monkeypatch: pytest.MonkeyPatch):
+    made, batch = model(), transitions(6, seed=1)
+    monkeypatch.setattr(latent, "shifted", lambda images: images)
+    with torch.no_grad():
+        for parameter in made.slow.parameters():
+            parameter.add_(0.01)
+    made.fit({ROBOT: np.array([[1.0, 2.0, 3.0], [3.0, 2.0, 1.0]], np.float32)})
+    assert made.mean.tolist() == [2, 2, 2] and made.std.tolist() == pytest.approx([1, 1e-3, 1])
+    with torch.no_grad():
+        made.std.fill_(2.0)
+
+    def latents(observations: Observations, encoder: torch.nn.Module) -> np.ndarray:
+        images = torch.from_numpy(observations[FRONT]).permute(0, 3, 1, 2).float() / 255 - 0.5
+        return encoder(images).detach().double().numpy()
+
+    before = [parameter.detach().clone() for parameter in made.slow.parameters()]
+    loss, parts = made.loss(batch)
+    for old, new, fast in zip(before, made.slow.parameters(), made.encoder.parameters(), strict=True):
+        torch.testing.assert_close(new, old + 0.02 * (fast - old))
+
+    code, chunk = task_codes(batch.tasks), batch.chunk.double().numpy().reshape(6, 4)
+    robot, robot_then = ((seen[ROBOT] - 2) / 2 for seen in (batch.observations, batch.following))
+    now = np.concatenate([latents(batch.observations, made.encoder), robot], 1)
+    then = np.concatenate([latents(batch.following, made.encoder), robot_then], 1)
+    predicted = now + slowly(made.dynamics, np.concatenate([now, chunk, code], 1))
+    observed = latents(batch.following, made.slow)
+    unit = predicted[:, :8] / np.linalg.norm(predicted[:, :8], axis=1, keepdims=True)
+    similar = unit @ (observed / np.linalg.norm(observed, axis=1, keepdims=True)).T
+    contrast = np.mean([np.log(np.exp(10 * row).sum()) - 10 * row[i] for i, row in enumerate(similar)])
+    value = slowly(made.value, np.concatenate([now, batch.elapsed.numpy()[:, None], code], 1))[:, 0]
+    cloned = slowly(made.cloned, np.concatenate([now, code], 1))
+    by_hand = {
+        "contrast": contrast,
+        "proprioception": np.square(predicted[:, 8:] - robot_then).mean(),
+        "return": np.square(value - batch.returns.numpy()).mean(),
+        "inverse": np.square(slowly(made.inverse, np.concatenate([now, then], 1)) - chunk).mean(),
+        "cloning": (np.square(cloned - chunk).mean(1) * batch.success.numpy()).mean(),
+    }
+    assert parts == pytest.approx(by_hand, rel=1e-3)
+    weights = {"contrast": 0.1, "proprioception": 1.0, "return": 4.0, "inverse": 0.3, "cloning": 0.5}
+    assert float(loss.detach()) == pytest.approx(sum(weights[k] * v for k, v in by_hand.items()), rel=1e-3)
+
+
+def test_a_state_is_latents_proprioception_and_time():
+    made, seen = model(), dots(np.array([[5, 5], [30, 40]]), np.arange(6, dtype=np.float32).reshape(2, 3))
+    state = made.encode(seen, ["a", "b"], np.array([0.25, 0.5], np.float32)).detach()
+    assert state.shape == (2, made.size) == (2, 8 + 3 + 1)
+    torch.testing.assert_close(state[:, :8].mean(1), torch.zeros(2), atol=1e-5, rtol=0)
+    assert state[:, 8:].tolist() == [[0, 1, 2, 0.25], [3, 4, 5, 0.5]]
+    assert not torch.allclose(state[0, :8], state[1, :8])
+
+
+def test_several_cameras_other_sizes_and_a_history_are_read():
+    spec = StateSpec(cameras=(FRONT, WRIST), state=6, environment_state=0, chunk=(2, 2))
+    made, rng = model(spec), np.random.default_rng(0)
+    seen = {
+        FRONT: rng.integers(0, 256, (2, 2, 96, 128, 3), dtype=np.uint8),
+        WRIST: rng.integers(0, 256, (2, 2, 64, 64, 3), dtype=np.uint8),
+        ROBOT: rng.standard_normal((2, 2, 3)).astype(np.float32),
+    }
+    time = np.zeros(2, np.float32)
+    state = made.encode(seen, ["a", "b"], time).detach()
+    np.testing.assert_array_equal(state[:, 8:14], seen[ROBOT].reshape(2, 6))
+    older = dict(seen) | {FRONT: seen[FRONT].copy()}
+    older[FRONT][:, 0] = 0
+    torch.testing.assert_close(made.encode(older, ["a", "b"], time).detach(), state)
+    for camera in (FRONT, WRIST):
+        other = dict(seen) | {camera: seen[camera].copy()}
+        other[camera][:, 1] = 255 - other[camera][:, 1]
+        assert not torch.allclose(made.encode(other, ["a", "b"], time).detach()[:, :8], state[:, :8])
+
+
+def test_each_image_is_moved_by_itself_and_its_edge_repeated():
+    torch.manual_seed(0)
+    images = torch.rand(40, 2, 9, 9)
+    moved = shifted(images)
+    padded = torch.nn.functional.pad(images, (3, 3, 3, 3), mode="replicate")
+    found = set()
+    for now, then in zip(moved, padded, strict=True):
+        windows = {(r, c): then[:, r : r + 9, c : c + 9] for r in range(7) for c in range(7)}
+        found.add(next(place for place, window in windows.items() if torch.equal(now, window)))
+    assert len(found) > 20
+
+
+def test_contrast_is_least_for_the_right_order():
+    observed = torch.eye(4)
+    assert float(info_nce(3 * observed, observed)) == pytest.approx(np.log(1 + 3 * np.exp(-10)), rel=1e-3)
+    assert float(info_nce(observed.roll(1, 0), observed)) > 9
+
+
+def learned(learner: StateLearner, steps: int, seed: int = 0) -> list[dict[str, float]]:
+    torch.manual_seed(seed)
+    return [learner.step(transitions(64, seed=i)) for i in range(steps)]
+
+
+def place_error(made: LatentModel) -> float:
+    """Root mean square error, pixels, of a linear reading of the square's place off the state."""
+    rng = np.random.default_rng(5)
+    places = rng.integers(0, 50, (400, 2))
+    with torch.no_grad():
+        state = made.encode(dots(places), ["a"] * 400, np.zeros(400, np.float32)).numpy()[:, :8]
+    state = np.concatenate([state, np.ones((400, 1))], 1).astype(np.float64)
+    weights = np.linalg.lstsq(state[:300], places[:300], rcond=None)[0]
+    return float(np.sqrt(np.square(state[300:] @ weights - places[300:]).mean()))
+
+
+@pytest.mark.slow
+def test_it_learns_where_things_are():
+    made = model()
+    learner, before = StateLearner(made), place_error(made)
+    metrics = learned(learner, 150)
+    assert metrics[-1]["contrast"] < 0.7 * metrics[0]["contrast"]
+    assert place_error(made) == before, "the model that acts stands still"
+    learner.publish(made)
+    assert place_error(made) < 0.6 * before
+
+
+def test_a_learner_is_restored_to_the_last_bit():
+    one, other = StateLearner(model()), StateLearner(model(latents=8))
+    learned(one, 2)
+    other.restore(one.state())
+    assert learned(one, 2, seed=7) == learned(other, 2, seed=7)
+    left, right = one.model.state_dict(), other.model.state_dict()
+    assert all(torch.equal(left[name], right[name]) for name in left) and one.count == other.count == 4
+
+
+def test_a_step_that_is_not_finite_is_left_out():
+    learner, batch = StateLearner(model()), transitions(8, seed=0)
+    before: dict[str, Tensor] = {k: v.clone() for k, v in learner.model.encoder.state_dict().items()}
+    learner.step(batch._replace(returns=torch.full((8,), float("nan"))))
+    after: dict[str, Any] = learner.model.encoder.state_dict()
+    assert learner.skipped == 1 and all(torch.equal(before[name], after[name]) for name in before)
