@@ -25,17 +25,21 @@ from accerl_lerobot import cli, load_policy
 from accerl_lerobot.algorithms import AlgorithmConfig
 from accerl_lerobot.config.parsing import parse
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig
+from accerl_lerobot.engine.run import make_engine
 from accerl_lerobot.envs import SimulatedConfig, make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Observation
 from accerl_lerobot.policies.config import PLUGINS, POLICIES, PolicyConfig
 from accerl_lerobot.policies.flow import FlowFamily
 from accerl_lerobot.policies.loading import load_adapter, rehearsed_config
+from accerl_lerobot.replay.pacing import ReplayConfig
+from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.testing import check_policy
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.update import make_update
+from accerl_lerobot.world_model.config import StateModelConfig
 from tests.policies.checkpoints import write_policy
-from tests.runs import pip_installed, tiny_run, trained
+from tests.runs import drive, pip_installed, tiny_run, trained
 from tests.trainer.test_chunk_critic import episode
 
 SOURCE = Path(__file__).parent / "packages" / "lerobot_policy_mlp_flow"
@@ -206,6 +210,36 @@ def test_the_off_policy_algorithm_of_the_page(tmp_path: Path, monkeypatch: Any, 
     finally:
         AlgorithmConfig.get_known_choices().pop("rwr", None)
         sys.modules.pop("rwr", None)
+
+
+def test_the_world_model_of_the_page(tmp_path: Path, monkeypatch: Any, tiny_checkpoint: Path):
+    page = (Path(__file__).parents[1] / "docs" / "world_model.md").read_text()
+    (code,) = (b for b in re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL) if "SmallPicture" in b)
+    (tmp_path / "small_picture.py").write_text(code)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    flags = ["--world_model.discover_packages_path=small_picture", "--world_model.type=small_picture"]
+    try:
+        chosen = parse(RunConfig, ["--config_path=few_shot", "--env.environment_state=false", *flags])
+        sections: Any = {
+            "algorithm": chosen.algorithm,
+            "world_model": chosen.world_model,
+            "rollout": RolloutConfig(worlds=4, segment_length=4),
+            "replay": ReplayConfig(capacity=64, min_decisions=16, ahead=32, samples_per_insert=1),
+        }
+        config = tiny_run(tiny_checkpoint, **sections)
+        engine: Any = make_engine(replace(config, launch=LaunchConfig(engine="local")), ("match",), history=1)
+        engine.train()
+        drive(engine)
+        engine.close()
+        memory = engine._update.memory
+        images = memory["observation.images.front"].reshape(-1, 4, 8, 4, 8, 3).mean((2, 4)) / 255
+        expected = np.concatenate(
+            [images.transpose(0, 3, 1, 2).reshape(-1, 48), memory["observation.state"]], 1
+        )
+        np.testing.assert_allclose(memory["state"][:, : expected.shape[1]], expected, rtol=1e-5, atol=1e-6)
+    finally:
+        StateModelConfig.get_known_choices().pop("small_picture", None)
+        sys.modules.pop("small_picture", None)
 
 
 def test_it_trains_with_its_own_algorithm(checkpoint: Path):
