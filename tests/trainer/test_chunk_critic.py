@@ -327,7 +327,7 @@ def test_a_latent_state_is_computed_anew_when_the_model_that_acts_changes(
         segment = episode([0.0, 0.0, 1.0], actions=rng.uniform(-1, 1, (3, 4, 2)).astype(np.float32))
         del segment.observations[ENVIRONMENT_STATE]
         segment.observations["observation.images.front"] = rng.integers(0, 256, (4, 32, 32, 3), np.uint8)
-        segment.elapsed = np.array([0, 0.25, 0.5], np.float32)
+        segment.time_limit = 16
         return segment
 
     def states_of_now() -> torch.Tensor:

@@ -57,6 +57,7 @@ def like() -> Segment:
     return make_segment(
         "explored", 1, observations=seen, task=str(observation["task"]),
         actions=np.zeros((1, K, world.spec.action_dim), np.float32), steps=np.array([K]), terminated=True,
+        time_limit=ENV.max_steps,
         origin=Origin("match", 0, 0),
     )  # fmt: skip
 
@@ -77,6 +78,8 @@ def test_decisions_are_the_frames_from_every_step_on(dataset: DatasetConfig, lik
         rewards = np.zeros(len(segment))
         rewards[-1] = won
         np.testing.assert_allclose(segment.reward, rewards - COST)
+        late = segment.observations[ENVIRONMENT_STATE][:-1, -1]
+        np.testing.assert_allclose(segment.elapsed, late, atol=1e-6)
         for t in range(len(segment)):
             at = phase + K * t
             for name in ("observation.state", ENVIRONMENT_STATE):
