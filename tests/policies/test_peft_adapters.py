@@ -13,7 +13,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.policies.adapter import stack_observations
+from accerl_lerobot.experience import stack_observations
 from accerl_lerobot.policies.config import PolicyConfig, TuningConfig
 from accerl_lerobot.policies.loading import load_adapter, policy_sizes
 from accerl_lerobot.policies.saving import save_pretrained

@@ -17,8 +17,7 @@ from safetensors.torch import save_file
 
 from accerl_lerobot import cli, load_policy
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import Request
-from accerl_lerobot.policies.adapter import stack_observations
+from accerl_lerobot.experience import Request, stack_observations
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.loading import load_acting, load_adapter
 from accerl_lerobot.seeds import noise_seed
