@@ -12,13 +12,13 @@ import yaml
 
 from accerl_lerobot import cli
 from accerl_lerobot.algorithms import GIPOConfig, PPOConfig
-from accerl_lerobot.cli.verbs import DemosRun, EvalRun, SFTRun
+from accerl_lerobot.cli.verbs import DemosRun, EvalRun, SFTRun, WorldModelRun
 from accerl_lerobot.config import parsing
 from accerl_lerobot.config.ranges import Positive, Range, Share
 from accerl_lerobot.demos.backbone import BackboneConfig
 from accerl_lerobot.demos.sft import SFTConfig
 from accerl_lerobot.engine import sizes
-from accerl_lerobot.engine.config import DatasetConfig, RunConfig, encode, parse
+from accerl_lerobot.engine.config import DatasetConfig, RunConfig, decode, encode, parse
 from accerl_lerobot.engine.preflight import check_sft_policy, check_start
 from accerl_lerobot.envs import LeRobotEnvConfig, MetaWorldConfig, SimulatedConfig
 from accerl_lerobot.errors import InputError
@@ -247,7 +247,7 @@ class TestPreflight:
     @pytest.mark.parametrize(
         ("policy", "message"),
         [
-            ({"type": "smol"}, "sft.policy.type='smol': LeRobot has act, "),
+            ({"type": "smol"}, "sft.policy.type='smol': no such policy type here; install the package"),
             ({"type": "gaussian_actor"}, "sft.policy.type='gaussian_actor': only LeRobot's SAC trains it"),
             ({"type": "smolvla", "chunks": 3}, "sft.policy.chunks=3: LeRobot's smolvla has no such field"),
             ({"type": "smolvla", "num_steps": "x"}, "sft.policy.num_steps='x': LeRobot says: "),
@@ -309,3 +309,22 @@ def test_every_field_has_a_name_on_the_command_line() -> None:
 )
 def test_types_in_words(hint: Any, words: str) -> None:
     assert parsing.wanted(hint) == words
+
+
+def test_the_world_model_of_a_run_is_not_that_of_pixels(tmp_path: Path):
+    run = parse(
+        RunConfig, ["--config_path=few_shot", "--world_model.type=latent", "--world_model.latents=32"]
+    )
+    assert decode(RunConfig, encode(run)) == run
+    recipe = tmp_path / "config.yaml"
+    recipe.write_text(yaml.safe_dump(encode(run)))
+    flags = [f"--config_path={recipe}", "--world_model.image_size=32"]
+    assert parse(WorldModelRun, flags, recipe_class=RunConfig).world_model.image_size == 32
+    recipe.write_text("world_model: {image_size: 32}")
+    assert parse(WorldModelRun, flags[:1], recipe_class=RunConfig).world_model.image_size == 32
+
+
+@pytest.mark.parametrize(("told", "expected"), [("true", "simulator"), ("false", "latent")])
+def test_the_state_is_the_simulators_where_it_is_told(told: str, expected: str):
+    run = parse(RunConfig, ["--config_path=few_shot", f"--env.environment_state={told}"])
+    assert run.world_model is None and run.state_model.type == expected

@@ -117,8 +117,9 @@ class ChunkCriticConfig(OffPolicyConfig):
 
     gamma: Share = 0.98
     """Discount per decision."""
-    critic_steps: Positive = 1.0
-    """Gradient steps of the critic for each new decision; the teacher makes half as many."""
+    critic_steps: Positive | None = None
+    """Gradient steps of the critic for each new decision; the teacher makes half as many. None: 1 on the
+    simulator's state, 0.5 on a state that is learned, where more had the critic learn episodes by heart."""
     teacher_episodes: Share = 0.5
     """Share of exploring episodes in which the teacher acts, after ``trainer.value_warmup_updates``."""
 

@@ -107,7 +107,7 @@ class OfflineRun(NewFolderRun):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not isinstance(self.algorithm, OffPolicyConfig) or isinstance(self.algorithm, ChunkCriticConfig):
-            why = "it needs likelihoods of what was done, or a simulator's state"
+            why = "it needs likelihoods of what was done, or new episodes of its teacher"
             raise InputError("algorithm.type", self.algorithm.type, f"{why}; use awr or self_imitation")
         if self.policy.path is None:
             raise InputError("policy.path", None, "give a LeRobot checkpoint; accerl sft makes one")

@@ -29,7 +29,16 @@ import yaml
 from accerl_lerobot.checkpoint.layout import CONFIG
 from accerl_lerobot.checkpoint.safety import brief
 from accerl_lerobot.config.lerobot import FLAGS, hint_for
-from accerl_lerobot.config.ranges import check, hints_of, is_optional, is_union, unmarked, wanted
+from accerl_lerobot.config.ranges import (
+    check,
+    default_of,
+    fits,
+    hints_of,
+    is_optional,
+    is_union,
+    unmarked,
+    wanted,
+)
 from accerl_lerobot.errors import InputError, expanded
 
 DISCOVER = "discover_packages_path"
@@ -97,6 +106,13 @@ def parse(config_class: type[Any], arguments: list[str], *, recipe_class: type[A
     if recipe_class is not None:
         # A run's own config is a recipe too, and its folder is taken.
         other = _names(recipe_class) - _names(config_class) | {"output_dir"}
+        # A section that has types in a run and none here is another one of the same name.
+        kinds = _sections(recipe_class), _sections(config_class)
+        other |= {
+            name
+            for name in kinds[0].keys() & kinds[1].keys()
+            if kinds[0][name] is not kinds[1][name] and TYPE in (tree.get(name) or {})
+        }
         tree = {key: value for key, value in tree.items() if key not in other}
     register_types(config_class, given)
     merged = _overridden(config_class, tree, given)
@@ -308,7 +324,8 @@ def _overridden(config_class: type[Any], tree: dict[str, Any], given: dict[str, 
     """`tree` with `given` laid over it.
 
     Where `given` picks another type than the file's, what the file says about fields that the new type does
-    not have is dropped: ``--algorithm.type=ppo`` replaces GIPO together with its ``sigma``.
+    not have is dropped: ``--algorithm.type=ppo`` replaces GIPO together with its ``sigma``. Defaults of the
+    former type that the new one does not take are dropped too: a run's config holds them, chosen or not.
     """
     merged = _merged(tree, given)
     hints = hints_of(config_class)
@@ -318,11 +335,23 @@ def _overridden(config_class: type[Any], tree: dict[str, Any], given: dict[str, 
             continue
         before = under.get(TYPE, _default_type(field))
         now = over.get(TYPE, before)
-        kind = choices_of(section).get(str(now), section)
+        kinds = choices_of(section)
+        kind = kinds.get(str(now), section)
         if now != before and kind is not section:
-            under = {k: v for k, v in under.items() if k in _names(kind)}
+            usual = _defaults(kinds.get(str(before), section))
+            taken = hints_of(kind)
+            under = {
+                name: value
+                for name, value in under.items()
+                if name in taken and (value != usual.get(name) or fits(taken[name], value))
+            }
         merged[field.name] = _overridden(kind, under, over)
     return merged
+
+
+def _defaults(cls: type[Any]) -> dict[str, Any]:
+    """Field → default, as a file has it."""
+    return {field.name: draccus.encode(default_of(field)) for field in dataclasses.fields(cls)}
 
 
 def register_types(cls: type[Any], tree: dict[str, Any], path: tuple[str, ...] = ()) -> None:
@@ -485,6 +514,12 @@ def _takes(hint: Any, value: Any) -> bool:
     except InputError:
         return False
     return True
+
+
+def _sections(cls: type[Any]) -> dict[str, type[Any]]:
+    """Field → class, of the fields that are sections."""
+    found = {name: section_of(hint) for name, hint in hints_of(cls).items()}
+    return {name: section for name, section in found.items() if section is not None}
 
 
 def _names(cls: type[Any]) -> set[str]:

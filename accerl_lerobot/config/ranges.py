@@ -150,25 +150,26 @@ def check(hint: Any, value: Any, field: str) -> None:
                 Path(text).expanduser()
             except RuntimeError as error:
                 raise InputError(field, value, "there is no such user; name a path in full") from error
-    if not _fits(hint, value):
+    if not fits(hint, value):
         raise InputError(field, value, f"use {wanted(hint)}")
 
 
-def _fits(hint: Any, value: Any) -> bool:
+def fits(hint: Any, value: Any) -> bool:
+    """True if a value fits an annotation and its range."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin is Annotated:
         kind, mark = arguments
-        return (_is_number(kind, value) if kind in (int, float) else _fits(kind, value)) and value in mark
+        return (_is_number(kind, value) if kind in (int, float) else fits(kind, value)) and value in mark
     if is_union(hint):
-        return any(_fits(kind, value) for kind in arguments)
+        return any(fits(kind, value) for kind in arguments)
     if origin is typing.Literal:
         return value in arguments
     if origin in (list, tuple):
         if not isinstance(value, (list, tuple)):
             return False
         if origin is list or Ellipsis in arguments:
-            return all(_fits(arguments[0], entry) for entry in value)
-        return len(value) == len(arguments) and all(map(_fits, arguments, value))
+            return all(fits(arguments[0], entry) for entry in value)
+        return len(value) == len(arguments) and all(map(fits, arguments, value))
     if hint in (int, float):
         return _is_number(hint, value) and math.isfinite(value)
     if hint in (bool, str, type(None)):

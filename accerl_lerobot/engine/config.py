@@ -143,7 +143,7 @@ class RunConfig(Section):
         """`world_model`, or the type that is used where none is given."""
         if self.world_model is not None:
             return self.world_model
-        return SimulatorStateConfig() if self.env.state_size else LatentConfig()
+        return SimulatorStateConfig() if self.env.tells_state else LatentConfig()
 
     @property
     def remembered(self) -> int:
@@ -189,7 +189,7 @@ class RunConfig(Section):
 
     def _check_off_policy(self) -> None:
         """A memory of its own stands for replay's reuse, and holds whole real episodes."""
-        if isinstance(self.world_model, SimulatorStateConfig) and not self.env.state_size:
+        if isinstance(self.world_model, SimulatorStateConfig) and not self.env.tells_state:
             offered = getattr(self.env, "environment_state", None)
             remedy = "use latent"
             if offered is not None:

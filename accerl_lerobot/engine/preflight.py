@@ -22,7 +22,7 @@ import draccus
 import numpy as np
 import yaml
 
-from accerl_lerobot.algorithms import LossInputs, OffPolicyConfig, RatioConfig
+from accerl_lerobot.algorithms import ChunkCriticConfig, LossInputs, OffPolicyConfig, RatioConfig
 from accerl_lerobot.checkpoint.safety import brief
 from accerl_lerobot.engine.sizes import check_disk, check_memory
 from accerl_lerobot.envs import (
@@ -50,6 +50,7 @@ from accerl_lerobot.policies.features import (
     resizes,
 )
 from accerl_lerobot.rollout.runner import nonfinite
+from accerl_lerobot.world_model.config import SimulatorStateConfig
 
 if TYPE_CHECKING:
     from accerl_lerobot.algorithms import AlgorithmConfig
@@ -185,6 +186,8 @@ def check_start(config: RunConfig, say: Callable[[str], object] = str) -> tuple[
         if config.rollout.segment_length < decisions:
             why = f"algorithm.type={config.algorithm.type} looks at whole episodes; use at least {decisions}"
             raise InputError("rollout.segment_length", config.rollout.segment_length, why)
+        if isinstance(config.algorithm, ChunkCriticConfig):
+            check_state_model(config, policy, decisions, say)
     renames, offered = config.policy.rename_map, env_features(spec)
     if config.policy.path is not None:
         check_features(policy_features(policy), offered, renames, "policy.path", config.policy.path)
@@ -199,6 +202,25 @@ def check_start(config: RunConfig, say: Callable[[str], object] = str) -> tuple[
         _check_remembered(config.dataset, spec, meta)
     check_disk(config.output_dir)
     return spec, history
+
+
+def check_state_model(config: RunConfig, policy: Any, decisions: int, say: Callable[[str], object]) -> None:
+    """Refuse a world model that no policy of this kind has, or that such short episodes do not teach."""
+    from accerl_lerobot.policies.teacher import state_spec
+    from accerl_lerobot.world_model.states import new_state_model
+
+    model, state_size = config.state_model, config.env.state_size * policy.n_obs_steps
+    if config.world_model is None and not config.env.tells_state:
+        offers = hasattr(config.env, "environment_state")
+        hint = "; env.environment_state gives them the simulator's" if offers else ""
+        say(f"critic and teacher see a latent state that is learned{hint}")
+    if policy.input_features and policy.output_features:
+        learns = new_state_model(state_spec(policy, config.policy.rename_map, state_size), model).learns
+    else:  # a new policy reads what is offered
+        learns = not isinstance(model, SimulatorStateConfig)
+    if learns and decisions < 2:
+        remedy = "an episode is one decision, after which nothing follows; lower policy.n_action_steps"
+        raise InputError("world_model.type", model.type, remedy)
 
 
 def _check_remembered(dataset: DatasetConfig, spec: WorldSpec, meta: Any) -> None:

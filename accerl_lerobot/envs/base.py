@@ -202,6 +202,11 @@ class EnvConfig(Section, draccus.ChoiceRegistry, section="env"):
     type = registered_name
 
     @property
+    def tells_state(self) -> bool:
+        """True if observations hold ``observation.environment_state``."""
+        return bool(getattr(self, "environment_state", None))
+
+    @property
     def state_size(self) -> int:
         """Numbers of ``observation.environment_state``; 0 where observations hold none."""
         return 0

@@ -24,10 +24,11 @@ from accerl_lerobot.seeds import episode_of
 
 if TYPE_CHECKING:
     from accerl_lerobot.world_model.config import StateModelConfig
-    from accerl_lerobot.world_model.states import Observations, StateModel
+    from accerl_lerobot.world_model.states import Observations, StateModel, StateSpec
 
 WIDTH = 256
 NOISE = 0.25  # standard deviation of its exploration, in normalised action units
+ENCODED = 64  # observations of which states are computed at once; images may be large
 TEACHER_PREFIX = "teacher."  # how names of its weights begin among those that are published
 
 
@@ -54,7 +55,7 @@ class Ensemble(nn.Module):
 class Teacher(nn.Module):
     """Chunks from states; once `ready`, it acts in a `share` of exploring episodes.
 
-    A state is what `model` makes of observations, and the code of the task.
+    A state consists of the output of ``model.encode`` and the code of the task.
 
     All its tensors are parameters, so that they are published with the policy's weights; those that no
     gradient reaches are set by the trainer.
@@ -76,8 +77,13 @@ class Teacher(nn.Module):
     @torch.no_grad()
     def states(self, observations: Observations, tasks: Sequence[str], elapsed: np.ndarray) -> Tensor:
         """States (B, S) of observations, each (B, ...), at shares `elapsed` (B,) of the time limit."""
-        seen = self.model.encode(observations, tasks, elapsed).to(self.mean)
-        return torch.cat([seen, torch.from_numpy(task_codes(tasks)).to(seen)], 1)
+        states = []
+        for rows in np.array_split(np.arange(len(tasks)), -(-len(tasks) // ENCODED)):
+            some = {name: values[rows] for name, values in observations.items()}
+            texts = [tasks[row] for row in rows]
+            seen = self.model.encode(some, texts, elapsed[rows]).to(self.mean)
+            states.append(torch.cat([seen, torch.from_numpy(task_codes(texts)).to(seen)], 1))
+        return torch.cat(states)
 
     def scaled(self, state: Tensor) -> Tensor:
         """States (B, S) in units of what has been seen."""
@@ -128,18 +134,24 @@ def with_teacher(
 
     `environment_state` is the number of numbers that the simulator tells; 0: it tells none.
     """
-    from accerl_lerobot.world_model.states import StateSpec, new_state_model
+    from accerl_lerobot.world_model.states import new_state_model
 
     adapter: Any = load(config)
-    policy = adapter.policy.config
-    chunk = policy.n_action_steps, policy.action_feature.shape[0]
-    env_names = {new: name for name, new in config.rename_map.items()}
-    shapes = policy_features(policy).shapes
-    spec = StateSpec(
-        cameras=tuple(env_names.get(name, name) for name, shape in shapes.items() if len(shape) == 3),
-        state=policy.n_obs_steps * shapes[STATE][0],
-        environment_state=environment_state,
-        chunk=chunk,
-    )
-    adapter.teacher = Teacher(new_state_model(spec, model), chunk, share, noise).to(adapter.device)
+    spec = state_spec(adapter.policy.config, config.rename_map, environment_state)
+    adapter.teacher = Teacher(new_state_model(spec, model), spec.chunk, share, noise).to(adapter.device)
     return adapter
+
+
+def state_spec(policy: Any, rename_map: dict[str, str], environment_state: int) -> StateSpec:
+    """Sizes that a state model of this policy has; `policy` is LeRobot's config of it."""
+    from accerl_lerobot.world_model.states import StateSpec
+
+    env_names = {new: name for name, new in rename_map.items()}
+    shapes = policy_features(policy).shapes
+    images = {name: shape[0] for name, shape in shapes.items() if len(shape) == 3}
+    return StateSpec(
+        cameras={env_names.get(name, name): channels for name, channels in images.items()},
+        state=policy.n_obs_steps * shapes.get(STATE, (0,))[0],
+        environment_state=environment_state,
+        chunk=(policy.n_action_steps, policy.action_feature.shape[0]),
+    )

@@ -5,7 +5,7 @@
     so many of each for each new decision
 
 `ChunkCriticConfig` has the formulas, `world_model.states` what a state is. A world model that learns does so
-on a copy; every `REFRESH` updates the one that acts takes over its weights, and all remembered states are
+on a copy; every `REFRESH` decisions the one that acts takes over its weights, and all remembered states are
 computed anew. Until ``trainer.value_warmup_updates`` the policy explores alone.
 Then the teacher first learns to do what has been done so far, and from there what the critic says.
 
@@ -32,7 +32,7 @@ from accerl_lerobot.policies.family import Encoded, pooled
 from accerl_lerobot.policies.teacher import Ensemble, Teacher
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.off_policy import OffPolicyUpdate, drawn, mean
-from accerl_lerobot.world_model import state_learner
+from accerl_lerobot.world_model.state_learner import BATCH as TRANSITIONS
 from accerl_lerobot.world_model.state_learner import StateLearner
 from accerl_lerobot.world_model.states import Transitions
 
@@ -52,9 +52,12 @@ MOST_FIRST = 5000  # most steps of the critic before the teacher's first along i
 MARGIN = 0.05  # share of the explored range of actions that the teacher may go beyond it
 SMALLEST_SCALE = 0.02  # smallest mean |Q| that Q is divided by
 FIRST_STATE_STEPS, STATE_STEPS = 1000, 0.5  # steps of the world model at first, and for each new decision
+MOST_STATE_STEPS = 200  # of the first ones, in one update
 LEAST_TRANSITIONS = 100  # with fewer, the world model does not begin
-REFRESH = 5  # updates after which the acting world model takes over what was learned
-ENCODED = 512  # observations whose states are computed at once
+REFRESH = 320  # new decisions after which the acting world model takes over what was learned, at least
+REENCODED = 16  # remembered states that are computed anew for each new decision, at most
+REENCODED_AT_ONCE = 512
+LATENT_CRITIC_STEPS = 0.5  # of the critic for each new decision, where the state is learned
 
 
 class Critic(nn.Module):
@@ -81,7 +84,8 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         self.critic = Critic(self.teacher).to(device)
         self.slow = copy.deepcopy(self.critic).requires_grad_(False)
         model = self.teacher.model
-        self.states = StateLearner(model) if model.learns else None
+        self.state_learner = StateLearner(model) if model.learns else None
+        self._unpublished = 0  # new decisions since the model that acts was replaced
         # Reads the scaled state off the policy's features.
         self.reader = nn.Linear(adapter.model.width, len(self.teacher.mean)).to(device)
         # The teacher lies beside the policy's weights.
@@ -101,54 +105,57 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         outcomes = {name: sum(last) / max(1, len(last)) for name, last in self._outcomes.items()}
         return super().step(segments) | outcomes
 
-    def remember(self, segment: Segment) -> None:
-        executed = self.adapter.processing.normalise(torch.from_numpy(segment.actions))
+    def columns(self, segment: Segment) -> dict[str, np.ndarray]:
         seen = {name: rows[:-1] for name, rows in segment.observations.items()}
         states = self.teacher.states(seen, [segment.task] * len(segment), segment.elapsed)
-        self.memory.add(segment, executed.numpy(), state=states.cpu().numpy())
+        last = np.arange(len(segment)) == len(segment) - 1
+        return {"state": states.cpu().numpy(), "elapsed": segment.elapsed, "last": last}
 
     def learn(self, new: int) -> dict[str, float]:
         metrics = self._learn_states(new)
+        if self.state_learner is not None and self.state_learner.count < FIRST_STATE_STEPS:
+            return metrics  # critic and teacher would learn on states that mean nothing yet
         return metrics | self._learn_to_act(new)
 
     def _learn_states(self, new: int) -> dict[str, float]:
         """Steps of the world model, where it learns; now and then the one that acts takes them over."""
         transitions = np.flatnonzero(~self.memory["last"])
-        if self.states is None or len(transitions) < LEAST_TRANSITIONS:
+        if self.state_learner is None or len(transitions) < LEAST_TRANSITIONS:
             return {}
-        self.states.model.fit(self.memory.seen())
-        first = 0 if self.states.count else FIRST_STATE_STEPS
-        due = first + len(self.steps("world_model", STATE_STEPS, new))
+        self.state_learner.model.fit(self.memory.seen())
+        behind = max(0, FIRST_STATE_STEPS - self.state_learner.count)
+        # A part at a time, so that no update takes minutes.
+        due = min(behind, MOST_STATE_STEPS) or len(self.steps("world_model", STATE_STEPS, new))
         metrics = mean(self._state_step(transitions) for _ in range(due))
-        if first or self.version % REFRESH == 0:
-            self.states.publish(self.teacher.model)
+        self._unpublished += new
+        if behind or self._unpublished >= max(REFRESH, len(self.memory) // REENCODED):
+            self._unpublished = 0
+            self.state_learner.publish(self.teacher.model)
             self._encode_memory()
         return {f"world_model_{name}": value for name, value in metrics.items()}
 
     def _state_step(self, transitions: np.ndarray) -> dict[str, float]:
-        assert self.states is not None
-        rows = drawn(transitions, state_learner.BATCH)
+        assert self.state_learner is not None
+        rows = drawn(transitions, TRANSITIONS)
         observations, tasks = self.memory.observations(rows)
         following, _ = self.memory.observations((rows + 1) % self.memory.capacity)
-        return self.states.step(
-            Transitions(
-                observations=observations,
-                following=following,
-                tasks=tasks,
-                elapsed=self.tensor("elapsed", rows),
-                chunk=self.tensor("chunk", rows),
-                returns=self.tensor("return", rows),
-                success=self.tensor("success", rows),
-            )
+        batch = Transitions(
+            observations=observations,
+            following=following,
+            tasks=tasks,
+            elapsed=self.tensor("elapsed", rows),
+            chunk=self.tensor("chunk", rows),
+            returns=self.tensor("return", rows),
+            success=self.tensor("success", rows),
         )
+        return self.state_learner.step(batch, self.apply)
 
     def _encode_memory(self) -> None:
         states = self.memory["state"]
-        for rows in np.array_split(np.arange(len(states)), math.ceil(len(states) / ENCODED)):
+        for rows in np.array_split(np.arange(len(states)), -(-len(states) // REENCODED_AT_ONCE)):
             observations, tasks = self.memory.observations(rows)
-            states[rows] = (
-                self.teacher.states(observations, tasks, self.memory["elapsed"][rows]).cpu().numpy()
-            )
+            elapsed = self.memory["elapsed"][rows]
+            states[rows] = self.teacher.states(observations, tasks, elapsed).cpu().numpy()
 
     def _learn_to_act(self, new: int) -> dict[str, float]:
         won = np.flatnonzero(self.memory["success"])
@@ -160,7 +167,7 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         bounds = float(returns.min()), float(returns.max())
         if not self.teacher.ready:
             self._begin(won, bounds)
-        each = self.algorithm.critic_steps
+        each = self.algorithm.critic_steps or (1.0 if self.state_learner is None else LATENT_CRITIC_STEPS)
         metrics = mean(self._critic_step(bounds) for _ in self.steps("critic", each, new))
         metrics |= mean(self._teacher_step(won) for _ in self.steps("teacher", each / 2, new))
         return metrics | super().learn(new)
@@ -183,7 +190,8 @@ class ChunkCriticUpdate(OffPolicyUpdate):
             "networks": {name: copied(module) for name, module in self.networks.items()},
             "optimizers": {name: optimizer_state(optimizer) for name, optimizer in self.optimizers.items()},
             "outcomes": {name: list(last) for name, last in self._outcomes.items()},
-            "states": None if self.states is None else self.states.state(),
+            "unpublished": self._unpublished,
+            "state_learner": None if self.state_learner is None else self.state_learner.state(),
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -194,8 +202,9 @@ class ChunkCriticUpdate(OffPolicyUpdate):
             restore_optimizer(optimizer, state["optimizers"][name])
         for name, last in self._outcomes.items():
             last.extend(state["outcomes"][name])
-        if self.states is not None:
-            self.states.restore(state["states"])
+        self._unpublished = state["unpublished"]
+        if self.state_learner is not None:
+            self.state_learner.restore(state["state_learner"])
 
     @torch.no_grad()
     def _scale_states(self) -> None:

@@ -47,8 +47,7 @@ class Memory:
     def __getitem__(self, name: str) -> np.ndarray:
         """A column, (len, ...).
 
-        ``chunk`` float32 (K, A); ``elapsed``, share of the time limit gone; ``last``, True for an episode's
-        last decision; ``following``, the row `n_step` decisions on; ``reward``, discounted, of
+        ``chunk`` float32 (K, A); ``following``, the row `n_step` decisions on; ``reward``, discounted, of
         the decisions before that; ``discount``, of what follows, 0 where the episode ends before;
         ``return``, discounted, of the episode from here on; ``success``, of the episode; ``task``, a place
         in `tasks`; ``observation.*``.
@@ -77,8 +76,6 @@ class Memory:
             self.tasks.append(segment.task)
         columns: dict[str, Any] = {
             "chunk": chunk,
-            "elapsed": segment.elapsed,
-            "last": np.arange(t) == t - 1,
             "reward": (returns[:-1] - discount * returns[np.arange(t) + ahead]).astype(np.float32),
             "discount": np.where(ends, 0.0, discount).astype(np.float32),
             "following": np.where(ends, rows, rows[0] + np.arange(t) + ahead) % self.capacity,
@@ -184,7 +181,11 @@ class OffPolicyUpdate(BaseUpdate):
 
     def remember(self, segment: Segment) -> None:
         executed = self.adapter.processing.normalise(torch.from_numpy(segment.actions))
-        self.memory.add(segment, executed.numpy())
+        self.memory.add(segment, executed.numpy(), **self.columns(segment))
+
+    def columns(self, segment: Segment) -> dict[str, np.ndarray]:
+        """Further columns of the memory, each (T, ...)."""
+        return {}
 
     def tensor(self, name: str, rows: np.ndarray) -> Tensor:
         """Rows of a column, where the policy lives."""

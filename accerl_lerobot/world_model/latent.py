@@ -23,11 +23,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK_BITS, task_codes
+from accerl_lerobot.policies.features import STATE
 from accerl_lerobot.world_model.config import LatentConfig
 from accerl_lerobot.world_model.states import Observations, StateModel, StateSpec, Transitions
 
-PROPRIOCEPTION = "observation.state"
 SIDE = 64  # pixels of the square that every image is resized to
 SHIFT = 3  # pixels of the random shift at most, in each direction
 CHANNELS, KERNELS, STRIDES = 32, (7, 5, 3, 3), (2, 2, 2, 1)
@@ -62,9 +63,12 @@ class LatentModel(StateModel):
 
     def __init__(self, spec: StateSpec, config: LatentConfig) -> None:
         super().__init__()
-        self.cameras, self.latents = spec.cameras, config.latents
+        if not spec.cameras:
+            remedy = "the policy reads no images; use simulator, or another algorithm"
+            raise InputError("world_model.type", config.type, remedy)
+        self.cameras, self.latents = tuple(spec.cameras), config.latents
         self.size = config.latents + spec.state + 1
-        self.encoder = Encoder(3 * len(spec.cameras), config.latents)
+        self.encoder = Encoder(sum(spec.cameras.values()), config.latents)
         self.slow = copy.deepcopy(self.encoder).requires_grad_(False)
         seen, chunk = config.latents + spec.state, spec.chunk[0] * spec.chunk[1]
         self.dynamics = network(seen + chunk + TASK_BITS, seen, hidden=2)
@@ -75,13 +79,15 @@ class LatentModel(StateModel):
         self.std = nn.Parameter(torch.ones(spec.state), requires_grad=False)
 
     def encode(self, observations: Observations, tasks: Sequence[str], elapsed: np.ndarray) -> Tensor:
-        latent = self.encoder(self._images(observations))
+        latent = self.encoder(torch.cat(self._images(observations), 1))
         late = torch.from_numpy(elapsed.astype(np.float32))[:, None].to(latent)
         return torch.cat([latent, self._proprioception(observations), late], 1)
 
     @torch.no_grad()
     def fit(self, observations: Observations) -> None:
-        numbers = observations[PROPRIOCEPTION]
+        if not len(self.mean):
+            return
+        numbers = observations[STATE]
         numbers = numbers.reshape(len(numbers), -1)
         # In float64, or the rounding of a long sum would look like a spread.
         self.mean.copy_(torch.from_numpy(numbers.mean(0, dtype=np.float64)))
@@ -97,14 +103,15 @@ class LatentModel(StateModel):
         code = torch.from_numpy(task_codes(transitions.tasks)).to(robot)
         chunk = transitions.chunk.flatten(1)
 
-        seen = torch.cat([self.encoder(shifted(now)), robot], 1)
-        seen_then = torch.cat([self.encoder(shifted(following)), robot_then], 1)
+        seen = torch.cat([self.encoder(augmented(now)), robot], 1)
+        seen_then = torch.cat([self.encoder(augmented(following)), robot_then], 1)
         with torch.no_grad():
-            latent_then = self.slow(shifted(following))
+            latent_then = self.slow(augmented(following))
 
         predicted = seen + self.dynamics(torch.cat([seen, chunk, code], 1))
         contrast = info_nce(predicted[:, : self.latents], latent_then)
-        proprioception = (predicted[:, self.latents :] - robot_then).square().mean()
+        error = predicted[:, self.latents :] - robot_then
+        proprioception = error.square().sum() / max(1, error.numel())
         value = self.value(torch.cat([seen, transitions.elapsed[:, None], code], 1))[:, 0]
         returns = (value - transitions.returns).square().mean()
         inverse = (self.inverse(torch.cat([seen, seen_then], 1)) - chunk).square().mean()
@@ -123,21 +130,23 @@ class LatentModel(StateModel):
         for slow, fast in zip(self.slow.parameters(), self.encoder.parameters(), strict=True):
             slow.lerp_(fast, FOLLOW)
 
-    def _images(self, observations: Observations) -> Tensor:
-        """Float (B, 3 · cameras, 64, 64) in [−½, ½]; of several env steps the newest."""
+    def _images(self, observations: Observations) -> list[Tensor]:
+        """Each camera's, float (B, C, 64, 64) in [−½, ½]; of several env steps the newest."""
         cameras = []
         for name in self.cameras:
             pixels = observations[name]
             newest = pixels if pixels.ndim == 4 else pixels[:, -1]
             image = torch.from_numpy(np.ascontiguousarray(newest)).to(self.mean.device)
-            image = image.permute(0, 3, 1, 2).float() / 255 - 0.5
+            image = image.permute(0, 3, 1, 2).float()
             if image.shape[-2:] != (SIDE, SIDE):
                 image = functional.interpolate(image, (SIDE, SIDE), mode="area")
-            cameras.append(image)
-        return torch.cat(cameras, 1)
+            cameras.append(image / 255 - 0.5)
+        return cameras
 
     def _proprioception(self, observations: Observations) -> Tensor:
-        numbers = observations[PROPRIOCEPTION]
+        if not len(self.mean):
+            return self.mean.new_zeros(len(observations[self.cameras[0]]), 0)
+        numbers = observations[STATE]
         return torch.from_numpy(numbers.reshape(len(numbers), -1)).to(self.mean)
 
 
@@ -155,6 +164,11 @@ def info_nce(predicted: Tensor, observed: Tensor) -> Tensor:
     similarity = functional.normalize(predicted, dim=1) @ functional.normalize(observed, dim=1).T
     own = torch.arange(len(predicted), device=predicted.device)
     return functional.cross_entropy(similarity / TEMPERATURE, own)
+
+
+def augmented(cameras: Sequence[Tensor]) -> Tensor:
+    """Images of several cameras, each shifted by itself, as one (B, channels, H, W)."""
+    return torch.cat([shifted(images) for images in cameras], 1)
 
 
 def shifted(images: Tensor) -> Tensor:

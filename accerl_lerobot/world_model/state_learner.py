@@ -8,7 +8,7 @@ weights over, after which remembered states are to be computed anew.
 from __future__ import annotations
 
 import copy
-import math
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -24,21 +24,18 @@ class StateLearner:
     """Gradient steps on a copy of `model`."""
 
     def __init__(self, model: StateModel) -> None:
-        self.model = copy.deepcopy(model)
+        self.model = copy.deepcopy(model).train()
         learned = [parameter for parameter in self.model.parameters() if parameter.requires_grad]
         self.optimizer = torch.optim.AdamW(learned, lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY)
-        self.count = self.skipped = 0  # gradient steps made, and those left out for not being finite
+        self.count = 0  # steps made
 
-    def step(self, transitions: Transitions) -> dict[str, float]:
-        """Make a gradient step; returns the loss's parts."""
+    def step(self, transitions: Transitions, apply: Callable[..., object]) -> dict[str, float]:
+        """Make a step by `BaseUpdate.apply`; returns the loss's parts."""
         loss, metrics = self.model.loss(transitions)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         norm = torch.nn.utils.clip_grad_norm_(self.optimizer.param_groups[0]["params"], CLIP)
-        if math.isfinite(float(loss.detach()) + float(norm)):
-            self.optimizer.step()
-        else:
-            self.skipped += 1
+        apply(self.optimizer, "a step of the world model", float(loss.detach()), float(norm))
         self.count += 1
         return metrics
 
@@ -48,11 +45,11 @@ class StateLearner:
 
     def state(self) -> dict[str, Any]:
         """A copy of all that `restore` needs."""
-        counts = {"count": self.count, "skipped": self.skipped}
-        return counts | {"model": copied(self.model), "optimizer": optimizer_state(self.optimizer)}
+        optimizer = optimizer_state(self.optimizer)
+        return {"count": self.count, "model": copied(self.model), "optimizer": optimizer}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Resume from `state`."""
-        self.count, self.skipped = state["count"], state["skipped"]
+        self.count = state["count"]
         self.model.load_state_dict(state["model"])
         restore_optimizer(self.optimizer, state["optimizer"])

@@ -22,18 +22,20 @@ import torch
 from torch import Tensor, nn
 
 from accerl_lerobot.config.parsing import imported
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE
 from accerl_lerobot.world_model.config import StateModelConfig
 
 Observations = dict[str, np.ndarray]
-"""Arrays (B, ...) by LeRobot's names, as `experience.Observation` has them, without the instruction."""
+"""Arrays (B, ...) by LeRobot's names, as `experience.Observation` has them, without the instruction. Where a
+policy looks back, so many env steps stand in a dimension after the first, oldest first."""
 
 
 class StateSpec(NamedTuple):
     """Sizes of what a state model reads, and of the chunks that its transitions hold."""
 
-    cameras: tuple[str, ...]  # names of uint8 images (H, W, 3)
-    state: int  # numbers of ``observation.state``, of all remembered env steps
+    cameras: dict[str, int]  # name → channels C of uint8 images (H, W, C)
+    state: int  # numbers of ``observation.state``, of all ``n_obs_steps`` together; 0 where there are none
     environment_state: int  # numbers of ``observation.environment_state``; 0 where there are none
     chunk: tuple[int, int]  # (K, A)
 
@@ -51,9 +53,9 @@ class Transitions(NamedTuple):
 
 
 class StateModel(nn.Module, ABC):
-    """A model of what critic and teacher see in place of observations.
+    """A model whose states critic and teacher see.
 
-    All its tensors are parameters: they are published with the policy's weights and saved with them.
+    All its tensors are parameters, as they are published and saved with the policy's weights.
     """
 
     size: int
@@ -61,13 +63,16 @@ class StateModel(nn.Module, ABC):
 
     @abstractmethod
     def encode(self, observations: Observations, tasks: Sequence[str], elapsed: np.ndarray) -> Tensor:
-        """States, float32 (B, S), where the model is; `elapsed` (B,) is the share of the time limit gone."""
+        """States, float32 (B, S), on any device; `elapsed` (B,) is the share of the time limit gone."""
 
     def fit(self, observations: Observations) -> None:
         """Take scales from all remembered observations; called before the first loss, and now and then."""
 
     def loss(self, transitions: Transitions) -> tuple[Tensor, dict[str, float]]:
-        """Loss, a scalar, and metrics of a step of learning. Randomness is torch's global generator's."""
+        """Loss, a scalar, and metrics; called once before each gradient step.
+
+        Randomness is torch's global generator's.
+        """
         raise NotImplementedError
 
     @property
@@ -89,7 +94,16 @@ class SimulatorState(StateModel):
 
 
 def new_state_model(spec: StateSpec, config: StateModelConfig) -> StateModel:
-    """The untrained model that `config` names."""
+    """The untrained model that `config` names, which does not learn by itself.
+
+    Raises:
+        InputError: it is no `StateModel`, has buffers, or cannot read what the policy reads.
+    """
     model: Any = imported(config.make)(spec, config)
-    assert isinstance(model, StateModel)
-    return model
+    if not isinstance(model, StateModel):
+        remedy = f"{config.make} is no accerl_lerobot.world_model.states.StateModel; derive it from that"
+        raise InputError("world_model.type", config.type, remedy)
+    if buffers := [name for name, _ in model.named_buffers()]:
+        remedy = f"{config.make} has the buffer {buffers[0]}; make it a parameter without gradient"
+        raise InputError("world_model.type", config.type, remedy)
+    return model.eval()

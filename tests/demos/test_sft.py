@@ -299,7 +299,7 @@ def test_a_preset_gets_only_what_it_has(tmp_path: Path, kind: str, schedule: set
     [
         (None, "sft.init_path=.*: config.json: is missing; give the whole folder"),
         ({"type": "gaussian_actor"}, "sft.init_path='gaussian_actor': only LeRobot's SAC trains it"),
-        ({"type": "mine"}, "sft.init_path='mine': LeRobot has act, "),
+        ({"type": "mine"}, "sft.init_path='mine': no such policy type here; install the package"),
     ],
 )
 def test_a_start_that_cannot_be_fine_tuned(tmp_path: Path, stored: dict | None, sentence: str):

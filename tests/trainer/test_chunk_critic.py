@@ -86,7 +86,7 @@ def taught(checkpoint: Path) -> LeRobotAdapter:
 
 def simulator(numbers: int) -> SimulatorState:
     """The state of a simulator that tells so many numbers."""
-    return SimulatorState(StateSpec((), 4, numbers, (4, 2)), SimulatorStateConfig())
+    return SimulatorState(StateSpec({}, 4, numbers, (4, 2)), SimulatorStateConfig())
 
 
 def state_of(teacher: Teacher, observation: Observation) -> torch.Tensor:
@@ -137,7 +137,6 @@ class TestMemory:
             segment = episode([0.0, 1.0])
             segment.task = name
             memory.add(segment, chunks(segment))
-        assert memory["last"].tolist() == [False, True, False, True]
         again = Memory(1000, GAMMA, n_step=2)
         again.restore(memory.state())
         for each in (memory, again):
@@ -318,8 +317,10 @@ def test_a_step_of_critic_and_teacher_by_hand(tiny_checkpoint: Path, monkeypatch
 def test_a_latent_state_is_computed_anew_when_the_model_that_acts_changes(
     tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(chunk_critic, "FIRST_STATE_STEPS", 2)
+    monkeypatch.setattr(chunk_critic, "FIRST_STATE_STEPS", 8)
+    monkeypatch.setattr(chunk_critic, "MOST_STATE_STEPS", 5)
     monkeypatch.setattr(chunk_critic, "LEAST_TRANSITIONS", 4)
+    monkeypatch.setattr(chunk_critic, "REFRESH", 12)
     torch.manual_seed(0)
     update, rng = latent_learner(tiny_checkpoint), np.random.default_rng(0)
 
@@ -336,16 +337,20 @@ def test_a_latent_state_is_computed_anew_when_the_model_that_acts_changes(
 
     metrics = update.step([played()])
     assert not any(name.startswith("world_model") for name in metrics), "two transitions are too few"
-    for _ in range(6):
+    assert not update.teacher.ready
+    replaced = []
+    for _ in range(7):
         acting = [parameter.detach().clone() for parameter in update.teacher.model.parameters()]
         metrics = update.step([played(), played()])
         now = list(update.teacher.model.parameters())
-        changed = any(not torch.equal(old, new) for old, new in zip(acting, now, strict=True))
-        assert changed == (update.version - 1 in (1, 5))
+        replaced.append(any(not torch.equal(old, new) for old, new in zip(acting, now, strict=True)))
         assert np.isfinite(metrics["world_model_contrast"])
+        assert bool(update.teacher.ready) == (update.version > 2), "once its 8 first steps are made"
         torch.testing.assert_close(torch.from_numpy(update.memory["state"]), states_of_now())
+    assert replaced == [True, True, False, True, False, True, False], "every 12 decisions, 6 an update"
     assert update.memory["state"][:3, 4 + 4].tolist() == [0, 0.25, 0.5]
-    assert update.states is not None and update.states.count == 2 + 6 * 3
+    assert update.memory["last"][:6].tolist() == [False, False, True] * 2
+    assert update.state_learner is not None and update.state_learner.count == 8 + 5 * 3
 
 
 def test_success_is_told_by_who_acted(tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch):
@@ -555,6 +560,10 @@ SECTIONS: dict[str, Any] = {
         (
             {"algorithm": SelfImitationConfig(), "world_model": LatentConfig()},
             r"world_model\.type='latent': .*use chunk_critic",
+        ),
+        (
+            {"env": SimulatedConfig(max_steps=4)},
+            r"world_model\.type='latent': an episode is one decision.*lower policy\.n_action_steps",
         ),
         ({"replay": ReplayConfig(samples_per_insert=2.0)}, r"replay\.samples_per_insert=2\.0: .*use 1\.0"),
         ({"trainer": TrainerConfig(ranks=2)}, r"trainer\.ranks=2: .*use 1"),
