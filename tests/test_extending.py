@@ -160,9 +160,7 @@ def test_a_density_that_leaves_out_executed_actions_is_found(checkpoint, observa
 
 
 def test_it_acts(checkpoint: Path, observations: list[Observation]):
-    with pytest.raises(
-        InputError, match=rf"^policy\.type='{POLICY}': .*or name its package: policy\.discover"
-    ):
+    with pytest.raises(InputError, match=rf"^policy\.type='{POLICY}': .*or name it: policy\.discover"):
         load_adapter(PolicyConfig(path=str(checkpoint)))
     policy = load_policy(checkpoint, device="cpu", discover_packages_path=PACKAGE)
     assert policy.act(observations[0]).shape == (4, 2)

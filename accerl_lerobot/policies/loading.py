@@ -43,9 +43,9 @@ from accerl_lerobot.policies.config import (
     sampler_config,
 )  # fmt: skip
 from accerl_lerobot.policies.family import Model
+from accerl_lerobot.policies.normalisation import check_statistics, correct_inputs, stored_steps
 from accerl_lerobot.policies.peft_adapters import merged, weights_folder
 from accerl_lerobot.policies.saving import tune
-from accerl_lerobot.policies.statistics import check_statistics, correct_inputs, stored_steps
 from accerl_lerobot.policies.stock import StockAdapter
 
 logger = logging.getLogger(__name__)

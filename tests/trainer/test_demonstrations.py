@@ -114,7 +114,7 @@ def test_labels_of_an_episode(
         lambda name, episode, step: [label[name][step]] if name in label else None,
     )  # fmt: skip
     shapes = {"observation.state": (4,), "action": (2,)}
-    (segment,) = recorded(dataset, open_metadata(dataset), shapes, 1, 100, 1)
+    (segment,) = recorded(dataset, open_metadata(dataset), shapes, 1, 100, 1, time_limit=100)
     assert (segment.reward.tolist(), segment.success, segment.task) == (rewards, success, "go")
     assert len(segment) == length and segment.observations["observation.state"].shape == (length + 1, 4)
 
