@@ -425,6 +425,12 @@ def test_what_a_policy_reads_of_a_dataset_is_looked_at_before_any_work(tmp_path:
     bad = {"observation.state": [0, 0, 0, np.nan], "action": "left", "observation.effort": [np.inf, 0]}
     cases: list[tuple[dict[str, Any], list[str], str, str | None]] = [
         (parts, [STATE], "", r"it is in parts \(observation.state.joints, observation.state.gripper\)"),
+        (
+            {"action.pose": VECTOR, "action.buttons": VECTOR},
+            ["action"],
+            "",
+            r"no action for a policy: it is in parts \(action.pose, action.buttons\); join them",
+        ),
         (text, [], "action", "no action for a policy: it is string, and policies read numbers"),
         ({}, ["action"], "", "no action, so that there is nothing to imitate"),
         ({}, [], STATE, "observation.state: a number that is not finite in episode 0"),

@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +20,12 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from accerl_lerobot.cli import main
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos.dataset_files import open_metadata, opened
-from accerl_lerobot.demos.episodes import pixels_of
 from accerl_lerobot.engine.config import RunConfig, parse
 from accerl_lerobot.envs import GymConfig, make_world
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.policies.features import check_features, env_features, policy_features
+from accerl_lerobot.policies.loading import load_lerobot_config
 from accerl_lerobot.seeds import demo_seed, eval_seed, train_seed
 from tests.policies.checkpoints import edit_config, write_smolvla
 from tests.policies.tiny import adapter_at, requests
@@ -121,6 +124,26 @@ def test_the_device_in_the_checkpoint_is_replaced(changes: dict, tiny_checkpoint
     np.testing.assert_array_equal(*chunks)
 
 
+def test_a_config_without_a_type_is_told_what_to_add(tiny_checkpoint: Path, tmp_path: Path):
+    copied = Path(shutil.copytree(tiny_checkpoint, tmp_path / "policy"))
+    path = copied / "config.json"
+    path.write_text(json.dumps({k: v for k, v in json.loads(path.read_text()).items() if k != "type"}))
+    with pytest.raises(InputError, match=r'^policy\.type=None: .*names no type; add "type": one of act, '):
+        adapter_at(copied)
+
+
+def test_a_policy_that_reads_an_instruction_warns_of_none(
+    tiny_checkpoint: Path, registered: Any, caplog: pytest.LogCaptureFixture
+):
+    policy = policy_features(load_lerobot_config(PolicyConfig(path=str(tiny_checkpoint), device="cpu")))
+    spec = make_world(registered(Arm)).spec
+    for task, warned in (("Reach", False), ("", True)):
+        offered = env_features(replace(spec, instructions=(task,) if task else ()))
+        needed = replace(policy, shapes={})
+        check_features(needed, offered, {}, "policy.path", "mine")
+        assert ("name it in env.task" in caplog.text) is warned
+
+
 def test_episodes_whose_borders_contradict_the_rows_are_refused(tmp_path: Path):
     dataset = write_dataset(tmp_path / "data")
 
@@ -158,7 +181,7 @@ def test_videos_in_several_files_and_timestamps_off_the_rate(tmp_path: Path):
     dataset = write_videos(tmp_path / "data")
     assert len(list((tmp_path / "data/videos").rglob("*.mp4"))) == 2
     with opened(dataset, open_metadata(dataset)) as data:
-        greys = [float(pixels_of(data[row][FRONT]).mean()) for row in range(12)]
+        greys = [255 * float(data[row][FRONT].mean()) for row in range(12)]
     np.testing.assert_allclose(greys, [100 * (row // 6) + 15 * (row % 6) + 10 for row in range(12)], atol=6)
 
     def delay(table: pa.Table) -> pa.Table:

@@ -206,7 +206,16 @@ def check_registered(policy_type: Any, field: str, prefix: str = "") -> None:
     from lerobot.configs.policies import PreTrainedConfig
 
     known = sorted(PreTrainedConfig.get_known_choices())
+    if policy_type is None:
+        why = f'its config.json names no type; add "type": one of {", ".join(known)}'
+        raise InputError(field, None, prefix + why)
     if policy_type in known:
+        package = PreTrainedConfig.get_choice_class(policy_type).__module__.partition(".")[0]
+        try:
+            importlib.import_module(package)
+        except (Exception, SystemExit) as error:  # it has registered the type, and then failed
+            why = f"{package} is installed and cannot be imported ({type(error).__name__}: {brief(error)})"
+            raise InputError(field, policy_type, prefix + why) from error
         return
     broken = [
         f"{package} is installed and cannot be imported ({why})" for package, why in NOT_IMPORTED.items()

@@ -31,6 +31,8 @@ IMAGENET = (
     "use ImageNet's: VISUAL: MEAN_STD in the policy's normalization_mapping, and no "
     "--dataset.use_imagenet_stats=false in sft.extra_args"
 )
+TEXT_FIELDS = ("tokenizer_", "text_encoder_", "text_tokenizer_", "vlm_", "qwen_")
+"""Beginnings of the fields of LeRobot's policy configs that only policies with an instruction have."""
 EPSILON = 1e-8
 """Number that LeRobot adds to a width that it divides by."""
 OUTSIDE_SHARE, OUTSIDE_SLACK = 0.05, 0.01
@@ -49,6 +51,7 @@ class Features:
     labelled_fps: tuple[float, ...] = ()  # see `WorldSpec.labelled_fps`
     tasks: tuple[str, ...] = ()  # instructions; empty: not known
     unusable: dict[str, str] = field(default_factory=dict)  # name → why no policy can read it
+    reads_text: bool = False  # True for a policy that is given an instruction
 
 
 def env_features(spec: WorldSpec) -> Features:
@@ -62,7 +65,8 @@ def env_features(spec: WorldSpec) -> Features:
 def policy_features(policy: Any) -> Features:
     """Features that a policy needs, from LeRobot's config of it."""
     features = (policy.input_features or {}) | (policy.output_features or {})
-    return Features(shapes=_shapes(features), any_size=resizes(policy))
+    text = any(name.startswith(TEXT_FIELDS) for name in vars(policy))
+    return Features(shapes=_shapes(features), any_size=resizes(policy), reads_text=text)
 
 
 def resizes(policy: Any) -> bool:
@@ -166,6 +170,12 @@ def check_features(
         why = f"recorded at {needed.fps:g} Hz, but the environment runs at {offered.fps:g} Hz"
         remedy = "its actions would be executed at another rate; use a dataset of this rate"
         raise InputError(field, value, f"{why}: {remedy}, or with env.type=gym set env.fps")
+    if needed.reads_text and offerer == "environment" and not offered.tasks:
+        logger.warning(
+            "%s=%r: the policy reads an instruction, and the environment gives none; name it in env.task",
+            field,
+            value,
+        )
     _check_tasks(needed.tasks, offered.tasks, field, value)
 
 

@@ -92,7 +92,10 @@ def load_lerobot_config(config: PolicyConfig) -> Any:
     """
     folder, origin = _checkpoint_folder(config), Origin("policy.path", config.path)
     _registered_type(config, folder)
-    with _refusing(config, "its config.json is not one of this LeRobot's policies"):
+    what = (
+        "its config.json is not one of this LeRobot's policies; remove the fields of another version from it"
+    )
+    with _refusing(config, what):
         lerobot_config = PreTrainedConfig.from_pretrained(folder)
         correct_inputs(lerobot_config, folder, origin)
     check_sizes(lerobot_config, origin)

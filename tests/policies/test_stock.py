@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from lerobot.configs.policies import PreTrainedConfig
 from safetensors.torch import save_file
 
 from accerl_lerobot import cli, load_policy
@@ -160,3 +161,34 @@ def test_a_type_that_is_missing_and_a_package_that_is_broken_are_two_lines(
     with pytest.raises(InputError, match=f"no such policy type here; {why}") as caught:
         load_acting(config)
     assert "\n" not in str(caught.value) and "lerobot_policy_theirs" not in sys.modules
+
+
+HALF = """
+from dataclasses import dataclass
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.policies.act.configuration_act import ACTConfig
+
+@PreTrainedConfig.register_subclass("half")
+@dataclass
+class HalfConfig(ACTConfig):
+    pass
+"""
+
+
+def test_a_package_that_registers_its_type_and_then_fails_is_told_by_its_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    (tmp_path / "policy").mkdir()
+    (tmp_path / "policy" / "config.json").write_text('{"type": "half"}')
+    save_file({"weight": torch.zeros(1)}, tmp_path / "policy" / "model.safetensors")
+    write_package(
+        tmp_path / "site", "lerobot_policy_half", "from . import config\nimport no_such_module_of_theirs"
+    )
+    (tmp_path / "site" / "lerobot_policy_half" / "config.py").write_text(HALF)
+    monkeypatch.syspath_prepend(str(tmp_path / "site"))
+    why = "lerobot_policy_half is installed and cannot be imported .ModuleNotFoundError: No module named"
+    try:
+        with pytest.raises(InputError, match=f"policy.type='half': .*{why} 'no_such_module_of_theirs'"):
+            load_acting(PolicyConfig(path=str(tmp_path / "policy"), device="cpu"))
+    finally:
+        PreTrainedConfig.get_known_choices().pop("half", None)
