@@ -23,7 +23,7 @@ from accerl_lerobot.engine.run import make_engine
 from accerl_lerobot.inference.batcher import Batcher
 from accerl_lerobot.metrics import MetricsLog, WandBConfig
 from accerl_lerobot.timeline import ROLES, STATES
-from accerl_lerobot.trainer import chunk_critic
+from accerl_lerobot.world_model.latent import LatentModel
 
 ROOT = Path(__file__).parents[1]
 
@@ -124,7 +124,7 @@ def explained(section: str) -> set[str]:
 
 def test_every_logged_number_is_explained(tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """And nothing is explained that is not logged."""
-    monkeypatch.setattr(chunk_critic, "FIRST_STATE_STEPS", 1)
+    monkeypatch.setattr(LatentModel, "first_steps", 1)
     arguments = [
         "--env.type=simulated", f"--policy.path={tiny_checkpoint}", "--launch.engine=local",
         "--replay.min_decisions=32", "--trainer.batch_decisions=16", "--rollout.worlds=4",

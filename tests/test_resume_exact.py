@@ -25,6 +25,7 @@ from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer import chunk_critic
 from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.world_model.latent import LatentModel
 from tests.runs import drive, tiny_run, until
 
 CASES: dict[str, dict[str, Any]] = {
@@ -62,7 +63,7 @@ def config_of(checkpoint: Path, case: str) -> RunConfig:
 @pytest.fixture(autouse=True, scope="module")
 def few_first_steps() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(chunk_critic, "FIRST_STATE_STEPS", 5)
+        patch.setattr(LatentModel, "first_steps", 5)
         patch.setattr(chunk_critic, "LEAST_TRANSITIONS", 40)
         yield
 

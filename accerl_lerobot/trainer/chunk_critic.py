@@ -51,8 +51,7 @@ FIRST_STEPS = 2000  # steps in which the teacher learns what was done before it 
 MOST_FIRST = 5000  # most steps of the critic before the teacher's first along it
 MARGIN = 0.05  # share of the explored range of actions that the teacher may go beyond it
 SMALLEST_SCALE = 0.02  # smallest mean |Q| that Q is divided by
-FIRST_STATE_STEPS, STATE_STEPS = 1000, 0.5  # steps of the world model at first, and for each new decision
-MOST_STATE_STEPS = 200  # of the first ones, in one update
+MOST_STATE_STEPS = 200  # of the world model's first steps, in one update
 LEAST_TRANSITIONS = 100  # with fewer, the world model does not begin
 REFRESH = 320  # new decisions after which the acting world model takes over what was learned, at least
 REENCODED = 16  # remembered states that are computed anew for each new decision, at most
@@ -113,7 +112,7 @@ class ChunkCriticUpdate(OffPolicyUpdate):
 
     def learn(self, new: int) -> dict[str, float]:
         metrics = self._learn_states(new)
-        if self.state_learner is not None and self.state_learner.count < FIRST_STATE_STEPS:
+        if self.state_learner is not None and self.state_learner.behind:
             return metrics  # critic and teacher would learn on states that mean nothing yet
         return metrics | self._learn_to_act(new)
 
@@ -123,9 +122,9 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         if self.state_learner is None or len(transitions) < LEAST_TRANSITIONS:
             return {}
         self.state_learner.model.fit(self.memory.seen())
-        behind = max(0, FIRST_STATE_STEPS - self.state_learner.count)
+        behind, each = self.state_learner.behind, self.teacher.model.steps_per_decision
         # A part at a time, so that no update takes minutes.
-        due = min(behind, MOST_STATE_STEPS) or len(self.steps("world_model", STATE_STEPS, new))
+        due = min(behind, MOST_STATE_STEPS) or len(self.steps("world_model", each, new))
         metrics = mean(self._state_step(transitions) for _ in range(due))
         self._unpublished += new
         if behind or self._unpublished >= max(REFRESH, len(self.memory) // REENCODED):

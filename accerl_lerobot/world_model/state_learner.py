@@ -29,6 +29,11 @@ class StateLearner:
         self.optimizer = torch.optim.AdamW(learned, lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY)
         self.count = 0  # steps made
 
+    @property
+    def behind(self) -> int:
+        """Steps to make before critic and teacher begin."""
+        return max(0, self.model.first_steps - self.count)
+
     def step(self, transitions: Transitions, apply: Callable[..., object]) -> dict[str, float]:
         """Make a step by `BaseUpdate.apply`; returns the loss's parts."""
         loss, metrics = self.model.loss(transitions)

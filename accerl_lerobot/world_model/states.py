@@ -60,6 +60,10 @@ class StateModel(nn.Module, ABC):
 
     size: int
     """Numbers of a state."""
+    first_steps = 1000
+    """Gradient steps of a model that learns before critic and teacher begin."""
+    steps_per_decision = 0.5
+    """Gradient steps of a model that learns for each new decision."""
 
     @abstractmethod
     def encode(self, observations: Observations, tasks: Sequence[str], elapsed: np.ndarray) -> Tensor:

@@ -42,6 +42,7 @@ from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.off_policy import AWRUpdate, Memory, OffPolicyUpdate
 from accerl_lerobot.trainer.update import make_update
 from accerl_lerobot.world_model.config import LatentConfig, SimulatorStateConfig
+from accerl_lerobot.world_model.latent import LatentModel
 from accerl_lerobot.world_model.states import SimulatorState, StateSpec
 from tests.replay.segments import make_segment
 from tests.rounding import assert_close
@@ -317,7 +318,7 @@ def test_a_step_of_critic_and_teacher_by_hand(tiny_checkpoint: Path, monkeypatch
 def test_a_latent_state_is_computed_anew_when_the_model_that_acts_changes(
     tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(chunk_critic, "FIRST_STATE_STEPS", 8)
+    monkeypatch.setattr(LatentModel, "first_steps", 8)
     monkeypatch.setattr(chunk_critic, "MOST_STATE_STEPS", 5)
     monkeypatch.setattr(chunk_critic, "LEAST_TRANSITIONS", 4)
     monkeypatch.setattr(chunk_critic, "REFRESH", 12)
@@ -467,7 +468,7 @@ def awr(checkpoint: Path, algorithm: AWRConfig | None = None, **trainer: Any) ->
 def test_what_was_learnt_is_restored_to_the_last_bit(
     make: Callable[[Path], OffPolicyUpdate], tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(chunk_critic, "FIRST_STATE_STEPS", 3)
+    monkeypatch.setattr(LatentModel, "first_steps", 3)
     monkeypatch.setattr(chunk_critic, "LEAST_TRANSITIONS", 8)
 
     def steps(update: OffPolicyUpdate, seed: int) -> dict[str, float]:
