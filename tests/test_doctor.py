@@ -217,6 +217,7 @@ def test_a_policy_is_compared_with_its_device(usable_gib, status, words, monkeyp
     memory = PolicyMemory(
         **{name: int(engine_sizes.GIB * size) for name, size in (sizes | {"learning": 0.25}).items()}
     )
+    monkeypatch.setattr(loading, "learning_config", lambda config: None)
     monkeypatch.setattr(loading, "rehearsed", lambda config, task: memory)
     monkeypatch.setattr(
         doctor, "_device_memory", lambda config, device: (engine_sizes.GIB * usable_gib, 1, "a GPU")
@@ -234,6 +235,7 @@ def test_a_policy_is_compared_with_its_device(usable_gib, status, words, monkeyp
 def test_ranks_keep_their_parts_of_a_policy(sharding, kept, monkeypatch):
     """A quarter each of 3.5 GiB, and a batch of 0.5; zero2 holds all of the 2 GiB of weights, too."""
     memory = PolicyMemory(*(int(engine_sizes.GIB * size) for size in (2, 0.5, 0, 0, 0.5, 0)))
+    monkeypatch.setattr(loading, "learning_config", lambda config: None)
     monkeypatch.setattr(loading, "rehearsed", lambda config, task: memory)
     monkeypatch.setattr(doctor, "_device_memory", lambda *_: (engine_sizes.GIB * 12.0, 1, "a GPU"))
     trainer = TrainerConfig(batch_decisions=64, ranks=4, sharding=sharding, probe_every=0)

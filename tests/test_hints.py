@@ -73,7 +73,7 @@ MISTAKES: list[tuple[str, list[str]]] = [
     ("train", ["--launch.placement={trainer: 1}"]),
     ("train", ["--launch.engine=local", "--launch.schedule=synchronous"]),
     ("train", ["--launch.engine=local", "--trainer.ranks=2"]),
-    ("train", ["--env.type=simulated", "--algorithm.type=chunk_critic"]),
+    ("train", ["--env.type=simulated", "--algorithm.type=chunk_critic", "--world_model.type=simulator"]),
     ("train", ["--algorithm.type=awr", "--replay.samples_per_insert=4"]),
     ("eval", ["--steps=3"]),
     ("eval", ["--eval.n_episodes=3"]),

@@ -494,7 +494,8 @@ def _unknown(key: str, value: Any, path: tuple[str, ...], names: list[str], whol
         leaf_name += f".{below}"
     hints = dict(_fields(whole))
     near = [".".join((*path, name)) for name in difflib.get_close_matches(key, names, n=3)]
-    lerobot_name = leaf_name in FLAGS or not near  # only what is no misspelling is of a section of LeRobot's
+    # Only what is no misspelling is of a section of LeRobot's.
+    lerobot_name = leaf_name in FLAGS or here in FLAGS or not near
     if lerobot_name and (hint := hint_for(leaf_name, leaf, hints.keys())):
         return InputError(leaf_name, leaf, f"the name is LeRobot's; {hint}")
     # The same name elsewhere, where the value would fit or no section was named.

@@ -62,7 +62,7 @@ def read(dataset: DatasetConfig, one_task: bool = True) -> list[EpisodeLabels]:
 def outcomes(dataset: DatasetConfig) -> dict[str, list[bool]]:
     """Which episodes are successes, by each verb that reads labels."""
     shapes = {STATE: (4,), ACTION: (2,)}
-    segments = recorded(dataset, open_metadata(dataset), shapes, STEPS, 1000, 1)
+    segments = recorded(dataset, open_metadata(dataset), shapes, STEPS, 1000, 1, time_limit=100)
     spec = WorldModelSpec(
         cameras=(FRONT,), image_size=(32, 32), state_dim=4, action_dim=2, chunk=2, context=1, fps=FPS
     )
@@ -124,7 +124,7 @@ def test_instructions_are_looked_up_by_their_index(tmp_path: Path):
     rewrite(tmp_path / "data/meta/tasks.parquet", lambda table: table.take([1, 0]))
     assert [episode.tasks for episode in read(dataset)] == [("open",), ("close",), ("open",)]
     shapes = {STATE: (4,), ACTION: (2,)}
-    segments = recorded(dataset, open_metadata(dataset), shapes, STEPS, 1000, 1)
+    segments = recorded(dataset, open_metadata(dataset), shapes, STEPS, 1000, 1, time_limit=100)
     assert [segment.task for segment in segments] == ["open", "close", "open"]
 
 
@@ -134,6 +134,6 @@ def test_images_of_another_size_than_the_dataset_says(tmp_path: Path):
     (tmp_path / "data" / DATA).write_bytes((tmp_path / "other" / DATA).read_bytes())
     shapes = {FRONT: (32, 32, 3), ACTION: (2,)}
     with pytest.raises(InputError, match=r"have shape \(3, 16, 16\), and meta/info.json says \(3, 32, 32\)"):
-        list(recorded(dataset, open_metadata(dataset), shapes, STEPS, 1000, 1))
+        list(recorded(dataset, open_metadata(dataset), shapes, STEPS, 1000, 1, time_limit=100))
     shapes[FRONT] = (16, 16, 3)
-    assert len(list(recorded(other, open_metadata(other), shapes, STEPS, 1000, 1))) == 2
+    assert len(list(recorded(other, open_metadata(other), shapes, STEPS, 1000, 1, time_limit=100))) == 2
