@@ -3,25 +3,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot.algorithms import ChunkCriticConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import task_codes
-from accerl_lerobot.replay.pacing import ReplayConfig
-from accerl_lerobot.rollout.runner import RolloutConfig
-from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.world_model import latent
-from accerl_lerobot.world_model.config import LatentConfig, StateModelConfig
+from accerl_lerobot.world_model.config import LatentConfig
 from accerl_lerobot.world_model.latent import LatentModel, info_nce, shifted
 from accerl_lerobot.world_model.state_learner import StateLearner
 from accerl_lerobot.world_model.states import Observations, StateSpec, Transitions
-from tests.runs import tiny_run, trained
 
 FRONT, WRIST, ROBOT = "observation.images.front", "observation.images.wrist", "observation.state"
 SPEC = StateSpec(cameras={FRONT: 3}, state=3, environment_state=0, chunk=(2, 2))
@@ -213,30 +205,3 @@ def test_a_policy_without_proprioception_or_without_images():
     assert made.encode(batch.observations, batch.tasks, np.zeros(6, np.float32)).shape == (6, 8 + 1)
     with pytest.raises(InputError, match=r"world_model\.type='latent': the policy reads no images"):
         model(SPEC._replace(cameras={}))
-
-
-class QuickModel(LatentModel):
-    first_steps = 40
-
-
-@StateModelConfig.register_subclass("quick")
-@dataclass(frozen=True, kw_only=True)
-class QuickConfig(LatentConfig):
-    make = "tests.world_model.test_latent:QuickModel"
-
-
-@pytest.mark.slow
-def test_critic_and_teacher_stand_on_it_in_the_asynchronous_engine(tiny_checkpoint: Path):
-    config = tiny_run(
-        tiny_checkpoint,
-        algorithm=ChunkCriticConfig(),
-        world_model=QuickConfig(latents=8),
-        rollout=RolloutConfig(worlds=4, segment_length=4),
-        replay=ReplayConfig(capacity=64, min_decisions=16, ahead=32, samples_per_insert=1),
-        trainer=TrainerConfig(updates=24, batch_decisions=16, warmup_updates=2, value_warmup_updates=2),
-    )
-    updates = trained(config, ("match",))
-    assert len(updates) == 24 and updates[-1]["skipped"] == 0
-    begun = [update["update"] for update in updates if "world_model_contrast" in update]
-    taught = [update["update"] for update in updates if "teacher_value" in update]
-    assert begun[-1] == taught[-1] == 24 and taught[0] >= begun[0]
