@@ -338,7 +338,7 @@ def _overridden(config_class: type[Any], tree: dict[str, Any], given: dict[str, 
         kinds = choices_of(section)
         kind = kinds.get(str(now), section)
         if now != before and kind is not section:
-            usual = _defaults(kinds.get(str(before), section))
+            usual = encoded_defaults(kinds.get(str(before), section))
             taken = hints_of(kind)
             under = {
                 name: value
@@ -349,7 +349,7 @@ def _overridden(config_class: type[Any], tree: dict[str, Any], given: dict[str, 
     return merged
 
 
-def _defaults(cls: type[Any]) -> dict[str, Any]:
+def encoded_defaults(cls: type[Any]) -> dict[str, Any]:
     """Field → default, as a file has it."""
     return {field.name: draccus.encode(default_of(field)) for field in dataclasses.fields(cls)}
 

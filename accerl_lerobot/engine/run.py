@@ -138,7 +138,7 @@ def play_evaluation(config: RunConfig, console: Console, filmed: int = 0) -> lis
         config = replace(config, policy=pinned(config.policy))
         history = check_policy(config, spec)
         # Nothing is learnt, whatever the recipe says.
-        config = replace(config, algorithm=GIPOConfig())
+        config = replace(config, algorithm=GIPOConfig(), world_model=None)
         engine = make_engine(config, spec.tasks, history, load=load_acting, session=session)
         with contextlib.closing(engine):
             count = config.evaluation.episodes

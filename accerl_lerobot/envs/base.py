@@ -8,7 +8,6 @@ itself, `terminated` means the task is over (bootstrap 0), `truncated` that only
 
 from __future__ import annotations
 
-import dataclasses
 import difflib
 import json
 import shlex
@@ -21,7 +20,8 @@ from typing import Annotated, Any, ClassVar, NamedTuple, Self
 import draccus
 import numpy as np
 
-from accerl_lerobot.config.ranges import Range, Section, default_of, registered_name
+from accerl_lerobot.config.parsing import encoded_defaults
+from accerl_lerobot.config.ranges import Range, Section, registered_name
 from accerl_lerobot.envs.graphics import start_graphics
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Observation
@@ -368,8 +368,7 @@ def lerobot_eval_arguments(env: Mapping[str, Any]) -> list[str]:
             fields["episode_length"] = env["max_steps"]
     elif kind in EnvConfig.get_known_choices():
         # Only what differs from the defaults, as the run wrote them.
-        owned = dataclasses.fields(EnvConfig.get_choice_class(str(kind)))
-        usual = {own.name: draccus.encode(default_of(own)) for own in owned}
+        usual = encoded_defaults(EnvConfig.get_choice_class(str(kind)))
         given = {name: value for name, value in env.items() if value != usual.get(name)}
         plugin = {"discover_packages_path": "accerl_lerobot.envs.lerobot_plugin", "type": "accerl"}
         fields = plugin | {"world": json.dumps(given)}

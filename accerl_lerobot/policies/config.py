@@ -162,7 +162,7 @@ POLICIES: dict[str, tuple[str, tuple[str, ...]]] = {
     "pi0_fast": ("accerl_lerobot.policies.vla:Pi0Fast", ("tokens",)),
 }
 """LeRobot policy type → its model, and the families that suit it, the default one first."""
-NOT_IMPORTED: dict[str, str] = {}  # installed ``lerobot_policy_*`` → why it cannot be imported
+NOT_IMPORTED: dict[str, str] = {}  # installed ``lerobot_policy_*`` → words on why it cannot be imported
 PLUGINS: dict[str, str] = {}  # policy type that is not LeRobot's own → package that registers it with LeRobot
 SIZES = (
     "chunk_size", "n_action_steps", "n_obs_steps", "horizon", "num_steps", "num_inference_steps",
@@ -198,7 +198,11 @@ def register_policies(wanted: str | None = None) -> None:
             try:
                 importlib.import_module(package)
             except (Exception, SystemExit) as error:  # it is somebody's code, which may do anything
-                NOT_IMPORTED[package] = f"{type(error).__name__}: {brief(error)}"
+                NOT_IMPORTED[package] = _not_imported(package, error)
+
+
+def _not_imported(package: str, error: BaseException) -> str:
+    return f"{package} is installed and cannot be imported ({type(error).__name__}: {brief(error)})"
 
 
 def check_registered(policy_type: Any, field: str, prefix: str = "") -> None:
@@ -214,14 +218,11 @@ def check_registered(policy_type: Any, field: str, prefix: str = "") -> None:
         try:
             importlib.import_module(package)
         except (Exception, SystemExit) as error:  # it has registered the type, and then failed
-            why = f"{package} is installed and cannot be imported ({type(error).__name__}: {brief(error)})"
-            raise InputError(field, policy_type, prefix + why) from error
+            raise InputError(field, policy_type, prefix + _not_imported(package, error)) from error
         return
-    broken = [
-        f"{package} is installed and cannot be imported ({why})" for package, why in NOT_IMPORTED.items()
-    ]
     install = "install the package that has it, or name it: policy.discover_packages_path"
-    why = f"no such policy type here; {'; '.join(broken) or install}; there are {', '.join(known)}"
+    broken = "; ".join(NOT_IMPORTED.values())
+    why = f"no such policy type here; {broken or install}; there are {', '.join(known)}"
     raise InputError(field, policy_type, prefix + why)
 
 
