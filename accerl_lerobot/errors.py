@@ -28,8 +28,8 @@ ERROR_LOG = "error.log"  # file of a run's folder with the tracebacks of unexpec
 TOKEN = re.compile(r"\bhf_\w{6,}")  # of the Hub, which somebody may have typed where it does not belong
 BAR = re.compile(r"[^\r\n]*?\d%\|[^\]\r\n]*\]|\r")  # of progress, which no line end follows
 LONGEST, LONGEST_REMEDY, MOST_SHOWN = 200, 1200, 600
-"""Characters that are shown of a value, of a remedy and of an unexpected error; a whole section may have been
-given where a number belongs, and some remedies repeat a part of it."""
+"""Characters that are shown of a value, of a hint and of an unexpected error; a whole section may have been
+given where a number belongs, and some hints repeat a part of it."""
 
 
 class InputError(ValueError):
@@ -41,17 +41,17 @@ class InputError(ValueError):
         accerl_lerobot.errors.InputError: env.task='push-v2': use one of: push-v3, reach-v3
     """
 
-    def __init__(self, field: str, value: object, remedy: str) -> None:
-        self.field, self.value, self.remedy = field, value, remedy
-        super().__init__(field, value, remedy)
+    def __init__(self, field: str, value: object, hint: str) -> None:
+        self.field, self.value, self.hint = field, value, hint
+        super().__init__(field, value, hint)
 
     def __str__(self) -> str:
-        value, remedy, half = repr(self.value), self.remedy, LONGEST_REMEDY // 2
+        value, hint, half = repr(self.value), self.hint, LONGEST_REMEDY // 2
         if len(value) > LONGEST:
             value = f"{value[: LONGEST - 1]}…"
-        if len(remedy) > LONGEST_REMEDY:  # what to do stands at its end
-            remedy = f"{remedy[:half]}…{remedy[-half:]}"
-        return TOKEN.sub("<token>", printable(" ".join(f"{self.field}={value}: {remedy}".split())))
+        if len(hint) > LONGEST_REMEDY:  # what to do stands at its end
+            hint = f"{hint[:half]}…{hint[-half:]}"
+        return TOKEN.sub("<token>", printable(" ".join(f"{self.field}={value}: {hint}".split())))
 
 
 def printable(text: str, keep: str = "") -> str:
@@ -249,7 +249,7 @@ def error_as_json(error: BaseException) -> dict[str, Any]:
     if refused is None:
         return {"error": in_one_line(error)[:LONGEST_HANDED]}
     value = None if refused.value is None else str(refused.value)[:LONGEST_HANDED]
-    return {"field": refused.field, "value": value, "why": refused.remedy[:LONGEST_HANDED]}
+    return {"field": refused.field, "value": value, "why": refused.hint[:LONGEST_HANDED]}
 
 
 def raise_refusal(answer: dict[str, Any]) -> None:

@@ -30,7 +30,7 @@ ENVIRONMENT_STATE = "observation.environment_state"
 """LeRobot's name for what a simulator says of itself. Ours end it with the share of the time limit gone."""
 REWARD, SUCCESS = "next.reward", "next.success"  # LeRobot's names for what an env step led to
 TASK_BITS = 16  # numbers that stand for a task in `task_codes`
-REAL, IMAGINED = "real", "imagined"  # which worlds a segment can be from
+REAL, IMAGINED = "real", "imagined"  # which environments a segment can be from
 
 
 @kind
@@ -59,11 +59,11 @@ class Decision:
 
 
 @kind
-class Origin(NamedTuple):
+class SegmentStart(NamedTuple):
     """Where in which episode something begins."""
 
-    task: str  # task of `World.reset`, which is not the instruction
-    seed: int  # seed of `World.reset`
+    task: str  # task of `Environment.reset`, which is not the instruction
+    seed: int  # seed of `Environment.reset`
     decision: int  # decisions made before
 
 
@@ -92,7 +92,9 @@ class Segment:
     success: bool  # True if the episode had succeeded when the segment ended
     key: str  # worker, incarnation, sequence number
     source: str = REAL  # ``real`` or ``imagined``
-    origin: Origin  # where it begins; of an imagined one, the real observation that it was imagined from
+    origin: (
+        SegmentStart  # where it begins; of an imagined one, the real observation that it was imagined from
+    )
     world_version: int | None = None  # version of the world model that imagined it, in gradient steps
 
     def __len__(self) -> int:

@@ -65,11 +65,11 @@ def remove(folder: Path) -> None:
     _tell(folder=str(folder.absolute()))
 
 
-def explain(cause: str = "", remedy: str = "") -> None:
-    """Sets the line that is printed if this process ends abruptly; empty: as it was. Without a remedy there
+def explain(cause: str = "", hint: str = "") -> None:
+    """Sets the line that is printed if this process ends abruptly; empty: as it was. Without a hint there
     is none, and without a cause it was killed.
     """
-    _tell(**{key: text for key, text in (("cause", cause), ("remedy", remedy)) if text})
+    _tell(**{key: text for key, text in (("cause", cause), ("hint", hint)) if text})
 
 
 def _tell(**message: Any) -> None:
@@ -107,7 +107,7 @@ def left_behind(identity: str, folders: Sequence[str]) -> list[psutil.Process]:
 
 
 def _listen(parent: int) -> dict[str, Any]:
-    told: dict[str, Any] = {"folders": [], "cause": "", "remedy": "", "bye": False}
+    told: dict[str, Any] = {"folders": [], "cause": "", "hint": "", "bye": False}
     text = b""
     while not told["bye"]:
         if not select.select([0], [], [], LOOK_S)[0]:
@@ -126,9 +126,9 @@ def _listen(parent: int) -> dict[str, Any]:
 def main(identity: str) -> None:
     """Waits for the end of the parent, then ends and removes what it has left."""
     told = _listen(os.getppid())
-    if told["remedy"] and not told["bye"]:
+    if told["hint"] and not told["bye"]:
         cause = told["cause"] or "the process was killed"
-        sys.stderr.write(f"accerl: {cause}; {told['remedy']}\n")
+        sys.stderr.write(f"accerl: {cause}; {told['hint']}\n")
         sys.stderr.flush()
     deadline = time.monotonic() + END_S
     while time.monotonic() < deadline and (left := left_behind(identity, told["folders"])):

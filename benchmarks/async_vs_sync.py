@@ -2,13 +2,15 @@
 """The gain from asynchrony: the same workers, asynchronous, overlapped and synchronous, by turns in one run.
 
     S    decisions learned from per second, asynchronous over synchronous
-    S*   the most that any schedule could gain over the synchronous one: the tightest of what the worlds, the
+    S*   the most that any schedule could gain over the synchronous one: the tightest of what the
+    environments, the
          service and the trainer can do at best, over what the synchronous schedule did
     S/S* how much of that there is
 
-A speed-up without the law of the worlds' latency says nothing: where all worlds take equally long there is
-little to gain. So there is one row per law. And it is worth nothing if less is learned from each sample;
-hence runs of equally many updates under each schedule, on a problem that the policy made of time can learn.
+A speed-up without the law of the environments' latency says nothing: where all environments take equally
+long there is little to gain. So there is one row per law. And it is worth nothing if less is learned from
+each sample; hence runs of equally many updates under each schedule, on a problem that the policy made of
+time can learn.
 """
 
 from __future__ import annotations
@@ -30,9 +32,9 @@ from accerl_lerobot.replay.pacing import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, Sch
 from benchmarks.latency import TRACE
 from benchmarks.machinery import MOST_BUSY, MachineryConfig
 from benchmarks.records import as_markdown, output_folder, write
-from benchmarks.simulated_world import read_trace
+from benchmarks.simulated_environment import read_trace
 
-LEARNING = MachineryConfig(worlds=4, latency_ms=4.0, image_size=16, decide_ms=1.0, update_ms=8.0)
+LEARNING = MachineryConfig(environments=4, latency_ms=4.0, image_size=16, decide_ms=1.0, update_ms=8.0)
 """Small, as nothing is timed in it."""
 TRIALS = 100
 """Episodes of the evaluation that ends a run that learns."""
@@ -45,7 +47,8 @@ class BenchAsyncVsSyncConfig(MachineryConfig):
     cvs: tuple[Annotated[float, Range("[0, 10]")], ...] = (0.0, 0.1, 0.3, 0.5, 1.0)
     """Laws of latency: standard deviation over mean; takes the place of `latency_cv`."""
     traces: tuple[str, ...] = ()
-    """More laws: files of the benchmark `latency`, each a world's own; takes the place of `latency_trace`."""
+    """More laws: files of the benchmark `latency`, each an environment's own; takes the place of
+    `latency_trace`."""
     seconds: Positive = 8.0
     """Shortest duration of a block."""
     rounds: Repeats = 3
@@ -119,7 +122,7 @@ def compare(config: MachineryConfig, blocks: list[Block]) -> dict[str, Any]:
 
 def table(result: dict[str, Any]) -> Group:
     """`result` for people."""
-    title = f"{result['config']['worlds']} worlds, decisions learned from per second"
+    title = f"{result['config']['environments']} environments, decisions learned from per second"
     shown = [as_table(title, _COLUMNS, _rows(result))]
     if result["learning"]:
         shown.append(as_table(_learnt(result), _LEARNING, _learning_rows(result)))
@@ -238,9 +241,9 @@ def _draw(path: Path, result: dict[str, Any]) -> None:
             axes.errorbar([i + place for i in x], middle, yerr=error, fmt="o", capsize=3, label=name)
         axes.set_xticks(list(x), [_named(law) for law in found])
         axes.set(
-            xlabel="latency of the worlds: standard deviation over mean",
+            xlabel="latency of the environments: standard deviation over mean",
             ylabel="speed-up of the asynchronous schedule",
-            title=f"{result['config']['worlds']} worlds, decisions learned from per second",
+            title=f"{result['config']['environments']} environments, decisions learned from per second",
         )
         axes.set_ylim(bottom=0)
         axes.legend()

@@ -21,14 +21,14 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.replay.pacing import ASYNCHRONOUS
 from benchmarks.machinery import MOST_BUSY, MachineryConfig
 from benchmarks.records import as_markdown, output_folder, write
-from benchmarks.simulated_world import read_trace
+from benchmarks.simulated_environment import read_trace
 
 
 @dataclass(frozen=True, kw_only=True)
 class BenchBatchingConfig(MachineryConfig):
     """Which rules, for how long."""
 
-    worlds: Annotated[int, Range("[1, 1000]")] = 32
+    environments: Annotated[int, Range("[1, 1000]")] = 32
     latency_ms: Positive = 50.0
     update_ms: NonNegative = 10.0
     """Short, so that the trainer is not what is measured."""
@@ -88,7 +88,9 @@ def summed(turns: list[dict[str, Any]]) -> dict[str, Any]:
 
 def table(result: dict[str, Any]) -> Table:
     """`result` for people."""
-    return as_table(f"{result['config']['worlds']} worlds, by rule of batching", _COLUMNS, _rows(result))
+    return as_table(
+        f"{result['config']['environments']} environments, by rule of batching", _COLUMNS, _rows(result)
+    )
 
 
 def _measure(rule: BenchBatchingConfig, seconds: float, count: int) -> dict[str, Any]:

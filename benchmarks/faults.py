@@ -39,7 +39,7 @@ from benchmarks.records import as_markdown, write
 from benchmarks.study import last_words
 from benchmarks.victims import CLASSES, DRIVER, EVERYTHING, LIGHT, TRAIN, Victim, alive
 
-IMAGINING = ("imagination", "world learning")
+IMAGINING = ("imagination", "world-model learning")
 """Targets that are there where anything is imagined."""
 TARGETS = (*CLASSES, *RAY_PROCESSES, DRIVER, EVERYTHING)
 GRACE_S = 60.0
@@ -57,7 +57,7 @@ class BenchFaultsConfig(Section):
 
     recipe: str | None = None
     """The run. Its demonstrations and SFT are cut short, unless it has a policy: they do not matter here.
-    None: one with worlds and a policy made of time, in which all else is real."""
+    None: one with environments and a policy made of time, in which all else is real."""
     output_dir: str = "outputs/faults"
     """Folder of the runs and of faults.json and .md; must not exist."""
     targets: tuple[str, ...] = (
@@ -70,7 +70,7 @@ class BenchFaultsConfig(Section):
         "everything",
     )
     """Processes to strike: these, and Ray's own: gcs_server, raylet, dashboard agent, runtime env agent and
-    log monitor; where anything is imagined, imagination and world learning too. driver: the run's own
+    log monitor; where anything is imagined, imagination and world-model learning too. driver: the run's own
     process, which is gone on with by its command line. everything: it and all below it, at once."""
     faults: tuple[str, ...] = FAULTS
     """kill, stop: SIGKILL and SIGSTOP, at a point or at any moment. exception, exit (with code 0), hang (of
@@ -94,8 +94,8 @@ class BenchFaultsConfig(Section):
             if not given or len(set(given)) < len(given) or not set(given) <= set(names):
                 raise InputError(name, given, f"use some of {', '.join(names)}, none twice")
         if not any(self.of(target) for target in self.targets):
-            remedy = f"none of them can befall {', '.join(self.targets)}; add kill"
-            raise InputError("faults", self.faults, remedy)
+            hint = f"none of them can befall {', '.join(self.targets)}; add kill"
+            raise InputError("faults", self.faults, hint)
 
     def of(self, target: str) -> list[str]:
         """The faults that can befall it."""

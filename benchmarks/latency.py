@@ -18,7 +18,7 @@ from rich.table import Table
 from accerl_lerobot.bench import as_table, host
 from accerl_lerobot.config.ranges import Range, Section, Seed
 from accerl_lerobot.console import Console
-from accerl_lerobot.envs import EnvConfig, MetaWorldConfig, World, make_world
+from accerl_lerobot.envs import EnvConfig, Environment, MetaWorldConfig, make_environment
 from accerl_lerobot.seeds import train_seed
 from benchmarks.records import output_folder
 
@@ -46,13 +46,13 @@ class BenchLatencyConfig(Section):
 def bench_latency(config: BenchLatencyConfig) -> dict[str, Any]:
     """Plays and times: ``decision_ms`` and ``reset_ms`` (None without any), see `described`; ``trace``."""
     console, root = Console(), output_folder(config.output_dir)
-    world = make_world(config.env)
+    environment = make_environment(config.env)
     try:
         with console.stage("decisions", total=config.decisions) as stage:
-            lines = timed(world, config, stage.update)
-        tasks = ", ".join(world.spec.tasks)
+            lines = timed(environment, config, stage.update)
+        tasks = ", ".join(environment.spec.tasks)
     finally:
-        world.close()
+        environment.close()
     decisions, resets = (np.asarray([s for s, reset in lines if reset is kind]) for kind in (False, True))
     result = {
         "decision_ms": described(decisions),
@@ -68,23 +68,23 @@ def bench_latency(config: BenchLatencyConfig) -> dict[str, Any]:
 
 
 def timed(
-    world: World, config: BenchLatencyConfig, progress: Callable[[int], Any]
+    environment: Environment, config: BenchLatencyConfig, progress: Callable[[int], Any]
 ) -> list[tuple[float, bool]]:
     """Seconds of each decision and each reset between episodes, in order; True marks a reset."""
-    rng, spec = np.random.default_rng(config.seed), world.spec
+    rng, spec = np.random.default_rng(config.seed), environment.spec
     low, high = np.maximum(spec.action_low, -1), np.minimum(spec.action_high, 1)
     found: list[tuple[float, bool]] = []
     episodes = itertools.count()
 
     def reset() -> None:
         episode = next(episodes)
-        world.reset(train_seed(config.seed, 0, episode), spec.tasks[episode % len(spec.tasks)])
+        environment.reset(train_seed(config.seed, 0, episode), spec.tasks[episode % len(spec.tasks)])
 
     reset()
     for made in range(1, config.decisions + 1):
         actions = rng.uniform(low, high, (config.chunk, spec.action_dim)).astype(np.float32)
         started = time.perf_counter()
-        done = world.step_chunk(actions).done
+        done = environment.step_chunk(actions).done
         ended = time.perf_counter()
         found.append((ended - started, False))
         if done:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run in which all is real but what takes long: `accerl train` with worlds and a policy made of time.
+"""A run in which all is real but what takes long: `accerl train` with environments and a policy made of time.
 
     python -m benchmarks.light_run --config_path=light.yaml --output_dir=RUN
 
@@ -21,7 +21,7 @@ from accerl_lerobot.policies.config import Load, PolicyConfig
 from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
-from benchmarks.simulated_world import LatencyConfig
+from benchmarks.simulated_environment import LatencyConfig
 
 BATCH = 16
 """Decisions of an update."""
@@ -35,8 +35,10 @@ def light_config(
         job_name="light",
         env=LatencyConfig(max_steps=32, frame_ms=40.0, latency_cv=0.5),
         policy=PolicyConfig(path="made of time", device="cpu"),
-        rollout=RolloutConfig(workers=2, worlds=4, segment_length=4),
-        replay=ReplayConfig(capacity=512, min_decisions=32, ahead=64, samples_per_insert=1.0),
+        rollout=RolloutConfig(workers=2, environments=4, segment_length=4),
+        replay=ReplayConfig(
+            capacity=512, min_decisions=32, max_unlearned_decisions=64, samples_per_insert=1.0
+        ),
         trainer=TrainerConfig(
             updates=updates,
             batch_decisions=BATCH,

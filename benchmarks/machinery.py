@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The asynchronous engine around worlds and a policy that are made of time, measured a block at a time.
+"""The asynchronous engine around environments and a policy that are made of time, measured a block at a time.
 
-Each world is a process of its own, as in a real run, and so are the service, the replay and the trainer; what
-takes time in them is slept. So 64 worlds are measured on two cores, as long as what is not slept leaves cores
-idle: `blocks.Block.processors` says so.
+Each environment is a process of its own, as in a real run, and so are the service, the replay and the
+trainer; what takes time in them is slept. So 64 environments are measured on two cores, as long as what is
+not slept leaves cores idle: `blocks.Block.processors` says so.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from accerl_lerobot.policies.config import Load
 from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
-from benchmarks.simulated_world import LatencyConfig, read_trace
+from benchmarks.simulated_environment import LatencyConfig, read_trace
 
 EPISODE = 16
 """Decisions of an episode."""
@@ -37,10 +37,10 @@ CHUNK = 4
 class MachineryConfig(Section):
     """Sizes and durations of what is simulated."""
 
-    worlds: Annotated[int, Range("[1, 1000]")] = 64
-    """Worlds, each a process."""
+    environments: Annotated[int, Range("[1, 1000]")] = 64
+    """Environments, each a process."""
     latency_ms: Positive = 200.0
-    """Mean time a world takes from a decision to its next observation, in milliseconds."""
+    """Mean time an environment takes from a decision to its next observation, in milliseconds."""
     latency_cv: Annotated[float, Range("[0, 10]")] = 0.5
     """Standard deviation of that over its mean, lognormal; 0: always the mean."""
     latency_trace: str | None = None
@@ -58,7 +58,7 @@ class MachineryConfig(Section):
     max_wait_ms: Annotated[float, Range("[0, 10000)")] = 2.0
     """How long the oldest request waits for others, in milliseconds."""
     update_ms: NonNegative = 800.0
-    """Time of an update, in milliseconds; it learns from one segment of each world."""
+    """Time of an update, in milliseconds; it learns from one segment of each environment."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -67,7 +67,7 @@ class MachineryConfig(Section):
 
     @property
     def cv(self) -> float:
-        """Standard deviation of the worlds' latency over its mean."""
+        """Standard deviation of the environments' latency over its mean."""
         if self.latency_trace is None:
             return self.latency_cv
         return float(read_trace(self.latency_trace).decisions.std())
@@ -75,21 +75,22 @@ class MachineryConfig(Section):
     @property
     def batch(self) -> int:
         """Decisions an update learns from."""
-        return self.worlds * self.segment_length
+        return self.environments * self.segment_length
 
     @property
     def world_bound(self) -> float:
-        """Decisions a second that the worlds cannot exceed: an episode costs them a reset as well, which
+        """Decisions a second that the environments cannot exceed: an episode costs them a reset as well,
+        which
         takes as long as a decision, or what resets take in `latency_trace`."""
         resets = np.ones(1) if self.latency_trace is None else read_trace(self.latency_trace).resets
         reset = float(resets.mean()) if len(resets) else 1.0
         cycle = self.latency_ms * (1 + reset / EPISODE) + self.decide_ms + self.decide_each_ms
-        return 1000 * self.worlds / cycle
+        return 1000 * self.environments / cycle
 
     @property
     def service_bound(self) -> float:
         """Decisions a second that the service cannot exceed."""
-        largest = min(self.max_batch, self.worlds)
+        largest = min(self.max_batch, self.environments)
         service = self.decide_ms + self.decide_each_ms * largest
         return 1000 * largest / service if service else float("inf")
 
@@ -116,10 +117,15 @@ class MachineryConfig(Section):
                 latency_cv=self.latency_cv,
                 latency_trace=trace and str(Path(trace).expanduser().resolve()),  # workers run elsewhere
             ),
-            rollout=RolloutConfig(workers=self.worlds, worlds=1, segment_length=self.segment_length),
+            rollout=RolloutConfig(
+                workers=self.environments, environments=1, segment_length=self.segment_length
+            ),
             inference=InferenceConfig(max_batch=self.max_batch, max_wait_s=self.max_wait_ms / 1000),
             replay=ReplayConfig(
-                capacity=8 * batch, min_decisions=batch, ahead=2 * batch, samples_per_insert=1.0
+                capacity=8 * batch,
+                min_decisions=batch,
+                max_unlearned_decisions=2 * batch,
+                samples_per_insert=1.0,
             ),
             trainer=TrainerConfig(
                 updates=updates,

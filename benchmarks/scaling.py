@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How collecting grows with the number of worlds: R(N) decisions a second of N worlds, through all workers.
+"""How collecting grows with the number of environments: R(N) decisions a second of N environments, through
+all workers.
 
     E(N) = R(N) / (N · R(1))
 
-Each world is a process, each observation 301 KB, and all of them go to the service, into the replay and to
-the trainer. What is slept costs no processor, so that many worlds can be measured on few cores; where these
-were busy for more than `MOST_BUSY` of the time, they may be what was measured, and the row says so.
+Each environment is a process, each observation 301 KB, and all of them go to the service, into the replay
+and to the trainer. What is slept costs no processor, so that many environments can be measured on few cores;
+where these were busy for more than `MOST_BUSY` of the time, they may be what was measured, and the row says
+so.
 """
 
 from __future__ import annotations
@@ -23,15 +25,15 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.replay.pacing import ASYNCHRONOUS
 from benchmarks.machinery import MOST_BUSY, MachineryConfig
 from benchmarks.records import as_markdown, output_folder, write
-from benchmarks.simulated_world import read_trace
+from benchmarks.simulated_environment import read_trace
 
 
 @dataclass(frozen=True, kw_only=True)
 class BenchScalingConfig(MachineryConfig):
-    """How many worlds, for how long."""
+    """How many environments, for how long."""
 
     counts: tuple[Annotated[int, Range("[1, 1000]")], ...] = (1, 2, 4, 8, 16, 32, 64)
-    """Worlds; takes the place of `worlds`. The first is what the others are compared with."""
+    """Environments; takes the place of `environments`. The first is what the others are compared with."""
     image_size: Annotated[int, Range("[8, 480]")] = 317
     latency_ms: Positive = 200.0
     latency_cv: Annotated[float, Range("[0, 10]")] = 0.0
@@ -47,7 +49,7 @@ class BenchScalingConfig(MachineryConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.counts or len(set(self.counts)) < len(self.counts):
-            raise InputError("counts", self.counts, "name numbers of worlds, none of them twice")
+            raise InputError("counts", self.counts, "name numbers of environments, none of them twice")
 
 
 def bench_scaling(config: BenchScalingConfig) -> dict[str, Any]:
@@ -66,9 +68,9 @@ def bench_scaling(config: BenchScalingConfig) -> dict[str, Any]:
     legs = [(n, forth) for n in config.counts] + [(n, back) for n in reversed(config.counts) if back]
     with console.stage("counts", total=len(legs)) as stage:
         for done, (n, repeats) in enumerate(legs, start=1):
-            with replace(config, worlds=n).open() as engine:
+            with replace(config, environments=n).open() as engine:
                 blocks[n] += [engine.block(ASYNCHRONOUS, config.seconds) for _ in range(repeats)]
-            stage.update(done, f"{n} worlds: {blocks[n][-1].decisions_per_s:.0f} decisions/s")
+            stage.update(done, f"{n} environments: {blocks[n][-1].decisions_per_s:.0f} decisions/s")
     result |= {"counts": compare(config, blocks), "host_after": host()}
     write(root, "scaling", result, as_markdown(_COLUMNS, _rows(result)))
     console.say(f"wrote scaling.json and .md into {root}")
@@ -82,10 +84,10 @@ def compare(config: BenchScalingConfig, blocks: dict[int, list[Block]]) -> list[
     one = rates[first]["median"] / first
     return [
         {
-            "worlds": n,
+            "environments": n,
             "decisions_per_s": rates[n],
             "efficiency": spread([rate / (n * one) for rate in rates[n]["blocks"]]),
-            "bound": (bound := replace(config, worlds=n).bound),
+            "bound": (bound := replace(config, environments=n).bound),
             "share_of_bound": rates[n]["median"] / bound,
             "processors": max(b.processors for b in of),
             "processor_bound": max(b.processors for b in of) > MOST_BUSY,
@@ -98,16 +100,16 @@ def compare(config: BenchScalingConfig, blocks: dict[int, list[Block]]) -> list[
 
 def table(result: dict[str, Any]) -> Table:
     """`result` for people."""
-    return as_table("decisions per second by number of worlds", _COLUMNS, _rows(result))
+    return as_table("decisions per second by number of environments", _COLUMNS, _rows(result))
 
 
-_COLUMNS = ("worlds", "decisions/s", "E(N)", "of the bound", "batch", "processors", "")
+_COLUMNS = ("environments", "decisions/s", "E(N)", "of the bound", "batch", "processors", "")
 
 
 def _rows(result: dict[str, Any]) -> list[list[str]]:
     return [
         [
-            str(row["worlds"]),
+            str(row["environments"]),
             ranged(row["decisions_per_s"], ".1f"),
             f"{row['efficiency']['median']:.2f}",
             f"{row['share_of_bound']:.2f}",

@@ -45,7 +45,8 @@ class SimulatedPolicyConfig(Section, section="policy"):
 
 
 class SimulatedAdapter(PolicyAdapter):
-    """u ~ N(g · target, 0.3²) around the target that a `SimulatedWorld` shows in its state; V is a number."""
+    """u ~ N(g · target, 0.3²) around the target that a `SimulatedEnvironment` shows in its state; V is a
+    number."""
 
     def __init__(self, config: SimulatedPolicyConfig) -> None:
         super().__init__()

@@ -315,8 +315,8 @@ def last_words(log: Path) -> str:
 def _check_same(folder: Path, config: RunConfig) -> None:
     """Refuses to count a finished run of other settings."""
     if not _is_same(folder, config):
-        remedy = f"{folder.name} in it was run with other settings; choose another folder or remove it"
-        raise InputError("output_dir", str(folder.parent), remedy)
+        hint = f"{folder.name} in it was run with other settings; choose another folder or remove it"
+        raise InputError("output_dir", str(folder.parent), hint)
 
 
 def _is_same(folder: Path, config: RunConfig) -> bool:
@@ -327,8 +327,8 @@ def _check_newer(folder: Path, start: Path) -> None:
     """Refuses to count a run from a warm start that has been replaced."""
     summary = folder / SUMMARY
     if summary.is_file() and summary.stat().st_mtime < (start / SUMMARY).stat().st_mtime:
-        remedy = f"{folder.name} in it is older than {start.name}, where it would have begun; remove it"
-        raise InputError("output_dir", str(folder.parent), remedy)
+        hint = f"{folder.name} in it is older than {start.name}, where it would have begun; remove it"
+        raise InputError("output_dir", str(folder.parent), hint)
 
 
 def _summary(folder: Path) -> dict[str, Any]:

@@ -30,7 +30,7 @@ CLASSES = {
     "trainer": "TrainerWorker",
     "trainer rank": "TrainerRank",
     "imagination": "ImaginationWorker",
-    "world learning": "WorldLearningWorker",
+    "world-model learning": "EnvironmentLearningWorker",
 }
 """Target → how Ray calls its processes."""
 DRIVER, EVERYTHING = "driver", "everything"

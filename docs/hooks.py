@@ -16,7 +16,7 @@ from accerl_lerobot.cli import VERBS  # noqa: E402
 from accerl_lerobot.cli.verbs import CONFIGS  # noqa: E402
 from accerl_lerobot.config.help import docstrings  # noqa: E402
 from accerl_lerobot.config.parsing import choices_of, section_of  # noqa: E402
-from accerl_lerobot.config.ranges import hints_of, range_in_words  # noqa: E402
+from accerl_lerobot.config.ranges import annotations_of, range_in_words  # noqa: E402
 
 
 def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
@@ -41,7 +41,7 @@ def options() -> str:
 
 def section(config_class: type[Any], prefix: str, seen: set[tuple[str, type]]) -> str:
     """Table of the fields of a config, then the sections inside it."""
-    hints, texts = hints_of(config_class), docstrings(config_class)
+    hints, texts = annotations_of(config_class), docstrings(config_class)
     rows, inner = [], []
     for field in dataclasses.fields(config_class):
         name, nested = f"{prefix}{field.name}", section_of(hints[field.name])

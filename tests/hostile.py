@@ -121,9 +121,9 @@ def write_examples(scratch: Path) -> dict[str, Path]:
         cameras=("observation.images.front",), image_size=(8, 8), state_dim=2, action_dim=2, chunk=2, fps=10,
         context=1, tasks=("reach",),
     )  # fmt: skip
-    world = PixelWorldModel(spec, PixelModelConfig(context=1, channels=(8,)))
+    environment = PixelWorldModel(spec, PixelModelConfig(context=1, channels=(8,)))
     success = SuccessPairsRewardModel(SuccessPairsConfig(chunk=2, channels=(8,), device="cpu"))
-    save_world_model(scratch / "world_model", world, success, {"a": "learnt", "b": "held out"})
+    save_world_model(scratch / "world_model", environment, success, {"a": "learnt", "b": "held out"})
     config = PolicyConfig(path=str(write_act(scratch / "made")), device="cpu")
     save_pretrained(load_adapter(config), scratch / "policy", config)
     shutil.copytree(DATASET, scratch / "dataset")
@@ -181,7 +181,7 @@ class Trial:
             run()
         except InputError as error:
             said = str(error)
-            if "\n" in said or not error.remedy or len(said) > 2000:
+            if "\n" in said or not error.hint or len(said) > 2000:
                 raise AssertionError(f"{name}: no line for people: {said[:500]!r}") from error
             self.outcomes[f"{name} refused"] += 1
         except BaseException as error:
@@ -235,11 +235,11 @@ def _too_long(*_: object) -> None:
 def checks(trial: Trial, at: dict[str, Path], times: int) -> None:
     """Checks that are called before anything is loaded."""
     from accerl_lerobot.checkpoint.isolation import rehearse
-    from accerl_lerobot.checkpoint.safety import Origin, read_json, tensor_shapes
+    from accerl_lerobot.checkpoint.safety import FileSource, read_json, tensor_shapes
     from accerl_lerobot.demos.dataset_files import check_info, check_metadata
     from accerl_lerobot.policies import untrusted
 
-    origin = Origin("path", "hostile")
+    origin = FileSource("path", "hostile")
     policy, dataset = at["policy"], at["dataset"]
 
     def metadata() -> None:  # in a child process, as `checked` does: Arrow may end it on a damaged footer
@@ -275,19 +275,19 @@ def loaders(trial: Trial, at: dict[str, Path], times: int) -> None:
     from accerl_lerobot.world_model.store import load_roles, load_world_model, rehearse_world_model
 
     isolation.CPU_S = CPU_S
-    world, policy, dataset = at["world_model"], at["policy"], at["dataset"]
+    environment, policy, dataset = at["world_model"], at["policy"], at["dataset"]
 
     def whole_world() -> None:
-        load_roles(world)
-        rehearse_world_model(world)
-        load_world_model(world)
+        load_roles(environment)
+        rehearse_world_model(environment)
+        load_world_model(environment)
 
     def whole_policy() -> None:
         rehearsed_config(config)
         load_adapter(config)
 
     for part, share in (("config.json", 8), ("model.safetensors", 8), ("success_model/config.json", 4)):
-        trial.files(f"load world model, {part}", world / part, whole_world, share * times // 10)
+        trial.files(f"load world model, {part}", environment / part, whole_world, share * times // 10)
     config = PolicyConfig(path=str(policy), device="cpu")
     for part in ("config.json", "accerl.json", "policy_preprocessor.json", "policy_postprocessor.json"):
         trial.files(f"load policy, {part}", policy / part, whole_policy, times // 10)
@@ -306,7 +306,7 @@ def rows(trial: Trial, dataset: Path, times: int) -> None:
     import pyarrow.parquet as pq
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    from accerl_lerobot.checkpoint.safety import Origin
+    from accerl_lerobot.checkpoint.safety import FileSource
     from accerl_lerobot.demos.dataset_files import checked
 
     path = dataset / "data/chunk-000/file-000.parquet"
@@ -315,7 +315,7 @@ def rows(trial: Trial, dataset: Path, times: int) -> None:
         table = file.read()
 
     def load() -> None:
-        with checked(Origin("dataset.root", str(dataset)), whole=True):
+        with checked(FileSource("dataset.root", str(dataset)), whole=True):
             loaded = LeRobotDataset("a/b", root=dataset, video_backend="pyav")
             with contextlib.suppress(TypeError, ValueError, RuntimeError):  # LeRobot's, of what is no number
                 for index in range(0, len(loaded), 8):

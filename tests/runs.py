@@ -55,12 +55,14 @@ def printed(table: Table) -> str:
 
 
 def tiny_run(checkpoint: Path, **sections: Any) -> RunConfig:
-    """A run on the simulated world from `checkpoint`; `sections` replaces whole sections."""
+    """A run on the simulated environment from `checkpoint`; `sections` replaces whole sections."""
     defaults: dict[str, Any] = {
         "env": SimulatedConfig(max_steps=16),
         "policy": PolicyConfig(path=str(checkpoint), device="cpu"),
-        "rollout": RolloutConfig(worlds=4, segment_length=3),
-        "replay": ReplayConfig(capacity=64, min_decisions=16, ahead=32, samples_per_insert=2.0),
+        "rollout": RolloutConfig(environments=4, segment_length=3),
+        "replay": ReplayConfig(
+            capacity=64, min_decisions=16, max_unlearned_decisions=32, samples_per_insert=2.0
+        ),
         "trainer": TrainerConfig(updates=12, batch_decisions=16, warmup_updates=2, value_warmup_updates=2),
         "evaluation": EvaluationConfig(episodes=6, videos=1),
         "launch": LaunchConfig(stall_s=120),

@@ -14,7 +14,7 @@ import pytest
 
 import accerl_lerobot
 from accerl_lerobot import RunConfig, evaluate, load_config, load_policy, resume, train
-from accerl_lerobot.envs import make_world
+from accerl_lerobot.envs import make_environment
 from accerl_lerobot.errors import InputError
 from tests.test_run import local_run
 
@@ -62,10 +62,10 @@ def test_train_evaluate_resume_act(tiny_checkpoint: Path, tmp_path: Path):
     further = resume(tmp_path / "run", {"trainer.updates": 14})
     assert further.summary["updates"] == 14 and further.directory == result.directory
 
-    policy, world = load_policy(further.policy), make_world(config.env)
-    observation = world.reset(3, "match")
+    policy, environment = load_policy(further.policy), make_environment(config.env)
+    observation = environment.reset(3, "match")
     chunk = policy.act(observation)
-    assert chunk.shape[1] == world.spec.action_dim and np.isfinite(chunk).all()
+    assert chunk.shape[1] == environment.spec.action_dim and np.isfinite(chunk).all()
     assert not np.array_equal(chunk, policy.act(observation)), "a flow policy samples"
     assert np.array_equal(chunk, load_policy(further.policy).act(observation))
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recipes and overrides into configs; every mistake is one line with field, value and remedy, exit code 2."""
+"""Recipes and overrides into configs; every mistake is one line with field, value and hint, exit code 2."""
 
 from __future__ import annotations
 
@@ -122,7 +122,10 @@ MISTAKES: list[tuple[list[str], str]] = [
     (["--env.type=mujoco"], "env.type='mujoco': use one of gym, lerobot, libero, metaworld, simulated"),
     (["--env.task=drawer-v3"], "env.task='drawer-v3': 'drawer-v3' is no task; did you mean"),
     (["--trainer.hold_back=50"], "replay.max_lag=50: use more than trainer.hold_back, 50, or all is"),
-    (["--replay.ahead=3"], "replay.ahead=3: use at least one batch, 128, or both sides wait for each other"),
+    (
+        ["--replay.max_unlearned_decisions=3"],
+        "replay.max_unlearned_decisions=3: use at least one batch, 128, or both sides wait for each other",
+    ),
     (["--dataset.root=x"], "dataset.repo_id=None: name the dataset in dataset.root"),
     (["--policy.path=x", "--sft.steps=5"], "policy.path='x': add --sft.steps=0 to improve this checkpoint"),
     (["--sft.policy.chunk_size=5"], "sft.policy={'chunk_size': 5}: name LeRobot's policy type, e.g."),
@@ -182,7 +185,7 @@ def test_odd_text_stays_text() -> None:
 def test_sizes_far_beyond_the_machine_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sizes, "memory_gib", lambda entry: 16.0)
     sizes.check_memory(parse(RunConfig, ["--rollout.workers=8"]))
-    with pytest.raises(InputError, match=r"rollout\.worlds=8: the run needs about .* GiB of memory"):
+    with pytest.raises(InputError, match=r"rollout\.environments=8: the run needs about .* GiB of memory"):
         sizes.check_memory(parse(RunConfig, ["--rollout.workers=100"]))
     with pytest.raises(InputError, match=r"replay\.capacity=50000000"):
         sizes.check_memory(parse(RunConfig, ["--replay.capacity=50000000"]))
@@ -217,7 +220,7 @@ class TestConsent:
         with pytest.raises(InputError) as caught:
             parse(RunConfig, [str(path)])
         assert "a file cannot allow this, only the command line can" in str(caught.value)
-        assert flag in str(caught.value) and "\x1b" not in caught.value.remedy
+        assert flag in str(caught.value) and "\x1b" not in caught.value.hint
 
     def test_is_given_again_where_a_file_has_it(self, tmp_path: Path) -> None:
         path = tmp_path / "config.yaml"

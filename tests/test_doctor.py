@@ -147,7 +147,7 @@ class TestResources:
             ({"rollout": {"workers": 4}}, "memory", ""),
             ({"rollout": {"workers": 5}}, "cpu", "lower rollout.workers"),
             ({"trainer": {"num_threads": 8}}, "cpu", "trainer.num_threads"),
-            ({"env": {"task": "all"}, "rollout": {"worlds": 4}}, "memory", ""),
+            ({"env": {"task": "all"}, "rollout": {"environments": 4}}, "memory", ""),
             ({"env": {"image_size": 480}, "replay": {"capacity": 100_000}}, "memory", "GiB needed: lower"),
         ],
     )
@@ -180,8 +180,13 @@ class TestResources:
 
     def test_lag_is_that_of_the_formula(self) -> None:
         """⌊⌈r⌉ (max(ahead, min) + 2·in_flight + capacity) / batch⌋ − 1; with Ray one pickup, one prefetch."""
-        replay = {"capacity": 1024, "ahead": 256, "min_decisions": 128, "samples_per_insert": 2.0}
-        rollout = {"workers": 2, "worlds": 4, "segment_length": 8}
+        replay = {
+            "capacity": 1024,
+            "max_unlearned_decisions": 256,
+            "min_decisions": 128,
+            "samples_per_insert": 2.0,
+        }
+        rollout = {"workers": 2, "environments": 4, "segment_length": 8}
         trainer = {"batch_decisions": 128}
         lag = checks(self.recipe(replay=replay, rollout=rollout, trainer=trainer))["lag"]
         by_hand = 2 * (256 + 2 * 64 + 1024) // 128 - 1

@@ -26,7 +26,7 @@ from accerl_lerobot.algorithms import AlgorithmConfig
 from accerl_lerobot.config.parsing import parse
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig
 from accerl_lerobot.engine.run import make_engine
-from accerl_lerobot.envs import SimulatedConfig, make_world
+from accerl_lerobot.envs import SimulatedConfig, make_environment
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Observation
 from accerl_lerobot.policies.config import PLUGINS, POLICIES, PolicyConfig
@@ -74,8 +74,8 @@ def checkpoint(tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def observations() -> list[Observation]:
-    world = make_world(SimulatedConfig())
-    return [world.reset(seed, "match") for seed in range(3)]
+    environment = make_environment(SimulatedConfig())
+    return [environment.reset(seed, "match") for seed in range(3)]
 
 
 def named(checkpoint: Path) -> PolicyConfig:
@@ -221,8 +221,10 @@ def test_the_world_model_of_the_page(tmp_path: Path, monkeypatch: Any, tiny_chec
         sections: Any = {
             "algorithm": chosen.algorithm,
             "world_model": chosen.world_model,
-            "rollout": RolloutConfig(worlds=4, segment_length=4),
-            "replay": ReplayConfig(capacity=64, min_decisions=16, ahead=32, samples_per_insert=1),
+            "rollout": RolloutConfig(environments=4, segment_length=4),
+            "replay": ReplayConfig(
+                capacity=64, min_decisions=16, max_unlearned_decisions=32, samples_per_insert=1
+            ),
         }
         config = tiny_run(tiny_checkpoint, **sections)
         engine: Any = make_engine(replace(config, launch=LaunchConfig(engine="local")), ("match",), history=1)
@@ -271,10 +273,15 @@ def test_the_installed_package_is_found_by_every_process(checkpoint: Path, tmp_p
     source = shutil.copytree(SOURCE, tmp_path / "source")  # pip builds within it
     environment = pip_installed(source, tmp_path / "site")
     accerl = [sys.executable, "-m", "accerl_lerobot.cli"]
-    common = ["--env.type=simulated", "--policy.device=cpu", "--rollout.worlds=4", "--evaluation.episodes=4"]
+    common = [
+        "--env.type=simulated",
+        "--policy.device=cpu",
+        "--rollout.environments=4",
+        "--evaluation.episodes=4",
+    ]
     run = [
         "train", *common, *NAMED, FLAG, f"--policy.path={checkpoint}", "--rollout.segment_length=3",
-        "--replay.capacity=64", "--replay.min_decisions=16", "--replay.ahead=32",
+        "--replay.capacity=64", "--replay.min_decisions=16", "--replay.max_unlearned_decisions=32",
         "--trainer.updates=4", "--trainer.batch_decisions=16", f"--output_dir={tmp_path / 'run'}",
     ]  # fmt: skip
     subprocess.run([*accerl, *run], check=True, env=environment, cwd=tmp_path)

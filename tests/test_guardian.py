@@ -28,7 +28,7 @@ def child(semaphore):
 if __name__ == "__main__":
     signal.signal(signal.SIGHUP, signal.SIG_DFL)  # whoever started the tests may ignore it
     guardian.start()
-    guardian.explain(remedy="begin again")
+    guardian.explain(hint="begin again")
     folder = Path(sys.argv[1])
     folder.mkdir()
     guardian.remove(folder)

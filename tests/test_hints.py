@@ -36,7 +36,7 @@ def outcome(verb: str, arguments: list[str]) -> InputError | None:
 
 def proposals(verb: str, error: InputError, arguments: list[str]) -> Iterator[list[str]]:
     """Command lines that a message proposes, each in place of what it complains about."""
-    text = error.remedy
+    text = error.hint
     fields = {name.partition(".")[0] for name in parsing.dotted_fields(CONFIGS[verb])}
     rest = [a for a in arguments if a.removeprefix("--").partition("=")[0] != error.field]
     typed = next((a.partition("=")[2] for a in arguments if a not in rest), "1")
@@ -91,7 +91,7 @@ def try_hints(verb: str, arguments: list[str]) -> None:
     assert tried, f"nothing to try in: {error}"
     for proposal in tried:
         again = outcome(verb, proposal)
-        same = again is not None and (again.field, again.remedy) == (error.field, error.remedy)
+        same = again is not None and (again.field, again.hint) == (error.field, error.hint)
         assert not same and "no such field" not in str(again), f"{error}\n{proposal} → {again}"
 
 

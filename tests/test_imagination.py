@@ -19,7 +19,7 @@ from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import RunConfig
-from accerl_lerobot.engine.imagination import ImaginationWorker, WorldLearningWorker
+from accerl_lerobot.engine.imagination import EnvironmentLearningWorker, ImaginationWorker
 from accerl_lerobot.engine.local import LocalEngine
 from accerl_lerobot.engine.loop import Progress
 from accerl_lerobot.engine.run import execute
@@ -63,7 +63,7 @@ def world_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     torch.manual_seed(0)
     config = PixelModelConfig(channels=(8, 8))
     spec = world_spec(WorldModelConfig(chunk=4, image_size=32, model=config), ENV)
-    folder = tmp_path_factory.mktemp("world") / "world_model"
+    folder = tmp_path_factory.mktemp("environment") / "world_model"
     save_world_model(folder, PixelWorldModel(spec, config), new_success_model(4))
     return folder
 
@@ -78,7 +78,7 @@ def imagining(
         checkpoint,
         env=ENV,
         imagination=adjusted(ImaginationConfig, **constants)(**(fields | config)),
-        rollout=RolloutConfig(worlds=4, segment_length=4, episodes=episodes),
+        rollout=RolloutConfig(environments=4, segment_length=4, episodes=episodes),
         trainer=TrainerConfig(updates=12, batch_decisions=16, warmup_updates=2, value_warmup_updates=2),
         **(sections or {}),
     )
@@ -213,7 +213,7 @@ def test_it_runs_asynchronously(tiny_checkpoint: Path, world_model: Path, tmp_pa
     engine = RayEngine(replace(config, output_dir=str(tmp_path)), ("match",))
     try:
         pids = engine.pids()
-        assert {"imagination", "world learning"} < set(pids)
+        assert {"imagination", "world-model learning"} < set(pids)
         engine.train()
         history: list[Progress] = []
         for progress in polls(engine):
@@ -241,10 +241,10 @@ def test_it_runs_asynchronously(tiny_checkpoint: Path, world_model: Path, tmp_pa
     assert len(list((tmp_path / "timeline").glob("imagination*"))) == 1
     saved = snapshot.load(tmp_path / "saved" / TRAINING_STATE / "imagination")["core"]
     assert len(saved["rows"]) == 4 and saved["counters"]["decisions"] >= last.imagination["decisions"]
-    assert {"recovery", "compute", "transport", "wait_in"} <= spent["world learning"].keys()
+    assert {"recovery", "compute", "transport", "wait_in"} <= spent["world-model learning"].keys()
 
 
-@pytest.mark.parametrize("kind", [ImaginationWorker, WorldLearningWorker])
+@pytest.mark.parametrize("kind", [ImaginationWorker, EnvironmentLearningWorker])
 def test_one_that_hangs_is_found_when_it_is_saved(kind: type, tmp_path: Path):
     """And not after the minutes that large files may take; `benchmarks.faults` does it to a whole run."""
     worker, held = object.__new__(kind), threading.Lock()

@@ -21,14 +21,14 @@ from safetensors.numpy import save_file
 
 from accerl_lerobot.checkpoint import isolation
 from accerl_lerobot.checkpoint.isolation import rehearse
-from accerl_lerobot.checkpoint.safety import MIB, Origin
+from accerl_lerobot.checkpoint.safety import MIB, FileSource
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies import loading
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.loading import rehearsed_config
 from tests.policies.checkpoints import edit_config
 
-ORIGIN = Origin("policy.path", "theirs")
+ORIGIN = FileSource("policy.path", "theirs")
 
 
 @pytest.fixture(autouse=True)

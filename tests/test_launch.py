@@ -23,7 +23,7 @@ from accerl_lerobot.replay.pacing import ReplayConfig, lag_bound
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
 from accerl_lerobot.timeline.read import ABSENT, read_timeline
 from accerl_lerobot.trainer.config import TrainerConfig
-from benchmarks.simulated_world import LatencyConfig
+from benchmarks.simulated_environment import LatencyConfig
 from tests.runs import collect, polls, tiny_run
 from tests.timeline.test_engines import adds_up
 
@@ -62,8 +62,10 @@ def story(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> It
     config = tiny_run(
         tiny_checkpoint,
         env=LatencyConfig(max_steps=16, frame_ms=8.0),
-        rollout=RolloutConfig(workers=2, worlds=3, segment_length=3),
-        replay=ReplayConfig(capacity=96, min_decisions=16, ahead=32, samples_per_insert=2.0),
+        rollout=RolloutConfig(workers=2, environments=3, segment_length=3),
+        replay=ReplayConfig(
+            capacity=96, min_decisions=16, max_unlearned_decisions=32, samples_per_insert=2.0
+        ),
         trainer=TrainerConfig(
             updates=UPDATES,
             batch_decisions=16,
@@ -122,7 +124,7 @@ def test_at_learning_rate_zero_every_ratio_is_one(story: Story):
 
 def test_samples_lag_behind_and_the_lag_is_bounded(story: Story):
     config = story.config
-    under_way = config.rollout.workers * config.rollout.worlds * config.rollout.segment_length
+    under_way = config.rollout.workers * config.rollout.environments * config.rollout.segment_length
     bound = lag_bound(
         config.replay, batch_decisions=config.trainer.batch_decisions, in_flight=2 * under_way, pickup=2,
         prefetch=1,

@@ -35,14 +35,14 @@ from accerl_lerobot.rollout import worker as rollout_worker
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.transport.shared_memory import available
-from benchmarks.simulated_world import LatencyConfig
+from benchmarks.simulated_environment import LatencyConfig
 from benchmarks.victims import alive
 from tests.light_workers import FULL, HANGS, NO_WEIGHTS, FalteringRollout, LightInference, WarningRollout
 from tests.runs import collect, drive, polls, until
 
 SLOW = LatencyConfig(max_steps=16, frame_ms=4.0)
 HARD = LatencyConfig(max_steps=16, tolerance=0.02, frame_ms=20.0)
-TWO = RolloutConfig(workers=2, worlds=2, segment_length=3)
+TWO = RolloutConfig(workers=2, environments=2, segment_length=3)
 ENDLESS = TrainerConfig(updates=1_000_000, batch_decisions=16)
 
 
@@ -136,7 +136,7 @@ def test_a_worker_that_does_not_start_is_an_error_and_the_others_are_ended(engin
 def test_a_world_that_keeps_crashing_ends_the_run_with_its_own_traceback(engine):
     one = engine(
         env=LatencyConfig(crash_after=30),
-        rollout=RolloutConfig(worlds=2),
+        rollout=RolloutConfig(environments=2),
         launch=LaunchConfig(max_restarts=2),
     )
     one.train()
@@ -146,7 +146,7 @@ def test_a_world_that_keeps_crashing_ends_the_run_with_its_own_traceback(engine)
             restarts.append(progress.rollout["restarts"])
     assert max(restarts) == 2.0
     text = str(caught.value)
-    assert "simulated crash after 30 env steps" in text and "simulated_world.py" in text
+    assert "simulated crash after 30 env steps" in text and "simulated_environment.py" in text
 
 
 def lose_a_rollout_worker(one: RayEngine, how: signal.Signals) -> None:
@@ -326,17 +326,22 @@ def test_an_inference_is_replaced_before_there_are_weights_and_after_the_last_on
 def test_a_world_that_does_not_return_is_no_reason_to_wait_for_ever(engine):
     endless = LatencyConfig(max_steps=16, frame_ms=4e6)
     one = engine(
-        env=endless, rollout=RolloutConfig(worlds=1), launch=LaunchConfig(stall_s=5.0, max_restarts=0)
+        env=endless, rollout=RolloutConfig(environments=1), launch=LaunchConfig(stall_s=5.0, max_restarts=0)
     )
     one.train()
     text = until_failure(one)
-    assert text.startswith("rollout 0 worker failed for good:") and "its world has not returned for" in text
+    assert (
+        text.startswith("rollout 0 worker failed for good:")
+        and "its environment has not returned for" in text
+    )
 
 
 @pytest.mark.slow
 def test_eight_slow_resets_one_after_another_are_progress(engine):
     slow = LatencyConfig(max_steps=4, frame_ms=600.0)
-    one = engine(env=slow, rollout=RolloutConfig(worlds=8), launch=LaunchConfig(stall_s=3.0, max_restarts=0))
+    one = engine(
+        env=slow, rollout=RolloutConfig(environments=8), launch=LaunchConfig(stall_s=3.0, max_restarts=0)
+    )
     one.plan(evaluation_plans(("match",), 8, "before"))
     assert len(collect(one, "before", 8)) == 8
 

@@ -15,7 +15,7 @@ from accerl_lerobot.engine.local import LocalEngine
 from accerl_lerobot.engine.loop import Progress
 from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.trainer.config import TrainerConfig
-from benchmarks.simulated_world import LatencyConfig
+from benchmarks.simulated_environment import LatencyConfig
 from tests.runs import ALGORITHMS, collect, drive, tiny_run
 
 

@@ -127,7 +127,7 @@ def test_every_logged_number_is_explained(tiny_checkpoint: Path, monkeypatch: py
     monkeypatch.setattr(LatentModel, "first_steps", 1)
     arguments = [
         "--env.type=simulated", f"--policy.path={tiny_checkpoint}", "--launch.engine=local",
-        "--replay.min_decisions=32", "--trainer.batch_decisions=16", "--rollout.worlds=4",
+        "--replay.min_decisions=32", "--trainer.batch_decisions=16", "--rollout.environments=4",
     ]  # fmt: skip
     off_policy = [
         "--algorithm.type=chunk_critic", "--algorithm.policy_steps=1", "--world_model.type=latent",

@@ -57,7 +57,7 @@ def run(
         policy=PolicyConfig(path="nowhere", device=device),
         trainer=TrainerConfig(updates=1, batch_decisions=16, ranks=ranks),
         inference=InferenceConfig(workers=services),
-        rollout=RolloutConfig(workers=max(rollouts, services), worlds=1, segment_length=3),
+        rollout=RolloutConfig(workers=max(rollouts, services), environments=1, segment_length=3),
         imagination=ImaginationConfig(share=0.5 if imagining else 0.0, model="oracle"),
         launch=LaunchConfig(address="auto", placement=placement),
     )

@@ -26,7 +26,7 @@ from accerl_lerobot.engine.preflight import (
     check_sft_policy,
     check_training_data,
 )
-from accerl_lerobot.envs import SimulatedConfig, make_world
+from accerl_lerobot.envs import SimulatedConfig, make_environment
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.features import (
@@ -47,7 +47,7 @@ TINY_ENV = ["--env.type=metaworld", "--env.task=drawer-open-v3"]
 ACT = "--sft.policy={type: act, chunk_size: 4, n_action_steps: 4, pretrained_backbone_weights: null}"
 SIMULATED = ["--env.type=simulated"]
 FRONT, STATE = "observation.images.front", "observation.state"
-OFFERED = env_features(make_world(SimulatedConfig()).spec)
+OFFERED = env_features(make_environment(SimulatedConfig()).spec)
 
 
 def with_shape(features: Features, name: str, shape: tuple[int, ...] | None) -> Features:
@@ -114,7 +114,7 @@ def test_a_rate_that_datasets_of_the_environment_are_known_to_name():
 
 
 def test_a_task_more_in_the_environment_is_only_warned_about(caplog: pytest.LogCaptureFixture):
-    both = env_features(make_world(SimulatedConfig(task="match,mirror")).spec)
+    both = env_features(make_environment(SimulatedConfig(task="match,mirror")).spec)
     check_features(OFFERED, both, {}, "dataset.repo_id", "x")
     assert "no episode of 'Mirror the target'" in caplog.text
 
@@ -361,7 +361,7 @@ def test_statistics_that_are_not_read_are_not_judged(caplog: pytest.LogCaptureFi
 
 
 def test_actions_in_another_unit_than_the_environment_s(caplog: pytest.LogCaptureFixture):
-    spec = make_world(SimulatedConfig()).spec
+    spec = make_environment(SimulatedConfig()).spec
     actions = np.array([[0.5, 0.5], [1.001, -1.0]] * 20, np.float32)
     check_actions(actions, spec, "dataset.repo_id", "x")
     assert not caplog.text
@@ -396,7 +396,7 @@ VECTOR = {"dtype": "float32", "shape": (2,), "names": None}
 def check_data(dataset: DatasetConfig, **policy: Any) -> None:
     """The check that `accerl sft` makes before it makes a folder."""
     sft = SFTConfig(steps=1, policy=SMALL_ACT | policy)
-    spec = make_world(SimulatedConfig()).spec
+    spec = make_environment(SimulatedConfig()).spec
     check_training_data(sft, dataset, check_sft_policy(sft), spec, {})
 
 
@@ -408,12 +408,12 @@ def check_data(dataset: DatasetConfig, **policy: Any) -> None:
     ],
 )
 def test_a_camera_that_the_policy_does_not_read_is_not_judged(camera: Any, why: str, tmp_path: Path):
-    """A third camera, or one of depth; the message's own remedy is applied."""
+    """A third camera, or one of depth; the message's own hint is applied."""
     more = {FRONT: IMAGE, "observation.images.top.left": camera}
     dataset = write_dataset(tmp_path / "data", more=more)
     with pytest.raises(InputError, match=why) as caught:
         check_data(dataset)
-    inputs = json.loads(caught.value.remedy.partition("--sft.policy.input_features='")[2].rstrip("'"))
+    inputs = json.loads(caught.value.hint.partition("--sft.policy.input_features='")[2].rstrip("'"))
     assert inputs.keys() == {FRONT, STATE}
     check_data(dataset, input_features=inputs)
 

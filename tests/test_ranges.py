@@ -17,7 +17,16 @@ import pytest
 
 from accerl_lerobot.cli.verbs import CONFIGS
 from accerl_lerobot.config.parsing import choices_of, section_of
-from accerl_lerobot.config.ranges import Device, Pattern, Positive, Range, Section, Share, check, hints_of
+from accerl_lerobot.config.ranges import (
+    Device,
+    Pattern,
+    Positive,
+    Range,
+    Section,
+    Share,
+    annotations_of,
+    check,
+)
 from accerl_lerobot.demos.backbone import BackboneConfig
 from accerl_lerobot.demos.sft import SFTConfig
 from accerl_lerobot.engine.config import LaunchConfig
@@ -40,7 +49,7 @@ from benchmarks.transport import BenchTransportConfig
 
 def sections(cls: type[Any]) -> Iterator[type[Any]]:
     yield cls
-    for hint in hints_of(cls).values():
+    for hint in annotations_of(cls).values():
         if (below := section_of(hint)) is not None:
             for kind in choices_of(below).values() or (below,):
                 yield from sections(kind)
@@ -66,7 +75,7 @@ def ranges(hint: Any) -> Iterator[tuple[Any, Range | None]]:
 @pytest.mark.parametrize("cls", SECTIONS, ids=lambda cls: cls.__name__)
 def test_every_field_refuses_a_value_that_is_not_in_its_range(cls: type[Any]):
     assert issubclass(cls, Section)
-    for name, hint in hints_of(cls).items():
+    for name, hint in annotations_of(cls).items():
         for kind, span in ranges(hint):
             assert kind is float or span is not None, f"{name} needs a Range"
             outside = [math.nan, *((span.low - 1,) if span is not None else (math.inf,))]
@@ -79,13 +88,13 @@ def test_every_field_refuses_a_value_that_is_not_in_its_range(cls: type[Any]):
                 with pytest.raises(InputError) as error:
                     cls(**{name: given})
                 assert error.value.field == (f"{cls.SECTION}.{name}" if cls.SECTION else name)
-                assert error.value.remedy.startswith("use ")
+                assert error.value.hint.startswith("use ")
 
 
 @pytest.mark.parametrize("cls", SECTIONS, ids=lambda cls: cls.__name__)
 def test_every_field_refuses_a_choice_that_there_is_not(cls: type[Any]):
     needed = {"repo_id": "owner/name"} if cls is PullConfig else {}
-    for name, hint in hints_of(cls).items():
+    for name, hint in annotations_of(cls).items():
         kinds = [hint, *typing.get_args(hint)]
         if any(typing.get_origin(kind) is Literal for kind in kinds) and typing.get_origin(hint) is not tuple:
             with pytest.raises(InputError) as error:
@@ -107,7 +116,7 @@ RULES = [
     (MachineryConfig, {"segment_length": 5}, "segment_length="),
     (PixelModelConfig, {"channels": ()}, "world_model.model.channels="),
     (ReplayConfig, {"min_decisions": 5000}, "replay.min_decisions="),
-    (ReplayConfig, {"ahead": 5000}, "replay.ahead="),
+    (ReplayConfig, {"max_unlearned_decisions": 5000}, "replay.max_unlearned_decisions="),
     (LaunchConfig, {"placement": {"rollout": " "}}, "launch.placement.rollout=' ': use one of"),
     (SFTConfig, {"policy": {"chunk_size": 4}}, "sft.policy="),
     (TimelineConfig, {"runs": ()}, "runs="),

@@ -379,7 +379,7 @@ gcs_server = psutil.Process(int(sys.argv[1]))
 ray_session.ray_processes = lambda: {gcs_server: "gcs_server"}
 ray_session.kill_ray = lambda processes: None
 ray_session.GIVE_UP_S = 0.1
-guardian.explain(remedy="to resume: accerl train --resume=true")
+guardian.explain(hint="to resume: accerl train --resume=true")
 ray_session.RaySession(LaunchConfig()).watch()
 os.kill(int(sys.argv[1]), signal.SIGKILL)
 time.sleep(600)

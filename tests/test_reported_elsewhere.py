@@ -21,7 +21,7 @@ from accerl_lerobot.cli import main
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos.dataset_files import open_metadata, opened
 from accerl_lerobot.engine.config import RunConfig, parse
-from accerl_lerobot.envs import GymConfig, make_world
+from accerl_lerobot.envs import GymConfig, make_environment
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.features import check_features, env_features, policy_features
@@ -68,9 +68,9 @@ def registered() -> Iterator[Callable[[type[Arm]], GymConfig]]:
 
 
 def test_success_reward_and_end_may_be_arrays_of_one(registered: Any):
-    world = make_world(registered(Arm))
-    world.reset(eval_seed(0, 0), "reported/Arm-v0")
-    result = world.step_chunk(np.zeros((4, 2), np.float32))
+    environment = make_environment(registered(Arm))
+    environment.reset(eval_seed(0, 0), "reported/Arm-v0")
+    result = environment.step_chunk(np.zeros((4, 2), np.float32))
     assert (result.success, result.done, result.steps) == (True, True, 2)
     assert result.rewards.sum() == 1.0
 
@@ -88,16 +88,16 @@ def test_an_environment_of_the_older_interface_is_told_what_to_return(
     full = getattr(Arm, method)
     older = type("Older", (Arm,), {method: lambda *args, **kw: given(full(*args, **kw))})
     with pytest.raises(InputError, match=f"^env.id='reported/Arm-v0': {message}"):
-        world = make_world(registered(older))
-        world.reset(0, "reported/Arm-v0")
-        world.step_chunk(np.zeros((4, 2), np.float32))
+        environment = make_environment(registered(older))
+        environment.reset(0, "reported/Arm-v0")
+        environment.step_chunk(np.zeros((4, 2), np.float32))
 
 
 @pytest.mark.parametrize("run_seed", [0, 2**32 - 1, 2**63 - 1])
 def test_every_seed_of_an_episode_is_one_that_numpy_s_old_generator_takes(registered: Any, run_seed: int):
-    world = make_world(registered(Arm))
+    environment = make_environment(registered(Arm))
     for seed in (demo_seed(run_seed, 7), train_seed(run_seed, 999, 10**6), eval_seed(run_seed, 9_999)):
-        world.reset(seed, "reported/Arm-v0")
+        environment.reset(seed, "reported/Arm-v0")
 
 
 def test_a_recipe_from_windows_names_a_policy(tiny_checkpoint: Path, tmp_path: Path):
@@ -136,7 +136,7 @@ def test_a_policy_that_reads_an_instruction_warns_of_none(
     tiny_checkpoint: Path, registered: Any, caplog: pytest.LogCaptureFixture
 ):
     policy = policy_features(load_lerobot_config(PolicyConfig(path=str(tiny_checkpoint), device="cpu")))
-    spec = make_world(registered(Arm)).spec
+    spec = make_environment(registered(Arm)).spec
     for task, warned in (("Reach", False), ("", True)):
         offered = env_features(replace(spec, instructions=(task,) if task else ()))
         needed = replace(policy, shapes={})

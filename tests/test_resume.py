@@ -136,8 +136,10 @@ def test_a_run_that_fell_over_in_its_sft_keeps_its_demonstrations(tmp_path: Path
         "sft": sft.SFTConfig(steps=2, batch_size=2, policy=small | {"pretrained_backbone_weights": None}),
         "policy": PolicyConfig(device="cpu", sampler=GaussianSamplerConfig(std=0.3)),
         "algorithm": SelfImitationConfig(),
-        "replay": ReplayConfig(capacity=64, min_decisions=16, ahead=32, samples_per_insert=1),
-        "rollout": RolloutConfig(worlds=4, segment_length=4),
+        "replay": ReplayConfig(
+            capacity=64, min_decisions=16, max_unlearned_decisions=32, samples_per_insert=1
+        ),
+        "rollout": RolloutConfig(environments=4, segment_length=4),
         "trainer": TrainerConfig(updates=3, batch_decisions=16, warmup_updates=0, value_warmup_updates=0),
         "evaluation": EvaluationConfig(episodes=2, videos=0),
     }
@@ -270,7 +272,7 @@ def test_an_asynchronous_run_that_was_killed_and_stopped_goes_on(tiny_checkpoint
         tiny_checkpoint,
         launch=LaunchConfig(stall_s=120),
         env=SimulatedConfig(max_steps=12, tolerance=0.4),
-        rollout=RolloutConfig(workers=2, worlds=2, segment_length=3),
+        rollout=RolloutConfig(workers=2, environments=2, segment_length=3),
         trainer=TrainerConfig(updates=150, batch_decisions=16, lr=1e-3),
         save_every_updates=4,
     )

@@ -23,11 +23,11 @@ from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
-from benchmarks.simulated_world import LatencyConfig
+from benchmarks.simulated_environment import LatencyConfig
 from tests.runs import drive, polls, until
 
 UPDATES, DURING = 60, 12
-TWO = RolloutConfig(workers=2, worlds=2, segment_length=3)
+TWO = RolloutConfig(workers=2, environments=2, segment_length=3)
 
 
 @pytest.fixture
@@ -35,7 +35,9 @@ def engine(light_engine: Callable[..., RayEngine]) -> Callable[..., RayEngine]:
     defaults: dict[str, Any] = {
         "env": LatencyConfig(max_steps=16, frame_ms=4.0),
         "rollout": TWO,
-        "replay": ReplayConfig(capacity=160, min_decisions=16, ahead=48, samples_per_insert=2.0, max_lag=40),
+        "replay": ReplayConfig(
+            capacity=160, min_decisions=16, max_unlearned_decisions=48, samples_per_insert=2.0, max_lag=40
+        ),
         "trainer": TrainerConfig(updates=UPDATES, batch_decisions=16),
     }
     return lambda state=None, **sections: light_engine(state, **{**defaults, **sections})
@@ -89,7 +91,7 @@ def test_nothing_committed_is_lost_or_doubled_and_no_update_made_twice(engine, t
 
 
 def test_episodes_that_were_paid_for_are_played_once(engine, tmp_path: Path):
-    rollout = RolloutConfig(workers=2, worlds=2, segment_length=3, episodes=40)
+    rollout = RolloutConfig(workers=2, environments=2, segment_length=3, episodes=40)
     endless = TrainerConfig(updates=10_000, batch_decisions=16)
     first = engine(rollout=rollout, trainer=endless)
     first.train()
@@ -113,6 +115,6 @@ def test_a_run_of_another_engine_or_size_is_refused(engine, tmp_path: Path):
         engine(tmp_path)
     first = engine()
     first.save(tmp_path)
-    three = RolloutConfig(workers=3, worlds=2, segment_length=3)
+    three = RolloutConfig(workers=3, environments=2, segment_length=3)
     with pytest.raises(InputError, match=r"rollout\.workers=3: this run has 2"):
         engine(tmp_path / TRAINING_STATE, rollout=three)

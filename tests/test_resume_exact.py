@@ -33,21 +33,27 @@ CASES: dict[str, dict[str, Any]] = {
     "weights held back": {"trainer": {"hold_back": 3, "probe_every": 4}},
     "chunk critic": {
         "env": SimulatedConfig(max_steps=16, environment_state=True),
-        "rollout": RolloutConfig(worlds=4, segment_length=4),
-        "replay": ReplayConfig(capacity=64, min_decisions=16, ahead=32, samples_per_insert=1),
+        "rollout": RolloutConfig(environments=4, segment_length=4),
+        "replay": ReplayConfig(
+            capacity=64, min_decisions=16, max_unlearned_decisions=32, samples_per_insert=1
+        ),
         "algorithm": ChunkCriticConfig(),
     },
     "latent world model": {
-        "rollout": RolloutConfig(worlds=4, segment_length=4),
-        "replay": ReplayConfig(capacity=64, min_decisions=16, ahead=32, samples_per_insert=1),
+        "rollout": RolloutConfig(environments=4, segment_length=4),
+        "replay": ReplayConfig(
+            capacity=64, min_decisions=16, max_unlearned_decisions=32, samples_per_insert=1
+        ),
         "algorithm": ChunkCriticConfig(),
     },
     "self-imitation": {
-        "rollout": RolloutConfig(worlds=4, segment_length=4),
-        "replay": ReplayConfig(capacity=64, min_decisions=16, ahead=32, samples_per_insert=1),
+        "rollout": RolloutConfig(environments=4, segment_length=4),
+        "replay": ReplayConfig(
+            capacity=64, min_decisions=16, max_unlearned_decisions=32, samples_per_insert=1
+        ),
         "algorithm": SelfImitationConfig(policy_steps=0.25),
     },
-    "counted episodes": {"rollout": RolloutConfig(worlds=4, segment_length=3, episodes=30)},
+    "counted episodes": {"rollout": RolloutConfig(environments=4, segment_length=3, episodes=30)},
     "several tasks": {"env": SimulatedConfig(max_steps=16, task="match,mirror")},
 }
 

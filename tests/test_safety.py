@@ -18,11 +18,11 @@ from safetensors.numpy import save_file
 
 from accerl_lerobot import cli
 from accerl_lerobot.checkpoint import safety
-from accerl_lerobot.checkpoint.safety import Origin, read_json, read_tensors, safe_join, tensor_shapes
+from accerl_lerobot.checkpoint.safety import FileSource, read_json, read_tensors, safe_join, tensor_shapes
 from accerl_lerobot.errors import InputError
 from tests.hostile import hostile_names
 
-ORIGIN = Origin("policy.path", "runs/theirs")
+ORIGIN = FileSource("policy.path", "runs/theirs")
 
 
 def test_twenty_thousand_hostile_names_stay_inside(tmp_path: Path):
@@ -144,7 +144,7 @@ def test_what_is_no_file_is_not_waited_for(tmp_path: Path):
         for name in ("config.json", "folder.json"):
             with pytest.raises(InputError) as caught:
                 read_json(tmp_path / name, ORIGIN)
-            found.append(caught.value.remedy)
+            found.append(caught.value.hint)
 
     thread = threading.Thread(target=look, daemon=True)
     thread.start()

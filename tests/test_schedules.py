@@ -23,8 +23,8 @@ from accerl_lerobot.replay.pacing import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, Rep
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.world_model.config import ImaginationConfig
+from benchmarks.simulated_environment import LatencyConfig
 from benchmarks.simulated_policy import SimulatedPolicyConfig, load_simulated
-from benchmarks.simulated_world import LatencyConfig
 from tests.replay.segments import make_segment
 from tests.replay.test_worker import BATCH, play, start, waits
 from tests.runs import collect, polls
@@ -72,7 +72,9 @@ def test_in_turn_who_brings_the_last_segment_waits_until_it_is_learned_from():
         assert await last
         assert await waits(following)  # nothing new yet
 
-    play(scene, ReplayConfig(capacity=64, min_decisions=8, ahead=16, samples_per_insert=1.0))
+    play(
+        scene, ReplayConfig(capacity=64, min_decisions=8, max_unlearned_decisions=16, samples_per_insert=1.0)
+    )
 
 
 def test_with_overlap_one_batch_is_collected_meanwhile():
@@ -89,15 +91,19 @@ def test_with_overlap_one_batch_is_collected_meanwhile():
         await worker.learnt()
         assert len(await following) == 2 and await last
 
-    play(scene, ReplayConfig(capacity=64, min_decisions=8, ahead=16, samples_per_insert=1.0))
+    play(
+        scene, ReplayConfig(capacity=64, min_decisions=8, max_unlearned_decisions=16, samples_per_insert=1.0)
+    )
 
 
 def run_of(schedule: Any) -> RunConfig:
     return RunConfig(
         env=LatencyConfig(max_steps=16, reward="dense", frame_ms=3.0, latency_cv=0.5),
-        rollout=RolloutConfig(workers=2, worlds=2, segment_length=4, decision_cost=0.0),
+        rollout=RolloutConfig(workers=2, environments=2, segment_length=4, decision_cost=0.0),
         inference=InferenceConfig(max_batch=3),
-        replay=ReplayConfig(capacity=256, min_decisions=16, ahead=16, samples_per_insert=1.0),
+        replay=ReplayConfig(
+            capacity=256, min_decisions=16, max_unlearned_decisions=16, samples_per_insert=1.0
+        ),
         trainer=TrainerConfig(updates=6, batch_decisions=16, probe_every=0),
         launch=LaunchConfig(schedule=schedule, stall_s=60.0),
     )
@@ -141,7 +147,8 @@ def drive_counting(engine: Any) -> tuple[list[Progress], Counter[int]]:
 
 @pytest.mark.parametrize("schedule", [SYNCHRONOUS, OVERLAP, ASYNCHRONOUS])
 def test_a_run_in_turn(counted: None, schedule: Any):
-    """Episodes of one segment each, of all four worlds: a batch is exactly what they do in one round."""
+    """Episodes of one segment each, of all four environments: a batch is exactly what they do in one
+    round."""
     from accerl_lerobot.engine.launch import RayEngine
 
     load = functools.partial(load_simulated, SimulatedPolicyConfig(decide_ms=1.0, update_ms=30.0))
@@ -161,7 +168,7 @@ def test_a_run_in_turn(counted: None, schedule: Any):
             # In lock step all four decide together, in batches of three and one.
             assert sizes[3] + sizes[1] > 0.9 * sizes.total() >= 10
             assert abs(sizes[3] - sizes[1]) < 0.15 * sizes.total()
-        # Nothing is lost on the way from the worlds to the trainer.
+        # Nothing is lost on the way from the environments to the trainer.
         assert end.replay["trained_decisions"] == 6 * 16
         assert np.isfinite([u["loss"] for u in updates]).all()
     finally:
@@ -177,7 +184,7 @@ def test_several_services_share_the_worlds_out(counted: None):
         run,
         rollout=replace(run.rollout, workers=3),
         inference=InferenceConfig(workers=2, max_batch=8),
-        replay=replace(run.replay, min_decisions=24, ahead=24),
+        replay=replace(run.replay, min_decisions=24, max_unlearned_decisions=24),
         trainer=replace(run.trainer, batch_decisions=24),
     )
     load = functools.partial(load_simulated, SimulatedPolicyConfig(decide_ms=1.0, update_ms=30.0))
@@ -187,7 +194,7 @@ def test_several_services_share_the_worlds_out(counted: None):
         assert len({pids["inference 0"], pids["inference 1"]}) == 2
         engine.train()
         history, sizes = drive_counting(engine)
-        # Two workers of two worlds ask the first service, one asks the second, each in lock step.
+        # Two workers of two environments ask the first service, one asks the second, each in lock step.
         assert sizes[4] + sizes[2] > 0.9 * sizes.total() >= 10
         # They do not wait for each other: the quicker one may begin the next round before the batch is whole.
         assert max(u["lag_max"] for p in history for u in p.updates) <= 1.0

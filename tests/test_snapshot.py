@@ -13,7 +13,7 @@ import torch
 
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import Origin
+from accerl_lerobot.experience import SegmentStart
 from tests.replay.segments import make_segment
 
 
@@ -51,9 +51,11 @@ def test_known_kinds_tensors_and_generators(tmp_path: Path):
     segment = make_segment("a", n=3, version=[1, 2, 3], success=True)
     tensor = torch.arange(6.0).reshape(2, 3).T
     back = there_and_back(
-        {"segment": segment, "rng": rng, "tensor": tensor, "origin": [Origin("t", 3, 1)]}, tmp_path
+        {"segment": segment, "rng": rng, "tensor": tensor, "origin": [SegmentStart("t", 3, 1)]}, tmp_path
     )
-    assert back["origin"] == [Origin("t", 3, 1)] and back["segment"].key == "a" and back["segment"].success
+    assert (
+        back["origin"] == [SegmentStart("t", 3, 1)] and back["segment"].key == "a" and back["segment"].success
+    )
     np.testing.assert_array_equal(back["segment"].version, [1, 2, 3])
     assert back["rng"].random(3).tolist() == rng.random(3).tolist()
     assert torch.equal(back["tensor"], tensor)

@@ -37,14 +37,14 @@ from accerl_lerobot.rollout.runner import RolloutConfig  # noqa: E402
 from accerl_lerobot.trainer import worker as trainer_worker  # noqa: E402
 from accerl_lerobot.trainer.config import TrainerConfig  # noqa: E402
 from accerl_lerobot.transport.shared_memory import Address  # noqa: E402
-from benchmarks.simulated_world import LatencyConfig  # noqa: E402
+from benchmarks.simulated_environment import LatencyConfig  # noqa: E402
 from tests.light_workers import LightInference, LightTrainer  # noqa: E402
 from tests.runs import collect, drive, polls, tiny_run  # noqa: E402
 
 NOTICED_SOON = {"health_check_initial_delay_ms": 1000, "health_check_period_ms": 1000,
                 "health_check_timeout_ms": 2000, "health_check_failure_threshold": 3}  # fmt: skip
 SLOW = LatencyConfig(max_steps=16, frame_ms=8.0)
-FOUR = RolloutConfig(workers=4, worlds=2, segment_length=3)
+FOUR = RolloutConfig(workers=4, environments=2, segment_length=3)
 
 
 class FarInference(LightInference):

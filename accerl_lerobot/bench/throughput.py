@@ -129,15 +129,15 @@ class BenchThroughputConfig(Section):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.policy_path is None:
-            remedy = "name a LeRobot checkpoint, such as RUN/checkpoints/last/pretrained_model"
-            raise InputError("policy_path", None, remedy)
+            hint = "name a LeRobot checkpoint, such as RUN/checkpoints/last/pretrained_model"
+            raise InputError("policy_path", None, hint)
         if not self.schedules:
             raise InputError("schedules", self.schedules, f"name some of {', '.join(ARMS)}")
 
 
 def bench_throughput(config: BenchThroughputConfig) -> dict[str, Any]:
     """Measures all schedules: env steps, decisions and updates per second, and the rest of `Block`."""
-    from accerl_lerobot.engine.preflight import check_policy, check_world
+    from accerl_lerobot.engine.preflight import check_environment, check_policy
 
     console = Console()
     fixed = ["--sft.steps=0", "--trainer.updates=1000000", "--trainer.final_lr_share=1"]
@@ -145,7 +145,7 @@ def bench_throughput(config: BenchThroughputConfig) -> dict[str, Any]:
     run: RunConfig = parse(RunConfig, named + fixed)
     for schedule in config.schedules:  # a recipe that one of them does not allow is refused
         replace(run, launch=replace(run.launch, schedule=schedule))
-    spec = check_world(run.env)
+    spec = check_environment(run.env)
     tasks, history = spec.tasks, check_policy(run, spec)
     result: dict[str, Any] = {"config": asdict(config), "host": host()}
     order = config.rounds * (*config.schedules, *reversed(config.schedules))

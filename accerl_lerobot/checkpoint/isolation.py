@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import cast
 
 from accerl_lerobot import errors
-from accerl_lerobot.checkpoint.safety import MIB, Origin
+from accerl_lerobot.checkpoint.safety import MIB, FileSource
 from accerl_lerobot.errors import InputError
 
 SLACK, PER_BYTE = 1536 * MIB, 4
@@ -44,7 +44,9 @@ NO_MEMORY = (
 PR_SET_PDEATHSIG = 1
 
 
-def rehearse[T](task: Callable[[], T], folder: Path, origin: Origin, pattern: str = "**/*.safetensors") -> T:
+def rehearse[T](
+    task: Callable[[], T], folder: Path, origin: FileSource, pattern: str = "**/*.safetensors"
+) -> T:
     """Runs `task` in a child process and returns its result, which JSON can hold.
 
     `task` loads what is in `folder`, on the CPU; files there that match `pattern` set the limits. Where
@@ -67,8 +69,8 @@ def rehearse[T](task: Callable[[], T], folder: Path, origin: Origin, pattern: st
         why = f"takes more than {memory // MIB} MiB beside the libraries"
     else:
         errors.raise_refusal(answer)
-    remedy = "the size of its files does not account for that; get it again, or another one"
-    raise InputError(origin.field, origin.value, f"loading it, tried in a process apart, {why}; {remedy}")
+    hint = "the size of its files does not account for that; get it again, or another one"
+    raise InputError(origin.field, origin.value, f"loading it, tried in a process apart, {why}; {hint}")
 
 
 def _try(task: Callable[[], object], memory: int, cpu_s: int, deadline: float) -> tuple[bytes, int | None]:

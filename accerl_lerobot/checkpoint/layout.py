@@ -26,7 +26,7 @@ from typing import Any
 
 from accerl_lerobot.checkpoint.safety import (
     MIB,
-    Origin,
+    FileSource,
     leads_out,
     read_json,
     safe_join,
@@ -163,7 +163,7 @@ def write_manifest(directory: Path) -> None:
 
 def read_manifest(directory: Path) -> dict[str, Any]:
     """The content of a manifest, not checked any further."""
-    return read_json(directory / MANIFEST, Origin("config_path", str(directory)), MANIFEST_MOST)
+    return read_json(directory / MANIFEST, FileSource("config_path", str(directory)), MANIFEST_MOST)
 
 
 def defect(directory: Path) -> str | None:
@@ -179,7 +179,7 @@ def defect(directory: Path) -> str | None:
         return f"its {MANIFEST} is broken ({' '.join(str(error).split())[-80:]})"
     for file, (size, sha256) in files.items():
         try:
-            path = safe_join(directory, file, Origin("config_path", str(directory)))
+            path = safe_join(directory, file, FileSource("config_path", str(directory)))
         except InputError:
             return f"its {MANIFEST} names {file!r}, outside of it"
         if not path.is_file():
@@ -202,8 +202,8 @@ def newest_whole(checkpoints: Path, wanted: str = LAST) -> tuple[Path, list[str]
     if wanted != LAST:
         if checkpoints / wanted not in numbers:
             names = ", ".join(p.name for p in numbers) or "none"
-            remedy = f"no such checkpoint; there are {names}"
-            raise InputError("config_path", str(checkpoints / wanted), remedy)
+            hint = f"no such checkpoint; there are {names}"
+            raise InputError("config_path", str(checkpoints / wanted), hint)
         numbers = numbers[: numbers.index(checkpoints / wanted) + 1]
     skipped: list[str] = []
     for path in reversed(numbers):
@@ -214,8 +214,8 @@ def newest_whole(checkpoints: Path, wanted: str = LAST) -> tuple[Path, list[str]
             return path, skipped
         skipped.append(f"{path.name}: {why}")
     reasons = "; ".join(skipped) or "there is none"
-    remedy = f"no checkpoint here can be resumed ({reasons}); start a new run from a policy: --policy.path"
-    raise InputError("config_path", str(checkpoints), remedy)
+    hint = f"no checkpoint here can be resumed ({reasons}); start a new run from a policy: --policy.path"
+    raise InputError("config_path", str(checkpoints), hint)
 
 
 def saved_version(state: Path) -> int:
@@ -295,7 +295,7 @@ def _local_names(directory: Path) -> tuple[dict[str, Any], dict[str, Any], list[
     return config, processor, [at for at, name in named if Path(name).is_absolute() or name == at[2]]
 
 
-def check_names(folder: Path, origin: Origin) -> None:
+def check_names(folder: Path, origin: FileSource) -> None:
     """Refuses files from elsewhere that name a file outside their own folder.
 
     The name of a backbone or tokeniser that lies in the folder is accepted: it is not read.

@@ -37,7 +37,7 @@ _CONTROL = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
 
 
 @dataclass(frozen=True)
-class Origin:
+class FileSource:
     """Where files came from, as the user named it.
 
     Example:
@@ -54,7 +54,7 @@ class Origin:
         return InputError(self.field, self.value, f"{_shown(file)}: {why}")
 
 
-def safe_join(root: Path, name: object, origin: Origin) -> Path:
+def safe_join(root: Path, name: object, origin: FileSource) -> Path:
     """`root` / `name` for a name from an untrusted file; one that is not relative or leads out is refused.
 
     Links may point within `root`, and in the Hub's cache to its blobs.
@@ -66,7 +66,7 @@ def safe_join(root: Path, name: object, origin: Origin) -> Path:
     return path
 
 
-def _check_link(path: Path, root: Path, name: str, origin: Origin) -> None:
+def _check_link(path: Path, root: Path, name: str, origin: FileSource) -> None:
     try:
         real, home = path.resolve(), root.resolve()
     except (OSError, RuntimeError, ValueError) as error:
@@ -78,7 +78,7 @@ def _check_link(path: Path, root: Path, name: str, origin: Origin) -> None:
         raise origin.refuse(name, "a link that leads out of the folder; put the file itself there")
 
 
-def matching_files(root: Path, patterns: Iterable[str], origin: Origin) -> dict[str, Path]:
+def matching_files(root: Path, patterns: Iterable[str], origin: FileSource) -> dict[str, Path]:
     """Files below `root` whose names match a pattern, by these names; hidden ones are left out.
 
     A ``*`` stands for a part of one name. A link that leads out of `root` is refused.
@@ -119,11 +119,11 @@ def texts_in(content: Any) -> Iterator[tuple[dict[str, Any], str, str]]:
                     parts.append(value)
 
 
-def check_folder(folder: Path, origin: Origin) -> None:
+def check_folder(folder: Path, origin: FileSource) -> None:
     """Refuses what is no folder, or has a link that leads out, a pipe or a device."""
     if not folder.is_dir():
-        remedy = "a file; name the folder of a run" if folder.exists() else "no such folder"
-        raise InputError(origin.field, origin.value, remedy)
+        hint = "a file; name the folder of a run" if folder.exists() else "no such folder"
+        raise InputError(origin.field, origin.value, hint)
     for at, folders, files in os.walk(folder):
         for path in (Path(at, name) for name in (*folders, *files)):
             name = path.relative_to(folder).as_posix()
@@ -135,14 +135,14 @@ def check_folder(folder: Path, origin: Origin) -> None:
             folders.remove("wandb")  # its client links a log that lies elsewhere, and nothing here reads it
 
 
-def check_name(name: object, what: str, origin: Origin) -> None:
+def check_name(name: object, what: str, origin: FileSource) -> None:
     """A name that will become part of a path, such as a camera's; more than one part is refused."""
     why = unsafe_name(name) or ("it has a slash in it" if "/" in str(name) else "")
     if why:
         raise origin.refuse(what, f"the name {_shown(str(name))!r} cannot be part of a path: {why}")
 
 
-def file_size(path: Path, origin: Origin) -> int:
+def file_size(path: Path, origin: FileSource) -> int:
     """Bytes of a regular file; a pipe or a device is refused, since reading it may never end."""
     try:
         found = path.stat()
@@ -153,12 +153,12 @@ def file_size(path: Path, origin: Origin) -> int:
     return found.st_size
 
 
-def read_json(path: Path, origin: Origin, most: int = JSON_MOST) -> dict[str, Any]:
+def read_json(path: Path, origin: FileSource, most: int = JSON_MOST) -> dict[str, Any]:
     """The mapping in a JSON file, or a YAML one by its suffix, of at most `most` bytes."""
     parse, language = (yaml.safe_load, "YAML") if path.suffix == ".yaml" else (json.loads, "JSON")
     if (size := file_size(path, origin)) > most:
-        remedy = f"{size} bytes, more than the {most} that such a file may have; it is not what it says"
-        raise origin.refuse(path.name, remedy)
+        hint = f"{size} bytes, more than the {most} that such a file may have; it is not what it says"
+        raise origin.refuse(path.name, hint)
     try:
         with path.open("rb") as file:
             content = parse(file.read(most + 1).decode())
@@ -173,7 +173,7 @@ def read_json(path: Path, origin: Origin, most: int = JSON_MOST) -> dict[str, An
 
 
 @contextlib.contextmanager
-def opened(path: Path, origin: Origin, framework: str = "np") -> Iterator[Any]:
+def opened(path: Path, origin: FileSource, framework: str = "np") -> Iterator[Any]:
     """A safetensors file, whose header safetensors itself compares with the file."""
     file_size(path, origin)
     try:
@@ -183,14 +183,14 @@ def opened(path: Path, origin: Origin, framework: str = "np") -> Iterator[Any]:
         raise origin.refuse(path.name, f"not safetensors ({brief(error)}); get it again") from error
 
 
-def tensor_shapes(path: Path, origin: Origin) -> dict[str, tuple[str, tuple[int, ...]]]:
+def tensor_shapes(path: Path, origin: FileSource) -> dict[str, tuple[str, tuple[int, ...]]]:
     """Dtype and shape by name of what a safetensors file holds; no tensor is read."""
     with opened(path, origin) as file:
         slices = {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118
         return {name: (one.get_dtype(), tuple(one.get_shape())) for name, one in slices.items()}
 
 
-def read_tensors(path: Path, origin: Origin) -> Iterator[tuple[str, Any]]:
+def read_tensors(path: Path, origin: FileSource) -> Iterator[tuple[str, Any]]:
     """Name and PyTorch tensor, one after the other, of a safetensors file; NaN and infinity are refused.
 
     A tensor is a view of the file, so that none is in memory twice. The file is opened again now and then:
@@ -218,14 +218,14 @@ def _finite(tensor: Any) -> bool:
     return math.isfinite(least) and math.isfinite(most)
 
 
-def check_not_pickled(folder: Path, weights: str, origin: Origin) -> None:
+def check_not_pickled(folder: Path, weights: str, origin: FileSource) -> None:
     """Refuses a folder without `weights`, and says so where there are only pickled ones."""
     if (folder / weights).is_file():
         return
     pickled = sorted(path.name for path in folder.iterdir() if path.suffix in PICKLES)
     if pickled:
-        remedy = f"is missing, and {pickled[0]} is a pickle, which may run code when it is loaded; convert it"
-        raise origin.refuse(weights, f"{remedy} to safetensors where you trust it: save_pretrained does")
+        hint = f"is missing, and {pickled[0]} is a pickle, which may run code when it is loaded; convert it"
+        raise origin.refuse(weights, f"{hint} to safetensors where you trust it: save_pretrained does")
     raise origin.refuse(weights, "is missing; give a folder with the weights as safetensors")
 
 

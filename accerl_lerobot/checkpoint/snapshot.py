@@ -53,8 +53,8 @@ def load(path: Path) -> Any:
         return from_json(json.loads(text), arrays)
     except (OSError, ValueError, KeyError, TypeError, RecursionError, SafetensorError) as error:
         said = " ".join(str(error).split())[:160]
-        remedy = f"not a state that accerl has saved ({said}); resume from another checkpoint"
-        raise InputError("checkpoint", str(file), remedy) from error
+        hint = f"not a state that accerl has saved ({said}); resume from another checkpoint"
+        raise InputError("checkpoint", str(file), hint) from error
 
 
 def to_json(value: Any, place: str, arrays: dict[str, np.ndarray]) -> Any:

@@ -31,7 +31,7 @@ VERBS = {
     "timeline": "show when every worker of a run did what: a picture and shares",
     "export": "write the episodes of a run as a LeRobotDataset, with an image at every env step",
     "doctor": "resolve a recipe and check this machine",
-    "bench": "measure this machine: accerl bench world, policy or throughput",
+    "bench": "measure this machine: accerl bench environment, policy or throughput",
 }
 FUNCTIONS = {"eval": "verbs:evaluate", "doctor": "doctor:main"}
 """Verb → module and function, where that is not the one of the same name in `verbs`."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``accerl doctor``: checks a recipe against this machine; every failure comes with its remedy.
+"""``accerl doctor``: checks a recipe against this machine; every failure comes with its hint.
 
 A frame is really drawn, in a process of its own, because a broken OpenGL can take a process down.
 """
@@ -58,7 +58,7 @@ class Check(NamedTuple):
 
     name: str
     status: str  # ok, warn or FAIL; only the last makes the exit code 1
-    text: str  # the finding and, unless it is fine, the remedy
+    text: str  # the finding and, unless it is fine, the hint
 
 
 def main(arguments: list[str]) -> int:
@@ -132,14 +132,14 @@ def rendering(*, needed: bool, script: str = DRAW) -> Check:
     """Draws a frame in a process of its own; if it is not `needed`, a failure is only a warning."""
     from accerl_lerobot.envs.graphics import choose_backend
 
-    command, remedy = [sys.executable, "-c", script], "set MUJOCO_GL to osmesa or egl"
+    command, hint = [sys.executable, "-c", script], "set MUJOCO_GL to osmesa or egl"
     if importlib.util.find_spec("mujoco") is None:
         text = "MuJoCo is not installed; install the extra: accerl-lerobot[metaworld] or [libero]"
         return Check("rendering", FAIL if needed else WARN, text)
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=RENDER_TIMEOUT_S, check=False)
     except subprocess.TimeoutExpired:
-        text = f"no frame within {RENDER_TIMEOUT_S} s; {remedy}"
+        text = f"no frame within {RENDER_TIMEOUT_S} s; {hint}"
     else:
         words = done.stdout.split()
         if done.returncode == 0 and words[:2] == ["drawn", "True"]:
@@ -148,7 +148,7 @@ def rendering(*, needed: bool, script: str = DRAW) -> Check:
         text = (done.stderr.strip().splitlines() or [f"ended with code {done.returncode}"])[-1]
         text = text.removeprefix("accerl_lerobot.errors.InputError: ")
         if done.returncode == 0:
-            text = f"MuJoCo draws an empty picture; {remedy}"
+            text = f"MuJoCo draws an empty picture; {hint}"
     return Check("rendering", FAIL if needed else WARN, text)
 
 
@@ -171,8 +171,10 @@ def resources(config: RunConfig | None, history: int = 1) -> Iterator[Check]:
             need = sizes.policy_gib(config) + sum(sizes.memory_parts_gib(config, history).values())
             text += f", about {need:.1f} GiB needed"
             if need > free:
-                remedy = "lower rollout.workers, rollout.worlds or replay.capacity, or use a smaller policy"
-                status, text = WARN, f"{text}: {remedy}"
+                hint = (
+                    "lower rollout.workers, rollout.environments or replay.capacity, or use a smaller policy"
+                )
+                status, text = WARN, f"{text}: {hint}"
         yield Check("memory", status, text)
     disk = shutil.disk_usage(Path.cwd()).free / sizes.GIB
     short = disk < DISK_GIB
@@ -227,10 +229,10 @@ def policy_fits(config: RunConfig) -> Iterator[Check]:
         yield Check("policy", OK, text)
         return
     fitting = int((usable - kept - replicas * acting) / memory.learning)
-    remedy = f"use --trainer.micro_batch={fitting}" if fitting > 0 else "use policy.tuning.mode=lora"
+    hint = f"use --trainer.micro_batch={fitting}" if fitting > 0 else "use policy.tuning.mode=lora"
     if not trainer.activation_checkpointing:
-        remedy += ", or --trainer.activation_checkpointing=true"
-    yield Check("policy", WARN, f"{text}: {remedy}")
+        hint += ", or --trainer.activation_checkpointing=true"
+    yield Check("policy", WARN, f"{text}: {hint}")
 
 
 def _device_memory(config: RunConfig, device: Any) -> tuple[float, int, str]:
@@ -264,7 +266,8 @@ def pace(config: RunConfig) -> Iterator[Check]:
     if of_pace > bound:
         text += (
             f"; the pace alone allows {of_pace}, so segments may be thrown away as too old: "
-            "lower replay.capacity, replay.ahead or replay.samples_per_insert, or raise replay.max_lag"
+            "lower replay.capacity, replay.max_unlearned_decisions or replay.samples_per_insert, "
+            "or raise replay.max_lag"
         )
     yield Check("lag", WARN if of_pace > bound else OK, text)
     collected = math.ceil(trainer.updates * trainer.batch_decisions / replay.samples_per_insert)

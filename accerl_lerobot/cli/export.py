@@ -20,15 +20,15 @@ from typing import Any, Literal
 import numpy as np
 
 from accerl_lerobot.checkpoint.layout import CONFIG
-from accerl_lerobot.checkpoint.safety import Origin, check_folder
+from accerl_lerobot.checkpoint.safety import FileSource, check_folder
 from accerl_lerobot.config.parsing import decode, parse, read_arguments, read_recipe
 from accerl_lerobot.config.ranges import DatasetName, NewFolder, Section
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos import record
 from accerl_lerobot.engine.config import RunConfig
-from accerl_lerobot.envs import EnvConfig, MetaWorldConfig, make_world
+from accerl_lerobot.envs import EnvConfig, MetaWorldConfig, make_environment
 from accerl_lerobot.errors import InputError, expanded
-from accerl_lerobot.replay.journal import EPISODES, Done, read_journal, whole_episodes
+from accerl_lerobot.replay.journal import EPISODES, JournalEntry, read_journal, whole_episodes
 from accerl_lerobot.rollout.runner import RolloutConfig
 
 SIDECAR = Path("meta") / "accerl_rollouts.json"
@@ -58,7 +58,7 @@ def export_config(arguments: list[str]) -> ExportConfig:
     if path is None:
         raise InputError("path", None, "name the folder of an accerl train run")
     run = expanded(str(path), "path")
-    check_folder(run, Origin("path", str(run)))
+    check_folder(run, FileSource("path", str(run)))
     if not (run / CONFIG).is_file():
         raise InputError("path", str(run), f"no run in it: there is no {CONFIG}")
     recipe = [f"--config_path={run / CONFIG}"]
@@ -77,21 +77,23 @@ def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
     episodes = whole_episodes(read_journal(run / EPISODES))
     chosen = [parts for parts in episodes if picks_all or parts[-1].success is wanted]
     if not chosen:
-        remedy = f"no whole episode in its {EPISODES} of those asked for ({config.pick})"
-        raise InputError("path", str(run), remedy)
+        hint = f"no whole episode in its {EPISODES} of those asked for ({config.pick})"
+        raise InputError("path", str(run), hint)
     with record.appearing(root) as partial:
         tally = _write(config, chosen, partial, console)
         if not tally["episodes"]:
-            remedy = "none of its episodes could be repeated: this environment is not deterministic"
-            raise InputError("path", str(run), remedy)
+            hint = "none of its episodes could be repeated: this environment is not deterministic"
+            raise InputError("path", str(run), hint)
         about = {"export": {"path": run.name, "pick": config.pick}, **tally}
         (partial / SIDECAR).write_text(json.dumps(about, indent=2) + "\n")
     return tally
 
 
-def _write(config: ExportConfig, chosen: list[list[Done]], root: Path, console: Console) -> dict[str, int]:
-    with closing(make_world(config.env)) as world:
-        spec = world.spec
+def _write(
+    config: ExportConfig, chosen: list[list[JournalEntry]], root: Path, console: Console
+) -> dict[str, int]:
+    with closing(make_environment(config.env)) as environment:
+        spec = environment.spec
     if others := {parts[0].origin.task for parts in chosen} - {*spec.tasks}:
         raise InputError("env.task", sorted(others)[0], f"{EPISODES} has this task, and env has {spec.tasks}")
     record.check_instruction(spec, config.env)
@@ -100,8 +102,8 @@ def _write(config: ExportConfig, chosen: list[list[Done]], root: Path, console: 
     stored = read_recipe(Path(str(config.path)).expanduser() / CONFIG).get("rollout")
     stored = stored if isinstance(stored, dict) else {}
     if isinstance(judge := stored.get("reward_model"), dict) and judge.get("path"):
-        remedy = "rollout.reward_model told its successes, which a repeated episode does not have"
-        raise InputError("path", str(config.path), remedy)
+        hint = "rollout.reward_model told its successes, which a repeated episode does not have"
+        raise InputError("path", str(config.path), hint)
     given = {k: v for k, v in stored.items() if k == "decision_cost"}
     replay = partial(_replay, decode(RolloutConfig, given).decision_cost)
     with (
@@ -121,10 +123,10 @@ def _write(config: ExportConfig, chosen: list[list[Done]], root: Path, console: 
     return tally
 
 
-def _replay(cost: float, parts: list[Done]) -> record.Episode | None:
+def _replay(cost: float, parts: list[JournalEntry]) -> record.Episode | None:
     """An episode with an observation at every step; None if it differs from the journal."""
     actions, origin = np.concatenate([part.actions for part in parts]), parts[0].origin
-    episode = record.played(record.this_world(), origin.task, origin.seed, actions)
+    episode = record.played(record.this_environment(), origin.task, origin.seed, actions)
     if len(episode) != len(actions) or episode.success != parts[-1].success:
         return None
     steps = np.concatenate([part.steps for part in parts])

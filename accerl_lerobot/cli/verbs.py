@@ -21,9 +21,9 @@ from typing import Any
 import yaml
 
 from accerl_lerobot.algorithms import AlgorithmConfig, AWRConfig, ChunkCriticConfig, OffPolicyConfig
+from accerl_lerobot.bench.environment import BenchEnvironmentConfig
 from accerl_lerobot.bench.policy import BenchPolicyConfig
 from accerl_lerobot.bench.throughput import BenchThroughputConfig
-from accerl_lerobot.bench.world import BenchWorldConfig
 from accerl_lerobot.checkpoint.layout import CHECKPOINTS, CONFIG, LAST, PRETRAINED, SUMMARY, write_atomically
 from accerl_lerobot.cli.export import ExportConfig, export_config, export_episodes
 from accerl_lerobot.config.parsing import read_arguments
@@ -200,12 +200,12 @@ def demos(arguments: list[str]) -> int:
     """``accerl demos``."""
     config: DemosRun = parse(DemosRun, arguments, recipe_class=RunConfig)
     from accerl_lerobot.demos.record import record_demos
-    from accerl_lerobot.engine.preflight import check_world
+    from accerl_lerobot.engine.preflight import check_environment
     from accerl_lerobot.engine.sizes import check_disk
 
     with redirect_stdout(sys.stderr):
         check_disk(config.root, "root")
-        check_world(config.env)
+        check_environment(config.env)
         path = record_demos(config.env, config.demos, config.root, config.seed)
     sys.stdout.write(f"{path}\n")
     return 0
@@ -218,14 +218,14 @@ def sft(arguments: list[str]) -> int:
         raise InputError("dataset.repo_id", None, NO_DATASET)
     if config.sft.steps == 0:
         raise InputError("sft.steps", 0, "use at least 1")
-    from accerl_lerobot.engine.preflight import check_training_data, check_world, sft_policy
+    from accerl_lerobot.engine.preflight import check_environment, check_training_data, sft_policy
     from accerl_lerobot.engine.run import fine_tune, make_output_dir
     from accerl_lerobot.engine.sizes import check_disk
     from accerl_lerobot.policies.loading import resolve_device
 
     device = str(resolve_device(config.device, "device"))
     policy = sft_policy(config.sft)
-    spec = None if config.env is None else check_world(config.env)
+    spec = None if config.env is None else check_environment(config.env)
     check_training_data(config.sft, config.dataset, policy, spec, {})
     check_disk(config.output_dir)
     directory = make_output_dir(config)
@@ -425,7 +425,7 @@ CONFIGS: dict[str, type[Any]] = {
     "timeline": TimelineConfig,
     "export": ExportConfig,
     "doctor": RunConfig,
-    "bench world": BenchWorldConfig,
+    "bench environment": BenchEnvironmentConfig,
     "bench policy": BenchPolicyConfig,
     "bench throughput": BenchThroughputConfig,
 }

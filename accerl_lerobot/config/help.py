@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import yaml
 
 from accerl_lerobot.config.parsing import TYPE, choices_of, section_of
-from accerl_lerobot.config.ranges import default_of, hints_of, range_in_words
+from accerl_lerobot.config.ranges import annotations_of, default_of, range_in_words
 from accerl_lerobot.errors import InputError
 
 WIDTH = 110
@@ -24,7 +24,7 @@ COMMON = (
     "output_dir", "job_name", "seed", "resume", "path", "repo_id", "env.type", "env.task", "env.image_size",
     "env.max_steps", "dataset.repo_id", "dataset.root", "demos.episodes", "root", "sft.steps",
     "sft.batch_size", "sft.lr", "policy.path", "policy.device", "policy.precision", "policy.tuning.mode",
-    "device", "rollout.workers", "rollout.worlds", "rollout.decision_cost", "replay.capacity",
+    "device", "rollout.workers", "rollout.environments", "rollout.decision_cost", "replay.capacity",
     "replay.samples_per_insert", "algorithm.type", "trainer.updates", "trainer.batch_decisions",
     "trainer.lr", "trainer.value_lr", "evaluation.episodes",
     "evaluation.every_updates", "launch.engine", "wandb.enable", "save_every_s",
@@ -47,7 +47,7 @@ def help_text(command: str, config_class: type[Any], what: str, section: str = "
     `what` says in one line what the command does; `section` is that of ``--help=SECTION``, or ``all``.
     """
     listed = _listed(config_class)
-    sections = {name: section_of(hint) for name, hint in hints_of(config_class).items()}
+    sections = {name: section_of(annotation) for name, annotation in annotations_of(config_class).items()}
     if section not in ("", "all"):
         inside = [line for line in listed if f"{line.name}.".startswith(f"{section}.")]
         if not inside:
@@ -108,12 +108,12 @@ def _listed(cls: type[Any], prefix: str = "", usual: Any = None, all_types: bool
 
     Of a choice, all types, or, with `all_types` off, the default one and the choice itself as a field.
     """
-    hints, texts, fields, sections = hints_of(cls), docstrings(cls), list[Line](), list[Line]()
+    annotations, texts, fields, sections = annotations_of(cls), docstrings(cls), list[Line](), list[Line]()
     for field in dataclasses.fields(cls):
-        hint, name = hints[field.name], f"{prefix}{field.name}"
-        section, default = section_of(hint), getattr(usual, field.name, default_of(field))
+        annotation, name = annotations[field.name], f"{prefix}{field.name}"
+        section, default = section_of(annotation), getattr(usual, field.name, default_of(field))
         if section is None:
-            fields.append(Line(name, shown(default), texts[field.name], range_in_words(hint)))
+            fields.append(Line(name, shown(default), texts[field.name], range_in_words(annotation)))
         elif not (choices := choices_of(section)):
             note = "" if default is not None else " (off unless given)"
             sections.append(Line(name, None, f"{name}{note}: {_summary(section)}"))

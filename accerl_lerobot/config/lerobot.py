@@ -28,7 +28,7 @@ FLAGS: dict[str, tuple[str, ...] | str] = {
     "eval_freq": ("evaluation.every_updates",),
     "env_eval_freq": ("evaluation.every_updates",),
     "eval.n_episodes": ("evaluation.episodes",),
-    "eval.batch_size": ("rollout.worlds",),
+    "eval.batch_size": ("rollout.environments",),
     "eval": "leave it out, the section evaluation says how it is done here",
     "rename_map": ("policy.rename_map",),
     "optimizer.lr": ("trainer.lr", "sft.lr"),

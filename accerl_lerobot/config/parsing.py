@@ -30,10 +30,10 @@ from accerl_lerobot.checkpoint.layout import CONFIG
 from accerl_lerobot.checkpoint.safety import brief
 from accerl_lerobot.config.lerobot import FLAGS, hint_for
 from accerl_lerobot.config.ranges import (
+    annotations_of,
     check,
     default_of,
     fits,
-    hints_of,
     is_optional,
     is_union,
     unmarked,
@@ -118,8 +118,8 @@ def parse(config_class: type[Any], arguments: list[str], *, recipe_class: type[A
     merged = _overridden(config_class, tree, given)
     if from_file := consents(merged, given):
         flags = consent_flags(from_file)
-        remedy = f"a file cannot allow this, only the command line can: if you trust it, add {flags}"
-        raise InputError(next(iter(from_file)), next(iter(from_file.values())), remedy)
+        hint = f"a file cannot allow this, only the command line can: if you trust it, add {flags}"
+        raise InputError(next(iter(from_file)), next(iter(from_file.values())), hint)
     return decode(config_class, merged)
 
 
@@ -222,8 +222,8 @@ def read_recipe(path: Path) -> dict[str, Any]:
         bare = path.stem if str(path.parent) == RECIPES else str(path)  # as in the repository
         path = shipped.get(bare, path)
     if path.is_dir():
-        remedy = f"a folder without {CONFIG}, so no run or checkpoint; name a recipe"
-        raise InputError("config_path", str(path), remedy)
+        hint = f"a folder without {CONFIG}, so no run or checkpoint; name a recipe"
+        raise InputError("config_path", str(path), hint)
     if not path.is_file():
         names = [*(str(p) for p in path.parent.glob("*.y*ml")), *shipped]
         near = difflib.get_close_matches(str(path), names, n=3)
@@ -247,9 +247,13 @@ def read_recipe(path: Path) -> dict[str, Any]:
     return tree or {}
 
 
-def section_of(hint: Any) -> type[Any] | None:
+def section_of(annotation: Any) -> type[Any] | None:
     """The config class behind a field's annotation, ``X`` or ``X | None``; None for a plain value."""
-    options = [a for a in typing.get_args(hint) if a is not type(None)] if is_union(hint) else [hint]
+    options = (
+        [a for a in typing.get_args(annotation) if a is not type(None)]
+        if is_union(annotation)
+        else [annotation]
+    )
     if len(options) == 1 and isinstance(options[0], type) and dataclasses.is_dataclass(options[0]):
         return options[0]
     return None
@@ -328,9 +332,13 @@ def _overridden(config_class: type[Any], tree: dict[str, Any], given: dict[str, 
     former type that the new one does not take are dropped too: a run's config holds them, chosen or not.
     """
     merged = _merged(tree, given)
-    hints = hints_of(config_class)
+    annotations = annotations_of(config_class)
     for field in dataclasses.fields(config_class):
-        section, over, under = section_of(hints[field.name]), given.get(field.name), tree.get(field.name)
+        section, over, under = (
+            section_of(annotations[field.name]),
+            given.get(field.name),
+            tree.get(field.name),
+        )
         if section is None or not isinstance(over, dict) or not isinstance(under, dict):
             continue
         before = under.get(TYPE, _default_type(field))
@@ -339,7 +347,7 @@ def _overridden(config_class: type[Any], tree: dict[str, Any], given: dict[str, 
         kind = kinds.get(str(now), section)
         if now != before and kind is not section:
             usual = encoded_defaults(kinds.get(str(before), section))
-            taken = hints_of(kind)
+            taken = annotations_of(kind)
             under = {
                 name: value
                 for name, value in under.items()
@@ -357,7 +365,7 @@ def encoded_defaults(cls: type[Any]) -> dict[str, Any]:
 def register_types(cls: type[Any], tree: dict[str, Any], path: tuple[str, ...] = ()) -> None:
     """Imports the packages that register types of what is to be decoded, as LeRobot's parser does."""
     for field in dataclasses.fields(cls):
-        value, section = tree.get(field.name), section_of(hints_of(cls)[field.name])
+        value, section = tree.get(field.name), section_of(annotations_of(cls)[field.name])
         if field.metadata.get(REGISTERS) and value is not None:
             field.metadata.get(PREPARES, bool)()
             discover(str(value), ".".join(path))
@@ -375,16 +383,16 @@ def _merged(tree: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
 
 def _decoded(cls: type[Any], tree: dict[str, Any], path: tuple[str, ...], whole: type[Any]) -> Any:
     """A config section, once all keys in `tree` are known to exist and all values fit."""
-    hints, by_name = hints_of(cls), {field.name: field for field in dataclasses.fields(cls)}
+    annotations, by_name = annotations_of(cls), {field.name: field for field in dataclasses.fields(cls)}
     values = {}
     for key, value in tree.items():
         here = (*path, str(key))
         if key not in by_name:
             raise _unknown(str(key), value, path, list(by_name), whole)
-        section = section_of(hints[key])
+        section = section_of(annotations[key])
         if section is None:
-            values[key] = _leaf(hints[key], value, ".".join(here))
-        elif value is None and is_optional(hints[key]):
+            values[key] = _leaf(annotations[key], value, ".".join(here))
+        elif value is None and is_optional(annotations[key]):
             values[key] = None
         elif not isinstance(value, dict | None):
             raise InputError(".".join(here), value, f"a config section; use --{here[-1]}.field=value")
@@ -392,7 +400,7 @@ def _decoded(cls: type[Any], tree: dict[str, Any], path: tuple[str, ...], whole:
             values[key] = _section(section, value or {}, here, by_name[key], whole)
     for field in by_name.values():
         if field.name not in values and field.default is field.default_factory is dataclasses.MISSING:
-            raise InputError(".".join((*path, field.name)), None, f"use {wanted(hints[field.name])}")
+            raise InputError(".".join((*path, field.name)), None, f"use {wanted(annotations[field.name])}")
     try:
         return cls(**values)
     except InputError as error:
@@ -401,7 +409,7 @@ def _decoded(cls: type[Any], tree: dict[str, Any], path: tuple[str, ...], whole:
         if usual in (".", actual) or not error.field.startswith(usual):
             raise
         moved = f"{actual}{error.field.removeprefix(usual)}"
-        raise InputError(moved, error.value, error.remedy.replace(usual, actual)) from error
+        raise InputError(moved, error.value, error.hint.replace(usual, actual)) from error
     except (TypeError, ValueError) as error:  # of a class that is not ours
         raise InputError(".".join(path) or "config", type(error).__name__, str(error)) from error
 
@@ -415,23 +423,23 @@ def _section(
     kind = value.get(TYPE, usual)
     if not isinstance(kind, str) or kind not in choices:
         near = difflib.get_close_matches(str(kind), choices, n=1)
-        remedy = f"did you mean {near[0]}? Otherwise " if near else ""
-        remedy += f"use one of {', '.join(sorted(choices))}"
+        hint = f"did you mean {near[0]}? Otherwise " if near else ""
+        hint += f"use one of {', '.join(sorted(choices))}"
         if here == ("env",):
-            remedy += f"; one of LeRobot's own is --env.type=lerobot --env.name={kind}"
-        raise InputError(".".join((*here, TYPE)), kind, remedy)
+            hint += f"; one of LeRobot's own is --env.type=lerobot --env.name={kind}"
+        raise InputError(".".join((*here, TYPE)), kind, hint)
     rest = {k: v for k, v in value.items() if k != TYPE}
     if kind == usual:
         rest = _merged(_apart(field, choices[kind]), rest)
     return _decoded(choices[kind], rest, here, whole)
 
 
-def _leaf(hint: Any, value: Any, field: str) -> Any:
+def _leaf(annotation: Any, value: Any, field: str) -> Any:
     """A plain value, decoded by draccus unless draccus would quietly turn it into something else.
 
     ``a,b`` and a lone value are the list that the field holds.
     """
-    plain = unmarked(hint)
+    plain = unmarked(annotation)
     kinds = set(typing.get_args(plain)) if is_union(plain) else {plain}
     entries = [typing.get_args(kind)[0] for kind in kinds if typing.get_origin(kind) in (list, tuple)]
     entry = entries[0] if len(entries) == 1 else None
@@ -452,8 +460,8 @@ def _leaf(hint: Any, value: Any, field: str) -> Any:
     except Exception:  # whatever draccus raises, the value does not fit
         wrong = True
     if wrong:
-        raise InputError(field, value, f"use {wanted(hint)}")
-    check(hint, decoded, field)
+        raise InputError(field, value, f"use {wanted(annotation)}")
+    check(annotation, decoded, field)
     return decoded
 
 
@@ -473,11 +481,11 @@ def dotted_fields(cls: type[Any]) -> Iterator[str]:
 
 def _fields(cls: type[Any], path: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
     """Dotted name and annotation of every field."""
-    hints = hints_of(cls)
+    annotations = annotations_of(cls)
     for field in dataclasses.fields(cls):
-        section, here = section_of(hints[field.name]), (*path, field.name)
+        section, here = section_of(annotations[field.name]), (*path, field.name)
         if section is None:
-            yield ".".join(here), hints[field.name]
+            yield ".".join(here), annotations[field.name]
             continue
         for kind in choices_of(section).values() or (section,):
             yield from _fields(kind, here)
@@ -492,16 +500,16 @@ def _unknown(key: str, value: Any, path: tuple[str, ...], names: list[str], whol
     while isinstance(leaf, dict) and leaf:
         below, leaf = next(iter(leaf.items()))
         leaf_name += f".{below}"
-    hints = dict(_fields(whole))
+    annotations = dict(_fields(whole))
     near = [".".join((*path, name)) for name in difflib.get_close_matches(key, names, n=3)]
     # Only what is no misspelling is of a section of LeRobot's.
     lerobot_name = leaf_name in FLAGS or here in FLAGS or not near
-    if lerobot_name and (hint := hint_for(leaf_name, leaf, hints.keys())):
+    if lerobot_name and (hint := hint_for(leaf_name, leaf, annotations.keys())):
         return InputError(leaf_name, leaf, f"the name is LeRobot's; {hint}")
     # The same name elsewhere, where the value would fit or no section was named.
     near += [
         name
-        for name, kind in hints.items()
+        for name, kind in annotations.items()
         if name.rpartition(".")[2] == key and name != here and (not path or _takes(kind, value))
     ]
     where = f"{'.'.join(path)} has" if path else "there are"
@@ -509,9 +517,9 @@ def _unknown(key: str, value: Any, path: tuple[str, ...], names: list[str], whol
     return InputError(here, value, f"no such field; {hint}")
 
 
-def _takes(hint: Any, value: Any) -> bool:
+def _takes(annotation: Any, value: Any) -> bool:
     try:
-        _leaf(hint, value, "")
+        _leaf(annotation, value, "")
     except InputError:
         return False
     return True
@@ -519,7 +527,7 @@ def _takes(hint: Any, value: Any) -> bool:
 
 def _sections(cls: type[Any]) -> dict[str, type[Any]]:
     """Field → class, of the fields that are sections."""
-    found = {name: section_of(hint) for name, hint in hints_of(cls).items()}
+    found = {name: section_of(annotation) for name, annotation in annotations_of(cls).items()}
     return {name: section for name, section in found.items() if section is not None}
 
 

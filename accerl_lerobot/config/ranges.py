@@ -95,8 +95,8 @@ class Section:
             cls.SECTION = section
 
     def __post_init__(self) -> None:
-        for name, hint in hints_of(type(self)).items():
-            check(hint, getattr(self, name), f"{self.SECTION}.{name}" if self.SECTION else name)
+        for name, annotation in annotations_of(type(self)).items():
+            check(annotation, getattr(self, name), f"{self.SECTION}.{name}" if self.SECTION else name)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,24 +113,24 @@ class DatasetConfig(Section, section="dataset"):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.root is not None and self.repo_id is None:
-            remedy = "name the dataset in dataset.root; any owner/name will do"
-            raise InputError("dataset.repo_id", None, remedy)
+            hint = "name the dataset in dataset.root; any owner/name will do"
+            raise InputError("dataset.repo_id", None, hint)
 
 
-def hints_of(cls: type[Any]) -> dict[str, Any]:
+def annotations_of(cls: type[Any]) -> dict[str, Any]:
     """Field name → annotation, with its range."""
     return _hints_of(typing.cast(Hashable, cls))
 
 
 @functools.cache
 def _hints_of(cls: Any) -> dict[str, Any]:
-    hints: dict[str, Any] = {}
+    annotations: dict[str, Any] = {}
     for base in reversed([base for base in cls.__mro__ if dataclasses.is_dataclass(base)]):
-        for name, hint in typing.get_type_hints(base, include_extras=True).items():
+        for name, annotation in typing.get_type_hints(base, include_extras=True).items():
             # A subclass that gives a field another default need not repeat its range.
-            if name not in hints or hint != unmarked(hints[name]):
-                hints[name] = hint
-    return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
+            if name not in annotations or annotation != unmarked(annotations[name]):
+                annotations[name] = annotation
+    return {field.name: annotations[field.name] for field in dataclasses.fields(cls)}
 
 
 def default_of(field: Any) -> Any:
@@ -140,7 +140,7 @@ def default_of(field: Any) -> Any:
     return None if field.default_factory is dataclasses.MISSING else field.default_factory()
 
 
-def check(hint: Any, value: Any, field: str) -> None:
+def check(annotation: Any, value: Any, field: str) -> None:
     """Refuses a value that does not fit an annotation."""
     for text in value if isinstance(value, (list, tuple)) else (value,):
         if isinstance(text, str) and (len(text) > LONGEST_TEXT or "\0" in text):
@@ -150,17 +150,17 @@ def check(hint: Any, value: Any, field: str) -> None:
                 Path(text).expanduser()
             except RuntimeError as error:
                 raise InputError(field, value, "there is no such user; name a path in full") from error
-    if not fits(hint, value):
-        raise InputError(field, value, f"use {wanted(hint)}")
+    if not fits(annotation, value):
+        raise InputError(field, value, f"use {wanted(annotation)}")
 
 
-def fits(hint: Any, value: Any) -> bool:
+def fits(annotation: Any, value: Any) -> bool:
     """True if a value fits an annotation and its range."""
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is Annotated:
         kind, mark = arguments
         return (_is_number(kind, value) if kind in (int, float) else fits(kind, value)) and value in mark
-    if is_union(hint):
+    if is_union(annotation):
         return any(fits(kind, value) for kind in arguments)
     if origin is typing.Literal:
         return value in arguments
@@ -170,10 +170,10 @@ def fits(hint: Any, value: Any) -> bool:
         if origin is list or Ellipsis in arguments:
             return all(fits(arguments[0], entry) for entry in value)
         return len(value) == len(arguments) and all(map(fits, arguments, value))
-    if hint in (int, float):
-        return _is_number(hint, value) and math.isfinite(value)
-    if hint in (bool, str, type(None)):
-        return isinstance(value, hint)
+    if annotation in (int, float):
+        return _is_number(annotation, value) and math.isfinite(value)
+    if annotation in (bool, str, type(None)):
+        return isinstance(value, annotation)
     return True
 
 
@@ -182,18 +182,18 @@ def _is_number(kind: type, value: Any) -> bool:
     return isinstance(value, numeric) and not isinstance(value, bool)
 
 
-def wanted(hint: Any) -> str:
+def wanted(annotation: Any) -> str:
     """Values that fit an annotation, in words."""
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is Annotated:
         kind, mark = arguments
         return mark.words if isinstance(mark, Pattern) else f"{wanted(kind)} in {mark.text}"
-    if is_union(hint):
+    if is_union(annotation):
         parts = [wanted(kind) for kind in arguments if kind is not type(None)]
-        return " or ".join(parts + (["null"] if is_optional(hint) else []))
+        return " or ".join(parts + (["null"] if is_optional(annotation) else []))
     plain = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
-    if hint in plain:
-        return plain[hint]
+    if annotation in plain:
+        return plain[annotation]
     if origin is typing.Literal:
         *others, last = map(str, arguments)
         return f"{', '.join(others)} or {last}" if others else last
@@ -203,12 +203,12 @@ def wanted(hint: Any) -> str:
         return f"a list such as [a, b], each {wanted(arguments[0])}"
     if origin is dict:
         return "a mapping such as {key: value}"
-    return getattr(hint, "__name__", str(hint))
+    return getattr(annotation, "__name__", str(annotation))
 
 
-def range_in_words(hint: Any) -> str:
+def range_in_words(annotation: Any) -> str:
     """The range of an annotation as ``--help`` shows it; empty where there is none."""
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is Annotated:
         return f"in {arguments[1].text}" if isinstance(arguments[1], Range) else ""
     if origin is typing.Literal:
@@ -216,16 +216,16 @@ def range_in_words(hint: Any) -> str:
     return next((text for kind in arguments if (text := range_in_words(kind))), "")
 
 
-def is_union(hint: Any) -> bool:
+def is_union(annotation: Any) -> bool:
     """True for ``X | Y``."""
-    return typing.get_origin(hint) in (typing.Union, types.UnionType)
+    return typing.get_origin(annotation) in (typing.Union, types.UnionType)
 
 
-def is_optional(hint: Any) -> bool:
+def is_optional(annotation: Any) -> bool:
     """True for ``X | None``."""
-    return is_union(hint) and type(None) in typing.get_args(hint)
+    return is_union(annotation) and type(None) in typing.get_args(annotation)
 
 
-def unmarked(hint: Any) -> Any:
+def unmarked(annotation: Any) -> Any:
     """An annotation without its ranges."""
-    return typing.get_type_hints(type("", (), {"__annotations__": {"x": hint}}))["x"]
+    return typing.get_type_hints(type("", (), {"__annotations__": {"x": annotation}}))["x"]

@@ -36,8 +36,8 @@ class BackboneConfig(Section, section="sft.backbone"):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.image % (2 * self.patch):
-            remedy = f"use a multiple of {2 * self.patch}, twice the patch"
-            raise InputError("sft.backbone.image", self.image, remedy)
+            hint = f"use a multiple of {2 * self.patch}, twice the patch"
+            raise InputError("sft.backbone.image", self.image, hint)
         if self.hidden % 8:  # four heads, which rotary embeddings halve
             raise InputError("sft.backbone.hidden", self.hidden, "use a multiple of 8")
 

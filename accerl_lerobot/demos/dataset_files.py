@@ -25,7 +25,7 @@ import numpy as np
 
 from accerl_lerobot.checkpoint.isolation import rehearse
 from accerl_lerobot.checkpoint.safety import (
-    Origin,
+    FileSource,
     brief,
     check_name,
     file_size,
@@ -78,14 +78,14 @@ def open_metadata(dataset: DatasetConfig) -> Any:
     except (CompatibilityError, NotImplementedError) as error:
         tool = f"python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id={name}"
         tool += f" --root={root}" * (root is not None) + " --push-to-hub=false"
-        remedy = (
+        hint = (
             f"its format is not {CODEBASE_VERSION}, which this LeRobot reads; from v2.1 convert with: {tool}"
         )
-        raise InputError("dataset.repo_id", name, remedy) from error
+        raise InputError("dataset.repo_id", name, hint) from error
     except Exception as error:  # LeRobot may fail over anything in the files
         if root is None and isinstance(error, (OSError, ValueError)):
-            remedy = f"not found locally nor on the Hub ({brief(error)})"
-            raise InputError("dataset.repo_id", name, remedy) from error
+            hint = f"not found locally nor on the Hub ({brief(error)})"
+            raise InputError("dataset.repo_id", name, hint) from error
         raise origin_of(dataset).refuse("meta", f"LeRobot cannot read it ({brief(error)})") from error
     if meta.episodes is None or meta.tasks is None:
         raise origin_of(dataset).refuse(INFO, "it has no episodes, or no tasks; name a dataset that has some")
@@ -108,11 +108,11 @@ def opened(dataset: DatasetConfig, meta: Any, episodes: Sequence[int] | None = N
         )
 
 
-def origin_of(dataset: DatasetConfig) -> Origin:
+def origin_of(dataset: DatasetConfig) -> FileSource:
     """The field that names a dataset's files."""
     if dataset.root is not None:
-        return Origin("dataset.root", dataset.root)
-    return Origin("dataset.repo_id", dataset.repo_id)
+        return FileSource("dataset.root", dataset.root)
+    return FileSource("dataset.repo_id", dataset.repo_id)
 
 
 def task_texts(meta: Any) -> list[str]:
@@ -121,7 +121,7 @@ def task_texts(meta: Any) -> list[str]:
 
 
 @contextlib.contextmanager
-def checked(origin: Origin, whole: bool = False) -> Iterator[None]:
+def checked(origin: FileSource, whole: bool = False) -> Iterator[None]:
     """In this context LeRobot has a dataset's files checked before it reads them.
 
     With `whole`, missing files and rows are refused; otherwise LeRobot fetches them.
@@ -194,8 +194,8 @@ def checked(origin: Origin, whole: bool = False) -> Iterator[None]:
             Pillow.open(io.BytesIO(content), formats=IMAGES).close()
             return decode(self, {"bytes": content, "path": None}, token_per_repo_id)
         except Exception as error:  # Pillow's plugins raise what they like
-            remedy = "an image that is no PNG, JPEG or TIFF, or broken; record it again"
-            raise origin.refuse(DATA, remedy) from error
+            hint = "an image that is no PNG, JPEG or TIFF, or broken; record it again"
+            raise origin.refuse(DATA, hint) from error
 
     guard_client()
     Image.decode_example = checked_decode
@@ -211,7 +211,7 @@ def checked(origin: Origin, whole: bool = False) -> Iterator[None]:
         Image.decode_example = decode
 
 
-def put_in_order(meta: Any, origin: Origin) -> None:
+def put_in_order(meta: Any, origin: FileSource) -> None:
     """Make good what LeRobot takes for granted: tasks and episodes in the order of their indices, names of an
     image's axes, and statistics of each camera, into which it writes those of ImageNet."""
     if meta.tasks is not None:
@@ -233,10 +233,10 @@ def put_in_order(meta: Any, origin: Origin) -> None:
     meta.stats = {camera: {} for camera in seen} | (meta.stats or {})
 
 
-def _check_numbers(numbers: list[int], where: str, name: str, origin: Origin) -> None:
+def _check_numbers(numbers: list[int], where: str, name: str, origin: FileSource) -> None:
     if numbers != list(range(len(numbers))):
-        remedy = f"its {name} are not 0 to {len(numbers) - 1}, as LeRobot wants them; number them anew"
-        raise origin.refuse(where, remedy)
+        hint = f"its {name} are not 0 to {len(numbers) - 1}, as LeRobot wants them; number them anew"
+        raise origin.refuse(where, hint)
 
 
 def _cause(error: BaseException) -> str:
@@ -244,7 +244,7 @@ def _cause(error: BaseException) -> str:
     return _cause(error.__cause__) if error.__cause__ else brief(error)
 
 
-def check_metadata(root: Path, origin: Origin, whole: bool = False) -> None:
+def check_metadata(root: Path, origin: FileSource, whole: bool = False) -> None:
     """Refuses metadata that are not what their names say; with `whole`, also missing files."""
     if not safe_join(root, INFO, origin).exists():
         return
@@ -268,7 +268,7 @@ def check_metadata(root: Path, origin: Origin, whole: bool = False) -> None:
         raise origin.refuse(EPISODES, f"{rows} episodes, and {INFO} says {info['total_episodes']}; {AGAIN}")
 
 
-def check_info(info: dict[str, Any], origin: Origin) -> None:
+def check_info(info: dict[str, Any], origin: FileSource) -> None:
     """Refuses an ``info.json`` that would lead LeRobot out of the folder, or that we cannot use."""
     for key, places in PLACES.items():
         template = info.get(key)
@@ -294,7 +294,7 @@ def check_info(info: dict[str, Any], origin: Origin) -> None:
             raise origin.refuse(where, f"shape {str(shape)[:80]}; {wanted}")
 
 
-def check_data(root: Path, origin: Origin) -> None:
+def check_data(root: Path, origin: FileSource) -> None:
     """Refuses files of rows and videos that lie elsewhere, before LeRobot reads them."""
     _files(root, DATA, origin)
     videos = safe_join(root, "videos", origin)
@@ -302,7 +302,7 @@ def check_data(root: Path, origin: Origin) -> None:
         safe_join(root, path.relative_to(root).as_posix(), origin)
 
 
-def check_rows(rows: Any, meta: Any, origin: Origin, every: bool, whole: bool) -> None:
+def check_rows(rows: Any, meta: Any, origin: FileSource, every: bool, whole: bool) -> None:
     """Refuses rows whose indices do not say where they belong; `every`: those of all episodes were loaded."""
     frames = meta.total_frames
     if len(rows) > frames or (whole and every and len(rows) < frames):
@@ -336,7 +336,7 @@ def check_rows(rows: Any, meta: Any, origin: Origin, every: bool, whole: bool) -
         raise origin.refuse(DATA, f"{where}, and {hint}")
 
 
-def _finite(rows: Any, name: str, origin: Origin) -> np.ndarray:
+def _finite(rows: Any, name: str, origin: FileSource) -> np.ndarray:
     """A column of numbers, one for each row."""
     values = np.asarray(rows.with_format("numpy", columns=[name])[:][name])
     if values.dtype.kind not in "iuf" or not np.isfinite(values).all():
@@ -344,7 +344,7 @@ def _finite(rows: Any, name: str, origin: Origin) -> np.ndarray:
     return values.reshape(-1)
 
 
-def _files(root: Path, folder: str, origin: Origin) -> list[Path]:
+def _files(root: Path, folder: str, origin: FileSource) -> list[Path]:
     """Files that LeRobot would read, none of which leads out of the dataset."""
     if not safe_join(root, folder, origin).is_dir():
         return []
@@ -353,7 +353,7 @@ def _files(root: Path, folder: str, origin: Origin) -> list[Path]:
 
 
 @contextlib.contextmanager
-def _parquet(path: Path, origin: Origin) -> Iterator[pq.ParquetFile]:
+def _parquet(path: Path, origin: FileSource) -> Iterator[pq.ParquetFile]:
     """An open file; whatever Arrow finds wrong with it becomes one line."""
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -368,7 +368,7 @@ def _parquet(path: Path, origin: Origin) -> Iterator[pq.ParquetFile]:
         raise origin.refuse(path.name, f"not good parquet ({brief(error)}); {AGAIN}") from error
 
 
-def _check_plain(file: pq.ParquetFile, name: str, origin: Origin) -> None:
+def _check_plain(file: pq.ParquetFile, name: str, origin: FileSource) -> None:
     """Refuses metadata that are not numbers and texts: `datasets` would open the files that others name."""
     stored = (file.schema_arrow.metadata or {}).get(b"huggingface")
     kinds: set[str] = set()
@@ -377,11 +377,11 @@ def _check_plain(file: pq.ParquetFile, name: str, origin: Origin) -> None:
     except (ValueError, RecursionError) as error:
         raise origin.refuse(name, f"its description of columns is not JSON; {AGAIN}") from error
     if kinds - PLAIN:
-        remedy = f"columns of kind {', '.join(sorted(kinds - PLAIN))[:80]}, which name other files"
-        raise origin.refuse(name, f"{remedy}; numbers and texts are wanted")
+        hint = f"columns of kind {', '.join(sorted(kinds - PLAIN))[:80]}, which name other files"
+        raise origin.refuse(name, f"{hint}; numbers and texts are wanted")
 
 
-def _check_episodes(file: pq.ParquetFile, frames: int, name: str, origin: Origin) -> None:
+def _check_episodes(file: pq.ParquetFile, frames: int, name: str, origin: FileSource) -> None:
     """Refuses a table of episodes that does not say where they are."""
     import pyarrow as pa
 

@@ -57,16 +57,16 @@ def read_labels(data: Any, dataset: DatasetConfig, one_task: bool = True) -> lis
         index = int(episode[rows[0]])
         names = tuple(texts[int(i)] for i in dict.fromkeys(task[rows].tolist()))
         if one_task and len(names) > 1:
-            remedy = f"its instruction changes from {names[0]!r} to {names[1]!r}, and one is read here"
-            raise origin.refuse(f"episode {index}", f"{remedy}; split the episode, or use accerl sft")
+            hint = f"its instruction changes from {names[0]!r} to {names[1]!r}, and one is read here"
+            raise origin.refuse(f"episode {index}", f"{hint}; split the episode, or use accerl sft")
         at = None
         if flags is not None:
             at = step_of_success(flags[rows])
         elif rewards is not None:
             at = step_of_reward(rewards[rows])
         if at is None and rewards is not None:
-            remedy = f"{REWARD} is above 0 at steps that do not end it, so that it tells no success"
-            raise origin.refuse(f"episode {index}", f"{remedy}; {LABEL}")
+            hint = f"{REWARD} is above 0 at steps that do not end it, so that it tells no success"
+            raise origin.refuse(f"episode {index}", f"{hint}; {LABEL}")
         own = None if rewards is None else rewards[rows].astype(np.float32)
         found.append(EpisodeLabels(index=index, rows=rows, tasks=names, rewards=own, success_at=at))
     return found
@@ -124,8 +124,8 @@ def check_images(data: Any, shapes: Mapping[str, tuple[int, ...]], dataset: Data
     first = data[0] if shapes else {}
     for name, shape in shapes.items():
         if (found := tuple(first[name].shape)) != shape:
-            remedy = f"its images have shape {found}, and meta/info.json says {shape}; record it again"
-            raise origin_of(dataset).refuse(name, remedy)
+            hint = f"its images have shape {found}, and meta/info.json says {shape}; record it again"
+            raise origin_of(dataset).refuse(name, hint)
 
 
 def observations(

@@ -22,7 +22,7 @@ import torch
 from torch.utils.data import Dataset
 
 from accerl_lerobot import errors
-from accerl_lerobot.checkpoint.safety import Origin
+from accerl_lerobot.checkpoint.safety import FileSource
 from accerl_lerobot.config.parsing import DISCOVER, discover
 from accerl_lerobot.demos.dataset_files import checked
 from accerl_lerobot.demos.sft import ANSWER, TRUST
@@ -127,7 +127,7 @@ def main() -> None:
         return next((a.removeprefix(prefix) for a in sys.argv[1:] if a.startswith(prefix)), None)
 
     code, root, name = given(TRUST), given("--dataset.root="), given("--dataset.repo_id=")
-    origin = Origin("dataset.repo_id", name) if root is None else Origin("dataset.root", root)
+    origin = FileSource("dataset.repo_id", name) if root is None else FileSource("dataset.root", root)
     lerobot_train.make_train_eval_datasets = _adapted(lerobot_train.make_train_eval_datasets)
     DatasetReader._query_hf_dataset = query_rows
     discover(given(PACKAGE), "policy")

@@ -14,8 +14,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from accerl_lerobot.demos.libero_grasp import DOWN, Grasp, Scene
-from accerl_lerobot.envs.base import World
-from accerl_lerobot.envs.libero import LiberoWorld
+from accerl_lerobot.envs.base import Environment
+from accerl_lerobot.envs.libero import LiberoEnvironment
 from accerl_lerobot.envs.libero_simulator import Simulator
 from accerl_lerobot.errors import InputError
 
@@ -237,13 +237,13 @@ def script(simulator: Simulator) -> Script:
     return pick_and_place(hand, name, lambda: simulator.pose(where)[0] + [*offset[:2], up])
 
 
-def libero_expert(world: World, task: str) -> Callable[[], np.ndarray]:
+def libero_expert(environment: Environment, task: str) -> Callable[[], np.ndarray]:
     """The expert of a task; it plans at its first call, when the episode has begun.
 
     Raises:
         InputError: there is none for this task.
     """
-    assert isinstance(world, LiberoWorld)
+    assert isinstance(environment, LiberoEnvironment)
     if task.split("/")[0] not in SUITES or task == UNSOLVED:
         known = f"{', '.join(SUITES)}, except {UNSOLVED}"
         raise InputError("env.task", task, f"scripted experts exist for {known}; name other tasks")
@@ -251,7 +251,7 @@ def libero_expert(world: World, task: str) -> Callable[[], np.ndarray]:
 
     def act() -> np.ndarray:
         if not actions:
-            actions.append(script(world.simulator))
+            actions.append(script(environment.simulator))
         return next(actions[0])
 
     return act

@@ -33,10 +33,10 @@ from accerl_lerobot import errors, guardian
 from accerl_lerobot.config.parsing import imported
 from accerl_lerobot.config.ranges import Range, Section, Share
 from accerl_lerobot.console import Console
-from accerl_lerobot.envs import make_world
-from accerl_lerobot.envs.base import EnvConfig, World, WorldSpec
+from accerl_lerobot.envs import make_environment
+from accerl_lerobot.envs.base import EnvConfig, Environment, EnvironmentSpec
 from accerl_lerobot.envs.metaworld import MetaWorld, expert_name
-from accerl_lerobot.envs.simulated import SimulatedWorld
+from accerl_lerobot.envs.simulated import SimulatedEnvironment
 from accerl_lerobot.errors import InputError, check_absent, expanded
 from accerl_lerobot.experience import ENVIRONMENT_STATE, REWARD, SUCCESS
 from accerl_lerobot.seeds import demo_seed
@@ -51,7 +51,7 @@ MOST_PROCESSES = 8  # a container may see more cores than it has
 _VERSIONS = {name: name for name in ("lerobot", "metaworld", "robosuite", "mujoco", "numpy")}
 _VERSIONS |= {"libero": "hf-libero"}  # module → distribution
 
-Expert = Callable[[], np.ndarray]  # gives the next action for the state its world is in
+Expert = Callable[[], np.ndarray]  # gives the next action for the state its environment is in
 
 _DRIFT_MEMORY = 0.9
 _DRIFT_SCALE = 0.5
@@ -63,7 +63,7 @@ class Episode:
     """One recorded episode; every array has one row per env step."""
 
     observations: dict[str, np.ndarray]  # before each step, under LeRobot's names
-    actions: np.ndarray  # float32 (T, A), as executed: noise included, clipped to the world's bounds
+    actions: np.ndarray  # float32 (T, A), as executed: noise included, clipped to the environment's bounds
     rewards: np.ndarray
     task: str
     done: bool
@@ -78,21 +78,21 @@ class Episode:
         return len(self.rewards)
 
 
-def make_expert(config: EnvConfig, world: World, task: str) -> Expert:
+def make_expert(config: EnvConfig, environment: Environment, task: str) -> Expert:
     """The scripted expert of `task`, reading the simulator's own state."""
     if config.expert is None:
         names = ", ".join(name for name, kind in config.get_known_choices().items() if kind.expert)
         raise InputError("env.type", config.type, f"scripted experts exist for: {names}")
-    expert: Expert = imported(config.expert)(world, task)
+    expert: Expert = imported(config.expert)(environment, task)
     return expert
 
 
-def played(world: World, task: str, seed: int, actions: Iterable[np.ndarray]) -> Episode:
+def played(environment: Environment, task: str, seed: int, actions: Iterable[np.ndarray]) -> Episode:
     """Plays actions, float32 (A,), until they or the episode end; each is asked for when it is its turn."""
-    observation, done, success_at = world.reset(seed, task), False, -1
+    observation, done, success_at = environment.reset(seed, task), False, -1
     seen, executed, rewards = [], [], []
     for action in actions:
-        result = world.step_chunk(action[None])
+        result = environment.step_chunk(action[None])
         seen.append(observation)
         executed.append(action)
         rewards.append(result.rewards[0])
@@ -113,7 +113,7 @@ def played(world: World, task: str, seed: int, actions: Iterable[np.ndarray]) ->
 
 
 def disturbed(
-    expert: Expert, spec: WorldSpec, seed: int, *, noise: float, push: float, fail: bool
+    expert: Expert, spec: EnvironmentSpec, seed: int, *, noise: float, push: float, fail: bool
 ) -> Iterator[np.ndarray]:
     """Actions of an expert, without end; equal arguments give equal ones.
 
@@ -134,26 +134,26 @@ def disturbed(
         yield np.clip(wanted + noise * rng.standard_normal(len(wanted)), low, high).astype(np.float32)
 
 
-def metaworld_expert(world: World, task: str) -> Expert:
+def metaworld_expert(environment: Environment, task: str) -> Expert:
     """MetaWorld's own policy for the task."""
     from metaworld import policies
 
-    assert isinstance(world, MetaWorld)
+    assert isinstance(environment, MetaWorld)
     policy = getattr(policies, expert_name(task))()
-    return lambda: policy.get_action(world.simulator.everything())
+    return lambda: policy.get_action(environment.simulator.everything())
 
 
-def simulated_expert(world: World, task: str) -> Expert:
+def simulated_expert(environment: Environment, task: str) -> Expert:
     """Holds the action that solves the episode."""
-    assert isinstance(world, SimulatedWorld)
-    return lambda: world.solution
+    assert isinstance(environment, SimulatedEnvironment)
+    return lambda: environment.solution
 
 
-def check_instruction(spec: WorldSpec, env_config: EnvConfig) -> None:
+def check_instruction(spec: EnvironmentSpec, env_config: EnvConfig) -> None:
     """Refuses to record without an instruction where ``env.task`` is its text."""
     if not any(spec.instructions) and getattr(env_config, "task", None) == "":
-        remedy = "each frame of a dataset has an instruction, and the environment names none; give its text"
-        raise InputError("env.task", "", f"{remedy}, such as --env.task='Reach the goal'")
+        hint = "each frame of a dataset has an instruction, and the environment names none; give its text"
+        raise InputError("env.task", "", f"{hint}, such as --env.task='Reach the goal'")
 
 
 def check_free(root: str) -> Path:
@@ -240,7 +240,7 @@ def simulated[Item, Result](
     each = len(getattr(env_config, "tasks", ("one",))) * SIMULATOR_GIB.get(env_config.type, 0.1)
     cores, fitting = len(os.sched_getaffinity(0)), (memory_gib("MemAvailable") or math.inf) / each
     processes, left = max(1, int(min(cores, MOST_PROCESSES, len(items), fitting))), iter(items)
-    with simulators(processes, _open_world, env_config) as pool:
+    with simulators(processes, _open_environment, env_config) as pool:
         first = itertools.islice(left, 2 * processes)
         waiting = collections.deque(pool.submit(_with_warnings, work, item) for item in first)
 
@@ -255,24 +255,28 @@ def simulated[Item, Result](
         yield results()
 
 
-_world: World
+_environment: Environment
 
 
-def _open_world(env_config: EnvConfig) -> None:
-    global _world
+def _open_environment(env_config: EnvConfig) -> None:
+    global _environment
     # The experts' gains are too high on purpose, and `disturbed` clips.
     warnings.filterwarnings("ignore", message="Constant.s. may be too high", category=UserWarning)
-    _world = make_world(env_config)
+    _environment = make_environment(env_config)
 
 
-def this_world() -> World:
-    """The world that a process of `simulated` has for all its episodes."""
-    return _world
+def this_environment() -> Environment:
+    """The environment that a process of `simulated` has for all its episodes."""
+    return _environment
 
 
 @contextmanager
 def new_dataset(
-    root: Path, repo_id: str, spec: WorldSpec, env_config: EnvConfig, more: Mapping[str, Any] | None = None
+    root: Path,
+    repo_id: str,
+    spec: EnvironmentSpec,
+    env_config: EnvConfig,
+    more: Mapping[str, Any] | None = None,
 ) -> Iterator[Any]:
     """A LeRobotDataset to be filled, with `more` features; complete when the context has been left."""
     from datasets.utils.logging import disable_progress_bar
@@ -311,7 +315,7 @@ class DemosConfig(Section, section="demos"):
     """Share of episodes that drift at random from early on and fail; for success and world models. Without a
     push, other episodes that fail are tried again with another seed."""
     shifted: bool = False
-    """Apply ``env.shift`` to the demonstrations too; otherwise they show the world without it."""
+    """Apply ``env.shift`` to the demonstrations too; otherwise they show the environment without it."""
 
 
 def record_demos(
@@ -327,12 +331,12 @@ def record_demos(
     folder, console = check_free(root), console or Console()
     if not config.shifted:
         env_config = env_config.nominal()
-    world = make_world(env_config)
-    spec = world.spec
+    environment = make_environment(env_config)
+    spec = environment.spec
     check_instruction(spec, env_config)
     for task in spec.tasks:
-        make_expert(env_config, world, task)  # refuses a task without an expert before any work
-    world.close()
+        make_expert(env_config, environment, task)  # refuses a task without an expert before any work
+    environment.close()
     tally = {"episodes": 0, "frames": 0, "successes": 0, "discarded": 0}
     record = partial(_record_one, env_config, config, seed)
     with appearing(folder) as unfinished:
@@ -376,8 +380,8 @@ def save_episode(
     tally["successes"] += episode.success
 
 
-def features(spec: WorldSpec, environment_state: int) -> dict[str, dict[str, Any]]:
-    """LeRobot's feature table for a world; reward, done and success under LeRobot's own names.
+def features(spec: EnvironmentSpec, environment_state: int) -> dict[str, dict[str, Any]]:
+    """LeRobot's feature table for an environment; reward, done and success under LeRobot's own names.
 
     `environment_state` is the size of its ``observation.environment_state``; 0: it offers none.
     """
@@ -398,14 +402,19 @@ def features(spec: WorldSpec, environment_state: int) -> dict[str, dict[str, Any
 
 def _record_one(env_config: EnvConfig, config: DemosConfig, seed: int, slot: int) -> tuple[Episode, int]:
     """The episode at place `slot` of the dataset, and how many tries were thrown away for it."""
-    world = this_world()
-    tasks, share = world.spec.tasks, config.failure_share
+    environment = this_environment()
+    tasks, share = environment.spec.tasks, config.failure_share
     task, rank = tasks[slot % len(tasks)], slot // len(tasks)
     fail = math.floor((rank + 1) * share) > math.floor(rank * share)
     for attempt in range(_MAX_TRIES):
-        own, expert = demo_seed(seed, slot + attempt * _MAX_EPISODES), make_expert(env_config, world, task)
-        actions = disturbed(expert, world.spec, own, noise=config.action_noise, push=config.push, fail=fail)
-        episode = played(world, task, own, actions)
+        own, expert = (
+            demo_seed(seed, slot + attempt * _MAX_EPISODES),
+            make_expert(env_config, environment, task),
+        )
+        actions = disturbed(
+            expert, environment.spec, own, noise=config.action_noise, push=config.push, fail=fail
+        )
+        episode = played(environment, task, own, actions)
         if episode.success != fail or (config.push and not fail):
             return episode, attempt
     raise InputError(

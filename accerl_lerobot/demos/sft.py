@@ -23,7 +23,7 @@ from typing import Annotated, Any, Literal
 
 from accerl_lerobot import errors
 from accerl_lerobot.checkpoint.layout import CHECKPOINTS, LAST, PRETRAINED, displaced, relocate
-from accerl_lerobot.checkpoint.safety import Origin, read_json
+from accerl_lerobot.checkpoint.safety import FileSource, read_json
 from accerl_lerobot.config.parsing import as_text
 from accerl_lerobot.config.ranges import Commit, DatasetConfig, LearningRate, Range, Section, Steps, Threads
 from accerl_lerobot.demos.backbone import BackboneConfig, Sizes, write_backbone
@@ -87,7 +87,9 @@ def sft_command(
     """The ``lerobot-train`` command line of this warm start; `episodes`: see `picked`."""
     policy: dict[str, Any]
     if config.init_path is not None:
-        stored = read_json(Path(config.init_path) / "config.json", Origin("sft.init_path", config.init_path))
+        stored = read_json(
+            Path(config.init_path) / "config.json", FileSource("sft.init_path", config.init_path)
+        )
         policy, kind = {"path": config.init_path}, str(stored.get("type"))
     else:
         policy, kind = dict(config.policy), str(config.policy["type"])
@@ -215,8 +217,8 @@ def picked(dataset: DatasetConfig, pick: str) -> list[int] | None:
 
     meta = open_metadata(dataset)
     if not {SUCCESS, REWARD} & set(meta.features):
-        remedy = f"the dataset's episodes are not labelled by {SUCCESS} or {REWARD}; use all"
-        raise InputError("sft.pick", pick, remedy)
+        hint = f"the dataset's episodes are not labelled by {SUCCESS} or {REWARD}; use all"
+        raise InputError("sft.pick", pick, hint)
     with opened(dataset, meta) as data:
         labels = read_labels(data, dataset, one_task=False)
     wanted = [episode.index for episode in labels if episode.success is (pick == "successes")]

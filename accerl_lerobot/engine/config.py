@@ -72,20 +72,20 @@ class LaunchConfig(Section, section="launch"):
         if self.engine == "local":
             for name, default in (("schedule", ASYNCHRONOUS), ("address", None), ("placement", {})):
                 if (value := getattr(self, name)) != default:
-                    remedy = "launch.engine=local is one process; leave it out"
-                    raise InputError(f"launch.{name}", value, remedy)
+                    hint = "launch.engine=local is one process; leave it out"
+                    raise InputError(f"launch.{name}", value, hint)
         for role, nodes in self.placement.items():
             if role not in ROLES or not nodes.strip():
-                remedy = f"use one of {', '.join(ROLES)}, and a node's number, a resource, or all"
-                raise InputError(f"launch.placement.{role}", nodes, remedy)
+                hint = f"use one of {', '.join(ROLES)}, and a node's number, a resource, or all"
+                raise InputError(f"launch.placement.{role}", nodes, hint)
         if self.address is not None and self.address != "auto":
             host, _, port = self.address.rpartition(":")
             if not host or not port.isdecimal() or not 0 < int(port) < 65536:
-                remedy = "use HOST:PORT as ray start --head prints it, or auto"
-                raise InputError("launch.address", self.address, remedy)
+                hint = "use HOST:PORT as ray start --head prints it, or auto"
+                raise InputError("launch.address", self.address, hint)
         if self.address is None and not {"0"}.issuperset(self.placement.values()):
-            remedy = "a private Ray has one node; add --launch.address=auto, or leave the field out"
-            raise InputError("launch.placement", self.placement, remedy)
+            hint = "a private Ray has one node; add --launch.address=auto, or leave the field out"
+            raise InputError("launch.placement", self.placement, hint)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,46 +155,46 @@ class RunConfig(Section):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.policy.path is not None and self.sft.steps:
-            remedy = "add --sft.steps=0 to improve this checkpoint, or fine-tune it first with sft.init_path"
-            raise InputError("policy.path", self.policy.path, remedy)
+            hint = "add --sft.steps=0 to improve this checkpoint, or fine-tune it first with sft.init_path"
+            raise InputError("policy.path", self.policy.path, hint)
         if self.world_model is not None and not isinstance(self.algorithm, ChunkCriticConfig):
-            remedy = (
+            hint = (
                 f"algorithm.type={self.algorithm.type} has no use for it; use chunk_critic, or leave it out"
             )
-            raise InputError("world_model.type", self.world_model.type, remedy)
+            raise InputError("world_model.type", self.world_model.type, hint)
         if isinstance(self.algorithm, OffPolicyConfig):
             self._check_off_policy()
         if (held := self.trainer.hold_back) >= self.replay.max_lag:
-            remedy = f"use more than trainer.hold_back, {held}, or all is thrown away as too old"
-            raise InputError("replay.max_lag", self.replay.max_lag, remedy)
+            hint = f"use more than trainer.hold_back, {held}, or all is thrown away as too old"
+            raise InputError("replay.max_lag", self.replay.max_lag, hint)
         counts = {"inference.workers": self.inference.workers, "trainer.ranks": self.trainer.ranks}
         for name, count in counts.items():
             if count > 1 and self.launch.engine == "local":
-                remedy = "launch.engine=local is one process; use launch.engine=ray, or 1"
-                raise InputError(name, count, remedy)
+                hint = "launch.engine=local is one process; use launch.engine=ray, or 1"
+                raise InputError(name, count, hint)
         if self.inference.workers > self.rollout.workers:
-            remedy = f"use at most rollout.workers, {self.rollout.workers}, or some have nobody to answer"
-            raise InputError("inference.workers", self.inference.workers, remedy)
+            hint = f"use at most rollout.workers, {self.rollout.workers}, or some have nobody to answer"
+            raise InputError("inference.workers", self.inference.workers, hint)
         batch, length = self.trainer.batch_decisions, self.rollout.segment_length
         if self.trainer.updates:
             # `engine.imagination` checks that a whole imagined rollout fits too.
             self.replay.check(batch_decisions=batch, segment_decisions=length)
         share = self.imagination.share
         if share and not 0 < round(share * batch) < batch:
-            remedy = f"that is {round(share * batch)} of the trainer.batch_decisions={batch}; leave both some"
-            raise InputError("imagination.share", share, remedy)
+            hint = f"that is {round(share * batch)} of the trainer.batch_decisions={batch}; leave both some"
+            raise InputError("imagination.share", share, hint)
         if self.launch.schedule != ASYNCHRONOUS and (share or self.rollout.episodes):
-            remedy = "use asynchronous, or leave out imagination.share and rollout.episodes"
-            raise InputError("launch.schedule", self.launch.schedule, remedy)
+            hint = "use asynchronous, or leave out imagination.share and rollout.episodes"
+            raise InputError("launch.schedule", self.launch.schedule, hint)
 
     def _check_off_policy(self) -> None:
         """A memory of its own stands for replay's reuse, and holds whole real episodes."""
         if isinstance(self.world_model, SimulatorStateConfig) and not self.env.tells_state:
             offered = getattr(self.env, "environment_state", None)
-            remedy = "use latent"
+            hint = "use latent"
             if offered is not None:
-                remedy = "add --env.environment_state=" + ("true" if offered is False else "'[KEY, …]'")
-            why = f"env.type={self.env.type} tells no state here; {remedy}"
+                hint = "add --env.environment_state=" + ("true" if offered is False else "'[KEY, …]'")
+            why = f"env.type={self.env.type} tells no state here; {hint}"
             raise InputError("world_model.type", "simulator", why)
         only = f"algorithm.type={self.algorithm.type}"
         for name, value, wanted, why in (

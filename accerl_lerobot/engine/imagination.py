@@ -25,8 +25,8 @@ from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE, WORLD_MODEL
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.preflight import policy_to_be
-from accerl_lerobot.envs import make_world
-from accerl_lerobot.envs.base import WorldSpec
+from accerl_lerobot.envs import make_environment
+from accerl_lerobot.envs.base import EnvironmentSpec
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.fault_points import fault_point
@@ -54,18 +54,20 @@ SWAP_S = 30.0  # largest wait of a checkpoint for a promoted model to be taken o
 
 def make_imagination(config: RunConfig, on_segment: Callable[[Segment], object]) -> Imagination:
     """Builds the imagination of a run; its ``policy.path`` must be set."""
-    world, model, success = _load(config, load_lerobot_config(config.policy))
+    environment, model, success = _load(config, load_lerobot_config(config.policy))
     cost, seed = config.rollout.decision_cost, config.seed
-    return Imagination(model, success, world, config.imagination, on_segment, decision_cost=cost, seed=seed)
+    return Imagination(
+        model, success, environment, config.imagination, on_segment, decision_cost=cost, seed=seed
+    )
 
 
 def make_learner(config: RunConfig) -> OnlineLearner:
     """Builds the learner of a run's world model, which starts at the saved one."""
-    world, model, success = _load(config, load_lerobot_config(config.policy))
+    environment, model, success = _load(config, load_lerobot_config(config.policy))
     assert success is not None  # only an oracle has none
     roles = load_roles(Path(str(config.imagination.path)).expanduser(), IMAGINATION)
     known = load_datasets({LEARN: config.imagination.learn.dataset}, model.spec).get(LEARN, [])
-    longest = _longest(world, model.spec.chunk)
+    longest = _longest(environment, model.spec.chunk)
     settings = (config.imagination.learn, known, roles, longest, config.seed)
     return OnlineLearner(learned_part(model), success, *settings)
 
@@ -98,7 +100,7 @@ def _warn_of_failed(path: Path) -> None:
 
 def _load(
     config: RunConfig, policy: Any, *, first: bool = False
-) -> tuple[WorldSpec, WorldModel, SuccessPairsRewardModel | None]:
+) -> tuple[EnvironmentSpec, WorldModel, SuccessPairsRewardModel | None]:
     """The environment, and the models, which are checked to fit it and LeRobot's config of the policy.
 
     Files that nobody has loaded before are tried in a child process (`first`). Oracles have no success model.
@@ -113,42 +115,43 @@ def _load(
     if policy.n_obs_steps > 1:
         why = "the policy looks back so many env steps, and only one frame per decision is imagined; use a"
         raise InputError("policy.n_obs_steps", policy.n_obs_steps, f"{why} policy with 1, or no imagination")
-    with closing(make_world(config.env)) as environment:
-        world = environment.spec
+    with closing(make_environment(config.env)) as environment:
+        spec = environment.spec
     imagination.imagined_replay(config.replay).check(
-        batch_decisions=config.trainer.batch_decisions, segment_decisions=_longest(world, executed)
+        batch_decisions=config.trainer.batch_decisions, segment_decisions=_longest(spec, executed)
     )
-    judge = config.rollout.reward_model
+    success_model = config.rollout.reward_model
     if not imagination.needs_path:
-        return world, OracleModel(world, executed, lambda: make_world(config.env, reward_model=judge)), None
+        oracle = OracleModel(spec, executed, lambda: make_environment(config.env, reward_model=success_model))
+        return spec, oracle, None
     device = resolve_device(config.policy.device)
     path, package = Path(str(imagination.path)).expanduser(), imagination.discover_packages_path
     if first:
         rehearse_world_model(path, package, section=IMAGINATION)
     learned, success = load_world_model(path, package, section=IMAGINATION)
-    check_fit(learned.spec, world, executed)
+    check_fit(learned.spec, spec, executed)
     if first:  # the driver keeps off the GPU
-        return world, learned, success
+        return spec, learned, success
     success.config.device = str(device)
     success.to(device)
     model = learned.to(device)
-    return world, ShuffledModel(model) if imagination.model == "shuffled" else model, success
+    return spec, ShuffledModel(model) if imagination.model == "shuffled" else model, success
 
 
-def check_fit(spec: WorldModelSpec, world: WorldSpec, executed: int) -> None:
+def check_fit(spec: WorldModelSpec, environment: EnvironmentSpec, executed: int) -> None:
     """Refuses one that does not fit environment and policy, which executes so many actions per decision."""
-    field, again = f"{IMAGINATION}.path", "train one of this world"
-    if missing := [camera for camera in world.images if camera not in spec.cameras]:
-        why = f"the world shows this camera, the world model {spec.cameras!r}; {again}"
+    field, again = f"{IMAGINATION}.path", "train one of this environment"
+    if missing := [camera for camera in environment.images if camera not in spec.cameras]:
+        why = f"the environment shows this camera, the world model {spec.cameras!r}; {again}"
         raise InputError(field, missing[0], why)
     for name in ("state_dim", "action_dim", "fps"):
-        theirs, ours = getattr(spec, name), getattr(world, name)
+        theirs, ours = getattr(spec, name), getattr(environment, name)
         if theirs != ours:
-            why = f"is the world model's {name}, and the world's is {ours}; {again}"
+            why = f"is the world model's {name}, and the environment's is {ours}; {again}"
             raise InputError(field, theirs, why)
-    if spec.tasks and (others := [task for task in world.tasks if not _is_of(task, spec.tasks)]):
-        remedy = f"the world model is of {spec.tasks!r}; name these, or train one of it"
-        raise InputError("env.task", others[0], remedy)
+    if spec.tasks and (others := [task for task in environment.tasks if not _is_of(task, spec.tasks)]):
+        hint = f"the world model is of {spec.tasks!r}; name these, or train one of it"
+        raise InputError("env.task", others[0], hint)
     if spec.chunk != executed:
         why = f"env steps per prediction, and the policy executes {executed} actions per decision"
         raise InputError(field, spec.chunk, f"{why}; train one with world_model.chunk={executed}")
@@ -160,8 +163,8 @@ def _is_of(task: str, known: Sequence[str]) -> bool:
     return task in known or suite in known or (not number and any(k.startswith(f"{suite}/") for k in known))
 
 
-def _longest(world: WorldSpec, chunk: int) -> int:
-    return math.ceil(world.max_steps / chunk)
+def _longest(environment: EnvironmentSpec, chunk: int) -> int:
+    return math.ceil(environment.max_steps / chunk)
 
 
 class _Worker:
@@ -218,8 +221,8 @@ class _Worker:
     @contextmanager
     def _unchanging(self, patience_s: float) -> Iterator[None]:
         if not self._changing.acquire(timeout=patience_s):
-            remedy = "raise launch.stall_s if one takes that long"
-            raise TimeoutError(f"{self.step_name} has not ended for {patience_s:.0f} s or more; {remedy}")
+            hint = "raise launch.stall_s if one takes that long"
+            raise TimeoutError(f"{self.step_name} has not ended for {patience_s:.0f} s or more; {hint}")
         try:
             yield
         finally:
@@ -315,7 +318,7 @@ class ImaginationWorker(_Worker):
             self._core.swap(self._promoted.pop())
 
 
-class WorldLearningWorker(_Worker):
+class EnvironmentLearningWorker(_Worker):
     """The worker that trains the world model."""
 
     name, state_name = WORLD_LEARNING, "world_learner"

@@ -239,9 +239,9 @@ class RayEngine(Engine):
         stores = (c.replay, c.seed, imagined, c.rollout.episodes > 0, state, c.folder, timeline)
         self._replay = make("replay", ReplayWorker, 1000, *stores)
         if imagination.share:
-            from accerl_lerobot.engine.imagination import ImaginationWorker, WorldLearningWorker
+            from accerl_lerobot.engine.imagination import EnvironmentLearningWorker, ImaginationWorker
 
-            for kind in (ImaginationWorker, WorldLearningWorker)[: 1 + imagination.learns]:
+            for kind in (ImaginationWorker, EnvironmentLearningWorker)[: 1 + imagination.learns]:
                 self._imagining.append(make(kind.name, kind, 4, c, state, timeline))
         self._rollouts.start(plan)
         for worker, reference in [(w, w.actor.ready.remote()) for w in self._everyone()]:

@@ -19,7 +19,7 @@ from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import PRETRAINED, TRAINING_STATE, WEIGHTS, WORLD_MODEL
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.loop import Engine, Progress, Saved
-from accerl_lerobot.envs import make_world
+from accerl_lerobot.envs import make_environment
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, REAL, Request, Segment
 from accerl_lerobot.policies.config import Load, loader
@@ -28,7 +28,7 @@ from accerl_lerobot.replay.journal import EPISODES, Journal
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodePlans, EpisodeResult, RolloutRunner
 from accerl_lerobot.seeds import global_generators, restore_global_generators
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, WEIGHT_SYNC, open_clock
-from accerl_lerobot.trainer.batch import keeping
+from accerl_lerobot.trainer.batch import save_batch_if_not_finite
 from accerl_lerobot.transport.weights import PublishDelay
 from accerl_lerobot.world_model.config import IMAGINATION
 
@@ -78,11 +78,13 @@ class LocalEngine(Engine):
         self._episodes: list[EpisodeResult] = []
         self._training = False
         self._outbox: deque[Segment] = deque()
-        count = config.rollout.worlds * config.rollout.workers
-        worlds = [make_world(config.env, history, config.rollout.reward_model) for _ in range(count)]
+        count = config.rollout.environments * config.rollout.workers
+        environments = [
+            make_environment(config.env, history, config.rollout.reward_model) for _ in range(count)
+        ]
         self._plans = EpisodePlans(tasks, config.seed, config.rollout.episodes or None)
         self._runner = RolloutRunner(
-            worlds,
+            environments,
             lambda: self._plans.next(self._exploring),
             config.rollout,
             "local",
@@ -111,7 +113,7 @@ class LocalEngine(Engine):
         if self._exploring and self._replay.may_sample(n):
             segments = self._replay.sample(n, self._update.version, self._rng)
             if segments:
-                with keeping(self._config.folder, self._update, segments):
+                with save_batch_if_not_finite(self._config.folder, self._update, segments):
                     updates.append(self._update.step(segments) | {"update": float(self._update.version)})
                 self._publish()
         self._clock.enter(WAIT_IN)
@@ -156,8 +158,8 @@ class LocalEngine(Engine):
 
     def _restore(self, directory: Path) -> None:
         if not (directory / f"{LOCAL}.json").is_file():
-            remedy = "this run was asynchronous; resume it with launch.engine=ray"
-            raise InputError("launch.engine", "local", remedy)
+            hint = "this run was asynchronous; resume it with launch.engine=ray"
+            raise InputError("launch.engine", "local", hint)
         self._adapter.load_trainable(snapshot.load(directory / WEIGHTS))
         self._update.restore(snapshot.load(directory / "trainer"))
         self._replay.restore(snapshot.load(directory / "replay"))
@@ -184,7 +186,7 @@ class LocalEngine(Engine):
             if self._imagination is not None:
                 self._imagination.close()
         except Exception:
-            logger.exception("could not close all worlds")
+            logger.exception("could not close all environments")
 
     def _end(self, result: EpisodeResult) -> None:
         self._plans.ended(result)

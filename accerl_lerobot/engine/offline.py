@@ -95,11 +95,11 @@ def _check(config: OfflineRun, policy: Any, meta: Any) -> dict[str, tuple[int, .
     offered, renames = dataset_features(meta), config.policy.rename_map
     check_features(policy_features(policy), offered, renames, "policy.path", config.policy.path, "dataset")
     if policy.n_obs_steps > 1:
-        remedy = "it sees several env steps at once, which offline learning does not; use accerl sft"
-        raise InputError("policy.path", config.policy.path, remedy)
+        hint = "it sees several env steps at once, which offline learning does not; use accerl sft"
+        raise InputError("policy.path", config.policy.path, hint)
     if not {SUCCESS, REWARD} & set(meta.features):
-        remedy = f"its episodes are labelled neither by {SUCCESS} nor {REWARD}; use accerl sft"
-        raise InputError("dataset.repo_id", config.dataset.repo_id, remedy)
+        hint = f"its episodes are labelled neither by {SUCCESS} nor {REWARD}; use accerl sft"
+        raise InputError("dataset.repo_id", config.dataset.repo_id, hint)
     read = policy_features(policy).shapes.keys() | {ACTION}
     return {name: shape for name, shape in offered.shapes.items() if renames.get(name, name) in read}
 
@@ -131,8 +131,8 @@ def _remember(
         logger.warning("%s, the others are left out", left)
     counts = {"episodes": len(outcomes), "successes": sum(outcomes.values()), "decisions": len(update.memory)}
     if not len(update.imitable()) or (not counts["successes"] and len(set(totals.values())) < 2):
-        remedy = "none of its episodes is a success, or better than another; there is nothing to imitate"
-        raise InputError("dataset.repo_id", config.dataset.repo_id, remedy)
+        hint = "none of its episodes is a success, or better than another; there is nothing to imitate"
+        raise InputError("dataset.repo_id", config.dataset.repo_id, hint)
     console.say(f"{counts['episodes']} episodes, {counts['successes']} of them successes; "
                 f"{counts['decisions']} decisions")  # fmt: skip
     return counts

@@ -107,7 +107,7 @@ def this_machine() -> Node:
 def roles_of(config: RunConfig) -> list[Role]:
     """The roles of a run besides replay, in the order in which they are placed."""
     c = config
-    imagining = ["imagination"] * bool(c.imagination.share) + ["world learning"] * c.imagination.learns
+    imagining = ["imagination"] * bool(c.imagination.share) + ["world-model learning"] * c.imagination.learns
     workers = {
         "trainer": ["trainer", *(f"trainer rank {i}" for i in range(1, c.trainer.ranks))],
         "inference": numbered("inference", c.inference.workers),
@@ -126,8 +126,8 @@ def candidates(nodes: Sequence[Node], role: Role) -> list[Node]:
     if not chosen:
         names = sorted({name for node in nodes for name in node.resources if ":" not in name})
         known = f"numbers 0 to {len(nodes) - 1}" + (f" and resources {', '.join(names)}" if names else "")
-        remedy = f"no node of the cluster is called that; there are {known}"
-        raise InputError(f"{SECTION}.{role.name}", role.selector, remedy)
+        hint = f"no node of the cluster is called that; there are {known}"
+        raise InputError(f"{SECTION}.{role.name}", role.selector, hint)
     return chosen
 
 
@@ -156,10 +156,8 @@ def _sites(nodes: Sequence[Node], role: Role) -> list[Node]:
     if seeing == named or (role.selector == ALL and seeing):
         return seeing
     blind = next(node for node in named if node.unseen)
-    remedy = "which its workers read or write; share it under the same path, or leave the field out"
-    raise InputError(
-        f"{SECTION}.{role.name}", role.selector, f"{blind} does not see {blind.unseen}, {remedy}"
-    )
+    hint = "which its workers read or write; share it under the same path, or leave the field out"
+    raise InputError(f"{SECTION}.{role.name}", role.selector, f"{blind} does not see {blind.unseen}, {hint}")
 
 
 def _gpu_shares(roles: list[Role], sites: dict[str, list[Node]], config: RunConfig) -> dict[str, float]:
@@ -172,8 +170,8 @@ def _gpu_shares(roles: list[Role], sites: dict[str, list[Node]], config: RunConf
     for here, group in groups.items():
         gpus = sum(node.gpus for node in here)
         if not gpus and config.policy.device.startswith("cuda") and any(node.number for node in here):
-            remedy = f"there is no GPU on {', '.join(map(str, here))}; use auto, cpu or other nodes"
-            raise InputError("policy.device", config.policy.device, remedy)
+            hint = f"there is no GPU on {', '.join(map(str, here))}; use auto, cpu or other nodes"
+            raise InputError("policy.device", config.policy.device, hint)
         others = sum(len(role.workers) for role in group if role.name != "trainer")
         share = 1 / math.ceil(others / gpus) if gpus and others else 0.0
         ranks = 0.0
@@ -190,11 +188,11 @@ def _take_gpu(sites: list[Node], free: dict[int, list[float]], share: float, rol
         if fitting := [i for i, rest in enumerate(left) if rest >= share - TINY]:
             left[min(fitting, key=lambda i: left[i])] -= share
             return node
-    remedy = (
+    hint = (
         f"{len(role.workers)} × {share:g} GPUs do not fit on {', '.join(map(str, sites))} beside others; "
         "name the same nodes for all of these, or nodes of their own"
     )
-    raise InputError(f"{SECTION}.{role.name}", role.selector, remedy)
+    raise InputError(f"{SECTION}.{role.name}", role.selector, hint)
 
 
 def place_workers(config: RunConfig) -> Plan:

@@ -27,11 +27,11 @@ from accerl_lerobot.checkpoint.safety import brief
 from accerl_lerobot.engine.sizes import check_disk, check_memory
 from accerl_lerobot.envs import (
     EnvConfig,
-    JudgedWorld,
+    EnvironmentSpec,
+    JudgedEnvironment,
     RewardModelConfig,
-    WorldSpec,
     environment_error,
-    make_world,
+    make_environment,
 )
 from accerl_lerobot.errors import InputError, causes, check_absent, expanded
 from accerl_lerobot.experience import Observation
@@ -72,23 +72,25 @@ SLOW_S = 30.0  # an environment that takes longer to reset, such as a robot, is 
 VISIBLE = 25  # levels of a pixel that rendering alone does not change
 
 
-def check_world(env: EnvConfig, reward_model: RewardModelConfig | None = None) -> WorldSpec:
+def check_environment(env: EnvConfig, reward_model: RewardModelConfig | None = None) -> EnvironmentSpec:
     """Build and reset an environment, so that what is wrong with it shows before anything long."""
-    with contextlib.closing(make_world(env, reward_model=reward_model)) as world:
-        task, began = world.spec.tasks[0], time.monotonic()
+    with contextlib.closing(make_environment(env, reward_model=reward_model)) as environment:
+        task, began = environment.spec.tasks[0], time.monotonic()
         try:
-            first = world.reset(0, task)
+            first = environment.reset(0, task)
             slow = time.monotonic() - began > SLOW_S
-            other, again = (first, first) if slow else (world.reset(1, task), world.reset(0, task))
+            other, again = (
+                (first, first) if slow else (environment.reset(1, task), environment.reset(0, task))
+            )
         except Exception as error:
             raise environment_error(env, error) from error
         if bad := nonfinite(first):
             raise InputError("env", task, f"{bad} of the first observation is not finite")
-        if isinstance(world, JudgedWorld):
-            world.succeeded(first)
+        if isinstance(environment, JudgedEnvironment):
+            environment.succeeded(first)
         if not slow:
             _compare_starts(first, other, again)
-        return world.spec
+        return environment.spec
 
 
 def _compare_starts(first: Observation, other: Observation, again: Observation) -> None:
@@ -115,7 +117,7 @@ def _same(one: np.ndarray | str, two: np.ndarray | str) -> bool:
     return one.shape == two.shape and np.allclose(one, two, rtol=1e-4, atol=1e-5)
 
 
-def check_policy(config: RunConfig, spec: WorldSpec, *, own: bool = False) -> int:
+def check_policy(config: RunConfig, spec: EnvironmentSpec, *, own: bool = False) -> int:
     """Refuse a checkpoint that does not fit the environment; returns how many env steps it is shown.
 
     Its files are not tried first if the run has done so, or written them itself (`own`).
@@ -134,8 +136,8 @@ def check_device(config: RunConfig) -> None:
     from accerl_lerobot.policies.loading import resolve_device
 
     if resolve_device(config.policy.device).index and config.launch.engine == "ray":
-        remedy = "Ray shows each worker its own GPU only; use cuda, and CUDA_VISIBLE_DEVICES to choose"
-        raise InputError("policy.device", config.policy.device, remedy)
+        hint = "Ray shows each worker its own GPU only; use cuda, and CUDA_VISIBLE_DEVICES to choose"
+        raise InputError("policy.device", config.policy.device, hint)
 
 
 def check_loss(algorithm: RatioConfig) -> None:
@@ -155,7 +157,7 @@ def check_loss(algorithm: RatioConfig) -> None:
         raise InputError("algorithm.type", algorithm.type, why) from error
 
 
-def check_start(config: RunConfig, say: Callable[[str], object] = str) -> tuple[WorldSpec, int]:
+def check_start(config: RunConfig, say: Callable[[str], object] = str) -> tuple[EnvironmentSpec, int]:
     """Refuse a run that could not begin, or whose outcome could not be used, as far as can be told; returns
     what the environment offers, and the policy's ``n_obs_steps``."""
     from accerl_lerobot.demos.dataset_files import open_metadata
@@ -163,8 +165,8 @@ def check_start(config: RunConfig, say: Callable[[str], object] = str) -> tuple[
     if config.output_dir is not None and not config.resume:
         check_absent(expanded(config.output_dir, "output_dir"))
     if config.policy.path is None and not config.sft.steps:
-        remedy = "give a LeRobot checkpoint, or sft.steps > 0 to make one; the recipe quickstart does"
-        raise InputError("policy.path", None, remedy)
+        hint = "give a LeRobot checkpoint, or sft.steps > 0 to make one; the recipe quickstart does"
+        raise InputError("policy.path", None, hint)
     check_device(config)
     if isinstance(config.algorithm, RatioConfig):
         check_loss(config.algorithm)
@@ -178,7 +180,7 @@ def check_start(config: RunConfig, say: Callable[[str], object] = str) -> tuple[
     say("looking at policy, environment and data …")
     policy = policy_to_be(config)
     check_memory(config)
-    spec = check_world(config.env, config.rollout.reward_model)
+    spec = check_environment(config.env, config.rollout.reward_model)
     off_policy = isinstance(config.algorithm, OffPolicyConfig)
     if off_policy:
         check_imitates(config.algorithm, config.policy, policy)
@@ -219,11 +221,11 @@ def check_state_model(config: RunConfig, policy: Any, decisions: int, say: Calla
     else:  # a new policy reads what is offered
         learns = not isinstance(model, SimulatorStateConfig)
     if learns and decisions < 2:
-        remedy = "an episode is one decision, after which nothing follows; lower policy.n_action_steps"
-        raise InputError("world_model.type", model.type, remedy)
+        hint = "an episode is one decision, after which nothing follows; lower policy.n_action_steps"
+        raise InputError("world_model.type", model.type, hint)
 
 
-def _check_remembered(dataset: DatasetConfig, spec: WorldSpec, meta: Any) -> None:
+def _check_remembered(dataset: DatasetConfig, spec: EnvironmentSpec, meta: Any) -> None:
     """Compare a dataset that joins the memory with the environment, and read its labels."""
     from accerl_lerobot.demos.dataset_files import opened
     from accerl_lerobot.demos.episodes import numbers, read_labels
@@ -235,7 +237,7 @@ def _check_remembered(dataset: DatasetConfig, spec: WorldSpec, meta: Any) -> Non
         check_actions(numbers(data, ACTION, dataset), spec, *about)
 
 
-def _say_if_unlike(config: RunConfig, spec: WorldSpec, meta: Any, history: int) -> bool:
+def _say_if_unlike(config: RunConfig, spec: EnvironmentSpec, meta: Any, history: int) -> bool:
     """Warn of a dataset that cannot be remembered, which is left out."""
     from accerl_lerobot.trainer.demonstrations import unlike
 
@@ -250,7 +252,11 @@ def _say_if_unlike(config: RunConfig, spec: WorldSpec, meta: Any, history: int) 
 
 
 def check_training_data(
-    sft: SFTConfig, dataset: DatasetConfig, policy: Any, spec: WorldSpec | None, rename_map: dict[str, str]
+    sft: SFTConfig,
+    dataset: DatasetConfig,
+    policy: Any,
+    spec: EnvironmentSpec | None,
+    rename_map: dict[str, str],
 ) -> Any:
     """Compare dataset, policy and environment of an SFT; returns the dataset's metadata, if there is one."""
     from accerl_lerobot.demos.dataset_files import open_metadata
@@ -326,7 +332,7 @@ def _check_values(
     meta: Any,
     needs: Features,
     renames: dict[str, str],
-    spec: WorldSpec | None,
+    spec: EnvironmentSpec | None,
 ) -> None:
     """Check statistics and numbers that a policy is trained on."""
     from lerobot.datasets.factory import IMAGENET_STATS
@@ -339,11 +345,11 @@ def _check_values(
     originals = {new: name for name, new in renames.items()}
     episodes = _extra_argument(sft, "dataset.episodes", [])
     if episodes and sft.pick != "all":
-        remedy = "--dataset.episodes in sft.extra_args names the episodes already; use sft.pick=all"
-        raise InputError("sft.pick", sft.pick, remedy)
+        hint = "--dataset.episodes in sft.extra_args names the episodes already; use sft.pick=all"
+        raise InputError("sft.pick", sft.pick, hint)
     if missing := [index for index in episodes if index not in range(meta.total_episodes)]:
-        remedy = f"--dataset.episodes: no episode {missing[0]}; the dataset has {meta.total_episodes} from 0"
-        raise InputError("sft.extra_args", sft.extra_args, remedy)
+        hint = f"--dataset.episodes: no episode {missing[0]}; the dataset has {meta.total_episodes} from 0"
+        raise InputError("sft.extra_args", sft.extra_args, hint)
     episodes = episodes or picked(dataset, sft.pick)
     read = {originals.get(name, name) for name in needs.shapes}
     shapes = {name: shape for name, shape in dataset_features(meta).shapes.items() if name in read}
@@ -373,8 +379,8 @@ def _extra_argument(sft: SFTConfig, name: str, default: Any) -> Any:
     except yaml.YAMLError:
         found = None
     if not isinstance(found, type(default)):
-        remedy = f"--{name} is {MEANINGS[name]}"
-        raise InputError("sft.extra_args", given[-1], remedy)
+        hint = f"--{name} is {MEANINGS[name]}"
+        raise InputError("sft.extra_args", given[-1], hint)
     return found
 
 
@@ -408,8 +414,8 @@ def check_wandb(config: WandBConfig) -> None:
     import wandb
 
     if not wandb.api.api_key:
-        remedy = "this machine is not logged in: run wandb login, or set WANDB_API_KEY or WANDB_MODE=offline"
-        raise InputError("wandb.enable", True, remedy)
+        hint = "this machine is not logged in: run wandb login, or set WANDB_API_KEY or WANDB_MODE=offline"
+        raise InputError("wandb.enable", True, hint)
 
 
 def check_imitates(algorithm: AlgorithmConfig, config: PolicyConfig, policy: Any) -> None:
@@ -418,11 +424,11 @@ def check_imitates(algorithm: AlgorithmConfig, config: PolicyConfig, policy: Any
 
     sampler = sampler_config(config, policy.type)
     if sampler.type not in ("flow", "gaussian"):
-        remedy = "use flow or gaussian, or another algorithm.type"
-        raise InputError("policy.sampler.type", sampler.type, f"algorithm.type={algorithm.type}: {remedy}")
+        hint = "use flow or gaussian, or another algorithm.type"
+        raise InputError("policy.sampler.type", sampler.type, f"algorithm.type={algorithm.type}: {hint}")
     if getattr(policy, "use_relative_actions", False):
-        remedy = f"algorithm.type={algorithm.type} keeps actions without the state they refer to"
-        raise InputError("policy.use_relative_actions", True, f"{remedy}; use another algorithm.type")
+        hint = f"algorithm.type={algorithm.type} keeps actions without the state they refer to"
+        raise InputError("policy.use_relative_actions", True, f"{hint}; use another algorithm.type")
 
 
 def policy_to_be(config: RunConfig) -> Any:
@@ -440,7 +446,7 @@ def policy_to_be(config: RunConfig) -> Any:
             if error.field not in ("policy.path", "policy.type", "policy.n_obs_steps"):
                 raise
             what = "" if error.field == "policy.path" else f"{error.field.partition('.')[2]}={error.value}: "
-            raise InputError("sft.init_path", start.path, what + error.remedy) from error
+            raise InputError("sft.init_path", start.path, what + error.hint) from error
     policy_config = check_sft_policy(config.sft)
     sampler_config(config.policy, config.sft.policy["type"], "sft.policy.type", "RL needs a likelihood: ")
     override(policy_config, config.policy)
@@ -459,13 +465,13 @@ def check_sft_policy(config: SFTConfig) -> Any:
     kind = config.policy["type"]
     names = policy_fields(kind, "sft.policy.type")
     if config.backbone is not None and "vlm_model_name" not in names:
-        remedy = f"{kind} has no vision-language backbone; leave the section out"
-        raise InputError("sft.backbone", config.backbone, remedy)
+        hint = f"{kind} has no vision-language backbone; leave the section out"
+        raise InputError("sft.backbone", config.backbone, hint)
     for key, value in fields.items():
         if key not in names:
             near = " or ".join(difflib.get_close_matches(key, names, n=3))
-            remedy = f"LeRobot's {kind} has no such field{f'; did you mean {near}?' if near else ''}"
-            raise InputError(f"sft.policy.{key}", value, remedy)
+            hint = f"LeRobot's {kind} has no such field{f'; did you mean {near}?' if near else ''}"
+            raise InputError(f"sft.policy.{key}", value, hint)
         check_size(key, value, f"sft.policy.{key}")
     try:
         # Without a device LeRobot looks for one.
@@ -483,17 +489,17 @@ def sft_policy(config: SFTConfig) -> Any:
         return check_sft_policy(config)
     from lerobot.configs.policies import PreTrainedConfig
 
-    from accerl_lerobot.checkpoint.safety import Origin, read_json
+    from accerl_lerobot.checkpoint.safety import FileSource, read_json
     from accerl_lerobot.policies.config import check_sizes, register_policies
     from accerl_lerobot.policies.untrusted import CONFIG, fetched_checkpoint, reason
 
     folder = fetched_checkpoint(config.init_path, None, "sft.init_path")
-    origin = Origin("sft.init_path", config.init_path)
+    origin = FileSource("sft.init_path", config.init_path)
     register_policies(str(read_json(folder / CONFIG, origin).get("type")))
     try:
         policy = PreTrainedConfig.from_pretrained(folder)
     except Exception as error:  # LeRobot takes the file at its word, and may fail over any of it
-        remedy = f"its config.json is not one of this LeRobot's policies ({reason(error)})"
-        raise InputError("sft.init_path", config.init_path, remedy) from error
+        hint = f"its config.json is not one of this LeRobot's policies ({reason(error)})"
+        raise InputError("sft.init_path", config.init_path, hint) from error
     check_sizes(policy, origin)
     return policy

@@ -127,8 +127,8 @@ def check_sockets(folder: str) -> None:
 def check_private() -> None:
     """Refuse to start a private Ray that others could use."""
     if not all(os.environ.get(key) for key in PRIVATE) or not any(os.environ.get(key) for key in _AUTH):
-        remedy = "start a new process, or call ray_session.prepare() before Ray is imported"
-        raise RuntimeError(f"Ray has been imported, and would be open to others if started now: {remedy}")
+        hint = "start a new process, or call ray_session.prepare() before Ray is imported"
+        raise RuntimeError(f"Ray has been imported, and would be open to others if started now: {hint}")
 
 
 def has_token() -> bool:
@@ -231,8 +231,8 @@ def _join(launch: LaunchConfig) -> None:
     from ray.exceptions import AuthenticationError
 
     if not has_token():
-        remedy = "there is no token; start the cluster with RAY_AUTH_MODE=token, and set RAY_AUTH_TOKEN_PATH"
-        raise InputError(FIELD, launch.address, remedy)
+        hint = "there is no token; start the cluster with RAY_AUTH_MODE=token, and set RAY_AUTH_TOKEN_PATH"
+        raise InputError(FIELD, launch.address, hint)
     check_cluster(launch)
     try:
         ray.init(
@@ -243,8 +243,8 @@ def _join(launch: LaunchConfig) -> None:
         )
     except (RuntimeError, ConnectionError, ValueError, AuthenticationError) as error:
         said = " ".join(str(error.__cause__ or error).split())[:300]
-        remedy = f"this process cannot join it; is one of its nodes on this machine? Ray says: {said}"
-        raise InputError(FIELD, launch.address, remedy) from error
+        hint = f"this process cannot join it; is one of its nodes on this machine? Ray says: {said}"
+        raise InputError(FIELD, launch.address, hint) from error
 
 
 def check_cluster(launch: LaunchConfig) -> None:
@@ -256,21 +256,21 @@ def check_cluster(launch: LaunchConfig) -> None:
             socket.create_connection((host.strip("[]"), int(port)), CONNECT_S).close()
         except OSError as error:
             why = error.strerror or error
-            remedy = f"nobody listens at {address} ({why}); is it what ray start --head printed?"
-            raise InputError(FIELD, address, remedy) from error
+            hint = f"nobody listens at {address} ({why}); is it what ray start --head printed?"
+            raise InputError(FIELD, address, hint) from error
     if (complaint := _complaint(address)) is not None:
         if any(word in complaint for word in UNAUTHORISED):
-            remedy = "it does not take the token that is configured here; see RAY_AUTH_TOKEN_PATH"
+            hint = "it does not take the token that is configured here; see RAY_AUTH_TOKEN_PATH"
         elif address == "auto" and "ConnectionError" in complaint:
-            remedy = "no cluster on this machine; give HOST:PORT, or start one with ray start --head"
+            hint = "no cluster on this machine; give HOST:PORT, or start one with ray start --head"
         else:
             last = (complaint.strip().splitlines() or ["no answer"])[-1][:200]
-            remedy = f"it does not answer as Ray does: {last}"
-        raise InputError(FIELD, address, remedy)
+            hint = f"it does not answer as Ray does: {last}"
+        raise InputError(FIELD, address, hint)
     if _complaint(address, without_token()) is None:
-        remedy = "it asks for no token, so whoever reaches it runs code in its workers; start it with "
-        remedy += "RAY_AUTH_MODE=token"
-        raise InputError(FIELD, address, remedy)
+        hint = "it asks for no token, so whoever reaches it runs code in its workers; start it with "
+        hint += "RAY_AUTH_MODE=token"
+        raise InputError(FIELD, address, hint)
 
 
 def _complaint(address: str, env: dict[str, str] | None = None) -> str | None:

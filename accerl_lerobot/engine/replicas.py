@@ -195,9 +195,9 @@ class Replicas[W: WorkerSlot](ABC):
 class RolloutSlot(WorkerSlot):
     """A rollout worker, and what its next process has to know; `budget`: exploring episodes left."""
 
-    def __init__(self, index: int, budget: int | None, worlds: int = 1) -> None:
+    def __init__(self, index: int, budget: int | None, environments: int = 1) -> None:
         super().__init__(f"rollout {index}")
-        self.index, self.budget, self._worlds = index, budget, worlds
+        self.index, self.budget, self._environments = index, budget, environments
         self.incarnation = 0  # grows with every process; part of its seeds and of its segments' keys
         self.outstanding: dict[tuple[str, int], EpisodePlan] = {}  # planned episodes without a result
         self.unsent: list[EpisodePlan] = []
@@ -225,16 +225,16 @@ class RolloutSlot(WorkerSlot):
         self.unsent += plans
 
     def start_timeout(self, limit: float) -> float:
-        """See the base class; its worlds are made one after the other."""
-        return max(START_S, limit * self._worlds)
+        """See the base class; its environments are made one after the other."""
+        return max(START_S, limit * self._environments)
 
     def hung(self, limit: float) -> str:
-        """Also a world that does not return."""
+        """Also an environment that does not return."""
         report: Report | None = self.told
         if (why := super().hung(limit if report else self.start_timeout(limit))) or report is None:
             return why
         if report.busy_s > limit:
-            what = "its world has not returned" if report.in_world else "it has done nothing"
+            what = "its environment has not returned" if report.in_environment else "it has done nothing"
             return f"{what} for {report.busy_s:.0f} s"
         return ""
 
@@ -246,12 +246,12 @@ class RolloutWorkers(Replicas[RolloutSlot]):
         self, config: RunConfig, tasks: tuple[str, ...], history: int, state: Path | None = None
     ) -> None:
         shares = enumerate(budgets(config.rollout))
-        super().__init__(config, [RolloutSlot(i, left, config.rollout.worlds) for i, left in shares])
+        super().__init__(config, [RolloutSlot(i, left, config.rollout.environments) for i, left in shares])
         self._tasks, self._history = tasks, history
         self._past: Counter[str] = Counter(restarts=0)  # counters of processes that have ended
         self._inference: list[Endpoint] = []
         self._replay: Endpoint | None = None
-        self.in_turn = False  # True if worlds wait for replay after each segment
+        self.in_turn = False  # True if environments wait for replay after each segment
         if state is not None:
             self._restore(state)
 
@@ -294,7 +294,7 @@ class RolloutWorkers(Replicas[RolloutSlot]):
 
     @property
     def moves(self) -> int:
-        """Resets and executed chunks of the worlds of today's processes."""
+        """Resets and executed chunks of the environments of today's processes."""
         return sum(worker.told.moves for worker in self._all if worker.told is not None)
 
     @property
@@ -312,12 +312,12 @@ class RolloutWorkers(Replicas[RolloutSlot]):
 
     def _restore(self, directory: Path) -> None:
         if not (directory / f"{ROLLOUT}.json").is_file():
-            remedy = "this run was in one process; resume it with launch.engine=local"
-            raise InputError("launch.engine", self._launch.engine, remedy)
+            hint = "this run was in one process; resume it with launch.engine=local"
+            raise InputError("launch.engine", self._launch.engine, hint)
         saved = snapshot.load(directory / ROLLOUT)
         if len(saved["slots"]) != len(self._all):
-            remedy = f"this run has {len(saved['slots'])}; leave the field out"
-            raise InputError("rollout.workers", len(self._all), remedy)
+            hint = f"this run has {len(saved['slots'])}; leave the field out"
+            raise InputError("rollout.workers", len(self._all), hint)
         self._past = Counter(saved["past"])
         for worker, was in zip(self._all, saved["slots"], strict=True):
             worker.incarnation, worker.budget = was["incarnation"] + 1, was["budget"]
@@ -386,7 +386,7 @@ class InferenceReplicas(Replicas[WorkerSlot]):
         return [self._serve(worker) for worker in self._all]
 
     def lock_step(self, in_turn: bool) -> None:
-        """Have each replica decide for all its worlds together, or not any more."""
+        """Have each replica decide for all its environments together, or not any more."""
         self._in_turn = in_turn
         for worker in self._all:
             self._lock(worker)
@@ -434,7 +434,7 @@ class InferenceReplicas(Replicas[WorkerSlot]):
     def _lock(self, worker: WorkerSlot) -> None:
         rollout = self._config.rollout
         clients = len(range(self._all.index(worker), rollout.workers, len(self._all)))
-        together = clients * rollout.worlds if self._in_turn else 0
+        together = clients * rollout.environments if self._in_turn else 0
         worker.call("lock_step", together, timeout=self._launch.stall_s)
 
     def _await_weights(self, worker: WorkerSlot, endpoint: Endpoint) -> None:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from accerl_lerobot.checkpoint import layout
-from accerl_lerobot.checkpoint.safety import Origin, check_folder, read_json
+from accerl_lerobot.checkpoint.safety import FileSource, check_folder, read_json
 from accerl_lerobot.config.parsing import consent_flags, consents, read_recipe
 from accerl_lerobot.config.ranges import Steps, check
 from accerl_lerobot.console import Console
@@ -67,13 +67,13 @@ def resumed_run(path: Path | None, config: RunConfig) -> tuple[Path, str]:
         directory, checkpoint = folders[2], folders[0].name
     if not (directory / layout.CONFIG).is_file() or not (directory / LOCK).is_file():
         raise InputError("config_path", str(path), f"no run has been begun there; {how}")
-    origin = Origin("config_path", str(path))
+    origin = FileSource("config_path", str(path))
     check_folder(directory, origin)
     before = decode(type(config), read_recipe(directory / layout.CONFIG))
     for name, (was, now) in _differences(encode(before), encode(config), "").items():
         if not any(name == free or name.startswith(f"{free}.") for free in CHANGEABLE):
-            remedy = f"the run was begun with {was!r}; leave it so, or begin a new run with --policy.path"
-            raise InputError(name, now, remedy)
+            hint = f"the run was begun with {was!r}; leave it so, or begin a new run with --policy.path"
+            raise InputError(name, now, hint)
     summary, checkpoints = directory / layout.SUMMARY, directory / layout.CHECKPOINTS
     newest = (checkpoints / checkpoint).resolve() == (checkpoints / layout.LAST).resolve()
     # From an earlier checkpoint there are updates left to make.
@@ -81,8 +81,8 @@ def resumed_run(path: Path | None, config: RunConfig) -> tuple[Path, str]:
         made: Any = read_json(summary, origin).get("updates")
         check(Steps, made, f"{summary}: updates")
         if made >= config.trainer.updates:
-            remedy = f"the run {directory} has made them, and has ended; ask for more"
-            raise InputError("trainer.updates", config.trainer.updates, remedy)
+            hint = f"the run {directory} has made them, and has ended; ask for more"
+            raise InputError("trainer.updates", config.trainer.updates, hint)
     return directory, checkpoint
 
 
@@ -143,9 +143,9 @@ def continued(config: RunConfig, directory: Path, checkpoint: Path) -> RunConfig
     # A folder of this machine has to be there; a Hub id is taken at its word.
     on_the_hub = path and not path.startswith((".", "/", "~", f"{layout.AWAY}/")) and path.count("/") <= 1
     if path is None or not (on_the_hub or Path(path).expanduser().is_dir()):
-        remedy = "the policy that this run began from is gone, and its low-rank adapters are of no other; "
-        remedy += f"put it back, or begin a new run with --policy.path={checkpoint / layout.PRETRAINED}"
-        raise InputError("policy.path", path, remedy)
+        hint = "the policy that this run began from is gone, and its low-rank adapters are of no other; "
+        hint += f"put it back, or begin a new run with --policy.path={checkpoint / layout.PRETRAINED}"
+        raise InputError("policy.path", path, hint)
     return improving(config, path)
 
 
@@ -168,7 +168,7 @@ def locked(directory: Path, field: str, in_use: str) -> Iterator[int]:
     """Keep other processes out of a folder, which is made if need be.
 
     Gives a file descriptor to hand to child processes that are to keep it locked. If another process has
-    locked it, the error names `field`, and `in_use` as the remedy.
+    locked it, the error names `field`, and `in_use` as the hint.
     """
     make_folder(directory, field, again=True)
     with (directory / LOCK).open("w") as file:

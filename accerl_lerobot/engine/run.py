@@ -6,7 +6,7 @@
 `train`, `resume`, `evaluate` and `load_policy` are the Python interface, imported from `accerl_lerobot`.
 Recording and Ray start processes that import the main module again, so a script calls `train` under
 ``if __name__ == "__main__":``. Progress goes to the standard error. A mistake in the settings raises
-`InputError` before any work begins: one line with the field, its value and the remedy.
+`InputError` before any work begins: one line with the field, its value and the hint.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from accerl_lerobot.engine import ray_session, resuming
 from accerl_lerobot.engine.config import RunConfig, encode, parse
 from accerl_lerobot.engine.loop import Engine, Loop, Times, run_plans
 from accerl_lerobot.engine.placement import check_placement
-from accerl_lerobot.engine.preflight import check_device, check_policy, check_start, check_world
+from accerl_lerobot.engine.preflight import check_device, check_environment, check_policy, check_start
 from accerl_lerobot.engine.sizes import check_memory
 from accerl_lerobot.engine.stopping import StoppedError, Stopping, WorkerError
 from accerl_lerobot.errors import (
@@ -62,7 +62,7 @@ from accerl_lerobot.timeline import RECOVERY, open_clock
 if TYPE_CHECKING:
     from accerl_lerobot.demos.sft import SFTConfig
     from accerl_lerobot.engine.ray_session import RaySession
-    from accerl_lerobot.envs import WorldSpec
+    from accerl_lerobot.envs import EnvironmentSpec
     from accerl_lerobot.policies.adapter import LeRobotAdapter
     from accerl_lerobot.policies.stock import StockAdapter
 
@@ -104,7 +104,7 @@ def start(
             directory = make_output_dir(config)
         console.say(f"run {directory}")
         how = resuming.resume_command(directory, config)
-        guardian.explain(remedy=printable(f"to resume: {how}"))
+        guardian.explain(hint=printable(f"to resume: {how}"))
         try:
             with (
                 redirect_stdout(sys.stderr),
@@ -134,7 +134,7 @@ def play_evaluation(config: RunConfig, console: Console, filmed: int = 0) -> lis
     with ray_session.opened(config.launch, now=True) as session:
         check_device(config)
         check_memory(config)
-        spec = check_world(config.env, config.rollout.reward_model)
+        spec = check_environment(config.env, config.rollout.reward_model)
         config = replace(config, policy=pinned(config.policy))
         history = check_policy(config, spec)
         # Nothing is learnt, whatever the recipe says.
@@ -233,7 +233,7 @@ def execute(
     wanted: str | None = None,
     load: Load | None = None,
     session: RaySession | None = None,
-    spec: WorldSpec | None = None,
+    spec: EnvironmentSpec | None = None,
 ) -> dict[str, Any]:
     """Do all phases and return the summary, which is also in ``summary.json``; `spec`: of a checked run."""
     started = time.monotonic()
@@ -245,7 +245,7 @@ def execute(
         config = resuming.continued(config, directory, checkpoint)
     if wanted is not None and load is None:
         spec, _ = check_start(config)
-    spec = spec or check_world(config.env)
+    spec = spec or check_environment(config.env)
     check_placement(replace(config, output_dir=str(directory)))
     if config.imagination.share:
         from accerl_lerobot.engine.imagination import check_imagination
@@ -329,7 +329,7 @@ class ActingPolicy:
 
         An observation has ``observation.images.<camera>`` uint8 (H, W, 3), ``observation.state`` float32 (S,)
         and ``task``, the instruction. For a policy with ``n_obs_steps`` above 1 each array begins with that
-        dimension, oldest first, as ``make_world(config, policy.history)`` gives them.
+        dimension, oldest first, as ``make_environment(config, policy.history)`` gives them.
         """
         self._decisions += 1
         seed = noise_seed(self._episode, self._decisions)

@@ -19,8 +19,8 @@ GIB = 2**30
 POLICY_PROCESS_GIB, ROLLOUT_PROCESS_GIB, RAY_GIB = 1.2, 0.4, 0.7
 SIMULATOR_GIB = {"metaworld": 0.17, "libero": 0.17}
 """Resident memory without a policy's weights, see `policy_gib`: a process with torch and LeRobot, a
-rollout process without its worlds, Ray's own processes, and, by type of environment, the simulator of one
-task with its renderers."""
+rollout process without its environments, Ray's own processes, and, by type of environment, the simulator of
+one task with its renderers."""
 ABSURD = 2  # times this machine's memory that a rough estimate may be; ``accerl doctor`` warns long before
 DISK_BYTES = 2**29  # disk space that demonstrations, checkpoints and videos take at least
 
@@ -33,13 +33,13 @@ def check_memory(config: RunConfig) -> None:
     parts = memory_parts_gib(config)
     needed, largest = sum(parts.values()), max(parts, key=lambda name: parts[name])
     if needed > ABSURD * total:
-        remedy = f"the run needs about {needed:,.0f} GiB of memory, this machine has {total:.0f}; lower it"
+        hint = f"the run needs about {needed:,.0f} GiB of memory, this machine has {total:.0f}; lower it"
         section, _, name = largest.partition(".")
-        raise InputError(largest, getattr(getattr(config, section), name), remedy)
+        raise InputError(largest, getattr(getattr(config, section), name), hint)
     if (need := policy_gib(config)) > total:
         text = f"its weights take {need:.1f} GiB in the processes of this run, this machine has {total:.1f}"
-        remedy = "use a smaller policy, a GPU, launch.engine=local or policy.tuning.mode=lora"
-        raise InputError("policy.path", config.policy.path, f"{text}; {remedy}")
+        hint = "use a smaller policy, a GPU, launch.engine=local or policy.tuning.mode=lora"
+        raise InputError("policy.path", config.policy.path, f"{text}; {hint}")
 
 
 def memory_parts_gib(config: RunConfig, history: int = 1) -> dict[str, float]:
@@ -48,7 +48,9 @@ def memory_parts_gib(config: RunConfig, history: int = 1) -> dict[str, float]:
 
     rollout, films, local = config.rollout, config.evaluation, config.launch.engine == "local"
     tasks = len(getattr(config.env, "tasks", ("one",)))
-    simulators = min(rollout.worlds * tasks, tasks + 2 * rollout.worlds)  # as shared by a process's worlds
+    simulators = min(
+        rollout.environments * tasks, tasks + 2 * rollout.environments
+    )  # as shared by a process's environments
     pictures = history * observation_bytes(config) / GIB
     loaded = 2 + config.trainer.ranks  # the driver, inference and the trainer each load torch
     imagination = config.imagination  # a second store, and one or two processes that load torch
@@ -59,7 +61,7 @@ def memory_parts_gib(config: RunConfig, history: int = 1) -> dict[str, float]:
         "trainer.ranks": POLICY_PROCESS_GIB if local else RAY_GIB + loaded * POLICY_PROCESS_GIB,
         "inference.workers": 0.0 if local else (config.inference.workers - 1) * POLICY_PROCESS_GIB,
         "rollout.workers": 0.0 if local else rollout.workers * ROLLOUT_PROCESS_GIB,
-        "rollout.worlds": rollout.workers * simulators * SIMULATOR_GIB.get(config.env.type, 0.0),
+        "rollout.environments": rollout.workers * simulators * SIMULATOR_GIB.get(config.env.type, 0.0),
         "rollout.segment_length": rollout.in_flight * pictures,
         "replay.capacity": config.replay.capacity * pictures,
         "algorithm.memory": config.remembered * pictures,
@@ -116,5 +118,5 @@ def check_disk(folder: str | None, field: str = "output_dir") -> None:
     while not path.exists():
         path = path.parent
     if (free := shutil.disk_usage(path).free) < DISK_BYTES:
-        remedy = f"{free / GIB:.2f} GiB are free on this disk, and {DISK_BYTES / GIB:.1f} are needed at least"
-        raise InputError(field, folder, f"{remedy}; make room or choose another")
+        hint = f"{free / GIB:.2f} GiB are free on this disk, and {DISK_BYTES / GIB:.1f} are needed at least"
+        raise InputError(field, folder, f"{hint}; make room or choose another")

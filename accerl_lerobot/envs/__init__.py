@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Worlds to act in: one contract, one config choice per world.
+"""Environments to act in: one contract, one config choice per environment.
 
-Importing this package loads no simulator; a world imports its own when it is made.
+Importing this package loads no simulator; an environment imports its own when it is made.
 """
 
 from __future__ import annotations
@@ -11,25 +11,27 @@ from importlib.metadata import PackageNotFoundError, metadata
 
 from accerl_lerobot.checkpoint.safety import brief
 from accerl_lerobot.config.parsing import discover, imported
-from accerl_lerobot.envs.base import ChunkResult, EnvConfig, HistoryWorld, World, WorldSpec
+from accerl_lerobot.envs.base import ChunkResult, EnvConfig, Environment, EnvironmentSpec, HistoryEnvironment
 from accerl_lerobot.envs.graphics import drawing_error, start_graphics
 from accerl_lerobot.envs.gym_env import GymConfig
 from accerl_lerobot.envs.lerobot_env import LeRobotEnvConfig
 from accerl_lerobot.envs.libero import LiberoConfig
 from accerl_lerobot.envs.metaworld import MetaWorldConfig
-from accerl_lerobot.envs.reward_model import JudgedWorld, RewardModelConfig, load_judge
+from accerl_lerobot.envs.reward_model import JudgedEnvironment, RewardModelConfig, load_judge
 from accerl_lerobot.envs.simulated import SimulatedConfig
 from accerl_lerobot.errors import InputError
 
 __all__ = [
-    "ChunkResult", "EnvConfig", "GymConfig", "HistoryWorld", "JudgedWorld", "LeRobotEnvConfig",
-    "LiberoConfig", "MetaWorldConfig", "RewardModelConfig", "SimulatedConfig", "World", "WorldSpec",
-    "environment_error", "make_world",
+    "ChunkResult", "EnvConfig", "GymConfig", "HistoryEnvironment", "JudgedEnvironment", "LeRobotEnvConfig",
+    "LiberoConfig", "MetaWorldConfig", "RewardModelConfig", "SimulatedConfig", "Environment",
+    "EnvironmentSpec", "environment_error", "make_environment",
 ]  # fmt: skip
 
 
-def make_world(config: EnvConfig, history: int = 1, reward_model: RewardModelConfig | None = None) -> World:
-    """Build the world that `config` describes.
+def make_environment(
+    config: EnvConfig, history: int = 1, reward_model: RewardModelConfig | None = None
+) -> Environment:
+    """Build the environment that `config` describes.
 
     An observation holds `history` env steps; above 1, arrays begin with that dimension. `reward_model` tells
     success, if it has a path.
@@ -37,12 +39,12 @@ def make_world(config: EnvConfig, history: int = 1, reward_model: RewardModelCon
     start_graphics()
     try:
         discover(config.discover_packages_path, "env")
-        world: World = imported(config.world)(config)
+        environment: Environment = imported(config.environment)(config)
     except Exception as error:
         raise environment_error(config, error) from error
     if reward_model is not None and reward_model.path is not None:
-        world = JudgedWorld(world, load_judge(reward_model))
-    return world if history == 1 else HistoryWorld(world, history)
+        environment = JudgedEnvironment(environment, load_judge(reward_model))
+    return environment if history == 1 else HistoryEnvironment(environment, history)
 
 
 def environment_error(config: EnvConfig, error: Exception) -> InputError:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The contract every world keeps, whatever simulator is behind it.
+"""The contract every environment keeps, whatever simulator is behind it.
 
-Episode limits, auto-reset and task text are ours, because simulators disagree on them: a world never resets
-itself, `terminated` means the task is over (bootstrap 0), `truncated` that only time ran out
+Episode limits, auto-reset and task text are ours, because simulators disagree on them: an environment never
+resets itself, `terminated` means the task is over (bootstrap 0), `truncated` that only time ran out
 (learning takes that as an end, too).
 """
 
@@ -29,18 +29,18 @@ from accerl_lerobot.seeds import EVAL_SEEDS
 
 
 @dataclass(frozen=True, kw_only=True)
-class WorldSpec:
-    """Sizes and features that a policy must fit to act in a world."""
+class EnvironmentSpec:
+    """Sizes and features that a policy must fit to act in an environment."""
 
     images: dict[str, tuple[int, int, int]]  # ``observation.images.<camera>`` → (H, W, 3)
     state_dim: int  # length of ``observation.state``
     action_dim: int
-    action_low: np.ndarray  # float32 (A,). Actions outside are clipped by the world.
+    action_low: np.ndarray  # float32 (A,). Actions outside are clipped by the environment.
     action_high: np.ndarray
     fps: int  # control rate in Hz
     labelled_fps: tuple[int, ...] = ()  # other rates that datasets of the environment name for the same
     max_steps: int  # episode limit in env steps; reaching it truncates
-    tasks: tuple[str, ...]  # names `World.reset` accepts
+    tasks: tuple[str, ...]  # names `Environment.reset` accepts
     instructions: tuple[str, ...] = ()
     """Text of each task, in the order of `tasks`; empty where the environment has none."""
 
@@ -66,16 +66,16 @@ class ChunkResult:
         return self.terminated or self.truncated
 
 
-class World(ABC):
+class Environment(ABC):
     """One environment instance.
 
     Example:
-        >>> world = make_world(MetaWorldConfig(task="drawer-open-v3"))
+        >>> environment = make_environment(MetaWorldConfig(task="drawer-open-v3"))
         >>> observation = world.reset(seed=3, task="drawer-open-v3")
         >>> result = world.step_chunk(np.zeros((10, 4), np.float32))
     """
 
-    spec: WorldSpec
+    spec: EnvironmentSpec
 
     @abstractmethod
     def reset(self, seed: int, task: str) -> Observation:
@@ -92,7 +92,7 @@ class World(ABC):
     def render(self, height: int, width: int) -> np.ndarray:
         """A frame for people, uint8 (height, width, 3); does not change the state."""
 
-    def close(self) -> None:  # noqa: B027 - most worlds hold nothing
+    def close(self) -> None:  # noqa: B027 - most environments hold nothing
         """Frees the simulator. Safe to call twice."""
 
 
@@ -107,8 +107,8 @@ class Step(NamedTuple):
     """False if the simulator diverged: the episode ends as truncated, and must not be trained on."""
 
 
-class EpisodeWorld(World):
-    """A world that is stepped one action at a time; counts steps and decides how an episode ends."""
+class EpisodeEnvironment(Environment):
+    """An environment that is stepped one action at a time; counts steps and decides how an episode ends."""
 
     _task = ""
     _steps = 0
@@ -134,10 +134,12 @@ class EpisodeWorld(World):
 
     def reset(self, seed: int, task: str) -> Observation:
         if task not in self.spec.tasks:
-            raise InputError("task", task, f"this world has: {', '.join(self.spec.tasks)}")
+            raise InputError("task", task, f"this environment has: {', '.join(self.spec.tasks)}")
         if not 0 <= seed < 2**32:
             raise InputError("seed", seed, "use 0 to 2**32 - 1")
-        self._done = True  # until the new episode stands: an error below leaves a world that must be reset
+        self._done = (
+            True  # until the new episode stands: an error below leaves an environment that must be reset
+        )
         self._begin(seed, task)
         self._task, self._steps, self._success, self._done = task, 0, False, False
         return self._observe()
@@ -169,8 +171,8 @@ class EpisodeWorld(World):
         )
 
 
-def checked_actions(actions: np.ndarray, spec: WorldSpec) -> np.ndarray:
-    """The chunk as float32 within the world's bounds; refuses other shapes than (K ≥ 1, A), and NaN."""
+def checked_actions(actions: np.ndarray, spec: EnvironmentSpec) -> np.ndarray:
+    """The chunk as float32 within the environment's bounds; refuses other shapes than (K ≥ 1, A), and NaN."""
     actions = np.asarray(actions, np.float32)
     if actions.ndim != 2 or len(actions) == 0 or actions.shape[1] != spec.action_dim:
         raise ValueError(f"actions have shape {actions.shape}; expected (K >= 1, {spec.action_dim})")
@@ -183,13 +185,14 @@ def checked_actions(actions: np.ndarray, spec: WorldSpec) -> np.ndarray:
 class EnvConfig(Section, draccus.ChoiceRegistry, section="env"):
     """Base of every environment config; subclasses register the name that ``--env.type`` takes."""
 
-    world: ClassVar[str]
-    """``module:class`` of the world, made from the config."""
+    environment: ClassVar[str]
+    """``module:class`` of the environment, made from the config."""
     named_by: ClassVar[str] = "type"
     """The field that names the environment."""
     expert: ClassVar[str | None] = None
-    """``module:function`` of the scripted expert for demonstrations: given a world and a task, it returns a
-    function whose every call is the action (A,) for the state that the world is in."""
+    """``module:function`` of the scripted expert for demonstrations: given an environment and a task, it
+    returns a
+    function whose every call is the action (A,) for the state that the environment is in."""
 
     discover_packages_path: str | None = field(
         default=None, metadata={"registers": True, "prepares": start_graphics}
@@ -232,8 +235,8 @@ def expand_tasks(text: str, groups: Mapping[str, Sequence[str]]) -> tuple[str, .
         if name not in groups and name not in tasks:
             close = difflib.get_close_matches(name, [*tasks, *groups], cutoff=0.4)
             hint = f"did you mean {' or '.join(close)}? " if close else ""
-            remedy = f"use names such as {next(iter(tasks))}, separated by commas, or of {', '.join(groups)}"
-            raise InputError("env.task", text, f"{name!r} is no task; {hint}{remedy}")
+            hint = f"use names such as {next(iter(tasks))}, separated by commas, or of {', '.join(groups)}"
+            raise InputError("env.task", text, f"{name!r} is no task; {hint}{hint}")
         found |= dict.fromkeys(groups.get(name, (name,)))
     return tuple(found)
 
@@ -260,8 +263,8 @@ class SuiteConfig(EnvConfig):
         if not self.cameras or len(set(self.cameras)) < len(self.cameras):
             raise InputError("env.camera", self.camera, "name each camera once, separated by commas")
         if unknown := [name for name in self.cameras if name not in self.CAMERAS]:
-            remedy = f"{unknown[0]!r} is none of: {', '.join(self.CAMERAS)}"
-            raise InputError("env.camera", self.camera, remedy)
+            hint = f"{unknown[0]!r} is none of: {', '.join(self.CAMERAS)}"
+            raise InputError("env.camera", self.camera, hint)
 
     @property
     def tasks(self) -> tuple[str, ...]:
@@ -280,9 +283,9 @@ class SuiteConfig(EnvConfig):
 
 def unit_spec(
     config: Any, images: Iterable[str], instruction: Callable[[str], str], state: int, action: int, fps: int
-) -> WorldSpec:
-    """Spec of a world whose images are squares and whose actions lie in [−1, 1]."""
-    return WorldSpec(
+) -> EnvironmentSpec:
+    """Spec of an environment whose images are squares and whose actions lie in [−1, 1]."""
+    return EnvironmentSpec(
         images=dict.fromkeys(images, (config.image_size, config.image_size, 3)),
         state_dim=state,
         action_dim=action,
@@ -295,16 +298,19 @@ def unit_spec(
     )
 
 
-_spare: dict[tuple[str, str], list[Any]] = defaultdict(list)  # simulators no world has, by config and task
+_spare: dict[tuple[str, str], list[Any]] = defaultdict(
+    list
+)  # simulators no environment has, by config and task
 
 
-class SuiteWorld(EpisodeWorld):
-    """A world of many tasks; simulators are kept, and shared by worlds that play the same tasks in turn."""
+class SuiteEnvironment(EpisodeEnvironment):
+    """An environment of many tasks; simulators are kept, and shared by environments that play the same tasks
+    in turn."""
 
     simulator: Any = None  # of the current task; for experts, not for policies
     _key = "", ""  # config and task of the simulator
 
-    def __init__(self, config: SuiteConfig, spec: WorldSpec) -> None:
+    def __init__(self, config: SuiteConfig, spec: EnvironmentSpec) -> None:
         self.config, self.spec = config, spec
 
     @abstractmethod
@@ -371,7 +377,7 @@ def lerobot_eval_arguments(env: Mapping[str, Any]) -> list[str]:
         usual = encoded_defaults(EnvConfig.get_choice_class(str(kind)))
         given = {name: value for name, value in env.items() if value != usual.get(name)}
         plugin = {"discover_packages_path": "accerl_lerobot.envs.lerobot_plugin", "type": "accerl"}
-        fields = plugin | {"world": json.dumps(given)}
+        fields = plugin | {"environment": json.dumps(given)}
         if package := given.get("discover_packages_path"):
             fields["world.discover_packages_path"] = package
     else:
@@ -380,48 +386,51 @@ def lerobot_eval_arguments(env: Mapping[str, Any]) -> list[str]:
     return [*(f"--env.{name}={shlex.quote(str(value))}" for name, value in fields.items()), seed]
 
 
-class WrappedWorld(World):
-    """Base of worlds that change what another one shows."""
+class WrappedEnvironment(Environment):
+    """Base of environments that change what another one shows."""
 
-    def __init__(self, world: World) -> None:
-        self._world, self.spec = world, world.spec
+    def __init__(self, environment: Environment) -> None:
+        self._environment, self.spec = environment, environment.spec
 
     def reset(self, seed: int, task: str) -> Observation:
-        return self._world.reset(seed, task)
+        return self._environment.reset(seed, task)
 
     def render(self, height: int, width: int) -> np.ndarray:
-        return self._world.render(height, width)
+        return self._environment.render(height, width)
 
     def close(self) -> None:
-        self._world.close()
+        self._environment.close()
 
 
-class HistoryWorld(WrappedWorld):
-    """A world whose observations hold its last states, in a dimension of `length` in front of each array.
+class HistoryEnvironment(WrappedEnvironment):
+    """An environment whose observations hold its last states, in a dimension of `length` in front of each
+    array.
 
     LeRobot's ``n_obs_steps`` counts env steps, not decisions, so the last states of a chunk are looked at one
     by one, those before them are not. An episode begins with copies of its first observation, as in LeRobot's
     queues; where one ends early, its last observation stands for those that were not looked at.
     """
 
-    def __init__(self, world: World, length: int) -> None:
-        super().__init__(world)
+    def __init__(self, environment: Environment, length: int) -> None:
+        super().__init__(environment)
         self._seen: deque[Observation] = deque(maxlen=length)
         self._length, self._left = length, 0
 
     def reset(self, seed: int, task: str) -> Observation:
-        self._seen.extend([self._world.reset(seed, task)] * self._length)
+        self._seen.extend([self._environment.reset(seed, task)] * self._length)
         self._left = self.spec.max_steps
         return self._observation()
 
     def step_chunk(self, actions: np.ndarray) -> ChunkResult:
         actions = checked_actions(actions, self.spec)
-        steps = min(len(actions), self._left) or len(actions)  # after the end, the world itself complains
+        steps = min(len(actions), self._left) or len(
+            actions
+        )  # after the end, the environment itself complains
         unseen = max(0, steps - self._length + 1)
         parts = ([actions[:unseen]] if unseen else []) + [actions[i : i + 1] for i in range(unseen, steps)]
         results: list[ChunkResult] = []
         for part in parts:
-            results.append(self._world.step_chunk(part))
+            results.append(self._environment.step_chunk(part))
             self._seen.append(results[-1].observation)
             if results[-1].done:
                 break

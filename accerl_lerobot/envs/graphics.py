@@ -55,7 +55,8 @@ def choose_backend() -> str | None:
 
 def start_graphics() -> None:
     """Set ``MUJOCO_GL`` to a backend that works here, unless it is set."""
-    # One software-rendering thread per world: several worlds then share the cores without fighting.
+    # One software-rendering thread per environment: several environments then share the cores without
+    # fighting.
     os.environ.setdefault("LP_NUM_THREADS", "1")
     if os.environ.get("MUJOCO_GL") or find_spec("mujoco") is None:
         return
@@ -88,8 +89,8 @@ def drawing_error(error: BaseException) -> InputError | None:
         return None
     given = os.environ.get("MUJOCO_GL", "")
     wrong = given and given.lower() not in _LIBRARIES and _headless()
-    remedy = _NO_DISPLAY if wrong else REMEDY
-    return InputError("MUJOCO_GL", given, f"the environment cannot draw ({brief(about)}); {remedy}")
+    hint = _NO_DISPLAY if wrong else REMEDY
+    return InputError("MUJOCO_GL", given, f"the environment cannot draw ({brief(about)}); {hint}")
 
 
 def new_renderer(model: Any, height: int, width: int) -> Any:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Any registered Gymnasium environment with continuous actions, with LeRobot's features.
 
-Also `GymnasiumWorld`, the base of all worlds that step environments of Gymnasium's interface.
-Importing this file loads no Gymnasium; making the world does.
+Also `GymnasiumEnvironment`, the base of all environments that step environments of Gymnasium's interface.
+Importing this file loads no Gymnasium; making the environment does.
 """
 
 from __future__ import annotations
@@ -18,7 +18,14 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 
 from accerl_lerobot.config.ranges import Range
-from accerl_lerobot.envs.base import IS_SUCCESS, ChunkResult, EnvConfig, EpisodeWorld, Step, WorldSpec
+from accerl_lerobot.envs.base import (
+    IS_SUCCESS,
+    ChunkResult,
+    EnvConfig,
+    EnvironmentSpec,
+    EpisodeEnvironment,
+    Step,
+)
 from accerl_lerobot.envs.graphics import close_at_exit
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Observation
@@ -53,12 +60,12 @@ class GymnasiumConfig(EnvConfig):
         super().__post_init__()
         if self.LIMIT in self.kwargs:
             limit = self.kwargs[self.LIMIT]
-            remedy = f"the limit of an episode is another field; use --env.max_steps={limit} in its place"
-            raise InputError(f"env.kwargs.{self.LIMIT}", limit, remedy)
+            hint = f"the limit of an episode is another field; use --env.max_steps={limit} in its place"
+            raise InputError(f"env.kwargs.{self.LIMIT}", limit, hint)
 
 
-class GymnasiumWorld(EpisodeWorld):
-    """A world that steps environments of Gymnasium's interface, one for each of its tasks."""
+class GymnasiumEnvironment(EpisodeEnvironment):
+    """An environment that steps environments of Gymnasium's interface, one for each of its tasks."""
 
     config: GymnasiumConfig
     ends_at_success: ClassVar[bool]
@@ -76,7 +83,7 @@ class GymnasiumWorld(EpisodeWorld):
         close_at_exit(self)
 
     @abstractmethod
-    def _look(self, observation: Observation) -> WorldSpec:
+    def _look(self, observation: Observation) -> EnvironmentSpec:
         """Learn sizes and features from a first observation."""
 
     def _processed(self, action: np.ndarray) -> np.ndarray:
@@ -144,7 +151,7 @@ class GymConfig(GymnasiumConfig):
     Keys of nested observations are joined by dots. An episode ends with its first success.
     """
 
-    world = "accerl_lerobot.envs.gym_env:GymWorld"
+    environment = "accerl_lerobot.envs.gym_env:GymEnvironment"
     named_by = "id"
     LIMIT = "max_episode_steps"
 
@@ -170,21 +177,21 @@ class GymConfig(GymnasiumConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.id or ":" in self.id:
-            remedy = "use a name of Gymnasium's registry, and env.discover_packages_path for its package"
-            raise InputError("env.id", self.id, remedy)
+            hint = "use a name of Gymnasium's registry, and env.discover_packages_path for its package"
+            raise InputError("env.id", self.id, hint)
 
     @functools.cached_property
     def state_size(self) -> int:
         """See the base class; only the environment knows, so it is made to ask."""
         if not self.environment_state:
             return 0
-        from accerl_lerobot.envs import make_world
+        from accerl_lerobot.envs import make_environment
 
-        with contextlib.closing(make_world(self)) as world:
-            return len(world.reset(0, self.id)[ENVIRONMENT_STATE])
+        with contextlib.closing(make_environment(self)) as environment:
+            return len(environment.reset(0, self.id)[ENVIRONMENT_STATE])
 
 
-class GymWorld(GymnasiumWorld):
+class GymEnvironment(GymnasiumEnvironment):
     """One Gymnasium environment."""
 
     config: GymConfig
@@ -199,10 +206,10 @@ class GymWorld(GymnasiumWorld):
             raise InputError("env.id", config.id, f"actions must be a bounded vector, they are {space}")
         super().__init__({config.id: env})
 
-    def _look(self, observation: Observation) -> WorldSpec:
+    def _look(self, observation: Observation) -> EnvironmentSpec:
         config, env = self.config, self.environments[self.config.id]
         space = env.action_space
-        return WorldSpec(
+        return EnvironmentSpec(
             images={f"observation.images.{name}": picture.shape for name, picture in self.pictures.items()},
             state_dim=len(observation["observation.state"]),
             action_dim=space.shape[0],
@@ -223,8 +230,8 @@ class GymWorld(GymnasiumWorld):
             env = self.environments[config.id]
             picture = one_picture(env.render()) if key == RENDER else _part(raw, key, "images")
             if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8:
-                remedy = f"{key} is {picture.dtype} {picture.shape}; an image is uint8 (H, W, 3)"
-                raise InputError("env.images", config.images, remedy)
+                hint = f"{key} is {picture.dtype} {picture.shape}; an image is uint8 (H, W, 3)"
+                raise InputError("env.images", config.images, hint)
             self.pictures[camera] = resized(picture, size, size) if size else picture.copy()
         observation |= {f"observation.images.{name}": picture for name, picture in self.pictures.items()}
         if config.environment_state:
@@ -250,13 +257,13 @@ def _made(config: GymConfig) -> Any:
     except gymnasium.error.VersionNotFound as error:
         raise InputError("env.id", config.id, str(error)) from error
     except gymnasium.error.UnregisteredEnv as error:
-        remedy = f"{error} Is env.discover_packages_path the package that registers it?"
-        raise InputError("env.id", config.id, remedy) from error
+        hint = f"{error} Is env.discover_packages_path the package that registers it?"
+        raise InputError("env.id", config.id, hint) from error
     except TypeError as error:
         if not any(f"unexpected keyword argument '{name}'" in str(error) for name in config.kwargs):
             raise
-        remedy = f"it takes {_arguments(config.id)} ({error})"
-        raise InputError("env.kwargs", config.kwargs, remedy) from error
+        hint = f"it takes {_arguments(config.id)} ({error})"
+        raise InputError("env.kwargs", config.kwargs, hint) from error
 
 
 def _arguments(name: str) -> str:

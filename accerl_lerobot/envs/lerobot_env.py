@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Any environment LeRobot can make, as a world.
+"""Any environment LeRobot can make, as an environment.
 
 LeRobot's environments disagree on autoreset, truncation and success, so this takes the single environment out
 of LeRobot's vector one and keeps episode limits itself. Observations and actions pass through LeRobot's own
 per-environment processors: a policy sees exactly what ``lerobot-eval`` would show it.
-Importing this file loads no LeRobot; making the world does.
+Importing this file loads no LeRobot; making the environment does.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from accerl_lerobot.envs.base import EnvConfig, WorldSpec
-from accerl_lerobot.envs.gym_env import GymnasiumConfig, GymnasiumWorld
+from accerl_lerobot.envs.base import EnvConfig, EnvironmentSpec
+from accerl_lerobot.envs.gym_env import GymnasiumConfig, GymnasiumEnvironment
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK, Observation
 
@@ -36,7 +36,7 @@ _INTERNAL = {"features", "features_map", "max_parallel_tasks", "disable_env_chec
 class LeRobotEnvConfig(GymnasiumConfig):
     """Which of LeRobot's environments, those of installed packages ``lerobot_env_*`` included."""
 
-    world = "accerl_lerobot.envs.lerobot_env:LeRobotWorld"
+    environment = "accerl_lerobot.envs.lerobot_env:LeRobotEnvironment"
     named_by = "name"
     LIMIT = _LIMIT
 
@@ -58,11 +58,11 @@ class LeRobotEnvConfig(GymnasiumConfig):
         if not self.name:
             raise InputError("env.name", self.name, "name one of LeRobot's environments, such as pusht")
         if self.name.startswith("libero"):
-            remedy = "LeRobot takes its starts in turn and not from the seed; use env.type=libero for LIBERO"
-            raise InputError("env.name", self.name, remedy)
+            hint = "LeRobot takes its starts in turn and not from the seed; use env.type=libero for LIBERO"
+            raise InputError("env.name", self.name, hint)
 
 
-class LeRobotWorld(GymnasiumWorld):
+class LeRobotEnvironment(GymnasiumEnvironment):
     """One of LeRobot's environments; a suite of several tasks has one simulator for each."""
 
     config: LeRobotEnvConfig
@@ -105,17 +105,17 @@ class LeRobotWorld(GymnasiumWorld):
                 vector.close()
         self._vectors, self.environments, self._done = {}, {}, True
 
-    def _look(self, observation: Observation) -> WorldSpec:
+    def _look(self, observation: Observation) -> EnvironmentSpec:
         images: dict[str, Any] = {k: np.shape(v) for k, v in observation.items() if k.startswith(_IMAGE)}
         if not images or _STATE not in observation:
             shown = ", ".join(k for k in observation if k != TASK) or "neither"
-            remedy = f"a policy needs images and a state, {self.config.name} shows {shown}"
+            hint = f"a policy needs images and a state, {self.config.name} shows {shown}"
             hint = self._fields
             if hasattr(self._lerobot_config, "obs_type"):
                 hint = "use obs_type=pixels_agent_pos"
-            raise InputError("env.kwargs", self.config.kwargs, f"{remedy}; {hint}")
+            raise InputError("env.kwargs", self.config.kwargs, f"{hint}; {hint}")
         space = self.environments[self._task].action_space
-        return WorldSpec(
+        return EnvironmentSpec(
             images=images, state_dim=len(observation[_STATE]), action_dim=space.shape[0],
             action_low=np.asarray(space.low, np.float32), action_high=np.asarray(space.high, np.float32),
             fps=int(self._lerobot_config.fps), max_steps=self.max_steps, tasks=tuple(self.environments),
@@ -150,17 +150,17 @@ class LeRobotWorld(GymnasiumWorld):
 def _check_hub(config: LeRobotEnvConfig, hub_path: str | None) -> None:
     """Refuses code from the Hub that nobody asked for, or whose version is not named."""
     if hub_path is None and config.trust_remote_code:
-        remedy = f"{config.name} is no environment on the Hub; leave it out"
-        raise InputError("env.trust_remote_code", True, remedy)
+        hint = f"{config.name} is no environment on the Hub; leave it out"
+        raise InputError("env.trust_remote_code", True, hint)
     if hub_path is None:
         return
     if not config.trust_remote_code:
-        remedy = f"{config.name} is code of {hub_path} on the Hub, which would run with your rights; read it,"
-        remedy += " then set this, and its commit in hub_path"
-        raise InputError("env.trust_remote_code", False, remedy)
+        hint = f"{config.name} is code of {hub_path} on the Hub, which would run with your rights; read it,"
+        hint += " then set this, and its commit in hub_path"
+        raise InputError("env.trust_remote_code", False, hint)
     if not _PINNED.fullmatch(hub_path) or ".." in hub_path:
-        remedy = "name a commit, owner/name@COMMIT or owner/name@COMMIT:file.py with 40 hexadecimal digits"
-        raise InputError("env.kwargs.hub_path", hub_path, f"{remedy}: branches can be moved to other code")
+        hint = "name a commit, owner/name@COMMIT or owner/name@COMMIT:file.py with 40 hexadecimal digits"
+        raise InputError("env.kwargs.hub_path", hub_path, f"{hint}: branches can be moved to other code")
 
 
 def _single_envs(vectors: dict[str, dict[int, Any]]) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
 from accerl_lerobot.config.ranges import Range
-from accerl_lerobot.envs.base import EnvConfig, SuiteConfig, SuiteWorld, unit_spec
+from accerl_lerobot.envs.base import EnvConfig, SuiteConfig, SuiteEnvironment, unit_spec
 from accerl_lerobot.envs.libero_simulator import FPS, NUMBERS, Simulator
 from accerl_lerobot.envs.libero_tasks import instruction, suites
 
@@ -35,7 +35,7 @@ class LiberoConfig(SuiteConfig):
     """
 
     expert = "accerl_lerobot.demos.libero_expert:libero_expert"
-    world = "accerl_lerobot.envs.libero:LiberoWorld"
+    environment = "accerl_lerobot.envs.libero:LiberoEnvironment"
     groups = staticmethod(suites)
     STATE_NUMBERS = NUMBERS
     CAMERAS = (*LEROBOT_NAMES, "frontview", "birdview", "sideview", "galleryview", "robot0_robotview")
@@ -69,7 +69,7 @@ class LiberoConfig(SuiteConfig):
             object.__setattr__(self, "max_steps", longest)
 
 
-class LiberoWorld(SuiteWorld):
+class LiberoEnvironment(SuiteEnvironment):
     """One LIBERO instance."""
 
     config: LiberoConfig

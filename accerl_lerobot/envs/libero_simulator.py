@@ -196,7 +196,8 @@ class Simulator:
         return np.concatenate([*arm, *fingers, points[1:].ravel(), openings, vectors, near])
 
     def pose(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Position (3,) and quaternion (4,), w first, of an object, a fixture or a region in the world."""
+        """Position (3,) and quaternion (4,), w first, of an object, a fixture or a region in the
+        environment."""
         if name in self.env.obj_body_id:
             body = self.env.obj_body_id[name]
             return self.data.xpos[body].copy(), self.data.xquat[body].copy()

@@ -33,8 +33,8 @@ def package() -> Path:
     """Folder of the installed ``libero.libero``, found without importing it: that would ask the terminal."""
     spec = find_spec("libero")
     if spec is None or not spec.submodule_search_locations:
-        remedy = "the package libero is not installed; pip install 'accerl-lerobot[libero]'"
-        raise InputError("env.type", "libero", remedy)
+        hint = "the package libero is not installed; pip install 'accerl-lerobot[libero]'"
+        raise InputError("env.type", "libero", hint)
     return Path(next(iter(spec.submodule_search_locations))) / "libero"
 
 

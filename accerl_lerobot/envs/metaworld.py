@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 
 from accerl_lerobot.config.ranges import Positive, Range, Section
-from accerl_lerobot.envs.base import EnvConfig, SuiteConfig, SuiteWorld, unit_spec
+from accerl_lerobot.envs.base import EnvConfig, SuiteConfig, SuiteEnvironment, unit_spec
 from accerl_lerobot.envs.graphics import import_mujoco, new_renderer
 
 if TYPE_CHECKING:
@@ -101,7 +101,7 @@ class MetaWorldConfig(SuiteConfig):
     """Which MetaWorld tasks, seen how."""
 
     expert = "accerl_lerobot.demos.record:metaworld_expert"
-    world = "accerl_lerobot.envs.metaworld:MetaWorld"
+    environment = "accerl_lerobot.envs.metaworld:MetaWorld"
     groups = staticmethod(groups)
     STATE_NUMBERS = 39
     CAMERAS = ("topview", "corner", "corner2", "corner3", "behindGripper", "gripperPOV")
@@ -126,7 +126,7 @@ class MetaWorldConfig(SuiteConfig):
         return replace(self, shift=ShiftConfig())
 
 
-class MetaWorld(SuiteWorld):
+class MetaWorld(SuiteEnvironment):
     """One MetaWorld instance.
 
     A simulator that diverges, so that MuJoCo had to reset it, ends the episode as truncated, with

@@ -16,9 +16,9 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from accerl_lerobot.checkpoint.safety import Origin, brief, tensor_shapes
+from accerl_lerobot.checkpoint.safety import FileSource, brief, tensor_shapes
 from accerl_lerobot.config.ranges import Commit, Range, Section
-from accerl_lerobot.envs.base import ChunkResult, World, WrappedWorld
+from accerl_lerobot.envs.base import ChunkResult, Environment, WrappedEnvironment
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK, Observation
 
@@ -43,7 +43,7 @@ class RewardModelConfig(Section, section=REWARD_MODEL):
 
 @functools.lru_cache(maxsize=1)
 def load_judge(config: RewardModelConfig) -> Callable[[Observation], bool]:
-    """Loads a reward model, one for all worlds of a process; the result tells if it sees a success."""
+    """Loads a reward model, one for all environments of a process; the result tells if it sees a success."""
     import torch
     from lerobot.configs.rewards import RewardModelConfig as LeRobotConfig
     from lerobot.processor import PolicyProcessorPipeline
@@ -53,7 +53,7 @@ def load_judge(config: RewardModelConfig) -> Callable[[Observation], bool]:
     from accerl_lerobot.policies import untrusted
 
     assert config.path is not None
-    origin = Origin(f"{REWARD_MODEL}.path", config.path)
+    origin = FileSource(f"{REWARD_MODEL}.path", config.path)
     folder = untrusted.fetched_checkpoint(config.path, config.revision, origin.field)
     names = [path.name for path in folder.glob("*_preprocessor.json")]
     if len(names) != 1:
@@ -65,8 +65,8 @@ def load_judge(config: RewardModelConfig) -> Callable[[Observation], bool]:
         with untrusted.guarded(REWARD_MODEL, trusted), contextlib.redirect_stdout(sys.stderr):
             theirs = LeRobotConfig.from_pretrained(folder)
             if theirs.observation_delta_indices is not None:
-                remedy = "looks at several observations at once; use one that judges each alone"
-                raise InputError(origin.field, config.path, f"{theirs.type} {remedy}")
+                hint = "looks at several observations at once; use one that judges each alone"
+                raise InputError(origin.field, config.path, f"{theirs.type} {hint}")
             theirs.device = "cpu"
             model = get_reward_model_class(theirs.type).from_pretrained(folder, config=theirs)
             on_cpu = {"device_processor": {"device": "cpu"}}
@@ -74,13 +74,13 @@ def load_judge(config: RewardModelConfig) -> Callable[[Observation], bool]:
     except InputError:
         raise
     except Exception as error:  # LeRobot takes the files at their word, and may fail over any of them
-        remedy = f"it cannot be loaded as one of LeRobot's reward models ({brief(error)})"
-        raise InputError(origin.field, config.path, remedy) from error
+        hint = f"it cannot be loaded as one of LeRobot's reward models ({brief(error)})"
+        raise InputError(origin.field, config.path, hint) from error
     mine, there = model.state_dict(), tensor_shapes(folder / untrusted.WEIGHTS, origin)
     held = {mine[name].data_ptr() for name in there if name in mine}  # some have several names
     if missing := [name for name, tensor in mine.items() if tensor.data_ptr() not in held]:
-        remedy = f"{len(missing)} tensors are missing, such as {missing[0]}; save it again"
-        raise origin.refuse(untrusted.WEIGHTS, remedy)
+        hint = f"{len(missing)} tensors are missing, such as {missing[0]}; save it again"
+        raise origin.refuse(untrusted.WEIGHTS, hint)
     wanted = {name: tuple(feature.shape) for name, feature in theirs.input_features.items()}
 
     @torch.no_grad()
@@ -91,8 +91,8 @@ def load_judge(config: RewardModelConfig) -> Callable[[Observation], bool]:
             value = value.permute(0, 3, 1, 2).float() / 255 if value.dim() == 4 else value.float()
             if value.shape[1:] != shape:
                 offers = tuple(value.shape[1:]) if name in observation else "is missing"
-                remedy = f"its {name} is {shape}, the environment's {offers}"
-                raise InputError(origin.field, config.path, remedy)
+                hint = f"its {name} is {shape}, the environment's {offers}"
+                raise InputError(origin.field, config.path, hint)
             batch[name] = value
         batch = prepare(batch)
         if hasattr(model, "predict_reward"):
@@ -102,18 +102,18 @@ def load_judge(config: RewardModelConfig) -> Callable[[Observation], bool]:
     return succeeded
 
 
-class JudgedWorld(WrappedWorld):
-    """A world whose successes, and rewards, are what a reward model says.
+class JudgedEnvironment(WrappedEnvironment):
+    """An environment whose successes, and rewards, are what a reward model says.
 
-    An episode also ends where the world itself ends it, successfully or not.
+    An episode also ends where the environment itself ends it, successfully or not.
     """
 
-    def __init__(self, world: World, succeeded: Callable[[Observation], bool]) -> None:
-        super().__init__(world)
+    def __init__(self, environment: Environment, succeeded: Callable[[Observation], bool]) -> None:
+        super().__init__(environment)
         self.succeeded = succeeded
 
     def step_chunk(self, actions: np.ndarray) -> ChunkResult:
-        result = self._world.step_chunk(actions)
+        result = self._environment.step_chunk(actions)
         success = not result.info.get("nonfinite") and self.succeeded(result.observation)
         rewards = np.zeros_like(result.rewards)
         rewards[-1] = success

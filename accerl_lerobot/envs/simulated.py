@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import numpy as np
 
 from accerl_lerobot.config.ranges import Positive, Range
-from accerl_lerobot.envs.base import EnvConfig, EpisodeWorld, Step, names, unit_spec
+from accerl_lerobot.envs.base import EnvConfig, EpisodeEnvironment, Step, names, unit_spec
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Observation
 
@@ -31,7 +31,7 @@ class SimulatedConfig(EnvConfig):
     """
 
     expert = "accerl_lerobot.demos.record:simulated_expert"
-    world = "accerl_lerobot.envs.simulated:SimulatedWorld"
+    environment = "accerl_lerobot.envs.simulated:SimulatedEnvironment"
 
     task: str = "match"
     """``match`` (the action is the target), ``mirror`` (its negative), or both separated by a comma."""
@@ -66,7 +66,7 @@ class SimulatedConfig(EnvConfig):
         return tuple(dict.fromkeys(names(self.task)))
 
 
-class SimulatedWorld(EpisodeWorld):
+class SimulatedEnvironment(EpisodeEnvironment):
     """One instance."""
 
     def __init__(self, config: SimulatedConfig) -> None:

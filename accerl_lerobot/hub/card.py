@@ -96,15 +96,15 @@ def recognise(folder: Path, field: str = "path") -> str:
         raise InputError(field, str(folder), _hint(folder))
     missing = [name for name in NEEDED[artifact] if not (folder / name).exists()]
     if missing:
-        remedy = f"looks like a {artifact} but lacks {', '.join(missing)}; name a complete folder"
-        raise InputError(field, str(folder), remedy)
+        hint = f"looks like a {artifact} but lacks {', '.join(missing)}; name a complete folder"
+        raise InputError(field, str(folder), hint)
     return artifact
 
 
 def read_json(path: Path) -> dict[str, Any]:
     """The mapping in a JSON file; empty if there is none, or a pipe or device in its place."""
     try:
-        return safety.read_json(path, safety.Origin("path", str(path)))
+        return safety.read_json(path, safety.FileSource("path", str(path)))
     except InputError:
         return {}
 
@@ -181,7 +181,7 @@ def find_provenance(folder: Path, artifact: str, evaluation: str | None) -> Prov
         is_last = step.isdigit() and int(step) == summary.get("updates")
         measured = home == carried or artifact != POLICY or is_last
         names = KEPT.get(artifact, ()) if measured else (RECIPE,)
-        there = safety.matching_files(home, names, safety.Origin("path", str(folder)))
+        there = safety.matching_files(home, names, safety.FileSource("path", str(folder)))
         files = {f"{FOLDER}/{name}": path for name, path in there.items()}
         known["validation"] = read_json(home / VALIDATION)
         with contextlib.suppress(InputError):

@@ -21,7 +21,7 @@ from huggingface_hub.errors import RepositoryNotFoundError
 from huggingface_hub.hf_api import RepoFile
 
 from accerl_lerobot.checkpoint.layout import check_names, digest, relocate
-from accerl_lerobot.checkpoint.safety import Origin, brief, unsafe_name
+from accerl_lerobot.checkpoint.safety import FileSource, brief, unsafe_name
 from accerl_lerobot.errors import InputError, check_absent, expanded, make_folder
 from accerl_lerobot.hub import card
 from accerl_lerobot.hub.errors import check_commit, hub_errors
@@ -125,7 +125,7 @@ def _receive(folder: Path, home: Path, files: dict[str, RepoFile], repo_id: str)
             raise refuse(f"{name} is not what the server lists: its hash is another")
     (folder / ATTRIBUTES).unlink(missing_ok=True)
     artifact = card.recognise(folder, "repo_id")
-    check_names(folder, Origin("repo_id", repo_id))
+    check_names(folder, FileSource("repo_id", repo_id))
     if artifact == card.POLICY:
         relocate(folder, home)
     code = sorted(path for path in folder.rglob("*") if path.name.endswith(CODE) and path.is_file())

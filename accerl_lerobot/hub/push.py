@@ -19,7 +19,7 @@ from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, ge
 from huggingface_hub.errors import RepositoryNotFoundError
 
 from accerl_lerobot.checkpoint import layout
-from accerl_lerobot.checkpoint.safety import Origin, matching_files
+from accerl_lerobot.checkpoint.safety import FileSource, matching_files
 from accerl_lerobot.errors import InputError, reading
 from accerl_lerobot.hub import card
 from accerl_lerobot.hub.errors import LOGIN, check_commit, hub_errors
@@ -64,7 +64,7 @@ def stage(config: card.PushConfig, folder: Path, artifact: str) -> tuple[card.Fi
     for name, path in provenance.files.items():
         files[name] = scrubbed(name, path.read_bytes(), folder) if is_record(name) else path
     repo_id = config.repo_id
-    readme = matching_files(folder, [card.CARD], Origin("path", str(folder))).values()
+    readme = matching_files(folder, [card.CARD], FileSource("path", str(folder))).values()
     own = any(card.MARK not in path.read_text() for path in readme)
     if own:
         (path,) = readme
@@ -136,13 +136,13 @@ def _parent(api: HfApi, config: card.PushConfig, artifact: str) -> str:
     except RepositoryNotFoundError:
         (other,) = set(card.REPO_TYPES) - {kind}
         if api.repo_exists(repo_id, repo_type=other):
-            remedy = f"it is a {other} repository, and this is a {artifact}; choose another name"
-            raise InputError("repo_id", repo_id, remedy) from None
+            hint = f"it is a {other} repository, and this is a {artifact}; choose another name"
+            raise InputError("repo_id", repo_id, hint) from None
         api.create_repo(repo_id, private=config.private, repo_type=kind, exist_ok=True)
         info = api.repo_info(repo_id, repo_type=kind)
     if config.private and info.private is False:
-        remedy = "this repository is public: add --private=false, or choose another name"
-        raise InputError("private", True, remedy)
+        hint = "this repository is public: add --private=false, or choose another name"
+        raise InputError("private", True, hint)
     return check_commit(info.sha)
 
 
@@ -161,7 +161,7 @@ def contents(folder: Path, artifact: str) -> card.Files:
     Their names are those of the artifact's type. A link that leads out is refused, and so is a policy without
     its backbone.
     """
-    origin = Origin("path", str(folder))
+    origin = FileSource("path", str(folder))
     patterns = (*card.CONTENTS[artifact], "LICENSE*")
     files: card.Files = {**matching_files(folder, patterns, origin)}
     others = [path.name for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
@@ -186,7 +186,7 @@ def _bring_backbone(files: card.Files, home: Path) -> None:
     if elsewhere.is_absolute() and not (home / layout.BACKBONE).is_dir():
         # The policy's own file holds its weights, unless LeRobot builds it from the backbone's.
         weights = layout.BACKBONE_WEIGHTS if config.get("load_vlm_weights") else ()
-        origin = Origin("path", str(elsewhere))
+        origin = FileSource("path", str(elsewhere))
         for name, path in matching_files(elsewhere, layout.BACKBONE_FILES + weights, origin).items():
             files[f"{layout.BACKBONE}/{name}"] = path
     ours = layout.CONFIG_FOLDERS.values()
@@ -195,8 +195,8 @@ def _bring_backbone(files: card.Files, home: Path) -> None:
         if not Path(named := fields.get(key) or "").is_absolute():
             continue
         if own not in has:
-            remedy = f"put a copy into {layout.BACKBONE}/ beside {card.CONFIG}"
-            raise InputError("path", str(home), f"it needs {named}, which is not in it; {remedy}")
+            hint = f"put a copy into {layout.BACKBONE}/ beside {card.CONFIG}"
+            raise InputError("path", str(home), f"it needs {named}, which is not in it; {hint}")
         fields[key] = own
     if json.dumps([config, processor]) != before:
         files[card.CONFIG] = (json.dumps(config, indent=4) + "\n").encode()

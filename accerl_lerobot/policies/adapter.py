@@ -315,8 +315,8 @@ class LeRobotAdapter(PolicyAdapter):
             return difference
         if (package := PLUGINS.get(self.policy.config.type)) is not None:
             why = f"its adapter in {package} acts unlike the policy without exploration"
-            remedy = f"{why}, by {difference:.2e}; correct the adapter's encode or stock"
-            raise InputError("policy.type", self.policy.config.type, remedy)
+            hint = f"{why}, by {difference:.2e}; correct the adapter's encode or stock"
+            raise InputError("policy.type", self.policy.config.type, hint)
         fits = f"the adapter of {self.policy.name} does not fit LeRobot {lerobot.__version__}"
-        remedy = f"{fits}: it differs from its sampler by {difference:.2e}; install the pinned version"
-        raise InputError("lerobot", lerobot.__version__, remedy)
+        hint = f"{fits}: it differs from its sampler by {difference:.2e}; install the pinned version"
+        raise InputError("lerobot", lerobot.__version__, hint)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import draccus
 
-from accerl_lerobot.checkpoint.safety import Origin, brief
+from accerl_lerobot.checkpoint.safety import FileSource, brief
 from accerl_lerobot.config.parsing import imported
 from accerl_lerobot.config.ranges import Commit, Device, Range, Section, check, registered_name
 from accerl_lerobot.errors import InputError
@@ -108,8 +108,8 @@ class TuningConfig(Section, section="policy.tuning"):
         try:
             re.compile(self.targets or "")
         except re.error as error:
-            remedy = f"not a regular expression: {error}"
-            raise InputError("policy.tuning.targets", self.targets, remedy) from error
+            hint = f"not a regular expression: {error}"
+            raise InputError("policy.tuning.targets", self.targets, hint) from error
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -136,7 +136,7 @@ class PolicyConfig(Section, section="policy"):
     """How it explores. None: the first family of its policy type, with that family's defaults."""
     tuning: TuningConfig = field(default_factory=TuningConfig)
     rename_map: dict[str, str] = field(default_factory=dict)
-    """World feature name → policy feature name, as in LeRobot's ``--rename_map``."""
+    """Environment feature name → policy feature name, as in LeRobot's ``--rename_map``."""
     temporal_ensemble_coeff: Literal["checkpoint"] | None = "checkpoint"
     """null: ACT does not average over earlier chunks, whose actions depend on more than the observation."""
     num_steps: Annotated[int, Range("[1, 10000]")] | None = None
@@ -234,11 +234,11 @@ def discovery(policy_type: str | None) -> list[str]:
 def check_observations(policy_config: Any, field: str) -> None:
     """Refuses the simulator's state, and a history that LeRobot's policy of this type does not read."""
     if ENVIRONMENT_STATE in (policy_config.input_features or {}):
-        remedy = "no policy is given the simulator's state; train it without, as accerl sft does"
-        raise InputError("policy.input_features", ENVIRONMENT_STATE, remedy)
+        hint = "no policy is given the simulator's state; train it without, as accerl sft does"
+        raise InputError("policy.input_features", ENVIRONMENT_STATE, hint)
     if env_steps_seen(policy_config) != 1 and policy_config.type not in USES_HISTORY:
-        remedy = f"only {', '.join(USES_HISTORY)} looks back; a {policy_config.type} policy takes 1"
-        raise InputError(field, policy_config.n_obs_steps, remedy)
+        hint = f"only {', '.join(USES_HISTORY)} looks back; a {policy_config.type} policy takes 1"
+        raise InputError(field, policy_config.n_obs_steps, hint)
 
 
 def sampler_config(
@@ -246,7 +246,7 @@ def sampler_config(
 ) -> SamplerConfig:
     """How a policy of this type explores in this run.
 
-    Refuses a type without a likelihood here, naming `field`, in a remedy that begins with `prefix`; and a
+    Refuses a type without a likelihood here, naming `field`, in a hint that begins with `prefix`; and a
     sampler of another family.
     """
     check_registered(policy_type, field, prefix)
@@ -256,8 +256,8 @@ def sampler_config(
     if config.sampler is None:
         return SamplerConfig.get_choice_class(families[0])()
     if config.sampler.type not in families:
-        remedy = f"use {' or '.join(families)}: the policy is of type {policy_type}"
-        raise InputError("policy.sampler.type", config.sampler.type, remedy)
+        hint = f"use {' or '.join(families)}: the policy is of type {policy_type}"
+        raise InputError("policy.sampler.type", config.sampler.type, hint)
     return config.sampler
 
 
@@ -279,14 +279,14 @@ def check_size(name: str, value: Any, field: str) -> None:
         check(Annotated[int, span], int(value), field)
 
 
-def check_sizes(policy_config: Any, origin: Origin) -> None:
+def check_sizes(policy_config: Any, origin: FileSource) -> None:
     """`check_size` of a checkpoint's config, which must not execute more rows than it predicts."""
     for name in SIZES:
         value = getattr(policy_config, name, None)
         try:
             check_size(name, value, name)
         except InputError as error:
-            raise origin.refuse(f"config.json: {name}={value}", error.remedy) from error
+            raise origin.refuse(f"config.json: {name}={value}", error.hint) from error
     steps, rows = getattr(policy_config, "n_action_steps", None), predicted_rows(policy_config)
     if steps is not None and rows is not None and steps > rows:
         raise origin.refuse(f"config.json: n_action_steps={steps}", f"use 1 to {rows}, the chunk it predicts")
@@ -310,8 +310,8 @@ def override(policy_config: Any, config: PolicyConfig) -> None:
     if config.num_steps is not None:
         names = (name for name in ("num_steps", "num_inference_steps") if hasattr(policy_config, name))
         if (name := next(names, None)) is None:
-            remedy = f"a {policy_config.type} policy does not denoise; leave the field out"
-            raise InputError("policy.num_steps", config.num_steps, remedy)
+            hint = f"a {policy_config.type} policy does not denoise; leave the field out"
+            raise InputError("policy.num_steps", config.num_steps, hint)
         setattr(policy_config, name, config.num_steps)
     policy_config.use_peft = False  # an adapter is merged into the weights
     if hasattr(policy_config, "dtype") and policy_config.type in POLICIES:
@@ -320,10 +320,10 @@ def override(policy_config: Any, config: PolicyConfig) -> None:
         policy_config.compile_model = False  # a compiled sampler rounds unlike the re-scoring pass
     if config.n_action_steps is not None:
         if not hasattr(policy_config, "n_action_steps"):
-            remedy = f"a {policy_config.type} policy has no such field; leave it out"
-            raise InputError("policy.n_action_steps", config.n_action_steps, remedy)
+            hint = f"a {policy_config.type} policy has no such field; leave it out"
+            raise InputError("policy.n_action_steps", config.n_action_steps, hint)
         chunk = predicted_rows(policy_config) or 1
         if config.n_action_steps > chunk:
-            remedy = f"use 1 to {chunk}, the chunk the policy predicts"
-            raise InputError("policy.n_action_steps", config.n_action_steps, remedy)
+            hint = f"use 1 to {chunk}, the chunk the policy predicts"
+            raise InputError("policy.n_action_steps", config.n_action_steps, hint)
         policy_config.n_action_steps = config.n_action_steps

@@ -151,7 +151,7 @@ class Diffusion(Model):
             shape = tuple(inputs[OBS_STATE].shape)
             raise ValueError(
                 f"observation.state is {shape}, but the policy reads {config.n_obs_steps} env steps at a "
-                "time: make worlds with history=n_obs_steps"
+                "time: make environments with history=n_obs_steps"
             )
         images = [inputs[key] for key in config.image_features]
         return inputs | {OBS_IMAGES: torch.stack(images, dim=-4)}

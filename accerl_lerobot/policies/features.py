@@ -13,7 +13,7 @@ import numpy as np
 from accerl_lerobot.errors import InputError
 
 if TYPE_CHECKING:
-    from accerl_lerobot.envs import WorldSpec
+    from accerl_lerobot.envs import EnvironmentSpec
 
 logger = logging.getLogger(__name__)
 
@@ -48,13 +48,13 @@ class Features:
     shapes: dict[str, tuple[int, ...]]  # name → shape; images are (channels, height, width)
     any_size: bool = False  # images of any height and width fit
     fps: float | None = None  # control rate in Hz; None: not known
-    labelled_fps: tuple[float, ...] = ()  # see `WorldSpec.labelled_fps`
+    labelled_fps: tuple[float, ...] = ()  # see `EnvironmentSpec.labelled_fps`
     tasks: tuple[str, ...] = ()  # instructions; empty: not known
     unusable: dict[str, str] = field(default_factory=dict)  # name → why no policy can read it
     reads_text: bool = False  # True for a policy that is given an instruction
 
 
-def env_features(spec: WorldSpec) -> Features:
+def env_features(spec: EnvironmentSpec) -> Features:
     """Features that an environment offers."""
     shapes: dict[str, tuple[int, ...]] = {name: (c, h, w) for name, (h, w, c) in spec.images.items()}
     shapes |= {STATE: (spec.state_dim,), ACTION: (spec.action_dim,)}
@@ -157,19 +157,19 @@ def check_features(
         if name not in shapes:
             same = [k for k, other in shapes.items() if len(other) == len(shape) and k != ACTION]
             offers = ", ".join(same) or "none"
-            remedy = "; choose env.camera (env.images of gym), or map names with policy.rename_map" * image
-            remedy += hint * image
-            raise InputError(field, value, f"no {name} in the {offerer}, which offers {offers}{remedy}")
+            hint = "; choose env.camera (env.images of gym), or map names with policy.rename_map" * image
+            hint += hint * image
+            raise InputError(field, value, f"no {name} in the {offerer}, which offers {offers}{hint}")
         skip = 1 if image and needed.any_size else len(shape)
         if shapes[name][:skip] != shape[:skip]:
-            remedy = "give both one image size" if image else "choose parties that were made for each other"
+            hint = "give both one image size" if image else "choose parties that were made for each other"
             sizes = f"its {name} is {shape}, but {shapes[name]} in the {offerer}"
-            raise InputError(field, value, f"{sizes}; {remedy}")
+            raise InputError(field, value, f"{sizes}; {hint}")
     rates = (offered.fps, *offered.labelled_fps) if offered.fps else ()
     if needed.fps and rates and not any(math.isclose(needed.fps, rate) for rate in rates):
         why = f"recorded at {needed.fps:g} Hz, but the environment runs at {offered.fps:g} Hz"
-        remedy = "its actions would be executed at another rate; use a dataset of this rate"
-        raise InputError(field, value, f"{why}: {remedy}, or with env.type=gym set env.fps")
+        hint = "its actions would be executed at another rate; use a dataset of this rate"
+        raise InputError(field, value, f"{why}: {hint}, or with env.type=gym set env.fps")
     if needed.reads_text and offerer == "environment" and not offered.tasks:
         logger.warning(
             "%s=%r: the policy reads an instruction, and the environment gives none; name it in env.task",
@@ -243,7 +243,7 @@ def check_statistics(
             logger.warning(text, field, value, np.flatnonzero(flat).tolist(), name)
 
 
-def check_actions(actions: np.ndarray, spec: WorldSpec, field: str, value: object) -> None:
+def check_actions(actions: np.ndarray, spec: EnvironmentSpec, field: str, value: object) -> None:
     """Warns where many of a dataset's actions (N, A) lie outside what the environment executes."""
     slack = OUTSIDE_SLACK * (spec.action_high - spec.action_low)
     outside = (actions < spec.action_low - slack) | (actions > spec.action_high + slack)

@@ -100,8 +100,8 @@ class ACT(GaussianModel):
         super().__init__(policy)
         config = policy.config
         if (coefficient := config.temporal_ensemble_coeff) is not None:
-            remedy = "averaging over earlier chunks makes actions depend on more than the observation"
-            raise InputError("policy.temporal_ensemble_coeff", coefficient, f"{remedy}; use null")
+            hint = "averaging over earlier chunks makes actions depend on more than the observation"
+            raise InputError("policy.temporal_ensemble_coeff", coefficient, f"{hint}; use null")
         self.executed, self.action_dim = config.n_action_steps, config.action_feature.shape[0]
         self.width = self.row_width = config.dim_model
 

@@ -24,7 +24,7 @@ from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 
 from accerl_lerobot.checkpoint.isolation import rehearse
 from accerl_lerobot.checkpoint.layout import BACKBONE, CONFIG_FOLDERS, STEP_FOLDERS
-from accerl_lerobot.checkpoint.safety import Origin, brief, read_json, read_tensors, tensor_shapes
+from accerl_lerobot.checkpoint.safety import FileSource, brief, read_json, read_tensors, tensor_shapes
 from accerl_lerobot.config.parsing import discover, imported
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK, stack_observations
@@ -90,7 +90,7 @@ def load_lerobot_config(config: PolicyConfig) -> Any:
     Raises:
         InputError: no checkpoint there, or one of a policy type that is not installed.
     """
-    folder, origin = _checkpoint_folder(config), Origin("policy.path", config.path)
+    folder, origin = _checkpoint_folder(config), FileSource("policy.path", config.path)
     _registered_type(config, folder)
     what = (
         "its config.json is not one of this LeRobot's policies; remove the fields of another version from it"
@@ -144,7 +144,7 @@ def rehearsed[T](config: PolicyConfig, task: Callable[[LeRobotAdapter], T], *, f
     """Result, which JSON can hold, of `task` with the policy of `policy_sizes`, in a child process."""
     precision = precision_on(resolve_device(config.device), config.precision)
     there = replace(config, device="cpu", precision=precision)
-    origin = Origin("policy.path", config.path)
+    origin = FileSource("policy.path", config.path)
     folder = weights_folder(_checkpoint_folder(config), origin)  # its size sets the limits
 
     def act() -> T:
@@ -187,7 +187,7 @@ def load_adapter(
     sampler = sampler_config(config, lerobot_config.type, prefix=f"{config.path} is of this type: ")
     model_class: type[Model] = imported(POLICIES[lerobot_config.type][0])
     policy, processing, precision = _load_parts(config, lerobot_config, model_class, rehearsal, fine_tuned)
-    folder, origin = _checkpoint_folder(config), Origin("policy.path", config.path)
+    folder, origin = _checkpoint_folder(config), FileSource("policy.path", config.path)
     with _refusing(config, "it cannot act here"):
         model = model_class(policy)
         family = imported(sampler.family)(model, sampler)
@@ -213,7 +213,7 @@ def _load_parts(
     fine_tuned: bool,
 ) -> tuple[Any, Processing, Precision]:
     """LeRobot's policy with the checkpoint's weights, its processors, and the precision it computes in."""
-    folder, origin = _checkpoint_folder(config), Origin("policy.path", config.path)
+    folder, origin = _checkpoint_folder(config), FileSource("policy.path", config.path)
     loading = contextlib.nullcontext if model_class is None else model_class.loading
     with (
         _refusing(config, "its network cannot be built as its config.json says"),
@@ -277,8 +277,8 @@ def _refusing(config: PolicyConfig, what: str) -> Iterator[None]:
 
 def _checkpoint_folder(config: PolicyConfig) -> Path:
     if config.path is None:
-        remedy = "give a LeRobot checkpoint directory or Hub id, or an sft section"
-        raise InputError("policy.path", None, remedy)
+        hint = "give a LeRobot checkpoint directory or Hub id, or an sft section"
+        raise InputError("policy.path", None, hint)
     return untrusted.fetched_checkpoint(config.path, config.revision, "policy.path")
 
 
@@ -291,13 +291,13 @@ def pinned(config: PolicyConfig) -> PolicyConfig:
 def _registered_type(config: PolicyConfig, folder: Path) -> Any:
     """The checkpoint's policy type; packages that may have it are imported."""
     discover(config.discover_packages_path, "policy")
-    kind = read_json(folder / untrusted.CONFIG, Origin("policy.path", config.path)).get("type")
+    kind = read_json(folder / untrusted.CONFIG, FileSource("policy.path", config.path)).get("type")
     register_policies(str(kind))
     check_registered(kind, "policy.type", f"{config.path} is of this type: ")
     return kind
 
 
-def _load_ours(adapter: LeRobotAdapter, folder: Path, origin: Origin, explores: bool) -> None:
+def _load_ours(adapter: LeRobotAdapter, folder: Path, origin: FileSource, explores: bool) -> None:
     """Loads critic and family, and says where a run explores with other options than they were made with."""
     there = json.loads((folder / untrusted.OURS).read_text()).get("sampler", {})
     here = draccus.encode(adapter.family.sampler, SamplerConfig)
@@ -319,8 +319,8 @@ def _load_ours(adapter: LeRobotAdapter, folder: Path, origin: Origin, explores: 
         try:
             adapter.value_head.load_state_dict(state)
         except RuntimeError as error:
-            remedy = f"it is no critic of this policy; remove it to start anew ({brief(error)})"
-            raise origin.refuse(untrusted.VALUE_HEAD, remedy) from error
+            hint = f"it is no critic of this policy; remove it to start anew ({brief(error)})"
+            raise origin.refuse(untrusted.VALUE_HEAD, hint) from error
 
 
 def _use_backbone(lerobot_config: Any, folder: Path, path: str | None) -> None:
@@ -333,8 +333,8 @@ def _use_backbone(lerobot_config: Any, folder: Path, path: str | None) -> None:
         named = Path(getattr(lerobot_config, field))
         if named.is_absolute() and not named.is_dir():
             what = "backbone was" if field == "vlm_model_name" else "tokeniser was"
-            remedy = f"its {what} in {named}, which is gone; put a copy into {own}/ beside config.json"
-            raise InputError("policy.path", path, remedy)
+            hint = f"its {what} in {named}, which is gone; put a copy into {own}/ beside config.json"
+            raise InputError("policy.path", path, hint)
 
 
 def _tokenizer_overrides(lerobot_config: Any, folder: Path) -> dict[str, dict[str, Any]]:
@@ -377,7 +377,7 @@ def load_weights(
 
     Those named in `unread` may be missing.
     """
-    origin = Origin("policy.path", path)
+    origin = FileSource("policy.path", path)
     shapes = {name: shape for name, (_, shape) in tensor_shapes(file, origin).items()}
     mine, stored = policy.state_dict(), _names(shapes, policy)
     # Nor is a tensor missing that a policy holds under several names: savers keep one of them.
@@ -387,13 +387,13 @@ def load_weights(
     unexpected = sorted(stored.keys() - mine.keys())
     if missing or unexpected:
         counts = f"{len(missing)} tensors missing {missing[:3]}, {len(unexpected)} unexpected "
-        remedy = f"{counts}{unexpected[:3]}; config.json and {file.name} disagree"
-        raise InputError("policy.path", path, f"the weights did not load: {remedy}")
+        hint = f"{counts}{unexpected[:3]}; config.json and {file.name} disagree"
+        raise InputError("policy.path", path, f"the weights did not load: {hint}")
     for name, theirs in stored.items():
         if mine[name].shape != shapes[theirs]:
             sizes = f"{shapes[theirs]} in the file, {tuple(mine[name].shape)} in the policy"
-            remedy = f"the weights did not load: size mismatch for {name}, {sizes}"
-            raise InputError("policy.path", path, remedy)
+            hint = f"the weights did not load: size mismatch for {name}, {sizes}"
+            raise InputError("policy.path", path, hint)
     for theirs, tensor in read_tensors(file, origin) if read else ():
         for name in (name for name, place in stored.items() if place == theirs):
             mine[name].copy_(tensor)

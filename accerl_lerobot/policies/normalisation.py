@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from accerl_lerobot.checkpoint.layout import PREPROCESSOR
-from accerl_lerobot.checkpoint.safety import Origin, read_tensors, tensor_shapes
+from accerl_lerobot.checkpoint.safety import FileSource, read_tensors, tensor_shapes
 from accerl_lerobot.policies.features import ACTION, STATE, pads, policy_features
 from accerl_lerobot.policies.untrusted import PROCESSORS
 
@@ -39,7 +39,7 @@ def stored_steps(folder: Path, name: str = PREPROCESSOR) -> list[dict[str, Any]]
     return json.loads((folder / name).read_text())["steps"] if (folder / name).is_file() else []
 
 
-def correct_inputs(lerobot_config: Any, folder: Path, origin: Origin) -> None:
+def correct_inputs(lerobot_config: Any, folder: Path, origin: FileSource) -> None:
     """Gives a policy that pads the inputs that it was trained on, by the statistics that it normalises by.
 
     LeRobot's fine-tuning leaves those of the policy that it started from in ``config.json``, whatever states
@@ -65,7 +65,9 @@ def correct_inputs(lerobot_config: Any, folder: Path, origin: Origin) -> None:
         inputs[STATE] = replace(inputs[STATE], shape=seen[STATE])
 
 
-def check_statistics(lerobot_config: Any, folder: Path, origin: Origin, *, replaced: bool = False) -> None:
+def check_statistics(
+    lerobot_config: Any, folder: Path, origin: FileSource, *, replaced: bool = False
+) -> None:
     """Checks the numbers that a checkpoint's processors normalise by against the policy's features.
 
     If they are `replaced` by those of a training to come, they have to be finite only.
@@ -95,7 +97,7 @@ def _normalised(step: str, options: dict[str, Any], features: dict[str, Any]) ->
 
 
 def _check_feature(
-    key: str, feature: Any, mode: str, state: dict[str, Tensor], origin: Origin, file: str
+    key: str, feature: Any, mode: str, state: dict[str, Tensor], origin: FileSource, file: str
 ) -> None:
     picture = feature.type.name == "VISUAL"
     found = {name: state[f"{key}.{name}"] for name in NUMBERS[mode] if f"{key}.{name}" in state}

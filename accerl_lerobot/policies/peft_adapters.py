@@ -11,12 +11,12 @@ from collections import deque
 from pathlib import Path
 from typing import Any
 
-from accerl_lerobot.checkpoint.safety import Origin, read_json, read_tensors, tensor_shapes
+from accerl_lerobot.checkpoint.safety import FileSource, read_json, read_tensors, tensor_shapes
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.untrusted import ADAPTER, ADAPTER_CONFIG, fetched_checkpoint, is_adapter
 
 
-def weights_folder(folder: Path, origin: Origin) -> Path:
+def weights_folder(folder: Path, origin: FileSource) -> Path:
     """The folder with all of a policy's weights: `folder` itself, or, of an adapter, the policy it is for."""
     if not is_adapter(folder):
         return folder
@@ -28,7 +28,7 @@ def weights_folder(folder: Path, origin: Origin) -> Path:
     try:
         found = fetched_checkpoint(base, revision, origin.field)
     except InputError as error:
-        why = f"{base!r}, the policy that the adapter is for: {error.remedy}"
+        why = f"{base!r}, the policy that the adapter is for: {error.hint}"
         raise origin.refuse(f"{ADAPTER_CONFIG}: base_model_name_or_path", why) from error
     if is_adapter(found):
         why = f"{base!r} is an adapter itself, which LeRobot does not load; train one on a whole policy"
@@ -36,7 +36,7 @@ def weights_folder(folder: Path, origin: Origin) -> Path:
     return found
 
 
-def merged(policy: Any, folder: Path, origin: Origin) -> Any:
+def merged(policy: Any, folder: Path, origin: FileSource) -> Any:
     """The policy with the adapter in `folder` added to its weights; what was trainable in it is again."""
     from peft import PeftModel, get_peft_model_state_dict
 

@@ -21,7 +21,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from accerl_lerobot.checkpoint.layout import BACKBONE, BACKBONE_FILES, BACKBONE_WEIGHTS, FAST, relocate
-from accerl_lerobot.checkpoint.safety import Origin, matching_files
+from accerl_lerobot.checkpoint.safety import FileSource, matching_files
 from accerl_lerobot.checkpoint.tensors import copy_of, place
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import PolicyConfig, SamplerConfig, TuningConfig
@@ -42,8 +42,8 @@ def tune(policy: Any, model: Model, config: TuningConfig) -> None:
         policy.requires_grad_(True)
     elif config.mode == "expert":
         if model.backbone is None:
-            remedy = f"{policy.name} has no action expert apart from a backbone; use full or lora"
-            raise InputError("policy.tuning.mode", "expert", remedy)
+            hint = f"{policy.name} has no action expert apart from a backbone; use full or lora"
+            raise InputError("policy.tuning.mode", "expert", hint)
         for name, parameter in policy.named_parameters():
             parameter.requires_grad_(not name.startswith(model.backbone))
     elif config.mode == "lora":
@@ -58,15 +58,15 @@ def _inject(policy: Any, config: TuningConfig) -> None:
 
     targets = config.targets or (policy._get_default_peft_targets() or {}).get("target_modules")
     if targets is None:
-        remedy = f"LeRobot names no default for {policy.name}; give a regular expression of module names"
-        raise InputError("policy.tuning.targets", None, remedy)
+        hint = f"LeRobot names no default for {policy.name}; give a regular expression of module names"
+        raise InputError("policy.tuning.targets", None, hint)
     # Not its subclasses: attention reads the weight of its own without calling it, past any adapter.
     linear = [name for name, module in policy.named_modules() if type(module) is nn.Linear]
     matching = [name for name in linear if re.fullmatch(targets, name)]
     if not matching:
         some = ", ".join(linear[:: max(1, len(linear) // 3)][:3])
-        remedy = f"matches none of the policy's {len(linear)} linear layers, such as {some}"
-        raise InputError("policy.tuning.targets", targets, remedy)
+        hint = f"matches none of the policy's {len(linear)} linear layers, such as {some}"
+        raise InputError("policy.tuning.targets", targets, hint)
     policy.requires_grad_(False)
     lora = LoraConfig(r=config.rank, lora_alpha=config.rank, target_modules=matching, lora_dropout=0.0)
     inject_adapter_in_model(lora, policy)
@@ -133,7 +133,7 @@ def _save_backbone(lerobot_config: Any, preprocessor: Any, directory: Path) -> N
         # The policy's own file holds the backbone's weights, unless LeRobot builds it from the backbone's.
         wanted = BACKBONE_FILES + (BACKBONE_WEIGHTS if lerobot_config.load_vlm_weights else ())
         (directory / BACKBONE).mkdir(exist_ok=True)
-        for name, file in matching_files(source, wanted, Origin("policy.path", str(source))).items():
+        for name, file in matching_files(source, wanted, FileSource("policy.path", str(source))).items():
             shutil.copyfile(file, directory / BACKBONE / name)
 
 

@@ -33,7 +33,7 @@ from accerl_lerobot.checkpoint.layout import (
 )  # fmt: skip
 from accerl_lerobot.checkpoint.safety import (
     HUB_ID,
-    Origin,
+    FileSource,
     brief,
     check_not_pickled,
     file_size,
@@ -72,15 +72,15 @@ def fetched_checkpoint(path: str, revision: str | None, field: str) -> Path:
         try:
             folder = Path(snapshot_download(path, revision=revision, allow_patterns=list(FILES)))
         except (OSError, ValueError) as error:
-            remedy = f"not a directory here and not loadable from the Hub ({brief(error)})"
-            raise InputError(field, path, remedy) from error
+            hint = f"not a directory here and not loadable from the Hub ({brief(error)})"
+            raise InputError(field, path, hint) from error
     if not (folder / CONFIG).is_file():
         raise InputError(field, path, "no config.json there; give the folder named pretrained_model")
-    check_checkpoint(folder, Origin(field, path), fetched=not local)
+    check_checkpoint(folder, FileSource(field, path), fetched=not local)
     return folder
 
 
-def check_checkpoint(folder: Path, origin: Origin, *, fetched: bool = False) -> None:
+def check_checkpoint(folder: Path, origin: FileSource, *, fetched: bool = False) -> None:
     """Checks all files of a LeRobot checkpoint that are read, before they are.
 
     One that was `fetched` from the Hub must not name folders of this machine.
@@ -111,17 +111,17 @@ def is_adapter(folder: Path) -> bool:
     """True for an adapter of LeRobot's PEFT training, which is loaded on top of another checkpoint."""
     if not (folder / ADAPTER_CONFIG).is_file():
         return False
-    config = read_json(folder / CONFIG, Origin("path", str(folder)))
+    config = read_json(folder / CONFIG, FileSource("path", str(folder)))
     return bool(config.get("use_peft")) or not (folder / WEIGHTS).is_file()
 
 
-def check_ours(ours: dict[str, Any], origin: Origin) -> None:
+def check_ours(ours: dict[str, Any], origin: FileSource) -> None:
     for key in ("sampler", "rename_map"):
         if not isinstance(ours.get(key, {}), dict):
             raise origin.refuse(f"{OURS}: {key}", "a mapping is wanted; remove the file to start without it")
 
 
-def check_processor(folder: Path, name: str, origin: Origin) -> None:
+def check_processor(folder: Path, name: str, origin: FileSource) -> None:
     """Checks a processor file: only LeRobot's registered steps, with state files in this folder."""
     steps = read_json(folder / name, origin).get("steps")
     if not isinstance(steps, list):
@@ -131,8 +131,8 @@ def check_processor(folder: Path, name: str, origin: Origin) -> None:
             raise origin.refuse(name, "a step is a mapping with a mapping named config")
         kind = step.get("registry_name")
         if not isinstance(kind, str) or "class" in step:
-            remedy = "only steps with a registry_name are loaded: LeRobot would import and call this class"
-            raise origin.refuse(f"{name}: {str(step.get('class'))[:60]}", remedy)
+            hint = "only steps with a registry_name are loaded: LeRobot would import and call this class"
+            raise origin.refuse(f"{name}: {str(step.get('class'))[:60]}", hint)
         if "state_file" in step:
             tensor_shapes(safe_join(folder, step["state_file"], origin), origin)
         if kind in STEP_FOLDERS:
@@ -141,7 +141,7 @@ def check_processor(folder: Path, name: str, origin: Origin) -> None:
             check_name(named, folder / own, f"{name}: {option}", origin)
 
 
-def check_name(name: Any, own: Path, what: str, origin: Origin) -> None:
+def check_name(name: Any, own: Path, what: str, origin: FileSource) -> None:
     """Checks that a backbone or tokeniser has the form of a Hub id, or is a folder.
 
     `own` is the checkpoint's own folder of it; `what` says file and key, for the error.
@@ -157,7 +157,7 @@ def check_name(name: Any, own: Path, what: str, origin: Origin) -> None:
         raise origin.refuse(what, f"{name[:80]!r} is neither a Hub id nor an absolute path")
 
 
-def _check_beside(folder: Path, origin: Origin) -> None:
+def _check_beside(folder: Path, origin: FileSource) -> None:
     """The backbone's own folder: links, what is no file, attention that is compiled code on the Hub."""
     for directory, _, files in os.walk(safe_join(folder, BACKBONE, origin)):
         for path in (Path(directory, name) for name in files):
@@ -190,11 +190,11 @@ def guarded(section: str, commit: str | None = None) -> Iterator[None]:
         snapshot = Path(file).parent
         pinned = commit is not None and f"snapshots/{commit}/" in Path(file).as_posix()
         if not pinned:
-            remedy = (
+            hint = (
                 "code that came with a model, which would run with your rights; read it, then name its "
                 f"commit in {section}.trust_remote_code"
             )
-            raise InputError(f"{section}.trust_remote_code", f"{snapshot.name}/{Path(file).name}", remedy)
+            raise InputError(f"{section}.trust_remote_code", f"{snapshot.name}/{Path(file).name}", hint)
         return look(file)
 
     def load_known(file: Any, *arguments: Any, **options: Any) -> Any:
@@ -203,8 +203,8 @@ def guarded(section: str, commit: str | None = None) -> Iterator[None]:
             Path(torch.hub.get_dir()).resolve()
         )
         if not known:
-            remedy = "a pickle, which may run code when it is loaded; convert it to safetensors"
-            raise InputError(f"{section}.path", str(file)[:200], f"{remedy} where you trust it")
+            hint = "a pickle, which may run code when it is loaded; convert it to safetensors"
+            raise InputError(f"{section}.path", str(file)[:200], f"{hint} where you trust it")
         return load(file, *arguments, **options | {"weights_only": True})
 
     # Without a time-out of 0 it would ask the terminal.

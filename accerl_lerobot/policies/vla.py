@@ -44,7 +44,7 @@ from scipy.fft import dct
 from torch import Tensor
 
 from accerl_lerobot.checkpoint.layout import BACKBONE_FILES
-from accerl_lerobot.checkpoint.safety import Origin, matching_files
+from accerl_lerobot.checkpoint.safety import FileSource, matching_files
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.family import Encoded
 from accerl_lerobot.policies.flow import FlowModel, Velocity, flow_shape
@@ -195,7 +195,7 @@ class FastTokenizer:
     def save_pretrained(self, directory: Path) -> None:
         """Copies its files; code, where it lies beside them, for those who run it."""
         directory.mkdir(parents=True, exist_ok=True)
-        files = matching_files(self.folder, BACKBONE_FILES, Origin("policy.path", str(self.folder)))
+        files = matching_files(self.folder, BACKBONE_FILES, FileSource("policy.path", str(self.folder)))
         for name, file in files.items():
             if not (directory / name).exists():
                 shutil.copyfile(file, directory / name)
@@ -224,12 +224,12 @@ class Pi0Fast(TokenModel):
         super().__init__(policy)
         config, tokenizer = policy.config, policy._paligemma_tokenizer
         if config.temperature != 0:
-            remedy = "LeRobot's sampler has to be greedy here: set it to 0 in config.json; exploration has a "
-            raise InputError("policy.temperature", config.temperature, f"{remedy}policy.sampler.temperature")
+            hint = "LeRobot's sampler has to be greedy here: set it to 0 in config.json; exploration has a "
+            raise InputError("policy.temperature", config.temperature, f"{hint}policy.sampler.temperature")
         if config.n_action_steps != (rows := config.chunk_size):
             # The coefficients of K rows, read as those of fewer, are another, faster and larger movement.
-            remedy = f"LeRobot decodes so many rows from the coefficients of {rows}; use {rows}"
-            raise InputError("policy.n_action_steps", config.n_action_steps, remedy)
+            hint = f"LeRobot decodes so many rows from the coefficients of {rows}; use {rows}"
+            raise InputError("policy.n_action_steps", config.n_action_steps, hint)
         config.validate_action_token_prefix = False
         logging.root.addFilter(_decodable)
         self.length = config.max_decoding_steps

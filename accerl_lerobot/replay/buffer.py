@@ -19,7 +19,7 @@ import numpy as np
 from accerl_lerobot.checkpoint.snapshot import kind
 from accerl_lerobot.experience import REAL, Segment
 from accerl_lerobot.replay.journal import Journal
-from accerl_lerobot.replay.pacing import ReplayConfig, entitle
+from accerl_lerobot.replay.pacing import ReplayConfig, draws_for
 
 DRAWS = 1024
 """Last draws that are remembered, to be taken back in `Replay.state`: a trainer draws one batch ahead, and
@@ -71,7 +71,7 @@ class Replay:
         self.stored_decisions = 0
         self.available_decisions = 0  # decisions of the segments with draws left
         self._entries: deque[_Entry] = deque()  # oldest first
-        self._carry = 0.0
+        self._remainder = 0.0
         self._drawn: deque[tuple[int, list[_Entry]]] = deque(maxlen=DRAWS)
         """The trainer's version and what it was given, of each of the last draws."""
 
@@ -98,7 +98,7 @@ class Replay:
             return False
         while self.stored_decisions + n > self.config.capacity:
             self._depart(self._entries.popleft(), "evicted")
-        draws, self._carry = entitle(self.config.samples_per_insert, n, self._carry)
+        draws, self._remainder = draws_for(self.config.samples_per_insert, n, self._remainder)
         self._add(_Entry(segment, draws))
         self.counters.inserted_segments += 1
         self.counters.inserted_decisions += n
@@ -152,11 +152,11 @@ class Replay:
                 if entry.left:
                     vars(counters)[f"{entry.left}_unused"] += 1
         entries = [{"segment": e.segment, "draws": e.draws, "uses": e.uses - back[e]} for e in self._entries]
-        return {"counters": counters, "entries": entries, "carry": self._carry}
+        return {"counters": counters, "entries": entries, "remainder": self._remainder}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Resumes from `state`, before the first insert."""
-        self.counters, self._carry = state["counters"], state["carry"]
+        self.counters, self._remainder = state["counters"], state["remainder"]
         for held in state["entries"]:
             self._add(_Entry(**held))
 

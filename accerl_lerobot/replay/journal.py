@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Record of the real episodes, on disk: ``RUN/episodes.jsonl`` has a line per segment that replay has stored.
 
-Pictures are not in it; a world that is given the same seed and actions shows the same again, at every env
-step and in any size. That is what `export.episodes` does.
+Pictures are not in it; an environment that is given the same seed and actions shows the same again, at every
+env step and in any size. That is what `export.episodes` does.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from accerl_lerobot.errors import InputError, reading
-from accerl_lerobot.experience import Origin, Segment
+from accerl_lerobot.experience import Segment, SegmentStart
 from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.metrics import cut_back
 
@@ -26,11 +26,11 @@ EPISODES = "episodes.jsonl"  # name of the file in a run's folder
 
 
 @dataclass(frozen=True, kw_only=True)
-class Done:
+class JournalEntry:
     """A segment as the journal knows it."""
 
     key: str
-    origin: Origin
+    origin: SegmentStart
     actions: np.ndarray  # float32 (env steps, A), as they were executed, one after the other
     steps: tuple[int, ...]  # env steps of each decision; `rewards` have its cost taken off
     versions: tuple[int, ...]
@@ -73,20 +73,20 @@ class Journal:
         cut_back(self._path, position)
 
 
-def read_journal(path: Path) -> Iterator[Done]:
+def read_journal(path: Path) -> Iterator[JournalEntry]:
     """Reads a journal, in order; a last line that is half written is left out."""
     if not path.is_file():
-        remedy = f"no {path.name} there; name the folder of an accerl train run"
-        raise InputError("path", str(path.parent), remedy)
+        hint = f"no {path.name} there; name the folder of an accerl train run"
+        raise InputError("path", str(path.parent), hint)
     with path.open("rb") as file:
         for number, line in enumerate(file, start=1):
             if line.endswith(b"\n"):
                 with reading("path", str(path), f"line {number}"):
-                    done = _done(json.loads(line))
+                    done = _entry(json.loads(line))
                 yield done
 
 
-def _done(line: dict[str, Any]) -> Done:
+def _entry(line: dict[str, Any]) -> JournalEntry:
     actions = np.frombuffer(base64.b64decode(line["actions"], validate=True), "<f4")
     actions = actions.reshape(-1, int(line["action_dim"]))
     steps = tuple(int(n) for n in line["steps"])
@@ -96,9 +96,9 @@ def _done(line: dict[str, Any]) -> Done:
         or not len(steps) == len(line["versions"]) == len(line["rewards"])
     ):
         raise ValueError("its parts are of different lengths")
-    return Done(
+    return JournalEntry(
         key=str(line["key"]),
-        origin=Origin(str(line["task"]), int(line["seed"]), int(line["decision"])),
+        origin=SegmentStart(str(line["task"]), int(line["seed"]), int(line["decision"])),
         actions=actions,
         steps=steps,
         versions=tuple(int(v) for v in line["versions"]),
@@ -108,9 +108,9 @@ def _done(line: dict[str, Any]) -> Done:
     )
 
 
-def whole_episodes(segments: Iterator[Done]) -> Iterator[list[Done]]:
+def whole_episodes(segments: Iterator[JournalEntry]) -> Iterator[list[JournalEntry]]:
     """Episodes of which all segments are there, in the order of their ends."""
-    under_way: dict[tuple[str, int], list[Done]] = {}
+    under_way: dict[tuple[str, int], list[JournalEntry]] = {}
     for segment in segments:
         name = segment.origin[:2]
         parts = under_way.get(name, [])

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from accerl_lerobot.checkpoint.layout import CONFIG, SUMMARY
-from accerl_lerobot.checkpoint.safety import Origin, check_folder, read_json
+from accerl_lerobot.checkpoint.safety import FileSource, check_folder, read_json
 from accerl_lerobot.config.parsing import encode, read_recipe
 from accerl_lerobot.console import ABSENT
 from accerl_lerobot.engine.config import RunConfig
@@ -86,12 +86,12 @@ class Run:
 
 
 def read_run(path: Path) -> Run:
-    origin = Origin("runs", str(path))
+    origin = FileSource("runs", str(path))
     check_folder(path, origin)
     config_path = path / CONFIG
     if not config_path.is_file():
-        remedy = f"no run in it: there is no {CONFIG}, which every run writes first"
-        raise InputError("runs", str(path), remedy)
+        hint = f"no run in it: there is no {CONFIG}, which every run writes first"
+        raise InputError("runs", str(path), hint)
     config = read_recipe(config_path)
     if not {"algorithm", "trainer"} <= config.keys():
         raise InputError("runs", str(path), f"no run in it: its {CONFIG} is not one of accerl train")
@@ -175,8 +175,8 @@ def _lines(path: Path) -> tuple[list[Record], bool]:
         if isinstance(record, dict) and isinstance(record.get("kind"), str):
             records.append(record)
         elif number < len(lines):
-            remedy = f"{line[:60].decode(errors='replace')!r} is not a whole record; mend or remove this line"
-            raise InputError("runs", f"{path}:{number}", remedy)
+            hint = f"{line[:60].decode(errors='replace')!r} is not a whole record; mend or remove this line"
+            raise InputError("runs", f"{path}:{number}", hint)
     return records, len(records) < len(lines)
 
 

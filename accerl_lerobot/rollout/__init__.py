@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Steps worlds, asks the policy, cuts episodes into segments."""
+"""Steps environments, asks the policy, cuts episodes into segments."""

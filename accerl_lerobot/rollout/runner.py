@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Several worlds, each somewhere between a decision and the next: the rollout worker without its process.
+"""Several environments, each somewhere between a decision and the next: the rollout worker without its
+process.
 
-A slot is one world. `start` resets it and `advance` executes a decision in it; both return the request for
-the next decision. The Ray worker goes on with other slots meanwhile, the local engine answers at once.
+A slot is one environment. `start` resets it and `advance` executes a decision in it; both return the request
+for the next decision. The Ray worker goes on with other slots meanwhile, the local engine answers at once.
 
-`EpisodePlans` says which episode a free world runs next: planned evaluations first, then exploring ones, of
-each task in turn and of failing ones more often, with seeds of this worker's own (`seeds.py`).
+`EpisodePlans` says which episode a free environment runs next: planned evaluations first, then exploring
+ones, of each task in turn and of failing ones more often, with seeds of this worker's own (`seeds.py`).
 """
 
 from __future__ import annotations
@@ -19,10 +20,10 @@ import numpy as np
 
 from accerl_lerobot.checkpoint.snapshot import kind
 from accerl_lerobot.config.ranges import NonNegative, Range, Section, Steps
-from accerl_lerobot.envs.base import ChunkResult, World
-from accerl_lerobot.envs.reward_model import JudgedWorld, RewardModelConfig
+from accerl_lerobot.envs.base import ChunkResult, Environment
+from accerl_lerobot.envs.reward_model import JudgedEnvironment, RewardModelConfig
 from accerl_lerobot.errors import InputError, for_viewing, warn_once
-from accerl_lerobot.experience import REAL, TASK, Decision, Observation, Origin, Request, Segment
+from accerl_lerobot.experience import REAL, TASK, Decision, Observation, Request, Segment, SegmentStart
 from accerl_lerobot.seeds import noise_seed, train_seed
 
 STARTS_PER_INCARNATION = 1000
@@ -39,7 +40,7 @@ class SegmentBuilder:
 
     observations: list[Observation]
     length: int
-    origin: Origin
+    origin: SegmentStart
     time_limit: int  # env steps of an episode at most
     source: str = REAL
     before: int = 0  # env steps of the episode before the first of `taken`
@@ -105,7 +106,7 @@ class ActiveEpisode:
     versions: list[int] = field(default_factory=list)  # of the weights of each decision
     frames: list[np.ndarray] = field(default_factory=list)
     chunks: list[np.ndarray] = field(default_factory=list)
-    """All that was executed, by which `RolloutRunner.restore` brings the world back to where it was."""
+    """All that was executed, by which `RolloutRunner.restore` brings the environment back to where it was."""
 
     def request(self) -> Request:
         seed = noise_seed(self.plan.seed, len(self.versions))
@@ -121,8 +122,8 @@ class RolloutConfig(Section, section="rollout"):
 
     workers: Annotated[int, Range("[1, 1000]")] = 1
     """Rollout processes."""
-    worlds: Annotated[int, Range("[1, 1000]")] = 8
-    """Worlds per process; while some wait for a decision the others step."""
+    environments: Annotated[int, Range("[1, 1000]")] = 8
+    """Environments per process; while some wait for a decision the others step."""
     segment_length: Annotated[int, Range("[1, 10000]")] = 16
     """Largest number of decisions in a segment."""
     decision_cost: NonNegative = 0.01
@@ -136,7 +137,7 @@ class RolloutConfig(Section, section="rollout"):
     @property
     def in_flight(self) -> int:
         """Decisions that environments of equal speed make while a segment is on its way to replay."""
-        return self.workers * self.worlds * self.segment_length
+        return self.workers * self.environments * self.segment_length
 
 
 @kind
@@ -193,7 +194,7 @@ class EpisodePlans:
         self._queued.extend(plans)
 
     def next(self, exploring: bool) -> EpisodePlan | None:
-        """The episode that a free world is to run; None: it has to wait."""
+        """The episode that a free environment is to run; None: it has to wait."""
         if self._queued:
             return self._queued.popleft()
         if not exploring or self.spent:
@@ -254,20 +255,20 @@ class Counters:
     env_steps: int = 0
     decisions: int = 0
     episodes: int = 0
-    dropped_nonfinite: int = 0  # decisions thrown away because the world returned NaN or infinity
+    dropped_nonfinite: int = 0  # decisions thrown away because the environment returned NaN or infinity
     dropped_episodes: int = 0  # episodes that ended so
 
 
 @dataclass(eq=False)
 class RolloutRunner:
-    """Drives a set of worlds, one per slot, through planned episodes.
+    """Drives a set of environments, one per slot, through planned episodes.
 
     `next_plan` is called for each new episode; None leaves the slot idle until `start` is called again.
     `name`, unique per incarnation of a worker, is the prefix of its segments' keys. `on_segment` receives
     finished segments of exploring episodes, `on_episode` every finished episode.
     """
 
-    worlds: Sequence[World]
+    environments: Sequence[Environment]
     next_plan: Callable[[], EpisodePlan | None]
     config: RolloutConfig
     name: str
@@ -276,12 +277,12 @@ class RolloutRunner:
 
     def __post_init__(self) -> None:
         self.counters = Counters()
-        self._episodes: list[ActiveEpisode | None] = [None] * len(self.worlds)
+        self._episodes: list[ActiveEpisode | None] = [None] * len(self.environments)
         self._sequence = 0
         self._dropped = 0  # episodes in a row
 
     def __len__(self) -> int:
-        return len(self.worlds)
+        return len(self.environments)
 
     @property
     def exploring(self) -> bool:
@@ -293,9 +294,9 @@ class RolloutRunner:
         if plan is None:
             self._episodes[slot] = None
             return None
-        observation = self.worlds[slot].reset(plan.seed, plan.task)
-        origin = Origin(plan.task, plan.seed, decision=0)
-        limit = self.worlds[slot].spec.max_steps
+        observation = self.environments[slot].reset(plan.seed, plan.task)
+        origin = SegmentStart(plan.task, plan.seed, decision=0)
+        limit = self.environments[slot].spec.max_steps
         builder = SegmentBuilder([observation], self.config.segment_length, origin, limit)
         episode = self._episodes[slot] = ActiveEpisode(plan, builder)
         if bad := nonfinite(observation):
@@ -304,9 +305,9 @@ class RolloutRunner:
 
     def advance(self, slot: int, decision: Decision) -> Request | None:
         """Executes `decision`; the request is about the same episode, or the first of the next one."""
-        world, episode = self.worlds[slot], self._episodes[slot]
+        environment, episode = self.environments[slot], self._episodes[slot]
         assert episode is not None
-        result = _execute(world, episode, decision.chunk)
+        result = _execute(environment, episode, decision.chunk)
         episode.chunks.append(decision.chunk)
         self.counters.env_steps += result.steps
         self.counters.decisions += 1
@@ -320,7 +321,7 @@ class RolloutRunner:
         episode.episode_return += reward
         episode.steps += result.steps
         episode.versions.append(decision.version)
-        actions = np.clip(decision.chunk, world.spec.action_low, world.spec.action_high)
+        actions = np.clip(decision.chunk, environment.spec.action_low, environment.spec.action_high)
         episode.builder.add(decision, actions, reward, result.steps, result.observation)
         if result.done or episode.builder.full:
             self._sequence += 1
@@ -339,8 +340,8 @@ class RolloutRunner:
         self.counters.dropped_episodes += 1
         self._dropped += 1
         if self._dropped >= MOST_DROPPED:
-            remedy = f"{self._dropped} episodes in a row had to be dropped, as {bad} is not finite"
-            raise InputError("env", plan.task, f"{remedy}; mend the environment")
+            hint = f"{self._dropped} episodes in a row had to be dropped, as {bad} is not finite"
+            raise InputError("env", plan.task, f"{hint}; mend the environment")
         if plan.explore:
             warn_once(note)
         else:  # an evaluation counts every episode it planned
@@ -357,16 +358,16 @@ class RolloutRunner:
         return {"counters": replace(self.counters), "sequence": self._sequence, "episodes": episodes}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Resumes from `state`: worlds are brought back by doing again what was done in them."""
+        """Resumes from `state`: environments are brought back by doing again what was done in them."""
         self.counters, self._sequence = state["counters"], state["sequence"]
         self._episodes = state["episodes"]
-        for world, episode in zip(self.worlds, self._episodes, strict=True):
+        for environment, episode in zip(self.environments, self._episodes, strict=True):
             if episode is None:
                 continue
             plan, latest = episode.plan, episode.builder.latest
-            observation = world.reset(plan.seed, plan.task)
+            observation = environment.reset(plan.seed, plan.task)
             for chunk in episode.chunks:
-                observation = world.step_chunk(chunk).observation
+                observation = environment.step_chunk(chunk).observation
             if not all(np.array_equal(observation[key], latest[key]) for key in latest):
                 raise RuntimeError(
                     f"{plan.task} with seed {plan.seed} does not show again what it had shown after "
@@ -375,8 +376,8 @@ class RolloutRunner:
                 )
 
     def close(self) -> None:
-        for world in self.worlds:
-            world.close()
+        for environment in self.environments:
+            environment.close()
 
     def _finish(self, episode: ActiveEpisode, success: bool, note: str) -> None:
         self.counters.episodes += 1
@@ -396,26 +397,26 @@ class RolloutRunner:
         self.on_episode(result)
 
 
-def _execute(world: World, episode: ActiveEpisode, actions: np.ndarray) -> ChunkResult:
+def _execute(environment: Environment, episode: ActiveEpisode, actions: np.ndarray) -> ChunkResult:
     """Executes a chunk; if it is filmed, part by part, with a frame of each."""
     if episode.plan.film is None:
-        return world.step_chunk(actions)
+        return environment.step_chunk(actions)
     side, every = episode.plan.film
-    if isinstance(world, JudgedWorld):
+    if isinstance(environment, JudgedEnvironment):
         every = len(actions)  # or filmed episodes would be judged more often than others
     rewards = []
     for i in range(0, len(actions), every):
-        result = world.step_chunk(actions[i : i + every])
+        result = environment.step_chunk(actions[i : i + every])
         rewards.append(result.rewards)
         with for_viewing("film"):
-            episode.frames.append(_frame(world, side))
+            episode.frames.append(_frame(environment, side))
         if result.done:
             break
     return replace(result, rewards=np.concatenate(rewards))
 
 
-def _frame(world: World, side: int) -> np.ndarray:
-    frame = np.asarray(world.render(side, side))
+def _frame(environment: Environment, side: int) -> np.ndarray:
+    frame = np.asarray(environment.render(side, side))
     if frame.shape != (side, side, 3) or frame.dtype != np.uint8:
         raise ValueError(f"a frame is {frame.dtype} {frame.shape}, not uint8 ({side}, {side}, 3)")
     return frame

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The rollout process: steps its worlds while other observations wait for a decision.
+"""The rollout process: steps its environments while other observations wait for a decision.
 
-It waits only when every world has an observation under way, and pauses exploring while replay does not take
-segments. It outlives inference, whose successor is asked again what has not been answered. A world that
-raises ends `run`, and the engine starts another process. Imports neither torch nor LeRobot, unless its world
-does.
+It waits only when every environment has an observation under way, and pauses exploring while replay does not
+take segments. It outlives inference, whose successor is asked again what has not been answered. An
+environment that raises ends `run`, and the engine starts another process. Imports neither torch nor LeRobot,
+unless its environment does.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from accerl_lerobot import errors
-from accerl_lerobot.envs import EnvConfig, make_world
+from accerl_lerobot.envs import EnvConfig, make_environment
 from accerl_lerobot.experience import Decision, Request, Segment
 from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.rollout.runner import (
@@ -33,8 +33,9 @@ from accerl_lerobot.timeline import COMPUTE, TRANSPORT, WAIT_IN, WAIT_OUT, open_
 from accerl_lerobot.transport.endpoint import Endpoint, ReconnectingClient
 
 PARTS = 2
-"""A worker's worlds are asked for in so many parts: one is stepped while the other's decisions are made."""
-MAX_PENDING = 2  # messages to replay that may be pending before exploring worlds pause
+"""A worker's environments are asked for in so many parts: one is stepped while the other's decisions are
+made."""
+MAX_PENDING = 2  # messages to replay that may be pending before exploring environments pause
 PAUSE_S = 0.005  # between two looks at whether there is something to do
 
 
@@ -46,8 +47,8 @@ class Report:
     counters: dict[str, float]  # since this process began
     busy_s: float = 0.0
     """Seconds for which its thread has been at what it does now; 0 before `RolloutWorker.run`."""
-    in_world: bool = False  # True if that is to step or reset a world
-    moves: int = 0  # resets and executed chunks of its worlds
+    in_environment: bool = False  # True if that is to step or reset an environment
+    moves: int = 0  # resets and executed chunks of its environments
     spent: bool = False  # every exploring episode that was paid for has been played, and replay has it
     starts: int = 0  # see `EpisodePlans.starts`
 
@@ -74,10 +75,12 @@ class RolloutWorker:
         self._moves = 0
         self._outbox: list[Segment] = []
         self._deciding = ReconnectingClient("inference")
-        worlds = [make_world(env, history, config.reward_model) for _ in range(config.worlds)]
+        environments = [
+            make_environment(env, history, config.reward_model) for _ in range(config.environments)
+        ]
         callbacks = self._outbox.append, self._end
         name = f"rollout{plans.worker}.{plans.incarnation}"
-        self._runner = RolloutRunner(worlds, self._next, config, name, *callbacks)
+        self._runner = RolloutRunner(environments, self._next, config, name, *callbacks)
         self._clock.enter(WAIT_IN)
 
     def ready(self) -> int:
@@ -102,19 +105,19 @@ class RolloutWorker:
         self._max_pending = 1 if in_turn else MAX_PENDING
         (self._training.set if training else self._training.clear)()
         now = time.monotonic()
-        since, in_world = self._active or (now, False)
+        since, in_environment = self._active or (now, False)
         return Report(
             episodes=[self._results.popleft() for _ in range(len(self._results))],
             counters={k: float(v) for k, v in vars(self._runner.counters).items()},
             busy_s=now - since,
-            in_world=in_world,
+            in_environment=in_environment,
             moves=self._moves,
             spent=self._spent,
             starts=self._plans.starts,
         )
 
     def run(self, inference: Endpoint, replay: Endpoint) -> None:
-        """Steps worlds until the process ends."""
+        """Steps environments until the process ends."""
         deciding, storing = self._deciding, replay.connect()
         deciding.move(inference)
         idle = list(range(len(self._runner)))

@@ -141,8 +141,8 @@ def check_importance(adapter: PolicyAdapter, observation: Observation, samples: 
     apart = torch.cat([weight, weight * (old - mean) - (new - old)], 1)
     error = apart.std(0) / math.sqrt(samples)
     worst = float((apart.mean(0).abs() / error.clamp(min=1e-12)).max())
-    remedy = "the log-prob is not that of the actions that are executed"
-    assert worst <= DEVIATIONS, f"E_μ[ρ f(a)] and E_π[f(a)] are {worst:.1f} standard errors apart: {remedy}"
+    hint = "the log-prob is not that of the actions that are executed"
+    assert worst <= DEVIATIONS, f"E_μ[ρ f(a)] and E_π[f(a)] are {worst:.1f} standard errors apart: {hint}"
 
 
 def check_gradient(

@@ -31,7 +31,16 @@ STATES = (
 (COMPUTE, WAIT_IN, WAIT_OUT, TRANSPORT, WEIGHT_SYNC, CHECKPOINT, RECOVERY, TRAINING, EVALUATION) = range(
     len(STATES)
 )
-ROLES = ("driver", "local", "rollout", "imagination", "inference", "replay", "trainer", "world learning")
+ROLES = (
+    "driver",
+    "local",
+    "rollout",
+    "imagination",
+    "inference",
+    "replay",
+    "trainer",
+    "world-model learning",
+)
 TIMELINE = "timeline"
 
 

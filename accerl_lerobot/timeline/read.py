@@ -18,7 +18,7 @@ from rich.box import SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
 
-from accerl_lerobot.checkpoint.safety import Origin, brief, check_folder
+from accerl_lerobot.checkpoint.safety import FileSource, brief, check_folder
 from accerl_lerobot.config.ranges import NonNegative, Positive, Section
 from accerl_lerobot.errors import InputError, check_output, expanded, reading
 from accerl_lerobot.timeline import (
@@ -122,11 +122,11 @@ def read_timeline(run_directory: Path) -> Timeline:
     Raises:
         InputError: there is none, or a file of it is damaged.
     """
-    check_folder(run_directory, Origin("runs", str(run_directory)))
+    check_folder(run_directory, FileSource("runs", str(run_directory)))
     parts = read_parts(run_directory / TIMELINE)
     if not parts:
-        remedy = "no timeline in it: it is no run of accerl train, or no worker has begun"
-        raise InputError("runs", str(run_directory), remedy)
+        hint = "no timeline in it: it is no run of accerl train, or no worker has begun"
+        raise InputError("runs", str(run_directory), hint)
     with reading("runs", str(run_directory), f"a file of {TIMELINE}/"):
         return Timeline(run=run_directory, rows=_rows(parts))
 
@@ -250,8 +250,8 @@ def choose_window(timeline: Timeline, start_s: float | None, seconds: float) -> 
     """The part of a timeline that is drawn: from `start_s` on, or in the middle of the longest training."""
     whole = timeline.seconds
     if start_s is not None and not start_s < whole:
-        remedy = f"use 0 or more, below {whole:.1f}, the seconds of {timeline.run}"
-        raise InputError("start_s", start_s, remedy)
+        hint = f"use 0 or more, below {whole:.1f}, the seconds of {timeline.run}"
+        raise InputError("start_s", start_s, hint)
     if start_s is None:
         first, last = max(timeline.training(), key=lambda window: window[1] - window[0])
         start_s = max(0.0, (first + last - seconds) / 2)

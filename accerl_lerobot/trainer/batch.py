@@ -69,7 +69,7 @@ def pick(
     return {k: v[rows] for k, v in observations.items()}, [tasks[i] for i in rows]
 
 
-def turns(rows: np.ndarray, size: int, rank: int, ranks: int) -> list[tuple[np.ndarray, bool]]:
+def split_rows(rows: np.ndarray, size: int, rank: int, ranks: int) -> list[tuple[np.ndarray, bool]]:
     """A rank's share of rows, consecutive ones, in parts of at most `size`; True beside its own.
 
     Every rank gets as many parts, because all ranks have to run a network of which each keeps a part: who has
@@ -90,7 +90,9 @@ class NonFiniteError(RuntimeError):
 
 
 @contextmanager
-def keeping(directory: Path | None, update: BaseUpdate, segments: Sequence[Segment]) -> Iterator[None]:
+def save_batch_if_not_finite(
+    directory: Path | None, update: BaseUpdate, segments: Sequence[Segment]
+) -> Iterator[None]:
     """Saves the segments of an update, made inside, that raises `NonFiniteError`, for `snapshot.load`.
 
     ``nonfinite-000123.json`` and ``.safetensors`` in the run's `directory` hold what would have made update

@@ -64,8 +64,8 @@ class TrainerConfig(Section, section="trainer"):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.ranks > self.batch_decisions:
-            remedy = f"use at most trainer.batch_decisions, {self.batch_decisions}: a decision for each"
-            raise InputError("trainer.ranks", self.ranks, remedy)
+            hint = f"use at most trainer.batch_decisions, {self.batch_decisions}: a decision for each"
+            raise InputError("trainer.ranks", self.ranks, hint)
 
     @property
     def zero(self) -> bool:
@@ -84,8 +84,8 @@ class TrainerConfig(Section, section="trainer"):
             return share, share
         if self.ranks > gpus:
             without = f"{self.ranks} ranks on {gpus:g} GPUs leave {self.ranks - gpus:g} without"
-            remedy = f"each needs one, and {without}; use at most {gpus:g}, or policy.device=cpu"
-            raise InputError("trainer.ranks", self.ranks, remedy)
+            hint = f"each needs one, and {without}; use at most {gpus:g}, or policy.device=cpu"
+            raise InputError("trainer.ranks", self.ranks, hint)
         if self.ranks == gpus:
             return 0.6, 0.4 / math.ceil(others / gpus)
         return 1.0, 1 / math.ceil(others / (gpus - self.ranks))

@@ -14,7 +14,7 @@ import numpy as np
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos.dataset_files import open_metadata, opened
 from accerl_lerobot.demos.episodes import check_images, numbers, observations, read_labels
-from accerl_lerobot.experience import Origin, Segment
+from accerl_lerobot.experience import Segment, SegmentStart
 from accerl_lerobot.policies.config import Load, PolicyConfig
 from accerl_lerobot.policies.features import dataset_shapes
 
@@ -117,5 +117,5 @@ def recorded(
                     terminated=True,
                     success=success,
                     key="demonstration",
-                    origin=Origin(task="", seed=episode.index, decision=0),
+                    origin=SegmentStart(task="", seed=episode.index, decision=0),
                 )

@@ -61,8 +61,8 @@ class Memory:
         """
         t = len(segment)
         if segment.origin.decision or not segment.terminated or t > self.capacity:
-            remedy = f"the memory holds whole episodes of at most algorithm.memory={self.capacity} decisions"
-            raise InputError("rollout.segment_length", t, remedy)
+            hint = f"the memory holds whole episodes of at most algorithm.memory={self.capacity} decisions"
+            raise InputError("rollout.segment_length", t, hint)
         rows = (self.total + np.arange(t)) % self.capacity
         returns = np.zeros(t + 1)
         for i in reversed(range(t)):
@@ -120,7 +120,7 @@ class OffPolicyUpdate(BaseUpdate):
         super().__init__(adapter, config)
         self.policy_steps = algorithm.policy_steps
         self.memory = Memory(algorithm.memory, algorithm.gamma, self.n_step)
-        self._owed: dict[str, float] = {}
+        self._pending_steps: dict[str, float] = {}
 
     def step(self, segments: Sequence[Segment]) -> dict[str, float]:
         if not self.memory.total and self.adapter.demonstrations is not None:
@@ -165,18 +165,18 @@ class OffPolicyUpdate(BaseUpdate):
         return {"imitation_loss": imitation.mean()}
 
     def state(self) -> dict[str, Any]:
-        return super().state() | {"owed": dict(self._owed), "memory": self.memory.state()}
+        return super().state() | {"pending_steps": dict(self._pending_steps), "memory": self.memory.state()}
 
     def restore(self, state: dict[str, Any]) -> None:
         super().restore(state)
-        self._owed = dict(state["owed"])
+        self._pending_steps = dict(state["pending_steps"])
         self.memory.restore(state["memory"])
 
     def steps(self, name: str, each: float, new: int) -> range:
         """As many steps as are due at ``each`` for a new decision; what is left over is due later."""
-        owed = self._owed.get(name, 0.0) + each * new
-        due = int(owed)
-        self._owed[name] = owed - due
+        pending_steps = self._pending_steps.get(name, 0.0) + each * new
+        due = int(pending_steps)
+        self._pending_steps[name] = pending_steps - due
         return range(due)
 
     def remember(self, segment: Segment) -> None:

@@ -20,7 +20,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
-from accerl_lerobot.trainer.batch import turns
+from accerl_lerobot.trainer.batch import split_rows
 
 
 class Ranks:
@@ -40,7 +40,7 @@ class Ranks:
 
     def each(self, score: Callable[[np.ndarray], Tensor], rows: np.ndarray, size: int) -> Tensor:
         """Results of `score` for rows, (rows, ...) on the CPU; a rank is asked of its own, `size` at once."""
-        parts = turns(rows, size, self.rank, self.size)
+        parts = split_rows(rows, size, self.rank, self.size)
         return self.gather(
             torch.cat([score(part).cpu()[: None if own else 0] for part, own in parts]), len(rows)
         )

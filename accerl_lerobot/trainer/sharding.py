@@ -56,8 +56,8 @@ def forget(seen: Watch) -> None:
     """Makes blocks compute again for the gradient what they computed before; see `arrange`."""
     forgetful = [block for block in seen.blocks if list(block.children())]
     if not forgetful:
-        remedy = "no block of this policy can be computed again by itself; leave the field out"
-        raise InputError("trainer.activation_checkpointing", True, remedy)
+        hint = "no block of this policy can be computed again by itself; leave the field out"
+        raise InputError("trainer.activation_checkpointing", True, hint)
     for block in forgetful:
         # FSDP's hooks stand around this, at the module's call: weights are there when it is repeated.
         block.forward = partial(checkpoint, block.forward, use_reentrant=False)

@@ -29,7 +29,7 @@ from accerl_lerobot.experience import Segment
 from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.policies.adapter import PolicyAdapter
 from accerl_lerobot.policies.teacher import TEACHER_PREFIX
-from accerl_lerobot.trainer.batch import MAX_NONFINITE, Batch, NonFiniteError, collate, pick, turns
+from accerl_lerobot.trainer.batch import MAX_NONFINITE, Batch, NonFiniteError, collate, pick, split_rows
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.probe import CRITIC_PREFIX, Probe
 from accerl_lerobot.trainer.ranks import ALONE, Ranks
@@ -153,7 +153,7 @@ class RatioUpdate(BaseUpdate):
 
     def _backward(self, batch: Batch) -> dict[str, float]:
         """Accumulates gradients over micro-batches; returns metrics of the whole batch."""
-        parts = turns(np.arange(len(batch)), self.config.micro_batch, self.ranks.rank, self.ranks.size)
+        parts = split_rows(np.arange(len(batch)), self.config.micro_batch, self.ranks.rank, self.ranks.size)
         bootstrap = self._values(batch.last_observations, batch.segment_tasks)
         targets: tuple[Tensor, Tensor] | None = None
         if len(parts) > 1:  # a single micro-batch supplies the values that GAE needs by its own forward pass

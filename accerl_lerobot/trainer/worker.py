@@ -26,7 +26,7 @@ from accerl_lerobot.checkpoint.layout import PRETRAINED, TRAINING_STATE, WEIGHTS
 from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.replay.pacing import ASYNCHRONOUS, Schedule
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
-from accerl_lerobot.trainer.batch import keeping
+from accerl_lerobot.trainer.batch import save_batch_if_not_finite
 from accerl_lerobot.trainer.peers import LearnerSettings, Peers
 from accerl_lerobot.transport.endpoint import Endpoint
 from accerl_lerobot.transport.weights import PublishDelay, WeightPublisher
@@ -116,7 +116,10 @@ class TrainerWorker:
                 self._clock.enter(COMPUTE)
                 started = time.monotonic()
                 fault_point("trainer.update")
-                with self._peers.joining("step", batch), keeping(self._directory, self._update, segments):
+                with (
+                    self._peers.joining("step", batch),
+                    save_batch_if_not_finite(self._directory, self._update, segments),
+                ):
                     metrics = self._update.step(segments)
                 updated = time.monotonic()
                 self._clock.enter(WEIGHT_SYNC)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Imagination: worlds that are learnt from experience, with the contract of real ones."""
+"""Imagination: environments that are learnt from experience, with the contract of real ones."""

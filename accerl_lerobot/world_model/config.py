@@ -16,7 +16,7 @@ from accerl_lerobot.replay.pacing import ReplayConfig
 PIXELS = "pixels"  # the type of our own class of learned world models
 SPACE_TO_DEPTH = 4  # side of the pixel blocks that become channels in its network
 IMAGINATION = "imagination"  # name of the worker that imagines, and of its state
-WORLD_LEARNING = "world learning"  # name of the worker that trains the world model
+WORLD_LEARNING = "world-model learning"  # name of the worker that trains the world model
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +66,7 @@ class LearnableModelConfig(Section, draccus.ChoiceRegistry, section="world_model
         >>> @LearnableModelConfig.register_subclass("mine")
         ... @dataclass(frozen=True, kw_only=True)
         ... class MyModelConfig(LearnableModelConfig):
-        ...     make = "my_package.model:MyWorldModel"
+        ...     make = "my_package.model:MyEnvironmentModel"
         ...     width: int = 64
     """
 
@@ -184,8 +184,8 @@ class WorldModelConfig(Section, section="world_model"):
         super().__post_init__()
         multiple = math.lcm(2, self.model.multiple)  # the success model halves it first
         if self.image_size < multiple or self.image_size % multiple:
-            remedy = f"use a multiple of {multiple}, or change world_model.model"
-            raise InputError("world_model.image_size", self.image_size, remedy)
+            hint = f"use a multiple of {multiple}, or change world_model.model"
+            raise InputError("world_model.image_size", self.image_size, hint)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -245,8 +245,8 @@ class ImaginationConfig(Section, section="imagination"):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.share and self.path is None and self.needs_path:
-            remedy = "give the folder world_model that accerl world-model has written"
-            raise InputError("imagination.path", None, remedy)
+            hint = "give the folder world_model that accerl world-model has written"
+            raise InputError("imagination.path", None, hint)
 
     def imagined_replay(self, replay: ReplayConfig) -> ReplayConfig:
         """Size and pace of the replay buffer of imagined segments, from those of the run's."""

@@ -103,7 +103,7 @@ def context_of(windows: Windows, rows: slice = slice(None)) -> Context:
 
 
 class Reset(NamedTuple):
-    """Arguments of the `World.reset` at which a rollout starts, for models that repeat it."""
+    """Arguments of the `Environment.reset` at which a rollout starts, for models that repeat it."""
 
     task: str
     seed: int

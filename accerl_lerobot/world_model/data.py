@@ -271,8 +271,8 @@ def load_datasets(sections: dict[str, DatasetConfig], spec: WorldModelSpec) -> d
                 logger.warning(text, dataset.repo_id, len(episodes) - len(once))
             keys = once.keys()
             if twice := len(keys & known):
-                remedy = f"{twice} of its episodes are in the other dataset, too; name one with others"
-                raise InputError("dataset.repo_id", dataset.repo_id, remedy)
+                hint = f"{twice} of its episodes are in the other dataset, too; name one with others"
+                raise InputError("dataset.repo_id", dataset.repo_id, hint)
         known |= keys
         loaded[section] = list(once.values())
     return loaded
@@ -285,7 +285,7 @@ def name_section(section: str) -> Iterator[None]:
         yield
     except InputError as error:
         field = error.field.replace("dataset.", f"{section}.", 1)
-        raise InputError(field, error.value, error.remedy) from error
+        raise InputError(field, error.value, error.hint) from error
 
 
 def check_metadata(meta: Any, name: str, spec: WorldModelSpec) -> None:
@@ -298,11 +298,11 @@ def check_metadata(meta: Any, name: str, spec: WorldModelSpec) -> None:
         why = f"no {missing[0]!r}: the dataset has {cameras}; choose env.camera accordingly"
     elif others:
         key, shape = next(iter(others.items()))
-        why = f"{key} has shape {shape}, the world's has ({sizes[key]},): it is another robot's"
+        why = f"{key} has shape {shape}, the environment's has ({sizes[key]},): it is another robot's"
     elif not {SUCCESS, REWARD} & shapes.keys():
         why = f"no {SUCCESS}: record it, as accerl demos does, or add it to the dataset"
     elif meta.fps != spec.fps:
-        why = f"{meta.fps} frames a second, and the world makes {spec.fps} steps; record at the world's rate"
+        why = f"{meta.fps} frames a second, and the environment makes {spec.fps} steps; record at its rate"
     elif meta.total_episodes < 2:
         why = "a single episode; at least one to train on and one to hold out are needed"
     else:

@@ -64,8 +64,8 @@ class LatentModel(StateModel):
     def __init__(self, spec: StateSpec, config: LatentConfig) -> None:
         super().__init__()
         if not spec.cameras:
-            remedy = "the policy reads no images; use simulator, or another algorithm"
-            raise InputError("world_model.type", config.type, remedy)
+            hint = "the policy reads no images; use simulator, or another algorithm"
+            raise InputError("world_model.type", config.type, hint)
         self.cameras, self.latents = tuple(spec.cameras), config.latents
         self.size = config.latents + spec.state + 1
         self.encoder = Encoder(sum(spec.cameras.values()), config.latents)

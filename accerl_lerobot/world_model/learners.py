@@ -220,7 +220,7 @@ def _halves(of: dict[bool, list[WindowStart]], count: int, rng: np.random.Genera
 
 def imagine_pairs(
     examples: Examples,
-    world: WorldModel,
+    environment: WorldModel,
     success: SuccessPairsRewardModel,
     count: int,
     depth: int,
@@ -231,10 +231,10 @@ def imagine_pairs(
     classifies as successes get the largest.
     """
     at = [WindowStart(e, 0 if rng.random() < 0.5 else f) for e, f in examples.chunks(count, rng)]
-    windows, predictions, executed = replay(world, examples.episodes, at, depth, rng)
+    windows, predictions, executed = replay(environment, examples.episodes, at, depth, rng)
     rows, depths = np.nonzero(executed)
     begun = [(examples.episodes[at[m].episode], at[m].frame) for m in rows]
-    steps = (depths + 1) * world.spec.chunk
+    steps = (depths + 1) * environment.spec.chunk
     progress = [e.progress(int(e.times[f]) + n) for (e, f), n in zip(begun, steps.tolist(), strict=True)]
     pairs = Pairs(
         before=predictions.frames[rows, depths],
@@ -268,12 +268,12 @@ class SuccessLearner(_Trainer):
         self.config = config
         self._imagined: tuple[Pairs, np.ndarray] | None = None
 
-    def step(self, examples: Examples, world: WorldModel) -> dict[str, float]:
+    def step(self, examples: Examples, environment: WorldModel) -> dict[str, float]:
         """Makes a gradient step on recorded pairs and on as many that the world model imagines."""
         batch, longest = self.config.success.batch, self.config.longest
         recorded = examples.sample(batch - batch // 2, self.rng)
         if self._imagined is None or self.count % REFRESH_EVERY == 0:
-            self._imagined = imagine_pairs(examples, world, self.model, REPLAYED, longest, self.rng)
+            self._imagined = imagine_pairs(examples, environment, self.model, REPLAYED, longest, self.rng)
         drawn = draw_pairs(*self._imagined, batch // 2, self.rng)
         pairs = Pairs(*(np.concatenate(both) for both in zip(recorded, drawn, strict=True)))
         before, after, task = self.model.inputs(*pairs[:3])

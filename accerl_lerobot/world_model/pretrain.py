@@ -23,7 +23,7 @@ import torch
 
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.console import Console, Stage
-from accerl_lerobot.envs import EnvConfig, make_world
+from accerl_lerobot.envs import EnvConfig, make_environment
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.loading import resolve_device
 from accerl_lerobot.world_model import data, learners, store, validation
@@ -40,8 +40,8 @@ METRICS = "metrics.jsonl"
 
 def world_spec(config: WorldModelConfig, env: EnvConfig) -> WorldModelSpec:
     """Spec of a model of this environment."""
-    with closing(make_world(env)) as world:
-        spec = world.spec
+    with closing(make_environment(env)) as environment:
+        spec = environment.spec
     return WorldModelSpec(
         cameras=tuple(spec.images), image_size=(config.image_size, config.image_size),
         state_dim=spec.state_dim, action_dim=spec.action_dim, chunk=config.chunk,
@@ -114,12 +114,12 @@ def pretrain(run: WorldModelRun, directory: Path, console: Console) -> dict[str,
 
 def _tasks(env: EnvConfig, episodes: Sequence[Episode]) -> tuple[str, ...]:
     """Names of the environment's tasks that the episodes have, matched by their instructions."""
-    with closing(make_world(env)) as world:
-        instructions = {name: str(world.reset(0, name)["task"]) for name in world.spec.tasks}
+    with closing(make_environment(env)) as environment:
+        instructions = {name: str(environment.reset(0, name)["task"]) for name in environment.spec.tasks}
     recorded = {episode.task for episode in episodes}
     if unknown := sorted(recorded - set(instructions.values())):
-        remedy = f"an episode's task is {unknown[0][:80]!r}, which none of these is; name its task"
-        raise InputError("env.task", ", ".join(instructions), remedy)
+        hint = f"an episode's task is {unknown[0][:80]!r}, which none of these is; name its task"
+        raise InputError("env.task", ", ".join(instructions), hint)
     return tuple(name for name, task in instructions.items() if task in recorded)
 
 
@@ -128,10 +128,10 @@ def _check_split(
 ) -> None:
     """Refuses a split that could not be validated, before the training."""
     if any({episode.success for episode in part} != {True, False} for part in (learnt, held_out)):
-        remedy = "at least two successes and two failures (demos.failure_share) are needed, to hold out one"
-        raise InputError("dataset.repo_id", dataset.repo_id, remedy)
+        hint = "at least two successes and two failures (demos.failure_share) are needed, to hold out one"
+        raise InputError("dataset.repo_id", dataset.repo_id, hint)
     needed = config.chunk * config.validation.depth + 1
     longest = max(len(episode.frames) for episode in held_out)
     if longest < needed:
-        remedy = f"held-out episodes have at most {longest} frames, and rollouts of this depth need {needed}"
-        raise InputError("world_model.validation.depth", config.validation.depth, remedy)
+        hint = f"held-out episodes have at most {longest} frames, and rollouts of this depth need {needed}"
+        raise InputError("world_model.validation.depth", config.validation.depth, hint)

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from accerl_lerobot.envs.base import ChunkResult, World, WorldSpec
+from accerl_lerobot.envs.base import ChunkResult, Environment, EnvironmentSpec
 from accerl_lerobot.experience import TASK
 from accerl_lerobot.world_model.contract import (
     Context,
@@ -53,14 +53,15 @@ class OracleModel(WorldModel):
     just goes on where it is there, and repeats these actions where it is not.
     """
 
-    def __init__(self, world: WorldSpec, executed: int, make: Callable[[], World]) -> None:
-        height, width, _ = next(iter(world.images.values()))
+    def __init__(self, environment: EnvironmentSpec, executed: int, make: Callable[[], Environment]) -> None:
+        height, width, _ = next(iter(environment.images.values()))
         self.spec = WorldModelSpec(
-            cameras=tuple(world.images), image_size=(height, width), state_dim=world.state_dim,
-            action_dim=world.action_dim, chunk=executed, fps=world.fps, context=1, tasks=world.tasks,
+            cameras=tuple(environment.images), image_size=(height, width), state_dim=environment.state_dim,
+            action_dim=environment.action_dim, chunk=executed, fps=environment.fps, context=1,
+            tasks=environment.tasks,
         )  # fmt: skip
-        self._make, self._longest = make, world.max_steps + executed
-        self._simulators: list[World] = []
+        self._make, self._longest = make, environment.max_steps + executed
+        self._simulators: list[Environment] = []
         self._where: list[bytes] = []
 
     def begin(self, context: Context, tasks: Sequence[str], resets: Sequence[Reset] | None = None) -> State:
@@ -94,18 +95,18 @@ class OracleModel(WorldModel):
 
     def close(self) -> None:
         """Closes the simulators."""
-        for world in self._simulators:
-            world.close()
+        for environment in self._simulators:
+            environment.close()
 
     def _play(self, state: State, row: int, actions: np.ndarray) -> ChunkResult:
         if row == len(self._simulators):
             self._simulators.append(self._make())
-        world = self._simulators[row]
+        environment = self._simulators[row]
         if row >= len(self._where) or self._where[row] != _key(state, row):
-            world.reset(int(state["seed"][row]), self.spec.tasks[int(state["task"][row])])
+            environment.reset(int(state["seed"][row]), self.spec.tasks[int(state["task"][row])])
             if n := int(state["count"][row]):
-                world.step_chunk(state["played"][row, :n].numpy())
-        return world.step_chunk(actions)
+                environment.step_chunk(state["played"][row, :n].numpy())
+        return environment.step_chunk(actions)
 
 
 def _key(state: State, row: int) -> bytes:

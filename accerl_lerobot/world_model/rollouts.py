@@ -25,15 +25,15 @@ import torch
 
 from accerl_lerobot.checkpoint.snapshot import kind
 from accerl_lerobot.checkpoint.tensors import copied
-from accerl_lerobot.envs.base import WorldSpec
+from accerl_lerobot.envs.base import EnvironmentSpec
 from accerl_lerobot.experience import (
     IMAGINED,
     TASK,
     Decision,
     Observation,
-    Origin,
     Request,
     Segment,
+    SegmentStart,
     task_codes,
 )
 from accerl_lerobot.rollout.runner import SegmentBuilder
@@ -62,7 +62,7 @@ class Start(NamedTuple):
     frames: np.ndarray  # uint8 (V, H, W, 3), of the model's size
     robot: np.ndarray  # float32 (S,)
     task: str  # the instruction
-    origin: Origin
+    origin: SegmentStart
 
 
 def start_of(segment: Segment, spec: WorldModelSpec) -> Start:
@@ -146,7 +146,7 @@ class Imagination:
         self,
         model: WorldModel,
         success: SuccessPairsRewardModel | None,
-        world: WorldSpec,
+        environment: EnvironmentSpec,
         config: ImaginationConfig,
         on_segment: Callable[[Segment], object],
         *,
@@ -157,7 +157,7 @@ class Imagination:
         self.counters = {"rollouts": 0, "decisions": 0, "successes": 0, "uncertain": 0}
         self.switch = KillSwitch(config.max_gap, config.window, config.min_real_episodes)
         self.version, self.awaits_model = 0, config.learns  # true until a model has passed validation
-        self._model, self._success, self._world = model, success, world
+        self._model, self._success, self._environment = model, success, environment
         self._roles: dict[str, str] = {}  # of episodes, see `Promotion`
         self._on_segment = on_segment
         self._decision_cost = decision_cost
@@ -168,8 +168,8 @@ class Imagination:
         frames = (config.rollouts, len(model.spec.cameras), *model.spec.image_size, 3)
         self._frames = np.zeros(frames, np.uint8)  # the newest of each row
         self._sequence = self._uncertain_in_a_row = 0
-        self._max_steps = world.max_steps
-        self._limit = math.ceil(world.max_steps / model.spec.chunk)
+        self._max_steps = environment.max_steps
+        self._limit = math.ceil(environment.max_steps / model.spec.chunk)
 
     def remember(self, segment: Segment) -> None:
         """Lets rollouts start where a real segment does, if its episode begins with it."""
@@ -250,7 +250,7 @@ class Imagination:
     def advance(self, decisions: list[Decision]) -> None:
         """Imagines one chunk in every rollout, with decisions in the order of `requests`."""
         assert self._state is not None
-        low, high = self._world.action_low, self._world.action_high
+        low, high = self._environment.action_low, self._environment.action_high
         actions = np.stack([np.clip(d.chunk, low, high) for d in decisions]).astype(np.float32)
         seeds = self._rng.integers(2**31, size=len(actions)).tolist()
         prediction = self._model.step(self._state, torch.from_numpy(actions), seeds)
@@ -336,8 +336,8 @@ class Imagination:
         """Observation of frames (V, H, W, 3) and a state (S,), in the sizes of the policy's environment."""
         observation: Observation = {TASK: task}
         for v, camera in enumerate(self._model.spec.cameras):
-            if camera in self._world.images:
-                observation[camera] = resize(frames[v : v + 1], self._world.images[camera][:2])[0]
-        if self._world.state_dim:
+            if camera in self._environment.images:
+                observation[camera] = resize(frames[v : v + 1], self._environment.images[camera][:2])[0]
+        if self._environment.state_dim:
             observation["observation.state"] = robot
         return observation

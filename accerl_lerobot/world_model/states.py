@@ -105,9 +105,9 @@ def new_state_model(spec: StateSpec, config: StateModelConfig) -> StateModel:
     """
     model: Any = imported(config.make)(spec, config)
     if not isinstance(model, StateModel):
-        remedy = f"{config.make} is no accerl_lerobot.world_model.states.StateModel; derive it from that"
-        raise InputError("world_model.type", config.type, remedy)
+        hint = f"{config.make} is no accerl_lerobot.world_model.states.StateModel; derive it from that"
+        raise InputError("world_model.type", config.type, hint)
     if buffers := [name for name, _ in model.named_buffers()]:
-        remedy = f"{config.make} has the buffer {buffers[0]}; make it a parameter without gradient"
-        raise InputError("world_model.type", config.type, remedy)
+        hint = f"{config.make} has the buffer {buffers[0]}; make it a parameter without gradient"
+        raise InputError("world_model.type", config.type, hint)
     return model.eval()

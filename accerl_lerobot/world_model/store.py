@@ -22,7 +22,7 @@ from safetensors.torch import save_file
 from accerl_lerobot.checkpoint.isolation import rehearse
 from accerl_lerobot.checkpoint.layout import write_atomically
 from accerl_lerobot.checkpoint.safety import (
-    Origin,
+    FileSource,
     brief,
     check_not_pickled,
     read_json,
@@ -103,8 +103,8 @@ def load_world_model(
     kind = named.get("type") if isinstance(named, dict) else None
     if kind not in known:
         package_field = origin.field.removesuffix("path") + DISCOVER
-        remedy = f"use one of {', '.join(known)}, or name its package: {package_field}"
-        raise origin.refuse(f"{CONFIG}: model.type", f"{str(kind)[:60]!r}; {remedy}")
+        hint = f"use one of {', '.join(known)}, or name its package: {package_field}"
+        raise origin.refuse(f"{CONFIG}: model.type", f"{str(kind)[:60]!r}; {hint}")
 
     def make_model() -> LearnableWorldModel:
         spec = draccus.decode(WorldModelSpec, content.get("spec"))
@@ -124,7 +124,7 @@ def load_world_model(
     return model, success
 
 
-def _filled[M: torch.nn.Module](what: str, make: Callable[[], M], directory: Path, origin: Origin) -> M:
+def _filled[M: torch.nn.Module](what: str, make: Callable[[], M], directory: Path, origin: FileSource) -> M:
     """A new model with the weights in `directory`."""
     check_not_pickled(directory, WEIGHTS, origin)
     weights = safe_join(directory, WEIGHTS, origin)
@@ -137,8 +137,8 @@ def _filled[M: torch.nn.Module](what: str, make: Callable[[], M], directory: Pat
     except Exception as error:  # the files may hold anything
         ours = input_error(error)  # draccus wraps what a config refuses
         if ours is None:
-            remedy = f"not a {what} of accerl world-model ({brief(error)})"
-            raise InputError(origin.field, origin.value, remedy) from error
+            hint = f"not a {what} of accerl world-model ({brief(error)})"
+            raise InputError(origin.field, origin.value, hint) from error
         raise (ours if ours.field == origin.field else origin.refuse(CONFIG, brief(ours))) from error
     return model.requires_grad_(False).eval()
 
@@ -163,5 +163,5 @@ def _predict_once(model: LearnableWorldModel, success: SuccessPairsRewardModel) 
     success.probabilities(frames[:, -1].numpy(), prediction.frames.numpy(), task_codes(tasks))
 
 
-def _origin(directory: Path, section: str) -> Origin:
-    return Origin(f"{section}.path" if section else "path", str(directory))
+def _origin(directory: Path, section: str) -> FileSource:
+    return FileSource(f"{section}.path" if section else "path", str(directory))

@@ -274,8 +274,8 @@ def evaluate(config: WorldModelEvalRun, directory: Path, console: Console) -> di
     for name, episodes in datasets.items():
         kept = [episode for episode in episodes if roles.get(episode.key) != store.LEARNT]
         if not kept:
-            remedy = "the world model was trained on every episode of it; give another dataset"
-            raise InputError(f"{name}.repo_id", named[name].repo_id, remedy)
+            hint = "the world model was trained on every episode of it; give another dataset"
+            raise InputError(f"{name}.repo_id", named[name].repo_id, hint)
         if trained_on := len(episodes) - len(kept):
             console.say(f"{name}: trained on {trained_on} episodes of it, evaluated on the other {len(kept)}")
         if any(roles.get(episode.key) == store.THRESHOLD for episode in kept):

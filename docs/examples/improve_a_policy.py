@@ -4,7 +4,7 @@
 from pathlib import Path
 
 from accerl_lerobot import evaluate, load_config, load_policy, train
-from accerl_lerobot.envs import make_world
+from accerl_lerobot.envs import make_environment
 
 if __name__ == "__main__":
     config = load_config(Path(__file__).parent / "simulated.yaml", {"seed": 0})
@@ -14,10 +14,10 @@ if __name__ == "__main__":
     again = evaluate(config, policy=result.policy, episodes=20)
     print(f"evaluated again: {again.success}")
 
-    world, policy = make_world(config.env), load_policy(result.policy)
+    environment, policy = make_environment(config.env), load_policy(result.policy)
     outcome = None
-    observation = world.reset(seed=7, task=world.spec.tasks[0])
+    observation = environment.reset(seed=7, task=environment.spec.tasks[0])
     while outcome is None or not outcome.done:
-        outcome = world.step_chunk(policy.act(observation))
+        outcome = environment.step_chunk(policy.act(observation))
         observation = outcome.observation
     print("one more episode:", "success" if outcome.success else "failure")

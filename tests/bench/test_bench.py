@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from accerl_lerobot.bench import environment
 from accerl_lerobot.bench import policy as bench
-from accerl_lerobot.bench import world
+from accerl_lerobot.bench.environment import BenchEnvironmentConfig, bench_environment
 from accerl_lerobot.bench.policy import BenchPolicyConfig
-from accerl_lerobot.bench.world import BenchWorldConfig, bench_world
 from accerl_lerobot.demos import backbone
 from accerl_lerobot.envs import EnvConfig, LiberoConfig, MetaWorldConfig, SimulatedConfig
 from benchmarks import latency
 from benchmarks.latency import BenchLatencyConfig, bench_latency, described
-from benchmarks.simulated_world import LatencyConfig, read_trace
+from benchmarks.simulated_environment import LatencyConfig, read_trace
 from tests.envs.libero_assets import ASSETS, needs_assets
 from tests.runs import printed
 
@@ -69,7 +69,7 @@ LIBERO = LiberoConfig(task="libero_object/0", image_size=64, rendering="fast", a
 )
 def test_three_arms_in_turns(env: EnvConfig, least: float):
     pytest.importorskip("metaworld")
-    result = bench_world(BenchWorldConfig(env=env, seconds=0.3, rounds=1, chunk=5))
+    result = bench_environment(BenchEnvironmentConfig(env=env, seconds=0.3, rounds=1, chunk=5))
     assert json.loads(json.dumps(result)) == result
     arms = result["arms"]
     for rates in arms.values():
@@ -77,8 +77,8 @@ def test_three_arms_in_turns(env: EnvConfig, least: float):
         assert rates["env_steps_per_s"]["min"] <= rates["env_steps_per_s"]["median"]
     ours = arms["ours"]
     assert ours["env_steps_per_s"]["median"] == pytest.approx(5 * ours["decisions_per_s"]["median"], rel=0.1)
-    assert result["ratio"]["min"] > least, "the whole point of our own world"
-    assert "stock" in printed(world.table(result))
+    assert result["ratio"]["min"] > least, "the whole point of our own environment"
+    assert "stock" in printed(environment.table(result))
 
 
 @pytest.fixture

@@ -27,7 +27,7 @@ def test_turns_of_a_rule_are_put_together():
 
 def test_a_small_run_of_batching(light_ray: None, tmp_path: Path):
     config = BenchBatchingConfig(
-        worlds=2, latency_ms=5.0, image_size=16, decide_ms=1.0, waits_ms=(20.0,), seconds=0.2, blocks=1,
+        environments=2, latency_ms=5.0, image_size=16, decide_ms=1.0, waits_ms=(20.0,), seconds=0.2, blocks=1,
         output_dir=str(tmp_path),
     )  # fmt: skip
     rules = batching.bench_batching(config)["rules"]

@@ -93,7 +93,7 @@ def kept(tmp_path: Path) -> Path:
     run = tmp_path / "run"
     run.mkdir()
     journal = Journal(run / EPISODES)
-    sizes = ReplayConfig(capacity=12, min_decisions=4, ahead=4)
+    sizes = ReplayConfig(capacity=12, min_decisions=4, max_unlearned_decisions=4)
     replay = MixedReplay(sizes, sizes, 0.0, journal=journal)
     for key in "abcd":  # the first has left when the last comes
         replay.insert(make_segment(key))

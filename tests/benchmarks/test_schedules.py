@@ -28,9 +28,9 @@ def block(schedule: str, rate: float, processors: float = 0.2, waits: float = 0.
 
 
 def test_bounds_by_hand():
-    """Ten worlds of 90 ms: 90 · 17/16 + 4 + 0.375 = 100 ms a decision."""
+    """Ten environments of 90 ms: 90 · 17/16 + 4 + 0.375 = 100 ms a decision."""
     machine = MachineryConfig(
-        worlds=10, latency_ms=90.0, decide_ms=4.0, decide_each_ms=0.375, max_batch=8, update_ms=500.0
+        environments=10, latency_ms=90.0, decide_ms=4.0, decide_each_ms=0.375, max_batch=8, update_ms=500.0
     )
     assert machine.world_bound == pytest.approx(100.0)
     assert machine.service_bound == pytest.approx(8 / 0.007)
@@ -43,7 +43,7 @@ def test_bounds_by_hand():
 
 def test_speed_ups_are_of_neighbouring_blocks():
     machine = MachineryConfig(
-        worlds=10, latency_ms=90.0, decide_ms=4.0, decide_each_ms=0.375, update_ms=500.0
+        environments=10, latency_ms=90.0, decide_ms=4.0, decide_each_ms=0.375, update_ms=500.0
     )
     rates = {"asynchronous": [60.0, 72.0], "overlap": [40.0, 36.0], "synchronous": [20.0, 36.0]}
     blocks = [block(arm, rates[arm][0]) for arm in ARMS]
@@ -58,7 +58,7 @@ def test_speed_ups_are_of_neighbouring_blocks():
 
 @pytest.mark.slow
 def test_a_small_run_of_everything(light_ray: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    small = {"worlds": 2, "latency_ms": 5.0, "update_ms": 20.0, "image_size": 16, "decide_ms": 1.0}
+    small = {"environments": 2, "latency_ms": 5.0, "update_ms": 20.0, "image_size": 16, "decide_ms": 1.0}
     trace = tmp_path / "drawers.txt"
     trace.write_text("1\n3\n")
     config = BenchAsyncVsSyncConfig(
@@ -71,7 +71,7 @@ def test_a_small_run_of_everything(light_ray: None, tmp_path: Path, monkeypatch:
     assert law["cv"] == 0.5 and law["trace"] == str(trace)
     assert [b["schedule"] for b in law["blocks"]] == [*ARMS, *reversed(ARMS)]
     assert all(b["decisions_per_s"] > 0 and b["updates"] >= 1 for b in law["blocks"])
-    # In lock step the service sees both worlds at once.
+    # In lock step the service sees both environments at once.
     assert {b["batch_size"] for b in law["blocks"] if b["schedule"] == "synchronous"} == {2.0}
     assert set(result["learning"]["success"]) == set(ARMS)
     assert json.loads((tmp_path / "async_vs_sync.json").read_text()) == json.loads(json.dumps(result))
@@ -87,7 +87,7 @@ def test_a_small_run_of_scaling(light_ray: None, tmp_path: Path):
         counts=(1, 2), latency_ms=5.0, image_size=16, seconds=0.2, blocks=1, output_dir=str(tmp_path)
     )
     rows = bench_scaling(config)["counts"]
-    assert [row["worlds"] for row in rows] == [1, 2] and rows[0]["efficiency"]["median"] == 1.0
+    assert [row["environments"] for row in rows] == [1, 2] and rows[0]["efficiency"]["median"] == 1.0
     assert "E(N)" in (tmp_path / "scaling.md").read_text()
 
 
@@ -96,7 +96,7 @@ def test_a_recipe_is_measured_under_two_schedules(tiny_checkpoint: Path, tmp_pat
     recipe = tmp_path / "recipe.yaml"
     recipe.write_text(
         "env: {type: simulated, max_steps: 16}\n"
-        "rollout: {workers: 1, worlds: 4, segment_length: 3}\n"
+        "rollout: {workers: 1, environments: 4, segment_length: 3}\n"
         "replay: {capacity: 64, min_decisions: 16, ahead: 32, samples_per_insert: 2.0}\n"
         "trainer: {updates: 12, batch_decisions: 16, warmup_updates: 0, value_warmup_updates: 0}\n"
     )

@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 
-from accerl_lerobot.checkpoint.safety import Origin
+from accerl_lerobot.checkpoint.safety import FileSource
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos.dataset_files import (
     check_data,
@@ -35,7 +35,7 @@ from tests.tiny_datasets import FRONT, IMAGE, STEPS, edit_json, rewrite, write_d
 ROOT = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
 CAMERA = "observation.images.corner2"
 PNG = b"\x89PNG\r\n\x1a\n"
-ORIGIN = Origin("dataset.root", "theirs")
+ORIGIN = FileSource("dataset.root", "theirs")
 EPISODES, DATA = "meta/episodes/chunk-000/file-000.parquet", "data/chunk-000/file-000.parquet"
 
 
@@ -330,7 +330,7 @@ def test_an_old_dataset_is_told_the_command_that_converts_it(tmp_path: Path):
     dataset = DatasetConfig(repo_id="a/b", root=str(old))
     with pytest.raises(InputError, match="its format is not v3.0") as caught:
         open_metadata(dataset)
-    command = caught.value.remedy.rpartition("convert with: python ")[2].split()
+    command = caught.value.hint.rpartition("convert with: python ")[2].split()
     subprocess.run([sys.executable, *command], check=True, capture_output=True)
     assert open_metadata(dataset).total_frames == 2 * STEPS
 

@@ -13,7 +13,7 @@ import yaml
 from accerl_lerobot.cli import main
 from accerl_lerobot.demos.dataset_files import open_metadata
 from accerl_lerobot.engine.config import DatasetConfig, LaunchConfig, RunConfig, encode, parse
-from accerl_lerobot.envs import SimulatedConfig, make_world
+from accerl_lerobot.envs import SimulatedConfig, make_environment
 from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.policies.features import check_features, dataset_features, env_features
 from accerl_lerobot.replay.journal import read_journal, whole_episodes
@@ -65,7 +65,7 @@ def test_every_whole_episode_is_in_the_dataset_step_by_step(run, tmp_path, capsy
     written = dataset_features(
         open_metadata(DatasetConfig(repo_id="accerl/rollouts", root=str(tmp_path / "set")))
     )
-    check_features(written, env_features(make_world(settings.env).spec), {}, "dataset.repo_id", "")
+    check_features(written, env_features(make_environment(settings.env).spec), {}, "dataset.repo_id", "")
 
 
 def test_some_of_them(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from accerl_lerobot.demos.record import DemosConfig, Episode, disturbed, make_expert, played, record_demos
-from accerl_lerobot.envs import make_world
+from accerl_lerobot.envs import make_environment
 from accerl_lerobot.envs.libero import LiberoConfig
 from accerl_lerobot.errors import InputError
 from tests.envs.libero_assets import ASSETS, needs_assets
@@ -28,36 +28,36 @@ def config(task: str) -> LiberoConfig:
     return LiberoConfig(task=task, assets=ASSETS, image_size=32, camera="agentview", rendering="fast")
 
 
-def episode(settings: LiberoConfig, world, seed: int) -> Episode:
+def episode(settings: LiberoConfig, environment, seed: int) -> Episode:
     (task,) = settings.tasks
-    expert = make_expert(settings, world, task)
-    actions = disturbed(expert, world.spec, seed, noise=0.1, push=0, fail=False)
-    return played(world, task, seed, actions)
+    expert = make_expert(settings, environment, task)
+    actions = disturbed(expert, environment.spec, seed, noise=0.1, push=0, fail=False)
+    return played(environment, task, seed, actions)
 
 
 @needs_assets
 @pytest.mark.parametrize("task", TASKS)
 def test_the_expert_solves_recorded_and_drawn_starts(task: str):
     settings = config(task)
-    world = make_world(settings)
+    environment = make_environment(settings)
     try:
-        assert all(episode(settings, world, seed).success for seed in STARTS)
+        assert all(episode(settings, environment, seed).success for seed in STARTS)
     finally:
-        world.close()
+        environment.close()
 
 
 @needs_assets
 def test_a_drawn_object_stands_on_its_fixture_in_every_episode():
     settings = config("libero_spatial/7")
-    world = make_world(settings)
+    environment = make_environment(settings)
     try:
         for seed in (5, 6):
-            world.reset(seed, settings.tasks[0])
-            bowl = world.simulator.pose("akita_black_bowl_1")[0]
-            burner = world.simulator.pose("flat_stove_1_cook_region")[0]
+            environment.reset(seed, settings.tasks[0])
+            bowl = environment.simulator.pose("akita_black_bowl_1")[0]
+            burner = environment.simulator.pose("flat_stove_1_cook_region")[0]
             assert np.linalg.norm((bowl - burner)[:2]) < 0.05
     finally:
-        world.close()
+        environment.close()
 
 
 @pytest.mark.parametrize("task", ["libero_10/0", "libero_goal"])

@@ -23,7 +23,7 @@ from accerl_lerobot.demos.record import (
     played,
     record_demos,
 )
-from accerl_lerobot.envs import EnvConfig, MetaWorldConfig, SimulatedConfig, make_world
+from accerl_lerobot.envs import EnvConfig, MetaWorldConfig, SimulatedConfig, make_environment
 from accerl_lerobot.envs.gym_env import GymConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.seeds import demo_seed
@@ -78,14 +78,14 @@ def test_the_expert_succeeds_at_the_last_frame_of_each_episode(recorded: Path):
 
 def test_frames_are_what_the_world_showed_when_the_action_was_chosen(recorded: Path):
     data = rows(recorded)
-    world = make_world(MetaWorldConfig(task=TASKS))
-    observation = world.reset(demo_seed(0, 0), "handle-press-v3")
+    environment = make_environment(MetaWorldConfig(task=TASKS))
+    observation = environment.reset(demo_seed(0, 0), "handle-press-v3")
     for row in data[:10]:
         stored = (row["observation.images.corner2"] * 255).round().astype(np.uint8).transpose(1, 2, 0)
         assert np.array_equal(stored, observation["observation.images.corner2"])
         assert np.array_equal(row["observation.state"], observation["observation.state"])
-        observation = world.step_chunk(row["action"][None]).observation
-    world.close()
+        observation = environment.step_chunk(row["action"][None]).observation
+    environment.close()
 
 
 def test_the_content_does_not_depend_on_the_processes(recorded, tmp_path, monkeypatch):
@@ -116,10 +116,13 @@ def test_failures_are_recorded_on_request_spread_over_tasks(tmp_path: Path):
 
 def match(seed: int = 5, noise: float = 0.0, push: float = 0.0) -> Episode:
     config = SimulatedConfig(tolerance=0.01, max_steps=20)
-    world = make_world(config)
-    expert = make_expert(config, world, "match")
+    environment = make_environment(config)
+    expert = make_expert(config, environment, "match")
     return played(
-        world, "match", seed, disturbed(expert, world.spec, seed, noise=noise, push=push, fail=False)
+        environment,
+        "match",
+        seed,
+        disturbed(expert, environment.spec, seed, noise=noise, push=push, fail=False),
     )
 
 
@@ -161,8 +164,8 @@ def test_replaying_its_actions_gives_its_frames():
     dataset = lerobot_dataset.LeRobotDataset("accerl/metaworld_tiny", root=TINY, video_backend="pyav")
     assert (dataset.num_episodes, dataset.num_frames, dataset.fps) == (4, 365, 80)
     sidecar = json.loads((TINY / SIDECAR).read_text())
-    world = make_world(draccus.decode(EnvConfig, sidecar["env"]))
-    observation, reward = world.reset(0, "drawer-open-v3"), 0.0
+    environment = make_environment(draccus.decode(EnvConfig, sidecar["env"]))
+    observation, reward = environment.reset(0, "drawer-open-v3"), 0.0
     for index in range(dataset.meta.episodes[0]["length"]):
         row = dataset[index]
         # Bit-equal on the machine that recorded it; another processor or OpenGL may round differently.
@@ -170,11 +173,11 @@ def test_replaying_its_actions_gives_its_frames():
         if index % 10 == 0:
             stored = (row["observation.images.corner2"] * 255).round().byte().permute(1, 2, 0).numpy()
             assert np.abs(stored - observation["observation.images.corner2"].astype(int)).mean() < 2
-        result = world.step_chunk(row["action"].numpy()[None])
+        result = environment.step_chunk(row["action"].numpy()[None])
         observation, reward = result.observation, float(row["next.reward"])
         assert result.rewards[0] == reward
     assert result.terminated and reward == 1.0
-    world.close()
+    environment.close()
 
 
 @pytest.mark.parametrize(("free", "processes"), [(100.0, 2), (0.2, 1), (None, 2)])
@@ -201,7 +204,7 @@ def test_no_more_simulators_than_memory_for_them(
 def test_an_instruction_is_asked_for_where_the_environment_has_none():
     """`export` calls it as well, before an episode is repeated."""
     config = GymConfig(id="reach/Reach-v0")
-    spec = make_world(SimulatedConfig()).spec
+    spec = make_environment(SimulatedConfig()).spec
     check_instruction(spec, config)
     silent = replace(spec, instructions=())
     with pytest.raises(InputError, match="^env.task='': each frame of a dataset has an .*--env.task="):

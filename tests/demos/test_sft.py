@@ -120,9 +120,9 @@ def test_what_lerobot_fine_tunes_from_another_robot_s_policy_is_taken_for_what_i
     edit_config(start, input_features=inputs)
     rename = json.dumps({CAMERA: "observation.images.camera1"})
     config = SFTConfig(steps=1, batch_size=4, init_path=str(start), extra_args=[f"--rename_map={rename}"])
-    world = MetaWorldConfig(task="drawer-open-v3", image_size=64)
+    environment = MetaWorldConfig(task="drawer-open-v3", image_size=64)
     policy = PolicyConfig(path=None, device="cpu", rename_map=json.loads(rename))
-    run = RunConfig(env=world, sft=config, dataset=LOCAL, policy=policy)
+    run = RunConfig(env=environment, sft=config, dataset=LOCAL, policy=policy)
     check_start(run)
     tuned = replace(policy, path=str(run_sft(config, LOCAL, tmp_path / "sft", seed=0)))
     assert len(json.loads((Path(tuned.path) / "config.json").read_text())["input_features"]) == 4

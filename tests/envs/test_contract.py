@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The contract of every world; a new world is one more row of `CASES`."""
+"""The contract of every environment; a new environment is one more row of `CASES`."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ import pytest
 
 from accerl_lerobot.envs import (
     EnvConfig,
+    Environment,
     LeRobotEnvConfig,
     LiberoConfig,
     MetaWorldConfig,
     SimulatedConfig,
-    World,
-    make_world,
+    make_environment,
 )
 from accerl_lerobot.errors import InputError
 from tests.envs.libero_assets import ASSETS, needs_assets
@@ -35,15 +35,15 @@ if importlib.util.find_spec("libero"):
 
 @dataclass
 class Case:
-    world: World
+    environment: Environment
     config: EnvConfig
 
     @property
     def task(self) -> str:
-        return self.world.spec.tasks[0]
+        return self.environment.spec.tasks[0]
 
     def actions(self, count: int, seed: int = 0) -> np.ndarray:
-        spec = self.world.spec
+        spec = self.environment.spec
         draw = np.random.default_rng(seed).uniform(0.2, 0.8, (count, spec.action_dim))
         return (spec.action_low + draw * (spec.action_high - spec.action_low)).astype(np.float32)
 
@@ -54,10 +54,10 @@ class Case:
 )
 def case(request: pytest.FixtureRequest) -> Iterator[Case]:
     pytest.importorskip({"metaworld": "metaworld", "pusht": "gym_pusht"}.get(request.param, "numpy"))
-    world = make_world(CASES[request.param])
-    yield Case(world, CASES[request.param])
-    world.close()
-    world.close()
+    environment = make_environment(CASES[request.param])
+    yield Case(environment, CASES[request.param])
+    environment.close()
+    environment.close()
 
 
 def assert_equal(one: dict, other: dict) -> None:
@@ -67,7 +67,7 @@ def assert_equal(one: dict, other: dict) -> None:
 
 
 def test_observation_fits_the_spec(case: Case):
-    observation, spec = case.world.reset(0, case.task), case.world.spec
+    observation, spec = case.environment.reset(0, case.task), case.environment.spec
     assert observation.keys() == {*spec.images, "observation.state", "task"}
     for key, shape in spec.images.items():
         assert observation[key].shape == shape and observation[key].dtype == np.uint8
@@ -80,10 +80,10 @@ def test_observation_fits_the_spec(case: Case):
 
 def test_a_chunk_is_its_actions_one_by_one(case: Case):
     actions = case.actions(12)
-    case.world.reset(3, case.task)
-    whole = [case.world.step_chunk(part) for part in (actions[:7], actions[7:])]
-    case.world.reset(3, case.task)
-    single = [case.world.step_chunk(action[None]) for action in actions]
+    case.environment.reset(3, case.task)
+    whole = [case.environment.step_chunk(part) for part in (actions[:7], actions[7:])]
+    case.environment.reset(3, case.task)
+    single = [case.environment.step_chunk(action[None]) for action in actions]
     assert_equal(whole[0].observation, single[6].observation)
     assert_equal(whole[1].observation, single[11].observation)
     assert np.array_equal(
@@ -94,38 +94,38 @@ def test_a_chunk_is_its_actions_one_by_one(case: Case):
 
 
 def test_reset_is_reproducible_whatever_came_before(case: Case):
-    first = case.world.reset(5, case.task)
-    played = case.world.step_chunk(case.actions(6))
-    other = case.world.reset(2_000_000_007, case.task)
+    first = case.environment.reset(5, case.task)
+    played = case.environment.step_chunk(case.actions(6))
+    other = case.environment.reset(2_000_000_007, case.task)
     assert not np.array_equal(first["observation.state"], other["observation.state"]) or any(
-        not np.array_equal(first[key], other[key]) for key in case.world.spec.images
+        not np.array_equal(first[key], other[key]) for key in case.environment.spec.images
     )
-    case.world.step_chunk(case.actions(4, seed=1))
-    assert_equal(first, case.world.reset(5, case.task))
-    again = case.world.step_chunk(case.actions(6))
+    case.environment.step_chunk(case.actions(4, seed=1))
+    assert_equal(first, case.environment.reset(5, case.task))
+    again = case.environment.step_chunk(case.actions(6))
     assert_equal(played.observation, again.observation)
     assert np.array_equal(played.rewards, again.rewards)
 
 
 def test_the_limit_truncates_and_cuts_the_chunk(case: Case):
-    case.world.reset(1, case.task)
-    idle = np.repeat((case.world.spec.action_low + case.world.spec.action_high)[None] / 2, 10, 0)
-    steps = [case.world.step_chunk(idle) for _ in range(3)]
+    case.environment.reset(1, case.task)
+    idle = np.repeat((case.environment.spec.action_low + case.environment.spec.action_high)[None] / 2, 10, 0)
+    steps = [case.environment.step_chunk(idle) for _ in range(3)]
     assert [r.steps for r in steps] == [10, 10, 5]
     assert [r.truncated for r in steps] == [False, False, True]
     assert not steps[-1].terminated and not steps[-1].success
     assert steps[-1].observation is not None, "a truncated episode is bootstrapped from"
     with pytest.raises(RuntimeError, match="reset"):
-        case.world.step_chunk(idle)
+        case.environment.step_chunk(idle)
 
 
 def test_actions_are_clipped_to_the_bounds(case: Case):
-    spec = case.world.spec
-    case.world.reset(1, case.task)
-    clipped = case.world.step_chunk(np.repeat(spec.action_high[None], 3, 0)).observation
-    case.world.reset(1, case.task)
+    spec = case.environment.spec
+    case.environment.reset(1, case.task)
+    clipped = case.environment.step_chunk(np.repeat(spec.action_high[None], 3, 0)).observation
+    case.environment.reset(1, case.task)
     beyond = np.repeat((spec.action_high * 3 + 1)[None], 3, 0)
-    assert_equal(clipped, case.world.step_chunk(beyond).observation)
+    assert_equal(clipped, case.environment.step_chunk(beyond).observation)
 
 
 @pytest.mark.parametrize("wrong", ["one dimension", "too wide", "empty", "nan"])
@@ -137,30 +137,30 @@ def test_a_wrong_chunk_is_refused_and_changes_nothing(case: Case, wrong: str):
         "empty": good[:0],
         "nan": np.full_like(good, np.nan),
     }[wrong]
-    case.world.reset(4, case.task)
+    case.environment.reset(4, case.task)
     with pytest.raises(ValueError, match="actions"):
-        case.world.step_chunk(bad)
-    after = case.world.step_chunk(good)
-    case.world.reset(4, case.task)
-    assert_equal(after.observation, case.world.step_chunk(good).observation)
+        case.environment.step_chunk(bad)
+    after = case.environment.step_chunk(good)
+    case.environment.reset(4, case.task)
+    assert_equal(after.observation, case.environment.step_chunk(good).observation)
 
 
 def test_an_unknown_task_says_what_there_is(case: Case):
     with pytest.raises(InputError, match=case.task):
-        case.world.reset(0, "no-such-task")
+        case.environment.reset(0, "no-such-task")
 
 
 def test_render_has_the_size_asked_for_and_changes_nothing(case: Case):
-    case.world.reset(6, case.task)
-    plain = case.world.step_chunk(case.actions(4))
-    case.world.reset(6, case.task)
-    frame = case.world.render(48, 80)
+    case.environment.reset(6, case.task)
+    plain = case.environment.step_chunk(case.actions(4))
+    case.environment.reset(6, case.task)
+    frame = case.environment.render(48, 80)
     assert frame.shape == (48, 80, 3) and frame.dtype == np.uint8 and frame.std() > 5
-    assert_equal(plain.observation, case.world.step_chunk(case.actions(4)).observation)
+    assert_equal(plain.observation, case.environment.step_chunk(case.actions(4)).observation)
 
 
 def test_stepping_before_a_reset_is_refused(case: Case):
-    fresh = type(case.world)(case.config)  # type: ignore[call-arg]
+    fresh = type(case.environment)(case.config)  # type: ignore[call-arg]
     with pytest.raises(RuntimeError, match="reset"):
         fresh.step_chunk(case.actions(1))
     fresh.close()

@@ -20,9 +20,9 @@ from gymnasium import spaces
 
 from accerl_lerobot.config.parsing import parse
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig
-from accerl_lerobot.engine.preflight import check_world
-from accerl_lerobot.envs import GymConfig, graphics, make_world
-from accerl_lerobot.envs.gym_env import GymWorld
+from accerl_lerobot.engine.preflight import check_environment
+from accerl_lerobot.envs import GymConfig, graphics, make_environment
+from accerl_lerobot.envs.gym_env import GymEnvironment
 from accerl_lerobot.errors import InputError
 from tests.runs import pip_installed, replacing, tiny_run, trained
 
@@ -47,14 +47,14 @@ def config(*more: str) -> GymConfig:
 
 
 def test_observations_are_mapped():
-    world = make_world(config("--env.environment_state=[goal]", "--env.image_size=16"))
-    assert isinstance(world, GymWorld)
-    seen = world.reset(3, "reach/Reach-v0")
-    raw = world.environments["reach/Reach-v0"].unwrapped.observation()
+    environment = make_environment(config("--env.environment_state=[goal]", "--env.image_size=16"))
+    assert isinstance(environment, GymEnvironment)
+    seen = environment.reset(3, "reach/Reach-v0")
+    raw = environment.environments["reach/Reach-v0"].unwrapped.observation()
     assert seen["observation.state"].tolist() == [*raw["agent_pos"], *raw["goal"]]
     assert seen["observation.environment_state"].tolist() == [*raw["goal"], 0.0]
     assert seen["observation.images.front"].shape == (16, 16, 3) and seen["task"] == "Reach the goal"
-    later = world.step_chunk(np.zeros((4, 2), np.float32)).observation
+    later = environment.step_chunk(np.zeros((4, 2), np.float32)).observation
     assert later["observation.environment_state"][-1] == 4 / 16
     assert config("--env.environment_state=[goal]").state_size == 3 and config().state_size == 0
 
@@ -63,22 +63,22 @@ def test_a_rendered_picture_and_the_whole_observation():
     pendulum = GymConfig(
         id="Pendulum-v1", images={"side": "render"}, image_size=64, environment_state=("state",)
     )
-    world = make_world(replace(pendulum, reward="env", max_steps=6))
-    seen = world.reset(1, "Pendulum-v1")
+    environment = make_environment(replace(pendulum, reward="env", max_steps=6))
+    seen = environment.reset(1, "Pendulum-v1")
     assert seen["observation.images.side"].shape == (64, 64, 3) and seen["observation.images.side"].std() > 5
     assert seen["observation.environment_state"].tolist() == [*seen["observation.state"], 0.0]
-    result = world.step_chunk(np.full((9, 1), 3, np.float32))
+    result = environment.step_chunk(np.full((9, 1), 3, np.float32))
     assert result.truncated and result.steps == 6 and (result.rewards < 0).all()
-    assert world.render(20, 30).shape == (20, 30, 3)
+    assert environment.render(20, 30).shape == (20, 30, 3)
 
 
 def test_the_first_success_ends_the_episode():
-    world = make_world(config())
-    world.reset(0, "reach/Reach-v0")
+    environment = make_environment(config())
+    environment.reset(0, "reach/Reach-v0")
     for _ in range(16):
-        inner = world.environments["reach/Reach-v0"].unwrapped
+        inner = environment.environments["reach/Reach-v0"].unwrapped
         way = (inner.goal - inner.agent) / inner.speed
-        result = world.step_chunk(way[None])
+        result = environment.step_chunk(way[None])
         if result.done:
             break
     assert result.terminated and result.success and result.rewards.tolist() == [1.0]
@@ -98,10 +98,10 @@ def test_the_environment_keeps_its_wrappers_but_not_its_time_limit():
     gymnasium.register("Tilted-v0", tilted, max_episode_steps=2)
     observed = []
     for name, torque in (("Tilted-v0", 2.0), ("Pendulum-v1", 1.0)):
-        world = make_world(GymConfig(id=name, images={}, reward="env", max_steps=6))
+        environment = make_environment(GymConfig(id=name, images={}, reward="env", max_steps=6))
         for _ in range(2):
-            world.reset(1, name)
-            result = world.step_chunk(np.full((6, 1), torque, np.float32))
+            environment.reset(1, name)
+            result = environment.step_chunk(np.full((6, 1), torque, np.float32))
             assert result.truncated and result.steps == 6
         observed.append(result.observation["observation.state"].tolist())
     assert observed[0] == observed[1]
@@ -158,9 +158,9 @@ def odd(**fields: Any) -> GymConfig:
 
 
 def ended(config: GymConfig, steps: int = 9) -> Any:
-    world = make_world(config)
-    world.reset(0, config.id)
-    return world.step_chunk(np.zeros((steps, 1), np.float32))
+    environment = make_environment(config)
+    environment.reset(0, config.id)
+    return environment.step_chunk(np.zeros((steps, 1), np.float32))
 
 
 def test_only_what_is_read_is_judged():
@@ -190,11 +190,11 @@ def test_success_is_read_by_its_key(key: str, told: dict[str, Any]):
 
 
 def test_the_environment_has_its_own_limit():
-    assert make_world(odd()).spec.max_steps == 7
-    assert make_world(odd(max_steps=3)).spec.max_steps == 3
+    assert make_environment(odd()).spec.max_steps == 7
+    assert make_environment(odd(max_steps=3)).spec.max_steps == 3
     unlimited = GymConfig(id="reach/Reach-v0", images={}, state=("agent_pos",))
-    assert "reach/Reach-v0" in gymnasium.registry or make_world(config())
-    assert make_world(unlimited).spec.max_steps == 500
+    assert "reach/Reach-v0" in gymnasium.registry or make_environment(config())
+    assert make_environment(unlimited).spec.max_steps == 500
     with pytest.raises(InputError, match=r"env\.kwargs\.max_episode_steps=9: .* use --env\.max_steps=9"):
         odd(kwargs={"max_episode_steps": 9})
 
@@ -206,9 +206,9 @@ VIEWS = [np.full((8, 6, 3), level, np.uint8) for level in (50, 200)]
     "views", [VIEWS, dict(enumerate(VIEWS)), np.stack(VIEWS)], ids=["list", "dict", "array"]
 )
 def test_several_views_stand_side_by_side(views: Any):
-    world = make_world(odd(images={"both": "render"}, kwargs={"views": views}))
-    seen = world.reset(0, "Odd-v0")["observation.images.both"]
-    film = world.render(16, 16)
+    environment = make_environment(odd(images={"both": "render"}, kwargs={"views": views}))
+    seen = environment.reset(0, "Odd-v0")["observation.images.both"]
+    film = environment.render(16, 16)
     assert seen.shape == (8, 12, 3) and film.shape == (16, 16, 3)
     for picture in (seen, film):
         assert picture[:, 1].mean() == 50 and picture[:, -1].mean() == 200
@@ -238,7 +238,7 @@ def test_several_views_stand_side_by_side(views: Any):
 )
 def test_an_environment_that_fails_is_one_line_without_a_question(fields: dict[str, Any], message: str):
     with pytest.raises(InputError, match=message) as caught:
-        make_world(odd(kwargs=fields))
+        make_environment(odd(kwargs=fields))
     assert "discover_packages_path" not in str(caught.value)
 
 
@@ -253,7 +253,7 @@ def test_an_environment_that_fails_is_one_line_without_a_question(fields: dict[s
 def test_starts_that_do_not_follow_from_the_seed_are_told(
     seeds: str, warning: str, caplog: pytest.LogCaptureFixture
 ):
-    check_world(odd(kwargs={"seeds": seeds}))
+    check_environment(odd(kwargs={"seeds": seeds}))
     assert len(caplog.messages) == bool(warning) and "".join(caplog.messages).startswith(warning)
 
 
@@ -265,7 +265,7 @@ def test_opengl_is_chosen_before_the_package_is_imported(tmp_path: Path, monkeyp
     config("--env.discover_packages_path=drawing_env")
     assert importlib.import_module("drawing_env").SEEN == "egl"
     monkeypatch.setenv("MUJOCO_GL", "")
-    make_world(odd())
+    make_environment(odd())
     assert os.environ["MUJOCO_GL"] == "egl"
 
 
@@ -283,7 +283,7 @@ def test_opengl_is_chosen_before_the_package_is_imported(tmp_path: Path, monkeyp
 )
 def test_bad_values_name_field_and_remedy(changed: str, message: str):
     with pytest.raises(InputError, match=message):
-        make_world(config(changed))
+        make_environment(config(changed))
 
 
 def test_it_trains(tiny_checkpoint: Path):
@@ -299,17 +299,17 @@ def test_the_installed_package_is_found_by_every_process(tiny_checkpoint: Path, 
     environment = pip_installed(source, tmp_path / "site")
     accerl = [sys.executable, "-m", "accerl_lerobot.cli"]
     run = [
-        "train", *GYM, f"--policy.path={tiny_checkpoint}", "--policy.device=cpu", "--rollout.worlds=4",
+        "train", *GYM, f"--policy.path={tiny_checkpoint}", "--policy.device=cpu", "--rollout.environments=4",
         "--rollout.segment_length=3", "--replay.capacity=64", "--replay.min_decisions=16",
-        "--replay.ahead=32",
+        "--replay.max_unlearned_decisions=32",
         "--trainer.updates=4", "--trainer.batch_decisions=16", "--evaluation.episodes=4",
         f"--output_dir={tmp_path / 'run'}",
     ]  # fmt: skip
     subprocess.run([*accerl, *run], check=True, env=environment, cwd=tmp_path)
     assert (tmp_path / "run" / "summary.json").is_file()
     code = (
-        "from accerl_lerobot.envs import LeRobotEnvConfig, make_world\n"
-        "world = make_world(LeRobotEnvConfig(name='reach', task='Reach the goal'))\n"
+        "from accerl_lerobot.envs import LeRobotEnvConfig, make_environment\n"
+        "environment = make_environment(LeRobotEnvConfig(name='reach', task='Reach the goal'))\n"
         "print(world.reset(0, 'reach')['observation.state'].shape)\n"
     )
     shown = subprocess.run([sys.executable, "-c", code], check=True, env=environment, capture_output=True)

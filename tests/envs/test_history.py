@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A world that looks back, against the same world stepped one action at a time."""
+"""An environment that looks back, against the same environment stepped one action at a time."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from accerl_lerobot.envs import HistoryWorld, SimulatedConfig, World, make_world
+from accerl_lerobot.envs import Environment, HistoryEnvironment, SimulatedConfig, make_environment
 from accerl_lerobot.envs.base import ChunkResult
 from accerl_lerobot.experience import TASK, Observation
 
@@ -21,11 +21,13 @@ def chunks(count: int, rows: int, dims: int = 2, seed: int = 0) -> list[np.ndarr
     return [rng.uniform(-1, 1, (rows, dims)).astype(np.float32) for _ in range(count)]
 
 
-def one_by_one(world: World, task: str, actions: np.ndarray) -> tuple[list[Observation], list[ChunkResult]]:
+def one_by_one(
+    environment: Environment, task: str, actions: np.ndarray
+) -> tuple[list[Observation], list[ChunkResult]]:
     """Every observation of an episode, and every result."""
-    seen, results = [world.reset(5, task)], []
+    seen, results = [environment.reset(5, task)], []
     for action in actions:
-        results.append(world.step_chunk(action[None]))
+        results.append(environment.step_chunk(action[None]))
         seen.append(results[-1].observation)
         if results[-1].done:
             break
@@ -45,11 +47,11 @@ def same(observation: Observation, states: list[Observation]) -> None:
 @pytest.mark.parametrize("rows", [1, 2, 4])
 def test_the_last_states_are_seen_and_nothing_else_changes(rows: int, length: int):
     played = chunks(12, rows)
-    seen, results = one_by_one(make_world(WORLD), "match", np.concatenate(played))
-    world, steps = make_world(WORLD, length), 0
-    same(world.reset(5, "match"), [seen[0]] * length)
+    seen, results = one_by_one(make_environment(WORLD), "match", np.concatenate(played))
+    environment, steps = make_environment(WORLD, length), 0
+    same(environment.reset(5, "match"), [seen[0]] * length)
     for actions in played:
-        result = world.step_chunk(actions)
+        result = environment.step_chunk(actions)
         expected = results[steps : steps + result.steps]
         steps += result.steps
         assert np.array_equal(result.rewards, np.concatenate([r.rewards for r in expected]))
@@ -62,18 +64,18 @@ def test_the_last_states_are_seen_and_nothing_else_changes(rows: int, length: in
             break
     assert steps == 11 and result.truncated
     with pytest.raises(RuntimeError, match="reset"):
-        world.step_chunk(played[0])
-    same(world.reset(5, "match"), [seen[0]] * length)
-    world.close()
+        environment.step_chunk(played[0])
+    same(environment.reset(5, "match"), [seen[0]] * length)
+    environment.close()
 
 
 def test_a_termination_inside_a_chunk_ends_it():
     config = SimulatedConfig(max_steps=50, tolerance=3.0, image_size=8)
-    seen, results = one_by_one(make_world(config), "match", np.zeros((5, 2), np.float32))
+    seen, results = one_by_one(make_environment(config), "match", np.zeros((5, 2), np.float32))
     assert 1 <= len(results) < 5
-    world = make_world(config, 2)
-    world.reset(5, "match")
-    result = world.step_chunk(np.zeros((5, 2), np.float32))
+    environment = make_environment(config, 2)
+    environment.reset(5, "match")
+    result = environment.step_chunk(np.zeros((5, 2), np.float32))
     assert result.terminated and result.success and result.steps == len(results)
     same(result.observation, seen[-2:])
 
@@ -92,9 +94,9 @@ def test_a_termination_inside_a_chunk_ends_it():
 def test_a_world_that_ends_early_shows_its_last_state_for_those_it_did_not_show(
     length: int, rows: int, cut: int, shown: tuple[int, ...]
 ):
-    inner = make_world(WORLD)
+    inner = make_environment(WORLD)
 
-    class Early(World):
+    class Early(Environment):
         """Truncates after `cut` steps, whatever its spec says."""
 
         spec = inner.spec
@@ -112,9 +114,9 @@ def test_a_world_that_ends_early_shows_its_last_state_for_those_it_did_not_show(
             return inner.render(height, width)
 
     actions = np.full((rows, 2), 0.3, np.float32)
-    states, _ = one_by_one(make_world(WORLD), "match", actions)
-    world = HistoryWorld(Early(), length)
-    world.reset(5, "match")
-    result = world.step_chunk(actions)
+    states, _ = one_by_one(make_environment(WORLD), "match", actions)
+    environment = HistoryEnvironment(Early(), length)
+    environment.reset(5, "match")
+    result = environment.step_chunk(actions)
     assert result.truncated and result.steps == cut and result.observation is not None
     same(result.observation, [states[i] for i in shown])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Both directions: LeRobot's environments as our worlds, ours as LeRobot's."""
+"""Both directions: LeRobot's environments as our environments, ours as LeRobot's."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import gymnasium
 import numpy as np
 import pytest
 
-from accerl_lerobot.envs import GymConfig, LeRobotEnvConfig, MetaWorldConfig, make_world
+from accerl_lerobot.envs import GymConfig, LeRobotEnvConfig, MetaWorldConfig, make_environment
 from accerl_lerobot.envs.base import lerobot_eval_arguments
-from accerl_lerobot.envs.lerobot_env import LeRobotWorld
+from accerl_lerobot.envs.lerobot_env import LeRobotEnvironment
 from accerl_lerobot.errors import InputError
 from tests.hub_cache import cached_repo
 
@@ -40,12 +40,12 @@ class Scripted(gymnasium.Wrapper):
 @pytest.fixture
 def pusht():
     pytest.importorskip("gym_pusht")
-    world = LeRobotWorld(LeRobotEnvConfig(name="pusht", camera="top"))
-    yield world
-    world.close()
+    environment = LeRobotEnvironment(LeRobotEnvConfig(name="pusht", camera="top"))
+    yield environment
+    environment.close()
 
 
-def test_success_terminates_with_one_reward(pusht: LeRobotWorld):
+def test_success_terminates_with_one_reward(pusht: LeRobotEnvironment):
     pusht.environments["pusht"] = Scripted(pusht.environments["pusht"])
     pusht.reset(0, "pusht")
     result = pusht.step_chunk(np.full((5, 2), 256, np.float32))
@@ -53,9 +53,9 @@ def test_success_terminates_with_one_reward(pusht: LeRobotWorld):
     assert result.rewards.tolist() == [0, 0, 1]
 
 
-def test_lerobots_limit_is_the_default(pusht: LeRobotWorld):
+def test_lerobots_limit_is_the_default(pusht: LeRobotEnvironment):
     assert pusht.spec.max_steps == 300
-    shorter = LeRobotWorld(LeRobotEnvConfig(name="pusht", max_steps=9, success="succeed"))
+    shorter = LeRobotEnvironment(LeRobotEnvConfig(name="pusht", max_steps=9, success="succeed"))
     shorter.reset(0, "pusht")
     result = shorter.step_chunk(np.full((20, 2), 256, np.float32))
     shorter.close()
@@ -72,7 +72,7 @@ def test_the_command_for_stock_lerobot_has_the_limit_and_needs_its_key():
     assert lerobot_eval_arguments(env | {"success": "succeed"}) == []
 
 
-def test_images_are_what_the_environment_drew(pusht: LeRobotWorld):
+def test_images_are_what_the_environment_drew(pusht: LeRobotEnvironment):
     ours = pusht.reset(7, "pusht")
     raw, _ = pusht.environments["pusht"].reset(seed=7)
     assert np.array_equal(ours["observation.images.top"], raw["pixels"])
@@ -95,7 +95,7 @@ def test_images_are_what_the_environment_drew(pusht: LeRobotWorld):
 def test_bad_values_name_field_and_remedy(values: dict, message: str):
     pytest.importorskip("gym_pusht")
     with pytest.raises(InputError, match=message):
-        make_world(LeRobotEnvConfig(**values))
+        make_environment(LeRobotEnvConfig(**values))
 
 
 @pytest.fixture
@@ -106,7 +106,7 @@ def plugin():
     load_plugin("accerl_lerobot.envs.lerobot_plugin")
     from lerobot.envs.factory import make_env_config
 
-    return lambda **values: make_env_config("accerl", world={"type": "metaworld"} | values)
+    return lambda **values: make_env_config("accerl", environment={"type": "metaworld"} | values)
 
 
 def test_stock_lerobot_loads_and_describes_the_plugin(plugin):
@@ -130,8 +130,8 @@ def test_stock_lerobot_sees_our_world(plugin):
     vectors = make_env(plugin(task="handle-press-v3", max_steps=6), n_envs=2)
     vector = vectors["handle-press-v3"][0]
     seen = preprocess_observation(vector.reset(seed=[3, 4], options={NEW_ROLLOUT_OPTION: True})[0])
-    world = make_world(MetaWorldConfig(task="handle-press-v3", max_steps=6))
-    ours = world.reset(3, "handle-press-v3")
+    environment = make_environment(MetaWorldConfig(task="handle-press-v3", max_steps=6))
+    ours = environment.reset(3, "handle-press-v3")
     image = (seen["observation.images.corner2"][0] * 255).round().byte().permute(1, 2, 0).numpy()
     assert np.array_equal(image, ours["observation.images.corner2"])
     assert np.array_equal(seen["observation.state"][0].numpy(), ours["observation.state"])
@@ -147,7 +147,7 @@ def test_stock_lerobot_sees_our_world(plugin):
     assert all(env.is_frozen for env in vector.envs), "an episode that is over is not played again"
     assert vector.envs[0].render().shape == (256, 256, 3)
     vector.close()
-    world.close()
+    environment.close()
 
 
 @pytest.mark.usefixtures("plugin")
@@ -157,17 +157,19 @@ def test_stock_lerobot_runs_a_gymnasium_environment(monkeypatch: pytest.MonkeyPa
     from lerobot.envs.utils import NEW_ROLLOUT_OPTION
 
     monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "packages" / "lerobot_env_reach"))
-    world = {"type": "gym", "id": "reach/Reach-v0", "discover_packages_path": "lerobot_env_reach"}
-    world |= {"images": {"front": "pixels"}, "state": ["agent_pos", "goal"], "max_steps": 5, "fps": 10}
-    with pytest.raises(InputError, match="only the command line .* add --env.world.discover_packages_path="):
-        make_env_config("accerl", world=world | {"discover_packages_path": "somebodys"})
+    environment = {"type": "gym", "id": "reach/Reach-v0", "discover_packages_path": "lerobot_env_reach"}
+    environment |= {"images": {"front": "pixels"}, "state": ["agent_pos", "goal"], "max_steps": 5, "fps": 10}
+    with pytest.raises(
+        InputError, match="only the command line .* add --env.environment.discover_packages_path="
+    ):
+        make_env_config("accerl", environment=environment | {"discover_packages_path": "somebodys"})
     importlib.import_module("lerobot_env_reach")
-    settings = make_env_config("accerl", world=world)
+    settings = make_env_config("accerl", environment=environment)
     assert settings.fps == 10 and settings.features["agent_pos"].shape == (4,)
     vector = make_env(settings, n_envs=2, use_async_envs=asynchronous)["reach/Reach-v0"][0]
     try:
         seen, _ = vector.reset(seed=[3, 4], options={NEW_ROLLOUT_OPTION: True})
-        ours = make_world(GymConfig(**{k: v for k, v in world.items() if k != "type"}))
+        ours = make_environment(GymConfig(**{k: v for k, v in environment.items() if k != "type"}))
         assert np.array_equal(seen["agent_pos"][1], ours.reset(4, "reach/Reach-v0")["observation.state"])
         ends = [vector.step(np.zeros((2, 2), np.float32))[3].all() for _ in range(5)]
         assert ends == [False] * 4 + [True]
@@ -206,12 +208,12 @@ def test_environments_on_the_hub_are_not_run_unasked(arena, hub_path: str, trust
         name="isaaclab_arena", kwargs={"hub_path": hub_path}, trust_remote_code=trust, max_steps=5
     )
     with pytest.raises(InputError, match=f"^{said}"):
-        make_world(config)
+        make_environment(config)
     assert not arena.exists()
 
 
 def test_an_environment_is_run_at_its_commit(arena):
     kwargs = {"hub_path": f"them/arena@{COMMIT}:env.py"}
     with pytest.raises(InputError, match=r"env\.kwargs=.*\(OSError: ran\)"):
-        make_world(LeRobotEnvConfig(name="isaaclab_arena", kwargs=kwargs, trust_remote_code=True))
+        make_environment(LeRobotEnvConfig(name="isaaclab_arena", kwargs=kwargs, trust_remote_code=True))
     assert arena.exists()

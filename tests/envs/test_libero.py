@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""LIBERO: LeRobot's world, physics and pictures; starts from the seed; coarser meshes that look the same."""
+"""LIBERO: LeRobot's environment, physics and pictures; starts from the seed; coarser meshes that look the
+same."""
 
 from __future__ import annotations
 
@@ -14,9 +15,9 @@ import numpy as np
 import pytest
 
 from accerl_lerobot.demos.record import disturbed, make_expert, played
-from accerl_lerobot.envs import LiberoConfig, libero_tasks, make_world
+from accerl_lerobot.envs import LiberoConfig, libero_tasks, make_environment
 from accerl_lerobot.envs.graphics import import_mujoco
-from accerl_lerobot.envs.libero import LiberoWorld
+from accerl_lerobot.envs.libero import LiberoEnvironment
 from accerl_lerobot.envs.libero_simulator import (
     FPS,
     TIMESTEP,
@@ -179,38 +180,38 @@ def test_a_coarser_mesh_keeps_its_shape_and_its_picture():
 
 
 @pytest.fixture(scope="module")
-def world() -> Iterator[LiberoWorld]:
+def environment() -> Iterator[LiberoEnvironment]:
     tasks = "libero_object/0,libero_spatial/3"
-    made = make_world(
+    made = make_environment(
         LiberoConfig(task=tasks, image_size=64, rendering="fast", assets=ASSETS, environment_state=True)
     )
-    assert isinstance(made, LiberoWorld)
+    assert isinstance(made, LiberoEnvironment)
     yield made
     made.close()
 
 
 @needs_assets
-def test_same_seed_same_episode_whatever_went_before(world: LiberoWorld):
-    for seed, task in itertools.product((eval_seed(0, 3), train_seed(0, 0, 1)), world.spec.tasks):
+def test_same_seed_same_episode_whatever_went_before(environment: LiberoEnvironment):
+    for seed, task in itertools.product((eval_seed(0, 3), train_seed(0, 0, 1)), environment.spec.tasks):
         episodes = []
-        for between in world.spec.tasks:
-            world.reset(train_seed(1, 0, 4), between)
-            world.step_chunk(some_actions(7, 5))
-            first = world.reset(seed, task)
-            last = world.step_chunk(some_actions(12)).observation
+        for between in environment.spec.tasks:
+            environment.reset(train_seed(1, 0, 4), between)
+            environment.step_chunk(some_actions(7, 5))
+            first = environment.reset(seed, task)
+            last = environment.step_chunk(some_actions(12)).observation
             episodes.append([*first.values(), *last.values()])
         assert all(np.array_equal(a, b) for a, b in zip(*episodes, strict=True))
 
 
 @needs_assets
-def test_starts_of_evaluation_are_the_recorded_ones_and_others_are_drawn(world: LiberoWorld):
+def test_starts_of_evaluation_are_the_recorded_ones_and_others_are_drawn(environment: LiberoEnvironment):
     task = "libero_spatial/3"
-    world.reset(eval_seed(2, 0), task)
-    simulator = world.simulator
+    environment.reset(eval_seed(2, 0), task)
+    simulator = environment.simulator
     bowl = slice(9, 11)  # x and y of the first object, behind the arm and the fingers
 
     def start(seed: int) -> np.ndarray:
-        world.reset(seed, task)
+        environment.reset(seed, task)
         return simulator.data.qpos[bowl].copy()
 
     recorded = recorded_states(task).reshape(50, -1)[:, 1 : 1 + simulator.model.nq][:, bowl]
@@ -228,14 +229,14 @@ def test_starts_of_evaluation_are_the_recorded_ones_and_others_are_drawn(world: 
 
 
 @needs_assets
-def test_what_is_observed_after_a_chunk(world: LiberoWorld):
-    world.reset(5, "libero_spatial/3")
-    observation = world.step_chunk(some_actions(10)).observation
+def test_what_is_observed_after_a_chunk(environment: LiberoEnvironment):
+    environment.reset(5, "libero_spatial/3")
+    observation = environment.step_chunk(some_actions(10)).observation
     assert observation["observation.state"].shape == (8,) and observation[IMAGE].shape == (64, 64, 3)
     state = observation["observation.environment_state"]
-    assert state.shape == (world.config.state_size,)
+    assert state.shape == (environment.config.state_size,)
     assert observation["task"].startswith("pick up the black bowl")
-    way = world.simulator.pose("akita_black_bowl_1")[0] - world.simulator.hand[0]
+    way = environment.simulator.pose("akita_black_bowl_1")[0] - environment.simulator.hand[0]
     assert np.array([state[41:44], state[71:74]]) == pytest.approx(np.array([way, np.tanh(way / 0.03)]))
     assert state[-1] == pytest.approx(10 / 280)
 
@@ -251,12 +252,12 @@ def test_what_is_observed_after_a_chunk(world: LiberoWorld):
 )
 def test_state_has_all_that_a_task_is_about(task: str, opening: tuple[str, ...]):
     config = LiberoConfig(task=task, image_size=64, rendering="fast", assets=ASSETS, environment_state=True)
-    with contextlib.closing(make_world(config)) as world:
-        assert isinstance(world, LiberoWorld)
-        state = world.reset(eval_seed(0, 0), task)["observation.environment_state"]
-        names = world.simulator.env.obj_of_interest
-        where = np.concatenate([world.simulator.pose(name)[0] for name in names])
-        joints = [world.simulator.data.joint(name).qpos[0] for name in opening]
+    with contextlib.closing(make_environment(config)) as environment:
+        assert isinstance(environment, LiberoEnvironment)
+        state = environment.reset(eval_seed(0, 0), task)["observation.environment_state"]
+        names = environment.simulator.env.obj_of_interest
+        where = np.concatenate([environment.simulator.pose(name)[0] for name in names])
+        joints = [environment.simulator.data.joint(name).qpos[0] for name in opening]
     assert state[25 : 25 + where.size] == pytest.approx(where, abs=1e-6)  # behind the robot's numbers
     openings = state[37:41]
     assert openings.sum() == pytest.approx(sum(joints), abs=1e-6) and np.any(openings) == bool(opening)
@@ -319,11 +320,11 @@ def test_physics_are_liberos(task: str, seed: int, rendering: Any):
 def test_success_comes_when_liberos_does():
     task = "libero_goal/7"
     config = LiberoConfig(task=task, image_size=64, camera="agentview", rendering="fast", assets=ASSETS)
-    with contextlib.closing(make_world(config)) as world:
+    with contextlib.closing(make_environment(config)) as environment:
         actions = disturbed(
-            make_expert(config, world, task), world.spec, RECORDED, noise=0.1, push=0, fail=False
+            make_expert(config, environment, task), environment.spec, RECORDED, noise=0.1, push=0, fail=False
         )
-        episode = played(world, task, RECORDED, actions)
+        episode = played(environment, task, RECORDED, actions)
     theirs = [success for *_, success in stock_physics(task, RECORDED, episode.actions)]
     assert theirs == [False] * len(episode) + [True]
 
@@ -361,11 +362,11 @@ def test_observations_are_lerobots(task: str):
     theirs += [seen(stock.step(action)[0]) for action in some_actions(12)]
     text = stock.task_description
     stock.close()
-    world = LiberoWorld(LiberoConfig(task=task, image_size=SIZE, assets=ASSETS))
-    ours = [world.reset(eval_seed(0, 7), task)]
-    ours += [world.step_chunk(action[None]).observation for action in some_actions(12)]
+    environment = LiberoEnvironment(LiberoConfig(task=task, image_size=SIZE, assets=ASSETS))
+    ours = [environment.reset(eval_seed(0, 7), task)]
+    ours += [environment.step_chunk(action[None]).observation for action in some_actions(12)]
     for their, our in zip(theirs, ours, strict=True):
         assert np.array_equal(their[IMAGE], our[IMAGE]) and np.array_equal(their[WRIST], our[WRIST])
         assert np.abs(their["observation.state"] - our["observation.state"]).max() < 1e-6
         assert our["task"] == text
-    world.close()
+    environment.close()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""MetaWorld: same world as LeRobot's, cheaper; success, termination, divergence, tasks."""
+"""MetaWorld: same environment as LeRobot's, cheaper; success, termination, divergence, tasks."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from accerl_lerobot.demos.record import make_expert
-from accerl_lerobot.envs import MetaWorldConfig, graphics, make_world
+from accerl_lerobot.envs import MetaWorldConfig, graphics, make_environment
 from accerl_lerobot.envs import metaworld as gl
 from accerl_lerobot.envs.metaworld import MetaWorld, description, expert_name, groups
 from accerl_lerobot.errors import InputError
@@ -22,20 +22,20 @@ TASK = "handle-press-v3"
 IMAGE = "observation.images.corner2"
 
 
-def play(world: MetaWorld, seed: int = 0, chunk: int = 1) -> list:
-    world.reset(seed, TASK)
-    expert, results = make_expert(world.config, world, TASK), []
+def play(environment: MetaWorld, seed: int = 0, chunk: int = 1) -> list:
+    environment.reset(seed, TASK)
+    expert, results = make_expert(environment.config, environment, TASK), []
     while not results or not results[-1].done:
         action = np.clip(expert(), -1, 1).astype(np.float32)
-        results.append(world.step_chunk(np.repeat(action[None], chunk, 0)))
+        results.append(environment.step_chunk(np.repeat(action[None], chunk, 0)))
     return results
 
 
 def test_success_terminates_with_one_reward_and_a_last_picture(monkeypatch: pytest.MonkeyPatch):
-    world, frames = MetaWorld(MetaWorldConfig(task=TASK)), []
+    environment, frames = MetaWorld(MetaWorldConfig(task=TASK)), []
     frame = gl.Simulator.render
     monkeypatch.setattr(gl.Simulator, "render", lambda *args: frames.append(1) or frame(*args))
-    results = play(world, chunk=3)
+    results = play(environment, chunk=3)
     assert results[-1].terminated and results[-1].success and not results[-1].truncated
     assert sum(float(r.rewards.sum()) for r in results) == 1.0 and results[-1].rewards[-1] == 1.0
     assert len(frames) == len(results) + 1, "one picture at the reset and one per chunk"
@@ -64,9 +64,9 @@ def test_worlds_share_simulators_in_turn(monkeypatch: pytest.MonkeyPatch):
 
 def test_touch_is_told_as_metaworld_tells_it(monkeypatch: pytest.MonkeyPatch):
     task, told = "push-v3", []
-    world = MetaWorld(MetaWorldConfig(task=task))
-    world.reset(0, task)
-    expert, sim = make_expert(world.config, world, task), world.simulator.env
+    environment = MetaWorld(MetaWorldConfig(task=task))
+    environment.reset(0, task)
+    expert, sim = make_expert(environment.config, environment, task), environment.simulator.env
     ours, theirs = sim.touching_object, type(sim).touching_object
 
     def both(geom: int) -> bool:
@@ -74,7 +74,7 @@ def test_touch_is_told_as_metaworld_tells_it(monkeypatch: pytest.MonkeyPatch):
         return told[-1][0]
 
     monkeypatch.setattr(sim, "touching_object", both)
-    while not world.step_chunk(np.clip(expert(), -1, 1).astype(np.float32)[None]).done:
+    while not environment.step_chunk(np.clip(expert(), -1, 1).astype(np.float32)[None]).done:
         pass
     assert {(False, False), (True, True)} == set(told)
 
@@ -86,23 +86,23 @@ def test_same_states_and_frames_as_lerobot():
     actions = np.random.default_rng(0).uniform(-1, 1, (3, 4)).astype(np.float32)
     # LeRobot's pictures first: once ours has an OpenGL context, theirs would be drawn into it.
     theirs = [stock.reset(seed=11)[0], *(stock.step(action)[0] for action in actions)]
-    world = make_world(MetaWorldConfig(task="push-v3", image_size=480, rendering="stock"))
-    ours = world.reset(11, "push-v3")
+    environment = make_environment(MetaWorldConfig(task="push-v3", image_size=480, rendering="stock"))
+    ours = environment.reset(11, "push-v3")
     assert np.array_equal(theirs[0]["agent_pos"].astype(np.float32), ours["observation.state"])
     for action, raw in zip(actions, theirs[1:], strict=True):
-        result = world.step_chunk(action[None])
+        result = environment.step_chunk(action[None])
         assert np.array_equal(raw["agent_pos"].astype(np.float32), result.observation["observation.state"])
         assert np.array_equal(raw["pixels"], result.observation[IMAGE])
     assert result.observation["task"] == stock.task_description
     stock.close()
-    world.close()
+    environment.close()
 
 
 def test_another_process_sees_the_same_episode_and_prints_nothing_at_its_end():
     code = (
         "import hashlib, numpy as np\n"
-        "from accerl_lerobot.envs import MetaWorldConfig, make_world\n"
-        "w = make_world(MetaWorldConfig(task='push-v3')); o = w.reset(9, 'push-v3')\n"
+        "from accerl_lerobot.envs import MetaWorldConfig, make_environment\n"
+        "w = make_environment(MetaWorldConfig(task='push-v3')); o = w.reset(9, 'push-v3')\n"
         "r = w.step_chunk(np.full((5, 4), .3, np.float32)).observation\n"
         "parts = [x[k].tobytes() for x in (o, r) for k in sorted(x) if k != 'task']\n"
         "print(hashlib.sha1(b''.join(parts)).hexdigest())"
@@ -112,43 +112,43 @@ def test_another_process_sees_the_same_episode_and_prints_nothing_at_its_end():
         [sys.executable, "-c", code], capture_output=True, text=True, cwd=root, check=True
     )
     assert not output.stderr, "renderers that nobody closed complained"
-    world = make_world(MetaWorldConfig(task="push-v3"))
-    world.reset(1, "push-v3")
-    world.step_chunk(np.ones((7, 4), np.float32))
-    first = world.reset(9, "push-v3")
-    later = world.step_chunk(np.full((5, 4), 0.3, np.float32)).observation
+    environment = make_environment(MetaWorldConfig(task="push-v3"))
+    environment.reset(1, "push-v3")
+    environment.step_chunk(np.ones((7, 4), np.float32))
+    first = environment.reset(9, "push-v3")
+    later = environment.step_chunk(np.full((5, 4), 0.3, np.float32)).observation
     parts = [x[k].tobytes() for x in (first, later) for k in sorted(x) if k != "task"]
     assert output.stdout.strip() == hashlib.sha1(b"".join(parts)).hexdigest()
 
 
 def test_every_camera_that_may_be_named_shows_something_else():
-    world = make_world(MetaWorldConfig(task=TASK, camera=",".join(MetaWorldConfig.CAMERAS)))
-    seen = world.reset(0, TASK)
+    environment = make_environment(MetaWorldConfig(task=TASK, camera=",".join(MetaWorldConfig.CAMERAS)))
+    seen = environment.reset(0, TASK)
     frames = {seen[f"observation.images.{name}"].tobytes() for name in MetaWorldConfig.CAMERAS}
     assert len(frames) == len(MetaWorldConfig.CAMERAS)
-    world.close()
+    environment.close()
 
 
 def test_cameras_and_tasks_side_by_side():
-    world = make_world(MetaWorldConfig(task="reach-v3,drawer-open-v3", camera="corner2,topview"))
-    one, other = world.reset(0, "reach-v3"), world.reset(0, "drawer-open-v3")
-    assert set(world.spec.images) == {IMAGE, "observation.images.topview"}
+    environment = make_environment(MetaWorldConfig(task="reach-v3,drawer-open-v3", camera="corner2,topview"))
+    one, other = environment.reset(0, "reach-v3"), environment.reset(0, "drawer-open-v3")
+    assert set(environment.spec.images) == {IMAGE, "observation.images.topview"}
     assert one["task"] == description("reach-v3") != other["task"]
     assert not np.array_equal(one[IMAGE], other[IMAGE])
-    assert np.array_equal(one[IMAGE], world.reset(0, "reach-v3")[IMAGE])
-    world.close()
+    assert np.array_equal(one[IMAGE], environment.reset(0, "reach-v3")[IMAGE])
+    environment.close()
 
 
 def test_a_diverged_simulator_ends_the_episode_and_says_so(tmp_path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)  # MuJoCo writes its log into the working directory
-    world = MetaWorld(MetaWorldConfig(task=TASK))
-    world.reset(0, TASK)
-    world.simulator.env.data.qpos[:] = np.nan
-    result = world.step_chunk(np.zeros((5, 4), np.float32))
+    environment = MetaWorld(MetaWorldConfig(task=TASK))
+    environment.reset(0, TASK)
+    environment.simulator.env.data.qpos[:] = np.nan
+    result = environment.step_chunk(np.zeros((5, 4), np.float32))
     assert result.info["nonfinite"] == 1.0 and result.truncated and result.steps == 1
-    healthy = world.reset(0, TASK)
+    healthy = environment.reset(0, TASK)
     assert np.isfinite(healthy["observation.state"]).all()
-    assert not world.step_chunk(np.zeros((5, 4), np.float32)).info
+    assert not environment.step_chunk(np.zeros((5, 4), np.float32)).info
 
 
 def test_tables_know_all_fifty_tasks():
@@ -189,11 +189,11 @@ def headless(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
 def test_a_backend_that_needs_a_display_is_refused_without_one(headless: pytest.MonkeyPatch):
     headless.setenv("MUJOCO_GL", "glfw")
     with pytest.raises(InputError, match="MUJOCO_GL='glfw': there is no display"):
-        make_world(MetaWorldConfig(task=TASK)).reset(0, TASK)
+        make_environment(MetaWorldConfig(task=TASK)).reset(0, TASK)
 
 
 def test_a_missing_opengl_names_the_package(headless: pytest.MonkeyPatch):
     headless.delenv("MUJOCO_GL", raising=False)
     headless.setattr(graphics, "_LIBRARIES", {"egl": ("libNoEGL.so",), "osmesa": ("libNoMesa.so",)})
     with pytest.raises(InputError, match="MUJOCO_GL='': .*apt-get install -y libosmesa6"):
-        make_world(MetaWorldConfig(task=TASK)).reset(0, TASK)
+        make_environment(MetaWorldConfig(task=TASK)).reset(0, TASK)

@@ -20,9 +20,9 @@ from safetensors.torch import load_file, save_file
 from transformers import ResNetConfig, ResNetModel
 
 from accerl_lerobot.engine.config import LaunchConfig
-from accerl_lerobot.engine.preflight import check_start, check_world
+from accerl_lerobot.engine.preflight import check_environment, check_start
 from accerl_lerobot.engine.run import make_engine
-from accerl_lerobot.envs import JudgedWorld, RewardModelConfig, SimulatedConfig, make_world
+from accerl_lerobot.envs import JudgedEnvironment, RewardModelConfig, SimulatedConfig, make_environment
 from accerl_lerobot.envs.reward_model import load_judge
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.rollout.runner import RolloutConfig
@@ -61,9 +61,9 @@ def write_classifier(folder: Path, encoder: Path, bias: float = 0.0, size: int =
 
 def test_it_is_asked_for_the_probability_that_lerobot_computes(encoder: Path, tmp_path: Path):
     model = write_classifier(tmp_path, encoder)
-    world = make_world(ENV)
+    environment = make_environment(ENV)
     for seed in range(3):
-        observation = world.reset(seed, "match")
+        observation = environment.reset(seed, "match")
         image = torch.from_numpy(np.asarray(observation[CAMERA]))[None].permute(0, 3, 1, 2) / 255
         p = model.predict([(image - MEAN) / STD]).probabilities.item()
         for threshold, expected in ((p - 1e-4, True), (p + 1e-4, False)):
@@ -71,13 +71,13 @@ def test_it_is_asked_for_the_probability_that_lerobot_computes(encoder: Path, tm
             assert judge(observation) is expected
 
 
-def solved(world: Any, seed: int) -> list[Any]:
+def solved(environment: Any, seed: int) -> list[Any]:
     """Chunks that solve the task, until the episode ends."""
-    world.reset(seed, "match")
-    inner = world._world if isinstance(world, JudgedWorld) else world
+    environment.reset(seed, "match")
+    inner = environment._environment if isinstance(environment, JudgedEnvironment) else environment
     results = []
     while not results or not results[-1].done:
-        results.append(world.step_chunk(np.tile(inner.solution, (2, 1))))
+        results.append(environment.step_chunk(np.tile(inner.solution, (2, 1))))
     return results
 
 
@@ -85,16 +85,16 @@ def test_episodes_succeed_and_end_as_it_says(encoder: Path, tmp_path: Path):
     for name, bias in (("always", 9.0), ("never", -9.0)):
         write_classifier(tmp_path / name, encoder, bias)
     always, never = (
-        make_world(ENV, reward_model=RewardModelConfig(path=str(tmp_path / name)))
+        make_environment(ENV, reward_model=RewardModelConfig(path=str(tmp_path / name)))
         for name in ("always", "never")
     )
     (only,) = solved(always, 0)
     assert only.success and only.terminated and not only.truncated and only.rewards.tolist() == [0.0, 1.0]
     *_, last = solved(never, 0)
-    assert last.terminated and not last.success and last.rewards.sum() == 0  # the world itself ends it
-    *_, last = solved(make_world(ENV), 0)
+    assert last.terminated and not last.success and last.rewards.sum() == 0  # the environment itself ends it
+    *_, last = solved(make_environment(ENV), 0)
     assert last.success and last.rewards.sum() == 1
-    lasting = make_world(
+    lasting = make_environment(
         replace(ENV, reward="dense"), reward_model=RewardModelConfig(path=str(tmp_path / "never"))
     )
     results = solved(lasting, 0)
@@ -105,7 +105,7 @@ def test_a_run_learns_from_what_it_says(encoder: Path, tmp_path: Path):
     write_classifier(tmp_path / "always", encoder, 9.0)
     checkpoint = write_smolvla(tmp_path / "policy", image=128)
     model = RewardModelConfig(path=str(tmp_path / "always"))
-    rollout = RolloutConfig(worlds=2, segment_length=3, reward_model=model)
+    rollout = RolloutConfig(environments=2, segment_length=3, reward_model=model)
     config = tiny_run(checkpoint, env=ENV, rollout=rollout, launch=LaunchConfig(engine="local"))
     check_start(config)
     with closing(make_engine(config, ("match",), history=1)) as engine:
@@ -124,7 +124,7 @@ def test_what_cannot_judge_is_refused_in_one_line(
 ):
     def refused(message: str, env: SimulatedConfig = ENV) -> None:
         with pytest.raises(InputError, match=message):
-            check_world(env, RewardModelConfig(path=str(path)))
+            check_environment(env, RewardModelConfig(path=str(path)))
 
     path = tmp_path / "absent"
     refused(r"^rollout\.reward_model\.path=.*no config\.json there")

@@ -20,7 +20,7 @@ IMAGE = "observation.images.corner2"
 ACTIONS = np.random.default_rng(0).uniform(-1, 1, (30, 4)).astype(np.float32)
 
 
-def world(**shift: Any) -> MetaWorld:
+def environment(**shift: Any) -> MetaWorld:
     return MetaWorld(MetaWorldConfig(task=TASK, shift=ShiftConfig(**shift)))
 
 
@@ -35,16 +35,16 @@ def played(of: MetaWorld, actions: np.ndarray = ACTIONS, seed: int = 5) -> tuple
 
 
 def test_pictures_change_with_camera_and_light_and_physics_does_not():
-    states, frame = played(world())
+    states, frame = played(environment())
     for shift in ({"camera": (0.0, 0.1, 0.0)}, {"light": 0.5}):
-        others, other = played(world(**shift))
+        others, other = played(environment(**shift))
         np.testing.assert_array_equal(others, states)
         assert np.abs(other.astype(int) - frame).mean() > 3
-    assert played(world(light=0.5))[1].mean() < 0.8 * frame.mean() < frame.mean()
+    assert played(environment(light=0.5))[1].mean() < 0.8 * frame.mean() < frame.mean()
 
 
 def test_friction_scales_that_of_every_surface():
-    nominal, slippery = world(), world(friction=0.25)
+    nominal, slippery = environment(), environment(friction=0.25)
     for each in (nominal, slippery):
         each.reset(0, TASK)
     a, b = (each.simulator.env.model.geom_friction for each in (nominal, slippery))
@@ -53,15 +53,15 @@ def test_friction_scales_that_of_every_surface():
 
 
 def test_an_action_comes_so_many_steps_late_in_every_episode():
-    late = world(action_delay=3)
+    late = environment(action_delay=3)
     first = np.concatenate([np.zeros((3, 4), np.float32), ACTIONS[:-3]])
-    expected, _ = played(world(), first)
+    expected, _ = played(environment(), first)
     for _ in range(2):  # nothing is left over from the episode before
         np.testing.assert_array_equal(played(late)[0], expected)
 
 
 def test_starts_come_from_wider_ranges():
-    nominal, wide = world(), world(start_range=2.0)
+    nominal, wide = environment(), environment(start_range=2.0)
     seen: dict[str, list[np.ndarray]] = {"nominal": [], "wide": []}
     for seed in range(40):
         for name, each in (("nominal", nominal), ("wide", wide)):

@@ -22,9 +22,9 @@ TOKENIZER = {"registry_name": "tokenizer_processor", "config": {"tokenizer_name"
 def test_kinds(tmp_path: Path):
     assert recognise(write_policy_folder(tmp_path / "policy")) == "policy"
     assert recognise(TINY) == "dataset" and repo_type("dataset") == "dataset"
-    write_json(tmp_path / "world" / "config.json", {"spec": {}, "model": {}})
-    (tmp_path / "world" / "model.safetensors").write_bytes(b"x")
-    assert recognise(tmp_path / "world") == "world model" and repo_type("world model") == "model"
+    write_json(tmp_path / "environment" / "config.json", {"spec": {}, "model": {}})
+    (tmp_path / "environment" / "model.safetensors").write_bytes(b"x")
+    assert recognise(tmp_path / "environment") == "world model" and repo_type("world model") == "model"
 
 
 @pytest.mark.parametrize(

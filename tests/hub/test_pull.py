@@ -12,7 +12,7 @@ import pytest
 
 from accerl_lerobot import cli
 from accerl_lerobot.checkpoint.layout import check_names
-from accerl_lerobot.checkpoint.safety import Origin
+from accerl_lerobot.checkpoint.safety import FileSource
 from accerl_lerobot.errors import InputError
 from tests.hub.folders import refusal, write_json, write_policy_folder
 from tests.hub_server import STRANGER, Answer, Fault, HubServer
@@ -285,15 +285,17 @@ def test_no_place_of_this_machine_is_named(hub, policy, refused, tmp_path, monke
     for name in names if file.endswith(".yaml") else [*names, "secret"]:
         write_json(policy / file, json.loads(json.dumps(content).replace("SECRET", name)))
         with pytest.raises(InputError, match=f"{file}: .* is a place on this machine"):
-            check_names(policy, Origin("policy.path", "theirs"))
+            check_names(policy, FileSource("policy.path", "theirs"))
     hub.plant(NAME, {file: (policy / file).read_bytes()})
     assert f"{file}: " in (line := refused()) and "is a place on this machine" in line
 
 
 def test_no_place_of_this_machine_is_named_by_a_world_model_or_dataset(hub: HubServer, refused: Refusal):
-    world = {"spec": {}, "model": {"type": "theirs", "backbone": "/etc/ssl"}}
-    hub.plant("alice/world", {"config.json": json.dumps(world).encode(), "model.safetensors": b"x"})
-    assert "config.json: backbone: '/etc/ssl' is a place" in refused(name="alice/world")
+    environment = {"spec": {}, "model": {"type": "theirs", "backbone": "/etc/ssl"}}
+    hub.plant(
+        "alice/environment", {"config.json": json.dumps(environment).encode(), "model.safetensors": b"x"}
+    )
+    assert "config.json: backbone: '/etc/ssl' is a place" in refused(name="alice/environment")
     info = {"codebase_version": "v3.0", "data_path": "../{chunk_index}/{file_index}.parquet"}
     files = {"meta/info.json": json.dumps(info).encode(), "meta/episodes/x": b"", "data/x": b""}
     hub.plant("alice/data", files | {"meta/tasks.parquet": b""}, repo_type="dataset")

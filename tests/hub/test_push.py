@@ -134,9 +134,11 @@ def test_a_name_that_holds_something_else(hub, policy, tmp_path, pushed, refused
     assert "it is a dataset repository, and this is a policy" in refused(policy)
     hub.repos.clear()
     pushed(policy)
-    write_json(tmp_path / "world" / "config.json", {"spec": {}, "model": {}})
-    (tmp_path / "world" / "model.safetensors").write_bytes(b"x")
-    assert "it holds a policy, and this is a world model; choose another name" in refused(tmp_path / "world")
+    write_json(tmp_path / "environment" / "config.json", {"spec": {}, "model": {}})
+    (tmp_path / "environment" / "model.safetensors").write_bytes(b"x")
+    assert "it holds a policy, and this is a world model; choose another name" in refused(
+        tmp_path / "environment"
+    )
     assert "it is a model repository, and this is a dataset" in refused(TINY)
     assert len(hub.repos) == 1 and len(hub.repo(NAME).commits) == 2
 

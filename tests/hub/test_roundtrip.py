@@ -126,16 +126,16 @@ def test_a_world_model_brings_its_success_model(hub: HubServer, tmp_path: Path):
     from accerl_lerobot.world_model.store import load_roles, load_world_model, save_world_model
     from accerl_lerobot.world_model.success_model import SuccessPairsRewardModel
 
-    world, success, roles = model(), new_success_model(5), {"a": "learnt", "b": "held out"}
-    world.fit_statistics(windows(dots(2)))
-    save_world_model(tmp_path / "world_model", world, success, roles)
-    accerl("push", f"--path={tmp_path / 'world_model'}", "--repo_id=alice/world")
-    accerl("pull", "--repo_id=alice/world", f"--output_dir={tmp_path / 'pulled'}")
+    environment, success, roles = model(), new_success_model(5), {"a": "learnt", "b": "held out"}
+    environment.fit_statistics(windows(dots(2)))
+    save_world_model(tmp_path / "world_model", environment, success, roles)
+    accerl("push", f"--path={tmp_path / 'world_model'}", "--repo_id=alice/environment")
+    accerl("pull", "--repo_id=alice/environment", f"--output_dir={tmp_path / 'pulled'}")
     came, judge = load_world_model(tmp_path / "pulled")
     assert load_roles(tmp_path / "pulled") == roles
-    assert (came.spec, came.config) == (world.spec, world.config)
+    assert (came.spec, came.config) == (environment.spec, environment.config)
     assert not any(p.requires_grad for p in came.parameters())
-    for first, second in ((world, came), (success, judge)):
+    for first, second in ((environment, came), (success, judge)):
         loaded = second.state_dict() | dict(second.named_buffers())
         saved = first.state_dict() | dict(first.named_buffers())
         assert all(torch.equal(value, loaded[key]) for key, value in saved.items())

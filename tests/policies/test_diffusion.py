@@ -12,7 +12,7 @@ import torch
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine import run
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig
-from accerl_lerobot.envs import SimulatedConfig, make_world
+from accerl_lerobot.envs import SimulatedConfig, make_environment
 from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.experience import TASK, Request, stack_observations
 from accerl_lerobot.policies.config import DiffusionSamplerConfig, PolicyConfig
@@ -91,7 +91,7 @@ def test_an_episode_is_the_one_that_stock_lerobot_plays(looking: Path):
     """LeRobot sees every env step and keeps its own queues; we look when a decision is due."""
     adapter = adapter_at(looking)
     policy, size = adapter.policy, adapter.family.size
-    ours, stock = make_world(WORLD, OBSERVED), make_world(WORLD)
+    ours, stock = make_environment(WORLD, OBSERVED), make_environment(WORLD)
     observation, policy_sees = ours.reset(3, "match"), stock.reset(3, "match")
     policy.reset()
     steps = decisions = 0
@@ -141,12 +141,12 @@ def test_a_run_asks_the_policy_how_far_it_looks_back(looking: Path, tmp_path: Pa
 
 def test_a_world_without_a_history_is_refused_in_words(looking: Path):
     request = requests(1, image=40)[0]
-    with pytest.raises(ValueError, match="but the policy reads 2 env steps at a time: make worlds"):
+    with pytest.raises(ValueError, match="but the policy reads 2 env steps at a time: make environments"):
         adapter_at(looking).decide([request], 0)
 
 
 def test_a_rollout_process_asks_with_the_history():
-    worker = RolloutWorker(WORLD, RolloutConfig(worlds=1), EpisodePlans(("match",), 0, None), OBSERVED)
+    worker = RolloutWorker(WORLD, RolloutConfig(environments=1), EpisodePlans(("match",), 0, None), OBSERVED)
     asked: list[Request] = []
 
     def decide(due: list[Request]) -> list[Request]:

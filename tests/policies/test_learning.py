@@ -132,9 +132,12 @@ def test_a_random_policy_gets_better(name: str, tmp_path: Path):
         path,
         env=run.env,
         policy=PolicyConfig(path=str(path), device="cpu", sampler=run.sampler),
-        rollout=RolloutConfig(worlds=32, segment_length=8),
+        rollout=RolloutConfig(environments=32, segment_length=8),
         replay=ReplayConfig(
-            capacity=run.capacity, min_decisions=run.least, ahead=2 * run.least, samples_per_insert=2.0
+            capacity=run.capacity,
+            min_decisions=run.least,
+            max_unlearned_decisions=2 * run.least,
+            samples_per_insert=2.0,
         ),
         algorithm=run.algorithm,
         trainer=TrainerConfig(

@@ -287,7 +287,7 @@ def test_lerobot_eval_runs_the_checkpoint(trained: tuple[Path, list[tuple[int, f
         sys.executable, "-m", "lerobot.scripts.lerobot_eval", f"--policy.path={trained[0]}",
         *discovery("smolvla_bins"), "--policy.device=cpu",
         "--env.discover_packages_path=accerl_lerobot.envs.lerobot_plugin", "--env.type=accerl",
-        "--env.world={type: metaworld, task: drawer-open-v3, image_size: 64, max_steps: 8}",
+        "--env.environment={type: metaworld, task: drawer-open-v3, image_size: 64, max_steps: 8}",
         "--eval.n_episodes=2", "--eval.batch_size=1", f"--output_dir={tmp_path / 'eval'}",
     ]  # fmt: skip
     done = subprocess.run(command, env=dict(os.environ), capture_output=True, text=True)

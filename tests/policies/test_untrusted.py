@@ -16,7 +16,7 @@ import torch
 from torch import nn
 
 from accerl_lerobot.checkpoint.layout import BACKBONE
-from accerl_lerobot.checkpoint.safety import Origin
+from accerl_lerobot.checkpoint.safety import FileSource
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.loading import load_adapter
@@ -26,7 +26,7 @@ from tests.hub_cache import cached_repo
 from tests.policies.checkpoints import edit_config, write_act, write_smolvla
 
 PRE = "policy_preprocessor.json"
-ORIGIN = Origin("policy.path", "theirs")
+ORIGIN = FileSource("policy.path", "theirs")
 
 
 @pytest.fixture(scope="module")
@@ -193,7 +193,7 @@ def test_code_on_the_hub_is_refused(theirs: Repository):
     with guarded("policy"), pytest.raises(InputError) as caught:
         load(theirs.name, trust_remote_code=True)
     assert str(caught.value).startswith("policy.trust_remote_code=") and "their_code.py" in str(caught.value)
-    assert "commit in policy.trust_remote_code" in caught.value.remedy
+    assert "commit in policy.trust_remote_code" in caught.value.hint
     assert not theirs.marker.exists()
 
 

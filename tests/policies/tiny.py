@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from accerl_lerobot.experience import TASK, Origin, Request, Segment
+from accerl_lerobot.experience import TASK, Request, Segment, SegmentStart
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.config import PolicyConfig, SamplerConfig
 from accerl_lerobot.policies.loading import load_adapter
@@ -61,7 +61,7 @@ def adapter_at(path: Path, sampler: SamplerConfig | None = None, **options: Any)
 
 def as_segment(asked: Sequence[Request], adapter: LeRobotAdapter, length: int) -> Segment:
     """Plays requests as one episode, in which each decision is made alone; it has been through a pickle."""
-    builder = SegmentBuilder([asked[0].observation], length, Origin("task", seed=0, decision=0), 100)
+    builder = SegmentBuilder([asked[0].observation], length, SegmentStart("task", seed=0, decision=0), 100)
     for i in range(length):
         decision = adapter.decide([asked[i]], 3)[0]
         builder.add(decision, decision.chunk, 0.0, 3, asked[i + 1].observation)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from accerl_lerobot.experience import Origin, Segment
+from accerl_lerobot.experience import Segment, SegmentStart
 from accerl_lerobot.replay.buffer import Replay
 
 
@@ -25,7 +25,7 @@ def make_segment(key: str, n: int = 4, version: int | list[int] = 0, **replace: 
         "actions": np.zeros((n, 1, 1), np.float32),
         "steps": np.ones(n, np.int64),
         "time_limit": 100,
-        "origin": Origin("push-v3", seed=0, decision=0),
+        "origin": SegmentStart("push-v3", seed=0, decision=0),
         "terminated": False,
         "success": False,
         "key": key,

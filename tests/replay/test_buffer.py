@@ -16,7 +16,11 @@ from tests.replay.segments import assert_books_balance, make_segment
 
 
 def make_replay(**settings: Any) -> Replay:
-    return Replay(ReplayConfig(**{"capacity": 40, "min_decisions": 4, "ahead": 20, "max_lag": 5, **settings}))
+    return Replay(
+        ReplayConfig(
+            **{"capacity": 40, "min_decisions": 4, "max_unlearned_decisions": 20, "max_lag": 5, **settings}
+        )
+    )
 
 
 def keys(segments: list[Any]) -> list[str]:
@@ -24,7 +28,7 @@ def keys(segments: list[Any]) -> list[str]:
 
 
 def test_the_oldest_leave_first_and_by_decisions() -> None:
-    replay = make_replay(capacity=10, ahead=10)
+    replay = make_replay(capacity=10, max_unlearned_decisions=10)
     for i, n in enumerate([4, 4, 3]):
         assert replay.insert(make_segment(f"k{i}", n))
     assert replay.stored_decisions == 7 and replay.counters.evicted_decisions == 4
@@ -34,7 +38,7 @@ def test_the_oldest_leave_first_and_by_decisions() -> None:
 
 
 def test_one_large_segment_may_push_out_all_others() -> None:
-    replay = make_replay(capacity=10, ahead=10)
+    replay = make_replay(capacity=10, max_unlearned_decisions=10)
     for i in range(3):
         replay.insert(make_segment(f"k{i}", 3))
     replay.insert(make_segment("long", 10))
@@ -130,7 +134,7 @@ def carried(replay: Replay, version: int | None, folder: Path) -> Replay:
 
 def test_what_is_saved_goes_on_as_if_it_had_never_been(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
-    replay = make_replay(capacity=16, ahead=16, samples_per_insert=1.5)
+    replay = make_replay(capacity=16, max_unlearned_decisions=16, samples_per_insert=1.5)
     for i in range(6):
         replay.insert(make_segment(f"k{i}"))
     replay.sample(8, 0, rng)
@@ -176,8 +180,16 @@ def test_what_is_too_long_ago_cannot_be_taken_back() -> None:
 
 
 def mixed(share: float = 0.5, patient: bool = False, **imagined: Any) -> MixedReplay:
-    real = ReplayConfig(capacity=100, min_decisions=8, samples_per_insert=2.0, ahead=16, max_lag=5)
-    config = {"capacity": 100, "min_decisions": 1, "samples_per_insert": 1.0, "ahead": 16, "max_lag": 5}
+    real = ReplayConfig(
+        capacity=100, min_decisions=8, samples_per_insert=2.0, max_unlearned_decisions=16, max_lag=5
+    )
+    config = {
+        "capacity": 100,
+        "min_decisions": 1,
+        "samples_per_insert": 1.0,
+        "max_unlearned_decisions": 16,
+        "max_lag": 5,
+    }
     return MixedReplay(real, ReplayConfig(**(config | imagined)), share, patient)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import IMAGINED, Origin, Segment
+from accerl_lerobot.experience import IMAGINED, Segment, SegmentStart
 from accerl_lerobot.replay.buffer import MixedReplay
 from accerl_lerobot.replay.journal import Journal, read_journal, whole_episodes
 from accerl_lerobot.replay.pacing import ReplayConfig
@@ -26,7 +26,7 @@ def part(key: str, seed: int, decision: int, n: int = 2, **fields: Any) -> Segme
         key,
         n=n,
         version=list(range(n)),
-        origin=Origin("push-v3", seed, decision),
+        origin=SegmentStart("push-v3", seed, decision),
         actions=rng.standard_normal((n, 3, 2)).astype(np.float32),
         steps=steps,
         reward=rng.standard_normal(n).astype(np.float32),
@@ -40,7 +40,7 @@ def test_what_is_written_is_read(tmp_path: Path):
     journal.write(first)
     journal.write(second)
     found = list(read_journal(tmp_path / "episodes.jsonl"))
-    assert [d.key for d in found] == ["a", "b"] and found[1].origin == Origin("push-v3", 5, 2)
+    assert [d.key for d in found] == ["a", "b"] and found[1].origin == SegmentStart("push-v3", 5, 2)
     assert found[0].steps == (3, 2) and found[0].versions == (0, 1) and not found[0].ended
     assert found[1].ended and found[1].success
     # Of the last chunk two of three actions were executed.
@@ -51,7 +51,7 @@ def test_what_is_written_is_read(tmp_path: Path):
 
 def test_only_what_replay_stores_is_written_and_a_cut_forgets(tmp_path: Path):
     path = tmp_path / "episodes.jsonl"
-    config = ReplayConfig(capacity=40, min_decisions=4, ahead=20)
+    config = ReplayConfig(capacity=40, min_decisions=4, max_unlearned_decisions=20)
     replay = MixedReplay(config, config, 0.5, journal=Journal(path))
     broken = part("c", 3, 0)
     broken.reward[0] = np.nan

@@ -11,10 +11,10 @@ import pytest
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.replay.buffer import Replay
-from accerl_lerobot.replay.pacing import ReplayConfig, entitle, lag_bound, lag_limits
+from accerl_lerobot.replay.pacing import ReplayConfig, draws_for, lag_bound, lag_limits
 from tests.replay.segments import assert_books_balance, make_segment
 
-CONFIG = ReplayConfig(capacity=100, min_decisions=10, samples_per_insert=2.0, ahead=30)
+CONFIG = ReplayConfig(capacity=100, min_decisions=10, samples_per_insert=2.0, max_unlearned_decisions=30)
 
 
 def test_the_door_and_the_warm_start() -> None:
@@ -27,14 +27,14 @@ def test_the_door_and_the_warm_start() -> None:
 
 
 def test_one_side_may_always_move_in_every_state() -> None:
-    config = ReplayConfig(capacity=40, min_decisions=7, ahead=12)
+    config = ReplayConfig(capacity=40, min_decisions=7, max_unlearned_decisions=12)
     for batch in (1, 5, 12):
         config.check(batch_decisions=batch, segment_decisions=4)
         for stored in range(41):
             for available in range(stored + 1):
                 inserting = config.may_insert(stored, available)
                 assert inserting or config.may_sample(stored, available, batch)
-    with pytest.raises(InputError, match=r"replay\.ahead=12"):
+    with pytest.raises(InputError, match=r"replay\.max_unlearned_decisions=12"):
         config.check(batch_decisions=13, segment_decisions=4)
 
 
@@ -44,14 +44,14 @@ def test_entitlement_averages_to_the_rate_and_never_exceeds_it(rate: float) -> N
     carry, inserted, granted = 0.0, 0, 0
     for _ in range(5000):
         n = int(rng.integers(1, 17))
-        draws, carry = entitle(rate, n, carry)
+        draws, carry = draws_for(rate, n, carry)
         assert draws in (math.floor(rate), math.ceil(rate)) and -1e-6 < carry < 16 + 1e-6
         inserted, granted = inserted + n, granted + draws * n
         assert -1e-6 < rate * inserted - granted < 16 + 1e-6
 
 
 def test_a_store_without_room_for_the_pace_is_refused() -> None:
-    config = ReplayConfig(capacity=32, min_decisions=8, ahead=30)
+    config = ReplayConfig(capacity=32, min_decisions=8, max_unlearned_decisions=30)
     config.check(batch_decisions=30, segment_decisions=3)
     with pytest.raises(InputError, match="use at least 33"):
         config.check(batch_decisions=30, segment_decisions=4)
@@ -61,7 +61,9 @@ def test_lag_bound_by_hand() -> None:
     # ⌊2·(30 + 2·12 + 100)/8⌋ − 1 = 37; pickup 4; prefetch 2
     arguments = {"batch_decisions": 8, "in_flight": 12, "pickup": 4, "prefetch": 2}
     assert lag_bound(CONFIG, **arguments) == 4 + 37 + 2
-    capped = ReplayConfig(capacity=100, min_decisions=10, samples_per_insert=2.0, ahead=30, max_lag=9)
+    capped = ReplayConfig(
+        capacity=100, min_decisions=10, samples_per_insert=2.0, max_unlearned_decisions=30, max_lag=9
+    )
     assert lag_bound(capped, **arguments) == 9
     of_32 = SimpleNamespace(batch_decisions=32, hold_back=4)  # 24 of them imagined
     sections = {
@@ -167,10 +169,26 @@ class Simulation:
 @pytest.mark.parametrize(
     ("settings", "batch", "longest"),
     [
-        ({"capacity": 64, "min_decisions": 16, "samples_per_insert": 1.0, "ahead": 32}, 16, 4),
-        ({"capacity": 48, "min_decisions": 40, "samples_per_insert": 2.0, "ahead": 8}, 8, 9),
-        ({"capacity": 200, "min_decisions": 1, "samples_per_insert": 3.5, "ahead": 12}, 12, 6),
-        ({"capacity": 31, "min_decisions": 16, "samples_per_insert": 1.25, "ahead": 30}, 7, 2),
+        (
+            {"capacity": 64, "min_decisions": 16, "samples_per_insert": 1.0, "max_unlearned_decisions": 32},
+            16,
+            4,
+        ),
+        (
+            {"capacity": 48, "min_decisions": 40, "samples_per_insert": 2.0, "max_unlearned_decisions": 8},
+            8,
+            9,
+        ),
+        (
+            {"capacity": 200, "min_decisions": 1, "samples_per_insert": 3.5, "max_unlearned_decisions": 12},
+            12,
+            6,
+        ),
+        (
+            {"capacity": 31, "min_decisions": 16, "samples_per_insert": 1.25, "max_unlearned_decisions": 30},
+            7,
+            2,
+        ),
     ],
 )
 def test_promises_hold_under_hostile_schedules(
@@ -194,7 +212,9 @@ def test_promises_hold_under_hostile_schedules(
 @pytest.mark.parametrize("max_lag", [0, 1, 4])
 def test_a_tight_max_lag_retires_but_never_stalls(max_lag: int) -> None:
     reuse = min(2.0, 1.0 + max_lag)
-    config = ReplayConfig(capacity=64, min_decisions=16, samples_per_insert=reuse, ahead=32, max_lag=max_lag)
+    config = ReplayConfig(
+        capacity=64, min_decisions=16, samples_per_insert=reuse, max_unlearned_decisions=32, max_lag=max_lag
+    )
     simulation = Simulation(
         config=config, batch=8, longest=4, workers=5, in_flight=40, publish_every=1, gate="insert", seed=1
     )
@@ -205,7 +225,9 @@ def test_a_tight_max_lag_retires_but_never_stalls(max_lag: int) -> None:
 
 def test_evenly_matched_sides_waste_nothing() -> None:
     """With room to spare, every decision is trained on just as often as asked, none goes unused."""
-    config = ReplayConfig(capacity=128, min_decisions=16, samples_per_insert=2.0, ahead=32, max_lag=200)
+    config = ReplayConfig(
+        capacity=128, min_decisions=16, samples_per_insert=2.0, max_unlearned_decisions=32, max_lag=200
+    )
     simulation = Simulation(
         config=config, batch=16, longest=4, workers=4, in_flight=32, publish_every=1, gate="insert", seed=0
     )
@@ -219,7 +241,7 @@ def test_evenly_matched_sides_waste_nothing() -> None:
 
 
 def test_reuse_that_the_largest_lag_does_not_allow_is_refused() -> None:
-    sizes = {"capacity": 64, "min_decisions": 8, "ahead": 16}
+    sizes = {"capacity": 64, "min_decisions": 8, "max_unlearned_decisions": 16}
     with pytest.raises(InputError, match=r"replay\.max_lag=0: .*samples_per_insert=1\.5 .* 1 updates old"):
         ReplayConfig(**sizes, samples_per_insert=1.5, max_lag=0).check(batch_decisions=8, segment_decisions=4)
     ReplayConfig(**sizes, samples_per_insert=1.5, max_lag=1).check(batch_decisions=8, segment_decisions=4)

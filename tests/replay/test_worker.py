@@ -16,7 +16,7 @@ from accerl_lerobot.replay.worker import ReplayWorker
 from accerl_lerobot.transport.contract import ServiceStoppedError
 from tests.replay.segments import make_segment
 
-CONFIG = ReplayConfig(capacity=64, min_decisions=8, ahead=8, samples_per_insert=1.0)
+CONFIG = ReplayConfig(capacity=64, min_decisions=8, max_unlearned_decisions=8, samples_per_insert=1.0)
 BATCH = 8
 
 
@@ -104,7 +104,7 @@ def test_sample_that_finds_everything_too_old_lets_rollouts_in_and_waits_on():
         assert [s.key for s in segments] == ["new"] and await late
         assert (await worker.metrics())["retired_segments"] == 1
 
-    play(scene, ReplayConfig(capacity=64, min_decisions=8, ahead=8, max_lag=3))
+    play(scene, ReplayConfig(capacity=64, min_decisions=8, max_unlearned_decisions=8, max_lag=3))
 
 
 @pytest.mark.parametrize("broken", ["insert", "sample"])

@@ -25,7 +25,7 @@ HOSTILE = "<script>document.title = 'owned'</script>\"'><img src=x onerror=\"doc
 
 
 def run_config(**fields: Any) -> RunConfig:
-    """A recipe on the simulated world."""
+    """A recipe on the simulated environment."""
     defaults: dict[str, Any] = {"env": SimulatedConfig(), "trainer": TrainerConfig(updates=40)}
     return RunConfig(**{**defaults, **fields})
 
@@ -36,7 +36,7 @@ def ppo(**fields: Any) -> RunConfig:
 
 
 def metaworld(**fields: Any) -> RunConfig:
-    """The same on a world that LeRobot can evaluate on, too."""
+    """The same on an environment that LeRobot can evaluate on, too."""
     return run_config(env=MetaWorldConfig(task="door-open-v3", max_steps=150), **fields)
 
 

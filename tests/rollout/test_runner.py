@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Worlds between decisions: what becomes a segment, what becomes a result."""
+"""Environments between decisions: what becomes a segment, what becomes a result."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from accerl_lerobot.envs import SimulatedConfig, World, make_world
-from accerl_lerobot.envs.reward_model import JudgedWorld
+from accerl_lerobot.envs import Environment, SimulatedConfig, make_environment
+from accerl_lerobot.envs.reward_model import JudgedEnvironment
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import summarise
-from accerl_lerobot.experience import TASK, Decision, Observation, Origin, Request, Segment
+from accerl_lerobot.experience import TASK, Decision, Observation, Request, Segment, SegmentStart
 from accerl_lerobot.rollout.runner import (
     EpisodePlan,
     EpisodePlans,
@@ -26,9 +26,9 @@ from accerl_lerobot.rollout.runner import (
     incarnation_after,
 )
 from accerl_lerobot.seeds import train_seed
-from tests.rollout.worlds import CHUNK, Recorder, ScriptedWorld, decide, evaluate, explore
+from tests.rollout.environments import CHUNK, Recorder, ScriptedEnvironment, decide, evaluate, explore
 
-CONFIG = RolloutConfig(worlds=1, segment_length=3, decision_cost=0.0)
+CONFIG = RolloutConfig(environments=1, segment_length=3, decision_cost=0.0)
 
 
 def steps_seen(segment) -> list[float]:
@@ -36,7 +36,7 @@ def steps_seen(segment) -> list[float]:
 
 
 def test_an_episode_is_cut_into_segments_without_a_gap():
-    recorder = Recorder([ScriptedWorld(steps=14, end="limit")], [explore()], CONFIG)
+    recorder = Recorder([ScriptedEnvironment(steps=14, end="limit")], [explore()], CONFIG)
     recorder.play()
     assert [len(s) for s in recorder.segments] == [3, 3, 1]
     assert [s.origin.decision for s in recorder.segments] == [0, 3, 6]
@@ -48,7 +48,7 @@ def test_an_episode_is_cut_into_segments_without_a_gap():
 
 @pytest.mark.parametrize(("end", "success"), [("success", True), ("failure", False), ("limit", False)])
 def test_the_last_segment_says_how_the_episode_ended(end, success):
-    recorder = Recorder([ScriptedWorld(steps=8, end=end)], [explore()], CONFIG)
+    recorder = Recorder([ScriptedEnvironment(steps=8, end=end)], [explore()], CONFIG)
     recorder.play()
     cut, last = recorder.segments
     assert (cut.terminated, cut.success) == (False, False)
@@ -58,7 +58,7 @@ def test_the_last_segment_says_how_the_episode_ended(end, success):
 
 
 def test_an_episode_that_ends_within_a_chunk_counts_the_steps_that_were_made():
-    recorder = Recorder([ScriptedWorld(steps=2 * CHUNK + 1)], [explore()], CONFIG)
+    recorder = Recorder([ScriptedEnvironment(steps=2 * CHUNK + 1)], [explore()], CONFIG)
     recorder.play()
     (segment,) = recorder.segments
     assert segment.steps.tolist() == [2, 2, 1] and segment.reward.tolist() == [2, 2, 1]
@@ -67,17 +67,17 @@ def test_an_episode_that_ends_within_a_chunk_counts_the_steps_that_were_made():
 
 def test_every_decision_costs():
     config = replace(CONFIG, decision_cost=0.25)
-    recorder = Recorder([ScriptedWorld(steps=8)], [explore()], config)
+    recorder = Recorder([ScriptedEnvironment(steps=8)], [explore()], config)
     recorder.play()
     assert np.concatenate([s.reward for s in recorder.segments]).tolist() == [1.75] * 4
     assert recorder.results[0].episode_return == pytest.approx(4 * 1.75)
-    evaluation = Recorder([ScriptedWorld(steps=8)], [replace(explore(), explore=False)], config)
+    evaluation = Recorder([ScriptedEnvironment(steps=8)], [replace(explore(), explore=False)], config)
     evaluation.play()
     assert evaluation.results[0].episode_return == 8.0, "the environment's own"
 
 
 def test_a_result_has_the_totals_of_its_episode():
-    recorder = Recorder([ScriptedWorld(steps=9)], [explore()], CONFIG)
+    recorder = Recorder([ScriptedEnvironment(steps=9)], [explore()], CONFIG)
     recorder.play(version=7)
     assert [s.terminated for s in recorder.segments] == [False, True]
     (result,) = recorder.results
@@ -86,22 +86,22 @@ def test_a_result_has_the_totals_of_its_episode():
 
 
 def test_a_world_that_does_not_show_the_same_again_cannot_be_resumed_in_an_episode():
-    begun = Recorder([ScriptedWorld(steps=9)], [explore()], CONFIG).runner
+    begun = Recorder([ScriptedEnvironment(steps=9)], [explore()], CONFIG).runner
     request = begun.start(0)
     assert request is not None
     begun.advance(0, decide(request))
     state = begun.state()
-    world = ScriptedWorld(steps=9)
-    resumed = Recorder([world], [], CONFIG).runner
+    environment = ScriptedEnvironment(steps=9)
+    resumed = Recorder([environment], [], CONFIG).runner
     resumed.restore(state)
-    assert world.now == CHUNK and resumed.counters.decisions == 1
-    world.render = lambda height, width: np.full((height, width, 3), 99, np.uint8)
+    assert environment.now == CHUNK and resumed.counters.decisions == 1
+    environment.render = lambda height, width: np.full((height, width, 3), 99, np.uint8)
     with pytest.raises(RuntimeError, match=r"does not show again .* after 1 decisions"):
         resumed.restore(state)
 
 
 def test_results_name_the_oldest_and_the_newest_weights():
-    recorder = Recorder([ScriptedWorld(steps=6)], [explore()], CONFIG)
+    recorder = Recorder([ScriptedEnvironment(steps=6)], [explore()], CONFIG)
     request = recorder.runner.start(0)
     for version in (4, 3, 5):
         assert request is not None
@@ -117,7 +117,7 @@ def test_keys_are_unique_over_slots_episodes_and_incarnations():
     segments = []
     for name in ("r0.0", "r0.1", "r1.0"):
         plans = [explore(seed) for seed in range(6)]
-        recorder = Recorder([ScriptedWorld(steps=10) for _ in range(2)], plans, CONFIG, name)
+        recorder = Recorder([ScriptedEnvironment(steps=10) for _ in range(2)], plans, CONFIG, name)
         recorder.play()
         segments += recorder.segments
     keys = [s.key for s in segments]
@@ -126,14 +126,14 @@ def test_keys_are_unique_over_slots_episodes_and_incarnations():
 
 @pytest.mark.parametrize("nan_in", ["reward", "state", "info"])
 def test_a_nan_is_counted_and_the_next_episode_goes_on(nan_in: str):
-    worlds = [ScriptedWorld(steps=20, nan_at=9, nan_in=nan_in)]
-    recorder = Recorder(worlds, [explore(1)], CONFIG)
+    environments = [ScriptedEnvironment(steps=20, nan_at=9, nan_in=nan_in)]
+    recorder = Recorder(environments, [explore(1)], CONFIG)
     recorder.play()
     # Decisions 1 to 3 had become a segment; the 4th and 5th had not when the 5th met the NaN.
     assert [len(s) for s in recorder.segments] == [3]
     assert recorder.runner.counters.dropped_nonfinite == 2
     assert recorder.results == [] and recorder.runner.counters.episodes == 0
-    worlds[0].nan_at = 0
+    environments[0].nan_at = 0
     recorder.plans = [explore(2)]
     recorder.play()
     assert len(recorder.results) == 1 and recorder.results[0].plan.seed == 2
@@ -142,7 +142,7 @@ def test_a_nan_is_counted_and_the_next_episode_goes_on(nan_in: str):
 
 
 def test_an_evaluation_that_meets_a_nan_still_has_a_result():
-    recorder = Recorder([ScriptedWorld(steps=20, nan_at=5)], [evaluate(1, 0), evaluate(2, 1)], CONFIG)
+    recorder = Recorder([ScriptedEnvironment(steps=20, nan_at=5)], [evaluate(1, 0), evaluate(2, 1)], CONFIG)
     recorder.play()
     assert [(r.plan.index, r.success) for r in recorder.results] == [(0, False), (1, False)]
     assert recorder.segments == []
@@ -152,8 +152,8 @@ def test_an_evaluation_that_meets_a_nan_still_has_a_result():
     assert summarise(recorder.results)["notes"] == [f"2 of 2 episodes: {recorder.results[0].note}"]
 
 
-class Unlucky(ScriptedWorld):
-    """A world whose first observation is not finite where the seed is odd."""
+class Unlucky(ScriptedEnvironment):
+    """An environment whose first observation is not finite where the seed is odd."""
 
     def reset(self, seed, task):
         observation = super().reset(seed, task)
@@ -175,7 +175,7 @@ def test_nothing_but_dropped_episodes_ends_the_rollout_with_one_line():
 
 
 def test_a_film_that_cannot_be_made_ends_nothing(caplog: pytest.LogCaptureFixture):
-    class Unseen(ScriptedWorld):
+    class Unseen(ScriptedEnvironment):
         def render(self, height, width):
             if height == 16:
                 raise AttributeError("no display")
@@ -189,14 +189,14 @@ def test_a_film_that_cannot_be_made_ends_nothing(caplog: pytest.LogCaptureFixtur
 
 
 def test_evaluation_asks_for_the_stock_sampler_and_makes_no_segment():
-    recorder = Recorder([ScriptedWorld()], [evaluate(1), explore(2)], CONFIG)
+    recorder = Recorder([ScriptedEnvironment()], [evaluate(1), explore(2)], CONFIG)
     requests = recorder.play()[0]
     assert [r.explore for r in requests] == [False] * 3 + [True] * 3
     assert len(recorder.segments) == 1 and len(recorder.results) == 2
 
 
 def seeds_by_episode(slots: int, plans: list[EpisodePlan]) -> dict[int, list[int]]:
-    recorder = Recorder([ScriptedWorld(steps=6) for _ in range(slots)], plans, CONFIG)
+    recorder = Recorder([ScriptedEnvironment(steps=6) for _ in range(slots)], plans, CONFIG)
     found: dict[int, list[int]] = {}
     for requests in recorder.play():
         for request in requests:
@@ -217,10 +217,10 @@ def simulated_episode(
     film: bool, seed: int, tolerance: float, judge: Callable[[Observation], bool] | None = None
 ) -> EpisodeResult:
     """One evaluation episode with actions drawn from the requests' own seeds."""
-    world: World = make_world(SimulatedConfig(max_steps=20, tolerance=tolerance))
-    world = world if judge is None else JudgedWorld(world, judge)
+    environment: Environment = make_environment(SimulatedConfig(max_steps=20, tolerance=tolerance))
+    environment = environment if judge is None else JudgedEnvironment(environment, judge)
     plan = EpisodePlan(task="match", seed=seed, explore=False, film=(8, 2) if film else None)
-    recorder = Recorder([world], [plan], CONFIG)
+    recorder = Recorder([environment], [plan], CONFIG)
     request: Request | None = recorder.runner.start(0)
     while request is not None:
         target = np.asarray(request.observation["observation.state"])[:2]
@@ -261,7 +261,7 @@ def decision(step: int, version: int = 0) -> Decision:
 
 
 def collected(count: int) -> SegmentBuilder:
-    builder = SegmentBuilder([observation(0)], 4, Origin("push-v3", seed=7, decision=0), 100)
+    builder = SegmentBuilder([observation(0)], 4, SegmentStart("push-v3", seed=7, decision=0), 100)
     for step in range(count):
         add(builder, step, float(step), step + 1)
     return builder

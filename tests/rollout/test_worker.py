@@ -19,7 +19,7 @@ from accerl_lerobot.rollout import worker as module
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodePlans, EpisodeResult, RolloutConfig
 from accerl_lerobot.rollout.worker import MAX_PENDING, RolloutWorker
 from accerl_lerobot.transport.contract import ServiceStoppedError
-from tests.rollout.worlds import evaluate
+from tests.rollout.environments import evaluate
 from tests.runs import HANGS_S
 from tests.transport.played import played
 
@@ -120,7 +120,7 @@ def stage() -> Iterator[Callable[..., Stage]]:
     made: list[Stage] = []
 
     def make(insert: Callable[[list[Segment]], Any], **config: Any) -> Stage:
-        made.append(Stage(RolloutConfig(**{"worlds": 4, "segment_length": 2, **config}), insert))
+        made.append(Stage(RolloutConfig(**{"environments": 4, "segment_length": 2, **config}), insert))
         return made[-1]
 
     yield make
@@ -216,7 +216,7 @@ def test_a_world_that_hangs_shows_in_the_report(stage, monkeypatch: pytest.Monke
     one = stage(lambda segments: True)
     advance = one.worker._runner.advance
     monkeypatch.setattr(one.worker._runner, "advance", lambda *a: (release.wait(HANGS_S), advance(*a))[1])
-    one.until(lambda: (report := one.order(True)).in_world and report.busy_s > 0.2)
+    one.until(lambda: (report := one.order(True)).in_environment and report.busy_s > 0.2)
     release.set()
     one.until(lambda: len(one.episodes) >= 2)
     one.until(lambda: one.order(True).busy_s < 0.2)
@@ -224,10 +224,10 @@ def test_a_world_that_hangs_shows_in_the_report(stage, monkeypatch: pytest.Monke
 
 def test_who_has_not_been_set_to_work_does_not_hang():
     """Others may take long to start."""
-    worker = RolloutWorker(WORLD, RolloutConfig(worlds=1), EpisodePlans(("match",), 0, None))
+    worker = RolloutWorker(WORLD, RolloutConfig(environments=1), EpisodePlans(("match",), 0, None))
     time.sleep(0.05)
     report = worker.report(True, [])
-    assert (report.busy_s, report.in_world) == (0.0, False)
+    assert (report.busy_s, report.in_environment) == (0.0, False)
 
 
 def test_a_thread_that_hangs_outside_of_a_world_shows_in_the_report(stage, monkeypatch: pytest.MonkeyPatch):
@@ -242,6 +242,6 @@ def test_a_thread_that_hangs_outside_of_a_world_shows_in_the_report(stage, monke
     monkeypatch.setattr(module, "fault_point", fault_point)
     one = stage(lambda segments: True)
     one.until(lambda: one.order(True).busy_s > 0.4)
-    assert not one.order(True).in_world
+    assert not one.order(True).in_environment
     release.set()
     one.until(lambda: len(one.episodes) >= 2 and one.order(True).busy_s < 0.4)

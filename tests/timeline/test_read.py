@@ -103,10 +103,10 @@ def test_machines_are_set_by_the_calendar_and_processes_of_one_by_its_clock(tmp_
 
 
 def test_workers_are_in_order(tmp_path: Path) -> None:
-    for worker in ("trainer", "rollout 10", "world learning", "rollout 9", "driver", "someone new"):
+    for worker in ("trainer", "rollout 10", "world-model learning", "rollout 9", "driver", "someone new"):
         write_worker(tmp_path, worker, [(COMPUTE, 1)])
     names = [row.worker for row in read_timeline(tmp_path).rows]
-    assert names == ["driver", "rollout 9", "rollout 10", "trainer", "world learning", "someone new"]
+    assert names == ["driver", "rollout 9", "rollout 10", "trainer", "world-model learning", "someone new"]
 
 
 def test_a_folder_without_a_run_and_a_run_without_a_timeline(tmp_path: Path) -> None:

@@ -14,16 +14,16 @@ import torch
 
 from accerl_lerobot.algorithms import AWRConfig, ChunkCriticConfig, SelfImitationConfig
 from accerl_lerobot.engine.preflight import check_start
-from accerl_lerobot.envs import SimulatedConfig, make_world
+from accerl_lerobot.envs import SimulatedConfig, make_environment
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import (
     ENVIRONMENT_STATE,
     TASK,
     TASK_BITS,
     Observation,
-    Origin,
     Request,
     Segment,
+    SegmentStart,
     stack_observations,
 )
 from accerl_lerobot.policies.adapter import LeRobotAdapter
@@ -71,7 +71,7 @@ def episode(rewards: list[float], *, first: float = 0.0, actions: np.ndarray | N
         steps=np.full(t, 4),
         terminated=True,
         success=rewards[-1] > 0,
-        origin=Origin("match", 0, 0),
+        origin=SegmentStart("match", 0, 0),
     )
 
 
@@ -204,7 +204,7 @@ class TestActing:
         model = SimulatorStateConfig()
         adapter = with_teacher(load_adapter, model, ENV.state_size, share=0.5, config=config, noise=0.0)
         assert adapter.teacher is not None
-        observation = make_world(ENV).reset(0, "match")
+        observation = make_environment(ENV).reset(0, "match")
         asked = [
             Request(observation=observation, noise_seed=noise_seed(episode, decision), explore=explore)
             for episode in range(200)
@@ -230,7 +230,7 @@ class TestActing:
         teacher = Teacher(simulator(ENV.state_size), chunk=(4, 2), share=1.0, noise=0.5)
         with torch.no_grad():
             teacher.ready.fill_(1)
-        observation = make_world(ENV).reset(0, "match")
+        observation = make_environment(ENV).reset(0, "match")
         asked = [Request(observation=observation, noise_seed=i) for i in range(400)]
         chunk = teacher.replace(torch.zeros(400, 4, 2), asked)
         torch.testing.assert_close(teacher.replace(torch.zeros(3, 4, 2), asked[7:10]), chunk[7:10])
@@ -358,7 +358,7 @@ def test_success_is_told_by_who_acted(tiny_checkpoint: Path, monkeypatch: pytest
     update = learner(tiny_checkpoint, value_warmup_updates=9)
     segments = [episode([float(won)]) for won in (1, 1, 0, 0)]
     for seed, segment in enumerate(segments):
-        segment.origin = Origin("match", seed, 0)
+        segment.origin = SegmentStart("match", seed, 0)
     monkeypatch.setattr(update.teacher, "plays", lambda episode: episode > 0)
     metrics = update.step(segments)
     assert (metrics["policy_success"], metrics["teacher_success"]) == (0.5, 0.0), "it is not ready"
@@ -546,8 +546,8 @@ def test_what_is_not_finite_is_skipped_and_ends_the_run(tiny_checkpoint: Path):
 SECTIONS: dict[str, Any] = {
     "env": ENV,
     "algorithm": ChunkCriticConfig(),
-    "rollout": RolloutConfig(worlds=4, segment_length=4),
-    "replay": ReplayConfig(capacity=64, min_decisions=16, ahead=32, samples_per_insert=1),
+    "rollout": RolloutConfig(environments=4, segment_length=4),
+    "replay": ReplayConfig(capacity=64, min_decisions=16, max_unlearned_decisions=32, samples_per_insert=1),
 }
 
 

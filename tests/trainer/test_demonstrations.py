@@ -19,9 +19,9 @@ from accerl_lerobot.demos.dataset_files import open_metadata
 from accerl_lerobot.demos.record import DemosConfig, record_demos
 from accerl_lerobot.demos.sft import SFTConfig, run_sft
 from accerl_lerobot.engine.preflight import _say_if_unlike, check_start
-from accerl_lerobot.envs import SimulatedConfig, make_world
+from accerl_lerobot.envs import SimulatedConfig, make_environment
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import ENVIRONMENT_STATE, Origin, Segment
+from accerl_lerobot.experience import ENVIRONMENT_STATE, Segment, SegmentStart
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.loading import load_adapter
 from accerl_lerobot.policies.teacher import with_teacher
@@ -51,14 +51,13 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> DatasetConfig:
 @pytest.fixture
 def like() -> Segment:
     """An explored episode of one decision."""
-    world = make_world(ENV)
-    observation = world.reset(3, world.spec.tasks[0])
+    environment = make_environment(ENV)
+    observation = environment.reset(3, environment.spec.tasks[0])
     seen = {name: np.stack([value] * 2) for name, value in observation.items() if name != "task"}
     return make_segment(
         "explored", 1, observations=seen, task=str(observation["task"]),
-        actions=np.zeros((1, K, world.spec.action_dim), np.float32), steps=np.array([K]), terminated=True,
-        time_limit=ENV.max_steps,
-        origin=Origin("match", 0, 0),
+        actions=np.zeros((1, K, environment.spec.action_dim), np.float32), steps=np.array([K]),
+        terminated=True, time_limit=ENV.max_steps, origin=SegmentStart("match", 0, 0),
     )  # fmt: skip
 
 
@@ -178,7 +177,7 @@ def test_they_are_looked_at_before_the_run_begins(
         assert "does not join" not in caplog.text
         check_start(replace(config, env=replace(ENV, image_size=48)))
         assert "does not join the memory: the dataset's observation.images.front has shape" in caplog.text
-        meta, spec = open_metadata(dataset), make_world(ENV).spec
+        meta, spec = open_metadata(dataset), make_environment(ENV).spec
         caplog.clear()
         _say_if_unlike(config, spec, meta, history=1)
         assert not caplog.text

@@ -18,7 +18,7 @@ import torch
 from accerl_lerobot.algorithms import GIPOConfig
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.trainer.batch import turns
+from accerl_lerobot.trainer.batch import split_rows
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.ranks import Ranks
 from accerl_lerobot.trainer.sharding import Watch, arrange
@@ -144,7 +144,7 @@ def test_the_cases_meet_what_they_are_for(alone: dict[str, dict[str, Any]]):
 @pytest.mark.parametrize(("count", "size"), [(1, 1), (1, 5), (2, 1), (5, 2), (13, 3), (13, 100), (64, 4)])
 def test_every_row_is_somebodys_and_all_run_equally_often(count: int, size: int, ranks: int):
     rows = 100 + np.arange(count)
-    shares = [turns(rows, size, rank, ranks) for rank in range(ranks)]
+    shares = [split_rows(rows, size, rank, ranks) for rank in range(ranks)]
     assert len({len(share) for share in shares}) == 1, "as many turns each"
     assert np.concatenate([part for share in shares for part, own in share if own]).tolist() == rows.tolist()
     assert all(1 <= len(part) <= size for share in shares for part, _ in share)

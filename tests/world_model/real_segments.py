@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Real experience of the simulated world, played at random."""
+"""Real experience of the simulated environment, played at random."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from accerl_lerobot.envs import SimulatedConfig, make_world
-from accerl_lerobot.experience import Decision, Origin, Segment
+from accerl_lerobot.envs import SimulatedConfig, make_environment
+from accerl_lerobot.experience import Decision, Segment, SegmentStart
 from accerl_lerobot.rollout.runner import SegmentBuilder
 from accerl_lerobot.world_model.contract import WorldModelSpec
 
@@ -34,16 +34,16 @@ def decided(chunk: np.ndarray, version: int = 0) -> Decision:
 
 def real_episode(seed: int, *, length: int = 8, solve_at: int = 99) -> list[Segment]:
     """An episode of random chunks, which are right from decision `solve_at` on."""
-    world = make_world(WORLD)
+    environment = make_environment(WORLD)
     rng = np.random.default_rng(seed)
-    origin = Origin("match", seed, 0)
-    builder = SegmentBuilder([world.reset(seed, "match")], length, origin, world.spec.max_steps)
+    origin = SegmentStart("match", seed, 0)
+    builder = SegmentBuilder([environment.reset(seed, "match")], length, origin, environment.spec.max_steps)
     segments: list[Segment] = []
     for t in range(99):
         chunk = rng.uniform(-0.2, 0.2, (K, 2)).astype(np.float32)
         if t >= solve_at:
-            chunk = np.repeat(world.solution[None], K, 0)  # type: ignore[attr-defined]
-        result = world.step_chunk(chunk)
+            chunk = np.repeat(environment.solution[None], K, 0)  # type: ignore[attr-defined]
+        result = environment.step_chunk(chunk)
         reward = float(result.rewards.sum()) - 0.01
         builder.add(decided(chunk), chunk, reward, result.steps, result.observation)
         if result.done or builder.full:

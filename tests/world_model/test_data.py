@@ -15,7 +15,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from accerl_lerobot.demos.record import DemosConfig, record_demos
 from accerl_lerobot.engine.config import DatasetConfig
-from accerl_lerobot.envs import SimulatedConfig, make_world
+from accerl_lerobot.envs import SimulatedConfig, make_environment
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.contract import WorldModelSpec
 from accerl_lerobot.world_model.data import (
@@ -150,15 +150,15 @@ SPEC = WorldModelSpec(
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[DatasetConfig, WorldModelSpec]:
-    """Six episodes of the simulated world, some of which fail."""
+    """Six episodes of the simulated environment, some of which fail."""
     root = tmp_path_factory.mktemp("demos") / "dataset"
     env = SimulatedConfig(max_steps=60, hold=25, image_size=16)
     config = DemosConfig(episodes=6, failure_share=0.5)
     record_demos(env, config, str(root))
-    world = make_world(env).spec
+    environment = make_environment(env).spec
     spec = replace(
-        SPEC, cameras=tuple(world.images), image_size=(16, 16), state_dim=world.state_dim,
-        action_dim=world.action_dim, fps=world.fps,
+        SPEC, cameras=tuple(environment.images), image_size=(16, 16), state_dim=environment.state_dim,
+        action_dim=environment.action_dim, fps=environment.fps,
     )  # fmt: skip
     return DatasetConfig(repo_id="a/b", root=str(root)), spec
 
@@ -212,10 +212,13 @@ def metadata(**changes: Any) -> SimpleNamespace:
             {"shapes": {"observation.images.corner2": None, "observation.images.top": (64, 64, 3)}},
             "no 'observation.images.corner2': the dataset has observation.images.top; choose env.camera",
         ),
-        ({"shapes": {"action": (7,)}}, r"action has shape \(7,\), the world's has \(4,\): it is another"),
-        ({"shapes": {"observation.state": None}}, "observation.state has shape None, the world's has"),
+        (
+            {"shapes": {"action": (7,)}},
+            r"action has shape \(7,\), the environment's has \(4,\): it is another",
+        ),
+        ({"shapes": {"observation.state": None}}, "observation.state has shape None, the environment's has"),
         ({"shapes": {"next.success": None}}, "no next.success: record it, as accerl demos does"),
-        ({"fps": 10}, "10 frames a second, and the world makes 80 steps"),
+        ({"fps": 10}, "10 frames a second, and the environment makes 80 steps"),
         ({"total_episodes": 1}, "a single episode; at least one to train on and one to hold out"),
     ],
 )

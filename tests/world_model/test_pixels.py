@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pixel model on a world of one dot that goes where it is told."""
+"""The pixel model on an environment of one dot that goes where it is told."""
 
 from __future__ import annotations
 

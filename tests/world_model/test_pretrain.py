@@ -86,12 +86,15 @@ def test_from_a_dataset_to_a_validation(demos: Path, tmp_path: Path, capsys: pyt
     kinds = [json.loads(line)["kind"] for line in (out / "metrics.jsonl").read_text().splitlines()]
     assert kinds == ["world_model"]
     assert all(check in stderr for check in found["checks"]) and "preview.mp4" in stderr
-    world, success = load_world_model(out / "world_model")
-    assert success.config.chunk == world.spec.chunk == 5
+    environment, success = load_world_model(out / "world_model")
+    assert success.config.chunk == environment.spec.chunk == 5
     assert success.config.threshold == pytest.approx(one["threshold"])
     failed = [name for name, check in found["checks"].items() if not check["holds"]]
     assert load_failed(out / "world_model") == failed != []
-    assert world.spec.cameras == ("observation.images.front",) and float(world.uncertainty_scale) != 1
+    assert (
+        environment.spec.cameras == ("observation.images.front",)
+        and float(environment.uncertainty_scale) != 1
+    )
     assert (out / "preview.mp4").stat().st_size > 1000
 
 
@@ -157,9 +160,9 @@ def test_a_policys_episodes_are_learned_from_beside_demonstrations(
     assert counts["threshold"] == online["episodes"]
     assert found["passed"] is all(check["holds"] for check in found["checks"].values()) is (code == 0)
     assert (out / "preview_online.mp4").stat().st_size > 1000
-    world, success = load_world_model(out / "world_model")
+    environment, success = load_world_model(out / "world_model")
     assert success.config.threshold == found["datasets"]["dataset"]["threshold"] == online["threshold"]
-    assert world.spec.tasks == ("match",) and "online" in stderr
+    assert environment.spec.tasks == ("match",) and "online" in stderr
 
 
 @pytest.mark.parametrize(

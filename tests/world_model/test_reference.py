@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot.envs import World, make_world
-from accerl_lerobot.envs.simulated import SimulatedWorld
+from accerl_lerobot.envs import Environment, make_environment
+from accerl_lerobot.envs.simulated import SimulatedEnvironment
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.world_model.contract import Reset, State, WorldModel
 from accerl_lerobot.world_model.data import model_arrays
@@ -16,7 +16,7 @@ from accerl_lerobot.world_model.reference import OracleModel, ShuffledModel
 from accerl_lerobot.world_model.rollouts import Start, context_at, start_of
 from tests.world_model.real_segments import SPEC, WORLD, K, real_episode
 
-WORLD_SPEC = make_world(WORLD).spec
+WORLD_SPEC = make_environment(WORLD).spec
 
 
 def begun(model: WorldModel, starts: list[Start]) -> State:
@@ -43,10 +43,10 @@ def test_a_start_is_the_reset_of_an_episode():
 
 
 def test_the_oracle_repeats_what_happened():
-    made: list[World] = []
+    made: list[Environment] = []
 
-    def make() -> World:
-        made.append(make_world(WORLD))
+    def make() -> Environment:
+        made.append(make_environment(WORLD))
         return made[-1]
 
     oracle = OracleModel(WORLD_SPEC, K, make)
@@ -68,9 +68,9 @@ def test_the_oracle_repeats_what_happened():
 
 def test_a_simulator_that_is_there_goes_on(monkeypatch: pytest.MonkeyPatch):
     resets: list[int] = []
-    reset = SimulatedWorld.reset
-    monkeypatch.setattr(SimulatedWorld, "reset", lambda *a: resets.append(1) or reset(*a))
-    oracle = OracleModel(WORLD_SPEC, K, lambda: make_world(WORLD))
+    reset = SimulatedEnvironment.reset
+    monkeypatch.setattr(SimulatedEnvironment, "reset", lambda *a: resets.append(1) or reset(*a))
+    oracle = OracleModel(WORLD_SPEC, K, lambda: make_environment(WORLD))
     starts, _ = starts_of(1)
     start = starts[0]
     resets.clear()
@@ -85,7 +85,7 @@ def test_a_simulator_that_is_there_goes_on(monkeypatch: pytest.MonkeyPatch):
 
 def test_shuffled_actions_are_those_of_the_row_before():
     starts, _ = starts_of(1, 2)
-    oracle = OracleModel(WORLD_SPEC, K, lambda: make_world(WORLD))
+    oracle = OracleModel(WORLD_SPEC, K, lambda: make_environment(WORLD))
     shuffled = ShuffledModel(oracle)
     actions = torch.rand(12, 4, 2) / 5
     got = shuffled.step(begun(shuffled, starts), actions, [0] * 12)

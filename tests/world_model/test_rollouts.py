@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from accerl_lerobot.engine.imagination import check_fit
-from accerl_lerobot.envs import make_world
+from accerl_lerobot.envs import make_environment
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, REAL, Decision, Request, Segment
 from accerl_lerobot.world_model.config import ImaginationConfig, OnlineLearnConfig
@@ -26,7 +26,7 @@ from accerl_lerobot.world_model.rollouts import Imagination, KillSwitch
 from tests.runs import adjusted
 from tests.world_model.real_segments import SPEC, WORLD, K, decided, real_episode
 
-WORLD_SPEC = make_world(WORLD).spec
+WORLD_SPEC = make_environment(WORLD).spec
 ENDLESS, SHORT = (replace(WORLD_SPEC, max_steps=steps) for steps in (400, 2 * K))
 CAMERA = "observation.images.front"
 
@@ -78,7 +78,7 @@ CONSTANTS = ("rollouts", "window", "min_real_episodes", "max_gap", "max_uncertai
 
 
 def imagination(
-    model: WorldModel, success: Any = None, *, world: Any = WORLD_SPEC, **config: Any
+    model: WorldModel, success: Any = None, *, environment: Any = WORLD_SPEC, **config: Any
 ) -> tuple[Imagination, list[Segment]]:
     kind = "oracle" if isinstance(model, OracleModel) else "learned"
     fields: dict[str, Any] = {
@@ -89,7 +89,7 @@ def imagination(
     made: list[Segment] = []
     given = adjusted(ImaginationConfig, **constants)(**(fields | config))
     settings: dict[str, Any] = {"decision_cost": 0.01, "seed": 0}
-    batch = Imagination(model, success, world, given, made.append, **settings)
+    batch = Imagination(model, success, environment, given, made.append, **settings)
     return batch, made
 
 
@@ -107,7 +107,7 @@ def play(batch: Imagination, rounds: int, size: float = 1.0) -> None:
 
 
 def test_a_rollout_is_a_segment_like_any_other(bright: Any):
-    batch, made = imagination(Counting(), bright, world=ENDLESS)
+    batch, made = imagination(Counting(), bright, environment=ENDLESS)
     [real] = real_episode(3)
     assert batch.requests() == [], "nothing to begin from"
     batch.remember(real)
@@ -128,7 +128,7 @@ def test_a_rollout_is_a_segment_like_any_other(bright: Any):
 
 
 def test_a_success_ends_a_rollout_and_nothing_follows_it(bright: Any):
-    batch, made = imagination(Counting(), bright, rollouts=1, world=ENDLESS)
+    batch, made = imagination(Counting(), bright, rollouts=1, environment=ENDLESS)
     batch.remember(real_episode(3)[0])
     play(batch, 4)
     assert len(made) == 1 and len(made[0]) == 3
@@ -147,7 +147,7 @@ def test_a_rollout_ends_at_the_time_limit(bright: Any):
 
 def test_what_is_too_uncertain_is_not_kept(bright: Any):
     model = Counting(uncertainty=1.9)
-    batch, made = imagination(model, bright, rollouts=2, max_uncertainty=2.0, world=ENDLESS)
+    batch, made = imagination(model, bright, rollouts=2, max_uncertainty=2.0, environment=ENDLESS)
     batch.remember(real_episode(3)[0])
     play(batch, 1, 0.1)
     model.uncertainty = 2.1
@@ -161,7 +161,7 @@ def test_what_is_too_uncertain_is_not_kept(bright: Any):
 def test_what_is_no_number_ends_a_rollout_and_is_not_kept(bright: Any):
     """A model that diverges says NaN of the robot, which nothing is larger than."""
     model = Counting()
-    batch, made = imagination(model, bright, rollouts=2, world=ENDLESS)
+    batch, made = imagination(model, bright, rollouts=2, environment=ENDLESS)
     batch.remember(real_episode(3)[0])
     play(batch, 1, 0.1)
     assert batch._state is not None
@@ -174,7 +174,7 @@ def test_what_is_no_number_ends_a_rollout_and_is_not_kept(bright: Any):
 
 
 def test_ended_rollouts_start_anew_beside_the_others():
-    oracle = OracleModel(WORLD_SPEC, K, lambda: make_world(WORLD))
+    oracle = OracleModel(WORLD_SPEC, K, lambda: make_environment(WORLD))
     batch, made = imagination(oracle, rollouts=8)
     for seed in range(3):
         batch.remember(real_episode(seed, solve_at=2)[0])
@@ -187,12 +187,12 @@ def test_ended_rollouts_start_anew_beside_the_others():
         batch.advance([decided(chunk) for chunk in rng.uniform(-1.2, 1.2, (8, K, 2))])
     assert len(made) > 20 and {len(s) for s in made} == {3, 4}
     for segment in made:
-        # The very same actions after the very same beginning, in the real world.
-        world = make_world(WORLD)
-        world.reset(segment.origin.seed, "match")
+        # The very same actions after the very same beginning, in the real environment.
+        environment = make_environment(WORLD)
+        environment.reset(segment.origin.seed, "match")
         assert (np.abs(segment.actions) <= 1).all()
         for t, actions in enumerate(segment.actions):
-            result = world.step_chunk(actions)
+            result = environment.step_chunk(actions)
             assert np.array_equal(segment.observations[CAMERA][t + 1], result.observation[CAMERA])
             state = segment.observations["observation.state"][t + 1]
             assert np.array_equal(state, result.observation["observation.state"])
@@ -201,7 +201,9 @@ def test_ended_rollouts_start_anew_beside_the_others():
 
 
 def test_rollouts_from_resets_are_compared_with_real_episodes(bright: Any):
-    batch, made = imagination(Counting(), bright, rollouts=4, window=4, min_real_episodes=3, world=ENDLESS)
+    batch, made = imagination(
+        Counting(), bright, rollouts=4, window=4, min_real_episodes=3, environment=ENDLESS
+    )
     for seed in range(4):
         batch.remember(real_episode(seed)[0])
     play(batch, 3)
@@ -223,7 +225,7 @@ def test_a_model_that_is_trained_is_used_once_it_has_passed(bright: Any):
 
 
 def test_unfinished_rollouts_are_dropped_when_a_model_is_promoted(bright: Any):
-    batch, made = imagination(Counting(), bright, world=SHORT)
+    batch, made = imagination(Counting(), bright, environment=SHORT)
     batch.remember(real_episode(3)[0])
     play(batch, 1, 0.1)
     batch.swap(promotion(Counting(), bright, 12))
@@ -235,7 +237,7 @@ def test_unfinished_rollouts_are_dropped_when_a_model_is_promoted(bright: Any):
 
 def test_a_model_that_is_uncertain_of_everything_is_switched_off(bright: Any):
     model = Counting(uncertainty=9.0)
-    batch, made = imagination(model, bright, rollouts=1, max_uncertainty=2.0, window=5, world=ENDLESS)
+    batch, made = imagination(model, bright, rollouts=1, max_uncertainty=2.0, window=5, environment=ENDLESS)
     batch.remember(real_episode(3)[0])
     play(batch, 5)
     assert batch.requests() == [] and not batch.on and not made and batch.counters["uncertain"] == 5
@@ -250,7 +252,7 @@ def test_an_episode_that_fails_ends_its_rollout(bright: Any, monkeypatch: pytest
         return replace(step(self, state, actions, seeds), done=torch.tensor([True, False]))
 
     monkeypatch.setattr(Counting, "step", broken)
-    batch, made = imagination(Counting(), bright, rollouts=2, world=ENDLESS)
+    batch, made = imagination(Counting(), bright, rollouts=2, environment=ENDLESS)
     batch.remember(real_episode(3)[0])
     play(batch, 1, 0.1)
     assert len(made) == 1 and made[0].terminated and not made[0].success
@@ -264,8 +266,8 @@ def test_a_placebo_stays_one_when_its_model_is_promoted(bright: Any):
 
 
 def test_pictures_have_the_world_s_size(bright: Any):
-    world = replace(WORLD_SPEC, images={CAMERA: (32, 24, 3)})
-    batch, _ = imagination(Counting(), bright, world=world)
+    environment = replace(WORLD_SPEC, images={CAMERA: (32, 24, 3)})
+    batch, _ = imagination(Counting(), bright, environment=environment)
     batch.remember(real_episode(3)[0])
     [*requests] = batch.requests()
     assert {np.asarray(r.observation[CAMERA]).shape for r in requests} == {(32, 24, 3)}
@@ -275,7 +277,7 @@ def test_pictures_have_the_world_s_size(bright: Any):
     ("change", "executed", "message"),
     [
         ({"cameras": ("observation.images.wrist",)}, K, "front.*the world model .*images.wrist"),
-        ({"state_dim": 7}, K, "=7: is the world model's state_dim, and the world's is 4"),
+        ({"state_dim": 7}, K, "=7: is the world model's state_dim, and the environment's is 4"),
         ({"action_dim": 7}, K, "action_dim"),
         ({"fps": 30}, K, "imagination.path=30: is the world model's fps"),
         ({}, 5, "executes 5 actions per decision; train one with world_model.chunk=5"),
@@ -298,9 +300,9 @@ def test_a_world_model_of_something_else_is_refused(change: dict[str, Any], exec
     ],
 )
 def test_a_task_that_is_played_alone_bears_the_name_of_its_suite(known: str, played: str, fits: bool):
-    spec, world = replace(SPEC, tasks=(known,)), replace(WORLD_SPEC, tasks=(played,))
+    spec, environment = replace(SPEC, tasks=(known,)), replace(WORLD_SPEC, tasks=(played,))
     with contextlib.nullcontext() if fits else pytest.raises(InputError, match="^env.task="):
-        check_fit(spec, world, K)
+        check_fit(spec, environment, K)
 
 
 def test_what_does_not_go_together():

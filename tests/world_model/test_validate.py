@@ -31,7 +31,7 @@ CONFIG = ValidationConfig(depth=3, stride=2)
 
 
 class Deterministic(WorldModel):
-    """The dot's own world: exact, or not listening, or standing still."""
+    """The dot's own environment: exact, or not listening, or standing still."""
 
     def __init__(self, kind: str) -> None:
         self.spec, self.kind = SPEC, kind
@@ -149,30 +149,30 @@ def test_the_success_model_is_classified_on_what_was_imagined():
     torch.manual_seed(0)
     success = new_success_model(K)
     learner = SuccessLearner(success, WorldModelConfig(success=SuccessLearnConfig(lr=2e-3)), seed=0)
-    world = Deterministic("exact")
+    environment = Deterministic("exact")
     examples = Examples(learn, K)
     for _ in range(120):
-        metrics = learner.step(examples, world)
+        metrics = learner.step(examples, environment)
     assert set(metrics) == {"loss", "accuracy", "progress"}
     success.eval()
     config = replace(CONFIG, stride=1, max_windows=5000, auroc=0.7, false_success=0.3)
-    exact = validate(world, held, config, success)
+    exact = validate(environment, held, config, success)
     assert exact["passed"] and exact["checks"]["auroc"]["value"] > 0.7 and exact["threshold"] >= 0.5
     still = validate(Deterministic("copy"), held, config, success)
     assert still["outcomes"]["auroc"]["value"] < exact["outcomes"]["auroc"]["value"] - 0.1, "nothing moved"
 
 
 def test_a_success_model_that_diverges_is_an_error_and_stays_as_it_was():
-    examples, world = Examples(with_successes(dots(30, seed=1)), K), Deterministic("exact")
+    examples, environment = Examples(with_successes(dots(30, seed=1)), K), Deterministic("exact")
     config = WorldModelConfig(success=SuccessLearnConfig(batch=8), longest=2)
     learner = SuccessLearner(new_success_model(K), config, seed=0)
-    learner.step(examples, world)
+    learner.step(examples, environment)
     with torch.no_grad():
         learner.model.out.bias.fill_(torch.nan)
     before = {k: v.clone() for k, v in learner.model.state_dict().items()}
     why = r"^the success model's .* not finite at step 2; lower world_model.success.lr"
     with pytest.raises(FloatingPointError, match=why):
-        learner.step(examples, world)
+        learner.step(examples, environment)
     now = learner.model.state_dict()
     assert all(torch.equal(v, now[k]) for k, v in before.items() if k != "out.bias")
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Our environments in stock LeRobot: ``lerobot-eval`` and ``lerobot-train`` on the world we train in.
+"""Our environments in stock LeRobot: ``lerobot-eval`` and ``lerobot-train`` on the environment we train in.
 
-``--env.discover_packages_path=accerl_lerobot.envs.lerobot_plugin --env.type=accerl --env.world='{type: …}'``.
-A package and not a module, because LeRobot's plugin loader looks for submodules.
+``--env.discover_packages_path=accerl_lerobot.envs.lerobot_plugin --env.type=accerl --env.environment='{type:
+…}'``. A package and not a module, because LeRobot's plugin loader looks for submodules.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
 
 from accerl_lerobot.config.parsing import DISCOVER, decode
-from accerl_lerobot.envs import EnvConfig as WorldConfig
-from accerl_lerobot.envs import make_world
+from accerl_lerobot.envs import EnvConfig as EnvironmentConfig
+from accerl_lerobot.envs import make_environment
 from accerl_lerobot.errors import InputError, warn_once
 from accerl_lerobot.experience import Observation
 
@@ -29,14 +29,14 @@ VIDEO_SIZE = 256
 
 
 class AccerlEnv(gym.Env):
-    """One task of a `World` as a Gymnasium environment; it never resets itself."""
+    """One task of a `Environment` as a Gymnasium environment; it never resets itself."""
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}
     render_mode = "rgb_array"
 
-    def __init__(self, config: WorldConfig, task: str) -> None:
-        self._world = make_world(config)  # its simulator is built at the first reset
-        spec = self._world.spec
+    def __init__(self, config: EnvironmentConfig, task: str) -> None:
+        self._environment = make_environment(config)  # its simulator is built at the first reset
+        spec = self._environment.spec
         self.task = task
         self.task_description = dict(zip(spec.tasks, spec.instructions, strict=False)).get(task, "")
         self.metadata = self.metadata | {"render_fps": spec.fps}
@@ -52,10 +52,10 @@ class AccerlEnv(gym.Env):
         super().reset(seed=seed)
         if seed is None:
             seed = int(self.np_random.integers(2**32))
-        return self._format(self._world.reset(seed, self.task)), {"is_success": False}
+        return self._format(self._environment.reset(seed, self.task)), {"is_success": False}
 
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        result = self._world.step_chunk(np.asarray(action, np.float32)[None])
+        result = self._environment.step_chunk(np.asarray(action, np.float32)[None])
         if result.note:
             warn_once(result.note)
         info = {"is_success": result.success, **result.info}
@@ -63,19 +63,19 @@ class AccerlEnv(gym.Env):
         return observation, float(result.rewards[0]), result.terminated, result.truncated, info
 
     def render(self) -> np.ndarray:
-        return self._world.render(VIDEO_SIZE, VIDEO_SIZE)
+        return self._environment.render(VIDEO_SIZE, VIDEO_SIZE)
 
     def close(self) -> None:
-        self._world.close()
+        self._environment.close()
 
     def _format(self, observation: Observation) -> dict[str, Any]:
-        pixels = {_camera(key): observation[key] for key in self._world.spec.images}
+        pixels = {_camera(key): observation[key] for key in self._environment.spec.images}
         return {"pixels": pixels, "agent_pos": observation["observation.state"]}
 
 
 @dataclass(frozen=True)
 class _Recipe:
-    env: WorldConfig
+    env: EnvironmentConfig
 
 
 @EnvConfig.register_subclass("accerl")
@@ -84,13 +84,15 @@ class AccerlEnvConfig(EnvConfig):
     """Any environment of ours, plugins included."""
 
     # The fields of a recipe's `env`; LeRobot's parser could not tell which ones a type has.
-    world: dict[str, Any] = field(default_factory=dict)
+    environment: dict[str, Any] = field(default_factory=dict)
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        with contextlib.closing(make_world(self.world_config)) as world:  # refuses bad values now
-            spec = world.spec
+        with contextlib.closing(
+            make_environment(self.environment_config)
+        ) as environment:  # refuses bad values now
+            spec = environment.spec
         self.fps, self.tasks = spec.fps, spec.tasks
         self.features = {
             "action": PolicyFeature(type=FeatureType.ACTION, shape=(spec.action_dim,)),
@@ -103,12 +105,12 @@ class AccerlEnvConfig(EnvConfig):
             self.features_map[name] = key
 
     @functools.cached_property
-    def world_config(self) -> WorldConfig:
-        package = self.world.get(DISCOVER)
+    def environment_config(self) -> EnvironmentConfig:
+        package = self.environment.get(DISCOVER)
         if package and package not in sys.modules:  # LeRobot imports what its command line names
-            remedy = f"only the command line can have code imported: add --env.world.{DISCOVER}={package}"
-            raise InputError(f"env.world.{DISCOVER}", package, remedy)
-        recipe: _Recipe = decode(_Recipe, {"env": self.world})
+            hint = f"only the command line can have code imported: add --env.environment.{DISCOVER}={package}"
+            raise InputError(f"env.environment.{DISCOVER}", package, hint)
+        recipe: _Recipe = decode(_Recipe, {"env": self.environment})
         return recipe.env
 
     @property
@@ -119,7 +121,7 @@ class AccerlEnvConfig(EnvConfig):
         self, n_envs: int, use_async_envs: bool = False
     ) -> dict[str, dict[int, gym.vector.VectorEnv]]:
         """One vector environment per task, as ``{task: {0: vector}}``."""
-        config, vectors = self.world_config, {}
+        config, vectors = self.environment_config, {}
         for task in self.tasks:
             make = functools.partial(AccerlEnv, config, task)
             if use_async_envs and n_envs > 1:  # one task's processes at a time

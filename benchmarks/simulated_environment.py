@@ -16,7 +16,7 @@ import numpy as np
 
 from accerl_lerobot.config.ranges import NonNegative, Range, Steps
 from accerl_lerobot.envs import ChunkResult, EnvConfig, SimulatedConfig
-from accerl_lerobot.envs.simulated import SimulatedWorld
+from accerl_lerobot.envs.simulated import SimulatedEnvironment
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Observation
 from benchmarks.latency import RESET
@@ -31,14 +31,14 @@ class LatencyConfig(SimulatedConfig):
         >>> LatencyConfig(task="match", frame_ms=6.0, latency_cv=0.5)
     """
 
-    world = "benchmarks.simulated_world:LatencyWorld"
+    environment = "benchmarks.simulated_environment:LatencyEnvironment"
 
     frame_ms: NonNegative = 0.0
     """Mean time from a decision to its observation, in milliseconds; slept, so it costs no processor."""
     latency_cv: Annotated[float, Range("[0, 10]")] = 0.0
     """Standard deviation over mean of its lognormal law, drawn from the episode's seed; 0: constant."""
     latency_trace: str | None = None
-    """File that the benchmark `latency` has written of another world, scaled so that its decisions take
+    """File that the benchmark `latency` has written of another environment, scaled so that its decisions take
     `frame_ms` on average: an episode takes a stretch of it, from a moment drawn from its seed. What a reset
     takes is drawn from what resets took there."""
     crash_after: Steps = 0
@@ -47,7 +47,7 @@ class LatencyConfig(SimulatedConfig):
     """Env steps of this instance after which one state is NaN and its episode ends; 0 for never."""
 
 
-class LatencyWorld(SimulatedWorld):
+class LatencyEnvironment(SimulatedEnvironment):
     """One instance; `crash_after` and `nan_after` count over all its episodes."""
 
     config: LatencyConfig
@@ -103,7 +103,7 @@ class LatencyWorld(SimulatedWorld):
 
 
 class Trace(NamedTuple):
-    """How long a world has taken, in units of its mean decision."""
+    """How long an environment has taken, in units of its mean decision."""
 
     decisions: np.ndarray
     """float64 (T,), one after the other, of mean 1."""
@@ -127,8 +127,8 @@ def read_trace(path: str, field: str = "latency_trace") -> Trace:
         except ValueError:
             value = math.nan
         if not 0 <= value < math.inf:
-            remedy = f"line {number}, {line.strip()!r}, is no duration; use a number, or {RESET} and a number"
-            raise InputError(field, path, remedy)
+            hint = f"line {number}, {line.strip()!r}, is no duration; use a number, or {RESET} and a number"
+            raise InputError(field, path, hint)
         found[len(words) > 1].append(value)
     if not sum(found[False]) > 0:
         raise InputError(field, path, "no time passes in it; write one duration on each line")

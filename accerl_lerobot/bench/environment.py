@@ -25,7 +25,7 @@ from rich.table import Table
 from accerl_lerobot.bench import as_table, host, ranged, spread
 from accerl_lerobot.config.ranges import Positive, Range, Repeats, Section
 from accerl_lerobot.demos.record import simulators
-from accerl_lerobot.envs import EnvConfig, LiberoConfig, MetaWorldConfig, make_world
+from accerl_lerobot.envs import EnvConfig, LiberoConfig, MetaWorldConfig, make_environment
 from accerl_lerobot.envs.graphics import import_mujoco
 from accerl_lerobot.envs.libero_simulator import Simulator, liberos_own
 from accerl_lerobot.envs.libero_tasks import load_libero
@@ -38,7 +38,7 @@ Decide = Callable[[], int]  # steps an environment for one decision and returns 
 
 
 @dataclass(frozen=True, kw_only=True)
-class BenchWorldConfig(Section):
+class BenchEnvironmentConfig(Section):
     """Speed of our MetaWorld or LIBERO next to LeRobot's."""
 
     env: EnvConfig = field(default_factory=MetaWorldConfig)
@@ -68,7 +68,7 @@ class BenchWorldConfig(Section):
         return (OURS, EVERY_STEP, STOCK, *alone)
 
 
-def bench_world(config: BenchWorldConfig) -> dict[str, Any]:
+def bench_environment(config: BenchEnvironmentConfig) -> dict[str, Any]:
     """Measures all arms.
 
     Returns: ``arms[name]`` with ``env_steps_per_s`` and ``decisions_per_s``, and ``ratio``, our env
@@ -114,10 +114,10 @@ def table(result: dict[str, Any]) -> Table:
 _decide: Decide
 
 
-def _start(arm: str, config: BenchWorldConfig) -> None:
+def _start(arm: str, config: BenchEnvironmentConfig) -> None:
     global _decide
     chunk = config.chunk if arm == OURS else 1
-    dims = make_world(config.env).spec.action_dim  # no simulator is built before the first reset
+    dims = make_environment(config.env).spec.action_dim  # no simulator is built before the first reset
     if arm == STOCK:
         del os.environ["LP_NUM_THREADS"]  # ours draws with one thread, LeRobot's by default with all
     actions = np.random.default_rng(0).uniform(-1, 1, (997, chunk, dims))
@@ -126,21 +126,21 @@ def _start(arm: str, config: BenchWorldConfig) -> None:
     _decide = make(config, chunks)
 
 
-def _ours(config: BenchWorldConfig, chunks: Iterator[np.ndarray]) -> Decide:
-    world = make_world(config.env)
+def _ours(config: BenchEnvironmentConfig, chunks: Iterator[np.ndarray]) -> Decide:
+    environment = make_environment(config.env)
     seeds = (train_seed(0, 0, episode) for episode in itertools.count())
-    world.reset(next(seeds), config.task)
+    environment.reset(next(seeds), config.task)
 
     def decide() -> int:
-        result = world.step_chunk(next(chunks))
+        result = environment.step_chunk(next(chunks))
         if result.done:
-            world.reset(next(seeds), config.task)
+            environment.reset(next(seeds), config.task)
         return result.steps
 
     return decide
 
 
-def _stock(config: BenchWorldConfig, chunks: Iterator[np.ndarray]) -> Decide:
+def _stock(config: BenchEnvironmentConfig, chunks: Iterator[np.ndarray]) -> Decide:
     env, left = _stock_env(config.env, config.task), config.env.max_steps
     env.reset(seed=0)
 
@@ -158,14 +158,14 @@ def _stock(config: BenchWorldConfig, chunks: Iterator[np.ndarray]) -> Decide:
     return decide
 
 
-def _physics(config: BenchWorldConfig, chunks: Iterator[np.ndarray]) -> Decide:
+def _physics(config: BenchEnvironmentConfig, chunks: Iterator[np.ndarray]) -> Decide:
     assert isinstance(config.env, LiberoConfig)
     simulator = Simulator(config.task, config.env.rendering, config.env.assets)
     simulator.reset(train_seed(0, 0, 0))
     return _put_back(config, simulator.env.sim, simulator.step, chunks)
 
 
-def _stock_physics(config: BenchWorldConfig, chunks: Iterator[np.ndarray]) -> Decide:
+def _stock_physics(config: BenchEnvironmentConfig, chunks: Iterator[np.ndarray]) -> Decide:
     assert isinstance(config.env, LiberoConfig)
     load_libero(config.env.assets)
     with contextlib.redirect_stdout(io.StringIO()):
@@ -175,7 +175,7 @@ def _stock_physics(config: BenchWorldConfig, chunks: Iterator[np.ndarray]) -> De
 
 
 def _put_back(
-    config: BenchWorldConfig, sim: Any, step: Callable[[np.ndarray], Any], chunks: Iterator[np.ndarray]
+    config: BenchEnvironmentConfig, sim: Any, step: Callable[[np.ndarray], Any], chunks: Iterator[np.ndarray]
 ) -> Decide:
     """Steps robosuite's `sim` and puts it back where it began after each episode's time."""
     start, steps = sim.get_state(), itertools.count(1)

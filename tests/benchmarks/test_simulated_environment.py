@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The simulated world with latency: as slow as asked, and broken on request."""
+"""The simulated environment with latency: as slow as asked, and broken on request."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from accerl_lerobot.envs import make_world
-from benchmarks import simulated_world
-from benchmarks.simulated_world import LatencyConfig, read_trace
+from accerl_lerobot.envs import make_environment
+from benchmarks import simulated_environment
+from benchmarks.simulated_environment import LatencyConfig, read_trace
 
 NO_ACTIONS = np.zeros((10, 2), np.float32)
 
@@ -19,35 +19,37 @@ NO_ACTIONS = np.zeros((10, 2), np.float32)
 def slept(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """Milliseconds of every sleep."""
     sleeps: list[float] = []
-    monkeypatch.setattr(simulated_world, "_wait", lambda delay: sleeps.append(round(1000 * delay, 9)))
+    monkeypatch.setattr(simulated_environment, "_wait", lambda delay: sleeps.append(round(1000 * delay, 9)))
     return sleeps
 
 
 def test_latency_is_slept_and_has_the_mean_asked_for(slept: list[float]):
-    world = make_world(LatencyConfig(frame_ms=10.0, tolerance=1e-6))
-    world.reset(0, "match")
-    world.step_chunk(NO_ACTIONS)
+    environment = make_environment(LatencyConfig(frame_ms=10.0, tolerance=1e-6))
+    environment.reset(0, "match")
+    environment.step_chunk(NO_ACTIONS)
     assert slept == [10.0, 10.0]
-    world = make_world(LatencyConfig(frame_ms=3.0, latency_cv=1.0))
-    world.reset(0, "match")
-    draws = [world._delay() for _ in range(20_000)]
+    environment = make_environment(LatencyConfig(frame_ms=3.0, latency_cv=1.0))
+    environment.reset(0, "match")
+    draws = [environment._delay() for _ in range(20_000)]
     assert np.mean(draws) == pytest.approx(0.003, rel=0.05)
     assert np.std(draws) / np.mean(draws) == pytest.approx(1.0, rel=0.15)
 
 
 def test_a_trace_is_gone_through_from_some_moment_on_and_scaled(tmp_path: Path, slept: list[float]):
     path = tmp_path / "trace.txt"
-    path.write_text("# of a world\n1.0\n\n2.0  # milliseconds\nreset 30\n6.0\nreset 60\n")
+    path.write_text("# of an environment\n1.0\n\n2.0  # milliseconds\nreset 30\n6.0\nreset 60\n")
     trace = read_trace(str(path))
     assert trace.decisions.tolist() == [1 / 3, 2 / 3, 2.0] and trace.resets.tolist() == [10.0, 20.0]
-    world = make_world(LatencyConfig(latency_trace=str(path), frame_ms=3.0, max_steps=1000, tolerance=1e-6))
+    environment = make_environment(
+        LatencyConfig(latency_trace=str(path), frame_ms=3.0, max_steps=1000, tolerance=1e-6)
+    )
     starts = set()
     for seed in range(20):
         for _ in range(2):  # equal seeds, equal latency
             slept.clear()
-            world.reset(seed, "match")
+            environment.reset(seed, "match")
             for _ in range(6):
-                world.step_chunk(NO_ACTIONS)
+                environment.step_chunk(NO_ACTIONS)
             reset, *draws = slept
             assert reset in (30.0, 60.0)
             assert draws[:3] == draws[3:] and sorted(draws[:3]) == [1.0, 2.0, 6.0]
@@ -57,19 +59,19 @@ def test_a_trace_is_gone_through_from_some_moment_on_and_scaled(tmp_path: Path, 
 
 
 def test_it_crashes_on_request_and_counts_over_episodes():
-    world = make_world(LatencyConfig(crash_after=12, tolerance=1e-6))
-    world.reset(0, "match")
-    world.step_chunk(NO_ACTIONS)
-    world.reset(1, "match")
+    environment = make_environment(LatencyConfig(crash_after=12, tolerance=1e-6))
+    environment.reset(0, "match")
+    environment.step_chunk(NO_ACTIONS)
+    environment.reset(1, "match")
     with pytest.raises(RuntimeError, match="simulated crash after 12"):
-        world.step_chunk(NO_ACTIONS)
+        environment.step_chunk(NO_ACTIONS)
 
 
 def test_one_nan_ends_the_episode_and_the_next_is_healthy():
-    world = make_world(LatencyConfig(nan_after=3))
-    world.reset(0, "match")
-    result = world.step_chunk(NO_ACTIONS)
+    environment = make_environment(LatencyConfig(nan_after=3))
+    environment.reset(0, "match")
+    result = environment.step_chunk(NO_ACTIONS)
     assert result.info == {"nonfinite": 1.0} and result.truncated and result.steps == 3
     assert np.isnan(result.observation["observation.state"]).all()
-    assert np.isfinite(world.reset(1, "match")["observation.state"]).all()
-    assert not world.step_chunk(NO_ACTIONS).info
+    assert np.isfinite(environment.reset(1, "match")["observation.state"]).all()
+    assert not environment.step_chunk(NO_ACTIONS).info

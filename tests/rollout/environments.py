@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A world that follows a script, and decisions made of nothing."""
+"""An environment that follows a script, and decisions made of nothing."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from accerl_lerobot.envs import ChunkResult, World, WorldSpec
+from accerl_lerobot.envs import ChunkResult, Environment, EnvironmentSpec
 from accerl_lerobot.experience import TASK, Decision, Observation, Request, Segment
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutConfig, RolloutRunner
 
@@ -13,7 +13,7 @@ CHUNK = 2
 CAMERA = "observation.images.front"
 
 
-class ScriptedWorld(World):
+class ScriptedEnvironment(Environment):
     """Every step earns 1; an episode ends after `steps` steps in the way `end` says.
 
     ``observation.state`` is (seed, steps so far), which names every observation.
@@ -22,13 +22,13 @@ class ScriptedWorld(World):
         steps: length of an episode in env steps.
         end: ``success`` (terminates), ``failure`` (terminates) or ``limit`` (truncates).
         nan_at: step of an episode that is no number; 0 for never.
-        nan_in: what of it: its ``reward``, the ``state`` after it, or what the world says in ``info``.
+        nan_in: what of it: its ``reward``, the ``state`` after it, or what the environment says in ``info``.
     """
 
     def __init__(self, steps: int = 5, end: str = "success", nan_at: int = 0, nan_in: str = "reward") -> None:
         self.steps, self.end, self.nan_at, self.nan_in = steps, end, nan_at, nan_in
         one = np.ones(1, np.float32)
-        self.spec = WorldSpec(
+        self.spec = EnvironmentSpec(
             images={CAMERA: (8, 8, 3)}, state_dim=2, action_dim=1, action_low=-one, action_high=one,
             fps=10, max_steps=steps, tasks=("push", "pull"),
         )  # fmt: skip
@@ -84,19 +84,23 @@ class Recorder:
     """A runner whose plans, segments and results are at hand.
 
     Args:
-        worlds: one per slot.
+        environments: one per slot.
         plans: handed out in order, then None.
         config: of the runner.
     """
 
     def __init__(
-        self, worlds: list[World], plans: list[EpisodePlan], config: RolloutConfig, name: str = "r0.0"
+        self,
+        environments: list[Environment],
+        plans: list[EpisodePlan],
+        config: RolloutConfig,
+        name: str = "r0.0",
     ) -> None:
         self.plans = list(plans)
         self.segments: list[Segment] = []
         self.results: list[EpisodeResult] = []
         self.runner = RolloutRunner(
-            worlds, lambda: self.plans.pop(0) if self.plans else None, config, name,
+            environments, lambda: self.plans.pop(0) if self.plans else None, config, name,
             self.segments.append, self.results.append,
         )  # fmt: skip
 
