@@ -159,7 +159,7 @@ def test_every_logged_number_is_explained(tiny_checkpoint: Path, monkeypatch: py
 
 def test_every_role_and_state_of_the_timeline_is_explained() -> None:
     text = (ROOT / "docs" / "metrics.md").read_text().split("## Timeline")[1].split("\n## ")[0]
-    assert set(re.findall(r"`([a-z_]+(?: learning)?)`", text)) == {*ROLES, *STATES}
+    assert set(re.findall(r"`([a-z_]+(?: model|-model learning)?)`", text)) == {*ROLES, *STATES}
 
 
 def test_the_summary_is_explained() -> None:

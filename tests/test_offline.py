@@ -20,6 +20,8 @@ from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.metrics import METRICS
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.loading import load_adapter
+from accerl_lerobot.trainer import chunk_critic
+from accerl_lerobot.world_model.latent import LatentModel
 
 
 @pytest.fixture(scope="module")
@@ -69,8 +71,12 @@ def test_the_checkpoint_does_more_of_what_succeeded(algorithm, tiny_checkpoint, 
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        (["--algorithm.type=gipo"], "algorithm.type='gipo': .*use awr or self_imitation"),
-        (["--algorithm.type=chunk_critic"], "algorithm.type='chunk_critic': .*use awr or self_imitation"),
+        (["--algorithm.type=gipo"], "algorithm.type='gipo': .*use awr, self_imitation or chunk_critic"),
+        (["--algorithm.type=awr", "--world_model.type=latent"], "world_model.type='latent': .*chunk_critic"),
+        (
+            ["--algorithm.type=chunk_critic", "--world_model.type=simulator"],
+            "world_model.type='simulator': the dataset has no observation.environment_state; use latent",
+        ),
         (["--trainer.ranks=2"], "trainer.ranks=2: .*use 1"),
         (["--dataset.repo_id=null", "--dataset.root=null"], "dataset.repo_id=None: name a LeRobotDataset"),
         (["--policy.path=null"], "policy.path=None: give a LeRobot checkpoint"),
@@ -116,3 +122,25 @@ def test_graded_rewards_without_a_success_are_enough_for_awr(
     assert main([*run, f"--algorithm.type={algorithm}"]) == code
     out, err = capsys.readouterr()
     assert json.loads(out)["successes"] == 0 if code == 0 else "none of its episodes is a success" in err
+
+
+@pytest.mark.parametrize("model", ["simulator", "latent"])
+def test_the_chunk_critic_learns_from_recorded_episodes(
+    model, tiny_checkpoint, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr(LatentModel, "first_steps", 20)
+    monkeypatch.setattr(chunk_critic, "LEAST_TRANSITIONS", 8)
+    monkeypatch.setattr(chunk_critic, "FIRST_STEPS", 200)
+    root = tmp_path / "recorded"
+    environment = SimulatedConfig(max_steps=16, environment_state=model == "simulator")
+    record_demos(environment, DemosConfig(episodes=8, failure_share=0.25), str(root))
+    out = tmp_path / "out"
+    run = [*arguments(tiny_checkpoint, root, out), "--algorithm.type=chunk_critic"]
+    assert main(run) == 0  # the state is the simulator's where the dataset has it
+    summary = json.loads(capsys.readouterr().out)
+    before, after = (summary["imitation_loss"][when]["successes"] for when in ("before", "after"))
+    assert after < 0.9 * before
+    records = [json.loads(line) for line in (out / METRICS).read_text().splitlines()]
+    assert all("explained_variance" in record for record in records)
+    assert ("world_model_contrast" in records[-1]) == (model == "latent")
+    load_adapter(PolicyConfig(path=summary["policy"], device="cpu"))

@@ -31,7 +31,14 @@ from accerl_lerobot.config.ranges import Device, NewFolder, Section, Seed
 from accerl_lerobot.console import Console, count, duration, number, rate
 from accerl_lerobot.demos.record import DemosConfig
 from accerl_lerobot.demos.sft import SFTConfig
-from accerl_lerobot.engine.config import DatasetConfig, LaunchConfig, RunConfig, encode, parse
+from accerl_lerobot.engine.config import (
+    DatasetConfig,
+    LaunchConfig,
+    RunConfig,
+    encode,
+    no_use_for_states,
+    parse,
+)
 from accerl_lerobot.envs import EnvConfig, MetaWorldConfig
 from accerl_lerobot.errors import InputError, check_absent, expanded, is_full, kept_traceback, make_folder
 from accerl_lerobot.evaluation import EvaluationConfig
@@ -43,7 +50,7 @@ from accerl_lerobot.report import ReportConfig, write_report
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.timeline.read import TimelineConfig, show_timelines, timeline_table
 from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.world_model.config import ValidationConfig, WorldModelConfig
+from accerl_lerobot.world_model.config import StateModelConfig, ValidationConfig, WorldModelConfig
 
 OUTCOME = (
     "success_before", "ci95_before", "success_after", "ci95_after", "n_after", "episodes", "env_steps",
@@ -101,14 +108,19 @@ class OfflineRun(NewFolderRun):
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     """Successes and failures, told apart by ``next.success``, or by sparse ``next.reward``."""
     algorithm: AlgorithmConfig = field(default_factory=AWRConfig)
+    world_model: StateModelConfig | None = None
+    """State that chunk_critic's critic and teacher see. None: simulator where the dataset has
+    ``observation.environment_state``, else latent."""
     trainer: TrainerConfig = field(default_factory=TrainerConfig)
     wandb: WandBConfig = field(default_factory=WandBConfig)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not isinstance(self.algorithm, OffPolicyConfig) or isinstance(self.algorithm, ChunkCriticConfig):
-            why = "it needs likelihoods of what was done, or new episodes of its teacher"
-            raise InputError("algorithm.type", self.algorithm.type, f"{why}; use awr or self_imitation")
+        if not isinstance(self.algorithm, OffPolicyConfig):
+            hint = "it needs likelihoods of what was done; use awr, self_imitation or chunk_critic"
+            raise InputError("algorithm.type", self.algorithm.type, hint)
+        if self.world_model is not None and not isinstance(self.algorithm, ChunkCriticConfig):
+            raise InputError("world_model.type", self.world_model.type, no_use_for_states(self.algorithm))
         if self.policy.path is None:
             raise InputError("policy.path", None, "give a LeRobot checkpoint; accerl sft makes one")
         if self.dataset.repo_id is None:

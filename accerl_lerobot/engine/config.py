@@ -28,15 +28,15 @@ from accerl_lerobot.timeline import TIMELINE
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.world_model.config import (
     ImaginationConfig,
-    LatentConfig,
     SimulatorStateConfig,
     StateModelConfig,
+    default_state_model,
 )
 
 __all__ = ["DatasetConfig", "LaunchConfig", "RunConfig", "decode", "encode", "parse"]
 
 
-ROLES = ("trainer", "inference", "imagination", "rollout")
+ROLES = ("trainer", "world_model", "inference", "imagination", "rollout")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,9 +50,9 @@ class LaunchConfig(Section, section="launch"):
     must ask for a token, which is looked for where Ray does: RAY_AUTH_TOKEN, RAY_AUTH_TOKEN_PATH,
     ``~/.ray/auth_token``. None: a private Ray on this machine."""
     placement: dict[str, str] = field(default_factory=dict)
-    """Role (trainer, inference, imagination or rollout) → nodes of its workers: a number as ``accerl doctor``
-    prints it, 0 being the node where the run is started; the name of a custom resource, as in
-    ``ray start --resources='{"simulators": 1}'``; or all. Not given: node 0, where replay always is."""
+    """Role (trainer, world_model, inference, imagination or rollout) → nodes of its workers: a number as
+    ``accerl doctor`` prints it, 0 being the node where the run is started; the name of a custom resource, as
+    in ``ray start --resources='{"simulators": 1}'``; or all. Not given: node 0, where replay always is."""
     schedule: Schedule = ASYNCHRONOUS
     """asynchronous: no worker waits for another. synchronous: a batch is collected, by all environments in
     lock step, then learned from. overlap: the next one is collected meanwhile. The last two are for measuring
@@ -86,6 +86,11 @@ class LaunchConfig(Section, section="launch"):
         if self.address is None and not {"0"}.issuperset(self.placement.values()):
             hint = "a private Ray has one node; add --launch.address=auto, or leave the field out"
             raise InputError("launch.placement", self.placement, hint)
+
+
+def no_use_for_states(algorithm: AlgorithmConfig) -> str:
+    """Hint for a `world_model` beside an algorithm that sees no states."""
+    return f"algorithm.type={algorithm.type} has no use for it; use chunk_critic, or leave it out"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,7 +148,7 @@ class RunConfig(Section):
         """`world_model`, or the type that is used where none is given."""
         if self.world_model is not None:
             return self.world_model
-        return SimulatorStateConfig() if self.env.tells_state else LatentConfig()
+        return default_state_model(self.env.tells_state)
 
     @property
     def remembered(self) -> int:
@@ -158,10 +163,7 @@ class RunConfig(Section):
             hint = "add --sft.steps=0 to improve this checkpoint, or fine-tune it first with sft.init_path"
             raise InputError("policy.path", self.policy.path, hint)
         if self.world_model is not None and not isinstance(self.algorithm, ChunkCriticConfig):
-            hint = (
-                f"algorithm.type={self.algorithm.type} has no use for it; use chunk_critic, or leave it out"
-            )
-            raise InputError("world_model.type", self.world_model.type, hint)
+            raise InputError("world_model.type", self.world_model.type, no_use_for_states(self.algorithm))
         if isinstance(self.algorithm, OffPolicyConfig):
             self._check_off_policy()
         if (held := self.trainer.hold_back) >= self.replay.max_lag:

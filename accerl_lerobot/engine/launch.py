@@ -29,7 +29,7 @@ from ray.exceptions import RayActorError, RayError, RayTaskError
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE, saved_version
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.loop import Engine, Progress, Saved
-from accerl_lerobot.engine.placement import actor_options, place_workers
+from accerl_lerobot.engine.placement import actor_options, learns_states, place_workers
 from accerl_lerobot.engine.ray_session import RaySession
 from accerl_lerobot.engine.replicas import (
     InferenceReplicas,
@@ -218,6 +218,7 @@ class RayEngine(Engine):
         from accerl_lerobot.replay.worker import ReplayWorker
         from accerl_lerobot.trainer.peers import SHARE, LearnerSettings, TrainerRank
         from accerl_lerobot.trainer.worker import TrainerWorker
+        from accerl_lerobot.world_model.worker import WORLD_MODEL_WORKER, WorldModelWorker
 
         c, state, timeline = self._config, self._state, self._config.timeline_folder
         plan, imagination = place_workers(c), c.imagination
@@ -233,7 +234,11 @@ class RayEngine(Engine):
         learner = LearnerSettings(c.policy, c.algorithm, c.trainer, c.seed, state, self._load, wait_s)
         others = range(1, c.trainer.ranks)
         ranks = [make(f"trainer rank {rank}", TrainerRank, 1, rank, learner).actor for rank in others]
-        self._trainer = make("trainer", TrainerWorker, 4, learner, timeline, ranks, c.folder)
+        world_model = None
+        if learns_states(c):
+            arguments = (c.seed, c.trainer.num_threads, timeline)
+            world_model = make(WORLD_MODEL_WORKER, WorldModelWorker, 4, *arguments).actor
+        self._trainer = make("trainer", TrainerWorker, 4, learner, timeline, ranks, c.folder, world_model)
         self._inference.start(plan)
         imagined = imagination.imagined_replay(c.replay) if imagination.share else None
         stores = (c.replay, c.seed, imagined, c.rollout.episodes > 0, state, c.folder, timeline)

@@ -19,12 +19,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from accerl_lerobot.algorithms import OffPolicyConfig
+from accerl_lerobot.algorithms import ChunkCriticConfig, OffPolicyConfig
 from accerl_lerobot.checkpoint import layout
 from accerl_lerobot.config.parsing import encode
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.experience import ENVIRONMENT_STATE
 from accerl_lerobot.metrics import MetricsLog, plain
+from accerl_lerobot.world_model.config import SimulatorStateConfig, StateModelConfig, default_state_model
 
 if TYPE_CHECKING:
     from accerl_lerobot.cli.verbs import OfflineRun
@@ -39,7 +41,7 @@ COMPARED = 256  # decisions of successes, and of failures, whose imitation loss 
 def learn_offline(config: OfflineRun, directory: Path, console: Console) -> dict[str, Any]:
     """Learns, writes ``checkpoints/NNNNNN`` and ``summary.json`` into `directory`; returns the summary."""
     from accerl_lerobot.demos.dataset_files import open_metadata
-    from accerl_lerobot.policies.loading import learning_config, load_adapter
+    from accerl_lerobot.policies.loading import learning_config
     from accerl_lerobot.trainer.update import make_update
 
     started = time.monotonic()
@@ -47,10 +49,12 @@ def learn_offline(config: OfflineRun, directory: Path, console: Console) -> dict
     torch.set_num_threads(config.trainer.num_threads)
     policy, meta = learning_config(config.policy), open_metadata(config.dataset)
     wanted = _check(config, policy, meta)
-    adapter = load_adapter(config.policy)
+    adapter = _adapter(config, wanted)
     # One step for each update, instead of so many for each new decision.
     assert isinstance(config.algorithm, OffPolicyConfig)
     algorithm = replace(config.algorithm, policy_steps=1.0)
+    if isinstance(algorithm, ChunkCriticConfig):
+        algorithm = replace(algorithm, critic_steps=algorithm.critic_steps or 1.0)
     update: Any = make_update(adapter, algorithm, config.trainer)
     counts = _remember(config, update, meta, wanted, console)
     before = _imitation(update)
@@ -63,7 +67,8 @@ def learn_offline(config: OfflineRun, directory: Path, console: Console) -> dict
             recent.append(update.learn(1))
             update.version += 1
             if update.version % LOG_EVERY == 0 or update.version == config.trainer.updates:
-                means = {k: float(np.mean([m[k] for m in recent if k in m])) for k in recent[-1]}
+                names = dict.fromkeys(name for metrics in recent for name in metrics)
+                means = {k: float(np.mean([m[k] for m in recent if k in m])) for k in names}
                 log.write("train", update.version, means)
                 stage.update(update.version, f"imitation loss {means.get('imitation_loss', math.nan):.4f}")
                 recent = []
@@ -85,11 +90,40 @@ def learn_offline(config: OfflineRun, directory: Path, console: Console) -> dict
     return summary
 
 
+def _adapter(config: OfflineRun, wanted: dict[str, tuple[int, ...]]) -> Any:
+    """The policy; with the teacher of `ChunkCriticConfig`, which labels and never acts here."""
+    from accerl_lerobot.policies.loading import load_adapter
+    from accerl_lerobot.policies.teacher import with_teacher
+
+    if not isinstance(config.algorithm, ChunkCriticConfig):
+        return load_adapter(config.policy)
+    numbers = math.prod(wanted[ENVIRONMENT_STATE]) if ENVIRONMENT_STATE in wanted else 0
+    model = config.world_model or default_state_model(numbers > 0)
+    return with_teacher(load_adapter, model, numbers, config.algorithm.teacher_episodes, config.policy)
+
+
+def _reads_environment_state(config: OfflineRun, offered: bool) -> bool:
+    """True if critic and teacher see the simulator's state, which a dataset may have `offered`."""
+    if not isinstance(config.algorithm, ChunkCriticConfig):
+        return False
+    model: StateModelConfig = config.world_model or default_state_model(offered)
+    if isinstance(model, SimulatorStateConfig) and not offered:
+        hint = f"the dataset has no {ENVIRONMENT_STATE}; use latent"
+        raise InputError("world_model.type", model.type, hint)
+    return offered
+
+
 def _check(config: OfflineRun, policy: Any, meta: Any) -> dict[str, tuple[int, ...]]:
     """Shapes of the observations that the policy reads, by the dataset's names, and of ``action``."""
     from accerl_lerobot.engine.preflight import check_imitates
     from accerl_lerobot.experience import REWARD, SUCCESS
-    from accerl_lerobot.policies.features import ACTION, check_features, dataset_features, policy_features
+    from accerl_lerobot.policies.features import (
+        ACTION,
+        check_features,
+        dataset_features,
+        dataset_shapes,
+        policy_features,
+    )
 
     check_imitates(config.algorithm, config.policy, policy)
     offered, renames = dataset_features(meta), config.policy.rename_map
@@ -100,8 +134,10 @@ def _check(config: OfflineRun, policy: Any, meta: Any) -> dict[str, tuple[int, .
     if not {SUCCESS, REWARD} & set(meta.features):
         hint = f"its episodes are labelled neither by {SUCCESS} nor {REWARD}; use accerl sft"
         raise InputError("dataset.repo_id", config.dataset.repo_id, hint)
-    read = policy_features(policy).shapes.keys() | {ACTION}
-    return {name: shape for name, shape in offered.shapes.items() if renames.get(name, name) in read}
+    shapes, read = dataset_shapes(meta), policy_features(policy).shapes.keys() | {ACTION}
+    if _reads_environment_state(config, ENVIRONMENT_STATE in shapes):
+        read |= {ENVIRONMENT_STATE}
+    return {name: shape for name, shape in shapes.items() if renames.get(name, name) in read}
 
 
 def _remember(
@@ -130,7 +166,8 @@ def _remember(
         left = f"{len(outcomes)} of {meta.total_episodes} episodes fit into {most} decisions"
         logger.warning("%s, the others are left out", left)
     counts = {"episodes": len(outcomes), "successes": sum(outcomes.values()), "decisions": len(update.memory)}
-    if not len(update.imitable()) or (not counts["successes"] and len(set(totals.values())) < 2):
+    graded = len(set(totals.values())) > 1 and not isinstance(algorithm, ChunkCriticConfig)
+    if not len(update.imitable()) or not (counts["successes"] or graded):
         hint = "none of its episodes is a success, or better than another; there is nothing to imitate"
         raise InputError("dataset.repo_id", config.dataset.repo_id, hint)
     console.say(f"{counts['episodes']} episodes, {counts['successes']} of them successes; "
@@ -152,6 +189,7 @@ def _imitation(update: Any) -> dict[str, float | None]:
                 losses = []
                 for part in np.array_split(rows, math.ceil(len(rows) / update.config.micro_batch)):
                     encoded = update.adapter.encode(*update.memory.observations(part))
-                    losses.append(update.adapter.family.imitation_loss(encoded, update.target(part)))
+                    executed = update.tensor("chunk", part)
+                    losses.append(update.adapter.family.imitation_loss(encoded, executed))
             found[name] = float(torch.cat(losses).float().mean())
     return found

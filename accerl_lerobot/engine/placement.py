@@ -22,6 +22,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from accerl_lerobot.algorithms import ChunkCriticConfig
 from accerl_lerobot.engine.ray_session import FIELD, RaySession, prepare
 from accerl_lerobot.engine.stopping import WorkerError
 from accerl_lerobot.errors import InputError
@@ -110,11 +111,19 @@ def roles_of(config: RunConfig) -> list[Role]:
     imagining = ["imagination"] * bool(c.imagination.share) + ["world-model learning"] * c.imagination.learns
     workers = {
         "trainer": ["trainer", *(f"trainer rank {i}" for i in range(1, c.trainer.ranks))],
+        "world_model": ["world model"] * learns_states(c),
         "inference": numbered("inference", c.inference.workers),
         "imagination": imagining,
         "rollout": [f"rollout {i}" for i in range(c.rollout.workers)],
     }
     return [Role(name, own, c.launch.placement.get(name)) for name, own in workers.items() if own]
+
+
+def learns_states(config: RunConfig) -> bool:
+    """True if the run has a world model that critic and teacher stand on, and that learns."""
+    from accerl_lerobot.world_model.states import can_learn
+
+    return isinstance(config.algorithm, ChunkCriticConfig) and can_learn(config.state_model)
 
 
 def candidates(nodes: Sequence[Node], role: Role) -> list[Node]:

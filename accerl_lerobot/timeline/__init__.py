@@ -39,6 +39,7 @@ ROLES = (
     "inference",
     "replay",
     "trainer",
+    "world model",
     "world-model learning",
 )
 TIMELINE = "timeline"

@@ -18,7 +18,7 @@ import copy
 import math
 from collections import deque
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -36,6 +36,9 @@ from accerl_lerobot.world_model.state_learner import BATCH as TRANSITIONS
 from accerl_lerobot.world_model.state_learner import StateLearner
 from accerl_lerobot.world_model.states import Transitions
 
+if TYPE_CHECKING:
+    from accerl_lerobot.world_model.worker import RemoteStateLearner
+
 MEMBERS = 6
 MONTE_CARLO = 0.25  # share of the observed return in the critic's target
 BATCH = 256  # rows of one step of critic or teacher
@@ -52,6 +55,7 @@ MOST_FIRST = 5000  # most steps of the critic before the teacher's first along i
 MARGIN = 0.05  # share of the explored range of actions that the teacher may go beyond it
 SMALLEST_SCALE = 0.02  # smallest mean |Q| that Q is divided by
 MOST_STATE_STEPS = 200  # of the world model's first steps, in one update
+STEPS_AT_ONCE = 25  # of the world model, whose transitions are drawn together
 LEAST_TRANSITIONS = 100  # with fewer, the world model does not begin
 REFRESH = 320  # new decisions after which the acting world model takes over what was learned, at least
 REENCODED = 16  # remembered states that are computed anew for each new decision, at most
@@ -83,8 +87,11 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         self.critic = Critic(self.teacher).to(device)
         self.slow = copy.deepcopy(self.critic).requires_grad_(False)
         model = self.teacher.model
-        self.state_learner = StateLearner(model) if model.learns else None
+        self.state_learner: StateLearner | RemoteStateLearner | None = None
+        if model.learns:
+            self.state_learner = StateLearner(model)
         self._unpublished = 0  # new decisions since the model that acts was replaced
+        self._unsubmitted = 0  # new decisions for which the world model has no steps yet
         # Reads the scaled state off the policy's features.
         self.reader = nn.Linear(adapter.model.width, len(self.teacher.mean)).to(device)
         # The teacher lies beside the policy's weights.
@@ -110,9 +117,16 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         last = np.arange(len(segment)) == len(segment) - 1
         return {"state": states.cpu().numpy(), "elapsed": segment.elapsed, "last": last}
 
+    def learn_states_in(self, worker: Any, timeout_s: float) -> None:
+        """Have a `WorldModelWorker`, of which `worker` is the handle, make the steps of the world model."""
+        from accerl_lerobot.world_model.worker import RemoteStateLearner
+
+        if isinstance(self.state_learner, StateLearner):
+            self.state_learner = RemoteStateLearner(worker, self.state_learner, timeout_s)
+
     def learn(self, new: int) -> dict[str, float]:
         metrics = self._learn_states(new)
-        if self.state_learner is not None and self.state_learner.behind:
+        if self.state_learner is not None and not self.state_learner.ready:
             return metrics  # critic and teacher would learn on states that mean nothing yet
         return metrics | self._learn_to_act(new)
 
@@ -121,24 +135,39 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         transitions = np.flatnonzero(~self.memory["last"])
         if self.state_learner is None or len(transitions) < LEAST_TRANSITIONS:
             return {}
-        self.state_learner.model.fit(self.memory.seen())
-        behind, each = self.state_learner.behind, self.teacher.model.steps_per_decision
-        # A part at a time, so that no update takes minutes.
-        due = min(behind, MOST_STATE_STEPS) or len(self.steps("world_model", each, new))
-        metrics = mean(self._state_step(transitions) for _ in range(due))
+        self._submit_steps(transitions, new)
+        if not self.state_learner.ready and self.version >= self.config.value_warmup_updates:
+            self.state_learner.wait()  # or episodes would be spent before anything is learned from them
+        steps = self.state_learner.collect()
         self._unpublished += new
-        if behind or self._unpublished >= max(REFRESH, len(self.memory) // REENCODED):
+        due = not self.teacher.ready or self._unpublished >= max(REFRESH, len(self.memory) // REENCODED)
+        if steps and due:
             self._unpublished = 0
             self.state_learner.publish(self.teacher.model)
             self._encode_memory()
-        return {f"world_model_{name}": value for name, value in metrics.items()}
+        return {f"world_model_{name}": value for name, value in mean(iter(steps)).items()}
 
-    def _state_step(self, transitions: np.ndarray) -> dict[str, float]:
-        assert self.state_learner is not None
-        rows = drawn(transitions, TRANSITIONS)
+    def _submit_steps(self, transitions: np.ndarray, new: int) -> None:
+        """Give the world model the steps that are due, unless it has not made the last ones yet."""
+        learner = self.state_learner
+        assert learner is not None
+        self._unsubmitted += new
+        if learner.busy:
+            return
+        numbers = {name: rows for name, rows in self.memory.seen().items() if rows.dtype != np.uint8}
+        # A part of the first steps at a time, so that no update takes minutes.
+        due = min(learner.behind, MOST_STATE_STEPS)
+        if not due:
+            due = len(self.steps("world_model", self.teacher.model.steps_per_decision, self._unsubmitted))
+        self._unsubmitted = 0
+        for first in range(0, due, STEPS_AT_ONCE):
+            count = min(STEPS_AT_ONCE, due - first)
+            learner.submit(self._transitions(drawn(transitions, count * TRANSITIONS)), numbers)
+
+    def _transitions(self, rows: np.ndarray) -> Transitions:
         observations, tasks = self.memory.observations(rows)
         following, _ = self.memory.observations((rows + 1) % self.memory.capacity)
-        batch = Transitions(
+        return Transitions(
             observations=observations,
             following=following,
             tasks=tasks,
@@ -147,7 +176,6 @@ class ChunkCriticUpdate(OffPolicyUpdate):
             returns=self.tensor("return", rows),
             success=self.tensor("success", rows),
         )
-        return self.state_learner.step(batch, self.apply)
 
     def _encode_memory(self) -> None:
         states = self.memory["state"]
@@ -189,7 +217,7 @@ class ChunkCriticUpdate(OffPolicyUpdate):
             "networks": {name: copied(module) for name, module in self.networks.items()},
             "optimizers": {name: optimizer_state(optimizer) for name, optimizer in self.optimizers.items()},
             "outcomes": {name: list(last) for name, last in self._outcomes.items()},
-            "unpublished": self._unpublished,
+            "unpublished": (self._unpublished, self._unsubmitted),
             "state_learner": None if self.state_learner is None else self.state_learner.state(),
         }
 
@@ -201,8 +229,8 @@ class ChunkCriticUpdate(OffPolicyUpdate):
             restore_optimizer(optimizer, state["optimizers"][name])
         for name, last in self._outcomes.items():
             last.extend(state["outcomes"][name])
-        self._unpublished = state["unpublished"]
-        if self.state_learner is not None:
+        self._unpublished, self._unsubmitted = state["unpublished"]
+        if isinstance(self.state_learner, StateLearner):
             self.state_learner.restore(state["state_learner"])
 
     @torch.no_grad()

@@ -38,7 +38,8 @@ RESEND_S = 0.2  # interval at which busy replicas get the newest weights while t
 class TrainerWorker:
     """Becomes a threaded Ray actor in `launch`: `run` on one thread, everything else beside it.
 
-    The run's `directory` is for batches that nothing could be learnt from.
+    The run's `directory` is for batches that nothing could be learnt from; `world_model` is the handle of a
+    `WorldModelWorker`, where the algorithm learns on its states.
     """
 
     def __init__(
@@ -47,12 +48,18 @@ class TrainerWorker:
         timeline: Path | None = None,
         peers: Sequence[Any] = (),
         directory: Path | None = None,
+        world_model: Any = None,
     ) -> None:
         errors.collect_warnings()
         self._clock = open_clock(timeline, "trainer")
         self._policy, self._config, self._directory = settings.policy, settings.trainer, directory
         self._peers = Peers(peers, self._config, settings.timeout_s)
         self._update = self._peers.begin(settings)
+        if world_model is not None:
+            from accerl_lerobot.trainer.chunk_critic import ChunkCriticUpdate
+
+            assert isinstance(self._update, ChunkCriticUpdate)
+            self._update.learn_states_in(world_model, settings.timeout_s)
         self._lock = threading.Lock()
         self._kept: Any = None
         self._in_turn = False

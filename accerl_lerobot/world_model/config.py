@@ -58,6 +58,11 @@ class LatentConfig(StateModelConfig):
     """Numbers of the latent state."""
 
 
+def default_state_model(tells_state: bool) -> StateModelConfig:
+    """The type of a run that names none; `tells_state`: the simulator's state is there to be read."""
+    return SimulatorStateConfig() if tells_state else LatentConfig()
+
+
 @dataclass(frozen=True, kw_only=True)
 class LearnableModelConfig(Section, draccus.ChoiceRegistry, section="world_model.model"):
     """Base config of a class of learned world models, which is a `contract.LearnableWorldModel`.

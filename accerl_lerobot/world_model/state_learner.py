@@ -2,19 +2,22 @@
 """Training of a state model beside the one that acts.
 
 Critic, teacher and memory use a model that stands still; its copy here learns. `publish` hands the copy's
-weights over, after which remembered states are to be computed anew.
+weights over, after which remembered states are to be computed anew. `worker` has the same in a process of
+its own.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+import math
 from typing import Any
 
+import numpy as np
 import torch
 
 from accerl_lerobot.checkpoint.tensors import copied, optimizer_state, restore_optimizer
-from accerl_lerobot.world_model.states import StateModel, Transitions
+from accerl_lerobot.trainer.batch import MAX_NONFINITE, NonFiniteError
+from accerl_lerobot.world_model.states import Observations, StateModel, Transitions
 
 BATCH = 64  # transitions of a step
 LEARNING_RATE, WEIGHT_DECAY, CLIP = 1e-3, 1e-4, 10.0
@@ -23,26 +26,40 @@ LEARNING_RATE, WEIGHT_DECAY, CLIP = 1e-3, 1e-4, 10.0
 class StateLearner:
     """Gradient steps on a copy of `model`."""
 
+    busy = False
+    """True while steps that were submitted are not made yet."""
+
     def __init__(self, model: StateModel) -> None:
         self.model = copy.deepcopy(model).train()
         learned = [parameter for parameter in self.model.parameters() if parameter.requires_grad]
         self.optimizer = torch.optim.AdamW(learned, lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY)
         self.count = 0  # steps made
+        self._skipped_in_a_row = 0
+        self._made: list[dict[str, float]] = []
 
     @property
     def behind(self) -> int:
-        """Steps to make before critic and teacher begin."""
+        """Steps to submit before critic and teacher begin."""
         return max(0, self.model.first_steps - self.count)
 
-    def step(self, transitions: Transitions, apply: Callable[..., object]) -> dict[str, float]:
-        """Make a step by `BaseUpdate.apply`; returns the loss's parts."""
-        loss, metrics = self.model.loss(transitions)
-        self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        norm = torch.nn.utils.clip_grad_norm_(self.optimizer.param_groups[0]["params"], CLIP)
-        apply(self.optimizer, "a step of the world model", float(loss.detach()), float(norm))
-        self.count += 1
-        return metrics
+    @property
+    def ready(self) -> bool:
+        """True once the first steps are made, after which critic and teacher may begin."""
+        return self.behind == 0
+
+    def submit(self, transitions: Transitions, numbers: Observations) -> None:
+        """Make a step on each `BATCH` of transitions; `numbers` are all that is remembered without images."""
+        self.model.fit(numbers)
+        for part in np.split(np.arange(len(transitions.tasks)), len(transitions.tasks) // BATCH):
+            self._made.append(self._step(transitions.rows(part)))
+
+    def wait(self) -> None:
+        """Wait until all that was submitted is made."""
+
+    def collect(self) -> list[dict[str, float]]:
+        """Parts of the loss in each step since the last call."""
+        made, self._made = self._made, []
+        return made
 
     def publish(self, model: StateModel) -> None:
         """Copy the weights of now into the model that acts."""
@@ -58,3 +75,19 @@ class StateLearner:
         self.count = state["count"]
         self.model.load_state_dict(state["model"])
         restore_optimizer(self.optimizer, state["optimizer"])
+
+    def _step(self, transitions: Transitions) -> dict[str, float]:
+        loss, metrics = self.model.loss(transitions)
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        norm = torch.nn.utils.clip_grad_norm_(self.optimizer.param_groups[0]["params"], CLIP)
+        self.count += 1
+        if math.isfinite(float(loss.detach()) + float(norm)):
+            self.optimizer.step()
+            self._skipped_in_a_row = 0
+            return metrics
+        self._skipped_in_a_row += 1
+        if self._skipped_in_a_row >= MAX_NONFINITE:
+            hint = "look at the observations and actions of the run, or name another world_model.type"
+            raise NonFiniteError(f"{MAX_NONFINITE} steps of the world model in a row were not finite; {hint}")
+        return metrics

@@ -51,6 +51,18 @@ class Transitions(NamedTuple):
     returns: Tensor  # float32 (B,), discounted, of the episode from here on
     success: Tensor  # bool (B,), of the episode
 
+    def rows(self, chosen: np.ndarray) -> Transitions:
+        """Copies of some of them."""
+        return Transitions(
+            observations={name: values[chosen] for name, values in self.observations.items()},
+            following={name: values[chosen] for name, values in self.following.items()},
+            tasks=[self.tasks[row] for row in chosen],
+            elapsed=self.elapsed[chosen],
+            chunk=self.chunk[chosen],
+            returns=self.returns[chosen],
+            success=self.success[chosen],
+        )
+
 
 class StateModel(nn.Module, ABC):
     """A model whose states critic and teacher see.
@@ -70,10 +82,13 @@ class StateModel(nn.Module, ABC):
         """States, float32 (B, S), on any device; `elapsed` (B,) is the share of the time limit gone."""
 
     def fit(self, observations: Observations) -> None:
-        """Take scales from all remembered observations; called before the first loss, and now and then."""
+        """Take scales from the numbers of all remembered observations, images left out.
+
+        It is called before the first loss, and again before each part of an update's steps.
+        """
 
     def loss(self, transitions: Transitions) -> tuple[Tensor, dict[str, float]]:
-        """Loss, a scalar, and metrics; called once before each gradient step.
+        """Loss, a scalar, and metrics; called once before each gradient step, on the model's own device.
 
         Randomness is torch's global generator's.
         """
@@ -95,6 +110,11 @@ class SimulatorState(StateModel):
     def encode(self, observations: Observations, tasks: Sequence[str], elapsed: np.ndarray) -> Tensor:
         numbers = observations[ENVIRONMENT_STATE]
         return torch.from_numpy(numbers.reshape(len(numbers), -1).astype(np.float32))
+
+
+def can_learn(config: StateModelConfig) -> bool:
+    """True if models of this type have a `loss`."""
+    return getattr(imported(config.make), "loss", StateModel.loss) is not StateModel.loss
 
 
 def new_state_model(spec: StateSpec, config: StateModelConfig) -> StateModel:
