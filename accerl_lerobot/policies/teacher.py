@@ -138,6 +138,10 @@ def with_teacher(
 
     adapter: Any = load(config)
     spec = state_spec(adapter.policy.config, config.rename_map, environment_state)
+    ends = torch.zeros(2, 1, spec.chunk[1])
+    ends[1] = 1
+    zero, one = adapter.processing.unnormalise(ends.to(adapter.device)).cpu().numpy()[:, 0]
+    spec = spec._replace(units=(zero, one - zero))
     adapter.teacher = Teacher(new_state_model(spec, model), spec.chunk, share, noise).to(adapter.device)
     return adapter
 

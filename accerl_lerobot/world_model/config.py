@@ -58,6 +58,19 @@ class LatentConfig(StateModelConfig):
     """Numbers of the latent state."""
 
 
+@StateModelConfig.register_subclass("tdmpc")
+@dataclass(frozen=True, kw_only=True)
+class TDMPCStateConfig(StateModelConfig):
+    """The latent state of a TD-MPC policy that ``lerobot-train`` has trained on play, failures included."""
+
+    make = "accerl_lerobot.world_model.tdmpc:TDMPCModel"
+
+    path: str | None = None
+    """Its LeRobot checkpoint, on disk or the Hub. It sees one image."""
+    learn: bool = True
+    """False: it stays as it is."""
+
+
 def default_state_model(tells_state: bool) -> StateModelConfig:
     """The type of a run that names none; `tells_state`: the simulator's state is there to be read."""
     return SimulatorStateConfig() if tells_state else LatentConfig()

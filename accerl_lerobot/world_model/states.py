@@ -38,6 +38,9 @@ class StateSpec(NamedTuple):
     state: int  # numbers of ``observation.state``, of all ``n_obs_steps`` together; 0 where there are none
     environment_state: int  # numbers of ``observation.environment_state``; 0 where there are none
     chunk: tuple[int, int]  # (K, A)
+    units: tuple[np.ndarray, np.ndarray] | None = None
+    """An action in environment units is the first (A,) plus the second (A,) times the normalised one; None
+    where no transition will come."""
 
 
 class Transitions(NamedTuple):

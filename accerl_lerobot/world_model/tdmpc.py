@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The latent state of LeRobot's TD-MPC policy, which stock ``lerobot-train`` has trained.
+
+    image, proprioception ──its encoder──► z ──its dynamics, once for each action of the chunk──► predicted z'
+
+While it goes on to learn, the last predicted z' is to equal the state that a slow copy of the encoder has of
+the next observation, and the return is to be read off z by its value network (TD-MPC, arXiv 2203.04955, as in
+FOWM, arXiv 2310.16029). Its policy, rewards and Q functions are not used.
+
+Shapes: B rows, K executed actions of A dims.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.policies.adapter import IMAGES
+from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.policies.features import STATE
+from accerl_lerobot.policies.loading import load_acting
+from accerl_lerobot.world_model.config import TDMPCStateConfig
+from accerl_lerobot.world_model.latent import shifted
+from accerl_lerobot.world_model.states import Observations, StateModel, StateSpec, Transitions
+
+RETURN = 0.5  # weight of the return's squared error; consistency's is in the policy's own config
+SMALLEST_SCALE = 1e-6
+
+
+class TDMPCModel(StateModel):
+    """Its states are z, proprioception, and the share of the time limit gone."""
+
+    def __init__(self, spec: StateSpec, config: TDMPCStateConfig) -> None:
+        super().__init__()
+        adapter = _loaded(config)
+        policy, processing = adapter.policy, adapter.processing
+        self.config, self.keeps_learning = policy.config, config.learn
+        self.image = next(iter(self.config.image_features), None)
+        self.camera = _camera(spec, self.image, config)
+        self.numbers = spec.state
+        _check_sizes(spec, policy.config, config)
+        self.size = self.config.latent_dim + spec.state + 1
+        self.encoder, self.dynamics = policy.model._encoder, policy.model._dynamics
+        self.value = policy.model._V
+        self.slow = policy.model_target._encoder
+        self.requires_grad_(config.learn)
+        self.slow.requires_grad_(False)
+        # What it normalises by, measured: LeRobot's normalisations are all affine.
+        with torch.no_grad():
+            zero, one = (processing.normalise(torch.full((1, 1, spec.chunk[1]), x))[0, 0] for x in (0.0, 1.0))
+            self.action_zero, self.action_scale = _fixed(zero), _fixed(one - zero)
+            if self.numbers:
+                ends = np.stack([np.zeros(self.numbers, np.float32), np.ones(self.numbers, np.float32)])
+                seen = {STATE: ends} | self._blank(2)
+                low, high = processing.prepare(seen, ["", ""])[STATE]
+                self.state_zero, self.state_scale = _fixed(low), _fixed(high - low)
+        self.units = [_fixed(torch.as_tensor(part)) for part in spec.units] if spec.units else None
+
+    @property
+    def learns(self) -> bool:
+        return self.keeps_learning
+
+    def encode(self, observations: Observations, tasks: Sequence[str], elapsed: np.ndarray) -> Tensor:
+        latent = self.encoder(self._read(observations))
+        late = torch.from_numpy(elapsed.astype(np.float32))[:, None].to(latent)
+        numbers = latent.new_zeros(len(latent), 0)
+        if self.numbers:
+            numbers = torch.from_numpy(observations[STATE]).to(latent)
+        return torch.cat([latent, numbers, late], 1)
+
+    def loss(self, transitions: Transitions) -> tuple[Tensor, dict[str, float]]:
+        with torch.no_grad():
+            for slow, fast in zip(self.slow.parameters(), self.encoder.parameters(), strict=True):
+                slow.lerp_(fast, 1 - self.config.target_model_momentum)
+            target = self.slow(self._read(transitions.following, shift=True))
+        latent = self.encoder(self._read(transitions.observations, shift=True))
+        value = self.value(latent)[:, 0]
+        for action in self._actions(transitions.chunk).unbind(1):
+            latent = self.dynamics(torch.cat([latent, action], 1))
+        consistency = functional.mse_loss(latent, target)
+        returns = functional.mse_loss(value, transitions.returns)
+        metrics = {"consistency": float(consistency.detach()), "return": float(returns.detach())}
+        return self.config.consistency_coeff * consistency + RETURN * returns, metrics
+
+    def _actions(self, chunk: Tensor) -> Tensor:
+        """Chunks (B, K, A) of the run's normalised units in those of TD-MPC."""
+        if self.units is not None:
+            zero, scale = self.units
+            chunk = zero + scale * chunk
+        return self.action_zero + self.action_scale * chunk
+
+    def _read(self, observations: Observations, shift: bool = False) -> dict[str, Tensor]:
+        """What TD-MPC's encoder takes."""
+        device, batch = self.action_zero.device, {}
+        if self.image is not None:
+            pixels = torch.from_numpy(np.ascontiguousarray(observations[self.camera])).to(device)
+            images = pixels.permute(0, 3, 1, 2).float() / 255
+            batch[self.image] = shifted(images) if shift else images
+        if self.numbers:
+            numbers = torch.from_numpy(observations[STATE]).to(device)
+            batch[STATE] = self.state_zero + self.state_scale * numbers
+        return batch
+
+    def _blank(self, count: int) -> Observations:
+        """Black images of TD-MPC's own name and size."""
+        if self.image is None:
+            return {}
+        channels, height, width = self.config.image_features[self.image].shape
+        return {self.image: np.zeros((count, height, width, channels), np.uint8)}
+
+
+def _loaded(config: TDMPCStateConfig) -> Any:
+    if config.path is None:
+        hint = "give the pretrained_model of a policy that lerobot-train --policy.type=tdmpc has trained"
+        raise InputError("world_model.path", None, hint)
+    try:
+        adapter = copy.copy(load_acting(PolicyConfig(path=config.path, device="cpu")))
+    except InputError as error:
+        field = error.field.replace("policy.", "world_model.", 1)
+        raise InputError(field, error.value, error.hint) from error
+    if (kind := adapter.policy.config.type) != "tdmpc":
+        raise InputError("world_model.path", config.path, f"its type is {kind}; give one of type tdmpc")
+    return adapter
+
+
+def _camera(spec: StateSpec, image: str | None, config: TDMPCStateConfig) -> str:
+    """The run's camera that TD-MPC sees: the one of its image's name, or the only one."""
+    if image is None or image in spec.cameras:
+        return image or ""
+    if len(spec.cameras) != 1:
+        has = ", ".join(name.removeprefix(IMAGES) for name in spec.cameras) or "none"
+        hint = f"it sees {image}, and the policy's cameras are {has}; train it on one of these names"
+        raise InputError("world_model.path", config.path, hint)
+    return next(iter(spec.cameras))
+
+
+def _check_sizes(spec: StateSpec, lerobot_config: Any, config: TDMPCStateConfig) -> None:
+    state = lerobot_config.robot_state_feature
+    for what, its, ours in (
+        (STATE, state.shape[0] if state else 0, spec.state),
+        ("action", lerobot_config.action_feature.shape[0], spec.chunk[1]),
+    ):
+        if its != ours:
+            hint = f"{what} has {its} numbers there and {ours} here; train it on this robot's data"
+            raise InputError("world_model.path", config.path, hint)
+
+
+def _fixed(values: Tensor) -> nn.Parameter:
+    return nn.Parameter(values.detach().clone().float(), requires_grad=False)
