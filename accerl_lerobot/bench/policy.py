@@ -197,7 +197,7 @@ def _adapter(config: BenchPolicyConfig, device: Any, directory: Path) -> Any:
     family = FlowFamily(model, FlowSamplerConfig(noise_level=0.2))
     inputs: Any = _RandomInputs(config, device)
     adapter = LeRobotAdapter(policy, inputs, model, family, ValueHead(model.width), config.precision)
-    tune(policy, model, config.tuning)
+    tune(policy, config.tuning, model.backbone, model.idle)
     return adapter
 
 

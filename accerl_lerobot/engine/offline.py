@@ -47,7 +47,7 @@ def learn_offline(config: OfflineRun, directory: Path, console: Console) -> dict
     started = time.monotonic()
     torch.manual_seed(config.seed)
     torch.set_num_threads(config.trainer.num_threads)
-    policy, meta = learning_config(config.policy), open_metadata(config.dataset)
+    policy, meta = learning_config(config.policy, imitates=True), open_metadata(config.dataset)
     wanted = _check(config, policy, meta)
     adapter = _adapter(config, wanted)
     # One step for each update, instead of so many for each new decision.
@@ -144,11 +144,12 @@ def _remember(
     config: OfflineRun, update: Any, meta: Any, wanted: dict[str, tuple[int, ...]], console: Console
 ) -> dict[str, Any]:
     """Fills the memory; counts of what is in it."""
+    from accerl_lerobot.policies.config import executed_rows
     from accerl_lerobot.trainer.demonstrations import recorded
 
     algorithm = config.algorithm
     assert isinstance(algorithm, OffPolicyConfig)
-    chunk = update.adapter.policy.config.n_action_steps
+    chunk = executed_rows(update.adapter.policy.config)
     size = sum(math.prod(shape) * (1 if len(shape) == 3 else 4) for shape in wanted.values())
     most = max(1, min(algorithm.memory, BYTES // size))
     longest = int(max(meta.episodes["length"]))
@@ -188,8 +189,8 @@ def _imitation(update: Any) -> dict[str, float | None]:
                 torch.manual_seed(0)
                 losses = []
                 for part in np.array_split(rows, math.ceil(len(rows) / update.config.micro_batch)):
-                    encoded = update.adapter.encode(*update.memory.observations(part))
                     executed = update.tensor("chunk", part)
-                    losses.append(update.adapter.family.imitation_loss(encoded, executed))
-            found[name] = float(torch.cat(losses).float().mean())
+                    loss, _ = update.adapter.imitate(*update.memory.observations(part), executed)
+                    losses.append(loss.float().mean() * len(part))
+            found[name] = float(torch.stack(losses).sum() / len(rows))
     return found

@@ -22,7 +22,7 @@ import draccus
 import numpy as np
 import yaml
 
-from accerl_lerobot.algorithms import ChunkCriticConfig, LossInputs, OffPolicyConfig, RatioConfig
+from accerl_lerobot.algorithms import AWRConfig, ChunkCriticConfig, LossInputs, OffPolicyConfig, RatioConfig
 from accerl_lerobot.checkpoint.safety import brief
 from accerl_lerobot.engine.sizes import check_disk, check_memory
 from accerl_lerobot.envs import (
@@ -128,7 +128,7 @@ def check_policy(config: RunConfig, spec: EnvironmentSpec, *, own: bool = False)
     policy = (load_lerobot_config if own else rehearsed_config)(config.policy)
     needed, offered, renames = policy_features(policy), env_features(spec), config.policy.rename_map
     check_features(needed, offered, renames, "policy.path", config.policy.path)
-    return env_steps_seen(policy)
+    return env_steps_seen(policy, learns=isinstance(config.algorithm, OffPolicyConfig))
 
 
 def check_device(config: RunConfig) -> None:
@@ -161,6 +161,7 @@ def check_start(config: RunConfig, say: Callable[[str], object] = str) -> tuple[
     """Refuse a run that could not begin, or whose outcome could not be used, as far as can be told; returns
     what the environment offers, and the policy's ``n_obs_steps``."""
     from accerl_lerobot.demos.dataset_files import open_metadata
+    from accerl_lerobot.policies.config import check_likelihood, executed_rows, sampler_config
 
     if config.output_dir is not None and not config.resume:
         check_absent(expanded(config.output_dir, "output_dir"))
@@ -179,12 +180,14 @@ def check_start(config: RunConfig, say: Callable[[str], object] = str) -> tuple[
     check_wandb(config.wandb)
     say("looking at policy, environment and data …")
     policy = policy_to_be(config)
+    if isinstance(config.algorithm, RatioConfig):
+        check_likelihood(config.algorithm.type, sampler_config(config.policy, policy.type), policy.type)
     check_memory(config)
     spec = check_environment(config.env, config.rollout.reward_model)
     off_policy = isinstance(config.algorithm, OffPolicyConfig)
     if off_policy:
         check_imitates(config.algorithm, config.policy, policy)
-        decisions = math.ceil(spec.max_steps / getattr(policy, "n_action_steps", 1))
+        decisions = math.ceil(spec.max_steps / executed_rows(policy))
         if config.rollout.segment_length < decisions:
             why = f"algorithm.type={config.algorithm.type} looks at whole episodes; use at least {decisions}"
             raise InputError("rollout.segment_length", config.rollout.segment_length, why)
@@ -420,12 +423,15 @@ def check_wandb(config: WandBConfig) -> None:
 
 def check_imitates(algorithm: AlgorithmConfig, config: PolicyConfig, policy: Any) -> None:
     """Refuse policies that cannot imitate a chunk; `policy` is LeRobot's config."""
-    from accerl_lerobot.policies.config import sampler_config
+    from accerl_lerobot.policies.config import ANY, sampler_config
 
     sampler = sampler_config(config, policy.type)
-    if sampler.type not in ("flow", "gaussian"):
-        hint = "use flow or gaussian, or another algorithm.type"
+    if sampler.type not in ("flow", "gaussian", ANY):
+        hint = f"use {ANY}, flow or gaussian, or another algorithm.type"
         raise InputError("policy.sampler.type", sampler.type, f"algorithm.type={algorithm.type}: {hint}")
+    if sampler.type == ANY and isinstance(algorithm, AWRConfig):
+        hint = "awr's critic reads the policy's features, which are not known; use chunk_critic"
+        raise InputError("policy.type", policy.type, hint)
     if getattr(policy, "use_relative_actions", False):
         hint = f"algorithm.type={algorithm.type} keeps actions without the state they refer to"
         raise InputError("policy.use_relative_actions", True, f"{hint}; use another algorithm.type")
@@ -436,12 +442,13 @@ def policy_to_be(config: RunConfig) -> Any:
     from accerl_lerobot.policies.config import check_observations, override, sampler_config
     from accerl_lerobot.policies.loading import learning_config
 
+    imitates = isinstance(config.algorithm, OffPolicyConfig)
     if config.policy.path is not None:
-        return learning_config(config.policy)
+        return learning_config(config.policy, imitates=imitates)
     if config.sft.init_path is not None:  # fine-tuning changes its weights alone
         start = replace(config.policy, path=config.sft.init_path, revision=None)
         try:
-            return learning_config(start, fine_tuned=True)
+            return learning_config(start, fine_tuned=True, imitates=imitates)
         except InputError as error:
             if error.field not in ("policy.path", "policy.type", "policy.n_obs_steps"):
                 raise

@@ -23,9 +23,10 @@ from accerl_lerobot.checkpoint.tensors import in_parts, part_of, whole
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK, Decision, Request, Segment, stack_observations
 from accerl_lerobot.policies import saving
-from accerl_lerobot.policies.config import PLUGINS, PolicyConfig
+from accerl_lerobot.policies.config import PLUGINS, PolicyConfig, SamplerConfig
 from accerl_lerobot.policies.family import Encoded, Family, Model, pooled
 from accerl_lerobot.policies.teacher import TEACHER_PREFIX, Teacher
+from accerl_lerobot.policies.untrusted import FAMILY, VALUE_HEAD
 
 HIDDEN = 128
 OBS_STATE = "observation.state"
@@ -134,6 +135,18 @@ class PolicyAdapter(nn.Module, ABC):
         return {name: view.copy() for name, view in self.view_trainable().items()}
 
 
+def trainable_of(parts: dict[str, nn.Module], teacher: Teacher | None) -> dict[str, nn.Parameter]:
+    """Trainable parameters of the parts, and all of the teacher's, by the names they are published under."""
+    named = {
+        f"{part}.{name}": parameter
+        for part, module in parts.items()
+        for name, parameter in module.named_parameters()
+        if parameter.requires_grad
+    }
+    learned = {} if teacher is None else dict(teacher.named_parameters())
+    return named | {TEACHER_PREFIX + name: parameter for name, parameter in learned.items()}
+
+
 def example_requests(config: Any, rename_map: dict[str, str], *, explore: bool = True) -> list[Request]:
     """Two requests with random observations for a policy, and instructions of unequal length.
 
@@ -229,6 +242,18 @@ class LeRobotAdapter(PolicyAdapter):
         """Reads raw observations, each (B, ...), and B instructions, for the family; differentiable."""
         return self.model.encode(self.processing.prepare(observations, tasks))
 
+    def imitate(
+        self, observations: dict[str, np.ndarray], tasks: Sequence[str], chunk: Tensor
+    ) -> tuple[Tensor, Encoded]:
+        """LeRobot's training loss (B,) of chunks (B, K, A) in normalised units, and what it was read from."""
+        encoded = self.encode(observations, tasks)
+        return self.family.imitation_loss(encoded, chunk), encoded
+
+    @property
+    def feature_width(self) -> int | None:
+        """Width of the features that `imitate` returns."""
+        return self.model.width
+
     def autocast(self) -> contextlib.AbstractContextManager[Any]:
         """Surrounds whatever runs the network."""
         return autocast_on(self.device, self.precision)
@@ -274,14 +299,7 @@ class LeRobotAdapter(PolicyAdapter):
 
     def trainable(self) -> dict[str, nn.Parameter]:
         parts = {"policy": self.policy, "family": self.family, "value_head": self.value_head}
-        named = {
-            f"{part}.{name}": parameter
-            for part, module in parts.items()
-            for name, parameter in module.named_parameters()
-            if parameter.requires_grad
-        }
-        teacher = {} if self.teacher is None else dict(self.teacher.named_parameters())
-        return named | {TEACHER_PREFIX + name: parameter for name, parameter in teacher.items()}
+        return trainable_of(parts, self.teacher)
 
     def example_requests(self) -> list[Request]:
         """Two requests with random observations for this policy, and instructions of unequal length."""
@@ -294,7 +312,12 @@ class LeRobotAdapter(PolicyAdapter):
         return *stack_observations(requests), stacked
 
     def copy_weights(self) -> saving.Weights:
-        return saving.copy_weights(self)
+        return saving.copy_weights(self, {VALUE_HEAD: self.value_head, FAMILY: self.family})
+
+    @property
+    def sampler(self) -> SamplerConfig:
+        """How it explores."""
+        return self.family.sampler
 
     def save(self, directory: Path, config: PolicyConfig, weights: Any) -> None:
         saving.save_pretrained(self, directory, config, weights)

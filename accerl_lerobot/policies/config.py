@@ -89,6 +89,20 @@ class DiffusionSamplerConfig(SamplerConfig):
     of its own, so this is the executed action's std around what the chain arrives at."""
 
 
+@SamplerConfig.register_subclass("chunk_noise")
+@dataclass(frozen=True, kw_only=True)
+class ChunkNoiseConfig(SamplerConfig):
+    """Policies of any type: Gaussian noise on the chunk that LeRobot's sampler gives; see `stock.py`.
+
+    It has no likelihood, so it is for the algorithms that learn from a memory.
+    """
+
+    family = "accerl_lerobot.policies.stock:StockAdapter"
+
+    noise_level: Annotated[float, Range("[0, 2]")] = 0.25
+    """Std of the noise on every action, in normalised units."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class TuningConfig(Section, section="policy.tuning"):
     """Which of the policy's weights are trained and published; the critic always is."""
@@ -162,6 +176,7 @@ POLICIES: dict[str, tuple[str, tuple[str, ...]]] = {
     "pi0_fast": ("accerl_lerobot.policies.vla:Pi0Fast", ("tokens",)),
 }
 """LeRobot policy type → its model, and the families that suit it, the default one first."""
+ANY = "chunk_noise"  # the family of a type that has no other
 NOT_IMPORTED: dict[str, str] = {}  # installed ``lerobot_policy_*`` → words on why it cannot be imported
 PLUGINS: dict[str, str] = {}  # policy type that is not LeRobot's own → package that registers it with LeRobot
 SIZES = (
@@ -246,13 +261,11 @@ def sampler_config(
 ) -> SamplerConfig:
     """How a policy of this type explores in this run.
 
-    Refuses a type without a likelihood here, naming `field`, in a hint that begins with `prefix`; and a
-    sampler of another family.
+    Refuses a type that is not there, naming `field`, in a hint that begins with `prefix`; and a sampler that
+    does not suit it.
     """
     check_registered(policy_type, field, prefix)
-    if policy_type not in POLICIES:
-        raise no_likelihood(policy_type, field, prefix)
-    families = POLICIES[policy_type][1]
+    families = (*POLICIES[policy_type][1], ANY) if policy_type in POLICIES else (ANY,)
     if config.sampler is None:
         return SamplerConfig.get_choice_class(families[0])()
     if config.sampler.type not in families:
@@ -261,15 +274,26 @@ def sampler_config(
     return config.sampler
 
 
-def no_likelihood(policy_type: str, field: str = "policy.type", prefix: str = "") -> InputError:
-    """The error of a policy type that acts and cannot learn."""
-    why = "no likelihood for it here, so it can be evaluated (accerl eval, load_policy) and cannot learn"
-    return InputError(field, policy_type, f"{prefix}{why}; {', '.join(POLICIES)} can")
+def check_likelihood(algorithm: str, sampler: SamplerConfig, policy_type: str) -> None:
+    """Refuses a policy without an exact likelihood for an `algorithm` that needs one."""
+    if sampler.type == ANY:
+        why = f"algorithm.type={algorithm} needs exact likelihoods, which {', '.join(POLICIES)} have here"
+        hint = f"{why}; use chunk_critic or self_imitation, or add a likelihood (docs/extending.md)"
+        raise InputError("policy.type", policy_type, hint)
 
 
-def env_steps_seen(policy_config: Any) -> int:
-    """Env steps that an observation holds. A policy that only acts keeps former ones itself."""
-    return int(policy_config.n_obs_steps) if policy_config.type in POLICIES else 1
+def env_steps_seen(policy_config: Any, *, learns: bool = False) -> int:
+    """Env steps that an observation holds.
+
+    A policy of another type than `POLICIES` keeps former ones itself, unless it `learns`.
+    """
+    return int(policy_config.n_obs_steps) if learns or policy_config.type in POLICIES else 1
+
+
+def executed_rows(policy_config: Any) -> int:
+    """Actions that a policy executes for each of its decisions, in LeRobot's loop and here."""
+    named = (getattr(policy_config, name, None) for name in ("n_action_steps", "action_chunk_size"))
+    return next((int(rows) for rows in named if rows), 1)
 
 
 def check_size(name: str, value: Any, field: str) -> None:

@@ -14,6 +14,7 @@ import logging
 import string
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,6 +33,7 @@ from accerl_lerobot.policies import untrusted
 from accerl_lerobot.policies.adapter import LeRobotAdapter, Processing, ValueHead
 from accerl_lerobot.policies.config import (
     POLICIES,
+    ChunkNoiseConfig,
     PolicyConfig,
     Precision,
     SamplerConfig,
@@ -112,17 +114,19 @@ def rehearsed_config(config: PolicyConfig, *, fine_tuned: bool = False) -> Any:
     return load_lerobot_config(config)
 
 
-def learning_config(config: PolicyConfig, *, fine_tuned: bool = False) -> Any:
-    """`rehearsed_config` of a policy that can learn."""
-    lerobot_config = rehearsed_config(config, fine_tuned=fine_tuned)
+def learning_config(config: PolicyConfig, *, fine_tuned: bool = False, imitates: bool = False) -> Any:
+    """`rehearsed_config` of a policy that learns, by LeRobot's training loss if it `imitates`."""
+    policy_sizes(config, fine_tuned=fine_tuned, imitates=imitates)
+    lerobot_config = load_lerobot_config(config)
     sampler_config(config, lerobot_config.type, prefix=f"{config.path} is of this type: ")
     return lerobot_config
 
 
-def policy_sizes(config: PolicyConfig, *, fine_tuned: bool = False) -> Sizes:
+def policy_sizes(config: PolicyConfig, *, fine_tuned: bool = False, imitates: bool = False) -> Sizes:
     """`Sizes` of a checkpoint's policy, which has been loaded and has acted once in a child process.
 
-    If it is to be `fine_tuned`, statistics that it lacks are no reason to refuse it.
+    One that `imitates`, of a type without a likelihood, computes LeRobot's training loss there too. If it is
+    to be `fine_tuned`, statistics that it lacks are no reason to refuse it.
 
     The child has limits of memory and time (`isolation`), and it does not read the weights. Networks of more
     than `ACTS_MOST` numbers are built and do not act.
@@ -133,14 +137,18 @@ def policy_sizes(config: PolicyConfig, *, fine_tuned: bool = False) -> Sizes:
     folder = _checkpoint_folder(config)
     _registered_type(config, folder)  # before the fork: it imports the policy's code
     files = [(str(path), path.stat()) for path in sorted(folder.rglob("*")) if path.is_file()]
-    key = repr((config, fine_tuned, [(path, stat.st_size, stat.st_mtime_ns) for path, stat in files]))
+    key = repr(
+        (config, fine_tuned, imitates, [(path, stat.st_size, stat.st_mtime_ns) for path, stat in files])
+    )
     if key not in _rehearsed:
         single = replace(config, precision="fp32")
-        _rehearsed[key] = Sizes(*rehearsed(single, sizes_of, fine_tuned=fine_tuned))
+        _rehearsed[key] = Sizes(*rehearsed(single, sizes_of, fine_tuned=fine_tuned, imitates=imitates))
     return _rehearsed[key]
 
 
-def rehearsed[T](config: PolicyConfig, task: Callable[[LeRobotAdapter], T], *, fine_tuned: bool = False) -> T:
+def rehearsed[T](
+    config: PolicyConfig, task: Callable[[Any], T], *, fine_tuned: bool = False, imitates: bool = False
+) -> T:
     """Result, which JSON can hold, of `task` with the policy of `policy_sizes`, in a child process."""
     precision = precision_on(resolve_device(config.device), config.precision)
     there = replace(config, device="cpu", precision=precision)
@@ -148,7 +156,8 @@ def rehearsed[T](config: PolicyConfig, task: Callable[[LeRobotAdapter], T], *, f
     folder = weights_folder(_checkpoint_folder(config), origin)  # its size sets the limits
 
     def act() -> T:
-        return task(load_acting(there, rehearsal=True, fine_tuned=fine_tuned))
+        load = partial(load_adapter, explores=False) if imitates else load_acting
+        return task(load(there, rehearsal=True, fine_tuned=fine_tuned))
 
     return rehearse(act, folder, origin)
 
@@ -165,16 +174,33 @@ def load_acting(
     lerobot_config = load_lerobot_config(config)
     if lerobot_config.type in POLICIES:
         return load_adapter(config, rehearsal=rehearsal, fine_tuned=fine_tuned, explores=False)
-    parts = _load_parts(config, lerobot_config, None, rehearsal, fine_tuned)
-    adapter = StockAdapter(*parts)
+    return _stock_adapter(config, lerobot_config, None, rehearsal, fine_tuned)
+
+
+def _stock_adapter(
+    config: PolicyConfig,
+    lerobot_config: Any,
+    sampler: ChunkNoiseConfig | None,
+    rehearsal: bool,
+    fine_tuned: bool,
+) -> StockAdapter:
+    """A policy of any type, which has acted once; with a `sampler` one that explores and learns."""
+    known = POLICIES.get(lerobot_config.type)
+    model_class: type[Model] | None = None if known is None else imported(known[0])
+    policy, processing, precision = _load_parts(config, lerobot_config, model_class, rehearsal, fine_tuned)
+    adapter = StockAdapter(policy, processing, precision, sampler)
     with _refusing(config, "it cannot act here"):
-        adapter.decide(adapter.example_requests(), 0)
+        if sampler is None:
+            adapter.decide(adapter.example_requests(), 0)
+        else:
+            tune(policy, config.tuning)
+            adapter.self_check()
     return adapter
 
 
 def load_adapter(
     config: PolicyConfig, *, rehearsal: bool = False, fine_tuned: bool = False, explores: bool = True
-) -> LeRobotAdapter:
+) -> LeRobotAdapter | StockAdapter:
     """Loads policy, processors and critic; proves that the sampler is LeRobot's.
 
     In a `rehearsal` the weights are not read, and a decision is made in place of that proof. `policy_sizes`
@@ -185,6 +211,8 @@ def load_adapter(
     """
     lerobot_config = load_lerobot_config(config)
     sampler = sampler_config(config, lerobot_config.type, prefix=f"{config.path} is of this type: ")
+    if isinstance(sampler, ChunkNoiseConfig):
+        return _stock_adapter(config, lerobot_config, sampler, rehearsal, fine_tuned)
     model_class: type[Model] = imported(POLICIES[lerobot_config.type][0])
     policy, processing, precision = _load_parts(config, lerobot_config, model_class, rehearsal, fine_tuned)
     folder, origin = _checkpoint_folder(config), FileSource("policy.path", config.path)
@@ -201,7 +229,7 @@ def load_adapter(
         elif sum(parameter.numel() for parameter in policy.parameters()) <= ACTS_MOST:
             observation = requests[0].observation | {TASK: TEXT}
             adapter.decide([replace(requests[0], observation=observation)], 0)
-        tune(policy, model, config.tuning)
+        tune(policy, config.tuning, model.backbone, model.idle)
     return adapter
 
 

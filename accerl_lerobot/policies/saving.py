@@ -25,15 +25,17 @@ from accerl_lerobot.checkpoint.safety import FileSource, matching_files
 from accerl_lerobot.checkpoint.tensors import copy_of, place
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import PolicyConfig, SamplerConfig, TuningConfig
-from accerl_lerobot.policies.family import Model
-from accerl_lerobot.policies.untrusted import FAMILY, OURS, VALUE_HEAD
+from accerl_lerobot.policies.untrusted import OURS
 
 if TYPE_CHECKING:
     from accerl_lerobot.policies.adapter import LeRobotAdapter
+    from accerl_lerobot.policies.stock import StockAdapter
 
 
-def tune(policy: Any, model: Model, config: TuningConfig) -> None:
+def tune(policy: Any, config: TuningConfig, backbone: str | None = None, idle: tuple[str, ...] = ()) -> None:
     """Sets what is trainable in `policy`; puts low-rank adapters in, for ``lora``.
+
+    `backbone` begins the names of its vision-language backbone's parameters, `idle` of those without a use.
 
     Raises:
         InputError: the policy has no expert, or ``lora`` targets nothing in it.
@@ -41,15 +43,15 @@ def tune(policy: Any, model: Model, config: TuningConfig) -> None:
     if config.mode == "full":
         policy.requires_grad_(True)
     elif config.mode == "expert":
-        if model.backbone is None:
+        if backbone is None:
             hint = f"{policy.name} has no action expert apart from a backbone; use full or lora"
             raise InputError("policy.tuning.mode", "expert", hint)
         for name, parameter in policy.named_parameters():
-            parameter.requires_grad_(not name.startswith(model.backbone))
+            parameter.requires_grad_(not name.startswith(backbone))
     elif config.mode == "lora":
         _inject(policy, config)
     for name, parameter in policy.named_parameters():
-        if name.startswith(model.idle):
+        if name.startswith(idle):
             parameter.requires_grad_(False)
 
 
@@ -92,31 +94,29 @@ class Weights(NamedTuple):
     """All of an adapter's, on the CPU, under the names that LeRobot gives them."""
 
     policy: dict[str, Tensor]
-    value_head: dict[str, Tensor]
-    family: dict[str, Tensor]
+    ours: dict[str, dict[str, Tensor]]  # by the name of their file
 
 
-def copy_weights(adapter: LeRobotAdapter) -> Weights:
-    """A copy to be saved while the adapter is trained on."""
+def copy_weights(adapter: LeRobotAdapter | StockAdapter, ours: dict[str, nn.Module]) -> Weights:
+    """A copy to be saved while the adapter is trained on; `ours` are its other modules, by file."""
     policy = merged_state_dict(adapter.policy) or adapter.policy.state_dict()
-    return Weights(*map(_copied, (policy, adapter.value_head.state_dict(), adapter.family.state_dict())))
+    states = {file: _copied(module.state_dict()) for file, module in ours.items()}
+    return Weights(_copied(policy), {file: state for file, state in states.items() if state})
 
 
 def save_pretrained(
-    adapter: LeRobotAdapter, directory: Path, config: PolicyConfig, weights: Weights | None = None
+    adapter: LeRobotAdapter | StockAdapter, directory: Path, config: PolicyConfig, weights: Weights
 ) -> None:
-    """Writes LeRobot's ``pretrained_model`` layout, and ours beside it; without `weights`, those of now."""
-    weights = weights or copy_weights(adapter)
+    """Writes LeRobot's ``pretrained_model`` layout, and ours beside it."""
     directory.mkdir(parents=True, exist_ok=True)
     _save_backbone(adapter.policy.config, adapter.processing.preprocessor, directory)
     adapter.policy.save_pretrained(directory, state_dict=weights.policy)
     adapter.processing.preprocessor.save_pretrained(directory)
     adapter.processing.postprocessor.save_pretrained(directory)
     relocate(directory, directory)
-    save_file(weights.value_head, directory / VALUE_HEAD)
-    if weights.family:
-        save_file(weights.family, directory / FAMILY)
-    ours = {"sampler": draccus.encode(adapter.family.sampler, SamplerConfig), "rename_map": config.rename_map}
+    for file, tensors in weights.ours.items():
+        save_file(tensors, directory / file)
+    ours = {"sampler": draccus.encode(adapter.sampler, SamplerConfig), "rename_map": config.rename_map}
     (directory / OURS).write_text(json.dumps(ours, indent=2) + "\n")
 
 

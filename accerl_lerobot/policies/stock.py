@@ -1,16 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""LeRobot's policies of any type, which act here as they do in LeRobot and do not learn.
+"""LeRobot's policies of any type: they act by LeRobot's sampler and learn by LeRobot's training loss.
 
-A decision is one call of LeRobot's `select_action`, for one env step. A policy may keep observations, a
-chunk or a plan from one call to the next. Each episode has a policy object of its own, which shares the
-weights with the others.
+Evaluated, a decision is one call of LeRobot's `select_action`, for one env step; a policy may keep
+observations, a chunk or a plan from one call to the next, so each episode has a policy object of its own,
+which shares the weights with the others. Given a `ChunkNoiseConfig`, a decision is a whole chunk, whose rows
+are what `select_action` gives one after the other. It depends on the observation and its history alone, and
+one call may be for many environments.
+
+Shapes: B rows, T env steps of an observation (``n_obs_steps``), H rows of a training chunk, K executed ones,
+A dims.
 """
 
 from __future__ import annotations
 
 import copy
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -18,43 +24,152 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from accerl_lerobot.experience import Decision, Request
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.experience import Decision, Request, Segment, stack_observations
+from accerl_lerobot.policies import saving
 from accerl_lerobot.policies.adapter import (
+    IMAGES,
     Evaluation,
     PolicyAdapter,
     Processing,
     autocast_on,
     example_requests,
-    stack_observations,
+    trainable_of,
 )  # fmt: skip
-from accerl_lerobot.policies.config import PolicyConfig, no_likelihood
+from accerl_lerobot.policies.config import ChunkNoiseConfig, PolicyConfig, SamplerConfig, executed_rows
+from accerl_lerobot.policies.features import ACTION
+from accerl_lerobot.policies.teacher import Teacher
 from accerl_lerobot.seeds import episode_of
 
 EPISODES = 256  # episodes whose state is kept; the one that acted longest ago goes first
 SHARED = ("config", "_modules", "_parameters", "_buffers")
 """Attributes of a policy that all episodes have in common."""
+NOISE = 6  # distinguishes the seeds of the noise on executed chunks
 
 
 class StockAdapter(PolicyAdapter):
-    """A LeRobot policy that acts by its own `select_action`."""
+    """A LeRobot policy without a likelihood. Without a `sampler` it acts and does not learn."""
 
-    def __init__(self, policy: Any, processing: Processing, precision: str = "fp32") -> None:
+    feature_width = None
+    """Width of the features that `imitate` returns: they are not known."""
+
+    def __init__(
+        self,
+        policy: Any,
+        processing: Processing,
+        precision: str = "fp32",
+        sampler: ChunkNoiseConfig | None = None,
+    ) -> None:
         super().__init__()
         self.policy, self.processing, self.precision = policy.eval(), processing, precision
+        self._sampler = sampler
         self.device = next(policy.parameters()).device
+        self.teacher: Teacher | None = None
+        """Acts in its place in part of the exploring episodes; given by `teacher.with_teacher`."""
+        self.demonstrations: Callable[[Segment], Iterator[Segment]] | None = None
+        """Remembered by off-policy learning from the start; set by `demonstrations.with_demonstrations`."""
         self._episodes: OrderedDict[tuple[int, str], Any] = OrderedDict()
+
+    @property
+    def sampler(self) -> SamplerConfig:
+        """How it explores."""
+        if self._sampler is None:
+            self._refuse()
+        return self._sampler
+
+    def autocast(self) -> Any:
+        """Surrounds whatever runs the network."""
+        return autocast_on(self.device, self.precision)
 
     @torch.no_grad()
     def decide(self, requests: Sequence[Request], version: int) -> list[Decision]:
+        if self._sampler is not None:
+            return self._decide_chunks(requests, version)
         if any(request.explore for request in requests):
             self._refuse()
-        return [self._decide(request, version) for request in requests]
+        return [self._decide_step(request, version) for request in requests]
 
-    def _decide(self, request: Request, version: int) -> Decision:
+    def imitate(
+        self, observations: dict[str, np.ndarray], tasks: Sequence[str], chunk: Tensor
+    ) -> tuple[Tensor, None]:
+        """LeRobot's training loss, a scalar, of chunks (B, K, A) in normalised units."""
+        batch = self._training_batch(observations, tasks, chunk)
+        self.policy.train()
+        for module in self.policy.modules():
+            if isinstance(module, nn.modules.batchnorm._BatchNorm):
+                module.eval()  # its running statistics are not published
+        try:
+            return self.policy.forward(batch)[0], None
+        finally:
+            self.policy.eval()
+
+    def self_check(self) -> None:
+        """Proves that the policy can be asked twice for a chunk, and that its training loss can be computed.
+
+        Raises:
+            InputError: it answers the same question differently, or trains on more than its chunks.
+        """
+        requests = self.example_requests()
+        config, request = self.policy.config, [requests[0]]
+        first, second = (self.decide(request, 0)[0].chunk for _ in range(2))
+        if not np.array_equal(first, second):
+            hint = "asked twice with the same noise, it gives two chunks: it changes while it acts"
+            raise InputError("policy.type", config.type, f"{hint}; it can be evaluated (accerl eval)")
+        deltas = [*(config.observation_delta_indices or ()), *(config.reward_delta_indices or ())]
+        if config.reward_delta_indices is not None or any(delta > 0 for delta in deltas):
+            hint = (
+                "LeRobot trains it on what follows a chunk, rewards or observations, and not on chunks alone"
+            )
+            raise InputError("policy.type", config.type, f"{hint}; it can be evaluated (accerl eval)")
+        arrays, tasks = stack_observations(requests)
+        chunk = torch.zeros(len(requests), *first.shape, device=self.device)
+        kept = {name: buffer.clone() for name, buffer in self.policy.named_buffers()}
+        with torch.no_grad(), torch.random.fork_rng(), self.autocast():
+            loss, _ = self.imitate(arrays, tasks, chunk)
+            for name, buffer in self.policy.named_buffers():  # such as a codebook that the loss moves
+                buffer.copy_(kept[name])
+        if loss.numel() != 1:
+            hint = (
+                f"its training loss has shape {tuple(loss.shape)}, where LeRobot's policies return a number"
+            )
+            raise InputError("policy.type", config.type, f"{hint}; it can be evaluated (accerl eval)")
+
+    def example_requests(self) -> list[Request]:
+        """Two requests with random observations for this policy, which explore if it learns."""
+        learns = self._sampler is not None
+        return example_requests(self.policy.config, self.processing.rename_map, explore=learns)
+
+    def trainable(self) -> dict[str, nn.Parameter]:
+        return trainable_of({"policy": self.policy}, self.teacher)
+
+    def copy_weights(self) -> Any:
+        return saving.copy_weights(self, {})
+
+    def save(self, directory: Path, config: PolicyConfig, weights: Any) -> None:
+        saving.save_pretrained(self, directory, config, weights)
+
+    def evaluate(
+        self, observations: dict[str, np.ndarray], tasks: Sequence[str], latent: dict[str, Tensor]
+    ) -> Evaluation:
+        self._refuse()
+
+    def values(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Tensor:
+        self._refuse()
+
+    def example(self) -> tuple[dict[str, np.ndarray], Sequence[str], dict[str, Tensor]]:
+        self._refuse()
+
+    def _refuse(self) -> NoReturn:
+        kind = self.policy.config.type
+        raise InputError(
+            "policy.type", kind, "it has no likelihood here, and was loaded to be evaluated only"
+        )
+
+    def _decide_step(self, request: Request, version: int) -> Decision:
         arrays, tasks = stack_observations([request])
         policy = self._policy_of(episode_of(request.noise_seed), tasks[0])
         # LeRobot's samplers draw from the global generator: here from the request's seed.
-        with torch.random.fork_rng(), autocast_on(self.device, self.precision):
+        with torch.random.fork_rng(), self.autocast():
             torch.manual_seed(request.noise_seed % 2**63)
             action = policy.select_action(self.processing.prepare(arrays, tasks))
         chunk = self.processing.unnormalise(action.float()).cpu().numpy()
@@ -74,29 +189,84 @@ class StockAdapter(PolicyAdapter):
             self._episodes.popitem(last=False)
         return policy
 
-    def example_requests(self) -> list[Request]:
-        """Two requests with random observations for this policy, which do not explore."""
-        return example_requests(self.policy.config, self.processing.rename_map, explore=False)
+    def _decide_chunks(self, requests: Sequence[Request], version: int) -> list[Decision]:
+        """Exploring environments are decided for together, the others one by one, each with its own noise."""
+        assert self._sampler is not None
+        exploring = [i for i, request in enumerate(requests) if request.explore]
+        groups = [[i] for i, request in enumerate(requests) if not request.explore]
+        chunks: dict[int, Tensor] = {}
+        for rows in [exploring, *groups] if exploring else groups:
+            chunk = self._chunk([requests[i] for i in rows])
+            chunks |= dict(zip(rows, chunk, strict=True))
+        executed = torch.stack([chunks[i] for i in range(len(requests))])
+        for i in exploring:
+            noise = np.random.default_rng((requests[i].noise_seed, NOISE)).standard_normal(executed[i].shape)
+            executed[i] += self._sampler.noise_level * torch.from_numpy(noise).to(executed)
+        if self.teacher is not None:
+            executed = self.teacher.replace(executed, requests)
+        actions = self.processing.unnormalise(executed).cpu().numpy()
+        nothing = np.zeros(1, np.float32)
+        return [Decision(chunk=chunk, latent={}, log_prob=nothing, version=version) for chunk in actions]
 
-    def trainable(self) -> dict[str, nn.Parameter]:
-        return {f"policy.{name}": parameter for name, parameter in self.policy.named_parameters()}
+    def _chunk(self, requests: Sequence[Request]) -> Tensor:
+        """(B, K, A) by LeRobot's sampler, in normalised units; its noise follows from the first request."""
+        arrays, tasks = stack_observations(requests)
+        policy = self.policy
+        with torch.random.fork_rng(), self.autocast():
+            torch.manual_seed(requests[0].noise_seed % 2**63)
+            policy.reset()
+            *earlier, newest = [self.processing.prepare(frame, tasks) for frame in self._frames(arrays)]
+            with self._only_looking():
+                for batch in earlier:
+                    policy.select_action(batch)
+            # It computes a chunk at the first call, and takes one action after the other out of it.
+            rows = [policy.select_action(dict(newest)) for _ in range(executed_rows(policy.config))]
+            policy.reset()
+        return torch.stack(rows, 1).float()
 
-    def evaluate(
-        self, observations: dict[str, np.ndarray], tasks: Sequence[str], latent: dict[str, Tensor]
-    ) -> Evaluation:
-        self._refuse()
+    def _frames(self, arrays: dict[str, np.ndarray]) -> list[dict[str, np.ndarray]]:
+        """The env steps of an observation, oldest first."""
+        steps = self.policy.config.n_obs_steps
+        if steps == 1:
+            return [arrays]
+        return [{name: values[:, step] for name, values in arrays.items()} for step in range(steps)]
 
-    def values(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Tensor:
-        self._refuse()
+    @contextmanager
+    def _only_looking(self) -> Iterator[None]:
+        """Inside, `select_action` notes the observation and gives zeros in the place of a prediction."""
+        policy, dims = self.policy, self.policy.config.action_feature.shape[0]
 
-    def example(self) -> tuple[dict[str, np.ndarray], Sequence[str], dict[str, Tensor]]:
-        self._refuse()
+        def nothing(batch: dict[str, Tensor], *args: Any, **fields: Any) -> Tensor:
+            count = next(len(value) for value in batch.values() if isinstance(value, Tensor))
+            return torch.zeros(count, 1, dims, device=self.device)
 
-    def copy_weights(self) -> Any:
-        self._refuse()
+        policy.predict_action_chunk = nothing
+        try:
+            yield
+        finally:
+            del policy.predict_action_chunk
 
-    def save(self, directory: Path, config: PolicyConfig, weights: Any) -> None:
-        self._refuse()
-
-    def _refuse(self) -> NoReturn:
-        raise no_likelihood(self.policy.config.type)
+    def _training_batch(
+        self, observations: dict[str, np.ndarray], tasks: Sequence[str], chunk: Tensor
+    ) -> dict[str, Any]:
+        """What LeRobot's trainer would give `forward`; the chunk is padded around the executed rows."""
+        config, count = self.policy.config, len(tasks)
+        executed = self.processing.unnormalise(chunk)
+        batch: dict[str, Any] = {"task": list(tasks), ACTION: executed[:, 0]}
+        if (deltas := config.action_delta_indices) is not None:
+            rows = torch.tensor(list(deltas), device=executed.device)
+            batch[ACTION] = executed[:, rows.clamp(0, chunk.shape[1] - 1)]
+            outside = (rows < 0) | (rows >= chunk.shape[1])
+            batch[f"{ACTION}_is_pad"] = outside.expand(count, -1)
+        steps = config.observation_delta_indices
+        for name, array in observations.items():
+            tensor = torch.from_numpy(np.ascontiguousarray(array)).to(self.device)
+            if name.startswith(IMAGES):
+                tensor = tensor.movedim(-1, -3).contiguous().float() / 255.0
+            key = self.processing.rename_map.get(name, name)
+            if steps is not None:
+                batch[f"{key}_is_pad"] = torch.zeros(count, len(steps), dtype=torch.bool, device=self.device)
+                tensor = tensor if config.n_obs_steps > 1 else tensor[:, None]
+            batch[key] = tensor
+        prepared: dict[str, Any] = self.processing.preprocessor(batch)
+        return prepared

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from accerl_lerobot.experience import TASK_BITS, Request, stack_observations, task_codes
-from accerl_lerobot.policies.config import Load, PolicyConfig
+from accerl_lerobot.policies.config import Load, PolicyConfig, executed_rows
 from accerl_lerobot.policies.features import STATE, policy_features
 from accerl_lerobot.seeds import episode_of
 
@@ -157,5 +157,5 @@ def state_spec(policy: Any, rename_map: dict[str, str], environment_state: int) 
         cameras={env_names.get(name, name): channels for name, channels in images.items()},
         state=policy.n_obs_steps * shapes.get(STATE, (0,))[0],
         environment_state=environment_state,
-        chunk=(policy.n_action_steps, policy.action_feature.shape[0]),
+        chunk=(executed_rows(policy), policy.action_feature.shape[0]),
     )

@@ -29,7 +29,6 @@ from accerl_lerobot.experience import Decision, Observation, Request, stack_obse
 from accerl_lerobot.policies.adapter import LeRobotAdapter, PolicyAdapter
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.loading import load_adapter
-from accerl_lerobot.policies.saving import save_pretrained
 
 TOLERANCE = 1e-4
 """|ρ − 1| of a whole chunk at equal weights, in fp32 on any CPU; found are 1e-7 to 2e-5. Also the error of
@@ -114,7 +113,7 @@ def check_saved(
     The adapter, which `config` loaded, must have weights other than its checkpoint's; `directory` is new.
     """
     decisions = [adapter.decide([request], 0)[0] for request in asked]
-    save_pretrained(adapter, directory, config)
+    adapter.save(directory, config, adapter.copy_weights())
     loaded = load_adapter(replace(config, path=str(directory), revision=None))
     check_ratio_one(loaded, asked, decisions)
     check_alike(loaded.decide(asked, 0), decisions)

@@ -29,6 +29,7 @@ from accerl_lerobot.checkpoint.tensors import copied, optimizer_state, restore_o
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.family import Encoded, pooled
+from accerl_lerobot.policies.stock import StockAdapter
 from accerl_lerobot.policies.teacher import Ensemble, Teacher
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.off_policy import OffPolicyUpdate, drawn, mean
@@ -79,7 +80,9 @@ class ChunkCriticUpdate(OffPolicyUpdate):
 
     n_step = 4
 
-    def __init__(self, adapter: LeRobotAdapter, algorithm: ChunkCriticConfig, config: TrainerConfig) -> None:
+    def __init__(
+        self, adapter: LeRobotAdapter | StockAdapter, algorithm: ChunkCriticConfig, config: TrainerConfig
+    ) -> None:
         super().__init__(adapter, algorithm, config)
         assert adapter.teacher is not None
         self.algorithm, self.teacher = algorithm, adapter.teacher
@@ -93,16 +96,19 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         self._unpublished = 0  # new decisions since the model that acts was replaced
         self._unsubmitted = 0  # new decisions for which the world model has no steps yet
         # Reads the scaled state off the policy's features.
-        self.reader = nn.Linear(adapter.model.width, len(self.teacher.mean)).to(device)
+        width = adapter.feature_width
+        self.reader = None if width is None else nn.Linear(width, len(self.teacher.mean)).to(device)
         # The teacher lies beside the policy's weights.
-        self.networks = {"critic": self.critic, "slow": self.slow, "reader": self.reader}
+        self.networks: dict[str, nn.Module] = {"critic": self.critic, "slow": self.slow}
         self.optimizers = {
             "critic": torch.optim.AdamW(self.critic.parameters(), lr=config.value_lr, weight_decay=1e-3),
             "teacher": torch.optim.AdamW(self.teacher.network.parameters(), lr=TEACHER_LR, weight_decay=1e-4),
         }
         # Success of the last exploring episodes, by who acted in them.
         self._outcomes = {name: deque[bool](maxlen=LAST) for name in ("policy_success", "teacher_success")}
-        self.optimizer.add_param_group({"params": list(self.reader.parameters()), "lr": READER_LR})
+        if self.reader is not None:
+            self.networks["reader"] = self.reader
+            self.optimizer.add_param_group({"params": list(self.reader.parameters()), "lr": READER_LR})
 
     def step(self, segments: Sequence[Segment]) -> dict[str, float]:
         for segment in segments:
@@ -206,7 +212,9 @@ class ChunkCriticUpdate(OffPolicyUpdate):
     def target(self, rows: np.ndarray) -> Tensor:
         return self.teacher(self.tensor("state", rows))
 
-    def losses(self, rows: np.ndarray, encoded: Encoded, imitation: Tensor) -> dict[str, Tensor]:
+    def losses(self, rows: np.ndarray, encoded: Encoded | None, imitation: Tensor) -> dict[str, Tensor]:
+        if encoded is None or self.reader is None:
+            return super().losses(rows, encoded, imitation)
         features = pooled(encoded.features, encoded.mask)
         state = self.teacher.scaled(self.tensor("state", rows))
         perception = PERCEPTION * (self.reader(features) - state).square().mean()

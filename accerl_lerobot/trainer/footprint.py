@@ -24,6 +24,7 @@ from accerl_lerobot.experience import stack_observations
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.family import Action
 from accerl_lerobot.policies.loading import sizes_of
+from accerl_lerobot.policies.stock import StockAdapter
 from accerl_lerobot.trainer.sharding import Watch, forget
 
 FAKED_FROM = 10**9
@@ -82,7 +83,9 @@ class Counter(TorchDispatchMode):
         self.now -= size
 
 
-def policy_memory(adapter: LeRobotAdapter, *, imitates: bool, checkpointing: bool = False) -> PolicyMemory:
+def policy_memory(
+    adapter: LeRobotAdapter | StockAdapter, *, imitates: bool, checkpointing: bool = False
+) -> PolicyMemory:
     """Measures an adapter on the CPU, which is of no use afterwards.
 
     `imitates` is true of off-policy algorithms, `checkpointing` is ``trainer.activation_checkpointing``.
@@ -90,6 +93,9 @@ def policy_memory(adapter: LeRobotAdapter, *, imitates: bool, checkpointing: boo
     from torch._subclasses.fake_tensor import FakeCopyMode, FakeTensorMode
 
     sizes = sizes_of(adapter)
+    weights, trained = FLOAT32 * sizes.policy, FLOAT32 * sizes.trained
+    if isinstance(adapter, StockAdapter):  # its layers are not known: the weights alone
+        return PolicyMemory(weights, trained, 0, 0, 0, 0)
     requests = adapter.example_requests()
     batch = adapter.processing.prepare(*stack_observations(requests))
     mode: Any = nullcontext()
@@ -113,7 +119,6 @@ def policy_memory(adapter: LeRobotAdapter, *, imitates: bool, checkpointing: boo
                 waiting = learn(rows)
             kept.append(counter.now)
             del waiting
-    weights, trained = FLOAT32 * sizes.policy, FLOAT32 * sizes.trained
     return PolicyMemory(weights, trained, *_line(*peaks), *_line(*kept))
 
 

@@ -23,6 +23,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE, Segment
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.family import Encoded
+from accerl_lerobot.policies.stock import StockAdapter
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.update import BaseUpdate
 
@@ -116,7 +117,11 @@ class OffPolicyUpdate(BaseUpdate):
 
     n_step = 1  # decisions after which a target bootstraps
 
-    def __init__(self, adapter: LeRobotAdapter, algorithm: OffPolicyConfig, config: TrainerConfig) -> None:
+    adapter: LeRobotAdapter | StockAdapter
+
+    def __init__(
+        self, adapter: LeRobotAdapter | StockAdapter, algorithm: OffPolicyConfig, config: TrainerConfig
+    ) -> None:
         super().__init__(adapter, config)
         self.policy_steps = algorithm.policy_steps
         self.memory = Memory(algorithm.memory, algorithm.gamma, self.n_step)
@@ -157,10 +162,11 @@ class OffPolicyUpdate(BaseUpdate):
         """Chunks (B, K, A) for the policy to imitate, in normalised units."""
         return self.tensor("chunk", rows)
 
-    def losses(self, rows: np.ndarray, encoded: Encoded, imitation: Tensor) -> dict[str, Tensor]:
+    def losses(self, rows: np.ndarray, encoded: Encoded | None, imitation: Tensor) -> dict[str, Tensor]:
         """Losses of a step of the policy, by name, each a scalar and already weighted.
 
-        `rows` (B,) are of the memory, `encoded` their observations, `imitation` (B,) LeRobot's training loss.
+        `rows` (B,) are of the memory, `encoded` are their observations where the policy's features are known,
+        `imitation` is LeRobot's training loss, (B,) or its mean.
         """
         return {"imitation_loss": imitation.mean()}
 
@@ -197,9 +203,8 @@ class OffPolicyUpdate(BaseUpdate):
         self.optimizer.zero_grad(set_to_none=True)
         for part in np.array_split(rows, math.ceil(len(rows) / self.config.micro_batch)):
             with self.adapter.autocast():
-                encoded = self.adapter.encode(*self.memory.observations(part))
-                imitation = self.adapter.family.imitation_loss(encoded, self.target(part)).float()
-            losses = self.losses(part, encoded, imitation)
+                imitation, encoded = self.adapter.imitate(*self.memory.observations(part), self.target(part))
+            losses = self.losses(part, encoded, imitation.float())
             losses = {name: len(part) / len(rows) * value for name, value in losses.items()}
             torch.stack(list(losses.values())).sum().backward()
             for name, value in losses.items():
@@ -226,7 +231,8 @@ class AWRUpdate(OffPolicyUpdate):
     def imitable(self) -> np.ndarray:  # of failures too, what went better than expected
         return np.arange(len(self.memory))
 
-    def losses(self, rows: np.ndarray, encoded: Encoded, imitation: Tensor) -> dict[str, Tensor]:
+    def losses(self, rows: np.ndarray, encoded: Encoded | None, imitation: Tensor) -> dict[str, Tensor]:
+        assert encoded is not None and isinstance(self.adapter, LeRobotAdapter)
         error = self.tensor("return", rows) - self.adapter.value_head(encoded.features, encoded.mask)
         square = float(error.detach().square().mean())
         self._variance = FORGET * self._variance + (1 - FORGET) * square if self._variance else square

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -19,10 +20,12 @@ from safetensors.torch import save_file
 from accerl_lerobot import cli, load_policy
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Request, stack_observations
-from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.policies.config import ChunkNoiseConfig, PolicyConfig
 from accerl_lerobot.policies.loading import load_acting, load_adapter
+from accerl_lerobot.policies.stock import StockAdapter
 from accerl_lerobot.seeds import noise_seed
-from tests.policies.checkpoints import write_policy
+from accerl_lerobot.trainer import chunk_critic
+from tests.policies.checkpoints import write_act, write_diffusion, write_policy, write_smolvla
 from tests.policies.tiny import requests
 
 KINDS: dict[str, dict[str, Any]] = {
@@ -95,32 +98,140 @@ def test_it_acts_as_in_lerobot_s_loop_whatever_other_episodes_do(written: Any, k
             assert decision.chunk.shape == (1, 2) and decision.version == 3 and not decision.log_prob.any()
 
 
-@pytest.mark.parametrize("kind", ["vqbet", "tdmpc"])
-def test_it_is_evaluated_and_not_trained(written: Any, kind: str, tmp_path: Path, capsys: Any):
-    path = written(kind)
+def test_what_cannot_learn_is_evaluated_and_refused_in_one_line(written: Any, tmp_path: Path, capsys: Any):
+    path = written("tdmpc")
     fields = [f"--policy.path={path}", "--env.type=simulated", "--env.image_size=64", "--launch.engine=local"]
-    fields += [f"--policy.rename_map={json.dumps({FRONT: CAMERAS[kind]})}"] if kind == "tdmpc" else []
+    fields += [f"--policy.rename_map={json.dumps({FRONT: CAMERAS['tdmpc']})}"]
     assert cli.main(["eval", *fields, "--evaluation.episodes=2", f"--output_dir={tmp_path / 'eval'}"]) == 0
     found = json.loads((tmp_path / "eval" / "evaluation.json").read_text())
     assert found["n"] == 2 and found["steps_mean"] > 1
-    why = f"policy.type='{kind}': {path} is of this type: no likelihood for it here, so it can be evaluated"
-    for verb in (["train", "--sft.steps=0"], ["offline", "--dataset.repo_id=a/b"]):
-        more = [field for field in fields if verb[0] == "train" or "policy" in field]
-        assert cli.main([*verb, *more, f"--output_dir={tmp_path / 'new'}"]) == 2
-        assert why in capsys.readouterr().err
-
-
-def test_it_does_not_explore_and_has_no_density(written: Any):
-    config = config_of(written("tdmpc"), "tdmpc")
-    adapter = load_acting(config)
-    (asked,) = requests(1, image=64)
-    for refused in (
-        lambda: adapter.decide([asked], 0),
-        lambda: adapter.values(*stack_observations([asked])),
-        lambda: load_adapter(config),
+    train = ["train", *fields, "--sft.steps=0", f"--output_dir={tmp_path / 'new'}"]
+    for kind, algorithm, why in (
+        ("tdmpc", "gipo", "algorithm.type=gipo needs exact likelihoods, which smolvla, act, .* have here"),
+        ("tdmpc", "self_imitation", "LeRobot trains it on what follows a chunk"),
+        ("vqbet", "awr", "awr's critic reads the policy's features, which are not known; use chunk_critic"),
     ):
-        with pytest.raises(InputError, match="policy.type='tdmpc': .*no likelihood"):
+        wrong = [f"--algorithm.type={algorithm}", "--rollout.segment_length=100"]
+        wrong += ["--policy.rename_map={}", f"--policy.path={written(kind)}"] if kind == "vqbet" else []
+        assert cli.main([*train, *wrong]) == 2
+        error = capsys.readouterr().err.strip().splitlines()[-1]
+        assert re.search(f"policy.type='{kind}': {why}", error), error
+    assert not (tmp_path / "new").exists()
+
+
+def test_loaded_to_be_evaluated_it_does_not_explore(written: Any):
+    adapter = load_acting(config_of(written("tdmpc"), "tdmpc"))
+    (asked,) = requests(1, image=64)
+    for refused in (lambda: adapter.decide([asked], 0), lambda: adapter.values(*stack_observations([asked]))):
+        with pytest.raises(InputError, match="policy.type='tdmpc': it has no likelihood here"):
             refused()
+
+
+def learning(path: Path, **fields: Any) -> StockAdapter:
+    """A policy of any type, loaded to learn."""
+    sampler = ChunkNoiseConfig(**fields)
+    adapter = load_adapter(PolicyConfig(path=str(path), device="cpu", sampler=sampler))
+    assert isinstance(adapter, StockAdapter)
+    return adapter
+
+
+def test_act_acts_as_by_its_own_likelihood(tmp_path: Path):
+    path = write_act(tmp_path / "act", image=32)
+    asked = requests(3, explore=False)
+    ours = load_adapter(PolicyConfig(path=str(path), device="cpu")).decide(asked, 1)
+    for one, other in zip(ours, learning(path).decide(asked, 1), strict=True):
+        np.testing.assert_allclose(one.chunk, other.chunk, atol=1e-5)
+
+
+@pytest.mark.parametrize("write", [write_smolvla, write_diffusion])
+def test_types_that_are_known_act_as_in_lerobot_s_loop(write: Callable[..., Path], tmp_path: Path):
+    adapter = learning(write(tmp_path / "policy", image=32))
+    (asked,) = requests(1, explore=False)
+    chunk = adapter.decide([asked], 0)[0].chunk
+    adapter.policy.reset()
+    torch.manual_seed(asked.noise_seed)
+    batch = adapter.processing.prepare(*stack_observations([asked]))
+    with torch.no_grad():
+        taken = [adapter.policy.select_action(dict(batch)) for _ in range(len(chunk))]
+    expected = [adapter.processing.postprocessor(action).numpy()[0] for action in taken]
+    np.testing.assert_allclose(chunk, np.stack(expected), atol=1e-5)
+
+
+def test_smolvla_s_training_loss_is_ours(tmp_path: Path):
+    path = write_smolvla(tmp_path / "smolvla")
+    ours, stock = load_adapter(PolicyConfig(path=str(path), device="cpu")), learning(path)
+    asked = requests(6, image=32)
+    arrays, tasks = stack_observations(asked)
+    chunk = torch.rand(6, 4, 2) - 0.5
+    found = []
+    for adapter in (ours, stock):
+        torch.manual_seed(3)
+        loss, _ = adapter.imitate(arrays, tasks, chunk)
+        found.append(float(loss.mean().detach()))
+    assert found[0] == pytest.approx(found[1], rel=1e-4)
+
+
+def test_a_policy_that_looks_back_is_shown_what_lerobot_s_loop_would_show_it(written: Any):
+    from lerobot.policies.factory import get_policy_class
+
+    path, steps = written("vqbet"), steps_of(4, 9)
+    adapter, stock = learning(path), get_policy_class("vqbet").from_pretrained(written("vqbet"))
+    stock.reset()
+    taken = []
+    for request in steps:
+        torch.manual_seed(steps[6].noise_seed)
+        batch = adapter.processing.prepare(*stack_observations([request]))
+        taken.append(adapter.processing.postprocessor(stock.select_action(batch)).numpy()[0])
+    # The third chunk begins at step 6, and is predicted from steps 4 to 6.
+    seen = [request.observation for request in steps[4:7]]
+    observation = {k: v if k == "task" else np.stack([s[k] for s in seen]) for k, v in seen[0].items()}
+    asked = Request(observation=observation, noise_seed=steps[6].noise_seed, explore=False)
+    chunk = adapter.decide([asked], 0)[0].chunk
+    np.testing.assert_allclose(chunk, np.stack(taken[6:9]), atol=1e-5)
+    assert "predict_action_chunk" not in vars(adapter.policy)
+
+
+def test_exploring_is_the_chunk_and_noise_of_the_request(written: Any):
+    adapter = learning(written("vqbet"), noise_level=0.1)
+    asked = adapter.example_requests() * 2
+    asked = [replace(request, noise_seed=i) for i, request in enumerate(asked)]
+    plain = learning(written("vqbet"), noise_level=0.0).decide(asked, 0)
+    noisy = adapter.decide(asked, 0)
+    scale = 2.0  # of MIN_MAX over ±2, or twice the std
+    noise = np.stack([n.chunk - p.chunk for n, p in zip(noisy, plain, strict=True)]) / scale
+    assert 0.03 < noise.std() < 0.3 and not np.allclose(noise[0], noise[1])
+    np.testing.assert_array_equal(noisy[2].chunk, adapter.decide(asked, 0)[2].chunk)
+
+
+@pytest.mark.parametrize("algorithm", ["self_imitation", "chunk_critic"])
+def test_any_policy_learns_and_is_saved_for_stock_lerobot(
+    algorithm: str, written: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    from lerobot.policies.factory import get_policy_class
+
+    monkeypatch.setattr(chunk_critic, "FIRST_STEPS", 50)
+    root, out = tmp_path / "data", tmp_path / "run"
+    data = ["--env.type=simulated", "--env.max_steps=12", "--env.image_size=64"]
+    data += [f"--env.environment_state={'true' if algorithm == 'chunk_critic' else 'false'}"]
+    assert cli.main(["demos", *data, "--demos.episodes=3", f"--root={root}"]) == 0
+    fields = [
+        f"--policy.path={written('vqbet')}", "--policy.device=cpu", "--sft.steps=0", "--launch.engine=local",
+        "--dataset.repo_id=a/b", f"--dataset.root={root}", f"--algorithm.type={algorithm}",
+        "--algorithm.policy_steps=1", "--rollout.environments=2", "--rollout.segment_length=4",
+        "--trainer.updates=6", "--trainer.batch_decisions=8", "--trainer.value_warmup_updates=1",
+        "--replay.min_decisions=8", "--replay.max_unlearned_decisions=16", "--replay.samples_per_insert=1",
+        "--replay.max_lag=100", "--evaluation.episodes=2", "--evaluation.videos=0", f"--output_dir={out}",
+    ]  # fmt: skip
+    assert cli.main(["train", *data, *fields]) == 0
+    saved = out / "checkpoints" / "last" / "pretrained_model"
+    before, after = (get_policy_class("vqbet").from_pretrained(path) for path in (written("vqbet"), saved))
+    changed = [
+        name
+        for name, tensor in before.state_dict().items()
+        if not torch.equal(tensor, after.state_dict()[name])
+    ]
+    assert changed and all(bool(torch.isfinite(tensor).all()) for tensor in after.state_dict().values())
+    load_acting(PolicyConfig(path=str(saved), device="cpu"))
 
 
 def test_in_python_an_episode_begins_with_reset(written: Any):
