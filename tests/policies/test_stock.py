@@ -99,21 +99,29 @@ def test_it_acts_as_in_lerobot_s_loop_whatever_other_episodes_do(written: Any, k
 
 
 def test_what_cannot_learn_is_evaluated_and_refused_in_one_line(written: Any, tmp_path: Path, capsys: Any):
-    path = written("tdmpc")
-    fields = [f"--policy.path={path}", "--env.type=simulated", "--env.image_size=64", "--launch.engine=local"]
-    fields += [f"--policy.rename_map={json.dumps({FRONT: CAMERAS['tdmpc']})}"]
-    assert cli.main(["eval", *fields, "--evaluation.episodes=2", f"--output_dir={tmp_path / 'eval'}"]) == 0
+    fields = ["--env.type=simulated", "--env.image_size=64", "--launch.engine=local"]
+    renames = f"--policy.rename_map={json.dumps({FRONT: CAMERAS['tdmpc']})}"
+    policies = {
+        "tdmpc": [f"--policy.path={written('tdmpc')}", renames],
+        "vqbet": [f"--policy.path={written('vqbet')}"],
+    }
+    evaluation = ["--evaluation.episodes=2", f"--output_dir={tmp_path / 'eval'}"]
+    assert cli.main(["eval", *fields, *policies["tdmpc"], *evaluation]) == 0
     found = json.loads((tmp_path / "eval" / "evaluation.json").read_text())
     assert found["n"] == 2 and found["steps_mean"] > 1
-    train = ["train", *fields, "--sft.steps=0", f"--output_dir={tmp_path / 'new'}"]
+    train = [
+        "train",
+        *fields,
+        "--sft.steps=0",
+        "--rollout.segment_length=100",
+        f"--output_dir={tmp_path / 'new'}",
+    ]
     for kind, algorithm, why in (
         ("tdmpc", "gipo", "algorithm.type=gipo needs exact likelihoods, which smolvla, act, .* have here"),
         ("tdmpc", "self_imitation", "LeRobot trains it on what follows a chunk"),
         ("vqbet", "awr", "awr's critic reads the policy's features, which are not known; use chunk_critic"),
     ):
-        wrong = [f"--algorithm.type={algorithm}", "--rollout.segment_length=100"]
-        wrong += ["--policy.rename_map={}", f"--policy.path={written(kind)}"] if kind == "vqbet" else []
-        assert cli.main([*train, *wrong]) == 2
+        assert cli.main([*train, *policies[kind], f"--algorithm.type={algorithm}"]) == 2
         error = capsys.readouterr().err.strip().splitlines()[-1]
         assert re.search(f"policy.type='{kind}': {why}", error), error
     assert not (tmp_path / "new").exists()
