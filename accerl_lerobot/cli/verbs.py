@@ -314,7 +314,11 @@ def evaluate(arguments: list[str]) -> int:
             outcome = "success" if result.success else "failure"
             name = f"{result.plan.task.replace('/', '-')}_{result.plan.seed}_{outcome}.mp4"
             write_video(out / name, [[result.frames]], fps=20)
-    return _told(summary)
+    rates = {
+        task: {name: value for name, value in of.items() if "seeds" not in name}
+        for task, of in summary["tasks"].items()
+    }
+    return _told(summary | {"tasks": rates})
 
 
 def world_model(arguments: list[str]) -> int:

@@ -43,11 +43,16 @@ class Action(NamedTuple):
     log_prob: Tensor  # (B, L); zero where not exploring
 
 
+class NoDensityError(InputError):
+    """An option of a checkpoint with which it acts in LeRobot, and has no exact likelihood here."""
+
+
 class Model(ABC):
     """One LeRobot policy type; holds the policy and no weights of its own.
 
     Raises:
-        InputError: an option of this checkpoint would make its density wrong.
+        NoDensityError: an option of this checkpoint would make its density wrong.
+        InputError: LeRobot itself does not act with an option, or acts wrongly.
     """
 
     backbone: ClassVar[str | None] = None  # prefix of what tuning mode ``expert`` freezes; None: no expert

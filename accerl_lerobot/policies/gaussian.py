@@ -20,10 +20,17 @@ import torch
 from lerobot.utils.constants import OBS_IMAGES
 from torch import Tensor, nn
 
-from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Request
 from accerl_lerobot.policies.config import GaussianSamplerConfig
-from accerl_lerobot.policies.family import Action, Encoded, Family, Model, normal_entropy, normal_log_prob
+from accerl_lerobot.policies.family import (
+    Action,
+    Encoded,
+    Family,
+    Model,
+    NoDensityError,
+    normal_entropy,
+    normal_log_prob,
+)
 
 
 class GaussianModel(Model):
@@ -101,7 +108,7 @@ class ACT(GaussianModel):
         config = policy.config
         if (coefficient := config.temporal_ensemble_coeff) is not None:
             hint = "averaging over earlier chunks makes actions depend on more than the observation"
-            raise InputError("policy.temporal_ensemble_coeff", coefficient, f"{hint}; use null")
+            raise NoDensityError("policy.temporal_ensemble_coeff", coefficient, f"{hint}; use null")
         self.executed, self.action_dim = config.n_action_steps, config.action_feature.shape[0]
         self.width = self.row_width = config.dim_model
 

@@ -44,7 +44,7 @@ from accerl_lerobot.policies.config import (
     register_policies,
     sampler_config,
 )  # fmt: skip
-from accerl_lerobot.policies.family import Model
+from accerl_lerobot.policies.family import Model, NoDensityError
 from accerl_lerobot.policies.normalisation import check_statistics, correct_inputs, stored_steps
 from accerl_lerobot.policies.peft_adapters import merged, weights_folder
 from accerl_lerobot.policies.saving import tune
@@ -116,17 +116,20 @@ def rehearsed_config(config: PolicyConfig, *, fine_tuned: bool = False) -> Any:
 
 def learning_config(config: PolicyConfig, *, fine_tuned: bool = False, imitates: bool = False) -> Any:
     """`rehearsed_config` of a policy that learns, by LeRobot's training loss if it `imitates`."""
-    policy_sizes(config, fine_tuned=fine_tuned, imitates=imitates)
+    policy_sizes(config, fine_tuned=fine_tuned, imitates=imitates, learns=True)
     lerobot_config = load_lerobot_config(config)
     sampler_config(config, lerobot_config.type, prefix=f"{config.path} is of this type: ")
     return lerobot_config
 
 
-def policy_sizes(config: PolicyConfig, *, fine_tuned: bool = False, imitates: bool = False) -> Sizes:
+def policy_sizes(
+    config: PolicyConfig, *, fine_tuned: bool = False, imitates: bool = False, learns: bool = False
+) -> Sizes:
     """`Sizes` of a checkpoint's policy, which has been loaded and has acted once in a child process.
 
     One that `imitates`, of a type without a likelihood, computes LeRobot's training loss there too. If it is
-    to be `fine_tuned`, statistics that it lacks are no reason to refuse it.
+    to be `fine_tuned`, statistics that it lacks are no reason to refuse it; if it `learns`, an option that
+    has no exact likelihood is one.
 
     The child has limits of memory and time (`isolation`), and it does not read the weights. Networks of more
     than `ACTS_MOST` numbers are built and do not act.
@@ -137,17 +140,22 @@ def policy_sizes(config: PolicyConfig, *, fine_tuned: bool = False, imitates: bo
     folder = _checkpoint_folder(config)
     _registered_type(config, folder)  # before the fork: it imports the policy's code
     files = [(str(path), path.stat()) for path in sorted(folder.rglob("*")) if path.is_file()]
-    key = repr(
-        (config, fine_tuned, imitates, [(path, stat.st_size, stat.st_mtime_ns) for path, stat in files])
-    )
+    how = {"fine_tuned": fine_tuned, "imitates": imitates, "learns": learns}
+    of_files = [(path, stat.st_size, stat.st_mtime_ns) for path, stat in files]
+    acts, key = (repr((config, asked, of_files)) for asked in (how | {"learns": False}, how))
     if key not in _rehearsed:
-        single = replace(config, precision="fp32")
-        _rehearsed[key] = Sizes(*rehearsed(single, sizes_of, fine_tuned=fine_tuned, imitates=imitates))
+        sizes = rehearsed(replace(config, precision="fp32"), sizes_of, **how)
+        _rehearsed[acts] = _rehearsed[key] = Sizes(*sizes)
     return _rehearsed[key]
 
 
 def rehearsed[T](
-    config: PolicyConfig, task: Callable[[Any], T], *, fine_tuned: bool = False, imitates: bool = False
+    config: PolicyConfig,
+    task: Callable[[Any], T],
+    *,
+    fine_tuned: bool = False,
+    imitates: bool = False,
+    learns: bool = False,
 ) -> T:
     """Result, which JSON can hold, of `task` with the policy of `policy_sizes`, in a child process."""
     precision = precision_on(resolve_device(config.device), config.precision)
@@ -156,7 +164,7 @@ def rehearsed[T](
     folder = weights_folder(_checkpoint_folder(config), origin)  # its size sets the limits
 
     def act() -> T:
-        load = partial(load_adapter, explores=False) if imitates else load_acting
+        load = partial(load_adapter, explores=False) if imitates else partial(load_acting, learns=learns)
         return task(load(there, rehearsal=True, fine_tuned=fine_tuned))
 
     return rehearse(act, folder, origin)
@@ -168,12 +176,16 @@ def sizes_of(adapter: Any) -> Sizes:
 
 
 def load_acting(
-    config: PolicyConfig, *, rehearsal: bool = False, fine_tuned: bool = False
+    config: PolicyConfig, *, rehearsal: bool = False, fine_tuned: bool = False, learns: bool = False
 ) -> LeRobotAdapter | StockAdapter:
-    """A policy of any of LeRobot's types: one that can learn by `load_adapter`, another one to act only."""
+    """A policy of any of LeRobot's types: one with an exact likelihood by `load_adapter`, another to act only.
+
+    If it `learns`, one of a type with a likelihood must have it.
+    """
     lerobot_config = load_lerobot_config(config)
     if lerobot_config.type in POLICIES:
-        return load_adapter(config, rehearsal=rehearsal, fine_tuned=fine_tuned, explores=False)
+        with contextlib.suppress(*(() if learns else (NoDensityError,))):
+            return load_adapter(config, rehearsal=rehearsal, fine_tuned=fine_tuned, explores=False)
     return _stock_adapter(config, lerobot_config, None, rehearsal, fine_tuned)
 
 

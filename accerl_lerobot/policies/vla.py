@@ -46,7 +46,7 @@ from torch import Tensor
 from accerl_lerobot.checkpoint.layout import BACKBONE_FILES
 from accerl_lerobot.checkpoint.safety import FileSource, matching_files
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.policies.family import Encoded
+from accerl_lerobot.policies.family import Encoded, NoDensityError
 from accerl_lerobot.policies.flow import FlowModel, Velocity, flow_shape
 from accerl_lerobot.policies.tokens import Choose, TokenContext, TokenModel
 
@@ -80,7 +80,9 @@ class SmolVLA(FlowModel):
     def __init__(self, policy: Any) -> None:
         super().__init__(policy)
         if policy.config.adapt_to_pi_aloha:
-            raise InputError("policy.adapt_to_pi_aloha", True, "not supported in RL; train one without it")
+            raise NoDensityError(
+                "policy.adapt_to_pi_aloha", True, "not supported in RL; train one without it"
+            )
         self.shape = flow_shape(policy.config, policy.config.num_steps)
         self.width = policy.model.vlm_with_expert.config.text_config.hidden_size
 
@@ -225,7 +227,8 @@ class Pi0Fast(TokenModel):
         config, tokenizer = policy.config, policy._paligemma_tokenizer
         if config.temperature != 0:
             hint = "LeRobot's sampler has to be greedy here: set it to 0 in config.json; exploration has a "
-            raise InputError("policy.temperature", config.temperature, f"{hint}policy.sampler.temperature")
+            hint += "policy.sampler.temperature"
+            raise NoDensityError("policy.temperature", config.temperature, hint)
         if config.n_action_steps != (rows := config.chunk_size):
             # The coefficients of K rows, read as those of fewer, are another, faster and larger movement.
             hint = f"LeRobot decodes so many rows from the coefficients of {rows}; use {rows}"

@@ -40,11 +40,17 @@ KINDS: dict[str, dict[str, Any]] = {
         "n_pi_samples": 4, "n_elites": 4, "image_encoder_hidden_dim": 8, "state_encoder_hidden_dim": 16,
         "latent_dim": 8, "mlp_dim": 16, "q_ensemble_size": 2, "max_random_shift_ratio": 0.0,
     },
+    "act": {
+        "temporal_ensemble_coeff": 0.1, "chunk_size": 4, "n_action_steps": 1, "dim_model": 16, "n_heads": 2,
+        "dim_feedforward": 16, "latent_dim": 4, "n_encoder_layers": 1, "n_vae_encoder_layers": 1,
+        "pretrained_backbone_weights": None,
+    },
 }  # fmt: skip
+"""The last one is of a type that has a likelihood, with an option that has none."""
 
 
 FRONT = "observation.images.front"
-CAMERAS = {"vqbet": FRONT, "tdmpc": "observation.image"}  # LeRobot's TD-MPC knows this one only
+CAMERAS = {"vqbet": FRONT, "tdmpc": "observation.image", "act": FRONT}  # LeRobot's TD-MPC knows this one only
 
 
 def config_of(path: Path, kind: str) -> PolicyConfig:
@@ -104,6 +110,7 @@ def test_what_cannot_learn_is_evaluated_and_refused_in_one_line(written: Any, tm
     policies = {
         "tdmpc": [f"--policy.path={written('tdmpc')}", renames],
         "vqbet": [f"--policy.path={written('vqbet')}"],
+        "act": [f"--policy.path={written('act')}"],
     }
     evaluation = ["--evaluation.episodes=2", f"--output_dir={tmp_path / 'eval'}"]
     assert cli.main(["eval", *fields, *policies["tdmpc"], *evaluation]) == 0
@@ -119,11 +126,14 @@ def test_what_cannot_learn_is_evaluated_and_refused_in_one_line(written: Any, tm
     for kind, algorithm, why in (
         ("tdmpc", "gipo", "algorithm.type=gipo needs exact likelihoods, which smolvla, act, .* have here"),
         ("tdmpc", "self_imitation", "LeRobot trains it on what follows a chunk"),
+        ("act", "gipo", ".*averaging over earlier chunks"),
+        ("act", "awr", ".*averaging over earlier chunks"),
         ("vqbet", "awr", "awr's critic reads the policy's features, which are not known; use chunk_critic"),
     ):
         assert cli.main([*train, *policies[kind], f"--algorithm.type={algorithm}"]) == 2
         error = capsys.readouterr().err.strip().splitlines()[-1]
-        assert re.search(f"policy.type='{kind}': {why}", error), error
+        field = "policy.temporal_ensemble_coeff='0.1'" if kind == "act" else f"policy.type='{kind}'"
+        assert re.search(f"{field}: {why}", error), error
     assert not (tmp_path / "new").exists()
 
 
