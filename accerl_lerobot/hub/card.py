@@ -31,7 +31,7 @@ from accerl_lerobot.checkpoint.layout import (
 )  # fmt: skip
 from accerl_lerobot.checkpoint.layout import CONFIG as RECIPE
 from accerl_lerobot.config.parsing import read_recipe
-from accerl_lerobot.config.ranges import NewFolder, Pattern, Section
+from accerl_lerobot.config.ranges import DatasetConfig, NewFolder, Pattern, Section
 from accerl_lerobot.console import number
 from accerl_lerobot.envs.base import lerobot_eval_arguments
 from accerl_lerobot.errors import InputError
@@ -40,6 +40,7 @@ from accerl_lerobot.policies.config import discovery
 POLICY, WORLD_MODEL, DATASET = "policy", "world model", "dataset"
 
 CONFIG, WEIGHTS, POSTPROCESSOR = "config.json", "model.safetensors", "policy_postprocessor.json"
+ADAPTER_CONFIG, ADAPTER = "adapter_config.json", "adapter_model.safetensors"
 INFO, CARD = "meta/info.json", "README.md"
 RECORD = "accerl_pulled.json"  # file that a pull adds: the commit that the others are from
 NEEDED = {
@@ -94,11 +95,23 @@ def recognise(folder: Path, field: str = "path") -> str:
     artifact = likely([INFO] if (folder / INFO).exists() else [], read_json(folder / CONFIG))
     if artifact is None:
         raise InputError(field, str(folder), _hint(folder))
-    missing = [name for name in NEEDED[artifact] if not (folder / name).exists()]
+    if artifact == DATASET:
+        from accerl_lerobot.demos.dataset_files import OLD_VERSION, another_version
+
+        if OLD_VERSION.match(str(read_json(folder / INFO).get("codebase_version"))):
+            old = DatasetConfig(repo_id="USER/NAME", root=str(folder))
+            raise InputError(field, str(folder), another_version(old).remedy)
+    needed = (ADAPTER if name == WEIGHTS and is_adapter(folder) else name for name in NEEDED[artifact])
+    missing = [name for name in needed if not (folder / name).exists()]
     if missing:
         hint = f"looks like a {artifact} but lacks {', '.join(missing)}; name a complete folder"
         raise InputError(field, str(folder), hint)
     return artifact
+
+
+def is_adapter(folder: Path) -> bool:
+    """True for an adapter of LeRobot's PEFT training, whose policy is elsewhere."""
+    return (folder / ADAPTER_CONFIG).is_file() and not (folder / WEIGHTS).is_file()
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -138,6 +151,7 @@ KEPT = {
 CONTENTS = {
     POLICY: (
         CONFIG, "train_config.json", "model*.safetensors", "model.safetensors.index.json",
+        ADAPTER_CONFIG, ADAPTER,
         "policy_*processor.json", "*processor_step_*.safetensors",
         "accerl.json", "value_head.safetensors", "family.safetensors",
         *(f"{own}/{name}" for own in (BACKBONE, FAST) for name in BACKBONE_FILES + BACKBONE_WEIGHTS),

@@ -171,6 +171,8 @@ def contents(folder: Path, artifact: str) -> card.Files:
         if (folder / card.RECORD).is_file():
             layout.check_names(folder, origin)
         _bring_backbone(files, folder)
+        if card.is_adapter(folder):
+            _check_base(folder)
     for name, content in files.items():
         if is_record(name):
             data = content if isinstance(content, bytes) else content.read_bytes()
@@ -201,6 +203,17 @@ def _bring_backbone(files: card.Files, home: Path) -> None:
     if json.dumps([config, processor]) != before:
         files[card.CONFIG] = (json.dumps(config, indent=4) + "\n").encode()
         files[layout.PREPROCESSOR] = (json.dumps(processor, indent=4) + "\n").encode()
+
+
+def _check_base(folder: Path) -> None:
+    """Refuses an adapter of a policy that is on this machine, or that it does not name."""
+    base = card.read_json(folder / card.ADAPTER_CONFIG).get("base_model_name_or_path")
+    if not re.fullmatch(card.REPO_ID, str(base)) or Path(str(base)).exists():
+        why = (
+            f"it is an adapter of {base!r}, which others cannot load; push that policy first, then write its"
+        )
+        remedy = f"{why} name on the Hub into {card.ADAPTER_CONFIG} as base_model_name_or_path"
+        raise InputError("path", str(folder), remedy)
 
 
 def is_record(name: str) -> bool:

@@ -90,6 +90,21 @@ def test_only_what_belongs_to_a_policy_is_pushed(tmp_path: Path, caplog: pytest.
     assert "not pushed, as no part of a policy: id_rsa, passwords.json" in caplog.text
 
 
+def test_an_adapter_is_pushed_where_others_have_its_policy(tmp_path: Path):
+    folder = write_policy_folder(tmp_path / "policy", use_peft=True)
+    (folder / "model.safetensors").rename(folder / "adapter_model.safetensors")
+    write_json(folder / "adapter_config.json", {"base_model_name_or_path": "lerobot/smolvla_base"})
+    assert recognise(folder) == "policy"
+    assert {"adapter_config.json", "adapter_model.safetensors"} <= contents(folder, "policy").keys()
+    for base in (str(tmp_path / "base"), None):
+        write_json(folder / "adapter_config.json", {"base_model_name_or_path": base})
+        with pytest.raises(InputError, match=r"is an adapter of .*push that policy first"):
+            contents(folder, "policy")
+    (folder / "adapter_model.safetensors").unlink()
+    with pytest.raises(InputError, match="looks like a policy but lacks adapter_model.safetensors"):
+        recognise(folder)
+
+
 @pytest.mark.parametrize(
     "name", ["config.json", "accerl.json", "backbone", "backbone/tokenizer.json", "README.md", "accerl_run"]
 )
