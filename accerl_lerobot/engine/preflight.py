@@ -498,10 +498,12 @@ def sft_policy(config: SFTConfig) -> Any:
 
     from accerl_lerobot.checkpoint.safety import FileSource, read_json
     from accerl_lerobot.policies.config import check_sizes, register_policies
+    from accerl_lerobot.policies.peft_adapters import weights_folder
     from accerl_lerobot.policies.untrusted import CONFIG, fetched_checkpoint, reason
 
     folder = fetched_checkpoint(config.init_path, None, "sft.init_path")
     origin = FileSource("sft.init_path", config.init_path)
+    weights_folder(folder, origin)  # what an adapter is for
     register_policies(str(read_json(folder / CONFIG, origin).get("type")))
     try:
         policy = PreTrainedConfig.from_pretrained(folder)

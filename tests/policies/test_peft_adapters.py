@@ -12,8 +12,11 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from accerl_lerobot.demos.sft import SFTConfig
+from accerl_lerobot.engine.preflight import sft_policy
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import stack_observations
+from accerl_lerobot.policies import peft_adapters
 from accerl_lerobot.policies.config import PolicyConfig, TuningConfig
 from accerl_lerobot.policies.loading import load_adapter, policy_sizes
 from accerl_lerobot.policies.saving import save_pretrained
@@ -101,6 +104,25 @@ def test_an_adapter_without_its_policy_is_refused(copied: Path, tmp_path: Path):
     ):
         file.write_text(json.dumps(stored | {"base_model_name_or_path": base}))
         refused(copied, why)
+        with pytest.raises(InputError, match=f"^sft.init_path=.*{why}"):
+            sft_policy(SFTConfig(init_path=str(copied)))
+
+
+def test_the_policy_of_an_adapter_is_of_the_revision_that_it_names(
+    copied: Path, monkeypatch: pytest.MonkeyPatch
+):
+    file = copied / "adapter_config.json"
+    stored = json.loads(file.read_text())
+    file.write_text(json.dumps(stored | {"base_model_name_or_path": "me/base", "revision": "a" * 40}))
+    asked: list[tuple[Any, ...]] = []
+
+    def fetched(*where: Any) -> Path:
+        asked.append(where)
+        return Path(stored["base_model_name_or_path"])
+
+    monkeypatch.setattr(peft_adapters, "fetched_checkpoint", fetched)
+    load_adapter(PolicyConfig(path=str(copied), device="cpu"))
+    assert set(asked) == {("me/base", "a" * 40, "policy.path")}
 
 
 def test_an_adapter_of_another_policy_is_refused(copied: Path):
