@@ -58,7 +58,7 @@ AGAIN = "get the dataset again"
 
 def open_metadata(dataset: DatasetConfig) -> Any:
     """LeRobot's metadata of a local or Hub dataset; anything wrong with it is one line."""
-    from lerobot.datasets.dataset_metadata import CODEBASE_VERSION, LeRobotDatasetMetadata
+    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
     from lerobot.datasets.utils import CompatibilityError
 
     name, root = dataset.repo_id, dataset.root
@@ -70,18 +70,16 @@ def open_metadata(dataset: DatasetConfig) -> Any:
         root = str(expanded(root, "dataset.root"))
         if not (Path(root) / INFO).is_file():
             raise InputError("dataset.root", root, f"no {INFO} there; give the folder of a LeRobotDataset v3")
+        info = read_json(Path(root) / INFO, origin_of(dataset))
+        if OLD_VERSION.match(str(info.get("codebase_version"))):  # LeRobot would warn of its fields first
+            raise another_version(dataset)
     try:
         with checked(origin_of(dataset), whole=root is not None):
             meta = LeRobotDatasetMetadata(name, root=root, revision=dataset.revision)
     except InputError:
         raise
     except (CompatibilityError, NotImplementedError) as error:
-        tool = f"python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id={name}"
-        tool += f" --root={root}" * (root is not None) + " --push-to-hub=false"
-        hint = (
-            f"its format is not {CODEBASE_VERSION}, which this LeRobot reads; from v2.1 convert with: {tool}"
-        )
-        raise InputError("dataset.repo_id", name, hint) from error
+        raise another_version(dataset) from error
     except Exception as error:  # LeRobot may fail over anything in the files
         if root is None and isinstance(error, (OSError, ValueError)):
             hint = f"not found locally nor on the Hub ({brief(error)})"
@@ -90,6 +88,17 @@ def open_metadata(dataset: DatasetConfig) -> Any:
     if meta.episodes is None or meta.tasks is None:
         raise origin_of(dataset).refuse(INFO, "it has no episodes, or no tasks; name a dataset that has some")
     return meta
+
+
+def another_version(dataset: DatasetConfig) -> InputError:
+    """The error of a dataset in another version of the format."""
+    from lerobot.datasets.dataset_metadata import CODEBASE_VERSION
+
+    tool = f"python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id={dataset.repo_id}"
+    if dataset.root is not None:
+        tool += f" --root={expanded(dataset.root, 'dataset.root')}"
+    why = f"its format is not {CODEBASE_VERSION}, which this LeRobot reads; from v2.1 convert with: {tool}"
+    return InputError("dataset.repo_id", dataset.repo_id, f"{why} --push-to-hub=false")
 
 
 @contextlib.contextmanager

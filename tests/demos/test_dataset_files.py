@@ -29,6 +29,7 @@ from accerl_lerobot.demos.dataset_files import (
     task_texts,
 )
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.hub.card import recognise
 from accerl_lerobot.policies.features import dataset_features
 from tests.tiny_datasets import FRONT, IMAGE, STEPS, edit_json, rewrite, write_dataset, write_old
 
@@ -87,6 +88,8 @@ def test_another_format_version(copied: Path, version: str):
     edit(copied, codebase_version=version)
     with pytest.raises(InputError, match="^dataset.repo_id='a/b': its format is not v3.0.* convert with: "):
         open_metadata(DatasetConfig(repo_id="a/b", root=str(copied)))
+    with pytest.raises(InputError, match="^path='.*': its format is not v3.0.* convert with: .* --root=/"):
+        recognise(copied)
 
 
 @pytest.mark.parametrize(
@@ -324,12 +327,15 @@ def test_a_missing_data_file_is_named_and_the_hub_is_not_asked(
         opened(dataset, meta).__enter__()
 
 
-def test_an_old_dataset_is_told_the_command_that_converts_it(tmp_path: Path):
+def test_an_old_dataset_is_told_the_command_that_converts_it(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
     new = Path(str(write_dataset(tmp_path / "new", more={FRONT: IMAGE}).root))
     old = write_old(new, tmp_path / "old")
     dataset = DatasetConfig(repo_id="a/b", root=str(old))
     with pytest.raises(InputError, match="its format is not v3.0") as caught:
         open_metadata(dataset)
+    assert not caplog.records, "LeRobot warns of its fields"
     command = caught.value.hint.rpartition("convert with: python ")[2].split()
     subprocess.run([sys.executable, *command], check=True, capture_output=True)
     assert open_metadata(dataset).total_frames == 2 * STEPS
