@@ -14,8 +14,10 @@ import dataclasses
 import difflib
 import gc
 import importlib
+import importlib.metadata
 import json
 import os
+import re
 import shlex
 import sys
 import typing
@@ -43,6 +45,8 @@ from accerl_lerobot.errors import InputError, expanded
 
 DISCOVER = "discover_packages_path"
 """LeRobot's name for the field that names a package whose import registers new types."""
+PLUGINS = ("lerobot_robot_", "lerobot_camera_", "lerobot_teleoperator_", "lerobot_policy_", "lerobot_env_")
+"""Beginnings of the names of installed packages that LeRobot imports to have their types registered."""
 
 
 def imported(path: str) -> Any:
@@ -73,6 +77,26 @@ def discover(package: str | None, section: str = "") -> None:
         if isinstance(error, ModuleNotFoundError) and error.name == package.partition(".")[0]:
             why += "; install it, or name the folder that it is in: PYTHONPATH=FOLDER accerl …"
         raise InputError(field, package, why) from error
+
+
+def import_plugins(*prefixes: str) -> dict[str, str]:
+    """Imports the installed packages whose names begin so; words on each one that cannot be imported.
+
+    LeRobot's `register_third_party_plugins` logs the traceback of each that is broken, wanted or not.
+    """
+    broken: dict[str, str] = {}
+    for distribution in importlib.metadata.distributions():
+        package = re.sub(r"[-.]", "_", distribution.metadata["Name"] or "").lower()
+        if package.startswith(prefixes):
+            try:
+                importlib.import_module(package)
+            except (Exception, SystemExit) as error:  # it is somebody's code, which may do anything
+                broken[package] = not_imported(package, error)
+    return broken
+
+
+def not_imported(package: str, error: BaseException) -> str:
+    return f"{package} is installed and cannot be imported ({type(error).__name__}: {brief(error)})"
 
 
 LARGEST_RECIPE = 2**18  # bytes of a recipe at most

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from accerl_lerobot.config.parsing import PLUGINS, import_plugins
 from accerl_lerobot.envs.base import EnvConfig, EnvironmentSpec
 from accerl_lerobot.envs.gym_env import GymnasiumConfig, GymnasiumEnvironment
 from accerl_lerobot.errors import InputError
@@ -71,14 +72,14 @@ class LeRobotEnvironment(GymnasiumEnvironment):
     def __init__(self, config: LeRobotEnvConfig) -> None:
         from lerobot.envs.configs import EnvConfig as LeRobotConfig
         from lerobot.envs.factory import make_env
-        from lerobot.utils.import_utils import register_third_party_plugins
 
         self.config = config
-        if config.name not in LeRobotConfig.get_known_choices():
-            register_third_party_plugins()
-        known = LeRobotConfig.get_known_choices()
+        known, broken = LeRobotConfig.get_known_choices(), dict[str, str]()
         if config.name not in known:
-            raise InputError("env.name", config.name, f"LeRobot has: {', '.join(known)}")
+            broken = import_plugins(*PLUGINS)
+        if config.name not in known:
+            words = "; ".join([*broken.values(), f"LeRobot has: {', '.join(known)}"])
+            raise InputError("env.name", config.name, words)
         fields = {own.name for own in dataclasses.fields(known[config.name])}
         limit = {_LIMIT: config.max_steps} if config.max_steps and _LIMIT in fields else {}
         self._fields = f"LeRobot's {config.name} has the fields {', '.join(sorted(fields - _INTERNAL))}"
@@ -109,11 +110,11 @@ class LeRobotEnvironment(GymnasiumEnvironment):
         images: dict[str, Any] = {k: np.shape(v) for k, v in observation.items() if k.startswith(_IMAGE)}
         if not images or _STATE not in observation:
             shown = ", ".join(k for k in observation if k != TASK) or "neither"
-            hint = f"a policy needs images and a state, {self.config.name} shows {shown}"
+            why = f"a policy needs images and a state, {self.config.name} shows {shown}"
             hint = self._fields
             if hasattr(self._lerobot_config, "obs_type"):
                 hint = "use obs_type=pixels_agent_pos"
-            raise InputError("env.kwargs", self.config.kwargs, f"{hint}; {hint}")
+            raise InputError("env.kwargs", self.config.kwargs, f"{why}; {hint}")
         space = self.environments[self._task].action_space
         return EnvironmentSpec(
             images=images, state_dim=len(observation[_STATE]), action_dim=space.shape[0],

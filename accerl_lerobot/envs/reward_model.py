@@ -17,6 +17,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from accerl_lerobot.checkpoint.safety import FileSource, brief, tensor_shapes
+from accerl_lerobot.config.parsing import PLUGINS, import_plugins
 from accerl_lerobot.config.ranges import Commit, Range, Section
 from accerl_lerobot.envs.base import ChunkResult, Environment, WrappedEnvironment
 from accerl_lerobot.errors import InputError
@@ -48,7 +49,6 @@ def load_judge(config: RewardModelConfig) -> Callable[[Observation], bool]:
     from lerobot.configs.rewards import RewardModelConfig as LeRobotConfig
     from lerobot.processor import PolicyProcessorPipeline
     from lerobot.rewards.factory import get_reward_model_class
-    from lerobot.utils.import_utils import register_third_party_plugins
 
     from accerl_lerobot.policies import untrusted
 
@@ -59,7 +59,7 @@ def load_judge(config: RewardModelConfig) -> Callable[[Observation], bool]:
     if len(names) != 1:
         raise origin.refuse("*_preprocessor.json", f"{len(names)} of them; lerobot-train writes one")
     untrusted.check_processor(folder, names[0], origin)
-    register_third_party_plugins()
+    import_plugins(*PLUGINS)
     try:
         trusted = config.trust_remote_code
         with untrusted.guarded(REWARD_MODEL, trusted), contextlib.redirect_stdout(sys.stderr):

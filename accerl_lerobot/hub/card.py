@@ -100,7 +100,7 @@ def recognise(folder: Path, field: str = "path") -> str:
 
         if OLD_VERSION.match(str(read_json(folder / INFO).get("codebase_version"))):
             old = DatasetConfig(repo_id="USER/NAME", root=str(folder))
-            raise InputError(field, str(folder), another_version(old).remedy)
+            raise InputError(field, str(folder), another_version(old).hint)
     needed = (ADAPTER if name == WEIGHTS and is_adapter(folder) else name for name in NEEDED[artifact])
     missing = [name for name in needed if not (folder / name).exists()]
     if missing:

@@ -212,8 +212,8 @@ def _check_base(folder: Path) -> None:
         why = (
             f"it is an adapter of {base!r}, which others cannot load; push that policy first, then write its"
         )
-        remedy = f"{why} name on the Hub into {card.ADAPTER_CONFIG} as base_model_name_or_path"
-        raise InputError("path", str(folder), remedy)
+        hint = f"{why} name on the Hub into {card.ADAPTER_CONFIG} as base_model_name_or_path"
+        raise InputError("path", str(folder), hint)
 
 
 def is_record(name: str) -> bool:

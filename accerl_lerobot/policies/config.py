@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import importlib
-import importlib.metadata
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -12,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import draccus
 
-from accerl_lerobot.checkpoint.safety import FileSource, brief
-from accerl_lerobot.config.parsing import imported
+from accerl_lerobot.checkpoint.safety import FileSource
+from accerl_lerobot.config.parsing import import_plugins, imported, not_imported
 from accerl_lerobot.config.ranges import Commit, Device, Range, Section, check, registered_name
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE
@@ -207,17 +206,7 @@ def register_policies(wanted: str | None = None) -> None:
 
     if wanted is None or wanted in PreTrainedConfig.get_known_choices():
         return
-    for distribution in importlib.metadata.distributions():
-        package = re.sub(r"[-.]", "_", distribution.metadata["Name"] or "").lower()
-        if package.startswith("lerobot_policy_"):
-            try:
-                importlib.import_module(package)
-            except (Exception, SystemExit) as error:  # it is somebody's code, which may do anything
-                NOT_IMPORTED[package] = _not_imported(package, error)
-
-
-def _not_imported(package: str, error: BaseException) -> str:
-    return f"{package} is installed and cannot be imported ({type(error).__name__}: {brief(error)})"
+    NOT_IMPORTED.update(import_plugins("lerobot_policy_"))
 
 
 def check_registered(policy_type: Any, field: str, prefix: str = "") -> None:
@@ -233,7 +222,7 @@ def check_registered(policy_type: Any, field: str, prefix: str = "") -> None:
         try:
             importlib.import_module(package)
         except (Exception, SystemExit) as error:  # it has registered the type, and then failed
-            raise InputError(field, policy_type, prefix + _not_imported(package, error)) from error
+            raise InputError(field, policy_type, prefix + not_imported(package, error)) from error
         return
     install = "install the package that has it, or name it: policy.discover_packages_path"
     broken = "; ".join(NOT_IMPORTED.values())

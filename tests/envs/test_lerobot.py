@@ -98,6 +98,21 @@ def test_bad_values_name_field_and_remedy(values: dict, message: str):
         make_environment(LeRobotEnvConfig(**values))
 
 
+def test_a_package_that_is_broken_is_told_in_the_line_of_an_unknown_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    """LeRobot would log its traceback, and the line would not name it."""
+    (tmp_path / "lerobot_env_theirs.py").write_text("import no_such_module_of_theirs")
+    (tmp_path / "lerobot_env_theirs-1.0.dist-info").mkdir()
+    text = "Metadata-Version: 2.1\nName: lerobot-env-theirs\nVersion: 1.0\n"
+    (tmp_path / "lerobot_env_theirs-1.0.dist-info" / "METADATA").write_text(text)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    why = "lerobot_env_theirs is installed and cannot be imported .ModuleNotFoundError: No module named"
+    with pytest.raises(InputError, match=f"env.name='theirs': {why} .*; LeRobot has: "):
+        make_environment(LeRobotEnvConfig(name="theirs"))
+    assert not caplog.records
+
+
 @pytest.fixture
 def plugin():
     pytest.importorskip("metaworld")
