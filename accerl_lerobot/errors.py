@@ -138,9 +138,9 @@ def make_folder(path: Path, field: str, *, again: bool = False) -> None:
 
 
 @functools.cache
-def warn_once(text: str) -> None:
-    """Warns, unless this process has warned so before."""
-    logger.warning(text)
+def warn_once(text: str, name: str = __name__) -> None:
+    """Warns by the logger of this name, unless this process has warned so before."""
+    logging.getLogger(name).warning("%s", text)
 
 
 @contextmanager
@@ -205,23 +205,34 @@ class ChildWarning(NamedTuple):
     text: str
 
 
+class Once(logging.Filter):
+    """Passes each distinct warning of this package once, whatever process or place it comes from."""
+
+    def __init__(self) -> None:
+        super().__init__(PACKAGE)
+        self._passed: set[str] = set()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        if record.levelno != logging.WARNING or not super().filter(record):
+            return True
+        known = (text := record.getMessage()) in self._passed
+        self._passed.add(text)
+        return not known
+
+
 class _Collector(logging.Handler):
-    """Keeps each distinct warning of this package until it is handed over."""
+    """Keeps the warnings of this package until they are handed over."""
 
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
-        self.known: set[ChildWarning] = set()
+        self.addFilter(Once())
         self.new: deque[ChildWarning] = deque()
 
     def emit(self, record: logging.LogRecord) -> None:
-        warning = ChildWarning(record.name, record.getMessage()[:LONGEST_HANDED])
-        if warning not in self.known:
-            self.known.add(warning)
-            self.new.append(warning)
+        self.new.append(ChildWarning(record.name, record.getMessage()[:LONGEST_HANDED]))
 
 
 _collector = _Collector()
-_shown: set[ChildWarning] = set()
 
 
 def collect_warnings() -> None:
@@ -238,9 +249,7 @@ def collected_warnings(worker: object = None) -> list[ChildWarning]:
 def show_warnings(warnings: Iterable[Any]) -> None:
     """Log warnings of other processes, each once."""
     for warning in map(ChildWarning._make, warnings):
-        if warning not in _shown:
-            _shown.add(warning)
-            logging.getLogger(warning.logger).warning("%s", warning.text)
+        warn_once(warning.text, warning.logger)
 
 
 def error_as_json(error: BaseException) -> dict[str, Any]:

@@ -93,7 +93,7 @@ def test_a_run_ends_by_itself_and_closing_leaves_no_process(engine):
 
 def test_a_warning_of_workers_is_shown_once_also_in_a_short_evaluation(engine, monkeypatch, caplog):
     monkeypatch.setattr(rollout_worker, "RolloutWorker", WarningRollout)
-    monkeypatch.setattr(errors, "_shown", set())
+    errors.warn_once.cache_clear()
     one = engine(rollout=TWO)
     one.plan(evaluation_plans(("match",), 2, "eval"))
     collect(one, "eval", 2)

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +14,12 @@ from accerl_lerobot.checkpoint.layout import saved_version
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine import loop, resuming, run
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig
-from accerl_lerobot.engine.loop import Engine, Progress, Saved
+from accerl_lerobot.engine.loop import Engine, Progress, Saved, run_plans
 from accerl_lerobot.engine.preflight import check_start
 from accerl_lerobot.engine.stopping import WorkerError
 from accerl_lerobot.envs import SimulatedConfig
-from accerl_lerobot.evaluation import EvaluationConfig
+from accerl_lerobot.errors import warn_once
+from accerl_lerobot.evaluation import EvaluationConfig, evaluation_plans
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.trainer.config import TrainerConfig
@@ -238,6 +239,22 @@ def test_an_evaluation_that_ends_after_training_is_not_lost(
     # What is stepped to evaluate after training is no experience that was learned from.
     assert summary["env_steps"] == found[-1]["env_steps"] == found[-2]["env_steps"] == 12 * 10
     assert engine.closed and (tmp_path / "checkpoints" / "last").is_symlink()
+
+
+def test_a_note_is_told_at_its_first_episode_and_counted_at_the_end_of_an_evaluation(
+    tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    warn_once.cache_clear()
+    noted = replace(
+        _succeeded(evaluation_plans(("match",), 1, "eval")[0]), note="env.success='won': no such key"
+    )
+    engine = Scripted(local_run(tiny_checkpoint, tmp_path))
+    monkeypatch.setattr(engine, "poll", lambda: Progress(version=0, episodes=[noted, noted]))
+    for _ in range(2):
+        run_plans(engine, 4, "eval", Console())
+    said = [r.getMessage() for r in caplog.records if r.levelname == "WARNING"]
+    counted = "evaluation (eval), 4 of 4 episodes: env.success='won'"
+    assert said == [noted.note, counted, counted]
 
 
 def losing(monkeypatch: pytest.MonkeyPatch, config: RunConfig, lost_at: list[int]) -> list[Scripted]:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 
 from accerl_lerobot import __version__
 from accerl_lerobot.engine.stopping import TerminatedError, interrupted
-from accerl_lerobot.errors import InputError, one_line, printable
+from accerl_lerobot.errors import InputError, Once, one_line, printable
 
 LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR")
 VERBS = {
@@ -150,23 +150,8 @@ def set_up_logging() -> None:
         raise InputError("ACCERL_LOG", level, f"use {', '.join(LEVELS)}")
     handler = logging.StreamHandler()
     handler.setFormatter(_Printable("%(levelname)s %(name)s: %(message)s"))
-    handler.addFilter(_Once())
+    handler.addFilter(Once())
     logging.basicConfig(level=level, handlers=[handler])
-
-
-class _Once(logging.Filter):
-    """Passes each distinct warning of this package once: the run's process and its workers may give it."""
-
-    def __init__(self) -> None:
-        super().__init__("accerl_lerobot")
-        self._passed: set[str] = set()
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        if record.levelno != logging.WARNING or not super().filter(record):
-            return True
-        known = (text := record.getMessage()) in self._passed
-        self._passed.add(text)
-        return not known
 
 
 class _Printable(logging.Formatter):

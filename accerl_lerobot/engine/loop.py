@@ -9,7 +9,7 @@ import math
 import shutil
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,6 +20,7 @@ from accerl_lerobot.checkpoint import layout, snapshot
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.stopping import Stopping
+from accerl_lerobot.errors import warn_once
 from accerl_lerobot.evaluation import (
     before_after,
     evaluation_plans,
@@ -118,12 +119,20 @@ def run_plans(
     with console.stage(f"evaluation ({group})", total=count) as stage:
         while len(results) < count:
             progress = engine.poll()
-            results += [e for e in progress.episodes if e.plan.group == group]
+            ended = [e for e in progress.episodes if e.plan.group == group]
+            _warn_of_notes(ended)
+            results += ended
             on_progress(progress)
             stage.update(len(results), f"{np.mean([r.success for r in results]):.0%}" if results else "")
-    for note in notes(results):
-        logger.warning("evaluation (%s), %s", group, note)
+    for note in notes(results):  # their first words, as all of them were told with the first such episode
+        logger.warning("evaluation (%s), %s", group, ": ".join(note.split(": ")[:2]))
     return sorted(results, key=lambda r: r.plan.index)
+
+
+def _warn_of_notes(episodes: Iterable[EpisodeResult]) -> None:
+    for episode in episodes:
+        if episode.note:
+            warn_once(episode.note)
 
 
 @dataclass(kw_only=True)
@@ -312,6 +321,7 @@ class Loop:
         explored = [e for e in progress.episodes if e.plan.explore]
         self.explored += len(explored)
         self.won += sum(e.success for e in explored)
+        _warn_of_notes(progress.episodes)
         self.note = next((e.note for e in reversed(explored) if e.note), self.note)
         self._check_hope(HOPELESS)
         self.recent = (self.recent + [e.success for e in explored])[-RECENT:]

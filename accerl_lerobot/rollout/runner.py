@@ -381,8 +381,6 @@ class RolloutRunner:
 
     def _finish(self, episode: ActiveEpisode, success: bool, note: str) -> None:
         self.counters.episodes += 1
-        if note:
-            warn_once(note)
         versions = episode.versions or [0]
         result = EpisodeResult(
             plan=episode.plan,
