@@ -36,6 +36,7 @@ FILM = (
 )
 WARNINGS = {
     "restarts": ("restart", "of a rollout worker, which crashed or hung"),
+    "dropped_episodes": ("episode", "dropped, because the environment returned NaN or infinity"),
     "dropped_nonfinite": ("decision", "thrown away, because the environment returned NaN or infinity"),
     "replay_evicted_unused": ("segment", "left the replay buffer unused because it was full"),
     "replay_retired_unused": ("segment", "left the replay buffer unused, being older than replay.max_lag"),
@@ -204,6 +205,11 @@ def warnings(run: Run, bound: int | None, now: float) -> Iterator[str]:
     for name, (thing, what) in WARNINGS.items():
         if n := int(newest(run.rollout, name) or 0):
             yield f"{count(n, thing)} {what}."
+    for evaluation in run.outcomes:
+        for note in evaluation.get("notes", ()):
+            yield f"Evaluation {evaluation.get('group')}, {note}."
+    if note := (run.result or {}).get("note"):
+        yield f"While exploring, {note}."
     if skipped := int(newest(run.train, "skipped") or 0):
         yield f"{count(skipped, 'update')} skipped, because loss or gradient was not finite."
     if run.train and newest(run.train, "lr") == np.nanmax([0.0, *column(run.train, "lr")]) == 0:

@@ -141,6 +141,8 @@ def _check_evaluation(record: Record) -> None:
     for measured in (record, *(record.get("tasks") or {}).values()):
         low, high = measured["ci95"]
         numbers += [measured["success"], measured["n"], low, high]
+    if {*map(type, record.get("notes", ()))} - {str}:
+        raise TypeError("notes")
     if not np.isfinite(np.array(numbers, dtype=np.float64)).all():
         raise ValueError("a number is missing")
 

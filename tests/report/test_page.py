@@ -16,6 +16,7 @@ import pytest
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine import run
 from accerl_lerobot.engine.config import LaunchConfig
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.report import ReportConfig, write_report
 from accerl_lerobot.report.charts import Chart
@@ -114,6 +115,7 @@ def test_numbers_of_a_known_run(tmp_path: Path) -> None:
     ("numbers", "said"),
     [
         ({"restarts": 2.0}, "2 restarts of a rollout worker"),
+        ({"dropped_episodes": 3.0}, "3 episodes dropped, because the environment returned NaN or infinity"),
         ({"dropped_nonfinite": 1.0}, "1 decision thrown away, because the environment returned NaN"),
         (
             {"replay_retired_unused": 7.0},
@@ -127,6 +129,20 @@ def test_numbers_of_a_known_run(tmp_path: Path) -> None:
 )
 def test_what_went_wrong_is_said(tmp_path: Path, numbers: dict[str, float], said: str) -> None:
     assert said in page_of(write_run(tmp_path / "run", rollout=numbers, train=numbers)).text
+
+
+def test_what_was_noted_of_episodes_is_said(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run")
+    summary, metrics = folder / "summary.json", folder / "metrics.jsonl"
+    summary.write_text(json.dumps(json.loads(summary.read_text()) | {"note": "no such key"}))
+    noted = '"notes": ["3 of 9 episodes: no such key"], "group": "after"'
+    metrics.write_text(metrics.read_text().replace('"group": "after"', noted))
+    text = page_of(folder).text
+    assert "Evaluation after, 3 of 9 episodes: no such key." in text
+    assert "While exploring, no such key." in text and "Evaluation before" not in text
+    metrics.write_text(metrics.read_text().replace('["3 of 9 episodes: no such key"]', "[3]"))
+    with pytest.raises(InputError, match=r"metrics.jsonl is not as a run writes it"):
+        read_run(folder)
 
 
 def test_a_recipe_with_types_of_another_package_is_compared_with_the_usual_defaults(tmp_path: Path) -> None:
