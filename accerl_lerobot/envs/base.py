@@ -234,9 +234,9 @@ def expand_tasks(text: str, groups: Mapping[str, Sequence[str]]) -> tuple[str, .
     for name in (part.strip() for part in text.split(",")):
         if name not in groups and name not in tasks:
             close = difflib.get_close_matches(name, [*tasks, *groups], cutoff=0.4)
-            hint = f"did you mean {' or '.join(close)}? " if close else ""
+            near = f"did you mean {' or '.join(close)}? " if close else ""
             hint = f"use names such as {next(iter(tasks))}, separated by commas, or of {', '.join(groups)}"
-            raise InputError("env.task", text, f"{name!r} is no task; {hint}{hint}")
+            raise InputError("env.task", text, f"{name!r} is no task; {near}{hint}")
         found |= dict.fromkeys(groups.get(name, (name,)))
     return tuple(found)
 

@@ -157,8 +157,8 @@ def check_features(
         if name not in shapes:
             same = [k for k, other in shapes.items() if len(other) == len(shape) and k != ACTION]
             offers = ", ".join(same) or "none"
-            hint = "; choose env.camera (env.images of gym), or map names with policy.rename_map" * image
-            hint += hint * image
+            choose = "; choose env.camera (env.images of gym), or map names with policy.rename_map" + hint
+            hint = choose * image
             raise InputError(field, value, f"no {name} in the {offerer}, which offers {offers}{hint}")
         skip = 1 if image and needed.any_size else len(shape)
         if shapes[name][:skip] != shape[:skip]:
