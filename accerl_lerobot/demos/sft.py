@@ -85,12 +85,18 @@ def sft_command(
     episodes: Sequence[int] | None = None,
 ) -> list[str]:
     """The ``lerobot-train`` command line of this warm start; `episodes`: see `picked`."""
+    from accerl_lerobot.policies.untrusted import is_adapter  # imports torch
+
     policy: dict[str, Any]
+    adapts = False
     if config.init_path is not None:
         stored = read_json(
             Path(config.init_path) / "config.json", FileSource("sft.init_path", config.init_path)
         )
         policy, kind = {"path": config.init_path}, str(stored.get("type"))
+        adapts = is_adapter(Path(config.init_path))
+        if adapts or stored.get("use_peft"):
+            policy["use_peft"] = adapts
     else:
         policy, kind = dict(config.policy), str(config.policy["type"])
         if config.backbone is not None:
@@ -109,6 +115,8 @@ def sft_command(
     command = [sys.executable, "-m", "accerl_lerobot.demos.guarded_train"]
     command += [f"{TRUST}{config.trust_remote_code}"] if config.trust_remote_code else []
     command += [f"--policy.{key}={as_text(value)}" for key, value in policy.items()]
+    # LeRobot writes an adapter's config.json only where it is told of one; the method is the adapter's own.
+    command += ["--peft.method_type=LORA"] if adapts else []
     command += discovery(kind)
     root = None if dataset.root is None else expanded(dataset.root, "dataset.root")
     named = {"repo_id": dataset.repo_id, "root": root, "revision": dataset.revision}

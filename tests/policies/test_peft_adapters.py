@@ -12,7 +12,8 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from accerl_lerobot.demos.sft import SFTConfig
+from accerl_lerobot.config.ranges import DatasetConfig
+from accerl_lerobot.demos.sft import SFTConfig, sft_command
 from accerl_lerobot.engine.preflight import sft_policy
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import stack_observations
@@ -136,6 +137,21 @@ def test_an_adapter_of_another_policy_is_refused(copied: Path):
     refused(copied, "NaN or infinity")
     (copied / "adapter_model.safetensors").rename(copied / "adapter_model.bin")
     refused(copied, "adapter_model.safetensors: is missing, and adapter_model.bin is a pickle")
+
+
+def test_it_is_fine_tuned_as_an_adapter(adapted: Path, tmp_path: Path):
+    """Without ``--peft`` LeRobot loads one and saves it without its ``config.json``."""
+    merged = write_smolvla(tmp_path / "merged")
+    edit_config(merged, use_peft=True)
+    for folder, flags in (
+        (adapted, {"--policy.use_peft=true", "--peft.method_type=LORA"}),
+        (merged, {"--policy.use_peft=false"}),
+        (write_smolvla(tmp_path / "whole"), set()),
+    ):
+        command = sft_command(
+            SFTConfig(init_path=str(folder)), DatasetConfig(repo_id="a/b"), tmp_path, 0, "cpu"
+        )
+        assert {flag for flag in command if "peft" in flag.partition("=")[0]} == flags
 
 
 def test_merged_weights_that_are_still_marked_as_an_adapter_load(tmp_path: Path):
