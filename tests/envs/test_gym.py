@@ -310,7 +310,7 @@ def test_the_installed_package_is_found_by_every_process(tiny_checkpoint: Path, 
     code = (
         "from accerl_lerobot.envs import LeRobotEnvConfig, make_environment\n"
         "environment = make_environment(LeRobotEnvConfig(name='reach', task='Reach the goal'))\n"
-        "print(world.reset(0, 'reach')['observation.state'].shape)\n"
+        "print(environment.reset(0, 'reach')['observation.state'].shape)\n"
     )
     shown = subprocess.run([sys.executable, "-c", code], check=True, env=environment, capture_output=True)
     assert shown.stdout.decode().splitlines()[-1] == "(2,)"
