@@ -133,7 +133,8 @@ def likely(names: Collection[str], config: dict[str, Any]) -> str | None:
 
 
 def _hint(folder: Path) -> str:
-    for below in (f"{CHECKPOINTS}/last/{PRETRAINED}", PRETRAINED, "world_model"):
+    last = f"{CHECKPOINTS}/last/{PRETRAINED}"
+    for below in (last, f"sft/{last}", PRETRAINED, "world_model"):
         if (folder / below).is_dir():
             return f"name the folder {below} in it"
     shapes = [f"a {artifact} has {', '.join(NEEDED[artifact])}" for artifact in NEEDED]

@@ -53,6 +53,9 @@ def test_folders_one_above_say_which_below(tmp_path: Path):
         recognise(run)
     with pytest.raises(InputError, match="name the folder pretrained_model in it"):
         recognise(run / "checkpoints" / "000012")
+    (tmp_path / "tuned" / "sft" / "checkpoints" / "last" / "pretrained_model").mkdir(parents=True)
+    with pytest.raises(InputError, match="name the folder sft/checkpoints/last/pretrained_model in it"):
+        recognise(tmp_path / "tuned")
     (tmp_path / "learnt" / "world_model").mkdir(parents=True)
     with pytest.raises(InputError, match="name the folder world_model in it"):
         recognise(tmp_path / "learnt")
