@@ -178,7 +178,7 @@ def sizes_of(adapter: Any) -> Sizes:
 def load_acting(
     config: PolicyConfig, *, rehearsal: bool = False, fine_tuned: bool = False, learns: bool = False
 ) -> LeRobotAdapter | StockAdapter:
-    """A policy of any of LeRobot's types: one with an exact likelihood by `load_adapter`, another to act only.
+    """A policy of any of LeRobot's types: by `load_adapter` if it has an exact likelihood, else to act only.
 
     If it `learns`, one of a type with a likelihood must have it.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Policies of types without a likelihood act as LeRobot's own loop has them act, and are not trained."""
+"""Policies without a likelihood act as LeRobot's own loop has them act, and are not trained."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ KINDS: dict[str, dict[str, Any]] = {
         "pretrained_backbone_weights": None,
     },
 }  # fmt: skip
-"""The last one is of a type that has a likelihood, with an option that has none."""
+"""Policies that have no likelihood; the last one is of a type that has one otherwise."""
 
 
 FRONT = "observation.images.front"
