@@ -189,6 +189,12 @@ def load_acting(
     return _stock_adapter(config, lerobot_config, None, rehearsal, fine_tuned)
 
 
+def load_network(config: PolicyConfig) -> tuple[Any, Processing]:
+    """LeRobot's policy of any type, and its processors, for another use than to act."""
+    policy, processing, _ = _load_parts(config, load_lerobot_config(config), None, False, False)
+    return policy, processing
+
+
 def _stock_adapter(
     config: PolicyConfig,
     lerobot_config: Any,

@@ -12,7 +12,6 @@ Shapes: B rows, K executed actions of A dims.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 from typing import Any
 
@@ -22,10 +21,10 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.policies.adapter import IMAGES
+from accerl_lerobot.policies.adapter import IMAGES, Processing
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.features import STATE
-from accerl_lerobot.policies.loading import load_acting
+from accerl_lerobot.policies.loading import load_network
 from accerl_lerobot.world_model.config import TDMPCStateConfig
 from accerl_lerobot.world_model.latent import shifted
 from accerl_lerobot.world_model.states import Observations, StateModel, StateSpec, Transitions
@@ -39,8 +38,7 @@ class TDMPCModel(StateModel):
 
     def __init__(self, spec: StateSpec, config: TDMPCStateConfig) -> None:
         super().__init__()
-        adapter = _loaded(config)
-        policy, processing = adapter.policy, adapter.processing
+        policy, processing = _loaded(config)
         self.config, self.keeps_learning = policy.config, config.learn
         self.image = next(iter(self.config.image_features), None)
         self.camera = _camera(spec, self.image, config)
@@ -116,18 +114,18 @@ class TDMPCModel(StateModel):
         return {self.image: np.zeros((count, height, width, channels), np.uint8)}
 
 
-def _loaded(config: TDMPCStateConfig) -> Any:
+def _loaded(config: TDMPCStateConfig) -> tuple[Any, Processing]:
     if config.path is None:
         hint = "give the pretrained_model of a policy that lerobot-train --policy.type=tdmpc has trained"
         raise InputError("world_model.path", None, hint)
     try:
-        adapter = copy.copy(load_acting(PolicyConfig(path=config.path, device="cpu")))
+        policy, processing = load_network(PolicyConfig(path=config.path, device="cpu"))
     except InputError as error:
         field = error.field.replace("policy.", "world_model.", 1)
         raise InputError(field, error.value, error.hint) from error
-    if (kind := adapter.policy.config.type) != "tdmpc":
+    if (kind := policy.config.type) != "tdmpc":
         raise InputError("world_model.path", config.path, f"its type is {kind}; give one of type tdmpc")
-    return adapter
+    return policy, processing
 
 
 def _camera(spec: StateSpec, image: str | None, config: TDMPCStateConfig) -> str:
