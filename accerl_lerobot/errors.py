@@ -32,6 +32,13 @@ LONGEST, LONGEST_REMEDY, MOST_SHOWN = 200, 1200, 600
 given where a number belongs, and some hints repeat a part of it."""
 
 
+MAX_NONFINITE = 5  # steps in a row with a non-finite loss or gradient that are an error; fewer are skipped
+
+
+class NonFiniteError(RuntimeError):
+    """Too many steps in a row had a non-finite loss or gradient."""
+
+
 class InputError(ValueError):
     """Bad input, refused before any long work: a field as it is written on the command line, and a sentence.
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from accerl_lerobot.engine.ray_session import RAY_PROCESSES, REQUIRED
-from accerl_lerobot.trainer.batch import MAX_NONFINITE
+from accerl_lerobot.errors import MAX_NONFINITE
 from benchmarks.audit import audit_updates
 from benchmarks.fault_injection import FULL, NAN, POINTS, TORN, inject, proof, withdraw
 from benchmarks.study import last_words

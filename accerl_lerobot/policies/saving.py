@@ -105,9 +105,13 @@ def copy_weights(adapter: LeRobotAdapter | StockAdapter, ours: dict[str, nn.Modu
 
 
 def save_pretrained(
-    adapter: LeRobotAdapter | StockAdapter, directory: Path, config: PolicyConfig, weights: Weights
+    adapter: LeRobotAdapter | StockAdapter,
+    directory: Path,
+    config: PolicyConfig,
+    weights: Weights | None = None,
 ) -> None:
-    """Writes LeRobot's ``pretrained_model`` layout, and ours beside it."""
+    """Writes LeRobot's ``pretrained_model`` layout, and ours beside it; without `weights`, those of now."""
+    weights = weights or adapter.copy_weights()
     directory.mkdir(parents=True, exist_ok=True)
     _save_backbone(adapter.policy.config, adapter.processing.preprocessor, directory)
     adapter.policy.save_pretrained(directory, state_dict=weights.policy)

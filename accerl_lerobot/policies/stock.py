@@ -249,7 +249,7 @@ class StockAdapter(PolicyAdapter):
     def _training_batch(
         self, observations: dict[str, np.ndarray], tasks: Sequence[str], chunk: Tensor
     ) -> dict[str, Any]:
-        """What LeRobot's trainer would give `forward`; the chunk is padded around the executed rows."""
+        """A batch as LeRobot's trainer makes it, in which the chunk is padded around the executed rows."""
         config, count = self.policy.config, len(tasks)
         executed = self.processing.unnormalise(chunk)
         batch: dict[str, Any] = {"task": list(tasks), ACTION: executed[:, 0]}

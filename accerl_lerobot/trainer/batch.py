@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from accerl_lerobot.checkpoint import snapshot
+from accerl_lerobot.errors import NonFiniteError
 from accerl_lerobot.experience import Segment
 
 if TYPE_CHECKING:
@@ -80,13 +81,6 @@ def split_rows(rows: np.ndarray, size: int, rank: int, ranks: int) -> list[tuple
     own = [(mine[start : start + size], True) for start in range(0, len(mine), size)]
     most = math.ceil(len(shares[0]) / size)
     return own + [(rows[:1], False)] * (most - len(own))
-
-
-MAX_NONFINITE = 5  # steps in a row with a non-finite loss or gradient that are an error; fewer are skipped
-
-
-class NonFiniteError(RuntimeError):
-    """Too many steps in a row had a non-finite loss or gradient."""
 
 
 @contextmanager

@@ -25,11 +25,12 @@ from accerl_lerobot.algorithms.advantages import decision_mask, gae, moments, no
 from accerl_lerobot.algorithms.objective import lag_metrics, present, sample_metrics
 from accerl_lerobot.checkpoint.tensors import optimizer_state, restore_optimizer, whole
 from accerl_lerobot.config.parsing import imported
+from accerl_lerobot.errors import MAX_NONFINITE, NonFiniteError
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.policies.adapter import PolicyAdapter
 from accerl_lerobot.policies.teacher import TEACHER_PREFIX
-from accerl_lerobot.trainer.batch import MAX_NONFINITE, Batch, NonFiniteError, collate, pick, split_rows
+from accerl_lerobot.trainer.batch import Batch, collate, pick, split_rows
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.probe import CRITIC_PREFIX, Probe
 from accerl_lerobot.trainer.ranks import ALONE, Ranks

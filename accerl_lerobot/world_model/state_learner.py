@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from accerl_lerobot.checkpoint.tensors import copied, optimizer_state, restore_optimizer
-from accerl_lerobot.trainer.batch import MAX_NONFINITE, NonFiniteError
+from accerl_lerobot.errors import MAX_NONFINITE, NonFiniteError
 from accerl_lerobot.world_model.states import Observations, StateModel, Transitions
 
 BATCH = 64  # transitions of a step

@@ -95,7 +95,7 @@ class TDMPCModel(StateModel):
         return self.action_zero + self.action_scale * chunk
 
     def _read(self, observations: Observations, shift: bool = False) -> dict[str, Tensor]:
-        """What TD-MPC's encoder takes."""
+        """Inputs of TD-MPC's encoder."""
         device, batch = self.action_zero.device, {}
         if self.image is not None:
             pixels = torch.from_numpy(np.ascontiguousarray(observations[self.camera])).to(device)

@@ -30,7 +30,7 @@ WORLD_MODEL_WORKER = "world model"
 
 
 class Learned(NamedTuple):
-    """What came of the steps of one call."""
+    """Outcome of the steps of one call."""
 
     metrics: list[dict[str, float]]  # parts of the loss, by step
     steps: int  # made in all

@@ -130,7 +130,7 @@ def test_a_policy_that_reads_the_simulators_state(damaged: Any):
         ("diffusion", {}, {"n_action_steps": 8}, "policy.n_action_steps=8: use 1 to 7, the chunk the policy"),
         ("diffusion", {}, {"num_steps": 21}, "policy.num_steps=21: use at most 20, as many as it was"),
         ("act", {"temporal_ensemble_coeff": 0.1, "n_action_steps": 1}, {}, "policy.temporal_en.*use null"),
-        ("act", {}, {"sampler": FlowSamplerConfig()}, "policy.sampler.type='flow': use gaussian: "),
+        ("act", {}, {"sampler": FlowSamplerConfig()}, "policy.sampler.type='flow': use gaussian or chunk_n"),
     ],
 )  # fmt: skip
 def test_options_under_which_its_density_would_be_another(

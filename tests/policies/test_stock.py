@@ -315,6 +315,7 @@ def test_a_package_that_registers_its_type_and_then_fails_is_told_by_its_error(
     )
     (tmp_path / "site" / "lerobot_policy_half" / "config.py").write_text(HALF)
     monkeypatch.syspath_prepend(str(tmp_path / "site"))
+    monkeypatch.setattr("accerl_lerobot.policies.config.NOT_IMPORTED", {})
     why = "lerobot_policy_half is installed and cannot be imported .ModuleNotFoundError: No module named"
     try:
         with pytest.raises(InputError, match=f"policy.type='half': .*{why} 'no_such_module_of_theirs'"):

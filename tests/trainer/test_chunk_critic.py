@@ -15,7 +15,7 @@ import torch
 from accerl_lerobot.algorithms import AWRConfig, ChunkCriticConfig, SelfImitationConfig
 from accerl_lerobot.engine.preflight import check_start
 from accerl_lerobot.envs import SimulatedConfig, make_environment
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.errors import InputError, NonFiniteError
 from accerl_lerobot.experience import (
     ENVIRONMENT_STATE,
     TASK,
@@ -36,7 +36,6 @@ from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.seeds import noise_seed
 from accerl_lerobot.trainer import chunk_critic
-from accerl_lerobot.trainer.batch import NonFiniteError
 from accerl_lerobot.trainer.chunk_critic import ChunkCriticUpdate
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.off_policy import AWRUpdate, Memory, OffPolicyUpdate

@@ -13,8 +13,9 @@ import pytest
 import torch
 
 from accerl_lerobot.algorithms import GIPOConfig, PPOConfig, RatioConfig
+from accerl_lerobot.errors import MAX_NONFINITE, NonFiniteError
 from accerl_lerobot.experience import Segment
-from accerl_lerobot.trainer.batch import MAX_NONFINITE, NonFiniteError, collate
+from accerl_lerobot.trainer.batch import collate
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.update import RatioUpdate
 from tests.rounding import assert_close

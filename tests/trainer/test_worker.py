@@ -15,11 +15,11 @@ import pytest
 from accerl_lerobot.algorithms import GIPOConfig
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import PRETRAINED, TRAINING_STATE
+from accerl_lerobot.errors import NonFiniteError
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies import loading
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.trainer import worker as module
-from accerl_lerobot.trainer.batch import NonFiniteError
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.peers import LearnerSettings
 from accerl_lerobot.trainer.worker import TrainerWorker

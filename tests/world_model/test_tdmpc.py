@@ -22,7 +22,7 @@ from tests.policies.test_stock import KINDS
 
 CAMERA, IMAGE, ROBOT = "observation.images.front", "observation.image", "observation.state"
 UNITS = (np.array([0.5, -1.0], np.float32), np.array([2.0, 0.25], np.float32))
-"""Of the policy that practises; TD-MPC normalises by the range of its own dataset."""
+"""Zero and scale of the policy that practises; TD-MPC normalises by the range of its own dataset."""
 
 
 @pytest.fixture(scope="module")
