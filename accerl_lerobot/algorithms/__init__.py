@@ -17,10 +17,9 @@ from accerl_lerobot.algorithms.contract import (
     Level,
     LossInputs,
     OffPolicyConfig,
-    RatioConfig,
     SelfImitationConfig,
 )
-from accerl_lerobot.algorithms.objective import GIPOConfig, LossOutput, PPOConfig
+from accerl_lerobot.algorithms.objective import GIPOConfig, LossOutput, PPOConfig, RatioConfig
 
 __all__ = [
     "AWRConfig", "AlgorithmConfig", "ChunkCriticConfig", "GIPOConfig", "Level", "LossInputs", "LossOutput",

@@ -16,8 +16,6 @@ from accerl_lerobot.config.ranges import NonNegative, Positive, Range, Section, 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from accerl_lerobot.algorithms.objective import LossOutput
-
 Level = Literal["token", "chunk"]
 
 
@@ -35,27 +33,6 @@ class AlgorithmConfig(Section, draccus.ChoiceRegistry, section="algorithm"):
     """Discount per decision (not per env step)."""
 
     type = registered_name
-
-
-@dataclass(frozen=True, kw_only=True)
-class RatioConfig(AlgorithmConfig):
-    """Base of the objectives that weight decisions by their likelihood under new and old weights."""
-
-    update = "accerl_lerobot.trainer.update:RatioUpdate"
-
-    lam: Share = 0.95
-    """λ of GAE per decision: 0 trusts the critic, 1 the observed rewards."""
-    level: Level = "token"
-    """Extent of one importance ratio: each log-prob factor, a token or, of a flow or Gaussian policy, an
-    action (``token``), or the whole ``chunk``."""
-    kl_coef: NonNegative = 0.0
-    """Weight of KL(μ‖π), the distance from the behaviour policy."""
-    entropy_coef: NonNegative = 0.0
-    """Weight of the entropy bonus."""
-
-    def loss(self, inputs: LossInputs) -> LossOutput:
-        """The objective, with its diagnostics; `objective.assemble` adds the shared terms."""
-        raise NotImplementedError(f"{type(self).__name__} has no loss(inputs)")
 
 
 @dataclass(frozen=True, kw_only=True)

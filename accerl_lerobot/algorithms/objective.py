@@ -24,8 +24,8 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
-from accerl_lerobot.algorithms.contract import AlgorithmConfig, Level, LossInputs, RatioConfig
-from accerl_lerobot.config.ranges import NonNegative, Range
+from accerl_lerobot.algorithms.contract import AlgorithmConfig, Level, LossInputs
+from accerl_lerobot.config.ranges import NonNegative, Range, Share
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -173,6 +173,27 @@ def assemble(
     samples = torch.cat([column.detach().double() for column in columns], 1)
     means = {name: mean.detach() for name, mean in means.items()}
     return LossOutput(loss=loss, means=means, samples=samples, clip=clip)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RatioConfig(AlgorithmConfig):
+    """Base of the objectives that weight decisions by their likelihood under new and old weights."""
+
+    update = "accerl_lerobot.trainer.update:RatioUpdate"
+
+    lam: Share = 0.95
+    """λ of GAE per decision: 0 trusts the critic, 1 the observed rewards."""
+    level: Level = "token"
+    """Extent of one importance ratio: each log-prob factor, a token or, of a flow or Gaussian policy, an
+    action (``token``), or the whole ``chunk``."""
+    kl_coef: NonNegative = 0.0
+    """Weight of KL(μ‖π), the distance from the behaviour policy."""
+    entropy_coef: NonNegative = 0.0
+    """Weight of the entropy bonus."""
+
+    def loss(self, inputs: LossInputs) -> LossOutput:
+        """The objective, with its diagnostics; `assemble` adds the shared terms."""
+        raise NotImplementedError(f"{type(self).__name__} has no loss(inputs)")
 
 
 @AlgorithmConfig.register_subclass("gipo")

@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from accerl_lerobot.checkpoint.safety import MIB, brief
 from accerl_lerobot.engine import sizes
+from accerl_lerobot.engine.config import lag_limits
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.replay.pacing import lag_limits
 
 if TYPE_CHECKING:
     from accerl_lerobot.engine.config import RunConfig

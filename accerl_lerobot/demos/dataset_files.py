@@ -38,7 +38,7 @@ from accerl_lerobot.errors import InputError, expanded
 if TYPE_CHECKING:
     import pyarrow.parquet as pq
 
-    from accerl_lerobot.engine.config import DatasetConfig
+    from accerl_lerobot.config.ranges import DatasetConfig
 
 INFO, STATS, TASKS, EPISODES, DATA = (
     "meta/info.json", "meta/stats.json", "meta/tasks.parquet", "meta/episodes", "data",

@@ -7,7 +7,7 @@ concern two sections are here.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -22,7 +22,7 @@ from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.metrics import WandBConfig
 from accerl_lerobot.policies.config import PolicyConfig
-from accerl_lerobot.replay.pacing import ASYNCHRONOUS, ReplayConfig, Schedule
+from accerl_lerobot.replay.pacing import ASYNCHRONOUS, ReplayConfig, Schedule, lag_bound
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.timeline import TIMELINE
 from accerl_lerobot.trainer.config import TrainerConfig
@@ -206,3 +206,14 @@ class RunConfig(Section):
         ):
             if value != wanted:
                 raise InputError(name, value, f"{only} {why}; use {wanted}")
+
+
+def lag_limits(config: RunConfig) -> tuple[int, int]:
+    """The largest lag under this recipe, and what its pace alone would allow; in updates."""
+    early = 1 if config.launch.engine == "ray" else 0  # publications under way, and batches drawn early
+    batch, in_flight = config.trainer.batch_decisions, config.rollout.in_flight
+    batch = max(1, batch - round(config.imagination.share * batch))  # real decisions
+    counts = {"batch_decisions": batch, "in_flight": in_flight, "prefetch": early}
+    counts["pickup"] = early + config.trainer.hold_back
+    of_pace = lag_bound(replace(config.replay, max_lag=10**9), **counts)
+    return lag_bound(config.replay, **counts), of_pace

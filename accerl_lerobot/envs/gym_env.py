@@ -185,7 +185,7 @@ class GymConfig(GymnasiumConfig):
         """See the base class; only the environment knows, so it is made to ask."""
         if not self.environment_state:
             return 0
-        from accerl_lerobot.envs import make_environment
+        from accerl_lerobot.envs.making import make_environment
 
         with contextlib.closing(make_environment(self)) as environment:
             return len(environment.reset(0, self.id)[ENVIRONMENT_STATE])

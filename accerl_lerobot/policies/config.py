@@ -7,7 +7,7 @@ import importlib
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import draccus
 
@@ -17,10 +17,6 @@ from accerl_lerobot.config.ranges import Commit, Device, Range, Section, check, 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE
 from accerl_lerobot.policies.deferred import import_policies
-
-if TYPE_CHECKING:
-    from accerl_lerobot.policies.adapter import PolicyAdapter
-
 
 Precision = Literal["fp32", "bf16", "auto"]
 
@@ -158,7 +154,8 @@ class PolicyConfig(Section, section="policy"):
     """Rows of a chunk that are executed before the next decision; None keeps the checkpoint's."""
 
 
-Load = Callable[[PolicyConfig], "PolicyAdapter"]
+Load = Callable[[PolicyConfig], Any]
+"""Makes a worker's `adapter.PolicyAdapter`."""
 
 
 def loader(load: Load | None) -> Load:

@@ -14,7 +14,7 @@ import json
 import re
 import shutil
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import draccus
 from safetensors.torch import save_file
@@ -26,10 +26,6 @@ from accerl_lerobot.checkpoint.tensors import copy_of, place
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import PolicyConfig, SamplerConfig, TuningConfig
 from accerl_lerobot.policies.untrusted import OURS
-
-if TYPE_CHECKING:
-    from accerl_lerobot.policies.adapter import LeRobotAdapter
-    from accerl_lerobot.policies.stock import StockAdapter
 
 
 def tune(policy: Any, config: TuningConfig, backbone: str | None = None, idle: tuple[str, ...] = ()) -> None:
@@ -97,7 +93,7 @@ class Weights(NamedTuple):
     ours: dict[str, dict[str, Tensor]]  # by the name of their file
 
 
-def copy_weights(adapter: LeRobotAdapter | StockAdapter, ours: dict[str, nn.Module]) -> Weights:
+def copy_weights(adapter: Any, ours: dict[str, nn.Module]) -> Weights:
     """A copy to be saved while the adapter is trained on; `ours` are its other modules, by file."""
     policy = merged_state_dict(adapter.policy) or adapter.policy.state_dict()
     states = {file: _copied(module.state_dict()) for file, module in ours.items()}
@@ -105,10 +101,7 @@ def copy_weights(adapter: LeRobotAdapter | StockAdapter, ours: dict[str, nn.Modu
 
 
 def save_pretrained(
-    adapter: LeRobotAdapter | StockAdapter,
-    directory: Path,
-    config: PolicyConfig,
-    weights: Weights | None = None,
+    adapter: Any, directory: Path, config: PolicyConfig, weights: Weights | None = None
 ) -> None:
     """Writes LeRobot's ``pretrained_model`` layout, and ours beside it; without `weights`, those of now."""
     weights = weights or adapter.copy_weights()

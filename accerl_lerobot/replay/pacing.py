@@ -18,14 +18,11 @@ environment.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Literal
+from dataclasses import dataclass
+from typing import Annotated, Literal
 
 from accerl_lerobot.config.ranges import Range, Section, Steps
 from accerl_lerobot.errors import InputError
-
-if TYPE_CHECKING:
-    from accerl_lerobot.engine.config import RunConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,17 +110,6 @@ def lag_bound(
     decisions = max(config.max_unlearned_decisions, config.min_decisions) + 2 * in_flight + config.capacity
     drawn = math.ceil(config.samples_per_insert) * decisions // batch_decisions - 1
     return min(config.max_lag, pickup + drawn + prefetch)
-
-
-def lag_limits(config: RunConfig) -> tuple[int, int]:
-    """The largest lag under this recipe, and what its pace alone would allow; in updates."""
-    early = 1 if config.launch.engine == "ray" else 0  # publications under way, and batches drawn early
-    batch, in_flight = config.trainer.batch_decisions, config.rollout.in_flight
-    batch = max(1, batch - round(config.imagination.share * batch))  # real decisions
-    counts = {"batch_decisions": batch, "in_flight": in_flight, "prefetch": early}
-    counts["pickup"] = early + config.trainer.hold_back
-    of_pace = lag_bound(replace(config.replay, max_lag=10**9), **counts)
-    return lag_bound(config.replay, **counts), of_pace
 
 
 Schedule = Literal["asynchronous", "overlap", "synchronous"]

@@ -15,10 +15,9 @@ from accerl_lerobot.checkpoint.layout import CHECKPOINTS, CONFIG, LAST, PRETRAIN
 from accerl_lerobot.config.help import shown
 from accerl_lerobot.config.parsing import decode
 from accerl_lerobot.console import ABSENT, count, duration, number, percent, rate
-from accerl_lerobot.engine.config import RunConfig
+from accerl_lerobot.engine.config import RunConfig, lag_limits
 from accerl_lerobot.errors import ERROR_LOG, InputError, reading
 from accerl_lerobot.hub.card import lerobot_eval_command, read_json
-from accerl_lerobot.replay.pacing import lag_limits
 from accerl_lerobot.report.charts import COLOURS, Chart, Series, line, rates
 from accerl_lerobot.report.read import Record, Run, apart, column, differences, newest
 from accerl_lerobot.timeline.read import COLOURS as STATE_COLOURS

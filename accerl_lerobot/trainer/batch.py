@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -21,8 +21,11 @@ from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.errors import NonFiniteError
 from accerl_lerobot.experience import Segment
 
-if TYPE_CHECKING:
-    from accerl_lerobot.trainer.update import BaseUpdate
+
+class Versioned(Protocol):
+    """Updates, of which so many have been made."""
+
+    version: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,7 +88,7 @@ def split_rows(rows: np.ndarray, size: int, rank: int, ranks: int) -> list[tuple
 
 @contextmanager
 def save_batch_if_not_finite(
-    directory: Path | None, update: BaseUpdate, segments: Sequence[Segment]
+    directory: Path | None, update: Versioned, segments: Sequence[Segment]
 ) -> Iterator[None]:
     """Saves the segments of an update, made inside, that raises `NonFiniteError`, for `snapshot.load`.
 

@@ -30,7 +30,6 @@ from accerl_lerobot.config.ranges import Range, Section
 
 if TYPE_CHECKING:
     from accerl_lerobot.world_model.config import LearnableModelConfig
-    from accerl_lerobot.world_model.data import Windows
 
 State = dict[str, Tensor]  # each (B, ...)
 
@@ -125,6 +124,36 @@ class WorldModel(ABC):
         Actions are float32 (B, K, A), in the environment's units. All randomness is that of B seeds, so a row
         does not depend on its batch.
         """
+
+
+@dataclass(frozen=True, kw_only=True)
+class Windows:
+    """A batch of windows. Chunks beyond an episode's end repeat its last frame and are not `valid`."""
+
+    frames: np.ndarray  # uint8 (B, L + R, V, H, W, 3): context, the first frame last, one after each chunk
+    anchor: np.ndarray  # uint8 (B, V, H, W, 3), some chunks before the first, where a rollout began
+    state: np.ndarray  # float32 (B, L + R, S), at each of the frames
+    before: np.ndarray  # float32 (B, L − 1, K, A), actions within the context; zero where none was executed
+    commanded_sum: np.ndarray  # float32 (B, A), the sum of the actions before the window's first frame
+    initial_state: np.ndarray  # float32 (B, S), the robot's state when the episode began
+    actions: np.ndarray  # float32 (B, R, K, A), zero where none was executed
+    steps: np.ndarray  # int64 (B, R), how many of a chunk's actions lie between its frames; 0 beyond the end
+    success: np.ndarray  # bool (B, R), True if the task was achieved in this chunk
+    episode: np.ndarray  # int64 (B,), index of the episode
+    task: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    @property
+    def valid(self) -> np.ndarray:
+        """bool (B, R), True if the chunk's frame is at least one step later than the one before."""
+        return self.steps > 0
+
+    @property
+    def context(self) -> int:
+        """L."""
+        return self.before.shape[1] + 1
 
 
 class LearnableWorldModel(nn.Module, WorldModel):

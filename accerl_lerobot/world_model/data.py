@@ -25,10 +25,10 @@ from accerl_lerobot.demos.dataset_files import open_metadata, opened
 from accerl_lerobot.demos.episodes import EpisodeLabels, numbers, observations, read_labels
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import REWARD, SUCCESS
+from accerl_lerobot.world_model.contract import Windows, WorldModelSpec
 
 if TYPE_CHECKING:
     from accerl_lerobot.config.ranges import DatasetConfig
-    from accerl_lerobot.world_model.contract import WorldModelSpec
 
 logger = logging.getLogger(__name__)
 
@@ -93,36 +93,6 @@ class WindowStart(NamedTuple):
 
     episode: int
     frame: int
-
-
-@dataclass(frozen=True, kw_only=True)
-class Windows:
-    """A batch of windows. Chunks beyond an episode's end repeat its last frame and are not `valid`."""
-
-    frames: np.ndarray  # uint8 (B, L + R, V, H, W, 3): context, the first frame last, one after each chunk
-    anchor: np.ndarray  # uint8 (B, V, H, W, 3), some chunks before the first, where a rollout began
-    state: np.ndarray  # float32 (B, L + R, S), at each of the frames
-    before: np.ndarray  # float32 (B, L − 1, K, A), actions within the context; zero where none was executed
-    commanded_sum: np.ndarray  # float32 (B, A), the sum of the actions before the window's first frame
-    initial_state: np.ndarray  # float32 (B, S), the robot's state when the episode began
-    actions: np.ndarray  # float32 (B, R, K, A), zero where none was executed
-    steps: np.ndarray  # int64 (B, R), how many of a chunk's actions lie between its frames; 0 beyond the end
-    success: np.ndarray  # bool (B, R), True if the task was achieved in this chunk
-    episode: np.ndarray  # int64 (B,), index of the episode
-    task: tuple[str, ...]
-
-    def __len__(self) -> int:
-        return len(self.frames)
-
-    @property
-    def valid(self) -> np.ndarray:
-        """bool (B, R), True if the chunk's frame is at least one step later than the one before."""
-        return self.steps > 0
-
-    @property
-    def context(self) -> int:
-        """L."""
-        return self.before.shape[1] + 1
 
 
 def hold_last_action(actions: np.ndarray, steps: np.ndarray) -> np.ndarray:

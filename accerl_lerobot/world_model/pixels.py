@@ -29,10 +29,10 @@ from accerl_lerobot.world_model.contract import (
     Prediction,
     Reset,
     State,
+    Windows,
     WorldModelSpec,
     context_of,
 )
-from accerl_lerobot.world_model.data import Windows
 
 COARSE = 8  # side of the coarse view that the state heads get
 CONTEXT_NOISE = 0.02

@@ -18,8 +18,8 @@ import torch
 
 from accerl_lerobot.experience import task_codes
 from accerl_lerobot.world_model.config import ValidationConfig
-from accerl_lerobot.world_model.contract import WorldModel, context_of, select_rows
-from accerl_lerobot.world_model.data import Episode, Windows, WindowStart, cut_windows, hold_last_action
+from accerl_lerobot.world_model.contract import Windows, WorldModel, context_of, select_rows
+from accerl_lerobot.world_model.data import Episode, WindowStart, cut_windows, hold_last_action
 from accerl_lerobot.world_model.success_model import SuccessPairsRewardModel
 
 BATCH = 64  # rollouts at once

@@ -34,8 +34,8 @@ from accerl_lerobot.evaluation import write_video
 from accerl_lerobot.policies.loading import resolve_device
 from accerl_lerobot.world_model import data, store
 from accerl_lerobot.world_model.config import ValidationConfig
-from accerl_lerobot.world_model.contract import LearnableWorldModel, WorldModel
-from accerl_lerobot.world_model.data import DATASET, ONLINE, Episode, Windows, WindowStart
+from accerl_lerobot.world_model.contract import LearnableWorldModel, Windows, WorldModel
+from accerl_lerobot.world_model.data import DATASET, ONLINE, Episode, WindowStart
 from accerl_lerobot.world_model.rollout_eval import (
     bootstrap,
     choose_threshold,

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from accerl_lerobot.engine.config import lag_limits
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.replay.buffer import Replay
-from accerl_lerobot.replay.pacing import ReplayConfig, draws_for, lag_bound, lag_limits
+from accerl_lerobot.replay.pacing import ReplayConfig, draws_for, lag_bound
 from tests.replay.segments import assert_books_balance, make_segment
 
 CONFIG = ReplayConfig(capacity=100, min_decisions=10, samples_per_insert=2.0, max_unlearned_decisions=30)

@@ -20,9 +20,9 @@ from accerl_lerobot.world_model.contract import (
     Prediction,
     Reset,
     State,
+    Windows,
     WorldModelSpec,
 )
-from accerl_lerobot.world_model.data import Windows
 
 
 @LearnableModelConfig.register_subclass("linear")

@@ -12,8 +12,8 @@ import torch
 
 from accerl_lerobot.world_model import pixels
 from accerl_lerobot.world_model.config import LearnConfig, PixelModelConfig, WorldModelConfig
-from accerl_lerobot.world_model.contract import Prediction, WorldModelSpec, context_of
-from accerl_lerobot.world_model.data import Episode, Windows, cut_windows, shuffle_actions, window_starts
+from accerl_lerobot.world_model.contract import Prediction, Windows, WorldModelSpec, context_of
+from accerl_lerobot.world_model.data import Episode, cut_windows, shuffle_actions, window_starts
 from accerl_lerobot.world_model.learners import Learner, train_from_scratch
 from accerl_lerobot.world_model.pixels import Attention, FrameNetwork, PixelWorldModel
 from accerl_lerobot.world_model.validation import sensitivity, skill, squared_errors
