@@ -14,6 +14,7 @@ A dims.
 from __future__ import annotations
 
 import copy
+import logging
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -24,6 +25,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from accerl_lerobot.checkpoint.safety import brief
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Decision, Request, Segment, stack_observations
 from accerl_lerobot.policies import saving
@@ -40,6 +42,8 @@ from accerl_lerobot.policies.config import ChunkNoiseConfig, PolicyConfig, Sampl
 from accerl_lerobot.policies.features import ACTION
 from accerl_lerobot.policies.teacher import Teacher
 from accerl_lerobot.seeds import episode_of
+
+logger = logging.getLogger(__name__)
 
 EPISODES = 256  # episodes whose state is kept; the one that acted longest ago goes first
 SHARED = ("config", "_modules", "_parameters", "_buffers")
@@ -69,6 +73,7 @@ class StockAdapter(PolicyAdapter):
         self.demonstrations: Callable[[Segment], Iterator[Segment]] | None = None
         """Remembered by off-policy learning from the start; set by `demonstrations.with_demonstrations`."""
         self._episodes: OrderedDict[tuple[int, str], Any] = OrderedDict()
+        self._takes_batches = True
 
     @property
     def sampler(self) -> SamplerConfig:
@@ -115,6 +120,16 @@ class StockAdapter(PolicyAdapter):
         if not np.array_equal(first, second):
             hint = "asked twice with the same noise, it gives two chunks: it changes while it acts"
             raise InputError("policy.type", config.type, f"{hint}; it can be evaluated (accerl eval)")
+        try:
+            with torch.no_grad():
+                self._chunk(requests)
+        except Exception as error:  # somebody's policy, which may fail in any way
+            self._takes_batches = False
+            reason = f"{type(error).__name__}: {brief(error)}"
+            logger.warning(
+                "%s policies decide for one environment at a time, which takes as many calls as there are "
+                "environments: a batch of two fails (%s)", config.type, reason,
+            )  # fmt: skip
         deltas = [*(config.observation_delta_indices or ()), *(config.reward_delta_indices or ())]
         if config.reward_delta_indices is not None or any(delta > 0 for delta in deltas):
             hint = (
@@ -193,9 +208,10 @@ class StockAdapter(PolicyAdapter):
         """Exploring environments are decided for together, the others one by one, each with its own noise."""
         assert self._sampler is not None
         exploring = [i for i, request in enumerate(requests) if request.explore]
-        groups = [[i] for i, request in enumerate(requests) if not request.explore]
+        together = exploring if self._takes_batches else []
+        groups = [[i] for i in range(len(requests)) if i not in together]
         chunks: dict[int, Tensor] = {}
-        for rows in [exploring, *groups] if exploring else groups:
+        for rows in [together, *groups] if together else groups:
             chunk = self._chunk([requests[i] for i in rows])
             chunks |= dict(zip(rows, chunk, strict=True))
         executed = torch.stack([chunks[i] for i in range(len(requests))])

@@ -221,6 +221,35 @@ def test_exploring_is_the_chunk_and_noise_of_the_request(written: Any):
     np.testing.assert_array_equal(noisy[2].chunk, adapter.decide(asked, 0)[2].chunk)
 
 
+def test_a_policy_that_takes_no_batch_decides_one_by_one(
+    written: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    from lerobot.policies.vqbet.modeling_vqbet import VQBeTPolicy
+
+    stock = VQBeTPolicy.select_action
+
+    def one_at_a_time(self: Any, batch: dict[str, torch.Tensor]) -> torch.Tensor:
+        if len(batch["observation.state"]) > 1:
+            raise RuntimeError("one at a time, please")
+        return stock(self, batch)
+
+    monkeypatch.setattr(VQBeTPolicy, "select_action", one_at_a_time)
+    adapter = learning(written("vqbet"))
+    assert "vqbet policies decide for one environment at a time" in caplog.text
+    assert len(adapter.decide(adapter.example_requests(), 0)) == 2
+
+
+def test_a_policy_that_changes_while_it_acts_is_refused(written: Any, monkeypatch: pytest.MonkeyPatch):
+    from lerobot.policies.vqbet.modeling_vqbet import VQBeTPolicy
+
+    stock, count = VQBeTPolicy.select_action, iter(range(10_000))
+    monkeypatch.setattr(VQBeTPolicy, "select_action", lambda self, batch: stock(self, batch) + next(count))
+    with pytest.raises(
+        InputError, match="policy.type='vqbet': asked twice with the same noise, it gives two"
+    ):
+        learning(written("vqbet"))
+
+
 @pytest.mark.parametrize("algorithm", ["self_imitation", "chunk_critic"])
 def test_any_policy_learns_and_is_saved_for_stock_lerobot(
     algorithm: str, written: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
