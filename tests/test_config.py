@@ -275,7 +275,9 @@ class TestPreflight:
         check_start(RunConfig(sft=SFTConfig(steps=1, policy={"type": "diffusion"})))
 
     def test_refuses_a_policy_without_a_likelihood_before_training_it(self) -> None:
-        with pytest.raises(InputError, match="sft.policy.type='vqbet': RL needs a likelihood"):
+        with pytest.raises(
+            InputError, match="sft.policy.type='vqbet': algorithm.type=gipo needs exact likelihoods"
+        ):
             check_start(RunConfig(sft=SFTConfig(steps=1, policy={"type": "vqbet"})))
 
     def test_accepts(self, tiny_checkpoint: Path) -> None:

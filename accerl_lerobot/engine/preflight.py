@@ -181,7 +181,12 @@ def check_start(config: RunConfig, say: Callable[[str], object] = str) -> tuple[
     say("looking at policy, environment and data …")
     policy = policy_to_be(config)
     if isinstance(config.algorithm, RatioConfig):
-        check_likelihood(config.algorithm.type, sampler_config(config.policy, policy.type), policy.type)
+        new = config.policy.path is None and config.sft.init_path is None
+        field, sampler = (
+            "sft.policy.type" if new else "policy.type",
+            sampler_config(config.policy, policy.type),
+        )
+        check_likelihood(config.algorithm.type, sampler, policy.type, field)
     check_memory(config)
     spec = check_environment(config.env, config.rollout.reward_model)
     off_policy = isinstance(config.algorithm, OffPolicyConfig)
@@ -455,7 +460,7 @@ def policy_to_be(config: RunConfig) -> Any:
             what = "" if error.field == "policy.path" else f"{error.field.partition('.')[2]}={error.value}: "
             raise InputError("sft.init_path", start.path, what + error.hint) from error
     policy_config = check_sft_policy(config.sft)
-    sampler_config(config.policy, config.sft.policy["type"], "sft.policy.type", "RL needs a likelihood: ")
+    sampler_config(config.policy, config.sft.policy["type"], "sft.policy.type")
     override(policy_config, config.policy)
     check_observations(policy_config, "sft.policy.n_obs_steps")
     return policy_config

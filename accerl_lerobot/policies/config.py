@@ -260,12 +260,12 @@ def sampler_config(
     return config.sampler
 
 
-def check_likelihood(algorithm: str, sampler: SamplerConfig, policy_type: str) -> None:
+def check_likelihood(algorithm: str, sampler: SamplerConfig, policy_type: str, field: str) -> None:
     """Refuses a policy without an exact likelihood for an `algorithm` that needs one."""
     if sampler.type == ANY:
         why = f"algorithm.type={algorithm} needs exact likelihoods, which {', '.join(POLICIES)} have here"
         hint = f"{why}; use chunk_critic or self_imitation, or add a likelihood (docs/extending.md)"
-        raise InputError("policy.type", policy_type, hint)
+        raise InputError(field, policy_type, hint)
 
 
 def env_steps_seen(policy_config: Any, *, learns: bool = False) -> int:
