@@ -3,29 +3,38 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
+from contextlib import redirect_stdout
 from typing import Any
 
 from accerl_lerobot.cli import exit_code, guarded, help_asked, set_up_logging
-from accerl_lerobot.cli.verbs import measure
+from accerl_lerobot.cli.verbs import tell
 from accerl_lerobot.config.help import brief, help_text
 from accerl_lerobot.config.parsing import parse
+from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError
 from benchmarks.async_vs_sync import BenchAsyncVsSyncConfig
 from benchmarks.batching import BenchBatchingConfig
 from benchmarks.efficiency import BenchEfficiencyConfig
+from benchmarks.environment import BenchEnvironmentConfig
 from benchmarks.faults import BenchFaultsConfig
 from benchmarks.few_shot import BenchFewShotConfig
 from benchmarks.gpu import BenchGpuConfig
 from benchmarks.lag import BenchLagConfig
 from benchmarks.latency import BenchLatencyConfig
+from benchmarks.policy import BenchPolicyConfig
 from benchmarks.scaling import BenchScalingConfig
 from benchmarks.soak import BenchSoakConfig
 from benchmarks.third_party import BenchThirdPartyConfig
+from benchmarks.throughput import BenchThroughputConfig
 from benchmarks.transport import BenchTransportConfig
 from benchmarks.weights import BenchWeightsConfig
 
 CONFIGS: dict[str, type[Any]] = {
+    "environment": BenchEnvironmentConfig,
+    "policy": BenchPolicyConfig,
+    "throughput": BenchThroughputConfig,
     "few_shot": BenchFewShotConfig,
     "lag": BenchLagConfig,
     "efficiency": BenchEfficiencyConfig,
@@ -62,7 +71,16 @@ def run(name: str, rest: list[str]) -> int:
         sys.stdout.write(f"{text}\n")
         return 0
     with guarded():
-        return measure(f"benchmarks.{name}", parse(CONFIGS[name], rest))
+        return measure(name, parse(CONFIGS[name], rest))
+
+
+def measure(name: str, config: Any) -> int:
+    """Run ``bench_NAME`` of the benchmark's module, and print its ``table`` and, for programs, its result."""
+    module: Any = importlib.import_module(f"benchmarks.{name}")
+    with redirect_stdout(sys.stderr):
+        result = getattr(module, f"bench_{name}")(config)
+    Console().rich.print(module.table(result))
+    return tell(result)
 
 
 def main(arguments: list[str] | None = None) -> int:

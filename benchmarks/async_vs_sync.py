@@ -22,8 +22,6 @@ from typing import Annotated, Any
 
 from rich.console import Group
 
-from accerl_lerobot.bench import as_table, host, ranged, spread
-from accerl_lerobot.bench.throughput import ARMS, Block
 from accerl_lerobot.config.ranges import Positive, Range, Repeats, Seed, Steps
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError
@@ -33,6 +31,8 @@ from benchmarks.latency import TRACE
 from benchmarks.machinery import MOST_BUSY, MachineryConfig
 from benchmarks.records import as_markdown, output_folder, write
 from benchmarks.simulated_environment import read_trace
+from benchmarks.tables import as_table, host, ranged, spread
+from benchmarks.throughput import ARMS, Block
 
 LEARNING = MachineryConfig(environments=4, latency_ms=4.0, image_size=16, decide_ms=1.0, update_ms=8.0)
 """Small, as nothing is timed in it."""

@@ -13,8 +13,6 @@ from typing import Annotated, Any
 
 from rich.table import Table
 
-from accerl_lerobot.bench import as_table, host, ranged, spread
-from accerl_lerobot.bench.throughput import Measured
 from accerl_lerobot.config.ranges import NonNegative, Positive, Range, Repeats
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError
@@ -22,6 +20,8 @@ from accerl_lerobot.replay.pacing import ASYNCHRONOUS
 from benchmarks.machinery import MOST_BUSY, MachineryConfig
 from benchmarks.records import as_markdown, output_folder, write
 from benchmarks.simulated_environment import read_trace
+from benchmarks.tables import as_table, host, ranged, spread
+from benchmarks.throughput import Measured
 
 
 @dataclass(frozen=True, kw_only=True)

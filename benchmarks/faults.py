@@ -24,7 +24,6 @@ import numpy as np
 import yaml
 from rich.table import Table
 
-from accerl_lerobot.bench import as_table, host
 from accerl_lerobot.checkpoint.layout import CHECKPOINTS, LAST, PRETRAINED, SUMMARY
 from accerl_lerobot.config.ranges import Range, Repeats, Section, Seed, Steps
 from accerl_lerobot.console import Console
@@ -37,6 +36,7 @@ from benchmarks.hits import FAULTS, START_S, TIDY_S, places, strike
 from benchmarks.light_run import light_config
 from benchmarks.records import as_markdown, write
 from benchmarks.study import last_words
+from benchmarks.tables import as_table, host
 from benchmarks.victims import CLASSES, DRIVER, EVERYTHING, LIGHT, TRAIN, Victim, alive
 
 IMAGINING = ("imagination", "world-model learning")

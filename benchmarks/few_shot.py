@@ -15,12 +15,12 @@ from typing import Any
 
 from rich.table import Table
 
-from accerl_lerobot.bench import as_table
 from accerl_lerobot.config.ranges import Steps
 from accerl_lerobot.console import Console
 from accerl_lerobot.evaluation import Rate, success_by_task
 from benchmarks.records import as_markdown, mean_interval, output_folder, write
 from benchmarks.study import Cell, Study, StudyConfig, named
+from benchmarks.tables import as_table
 
 COLUMNS = ("task", "seed", "algorithm", "SFT", "after", "real episodes", "env steps")
 

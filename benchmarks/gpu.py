@@ -19,13 +19,13 @@ from typing import Annotated, Any
 
 from rich.table import Table
 
-from accerl_lerobot.bench import as_table, host
-from accerl_lerobot.bench.policy import BenchPolicyConfig, bench_policy
 from accerl_lerobot.config.ranges import Device, Range, Repeats, Section
 from accerl_lerobot.console import Console
 from accerl_lerobot.policies.config import TuningConfig
 from accerl_lerobot.trainer.footprint import PolicyMemory
+from benchmarks.policy import BenchPolicyConfig, bench_policy
 from benchmarks.records import as_markdown, output_folder, write
+from benchmarks.tables import as_table, host
 
 COLUMNS = ("check", "result")
 GIB = 2**30

@@ -15,12 +15,12 @@ from typing import Annotated, Any
 import numpy as np
 from rich.table import Table
 
-from accerl_lerobot.bench import as_table, host
 from accerl_lerobot.config.ranges import Range, Section, Seed
 from accerl_lerobot.console import Console
 from accerl_lerobot.envs import EnvConfig, Environment, MetaWorldConfig, make_environment
 from accerl_lerobot.seeds import train_seed
 from benchmarks.records import output_folder
+from benchmarks.tables import as_table, host
 
 TRACE = "trace.txt"
 RESET = "reset"  # first word of a trace's lines about resets

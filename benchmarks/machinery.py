@@ -15,7 +15,6 @@ from typing import Annotated
 
 import numpy as np
 
-from accerl_lerobot.bench.throughput import Measured
 from accerl_lerobot.config.ranges import NonNegative, Positive, Range, Section
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig
 from accerl_lerobot.errors import InputError
@@ -25,6 +24,7 @@ from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
 from benchmarks.simulated_environment import LatencyConfig, read_trace
+from benchmarks.throughput import Measured
 
 EPISODE = 16
 """Decisions of an episode."""

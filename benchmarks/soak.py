@@ -18,7 +18,6 @@ from typing import Annotated, Any
 
 from rich.table import Table
 
-from accerl_lerobot.bench import as_table, host, ranged, spread
 from accerl_lerobot.config.ranges import Positive, Range, Section, Seed
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError, check_absent, make_folder
@@ -26,6 +25,7 @@ from benchmarks.audit import audit_segments, audit_updates
 from benchmarks.faults import BenchFaultsConfig, Start, end_run, recipe_of
 from benchmarks.hits import START_S, strike
 from benchmarks.records import as_markdown, write
+from benchmarks.tables import as_table, host, ranged, spread
 from benchmarks.victims import DRIVER, EVERYTHING, Victim
 
 QUIET, STRUCK = "quiet", "struck"

@@ -21,7 +21,6 @@ from typing import Annotated, Any, NamedTuple
 import yaml
 from rich.table import Table
 
-from accerl_lerobot.bench import as_table
 from accerl_lerobot.checkpoint.layout import CHECKPOINTS, CONFIG, DEMOS, LAST, PRETRAINED, SUMMARY
 from accerl_lerobot.config.ranges import Range, Section, Seed, Steps
 from accerl_lerobot.console import Console
@@ -31,6 +30,7 @@ from accerl_lerobot.engine.resuming import locked
 from accerl_lerobot.errors import InputError, expanded
 from accerl_lerobot.evaluation import Rate, drawing
 from benchmarks.records import mean_interval
+from benchmarks.tables import as_table
 
 INTERVALS = "intervals are 95 %, over seeds where there are several"
 """For people, see `together`."""

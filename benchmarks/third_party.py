@@ -24,10 +24,10 @@ from typing import Annotated, Any
 import yaml
 from rich.table import Table
 
-from accerl_lerobot.bench import as_table, host
 from accerl_lerobot.config.ranges import Range, Section
 from accerl_lerobot.console import Console
 from benchmarks.records import as_markdown, output_folder, write
+from benchmarks.tables import as_table, host
 
 COLUMNS = ("package", "version", "tried", "came out", "right")
 HIDDEN = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "DISPLAY")

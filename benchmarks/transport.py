@@ -20,7 +20,6 @@ from typing import Annotated, Any
 import numpy as np
 from rich.table import Table
 
-from accerl_lerobot.bench import as_table, host, ranged, spread
 from accerl_lerobot.config.ranges import Pattern, Range, Repeats, Section, Seed
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine import ray_session
@@ -28,6 +27,7 @@ from accerl_lerobot.errors import check_absent, make_folder
 from accerl_lerobot.experience import Decision, Request
 from benchmarks.records import as_markdown, write
 from benchmarks.study import named
+from benchmarks.tables import as_table, host, ranged, spread
 
 RAY, SHARED_MEMORY, SLOT = "ray", "shared_memory", "slot"
 IMAGES = {"12 KB": (1, 64, 4), "301 KB": (2, 224, 8)}

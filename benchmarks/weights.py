@@ -22,7 +22,6 @@ from typing import Annotated, Any
 import numpy as np
 from rich.table import Table
 
-from accerl_lerobot.bench import as_table, host, ranged, spread
 from accerl_lerobot.config.ranges import Range, Repeats, Section, Seed
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine import ray_session
@@ -31,6 +30,7 @@ from accerl_lerobot.transport.endpoint import Endpoint
 from accerl_lerobot.transport.weights import Tensors, WeightPublisher
 from benchmarks.records import as_markdown, write
 from benchmarks.study import named
+from benchmarks.tables import as_table, host, ranged, spread
 
 ARMS = ("shared memory", "Ray")
 MB = 1 << 20

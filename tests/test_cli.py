@@ -42,7 +42,7 @@ def test_help_answers_without_torch_or_lerobot() -> None:
 
 
 def test_every_verb_has_a_function_and_a_config() -> None:
-    assert {name.split()[0] for name in verbs.CONFIGS} == cli.VERBS.keys()
+    assert verbs.CONFIGS.keys() == cli.VERBS.keys()
 
 
 @pytest.mark.parametrize("verb", list(cli.VERBS))
@@ -51,8 +51,6 @@ def test_verb_help_lists_fields_with_their_docstrings(verb: str, capsys: pytest.
     out = capsys.readouterr().out
     assert out.startswith(f"usage: accerl {verb}")
     assert out.count("\n") <= 60 and max(map(len, out.splitlines())) <= 115
-    if verb == "bench":
-        return
     if verb in ("train", "doctor"):
         assert "  --trainer.lr=" in out and "--algorithm.clip_low" not in out
         assert "--algorithm.type=gipo" in out and "| ppo" in out

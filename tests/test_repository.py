@@ -254,8 +254,6 @@ def test_commands_in_the_documents_parse(path: str, line: str, monkeypatch: pyte
         monkeypatch.syspath_prepend(str(package))
     configs = CONFIGS if line.startswith("accerl ") else BENCHMARKS
     verb, *arguments = shlex.split(line.removeprefix("python -m ").partition(" ")[2])
-    if verb == "bench":
-        verb, arguments = f"bench {arguments[0]}", arguments[1:]
     assert verb in configs, path
     # A run's own config is one that train resolved, so its place is taken by no recipe at all.
     here = [a.replace("recipes/", f"{ROOT}/recipes/") for a in arguments if "RUN/config.yaml" not in a]

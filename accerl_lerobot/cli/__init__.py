@@ -31,7 +31,6 @@ VERBS = {
     "timeline": "show when every worker of a run did what: a picture and shares",
     "export": "write the episodes of a run as a LeRobotDataset, with an image at every env step",
     "doctor": "resolve a recipe and check this machine",
-    "bench": "measure this machine: accerl bench environment, policy or throughput",
 }
 FUNCTIONS = {"eval": "verbs:evaluate", "doctor": "doctor:main"}
 """Verb → module and function, where that is not the one of the same name in `verbs`."""
@@ -59,24 +58,17 @@ def usage() -> str:
 
 
 def show_help(verb: str, rest: list[str], section: str) -> int:
-    """``accerl VERB --help``; for bench, of the measurement that is named, or a list of them."""
+    """``accerl VERB --help``, or of one section of its fields."""
     from accerl_lerobot.cli.verbs import CONFIGS
-    from accerl_lerobot.config.help import brief, help_text
+    from accerl_lerobot.config.help import help_text
     from accerl_lerobot.config.parsing import DISCOVER, read_arguments, register_types, shipped_recipes
 
-    names = [name for name in CONFIGS if name.split()[0] == verb]
-    named = [name for name in names if len(names) == 1 or name.split()[-1] in rest]
-    if named:
-        given = read_arguments([argument for argument in rest if f"{DISCOVER}=" in argument])[1]
-        register_types(CONFIGS[named[0]], given)
-        text = help_text(f"accerl {named[0]}", CONFIGS[named[0]], VERBS[verb], section)
-        if verb in ("train", "doctor") and not section:
-            recipes = f"recipes: {', '.join(shipped_recipes())}, or a YAML file of your own"
-            text = "\n".join([text, "", *textwrap.wrap(recipes, 100)])
-    else:
-        lines = [f"  {name.split()[-1]:16} {brief(CONFIGS[name])[:90]}" for name in names]
-        usage = [f"usage: accerl {verb} NAME [--field=value …]", "", *lines]
-        text = "\n".join([*usage, "", f"accerl {verb} NAME --help lists its fields."])
+    packages = [argument for argument in rest if f"{DISCOVER}=" in argument]
+    register_types(CONFIGS[verb], read_arguments(packages)[1])
+    text = help_text(f"accerl {verb}", CONFIGS[verb], VERBS[verb], section)
+    if verb in ("train", "doctor") and not section:
+        recipes = f"recipes: {', '.join(shipped_recipes())}, or a YAML file of your own"
+        text = "\n".join([text, "", *textwrap.wrap(recipes, 100)])
     sys.stdout.write(f"{text}\n")
     return 0
 

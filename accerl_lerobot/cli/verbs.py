@@ -8,7 +8,6 @@ among the lines before.
 
 from __future__ import annotations
 
-import importlib
 import json
 import shlex
 import sys
@@ -21,9 +20,6 @@ from typing import Any
 import yaml
 
 from accerl_lerobot.algorithms import AlgorithmConfig, AWRConfig, ChunkCriticConfig, OffPolicyConfig
-from accerl_lerobot.bench.environment import BenchEnvironmentConfig
-from accerl_lerobot.bench.policy import BenchPolicyConfig
-from accerl_lerobot.bench.throughput import BenchThroughputConfig
 from accerl_lerobot.checkpoint.layout import CHECKPOINTS, CONFIG, LAST, PRETRAINED, SUMMARY, write_atomically
 from accerl_lerobot.cli.export import ExportConfig, export_config, export_episodes
 from accerl_lerobot.config.parsing import read_arguments
@@ -205,7 +201,7 @@ def train(arguments: list[str], load: Load | None = None) -> int:
     success = " → ".join(rate(summary[f"success_{end}"], summary[f"ci95_{end}"]) for end in ends)
     practice = f"{count(summary['episodes'], 'episode')}, {count(summary['env_steps'], 'env step')}"
     console.say(f"success {success} of {summary['n_after']}; {practice}; {duration(summary['wall_s'])}")
-    return _told({name: summary[name] for name in OUTCOME} | _say_places(directory, console))
+    return tell({name: summary[name] for name in OUTCOME} | _say_places(directory, console))
 
 
 def demos(arguments: list[str]) -> int:
@@ -262,7 +258,7 @@ def offline(arguments: list[str]) -> int:
         f"{count(summary['episodes'], 'episode')}; {duration(summary['wall_s'])}"
     )
     _say_places(directory, console)
-    return _told(summary)
+    return tell(summary)
 
 
 def _say_places(directory: Path, console: Console) -> dict[str, str]:
@@ -318,7 +314,7 @@ def evaluate(arguments: list[str]) -> int:
         task: {name: value for name, value in of.items() if "seeds" not in name}
         for task, of in summary["tasks"].items()
     }
-    return _told(summary | {"tasks": rates})
+    return tell(summary | {"tasks": rates})
 
 
 def world_model(arguments: list[str]) -> int:
@@ -349,7 +345,7 @@ def _validated(
     (directory / "validation.json").write_text(json.dumps(plain(found), indent=2) + "\n")
     console.rich.print(checks_table(found))
     console.say(f"{'passed' if found['passed'] else 'FAILED'}; see {directory / 'preview.mp4'}")
-    return _told(found, 0 if found["passed"] else 1)
+    return tell(found, 0 if found["passed"] else 1)
 
 
 def push(arguments: list[str]) -> int:
@@ -361,7 +357,7 @@ def push(arguments: list[str]) -> int:
         found = to_hub(config)
     done = "is there already, as" if found["unchanged"] else "is now"
     Console().say(f"{found['kind']} {done} {found['url']} at commit {found['commit']}")
-    return _told(found)
+    return tell(found)
 
 
 def pull(arguments: list[str]) -> int:
@@ -372,7 +368,7 @@ def pull(arguments: list[str]) -> int:
     with redirect_stdout(sys.stderr):
         found = from_hub(config)
     Console().say(f"{found['kind']} {found['path']} is {found['commit']}, {found['files']} files")
-    return _told(found)
+    return tell(found)
 
 
 def report(arguments: list[str]) -> int:
@@ -388,7 +384,7 @@ def timeline(arguments: list[str]) -> int:
     found, console = show_timelines(config), Console()
     console.rich.print(timeline_table(found))
     console.say(f"picture {found['picture']}")
-    return _told(found)
+    return tell(found)
 
 
 def export(arguments: list[str]) -> int:
@@ -398,29 +394,10 @@ def export(arguments: list[str]) -> int:
     with redirect_stdout(sys.stderr):
         found = export_episodes(config, console)
     console.say(f"{count(found['episodes'], 'episode')}, {found['successes']} successes, in {config.root}")
-    return _told(found)
+    return tell(found)
 
 
-def bench(arguments: list[str]) -> int:
-    """``accerl bench NAME``; see `CONFIGS` for the names."""
-    name = arguments[0] if arguments else ""
-    if f"bench {name}" not in CONFIGS:
-        names = [verb.split()[1] for verb in CONFIGS if verb.startswith("bench ")]
-        raise InputError("bench", name, f"name what is measured: {', '.join(names)}")
-    config = parse(CONFIGS[f"bench {name}"], arguments[1:])
-    return measure(f"accerl_lerobot.bench.{name}", config)
-
-
-def measure(module_name: str, config: Any) -> int:
-    """Runs ``bench_NAME`` of the module ``….NAME``, and shows what its ``table`` makes of the result."""
-    module: Any = importlib.import_module(module_name)
-    with redirect_stdout(sys.stderr):
-        result = getattr(module, f"bench_{module_name.rpartition('.')[2]}")(config)
-    Console().rich.print(module.table(result))
-    return _told(result)
-
-
-def _told(result: dict[str, Any], code: int = 0) -> int:
+def tell(result: dict[str, Any], code: int = 0) -> int:
     """Gives a result to programs: as JSON, unless people see what has been said of it on a terminal."""
     if not sys.stdout.isatty():
         sys.stdout.write(json.dumps(plain(result), indent=2) + "\n")
@@ -441,8 +418,5 @@ CONFIGS: dict[str, type[Any]] = {
     "timeline": TimelineConfig,
     "export": ExportConfig,
     "doctor": RunConfig,
-    "bench environment": BenchEnvironmentConfig,
-    "bench policy": BenchPolicyConfig,
-    "bench throughput": BenchThroughputConfig,
 }
 """Verb → what its command line is parsed into."""

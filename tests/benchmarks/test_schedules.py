@@ -9,8 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from accerl_lerobot.bench.throughput import BenchThroughputConfig, Block, bench_throughput
-from accerl_lerobot.bench.throughput import table as throughput_table
 from accerl_lerobot.console import Console
 from benchmarks import async_vs_sync
 from benchmarks.async_vs_sync import ARMS, BenchAsyncVsSyncConfig, bench_async_vs_sync
@@ -18,6 +16,8 @@ from benchmarks.async_vs_sync import compare as compare_schedules
 from benchmarks.async_vs_sync import table as schedules_table
 from benchmarks.machinery import MachineryConfig
 from benchmarks.scaling import BenchScalingConfig, bench_scaling
+from benchmarks.throughput import BenchThroughputConfig, Block, bench_throughput
+from benchmarks.throughput import table as throughput_table
 
 
 def block(schedule: str, rate: float, processors: float = 0.2, waits: float = 0.5) -> Block:

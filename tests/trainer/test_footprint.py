@@ -99,8 +99,8 @@ def published(folder: Path) -> tuple[LeRobotAdapter, tuple, dict]:
     """SmolVLA of its published size, and two decisions."""
     import numpy as np
 
-    from accerl_lerobot.bench.policy import STATE, BenchPolicyConfig, _adapter
     from accerl_lerobot.experience import TASK, Request, stack_observations
+    from benchmarks.policy import STATE, BenchPolicyConfig, _adapter
 
     adapter = _adapter(BenchPolicyConfig(), torch.device("cpu"), folder)
     requests = [

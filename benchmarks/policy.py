@@ -17,10 +17,10 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from rich.table import Table
 
-from accerl_lerobot.bench import as_table, host, ranged, spread
 from accerl_lerobot.config.ranges import Device, Range, Repeats, Section
 from accerl_lerobot.demos.backbone import Sizes, write_backbone
 from accerl_lerobot.policies.config import TuningConfig
+from benchmarks.tables import as_table, host, ranged, spread
 
 STATE = "observation.state"
 STATE_DIM, ACTION_DIM, TOKENS = 8, 7, 48

@@ -16,7 +16,6 @@ from typing import Any
 import psutil
 from rich.table import Table
 
-from accerl_lerobot.bench import as_table, host, ranged, spread
 from accerl_lerobot.config.ranges import Positive, Repeats, Section
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import RunConfig, parse
@@ -24,6 +23,7 @@ from accerl_lerobot.engine.loop import Progress
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import Load
 from accerl_lerobot.replay.pacing import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, Schedule
+from benchmarks.tables import as_table, host, ranged, spread
 
 SETTLE = 2  # updates after a change that are not counted, beside those that need nothing new
 ARMS: tuple[Schedule, ...] = (ASYNCHRONOUS, OVERLAP, SYNCHRONOUS)

@@ -22,7 +22,6 @@ import draccus
 import numpy as np
 from rich.table import Table
 
-from accerl_lerobot.bench import as_table, host, ranged, spread
 from accerl_lerobot.config.ranges import Positive, Range, Repeats, Section
 from accerl_lerobot.demos.record import simulators
 from accerl_lerobot.envs import EnvConfig, LiberoConfig, MetaWorldConfig, make_environment
@@ -31,6 +30,7 @@ from accerl_lerobot.envs.libero_simulator import Simulator, liberos_own
 from accerl_lerobot.envs.libero_tasks import load_libero
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.seeds import train_seed
+from benchmarks.tables import as_table, host, ranged, spread
 
 OURS, EVERY_STEP, STOCK = "ours", "ours_every_step", "stock"
 PHYSICS, STOCK_PHYSICS = "physics", "stock_physics"

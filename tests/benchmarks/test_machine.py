@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from accerl_lerobot.bench import environment
-from accerl_lerobot.bench import policy as bench
-from accerl_lerobot.bench.environment import BenchEnvironmentConfig, bench_environment
-from accerl_lerobot.bench.policy import BenchPolicyConfig
 from accerl_lerobot.demos import backbone
 from accerl_lerobot.envs import EnvConfig, LiberoConfig, MetaWorldConfig, SimulatedConfig
-from benchmarks import latency
+from benchmarks import environment, latency
+from benchmarks import policy as bench
+from benchmarks.environment import BenchEnvironmentConfig, bench_environment
 from benchmarks.latency import BenchLatencyConfig, bench_latency, described
+from benchmarks.policy import BenchPolicyConfig
 from benchmarks.simulated_environment import LatencyConfig, read_trace
 from tests.envs.libero_assets import ASSETS, needs_assets
 from tests.runs import printed
