@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``accerl doctor``: checks a recipe against this machine; every failure comes with its hint.
+"""``accerl doctor``: checks this machine, and a recipe against it; every failure comes with its hint.
 
 A frame is really drawn, in a process of its own, because a broken OpenGL can take a process down.
 """
@@ -15,11 +15,10 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-from accerl_lerobot.checkpoint.safety import MIB, brief
+from accerl_lerobot.checkpoint.safety import brief
 from accerl_lerobot.engine import sizes
 from accerl_lerobot.engine.config import lag_limits
 from accerl_lerobot.errors import InputError
@@ -30,12 +29,8 @@ if TYPE_CHECKING:
 OK, WARN, FAIL = "ok", "warn", "FAIL"
 DISK_GIB = 2.0  # space that demonstrations, checkpoints and videos of a run may need
 RENDER_TIMEOUT_S = 120
-USABLE = 0.8
-"""Share of a device's memory that an estimate may fill. SmolVLA's backward pass took 1.19 times its estimate
-on a CPU, for gradients under way and fragmentation; on a GPU CUDA's libraries need their part too."""
 
 DRAW = """
-import time
 from accerl_lerobot.envs.graphics import import_mujoco, new_renderer
 mujoco = import_mujoco()
 model = mujoco.MjModel.from_xml_string(
@@ -45,11 +40,7 @@ data = mujoco.MjData(model)
 mujoco.mj_forward(model, data)
 renderer = new_renderer(model, 64, 64)
 renderer.update_scene(data)
-renderer.render()
-started = time.perf_counter()
-renderer.update_scene(data)
-frame = renderer.render()
-print("drawn", frame.std() > 1, round(1000 * (time.perf_counter() - started), 1))
+print("drawn" if renderer.render().std() > 1 else "empty")
 """
 
 
@@ -63,11 +54,19 @@ class Check(NamedTuple):
 
 def main(arguments: list[str]) -> int:
     """``accerl doctor``; 0 if everything needed is there, otherwise 1."""
-    config, history, checks = _resolve(arguments) if arguments else (None, 1, [])
+    config: RunConfig | None = None
+    history = 1
+    checks = []
+    if arguments:
+        try:
+            config, history = _resolve(arguments)
+            checks.append(Check("recipe", OK, "resolves"))
+        except InputError as error:
+            checks.append(Check("recipe", FAIL, str(error)))
     checks += machine(config, history)
     if config is not None:
         checks += pace(config)
-        for name, check in (("imagination", imagination), ("placement", placement), ("policy", policy_fits)):
+        for name, check in (("imagination", imagination), ("placement", placement)):
             try:
                 checks += check(config)
             except InputError as error:
@@ -75,8 +74,18 @@ def main(arguments: list[str]) -> int:
     for each in checks:
         sys.stdout.write(f"{each.status:5} {each.name:10} {each.text}\n")
     failed = sum(each.status == FAIL for each in checks)
-    sys.stdout.write(f"\n{'all good' if not failed else f'{failed} of {len(checks)} checks failed'}\n")
+    sys.stdout.write(f"\n{failed} of {len(checks)} checks failed\n" if failed else "\nall good\n")
     return 1 if failed else 0
+
+
+def _resolve(arguments: list[str]) -> tuple[RunConfig, int]:
+    """The config of a command line, and its policy's ``n_obs_steps``."""
+    from accerl_lerobot.engine.config import RunConfig, parse
+    from accerl_lerobot.engine.preflight import check_start
+
+    config: RunConfig = parse(RunConfig, arguments)
+    _, history = check_start(config)
+    return config, history
 
 
 def machine(config: RunConfig | None, history: int = 1) -> Iterator[Check]:
@@ -91,20 +100,28 @@ def machine(config: RunConfig | None, history: int = 1) -> Iterator[Check]:
 def packages() -> Check:
     """Installed versions against the ranges of this package's requirements."""
     from packaging.requirements import Requirement
-    from packaging.utils import canonicalize_name
 
-    here: dict[str, str] = {canonicalize_name(d.name): d.version for d in importlib.metadata.distributions()}
-    if "accerl-lerobot" not in here:
+    wrong = []
+    missing = False
+    try:
+        requirements = importlib.metadata.requires("accerl-lerobot") or []
+    except importlib.metadata.PackageNotFoundError:
         return Check("packages", FAIL, "accerl-lerobot is not installed: run make setup")
-    wrong: dict[str, str | None] = {}
-    for requirement in map(Requirement, importlib.metadata.requires("accerl-lerobot") or ()):
-        installed = here.get(canonicalize_name(requirement.name))
-        needed = requirement.marker is None or requirement.marker.evaluate({"extra": ""})
-        if needed and not (installed and requirement.specifier.contains(installed, prereleases=True)):
-            wrong[f"{requirement.name} {installed or 'missing'}, not {requirement.specifier}"] = installed
+    for requirement in map(Requirement, requirements):
+        if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
+            continue
+        try:
+            version = importlib.metadata.version(requirement.name)
+        except importlib.metadata.PackageNotFoundError:
+            missing = True
+            wrong.append(f"{requirement.name} missing")
+            continue
+        if not requirement.specifier.contains(version, prereleases=True):
+            wrong.append(f"{requirement.name} {version}, not {requirement.specifier}")
     if wrong:
-        return Check("packages", WARN if all(wrong.values()) else FAIL, f"{'; '.join(wrong)}: run make setup")
-    return Check("packages", OK, f"all within their ranges, lerobot {here['lerobot']} among them")
+        return Check("packages", FAIL if missing else WARN, f"{'; '.join(wrong)}: run make setup")
+    lerobot = importlib.metadata.version("lerobot")
+    return Check("packages", OK, f"all within their ranges, lerobot {lerobot} among them")
 
 
 def libraries(config: RunConfig | None) -> Iterator[Check]:
@@ -113,43 +130,70 @@ def libraries(config: RunConfig | None) -> Iterator[Check]:
 
     try:
         ray_session.prepare(joins=config is not None and config.launch.address is not None)
-    except InputError as error:
-        yield Check("ray", FAIL, str(error))
-    for name in ("ray", "torch"):
-        try:
-            module = importlib.import_module(name)
-        except Exception as error:
-            yield Check(name, FAIL, f"cannot be imported ({brief(error)}); run make setup")
-            continue
-        text = str(module.__version__)
-        if name == "torch":
-            count = module.cuda.device_count() if module.cuda.is_available() else 0
-            text += f", {count} × {module.cuda.get_device_name(0)}" if count else ", no CUDA device"
-        yield Check(name, OK, text)
+        import ray
+
+        yield Check("ray", OK, ray.__version__)
+    except Exception as error:
+        yield Check("ray", FAIL, _importing(error))
+    try:
+        import torch
+    except Exception as error:
+        yield Check("torch", FAIL, _importing(error))
+        return
+    yield Check("torch", OK, str(torch.__version__))
+    if not torch.cuda.is_available():
+        yield Check("gpu", OK, "none")
+        return
+    gib = torch.cuda.get_device_properties(0).total_memory / sizes.GIB
+    text = f"{torch.cuda.device_count()} × {torch.cuda.get_device_name(0)}, {gib:.0f} GiB each"
+    need = 0.0 if config is None else _learning_gib(config)
+    if need > gib:
+        hint = "use policy.tuning.mode=lora, or several GPUs and trainer.sharding=zero3"
+        yield Check("gpu", WARN, f"{text}; weights, gradients and AdamW take {need:.1f} GiB: {hint}")
+        return
+    if need:
+        text += f"; weights, gradients and AdamW take {need:.1f}, trainer.micro_batch sizes the rest"
+    yield Check("gpu", OK, text)
+
+
+def _learning_gib(config: RunConfig) -> float:
+    """Memory that a given policy takes on the GPU of its trainer, without what a batch adds."""
+    from accerl_lerobot.policies.loading import policy_sizes, resolve_device
+
+    if config.policy.path is None or resolve_device(config.policy.device).type == "cpu":
+        return 0.0
+    policy = policy_sizes(config.policy)
+    return 4 * (policy.policy + policy.trained * sizes.trained_copies(config)) / sizes.GIB
+
+
+def _importing(error: Exception) -> str:
+    if isinstance(error, InputError):
+        return str(error)
+    return f"cannot be imported ({brief(error)}); run make setup"
 
 
 def rendering(*, needed: bool, script: str = DRAW) -> Check:
     """Draws a frame in a process of its own; if it is not `needed`, a failure is only a warning."""
     from accerl_lerobot.envs.graphics import choose_backend
 
-    command, hint = [sys.executable, "-c", script], "set MUJOCO_GL to osmesa or egl"
+    failure = FAIL if needed else WARN
     if importlib.util.find_spec("mujoco") is None:
         text = "MuJoCo is not installed; install the extra: accerl-lerobot[metaworld] or [libero]"
-        return Check("rendering", FAIL if needed else WARN, text)
+        return Check("rendering", failure, text)
+    hint = "set MUJOCO_GL to osmesa or egl"
+    command = [sys.executable, "-c", script]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=RENDER_TIMEOUT_S, check=False)
     except subprocess.TimeoutExpired:
-        text = f"no frame within {RENDER_TIMEOUT_S} s; {hint}"
-    else:
-        words = done.stdout.split()
-        if done.returncode == 0 and words[:2] == ["drawn", "True"]:
-            backend = os.environ.get("MUJOCO_GL") or choose_backend() or "the display"
-            return Check("rendering", OK, f"MuJoCo draws 64 × 64 pixels in {words[2]} ms ({backend})")
-        text = (done.stderr.strip().splitlines() or [f"ended with code {done.returncode}"])[-1]
-        text = text.removeprefix("accerl_lerobot.errors.InputError: ")
-        if done.returncode == 0:
-            text = f"MuJoCo draws an empty picture; {hint}"
-    return Check("rendering", FAIL if needed else WARN, text)
+        return Check("rendering", failure, f"no frame within {RENDER_TIMEOUT_S} s; {hint}")
+    if done.returncode:
+        lines = done.stderr.strip().splitlines() or [f"ended with code {done.returncode}"]
+        text = lines[-1].removeprefix("accerl_lerobot.errors.InputError: ")
+        return Check("rendering", failure, text)
+    if done.stdout.split() != ["drawn"]:
+        return Check("rendering", failure, f"MuJoCo draws an empty picture; {hint}")
+    backend = os.environ.get("MUJOCO_GL") or choose_backend() or "the display"
+    return Check("rendering", OK, f"MuJoCo draws 64 × 64 pixels ({backend})")
 
 
 def resources(config: RunConfig | None, history: int = 1) -> Iterator[Check]:
@@ -157,11 +201,10 @@ def resources(config: RunConfig | None, history: int = 1) -> Iterator[Check]:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     text, status = f"{cores} cores", OK
     if config is not None:
-        threads = max(config.trainer.num_threads, config.inference.num_threads)
         text += f" for {config.rollout.workers} rollout, 1 inference, 1 trainer"
         if config.rollout.workers > cores:
             status, text = WARN, f"{text}: they will wait for each other; lower rollout.workers"
-        elif threads > cores:
+        elif max(config.trainer.num_threads, config.inference.num_threads) > cores:
             status, text = WARN, f"{text}: lower trainer.num_threads and inference.num_threads to {cores}"
     yield Check("cpu", status, text)
     free = sizes.memory_gib("MemAvailable")
@@ -171,22 +214,25 @@ def resources(config: RunConfig | None, history: int = 1) -> Iterator[Check]:
             need = sizes.policy_gib(config) + sum(sizes.memory_parts_gib(config, history).values())
             text += f", about {need:.1f} GiB needed"
             if need > free:
-                hint = (
-                    "lower rollout.workers, rollout.environments or replay.capacity, or use a smaller policy"
+                status = WARN
+                text += (
+                    ": lower rollout.workers, rollout.environments or replay.capacity, "
+                    "or use a smaller policy"
                 )
-                status, text = WARN, f"{text}: {hint}"
         yield Check("memory", status, text)
     disk = shutil.disk_usage(Path.cwd()).free / sizes.GIB
-    short = disk < DISK_GIB
-    text = f"{disk:.0f} GiB free here" + (f"; a run may need {DISK_GIB:.0f}" if short else "")
-    yield Check("disk", WARN if short else OK, text)
+    if disk < DISK_GIB:
+        yield Check("disk", WARN, f"{disk:.0f} GiB free here; a run may need {DISK_GIB:.0f}")
+    else:
+        yield Check("disk", OK, f"{disk:.0f} GiB free here")
 
 
 def imagination(config: RunConfig) -> Iterator[Check]:
     """Imagination settings against the environment and the policy."""
     from accerl_lerobot.engine.imagination import check_imagination
 
-    if share := config.imagination.share:
+    share = config.imagination.share
+    if share:
         check_imagination(config)
         yield Check("imagination", OK, f"{share:.0%} of every batch; world model: {config.imagination.model}")
 
@@ -198,71 +244,11 @@ def placement(config: RunConfig) -> Iterator[Check]:
     return (Check("placement", OK, row) for row in check_placement(config))
 
 
-def policy_fits(config: RunConfig) -> Iterator[Check]:
-    """The memory of a given policy where it learns and acts, against that of its device."""
-    from accerl_lerobot.algorithms import RatioConfig
-    from accerl_lerobot.policies.loading import learning_config, rehearsed, resolve_device
-    from accerl_lerobot.trainer.footprint import PolicyMemory, policy_memory
-    from accerl_lerobot.trainer.off_policy import POLICY_BATCH
-
-    if config.policy.path is None or not config.trainer.updates:
-        return
-    trainer, ratio = config.trainer, isinstance(config.algorithm, RatioConfig)
-    device = resolve_device(config.policy.device)
-    measure = partial(policy_memory, imitates=not ratio, checkpointing=trainer.activation_checkpointing)
-    learning_config(config.policy)
-    memory = PolicyMemory(*rehearsed(config.policy, measure))
-    batch = math.ceil(trainer.batch_decisions / trainer.ranks) if ratio else POLICY_BATCH
-    decisions = min(batch, trainer.micro_batch)
-    kept: float = memory.weights + sizes.trained_copies(config) * memory.trained
-    if trainer.zero:  # zero2 holds all weights from the forward pass to the end of the backward pass
-        kept = kept / trainer.ranks + (memory.weights if trainer.sharding == "zero2" else 0)
-    kept += memory.learning_batch
-    acting = memory.replica(config.inference.max_batch)
-    usable, replicas, place = _device_memory(config, device)
-    need = kept + decisions * memory.learning + replicas * acting
-    text = (
-        f"trainer {_gib(kept)} and {_gib(memory.learning)} for each of {decisions} decisions, "
-        f"inference {_gib(acting)}; {_gib(need)} of {_gib(usable)} on {place}"
-    )
-    if need <= usable:
-        yield Check("policy", OK, text)
-        return
-    fitting = int((usable - kept - replicas * acting) / memory.learning)
-    hint = f"use --trainer.micro_batch={fitting}" if fitting > 0 else "use policy.tuning.mode=lora"
-    if not trainer.activation_checkpointing:
-        hint += ", or --trainer.activation_checkpointing=true"
-    yield Check("policy", WARN, f"{text}: {hint}")
-
-
-def _device_memory(config: RunConfig, device: Any) -> tuple[float, int, str]:
-    """Bytes that a rank and the inference replicas beside it may take, how many these are, and of what."""
-    import torch
-
-    others = config.inference.workers if config.launch.engine != "local" else 0
-    if device.type == "cpu":
-        free = sizes.memory_gib("MemAvailable") or math.inf
-        rest = free - sum(sizes.memory_parts_gib(config).values())
-        return USABLE * rest * sizes.GIB, others, "this machine"
-    gpus = torch.cuda.device_count()
-    rank, other = config.trainer.gpu_shares(gpus, others)
-    beside = int((1 - rank) / other + 1e-6) if other else 0
-    smallest = min(torch.cuda.get_device_properties(i).total_memory for i in range(gpus))
-    return USABLE * smallest, min(others, beside), "a GPU"
-
-
-def _gib(size: float) -> str:
-    if size < sizes.GIB:
-        return f"{size / MIB:.0f} MiB"
-    return f"{size / sizes.GIB:.1f} GiB" if size < 10 * sizes.GIB else f"{size / sizes.GIB:.0f} GiB"
-
-
 def pace(config: RunConfig) -> Iterator[Check]:
     """How far apart collecting and learning may run under this recipe, and how much it collects."""
     replay, trainer = config.replay, config.trainer
-    in_flight = config.rollout.in_flight
     bound, of_pace = lag_limits(config)
-    text = f"at most {bound} updates with {in_flight} decisions under way"
+    text = f"at most {bound} updates with {config.rollout.in_flight} decisions under way"
     if of_pace > bound:
         text += (
             f"; the pace alone allows {of_pace}, so segments may be thrown away as too old: "
@@ -273,18 +259,7 @@ def pace(config: RunConfig) -> Iterator[Check]:
     collected = math.ceil(trainer.updates * trainer.batch_decisions / replay.samples_per_insert)
     text = f"{trainer.updates:,} updates of {trainer.batch_decisions} on about {collected:,} decisions"
     of_sft = config.sft.policy.get("n_action_steps", 0) if config.sft.steps else 0
-    if actions := int(config.policy.n_action_steps or of_sft):
+    actions = int(config.policy.n_action_steps or of_sft)
+    if actions:
         text += f", at most {collected * actions:,} env steps"
     yield Check("work", OK, text)
-
-
-def _resolve(arguments: list[str]) -> tuple[RunConfig | None, int, list[Check]]:
-    from accerl_lerobot.engine.config import RunConfig, parse
-    from accerl_lerobot.engine.preflight import check_start
-
-    try:
-        config: RunConfig = parse(RunConfig, arguments)
-        _, history = check_start(config)
-    except InputError as error:
-        return None, 1, [Check("recipe", FAIL, str(error))]
-    return config, history, [Check("recipe", OK, "resolves")]

@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from accerl_lerobot.cli.doctor import USABLE
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.config import PolicyConfig, TuningConfig
 from accerl_lerobot.policies.loading import load_adapter
@@ -21,6 +20,7 @@ from accerl_lerobot.trainer.footprint import Counter, PolicyMemory, policy_memor
 from tests.policies.tiny_pi import small, write_pi
 
 MIB = 2**20
+USABLE = 0.8  # share of what a process takes that was estimated; SmolVLA took 1.19 times its estimate
 
 
 def test_tensors_are_counted_while_they_live():
@@ -129,5 +129,5 @@ def test_a_process_takes_what_was_estimated_at_published_size(tmp_path: Path):
     assert memory.weights > 1600 * MIB
     # Gradients appear as what was kept for them goes, so not all of both is there at once.
     most = memory.trained + memory.learning_batch + DECISIONS * memory.learning
-    # Further gradients under way, and fragmentation: see `doctor.USABLE`.
+    # Further gradients under way, and fragmentation: see `USABLE`.
     assert DECISIONS * memory.learning < taken < most / USABLE
