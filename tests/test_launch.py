@@ -21,11 +21,11 @@ from accerl_lerobot.engine.loop import Progress
 from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.replay.pacing import ReplayConfig, lag_bound
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
-from accerl_lerobot.timeline.read import ABSENT, read_timeline
+from accerl_lerobot.timeline.read import read_timeline
 from accerl_lerobot.trainer.config import TrainerConfig
 from benchmarks.simulated_environment import LatencyConfig
 from tests.runs import collect, polls, tiny_run
-from tests.timeline.test_engines import adds_up
+from tests.timeline.test_engines import adds_up, gaps
 
 UPDATES = 40
 DURING = 12
@@ -214,7 +214,7 @@ def test_every_worker_has_left_its_timeline(story: Story):
     timeline = read_timeline(story.directory)
     rows = {row.worker: row for row in timeline.rows}
     assert list(rows) == ["rollout 0", "rollout 1", "inference", "replay", "trainer"]
-    assert [name for name, row in rows.items() if ABSENT in row.states] == ["rollout 1", "inference"]
+    assert [name for name, row in rows.items() if len(gaps(row))] == ["rollout 1", "inference"]
     adds_up(timeline)
     spent = timeline.shares()
     assert {"recovery", "compute", "transport", "wait_in"} <= spent["rollout"].keys()

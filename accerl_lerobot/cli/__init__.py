@@ -28,7 +28,7 @@ VERBS = {
     "push": "push a policy, world model or dataset to the Hub, as one commit",
     "pull": "pull from the Hub into a new folder, pinned and checked",
     "report": "write one HTML page about a run, or several side by side",
-    "timeline": "show when every worker of a run did what: a picture and shares",
+    "timeline": "show when every worker of a run did what: a trace for Perfetto, and shares",
     "export": "write the episodes of a run as a LeRobotDataset, with an image at every env step",
     "doctor": "resolve a recipe and check this machine",
 }

@@ -44,7 +44,7 @@ from accerl_lerobot.metrics import WandBConfig, plain
 from accerl_lerobot.policies.config import Load, PolicyConfig
 from accerl_lerobot.report import ReportConfig, write_report
 from accerl_lerobot.rollout.runner import RolloutConfig
-from accerl_lerobot.timeline.read import TimelineConfig, show_timelines, timeline_table
+from accerl_lerobot.timeline.read import TimelineConfig, write_trace
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.world_model.config import StateModelConfig, ValidationConfig, WorldModelConfig
 
@@ -381,9 +381,14 @@ def report(arguments: list[str]) -> int:
 def timeline(arguments: list[str]) -> int:
     """``accerl timeline``."""
     config: TimelineConfig = parse(TimelineConfig, arguments)
-    found, console = show_timelines(config), Console()
-    console.rich.print(timeline_table(found))
-    console.say(f"picture {found['picture']}")
+    console = Console()
+    found = write_trace(config)
+    for run in found["runs"]:
+        console.say(f"{run['run']}: time of its workers while it trained")
+        for role, shares in run["shares"].items():
+            parts = (f"{state} {share:.0%}" for state, share in shares.items())
+            console.say(f"{role:20} {', '.join(parts)}")
+    console.say(f"trace {found['trace']}; open it at https://ui.perfetto.dev")
     return tell(found)
 
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The timeline: every worker's activity over time, recorded by each, read and drawn afterwards.
+"""The timeline: every worker's activity over time, recorded by each, and read afterwards.
 
 Entering a state ends the one before, so states exclude each other and their times add up to the time of the
-process by construction. Time is that of the monotonic clock, which processes of one machine share; the
-calendar time at which a process began is noted too.
+process by construction. Time is that of the monotonic clock; the calendar time at which a process began is
+noted too.
 
 ``RUN/timeline/rollout-0.1.3.bin`` is part 3 of the second process (1) of ``rollout 0``: a line of JSON, then
 8 bytes per entry, nanoseconds since the process began << 4 | state, little-endian. The newest two parts are
@@ -16,10 +16,10 @@ import json
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO
 
 from accerl_lerobot.fault_points import fault_point
 
@@ -43,6 +43,12 @@ ROLES = (
     "world-model learning",
 )
 TIMELINE = "timeline"
+FORMAT = 1
+BITS = 4
+FLUSH_NS = 1_000_000_000
+"""An entry is on its way to the disk after so long, if another follows or `Clock.beat` is called."""
+PART_BYTES = 4_000_000
+SUFFIX = ".bin"
 
 
 def role_of(worker: str) -> str:
@@ -50,34 +56,11 @@ def role_of(worker: str) -> str:
     return worker.rstrip("0123456789").rstrip()
 
 
-def bubble(shares: Mapping[str, float]) -> float:
-    """Share of its time that a worker waits for others, of its shares by state."""
-    return shares.get("wait_in", 0.0) + shares.get("wait_out", 0.0)
-
-
-FORMAT = 1
-BITS = 4
-FLUSH_NS = 1_000_000_000
-"""An entry is on its way to the disk after so long, if another follows or `Clock.beat` is called."""
-PART_BYTES = 4_000_000
-SUFFIX = ".bin"
-BOOT = Path("/proc/sys/kernel/random/boot_id")
-"""Tells one machine's monotonic clock from another's; without such a file all are taken for one."""
-
-
-class Moment(NamedTuple):
-    """A moment by the monotonic clock of a node and by the calendar, in nanoseconds."""
-
-    node: str
-    clock_ns: int
-    wall_ns: int
-
-
 class Clock:
     """One worker's recorder; begins in the state `RECOVERY`, which is to get ready for work.
 
     States are entered from one thread; `beat`, from any, writes entries so far, up to now. The part of
-    `worker` before a number is its role; its process `begins` now, unless it is said.
+    `worker` before a number is its role.
     """
 
     def __init__(
@@ -85,23 +68,23 @@ class Clock:
         folder: Path,
         worker: str,
         *,
-        begins: Moment | None = None,
         part_bytes: int = PART_BYTES,
         now: Callable[[], int] = time.monotonic_ns,
+        calendar: Callable[[], int] = time.time_ns,
     ) -> None:
-        if begins is None:
-            node = BOOT.read_text().strip() if BOOT.is_file() else ""
-            begins = Moment(node, time.monotonic_ns(), time.time_ns())
-        self._now, self._lock = now, threading.Lock()
-        self._state, self._origin = RECOVERY, begins.clock_ns
-        self._since, self._due = self._origin, self._origin + FLUSH_NS
-        self._head = {"timeline": FORMAT, "worker": worker, "pid": os.getpid(), **begins._asdict()}
+        self._now = now
+        self._lock = threading.Lock()
+        self._state = RECOVERY
+        self._origin = self._since = now()
+        self._due = self._origin + FLUSH_NS
+        self._head = {"timeline": FORMAT, "worker": worker, "pid": os.getpid(), "wall_ns": calendar()}
         self._point = f"{role_of(worker).split()[-1]}.timeline"
         folder.mkdir(parents=True, exist_ok=True)
         slug = worker.replace(" ", "-")
-        earlier = [path.name.split(".") for path in folder.glob(f"{slug}.*.*{SUFFIX}")]
-        process = 1 + max((int(number) for _, number, *_ in earlier), default=-1)
-        self._stem, self._part, self._part_bytes = folder / f"{slug}.{process}", -1, part_bytes
+        earlier = [int(path.name.split(".")[1]) for path in folder.glob(f"{slug}.*.*{SUFFIX}")]
+        self._stem = folder / f"{slug}.{max(earlier, default=-1) + 1}"
+        self._part = -1
+        self._part_bytes = part_bytes
         self._file = self._next_part()
 
     def enter(self, state: int) -> None:
@@ -135,7 +118,8 @@ class Clock:
     def _note(self, state: int) -> None:
         now = self._now()
         self._file.write(((now - self._origin) << BITS | state).to_bytes(8, "little"))
-        self._state, self._since = state, now
+        self._state = state
+        self._since = now
 
     def _flush(self) -> None:
         fault_point(self._point)

@@ -10,17 +10,24 @@ import pytest
 
 from accerl_lerobot.engine.config import LaunchConfig
 from accerl_lerobot.engine.local import LocalEngine
-from accerl_lerobot.timeline.read import ABSENT, Timeline, read_timeline
+from accerl_lerobot.timeline.read import Row, Timeline, read_timeline
 from tests.runs import drive, tiny_run
 
 
 def adds_up(timeline: Timeline) -> None:
+    """A worker is in one state at a time, and every moment of its processes is in one."""
     for row in timeline.rows:
-        there = row.states != ABSENT
-        whole = row.times[-1] - row.times[0] - np.diff(row.times)[~there].sum()
-        assert row.until(row.times[-1:])[0].sum() == pytest.approx(whole, rel=1e-9) and whole > 0
+        whole = int(row.ends[-1] - row.starts[0] - gaps(row).sum())
+        assert row.spent((0.0, timeline.seconds + 1.0)).sum() == pytest.approx(whole, rel=1e-9) and whole > 0
     for own in timeline.shares().values():
         assert sum(own.values()) == pytest.approx(1.0)
+
+
+def gaps(row: Row) -> np.ndarray:
+    """Lengths of the times between two processes of a worker."""
+    between: np.ndarray = row.starts[1:] - row.ends[:-1]
+    assert (between >= 0).all()
+    return between[between > 0]
 
 
 def test_the_engine_in_one_process_is_one_row(tiny_checkpoint: Path, tmp_path: Path) -> None:

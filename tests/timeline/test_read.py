@@ -1,38 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the time of roles divides, in all and in a part; workers that were started again; machines apart."""
+"""How the time of roles divides, in all and in a part; workers that were started again; the trace."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
-from PIL import Image
 
 from accerl_lerobot.cli import main
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.timeline import (
-    CHECKPOINT,
-    COMPUTE,
-    EVALUATION,
-    RECOVERY,
-    TRAINING,
-    WAIT_IN,
-    WAIT_OUT,
-    Moment,
-    bubble,
-)  # fmt: skip
-from accerl_lerobot.timeline.read import (
-    ABSENT,
-    TimelineConfig,
-    choose_window,
-    read_timeline,
-    show_timelines,
-    timeline_table,
-)
-from tests.runs import printed
-from tests.timeline.folders import SECOND, UP, a_clock, write_worker
+from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, EVALUATION, RECOVERY, TRAINING, WAIT_IN, WAIT_OUT
+from accerl_lerobot.timeline.read import TimelineConfig, read_timeline, write_trace
+from tests.timeline.folders import SECOND, write_worker
 
 
 @pytest.fixture
@@ -51,7 +31,6 @@ def test_shares_are_of_the_time_of_all_workers_of_a_role(run: Path) -> None:
     assert found["rollout"] == pytest.approx({"compute": 0.4, "wait_in": 0.2, "wait_out": 0.4})
     assert found["trainer"] == pytest.approx({"compute": 4 / 9, "wait_in": 5 / 9})
     assert list(found) == ["driver", "rollout", "trainer"]
-    assert bubble(found["rollout"]) == pytest.approx(0.6) and bubble(found["driver"]) == 0
 
 
 def test_shares_of_a_part(run: Path) -> None:
@@ -77,29 +56,13 @@ def test_a_worker_that_was_started_again_is_one_row_with_a_gap(tmp_path: Path) -
     write_worker(tmp_path, "rollout 3", [(COMPUTE, 2)])
     write_worker(tmp_path, "rollout 3", [(RECOVERY, 1), (COMPUTE, 1)], at_s=4)
     (row,) = read_timeline(tmp_path).rows
-    assert row.states.tolist() == [RECOVERY, COMPUTE, ABSENT, RECOVERY, COMPUTE]
-    assert (row.times / SECOND).tolist() == [0, 0, 2, 4, 5, 6]
+    assert row.states.tolist() == [RECOVERY, COMPUTE, RECOVERY, COMPUTE]
+    assert (row.starts / SECOND).tolist() == [0, 0, 4, 5] and (row.ends / SECOND).tolist() == [0, 2, 5, 6]
     assert read_timeline(tmp_path).shares()["rollout"] == pytest.approx({"compute": 0.75, "recovery": 0.25})
     # The next process begins before the last entries of this one end.
     write_worker(tmp_path, "rollout 3", [(COMPUTE, 1)], at_s=5.5)
     (row,) = read_timeline(tmp_path).rows
-    assert (np.diff(row.times) >= 0).all() and len(row.states) == len(row.times) - 1
-    assert row.times[-1] == 6.5 * SECOND
-
-
-def test_machines_are_set_by_the_calendar_and_processes_of_one_by_its_clock(tmp_path: Path) -> None:
-    """A clock that has run for another time, and a calendar that is put right meanwhile."""
-    moments = {
-        "trainer": Moment("here", UP, 2 * UP),
-        "replay": Moment("here", UP + 5 * SECOND, 2 * UP + 9 * SECOND),
-        "rollout 0": Moment("there", 77, 2 * UP + 3 * SECOND),
-    }
-    for worker, moment in moments.items():
-        clock, hands = a_clock(tmp_path, worker, begins=moment)
-        hands.now += SECOND
-        clock.close()
-    begins = {row.worker: int(row.times[0]) for row in read_timeline(tmp_path).rows}
-    assert begins == {"trainer": 0, "replay": 5 * SECOND, "rollout 0": 3 * SECOND}
+    assert (row.starts[1:] >= row.ends[:-1]).all() and row.ends[-1] == 6.5 * SECOND
 
 
 def test_workers_are_in_order(tmp_path: Path) -> None:
@@ -118,50 +81,18 @@ def test_a_folder_without_a_run_and_a_run_without_a_timeline(tmp_path: Path) -> 
             read_timeline(tmp_path / name)
 
 
-def write_run(folder: Path, turn: float = 0.5, turns: int = 200) -> Path:
-    """The trainer computes half of each turn; the rollout worker is lost once, and the other waits then."""
-    write_worker(folder, "driver", [(RECOVERY, 5), (TRAINING, turn * turns), (RECOVERY, 1)])
-    write_worker(folder, "trainer", [(WAIT_IN, 5), *turns * [(COMPUTE, turn / 2), (WAIT_IN, turn / 2)]])
-    write_worker(folder, "rollout 0", [(COMPUTE, 3)])
-    write_worker(folder, "rollout 0", [(RECOVERY, 1), (COMPUTE, 5 + turn * turns)], at_s=4)
-    write_worker(folder, "rollout 1", [(WAIT_IN, 2), (COMPUTE, 3 + turn * turns)])
-    return folder
-
-
-@pytest.fixture
-def long_run(tmp_path: Path) -> Path:
-    return write_run(tmp_path / "run")
-
-
-def test_a_window_is_in_the_middle_of_the_training_unless_it_is_chosen(long_run: Path) -> None:
-    timeline = read_timeline(long_run)
-    assert choose_window(timeline, None, 10.0) == pytest.approx((50.0, 60.0)), "the training is from 5 to 105"
-    assert choose_window(timeline, 7.0, 3.0) == (7.0, 10.0)
-    assert choose_window(timeline, 100.0, 30.0) == (100.0, timeline.seconds)
-    with pytest.raises(InputError, match=r"^start_s=200\.0: use 0 or more, below 110\.0"):
-        choose_window(timeline, 200.0, 10.0)
-
-
-def test_pictures_stand_above_each_other_and_are_replaced(long_run, tmp_path, monkeypatch, capsys):
-    assert main(["timeline", str(long_run)]) == 0
-    result = json.loads(capsys.readouterr().out)
-    with Image.open(long_run / "timeline.png") as image:
-        one = image.size
-        seen = {tuple(pixel[:3]) for _, pixel in image.convert("RGB").getcolors(2**20)}
-    assert (0x3A, 0x7D, 0x44) in seen, "nobody works"
-    assert result["picture"] == str(long_run / "timeline.png")
-    assert result["runs"][0]["bubble"]["trainer"] == pytest.approx(0.5)
-    other = write_run(tmp_path / "other")
+def test_a_trace_that_perfetto_shows(run: Path, tmp_path: Path, monkeypatch, capsys) -> None:
+    assert main(["timeline", str(run)]) == 0
+    out, err = capsys.readouterr()
+    found = json.loads(out)
+    assert found["trace"] == str(run / "timeline.json") and "ui.perfetto.dev" in err
+    assert found["runs"][0]["training_s"] == [[2.0, 8.0]] and "rollout" in found["runs"][0]["shares"]
+    assert "trainer              compute 50%, wait_in 50%" in err
+    events = json.loads((run / "timeline.json").read_text())
+    names = {e["tid"]: e["args"]["name"] for e in events if e["name"] == "thread_name"}
+    assert list(names.values()) == ["driver", "rollout 0", "rollout 1", "trainer"]
+    spans = [(names[e["tid"]], e["name"], e["ts"], e["dur"]) for e in events if e["ph"] == "X" and e["dur"]]
+    assert ("rollout 0", "wait_in", 6e6, 4e6) in spans and ("trainer", "compute", 5e6, 4e6) in spans
     monkeypatch.chdir(tmp_path)
-    for _ in range(2):
-        show_timelines(TimelineConfig(runs=(str(long_run), str(other)), seconds=4.0))
-    with Image.open(tmp_path / "timeline.png") as image:
-        assert image.width == one[0] and image.height > 1.5 * one[1]
-    text = printed(timeline_table(show_timelines(TimelineConfig(runs=(str(long_run), str(other))))))
-    assert "other" in text and "bubble" in text and "50.0" in text
-
-
-def test_a_place_that_cannot_hold_a_picture(long_run: Path, tmp_path: Path) -> None:
-    for path, said in ((tmp_path / "a.svg", "PNG"), (tmp_path / "no" / "a.png", "a folder that exists")):
-        with pytest.raises(InputError, match=f"^output=.*{said}"):
-            show_timelines(TimelineConfig(runs=(str(long_run),), output=str(path)))
+    write_trace(TimelineConfig(runs=(str(run), str(run))))
+    assert {e["pid"] for e in json.loads(Path("timeline.json").read_text())} == {0, 1}
