@@ -69,7 +69,9 @@ def write_report(config: ReportConfig) -> Path:
 def _html(page: dict[str, Any], folder: Path) -> str:
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
+    from accerl_lerobot.console import percent
     from accerl_lerobot.report.charts import POINTS
+    from accerl_lerobot.report.content import STATE_COLOURS
 
     template = Environment(
         loader=PackageLoader("accerl_lerobot", "report"), autoescape=True, undefined=StrictUndefined,
@@ -79,6 +81,8 @@ def _html(page: dict[str, Any], folder: Path) -> str:
         **page,
         version=__version__,
         points=POINTS,
+        colours=STATE_COLOURS,
+        percent=percent,
         video_mb=VIDEO_MB,
         base64=lambda path: base64.b64encode(path.read_bytes()).decode(),
         address=lambda path: quote(os.path.relpath(path.resolve(), folder)),

@@ -2,14 +2,13 @@
 """The folder of a run of ``accerl train`` or ``accerl offline`` as plain data.
 
 A run that is still going or has crashed has no result file, and the last line of its ``metrics.jsonl`` may be
-incomplete. Both are common and no error; any other damage is an error that names the file.
+incomplete. Both are common and no error.
 
 Also the differences of a run's recipe from the defaults and from other runs.
 """
 
 from __future__ import annotations
 
-import contextlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -23,10 +22,11 @@ from accerl_lerobot.checkpoint.safety import FileSource, check_folder, read_json
 from accerl_lerobot.config.parsing import encode, read_recipe
 from accerl_lerobot.console import ABSENT
 from accerl_lerobot.engine.config import RunConfig
-from accerl_lerobot.errors import ERROR_LOG, InputError, reading
+from accerl_lerobot.errors import ERROR_LOG, InputError
 from accerl_lerobot.metrics import METRICS
 
 Record = dict[str, Any]
+PLACES = ("output_dir", "job_name")  # fields that say where results go, which are never shown as differences
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,17 +67,22 @@ class Run:
         """In the order of the policy's experience."""
         return sorted(self.records.get("evaluation", []), key=lambda e: e["env_steps"])
 
+    def evaluated(self, *groups: str) -> list[Record]:
+        """Evaluations of these groups, such as ``before``."""
+        return [e for e in self.evaluations if e.get("group") in groups]
+
     @property
     def outcomes(self) -> list[Record]:
         """Evaluations before and after training; of a run that is not finished, the newest."""
-        ends = [e for e in self.evaluations if e.get("group") in ("before", "after")]
-        return self.evaluations[-1:] if self.result is None else ends
+        return self.evaluations[-1:] if self.result is None else self.evaluated("before", "after")
 
     @property
     def wall_s(self) -> float | None:
         """Seconds that it took, or has taken so far."""
+        if self.result is not None and "wall_s" in self.result:
+            return float(self.result["wall_s"])
         walls = [newest(records, "wall_s") for records in self.records.values()]
-        return (self.result or {}).get("wall_s", max((w for w in walls if w is not None), default=None))
+        return max((wall for wall in walls if wall is not None), default=None)
 
     def section(self, name: str) -> Record:
         """Section of its config; empty if another version wrote it without."""
@@ -86,8 +91,8 @@ class Run:
 
 
 def read_run(path: Path) -> Run:
-    origin = FileSource("runs", str(path))
-    check_folder(path, origin)
+    source = FileSource("runs", str(path))
+    check_folder(path, source)
     config_path = path / CONFIG
     if not config_path.is_file():
         hint = f"no run in it: there is no {CONFIG}, which every run writes first"
@@ -95,65 +100,48 @@ def read_run(path: Path) -> Run:
     config = read_recipe(config_path)
     if not {"algorithm", "trainer"} <= config.keys():
         raise InputError("runs", str(path), f"no run in it: its {CONFIG} is not one of accerl train")
-    lines, truncated = _lines(path / METRICS)
-    records: dict[str, list[Record]] = {}
-    for number, line in enumerate(lines, 1):
-        with reading("runs", str(path), f"line {number} of {METRICS}"):
-            _check_numbers(line)
-            if line["kind"] == "evaluation":
-                _check_evaluation(line)
-        records.setdefault(line["kind"], []).append(line)
-    written = max(_modified(file) for file in path.iterdir() if file.suffix != ".html")
-    summary, log = path / SUMMARY, path / ERROR_LOG
-    result = read_json(summary, origin) if summary.is_file() else None
-    with reading("runs", str(path), SUMMARY):
-        _check_numbers(result or {})
-        if result is not None and {*map(type, result.get("tasks", ()))} - {str}:
-            raise TypeError("tasks")
-    failed = log.is_file() and _modified(log) >= written
+    records, truncated = _records(path / METRICS)
+    written = max(file.stat().st_mtime for file in path.iterdir() if file.suffix != ".html")
+    summary = path / SUMMARY
     return Run(
         path=path,
         config=config,
         config_text=config_path.read_text(),
         records=records,
-        result=result,
+        result=read_json(summary, source) if summary.is_file() else None,
         truncated=truncated,
         written=written,
-        error=(log.read_text(errors="replace").splitlines() or ["?"])[-1] if failed else "",
+        error=_error(path / ERROR_LOG, written),
         videos=tuple(sorted(path.glob("*.mp4"))),
     )
 
 
-COUNTS = ("wall_s", "env_steps", "episodes", "updates", "rl_s", "warm_start_s", "success", "n", "steps_mean")
-"""Numbers of records and summaries that are computed with."""
+def _error(log: Path, written: float) -> str:
+    if not log.is_file() or log.stat().st_mtime < written:
+        return ""
+    lines = log.read_text(errors="replace").splitlines()
+    return lines[-1] if lines else "?"
 
 
-def _check_numbers(record: Record) -> None:
-    for name, value in record.items():
-        if isinstance(value, int):
-            float(value)  # or it is too large
-        if name in COUNTS and not isinstance(value, int | float | None):
-            raise TypeError(f"{name} is {type(value).__name__}")
-
-
-def _check_evaluation(record: Record) -> None:
-    numbers = [record["env_steps"], record["steps_mean"]]
-    for measured in (record, *(record.get("tasks") or {}).values()):
-        low, high = measured["ci95"]
-        numbers += [measured["success"], measured["n"], low, high]
-    if {*map(type, record.get("notes", ()))} - {str}:
-        raise TypeError("notes")
-    if not np.isfinite(np.array(numbers, dtype=np.float64)).all():
-        raise ValueError("a number is missing")
-
-
-def _modified(path: Path) -> float:
-    return path.stat().st_mtime
+def _records(path: Path) -> tuple[dict[str, list[Record]], bool]:
+    """Records by their kind, and whether the last line is incomplete."""
+    records: dict[str, list[Record]] = {}
+    lines = path.read_bytes().splitlines() if path.is_file() else []
+    for number, text in enumerate(lines, 1):
+        try:
+            record = json.loads(text)
+            records.setdefault(record["kind"], []).append(record)
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            if number == len(lines):
+                return records, True
+            hint = f"{text[:60].decode(errors='replace')!r} is not a whole record; mend or remove this line"
+            raise InputError("runs", f"{path}:{number}", hint) from error
+    return records, False
 
 
 def column(records: Sequence[Record], name: str) -> np.ndarray:
     """One number of each record, float64; NaN where it is missing or not a number."""
-    values = (record.get(name) for record in records)
+    values = [record.get(name) for record in records]
     return np.array([v if isinstance(v, (int, float)) else np.nan for v in values], dtype=np.float64)
 
 
@@ -164,25 +152,10 @@ def newest(records: Sequence[Record], name: str) -> float | None:
     return float(finite[-1]) if len(finite) else None
 
 
-def _lines(path: Path) -> tuple[list[Record], bool]:
-    """All records, and whether the last line is incomplete."""
-    if not path.is_file():
-        return [], False
-    records: list[Record] = []
-    lines = path.read_bytes().splitlines()
-    for number, line in enumerate(lines, 1):
-        record = None
-        with contextlib.suppress(ValueError, RecursionError):
-            record = json.loads(line)
-        if isinstance(record, dict) and isinstance(record.get("kind"), str):
-            records.append(record)
-        elif number < len(lines):
-            hint = f"{line[:60].decode(errors='replace')!r} is not a whole record; mend or remove this line"
-            raise InputError("runs", f"{path}:{number}", hint)
-    return records, len(records) < len(lines)
-
-
-PLACES = ("output_dir", "job_name")  # fields that say where results go, which are never shown as differences
+def largest(records: Sequence[Record], name: str) -> float:
+    """The largest value of this number; 0 if there is none above."""
+    values = column(records, name)
+    return float(np.max(values[np.isfinite(values)], initial=0.0))
 
 
 def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -194,24 +167,30 @@ def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return fields
 
 
-def differences(tree: dict[str, Any]) -> list[tuple[str, Any, Any]]:
-    """Dotted field, value and default, where the two differ; a dash for a field of another type.
+def differences(trees: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[Any]]]:
+    """Fields in which configs differ, with the value of each; a dash where one does not have it."""
+    flats = [flat(tree) for tree in trees]
+    names: dict[str, Any] = {}
+    for fields in flats:
+        names |= fields
+    rows = []
+    for name in names:
+        values = [fields.get(name, ABSENT) for fields in flats]
+        if name not in PLACES and any(value != values[0] for value in values):
+            rows.append((name, values))
+    return rows
+
+
+def changed_fields(tree: Mapping[str, Any]) -> list[tuple[str, list[Any]]]:
+    """Fields of a config that differ from the defaults, with value and default.
 
     Fields of stages that the run skips are left out.
     """
-    usual, fields = flat(encode(RunConfig())), flat(tree)
+    fields = flat(tree)
     skipped: tuple[str, ...] = ()
-    if fields.get("dataset.repo_id"):
-        skipped = ("demos.",)
     if not fields.get("sft.steps"):
         skipped = ("demos.", "sft.")
-    rows = ((name, value, usual.get(name, ABSENT)) for name, value in fields.items())
-    shown = (row for row in rows if row[0] not in PLACES and not row[0].startswith(skipped))
-    return [row for row in shown if row[1] != row[2]]
-
-
-def apart(trees: list[dict[str, Any]]) -> list[tuple[str, list[Any]]]:
-    """Fields in which runs differ, with each run's value; a dash where one does not have it."""
-    flats = [flat(tree) for tree in trees]
-    rows = {key: [one.get(key, ABSENT) for one in flats] for one in flats for key in one}
-    return [(key, row) for key, row in rows.items() if key not in PLACES and any(v != row[0] for v in row)]
+    elif fields.get("dataset.repo_id"):
+        skipped = ("demos.",)
+    rows = differences([tree, encode(RunConfig())])
+    return [row for row in rows if row[0] in fields and not row[0].startswith(skipped)]

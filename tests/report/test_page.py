@@ -43,7 +43,7 @@ def pictures() -> None:
 @pytest.fixture(autouse=True)
 def stand_in(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     if "pictures" not in request.fixturenames:
-        monkeypatch.setattr(Chart, "svg", lambda chart: '<svg aria-hidden="true"/>')
+        monkeypatch.setattr(Chart, "svg", lambda chart: "")
 
 
 def test_a_run_that_was_really_made(tiny_checkpoint: Path, tmp_path: Path) -> None:
@@ -58,9 +58,9 @@ def test_a_run_that_was_really_made(tiny_checkpoint: Path, tmp_path: Path) -> No
     assert f"{100 * after:.3g} % [{low}, {high}] 8" in seen.text, "the evaluation's row"
     for part in (f"env steps {summary['env_steps']:,}", "gipo", "seed 0", "finished", "updates 12 of 12"):
         assert part in seen.text
-    for name in ("lag", "env steps", "decisions", "updates", "policy loss", "value loss"):
+    for name in ("lag", "env steps", "updates", "policy loss", "value loss"):
         assert f" {name} " in seen.text
-    assert len(evaluated(read_run(directory), "", 0).x) == 3
+    assert len(evaluated(read_run(directory), "").x) == 3
     (video,) = seen.named("video")
     assert video["src"].startswith("data:video/mp4;base64,") and "controls" in video
     assert "trainer.updates 12 1000" in seen.text and "env.type simulated metaworld" in seen.text
@@ -101,13 +101,12 @@ def test_numbers_of_a_known_run(tmp_path: Path) -> None:
     seen, run = page_of(folder), read_run(folder)
     text = seen.text
     assert not [a for _, a in seen.elements if a.get("class") == "warnings"], "nothing went wrong"
-    points = evaluated(run, "evaluation", 0)
+    points = evaluated(run, "evaluation")
     assert (points.x.tolist(), points.y.tolist()) == ([0, 4000], [0.4, 0.9])
     # The 1000 env steps of the evaluation before are not experience; the first 24 episodes say nothing.
     steps, share = exploring(run)
     assert steps[np.isfinite(share)].tolist() == [100.0 * i for i in range(25, 41)]
     assert "while exploring 45 % → 60 % evaluation 40 % → 90 %" in text
-    assert "env steps 100 → 100" in text and "updates 1 → 1" in text
     assert "mean of a batch 4 → 3 largest 8 → 8" in text and "the bound of the recipe, 39" in text
 
 
@@ -124,7 +123,6 @@ def test_numbers_of_a_known_run(tmp_path: Path) -> None:
         ({"lr": 0.0}, "The policy was not changed"),
         ({"success_exploring": 0.0}, "No exploring episode succeeded"),
         ({"low_weight": 0.4}, "Many samples hardly counted"),
-        ({"explained_variance": -0.2}, "The critic explained less of the returns than their mean does"),
     ],
 )
 def test_what_went_wrong_is_said(tmp_path: Path, numbers: dict[str, float], said: str) -> None:
@@ -168,7 +166,7 @@ def test_a_run_that_is_going_on_and_one_that_has_died(tmp_path: Path) -> None:
     going = page_of(folder)
     assert "still going" in going.text and "there is no summary.json yet" in going.text
     assert "40 of 40 updates on door-open-v3 so far, with 60 % success while exploring" in going.text
-    assert "The last line of metrics.jsonl is incomplete" in going.text and len(going.named("svg")) >= 14
+    assert "The last line of metrics.jsonl is incomplete" in going.text and len(going.named("img")) >= 9
     (folder / "error.log").write_text("Traceback …\nValueError: no film\n")
     failed = page_of(folder).text
     assert "The run failed: ValueError: no film The traceback is in error.log." in failed
@@ -186,18 +184,16 @@ def test_a_run_that_died_before_its_first_record(tmp_path: Path) -> None:
     folder = write_run(tmp_path / "run", finished=False)
     (folder / "metrics.jsonl").unlink()
     seen = page_of(folder)
-    assert "the run has not come to its first record" in seen.text and seen.named("svg") == []
+    assert "the run has not come to its first record" in seen.text and seen.named("img") == []
     assert "0 of 40 updates on match so far" in seen.text
 
 
 def test_imagined_rollouts(tmp_path: Path) -> None:
     text = page_of(write_run(tmp_path / "on", config=imagining(), rollout=imagined())).text
-    assert "100 imagined rollouts of 700 decisions; 60 % of them succeeded, and 3 ended early" in text
-    assert "The world model passed 1 of 3 validations." in text
-    assert "75 % of the decisions learned from were imagined" in text and "real 40 % → 40 %" in text
+    assert "Imagined rollouts" in text and "imagined 60 % → 60 % real 40 % → 40 %" in text
     off = page_of(write_run(tmp_path / "off", config=imagining(), rollout=imagined(on=0.0))).text
     assert "Imagination was switched off: 70 % success imagined, 40 % in reality." in off
-    assert "imagined rollouts" not in page_of(write_run(tmp_path / "none")).text
+    assert "Imagined rollouts" not in page_of(write_run(tmp_path / "none")).text
 
 
 def test_runs_side_by_side(tmp_path: Path) -> None:
@@ -220,7 +216,8 @@ def test_text_of_a_run_is_text(pictures: None, tmp_path: Path) -> None:
     (folder / "<i onclick='x'>.mp4").write_bytes(b"")
     other = write_run(tmp_path / "<script>2", config=config, tasks=(HOSTILE,))
     for seen in (page_of(folder), page_of(folder, other, output=str(tmp_path / "both.html"))):
-        assert seen.named("script") == seen.named("img") == seen.named("i onclick") == []
+        assert seen.named("script") == seen.named("i onclick") == []
+        assert all(image["src"].startswith("data:") for image in seen.named("img"))
         assert not any(name.startswith("on") for _, attributes in seen.elements for name in attributes)
         assert "<b>&run" in seen.text
     assert HOSTILE in page_of(folder).text

@@ -16,14 +16,14 @@ from accerl_lerobot.demos.record import DemosConfig
 from accerl_lerobot.demos.sft import SFTConfig
 from accerl_lerobot.engine.config import DatasetConfig, RunConfig, encode, parse
 from accerl_lerobot.policies.config import PolicyConfig
-from accerl_lerobot.report.read import apart, differences, flat
+from accerl_lerobot.report.read import changed_fields, differences, flat
 from tests.report.folders import run_config
 
 ROOT = Path(__file__).parents[2]
 
 
 def changed(config: RunConfig) -> dict[str, Any]:
-    return {field: value for field, value, _ in differences(encode(config))}
+    return {field: value for field, (value, _) in changed_fields(encode(config))}
 
 
 def test_the_defaults_differ_in_nothing() -> None:
@@ -64,6 +64,6 @@ def test_runs_apart() -> None:
     a, b = (encode(run_config(seed=seed)) for seed in (1, 2))
     b["algorithm"] = {"type": "ppo"}
     b["output_dir"] = "elsewhere"
-    rows = dict(apart([a, b]))
+    rows = dict(differences([a, b]))
     assert rows["seed"] == [1, 2] and rows["algorithm.type"] == ["gipo", "ppo"]
     assert rows["algorithm.sigma"] == [1.0, "–"] and "output_dir" not in rows

@@ -138,7 +138,7 @@ def damage(file: Path, rng: random.Random) -> None:
 
 
 def test_a_damaged_run_is_read_or_one_line_names_its_file(tmp_path, monkeypatch, capsys) -> None:
-    monkeypatch.setattr(Chart, "svg", lambda chart: "<svg/>")
+    monkeypatch.setattr(Chart, "svg", lambda chart: "")
     monkeypatch.setattr(cli, "guarded", contextlib.nullcontext)
     whole = write_run(tmp_path / "whole", config=imagining(), rollout=imagined())
     write_worker(whole, "driver", [(0, TRAINING), (5, TRAINING)])
