@@ -76,18 +76,26 @@ def summarise(results: Sequence[EpisodeResult]) -> dict[str, Any]:
     """
     if not results:
         raise ValueError("nothing to summarise: no episodes")
-    outcomes = {(r.plan.task, r.plan.seed): r.success for r in results}
+    outcomes: dict[str, dict[int, bool]] = {}  # task → seed → success
+    for result in results:
+        outcomes.setdefault(result.plan.task, {})[result.plan.seed] = result.success
     tasks = {}
-    for name in sorted({task for task, _ in outcomes}):
-        seeds = {seed: success for (task, seed), success in outcomes.items() if task == name}
+    every: list[bool] = []
+    for name in sorted(outcomes):
+        seeds = outcomes[name]
+        every += seeds.values()
         failed = sorted(seed for seed, success in seeds.items() if not success)
-        tasks[name] = {**_rate(seeds.values()), "seeds": [min(seeds), max(seeds)], "failed_seeds": failed}
+        tasks[name] = {
+            **_rate(list(seeds.values())),
+            "seeds": [min(seeds), max(seeds)],
+            "failed_seeds": failed,
+        }
     return {
-        **_rate(outcomes.values()),
-        "return_mean": float(np.mean([r.episode_return for r in results])),
-        "steps_mean": float(np.mean([r.steps for r in results])),
-        "version_min": min(r.versions[0] for r in results),
-        "version_max": max(r.versions[1] for r in results),
+        **_rate(every),
+        "return_mean": float(np.mean([result.episode_return for result in results])),
+        "steps_mean": float(np.mean([result.steps for result in results])),
+        "version_min": min(result.versions[0] for result in results),
+        "version_max": max(result.versions[1] for result in results),
         "tasks": tasks,
         "notes": notes(results),
     }
@@ -102,14 +110,16 @@ def notes(results: Sequence[EpisodeResult]) -> list[str]:
 def table(summary: dict[str, Any], title: str) -> Table:
     """`summarise`'s numbers for the terminal."""
     out = Table("task", "success [95 % Wilson]", title=title)
-    rows = list(summary["tasks"].items())
-    for name, entry in [*rows, ("all", summary)] if len(rows) > 1 else rows:
+    rows = dict(summary["tasks"])
+    if len(rows) > 1:
+        rows["all"] = summary
+    for name, entry in rows.items():
         out.add_row(name, str(Rate(successes=round(entry["success"] * entry["n"]), n=entry["n"])))
     return out
 
 
-def _rate(successes: Any) -> dict[str, Any]:
-    rate = Rate(successes=sum(map(bool, successes)), n=len(successes))
+def _rate(successes: Sequence[bool]) -> dict[str, Any]:
+    rate = Rate(successes=sum(successes), n=len(successes))
     return {"success": rate.value, "n": rate.n, "ci95": list(rate.interval())}
 
 
@@ -137,17 +147,13 @@ def evaluation_plans(
 
     The run's `seed` decides on the starts, see `eval_seed`.
     """
-    return [
-        EpisodePlan(
-            task=tasks[i % len(tasks)],
-            seed=eval_seed(seed, i // len(tasks)),
-            explore=False,
-            index=i,
-            group=group,
-            film=FILM if i < filmed else None,
-        )
-        for i in range(episodes)
-    ]
+    plans = []
+    for i in range(episodes):
+        start = eval_seed(seed, i // len(tasks))
+        film = FILM if i < filmed else None
+        task = tasks[i % len(tasks)]
+        plans.append(EpisodePlan(task=task, seed=start, explore=False, index=i, group=group, film=film))
+    return plans
 
 
 GAP = 4
@@ -202,19 +208,25 @@ def success_by_task(path: Path, arms: Mapping[str, Mapping[str, Sequence[float]]
 
     `arms` is arm → task → success of each policy; the last arm sorts the tasks.
     """
-    means = {name: {t: sum(of) / len(of) for t, of in success.items()} for name, success in arms.items()}
-    *_, last = means.values()
-    dots = any(len(of) > 1 for success in arms.values() for of in success.values())
-    tasks = sorted({t for of in arms.values() for t in of}, key=lambda task: (last.get(task, 0.0), task))
+    last = list(arms.values())[-1]
+
+    def order(task: str) -> tuple[float, str]:
+        return float(np.mean(last.get(task, 0.0))), task
+
+    tasks = sorted(set().union(*arms.values()), key=order)
     with drawing(path) as axes:
         for i, (name, success) in enumerate(arms.items()):
-            x = [tasks.index(task) + 0.8 * (i + 0.5) / len(arms) - 0.4 for task in success]
-            axes.bar(x, list(means[name].values()), 0.75 / len(arms), color=f"C{i}", label=name)
-            for place, values in zip(x, success.values(), strict=True) if dots else ():
-                axes.scatter([place] * len(values), values, s=10, color="black", zorder=3)
+            places = [tasks.index(task) + 0.8 * (i + 0.5) / len(arms) - 0.4 for task in success]
+            means = [float(np.mean(values)) for values in success.values()]
+            axes.bar(places, means, 0.75 / len(arms), color=f"C{i}", label=name)
+            for place, values in zip(places, success.values(), strict=True):
+                if len(values) > 1:
+                    axes.scatter([place] * len(values), values, s=10, color="black", zorder=3)
         labels = [task.removesuffix("-v3") for task in tasks]
-        angle, side, size = (90, "center", 6) if len(tasks) > MAX_SLANTED else (20, "right", 10)
-        axes.set_xticks(range(len(tasks)), labels, rotation=angle, ha=side, fontsize=size)
+        if len(tasks) > MAX_SLANTED:
+            axes.set_xticks(range(len(tasks)), labels, rotation=90, fontsize=6)
+        else:
+            axes.set_xticks(range(len(tasks)), labels, rotation=20, ha="right")
         axes.set(ylabel="success", ylim=(0, 1.02))
         axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1), ncols=len(arms))
 
@@ -227,7 +239,7 @@ def write_video(path: Path, rows: Sequence[Sequence[Sequence[np.ndarray]]], fps:
     """
     import imageio.v2 as imageio
 
-    length = max(len(clip) for row in rows for clip in row)
+    length = max(max(map(len, row)) for row in rows)
     # The pixel format every player knows, at the price of even sides: an odd last row or column is left out.
     writer: Any = imageio.get_writer(
         path, fps=fps, macro_block_size=1, codec="libx264", pixelformat="yuv420p"
@@ -252,23 +264,32 @@ def before_after(
     success and red for a failure. Nothing is written when no episode was filmed. `before` and `after` are
     results of the same plans, and their summaries.
     """
-    filmed = [{r.plan.index: r for r in results if r.frames} for results, _ in (before, after)]
-    both = sorted(filmed[0].keys() & filmed[1].keys())
+    halves = [_filmed(results) for results, _ in (before, after)]
+    both = sorted(halves[0].keys() & halves[1].keys())
     if not both:
         return
+    blank = np.full_like(halves[0][both[0]].frames[0], 255)
     columns = math.ceil(math.sqrt(len(both)))
-    blank = np.full_like(filmed[0][both[0]].frames[0], 255)
     width = columns * (blank.shape[1] + GAP) - GAP
-    texts = [f"{name} RL: {_rate_text(of[1])}" for name, of in (("before", before), ("after", after))]
-    halves = []
-    for text, half in zip(texts, filmed, strict=True):
-        clips = [_with_outcome(half[i].frames, half[i].success) for i in both]
-        clips += [[blank]] * (-len(both) % columns)
-        lines = [clips[i : i + columns] for i in range(0, len(clips), columns)]
-        halves.append([[[_caption(text, width, max(map(len, texts)))]], *lines])
-    between = [np.full((len(left[0][0]), 2 * GAP, 3), 255, np.uint8) for left in halves[0]]
-    rows = [[*left, [gap], *right] for left, gap, right in zip(halves[0], between, halves[1], strict=True)]
+    texts = [f"before RL: {_rate_text(before[1])}", f"after RL: {_rate_text(after[1])}"]
+    size = min(20, max(8, 2 * width // max(map(len, texts))))
+    left, right = (_caption(text, width, size) for text in texts)
+    rows = [[[left], [_gap(left)], [right]]]
+    for start in range(0, len(both), columns):
+        shown = both[start : start + columns]
+        missing = [[blank]] * (columns - len(shown))
+        clips = [[_with_outcome(half[index]) for index in shown] + missing for half in halves]
+        rows.append([*clips[0], [_gap(blank)], *clips[1]])
     write_video(path, rows, fps)
+
+
+def _filmed(results: Sequence[EpisodeResult]) -> dict[int, EpisodeResult]:
+    return {result.plan.index: result for result in results if result.frames}
+
+
+def _gap(beside: np.ndarray) -> np.ndarray:
+    """White between the halves, as high as a picture."""
+    return np.full((len(beside), 2 * GAP, 3), 255, np.uint8)
 
 
 def _rate_text(summary: dict[str, Any] | None) -> str:
@@ -278,27 +299,30 @@ def _rate_text(summary: dict[str, Any] | None) -> str:
     return f"{summary['success']:.0%} success [{low:.0%}, {high:.0%}], n = {summary['n']}"
 
 
-def _caption(text: str, width: int, longest: int) -> np.ndarray:
-    """Black text, 8 to 20 pixels high, in a picture as wide as asked; as high as the `longest` one's."""
+def _caption(text: str, width: int, size: int) -> np.ndarray:
+    """Black text, `size` pixels high, in a picture of this width."""
     from PIL import Image, ImageDraw, ImageFont
 
-    size = min(20, max(8, 2 * width // longest))
     image = Image.new("RGB", (width, size + 12), "white")
     ImageDraw.Draw(image).text((4, 4), text, fill="black", font=ImageFont.load_default(size))
     return np.asarray(image)
 
 
-def _with_outcome(frames: Sequence[np.ndarray], success: bool) -> list[np.ndarray]:
-    """Frames uint8 (H, W, 3), and the last once more in a frame whose colour tells how the episode ended."""
-    ended = frames[-1].copy()
-    colour = (40, 160, 60) if success else (200, 40, 40)
-    for edge in (ended[:BORDER], ended[-BORDER:], ended[:, :BORDER], ended[:, -BORDER:]):
-        edge[:] = colour
-    return [*frames, ended]
+def _with_outcome(result: EpisodeResult) -> list[np.ndarray]:
+    """Frames of an episode, and the last once more in a frame whose colour tells how it ended."""
+    last = result.frames[-1]
+    ended = np.empty_like(last)
+    ended[:] = (40, 160, 60) if result.success else (200, 40, 40)
+    ended[BORDER:-BORDER, BORDER:-BORDER] = last[BORDER:-BORDER, BORDER:-BORDER]
+    return [*result.frames, ended]
 
 
 def _joined(pictures: Sequence[np.ndarray], axis: int) -> np.ndarray:
     """Pictures beside (axis 1) or below (axis 0) each other, white between them."""
-    shape = [GAP if i == axis else size for i, size in enumerate(pictures[0].shape)]
+    shape = list(pictures[0].shape)
+    shape[axis] = GAP
     gap = np.full(shape, 255, np.uint8)
-    return np.concatenate([part for picture in pictures for part in (picture, gap)][:-1], axis=axis)
+    parts = [pictures[0]]
+    for picture in pictures[1:]:
+        parts += [gap, picture]
+    return np.concatenate(parts, axis=axis)

@@ -1,20 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Provenance of a pushed folder (its run and measurements), and the card that tells it.
+"""Types of artifacts that are pushed and pulled, the files that belong to each, and the card that tells them.
 
 A number goes with a policy only if it was measured on it: a run's summary is about its last checkpoint, and
-an evaluation names its policy.
-Also the types of artifacts that are pushed and pulled, and the fields of the two verbs.
+an evaluation names its policy. Also the fields of the two verbs.
 """
 
 from __future__ import annotations
 
-import contextlib
+import json
 import re
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import yaml
 from huggingface_hub import DatasetCard, ModelCard, ModelCardData
 
 from accerl_lerobot.checkpoint import safety
@@ -30,7 +30,6 @@ from accerl_lerobot.checkpoint.layout import (
     SUMMARY,
 )  # fmt: skip
 from accerl_lerobot.checkpoint.layout import CONFIG as RECIPE
-from accerl_lerobot.config.parsing import read_recipe
 from accerl_lerobot.config.ranges import DatasetConfig, NewFolder, Pattern, Section
 from accerl_lerobot.console import number
 from accerl_lerobot.envs.base import lerobot_eval_arguments
@@ -53,7 +52,6 @@ CODEBASE_VERSION = "v3.0"
 REPO_ID = r"(?=.{3,192}\Z)(?!.*\.\.)[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*"
 RepoId = Annotated[str, Pattern(REPO_ID, "the name of a repository, user/name")]
 RepoType = Literal["model", "dataset"]
-REPO_TYPES: tuple[RepoType, ...] = ("model", "dataset")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,6 +145,7 @@ EVALUATION, VALIDATION = "evaluation.json", "validation.json"
 KEPT = {
     POLICY: (RECIPE, SUMMARY, EVALUATION, "success_curve.png", "success_by_task.png", "before_after.mp4"),
     WORLD_MODEL: (RECIPE, VALIDATION, "preview.mp4", "preview_online.mp4"),
+    DATASET: (),
 }
 """Artifact type → files of its run that go with it."""
 CONTENTS = {
@@ -155,7 +154,8 @@ CONTENTS = {
         ADAPTER_CONFIG, ADAPTER,
         "policy_*processor.json", "*processor_step_*.safetensors",
         "accerl.json", "value_head.safetensors", "family.safetensors",
-        *(f"{own}/{name}" for own in (BACKBONE, FAST) for name in BACKBONE_FILES + BACKBONE_WEIGHTS),
+        *(f"{BACKBONE}/{name}" for name in BACKBONE_FILES + BACKBONE_WEIGHTS),
+        *(f"{FAST}/{name}" for name in BACKBONE_FILES + BACKBONE_WEIGHTS),
         *(f"{FOLDER}/{name}" for name in KEPT[POLICY]),
     ),
     WORLD_MODEL: (
@@ -168,47 +168,26 @@ CONTENTS = {
 MARK = "<!-- Written by accerl push, and anew each time. Delete this line to keep what you change. -->"
 
 
-@dataclass(frozen=True, kw_only=True)
-class Provenance:
-    """Facts about a folder's run."""
-
-    recipe: dict[str, Any] = field(default_factory=dict)
-    summary: dict[str, Any] = field(default_factory=dict)  # summary of a run that ended with this very policy
-    evaluation: dict[str, Any] = field(default_factory=dict)  # by ``accerl eval``, of this very policy
-    validation: dict[str, Any] = field(default_factory=dict)  # validation of the world model
-    files: Mapping[str, Path] = field(default_factory=dict)
-    """Name in the repository → file that goes with the folder."""
-
-
-def find_provenance(folder: Path, artifact: str, evaluation: str | None) -> Provenance:
-    """Finds the run of a folder, or the files of it that the folder carries.
+def run_files(folder: Path, artifact: str, evaluation: str | None) -> dict[str, Path]:
+    """Name in the repository → file of the run of a folder, if it lies in one, and of an evaluation.
 
     `evaluation` is a folder or file of ``accerl eval``; one of another policy is refused.
     """
-    if evaluation is not None and artifact != POLICY:
-        raise InputError("evaluation", evaluation, f"only a policy is evaluated, this is a {artifact}")
-    carried = folder / FOLDER
-    home = carried if carried.is_dir() else _run_of(folder.resolve(), artifact)
-    known: dict[str, Any] = {}
     files: dict[str, Path] = {}
+    home = None if (folder / FOLDER).is_dir() else _run_of(folder.resolve(), artifact)
     if home is not None:
-        summary, step = read_json(home / SUMMARY), folder.resolve().parent.name
-        is_last = step.isdigit() and int(step) == summary.get("updates")
-        measured = home == carried or artifact != POLICY or is_last
-        names = KEPT.get(artifact, ()) if measured else (RECIPE,)
-        there = safety.matching_files(home, names, safety.FileSource("path", str(folder)))
-        files = {f"{FOLDER}/{name}": path for name, path in there.items()}
-        known["validation"] = read_json(home / VALIDATION)
-        with contextlib.suppress(InputError):
-            known["recipe"] = read_recipe(home / RECIPE)
-        if measured and artifact == POLICY:
-            known |= {"summary": summary, "evaluation": read_json(home / EVALUATION)}
+        measured = artifact != POLICY or _is_last(folder.resolve().parent.name, home)
+        names = KEPT[artifact] if measured else (RECIPE,)
+        for name, path in safety.matching_files(home, names, safety.FileSource("path", str(folder))).items():
+            files[f"{FOLDER}/{name}"] = path
     if evaluation is not None:
+        if artifact != POLICY:
+            raise InputError("evaluation", evaluation, f"only a policy is evaluated, this is a {artifact}")
         path = Path(evaluation).expanduser()
         path = path / EVALUATION if path.is_dir() else path
-        known["evaluation"] = _read_evaluation(path, folder)
+        _check_evaluation(path, folder)
         files[f"{FOLDER}/{EVALUATION}"] = path
-    return Provenance(**known, files=files)
+    return files
 
 
 def _run_of(folder: Path, artifact: str) -> Path | None:
@@ -222,33 +201,38 @@ def _run_of(folder: Path, artifact: str) -> Path | None:
     return home if (home / sign).is_file() else None
 
 
-def _read_evaluation(path: Path, policy: Path) -> dict[str, Any]:
+def _is_last(step: str, run: Path) -> bool:
+    """True if the checkpoint of a step is the one that the run's summary is about."""
+    return step.isdigit() and int(step) == read_json(run / SUMMARY).get("updates")
+
+
+def _check_evaluation(path: Path, policy: Path) -> None:
     content = read_json(path)
     if "success" not in content or "ci95" not in content:
         raise InputError("evaluation", str(path), "not a file of accerl eval; name its output_dir")
     if Path(str(content.get("policy"))).expanduser().resolve() != policy.resolve():
         raise InputError("evaluation", str(path), f"it is of another policy, {content.get('policy')}")
-    return content
 
 
-def model_card(repo_id: str, artifact: str, folder: Path, files: Files, provenance: Provenance) -> str:
+def model_card(repo_id: str, artifact: str, folder: Path, files: Files) -> str:
     """README.md of a model repository; pictures and videos among `files` are shown."""
-    recipe, summary, local = provenance.recipe, provenance.summary, repo_id.split("/")[1]
-    place, config, env = f"{FOLDER}/{RECIPE}", read_json(folder / CONFIG), recipe.get("env") or {}
+    recipe_text = _carried(files, RECIPE)
+    recipe = yaml.safe_load(recipe_text) or {}
+    summary = json.loads(_carried(files, SUMMARY) or "{}")
+    config = read_json(folder / CONFIG)
+    env = dict(recipe.get("env") or {})
+    env.pop("assets", None)
     tags = ["accerl-lerobot", artifact.replace(" ", "-"), config.get("type"), env.get("type")]
     if summary:
         tags += ["reinforcement-learning", (recipe.get("algorithm") or {}).get("type")]
-    sections = [recipe.get(name) or {} for name in ("dataset", "online")]
-    # Beside a folder the name is a label, and no dataset on the Hub.
-    datasets = [s["repo_id"] for s in sections if s.get("repo_id") and not s.get("root")]
     data = ModelCardData(
         library_name="lerobot",
         pipeline_tag="robotics",
         tags=list(dict.fromkeys(str(tag) for tag in tags if tag)),
-        datasets=datasets or None,
+        datasets=_datasets(recipe) or None,
         base_model=_base_model(recipe),
     )
-    own_recipe = files.get(place, b"")  # scrubbed
+    local = repo_id.split("/")[1]
     card = ModelCard.from_template(
         data,
         template_str=Path(__file__).with_name("card.md.jinja").read_text(),
@@ -257,29 +241,34 @@ def model_card(repo_id: str, artifact: str, folder: Path, files: Files, provenan
         local=local,
         artifact=artifact,
         config=config,
-        measurements=_measurements(provenance),
+        measurements=_measurements(summary, json.loads(_carried(files, EVALUATION) or "{}")),
         summary=summary,
-        validation=provenance.validation,
+        validation=json.loads(_carried(files, VALIDATION) or "{}"),
         number=number,
-        shown=sorted(name for name in files if name.startswith(f"{FOLDER}/") or "/" not in name),
-        recipe_path=f"{local}/{place}" if recipe else None,
-        # Of a policy's runs, only those of `accerl offline` have no environment.
-        verb="world-model" if artifact == WORLD_MODEL else "train" if env else "offline",
-        improved="" if not recipe else f" improved {'by online RL' if env else 'on recorded episodes'}",
-        stock=lerobot_eval_command(local, config, {k: v for k, v in env.items() if k != "assets"}),
+        shown=sorted(name for name in files if name.startswith(f"{FOLDER}/")),
+        recipe=recipe_text,
+        recipe_path=f"{local}/{FOLDER}/{RECIPE}",
+        learns_online=bool(env),  # only runs of `accerl offline` have no environment
+        stock=lerobot_eval_command(local, config, env),
         # With one of its own, LeRobot finds the backbone only once a pull has set its place.
         has_backbone=str(config.get("vlm_model_name") or "").startswith(("/", BACKBONE)),
-        recipe=own_recipe.decode() if isinstance(own_recipe, bytes) else "",
     )
     return f"{card}\n"
+
+
+def _carried(files: Files, name: str) -> str:
+    """Text of a record of the run that goes with a folder; empty if there is none."""
+    content = files.get(f"{FOLDER}/{name}", b"")
+    return content.read_text() if isinstance(content, Path) else content.decode()
 
 
 def lerobot_eval_command(policy: str, config: Mapping[str, Any], env: Mapping[str, Any]) -> str | None:
     """Stock LeRobot's evaluation of a policy with this config.json in this environment of a recipe."""
     stock = lerobot_eval_arguments(env)
-    counts = "--eval.n_episodes=50 --eval.batch_size=5"
-    flags = " ".join([f"--policy.path={policy}", *discovery(config.get("type")), *(stock or ())])
-    return f"lerobot-eval {flags} {counts}" if stock else None
+    if stock is None:
+        return None
+    flags = [f"--policy.path={policy}", *discovery(config.get("type")), *stock]
+    return f"lerobot-eval {' '.join(flags)} --eval.n_episodes=50 --eval.batch_size=5"
 
 
 def dataset_card(repo_id: str, folder: Path) -> str:
@@ -287,38 +276,45 @@ def dataset_card(repo_id: str, folder: Path) -> str:
     from lerobot.datasets.io_utils import load_info
     from lerobot.datasets.utils import create_lerobot_dataset_card
 
-    info = read_json(folder / INFO)
-    counts = ", ".join(f"{info.get(f'total_{what}')} {what}" for what in ("episodes", "frames", "tasks"))
     command = f"accerl sft --config_path=RECIPE --dataset.repo_id={repo_id}"
-    text = f"{counts}, {info.get('fps')} frames a second.\n\n```bash\n{command}\n```"
     card: DatasetCard = create_lerobot_dataset_card(
-        tags=["accerl-lerobot"], dataset_info=load_info(folder), repo_id=repo_id, dataset_description=text
+        tags=["accerl-lerobot"],
+        dataset_info=load_info(folder),
+        repo_id=repo_id,
+        dataset_description=f"```bash\n{command}\n```",
     )
     head, _, body = str(card).partition("\n---\n")
     return f"{head}\n---\n\n{MARK}\n{body}"
 
 
+def _datasets(recipe: Mapping[str, Any]) -> list[str]:
+    sections = [recipe.get(name) or {} for name in ("dataset", "online")]
+    # Beside a folder the name is a label, and no dataset on the Hub.
+    return [section["repo_id"] for section in sections if section.get("repo_id") and not section.get("root")]
+
+
 def _base_model(recipe: Mapping[str, Any]) -> str | None:
     for name in ((recipe.get("policy") or {}).get("path"), (recipe.get("sft") or {}).get("init_path")):
-        if name and (pulled := read_json(Path(name).expanduser() / RECORD)):
-            return str(pulled.get("repo_id"))
-        if name and re.fullmatch(REPO_ID, name) and not Path(name).exists():
-            return None if name.startswith(f"{AWAY}/") else str(name)
+        if name and re.fullmatch(REPO_ID, name) and not name.startswith(f"{AWAY}/"):
+            return str(name)
     return None
 
 
-def _measurements(provenance: Provenance) -> list[tuple[str, str, dict[str, Any]]]:
+def _measurements(
+    summary: dict[str, Any], evaluation: dict[str, Any]
+) -> list[tuple[str, str, dict[str, Any]]]:
     """(when, task, {success, n, ci95}) of every measurement: all tasks together first, then each."""
-    summary, sources = provenance.summary, []
+    sources = []
     for when in ("before", "after"):
-        if summary.get(f"success_{when}") is not None and summary.get(f"ci95_{when}"):
-            keys = ("success", "n", "ci95", "tasks")
-            sources.append((f"{when} RL", {key: summary.get(f"{key}_{when}") for key in keys}))
-    if provenance.evaluation:
-        sources.append(("accerl eval", dict(provenance.evaluation)))
+        if summary.get(f"success_{when}") is not None:
+            result = {key: summary.get(f"{key}_{when}") for key in ("success", "n", "ci95", "tasks")}
+            sources.append((f"{when} RL", result))
+    if evaluation:
+        sources.append(("accerl eval", evaluation))
     rows = []
     for when, result in sources:
         tasks = result.get("tasks") or {}
-        rows += [(when, next(iter(tasks)) if len(tasks) == 1 else "all tasks", result)]
-        rows += [(when, task, each) for task, each in tasks.items() if len(tasks) > 1]
+        rows.append((when, next(iter(tasks)) if len(tasks) == 1 else "all tasks", result))
+        if len(tasks) > 1:
+            rows += [(when, task, each) for task, each in tasks.items()]
     return rows

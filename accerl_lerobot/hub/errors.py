@@ -13,12 +13,7 @@ from contextlib import contextmanager
 
 import httpx
 from huggingface_hub import constants, get_token, set_client_factory
-from huggingface_hub.errors import (
-    HfHubHTTPError,
-    OfflineModeIsEnabled,
-    RepositoryNotFoundError,
-    RevisionNotFoundError,
-)
+from huggingface_hub.errors import HfHubHTTPError, OfflineModeIsEnabled, RevisionNotFoundError
 from huggingface_hub.utils._http import default_client_factory
 
 from accerl_lerobot.checkpoint.safety import REVISION
@@ -29,6 +24,13 @@ CONNECT_S, SILENT_S = 30.0, 300.0
 ETAG = re.compile(r'(W/)?"?[\w-]{1,128}"?', re.ASCII)
 LOGIN = "log in with 'hf auth login', or set HF_TOKEN to a token"
 AGAIN = "run the same command again, it resumes"
+STATUS = {
+    401: f"the Hub does not accept the token; {LOGIN} that may read and write it",
+    403: "the token has no right to do this here; use another one, and a user/ it belongs to",
+    404: f"it is not there, or private: mind the spelling, or {LOGIN} that may see it",
+    412: "somebody else wrote to it meanwhile; look at what is there and run the same command again",
+    429: "the Hub asks for fewer requests; wait a few minutes and run the same command again",
+}
 
 
 def guard_client() -> None:
@@ -53,16 +55,17 @@ def _guarded_client() -> httpx.Client:
 
 def _check_answer(response: httpx.Response) -> None:
     headers = response.headers
-    if (commit := headers.get("x-repo-commit")) is not None:
-        check_commit(commit)
-        for name in ("etag", "x-linked-etag"):
-            if name in headers and not ETAG.fullmatch(headers[name]):
-                why = f"its {name} {ascii(headers[name])[:99]} is no hash; use another server"
-                raise InputError("HF_ENDPOINT", constants.ENDPOINT, why)
+    if "x-repo-commit" not in headers:
+        return
+    check_commit(headers["x-repo-commit"])
+    for name in ("etag", "x-linked-etag"):
+        if name in headers and not ETAG.fullmatch(headers[name]):
+            why = f"its {name} {ascii(headers[name])[:99]} is no hash; use another server"
+            raise InputError("HF_ENDPOINT", constants.ENDPOINT, why)
 
 
 @contextmanager
-def hub_errors(repo_id: str, revision: str | None, *, writing: bool) -> Iterator[None]:
+def hub_errors(repo_id: str, revision: str | None) -> Iterator[None]:
     """Turns all failures of the client into an `InputError`."""
     guard_client()
     try:
@@ -70,18 +73,19 @@ def hub_errors(repo_id: str, revision: str | None, *, writing: bool) -> Iterator
     except InputError:
         raise
     except Exception as error:
-        if (explained := _explain(error, repo_id, revision, writing)) is None:
+        explained = _explain(error, repo_id, revision)
+        if explained is None:
             raise
         raise explained from None  # the client's own words may hold a header
 
 
-def _explain(error: BaseException, repo_id: str, revision: str | None, writing: bool) -> InputError | None:
+def _explain(error: BaseException, repo_id: str, revision: str | None) -> InputError | None:
     """The error in the user's words; None if it is not about the Hub."""
     for link in causes(error):
         if isinstance(link, RevisionNotFoundError):
             return InputError("revision", revision, f"{repo_id} has no such commit, tag or branch")
         if isinstance(link, HfHubHTTPError):
-            return InputError("repo_id", repo_id, _status(link, "write" if writing else "read"))
+            return InputError("repo_id", repo_id, _status(link))
         if isinstance(link, OfflineModeIsEnabled):
             return InputError("repo_id", repo_id, "the Hub is switched off by HF_HUB_OFFLINE; unset it")
         if isinstance(link, httpx.TransportError | ConnectionError | TimeoutError):
@@ -94,24 +98,17 @@ def _explain(error: BaseException, repo_id: str, revision: str | None, writing: 
     return None
 
 
-def _status(error: HfHubHTTPError, role: str) -> str:
+def _status(error: HfHubHTTPError) -> str:
     code = error.response.status_code
-    if code in (401, 404):
-        if get_token() is None:
-            return f"it is not there, or private; {LOGIN} that may {role} it"
-        if code == 401 and not isinstance(error, RepositoryNotFoundError):
-            return f"the Hub does not accept the token; {LOGIN} that may {role}"
-        return "it is not there, or the token's account may not see it; mind the spelling"
-    if code == 403:
-        return f"the token may not {role} here; use one with the right to {role}, and a user/ it belongs to"
-    if code in (409, 412):
-        return "somebody else wrote to it meanwhile; look at what is there and run the same command again"
-    if code == 429:
-        return "the Hub asks for fewer requests; wait a few minutes and run the same command again"
-    return f"the Hub answered {code}: {_last_line(error)}; {AGAIN}"
+    if code == 401 and get_token() is None:  # the Hub's answer to a stranger who asks for what is not there
+        code = 404
+    return STATUS.get(code) or f"the Hub answered {code}: {_last_line(error)}; {AGAIN}"
 
 
 def _last_line(error: BaseException) -> str:
     """The last line of an error's text, which is what the server said, without the token."""
-    token, text = get_token(), str(error).strip() or type(error).__name__
-    return (text.replace(token, "<token>") if token else text).splitlines()[-1].strip()[:160]
+    text = str(error).strip() or type(error).__name__
+    token = get_token()
+    if token:
+        text = text.replace(token, "<token>")
+    return text.splitlines()[-1].strip()[:160]

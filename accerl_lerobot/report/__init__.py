@@ -45,7 +45,7 @@ class ReportConfig(Section):
 
 def write_report(config: ReportConfig) -> Path:
     """Reads the runs and writes the page."""
-    from accerl_lerobot.report.content import comparison_page, run_page
+    from accerl_lerobot.report.content import comparison, one_run
     from accerl_lerobot.report.read import read_run
 
     output = None if config.output is None else expanded(config.output, "output")
@@ -57,8 +57,11 @@ def write_report(config: ReportConfig) -> Path:
     check_output(output)
     now = time.time()
     with reading("runs", ",".join(config.runs), f"{CONFIG}, {METRICS} or {SUMMARY}"):
-        page = comparison_page(runs, now) if len(runs) > 1 else run_page(runs[0], now)
-        html = _html(page, output.resolve().parent)
+        folder = output.resolve().parent
+        if len(runs) == 1:
+            html = _html("run.html", one_run(runs[0], now), folder)
+        else:
+            html = _html("comparison.html", comparison(runs, now), folder)
     try:
         output.write_text(html, encoding="utf-8")
     except OSError as error:
@@ -66,24 +69,22 @@ def write_report(config: ReportConfig) -> Path:
     return output
 
 
-def _html(page: dict[str, Any], folder: Path) -> str:
+def _html(name: str, values: dict[str, Any], folder: Path) -> str:
+    """A template filled in, as a page in this folder."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     from accerl_lerobot.console import percent
     from accerl_lerobot.report.charts import POINTS
     from accerl_lerobot.report.content import STATE_COLOURS
 
-    template = Environment(
+    environment = Environment(
         loader=PackageLoader("accerl_lerobot", "report"), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
-    ).get_template("page.html")  # fmt: skip
-    return template.render(
-        **page,
-        version=__version__,
-        points=POINTS,
-        colours=STATE_COLOURS,
-        percent=percent,
-        video_mb=VIDEO_MB,
-        base64=lambda path: base64.b64encode(path.read_bytes()).decode(),
-        address=lambda path: quote(os.path.relpath(path.resolve(), folder)),
-    )
+    )  # fmt: skip
+    environment.filters |= {
+        "percent": percent,
+        "base64": lambda path: base64.b64encode(path.read_bytes()).decode(),
+        "address": lambda path: quote(os.path.relpath(path.resolve(), folder)),
+    }
+    fixed = {"version": __version__, "points": POINTS, "colours": STATE_COLOURS, "video_mb": VIDEO_MB}
+    return environment.get_template(name).render(**values, **fixed)

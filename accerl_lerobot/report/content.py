@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Contents of the pages: of one run, and of several side by side."""
+"""Values for the templates of the pages: of one run, and of several side by side."""
 
 from __future__ import annotations
 
 import datetime
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, field
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -32,10 +30,6 @@ SHARE: dict[str, Any] = {"share": True, "bottom": -0.03, "top": 1.04}
 """Options of a chart of shares, such that points at both ends are whole."""
 SAMPLER = "LeRobot's own sampler on seeds that no run trains on, with 95 % Wilson intervals"
 EXPLORING = "the policy with its noise, over the newest 100 episodes"
-FILM = (
-    "The same episodes before training, left, and after it, right, under the success of the evaluation. The "
-    "frame at the end of a clip is green for a success and red for a failure."
-)
 STATE_COLOURS = {
     "compute": "#3a7d44", "wait_in": "#dfe3e8", "wait_out": "#f0b429", "transport": "#5b8def",
     "weights": "#9b5de5", "checkpoint": "#8d6e63", "recovery": "#d64545", "training": "#a8c8a0",
@@ -75,93 +69,52 @@ IMAGINATION: tuple[Spec, ...] = (
 )  # fmt: skip
 
 
-class Table(NamedTuple):
-    """Rows under a caption; the first cell of each is its heading."""
-
-    caption: str
-    columns: Sequence[str]
-    rows: Sequence[Sequence[str]]
-
-
-@dataclass(frozen=True)
-class Section:
-    """A heading and what is under it, in this order."""
-
-    title: str
-    text: str = ""
-    _: KW_ONLY
-    bars: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    """Role → state → share of its time."""
-    charts: Sequence[Chart] = ()
-    tables: Sequence[Table] = ()
-    videos: Sequence[tuple[Path, str]] = ()
-    details: str = ""
-
-    @property
-    def empty(self) -> bool:
-        shown = [self.text, self.bars, self.videos, self.details]
-        shown += [table.rows for table in self.tables]
-        shown += [chart.drawable for chart in self.charts]
-        return not any(shown)
-
-
-def run_page(run: Run, now: float) -> dict[str, Any]:
-    """Values for the template: the page of one run, at `now`, in seconds since 1970."""
-    note = ""
+def one_run(run: Run, now: float) -> dict[str, Any]:
+    """Values for ``run.html``, at `now`, in seconds since 1970."""
+    unknown = ""
     bound = None
     try:
         if not run.offline:
             bound = lag_limits(decode(RunConfig, run.config))[0]
     except InputError as error:  # another version, or a package of the user's, wrote it
-        note = f"This accerl does not know all of the recipe's types or fields: {error}."
-    rows = [(name, shown(value), shown(default)) for name, (value, default) in changed_fields(run.config)]
-    changed = Table("Fields that differ from the defaults", ("field", "value", "default"), rows)
-    videos = [(path, FILM if path.stem == "before_after" else path.name) for path in run.videos]
-    sections = [
-        _success(run),
-        Section("Videos", videos=videos),
-        Section("Policy", tables=[_commands(run)]),
-        Section("Imagined rollouts", charts=_charts(run.rollout, IMAGINATION)),
-        Section("Staleness", charts=[_lag(run, bound)]),
-        Section("Time of each role while training", bars=_time_shares(run)),
-        Section("Learning", charts=_charts(run.train, LEARNING)),
-        Section("Recipe", note, tables=[changed], details=run.config_text),
-    ]
+        unknown = str(error)
+    curves = [line("while exploring", *exploring(run)), evaluated(run, "evaluation")]
+    changed = changed_fields(run.config)
     return {
-        "verb": "offline" if run.offline else "train",
-        "title": run.name,
+        "run": run,
         "status": status(run, now),
         "headline": _headline(run),
         "tiles": _tiles(run, bound),
         "warnings": list(warnings(run, bound, now)),
-        "sections": [section for section in sections if not section.empty],
+        "success": Chart("Success rate", f"{SAMPLER}; exploring: {EXPLORING}.", STEPS, curves, **SHARE),
+        "evaluations": _evaluations(run),
+        "commands": _commands(run),
+        "imagination": _charts(run.rollout, IMAGINATION),
+        "lag": _lag(run, bound),
+        "shares": _time_shares(run),
+        "learning": _charts(run.train, LEARNING),
+        "unknown": unknown,
+        "changed": [(name, shown(value), shown(default)) for name, (value, default) in changed],
     }
 
 
-def comparison_page(runs: Sequence[Run], now: float) -> dict[str, Any]:
-    """Values for the template: several runs. No winner is named."""
+def comparison(runs: Sequence[Run], now: float) -> dict[str, Any]:
+    """Values for ``comparison.html``: several runs. No winner is named."""
     names = [run.name for run in runs]
     each = {}
     for name, run in zip(names, runs, strict=True):
         each[name if names.count(name) == 1 else str(run.path)] = run
-    rows = [(name, *map(shown, values)) for name, values in differences([run.config for run in runs])]
-    unlike = Table("Fields that are not the same in all of them", ("field", *each), rows)
-    sections = [
-        Section("Runs", tables=[_run_table(each, now)]),
-        Section("Curves", charts=_curves(each)),
-        Section("Differences", "" if rows else "Their recipes are the same.", tables=[unlike]),
-    ]
     notes = []
     for name, run in each.items():
         notes += [f"{name}: {text}" for text in warnings(run, None, now)]
+    unlike = differences([run.config for run in runs])
     return {
-        "verb": "train",
-        "title": f"{len(runs)} runs",
-        "status": f"{sum(run.result is not None for run in runs)} of {len(runs)} finished",
-        "headline": count(len(runs), "training run"),
-        "tiles": (),
+        "names": list(each),
+        "runs": [_compared(name, run, now) for name, run in each.items()],
+        "finished": sum(run.result is not None for run in runs),
         "warnings": notes,
-        "sections": [section for section in sections if not section.empty],
+        "curves": _curves(each),
+        "differences": [(name, *map(shown, values)) for name, values in unlike],
     }
 
 
@@ -233,7 +186,8 @@ def _warnings_of_imagination(run: Run) -> Iterator[str]:
         yield "No rollout was imagined: no world model passed validation."
 
 
-def _success(run: Run) -> Section:
+def _evaluations(run: Run) -> list[tuple[str, ...]]:
+    """Group, env steps, task, success and episodes of every evaluation."""
     rows = []
     for e in run.evaluations:
         tasks = dict(e.get("tasks") or {})
@@ -242,12 +196,7 @@ def _success(run: Run) -> Section:
         for task, one in tasks.items():
             success = rate(one["success"], one["ci95"])
             rows.append((str(e.get("group")), number(e["env_steps"]), task, success, number(one["n"])))
-    columns = ("", "env steps", "task", "success", "n")
-    curves = [line("while exploring", *exploring(run)), evaluated(run, "evaluation")]
-    chart = Chart("Success rate", f"{SAMPLER}; exploring: {EXPLORING}.", STEPS, curves, **SHARE)
-    return Section(
-        "Success", charts=[chart], tables=[Table("Evaluations, with 95 % Wilson intervals", columns, rows)]
-    )
+    return rows
 
 
 def exploring(run: Run) -> tuple[np.ndarray, np.ndarray]:
@@ -274,16 +223,18 @@ def evaluated(run: Run, name: str) -> Series:
     return Series(name, x, y, ends[:, 0], ends[:, 1], points=True)
 
 
-def _commands(run: Run) -> Table:
+def _commands(run: Run) -> list[tuple[str, str]]:
+    """Uses of the run's policy, and the commands for them."""
     policy = run.path.resolve() / CHECKPOINTS / LAST / PRETRAINED
-    rows: list[tuple[str, str]] = []
-    if policy.is_dir():
-        with reading("runs", str(run.path), f"{CHECKPOINTS}/{LAST}/{PRETRAINED}/config.json or {CONFIG}"):
-            stock = lerobot_eval_command(str(policy), read_json(policy / "config.json"), run.section("env"))
-        if stock:
-            rows.append(("evaluate it with LeRobot alone", stock))
-        rows.append(("publish it", f"accerl push --path={policy} --repo_id=USER/NAME"))
-    return Table(f"{policy}, a LeRobot checkpoint", ("", "command"), rows)
+    if not policy.is_dir():
+        return []
+    rows = []
+    with reading("runs", str(run.path), f"{CHECKPOINTS}/{LAST}/{PRETRAINED}/config.json or {CONFIG}"):
+        stock = lerobot_eval_command(str(policy), read_json(policy / "config.json"), run.section("env"))
+    if stock:
+        rows.append(("evaluate it with LeRobot alone", stock))
+    rows.append(("publish it", f"accerl push --path={policy} --repo_id=USER/NAME"))
+    return rows
 
 
 def _lag(run: Run, bound: int | None) -> Chart:
@@ -385,19 +336,14 @@ def _tiles(run: Run, bound: int | None) -> list[tuple[str, str, str]]:
     ]
 
 
-def _run_table(runs: Mapping[str, Run], now: float) -> Table:
-    rows = []
-    for name, run in runs.items():
-        ends = [run.evaluated("before")[:1], run.outcomes[-1:]]
-        success = [rate(e[0]["success"], e[0]["ci95"]) if e else ABSENT for e in ends]
-        tiles = {key: value for key, value, _ in _tiles(run, None)}
-        numbers = [tiles.get(key, ABSENT) for key in ("env steps", "lag", "wall time")]
-        seed = str(run.config.get("seed"))
-        rows.append((name, *success, tiles["algorithm"], seed, *numbers, status(run, now)))
-    columns = ("run", "before", "newest", "algorithm", "seed", "env steps", "mean lag", "wall time", "")
-    return Table(
-        "Success before training and in the newest evaluation, with 95 % Wilson intervals", columns, rows
-    )
+def _compared(name: str, run: Run, now: float) -> tuple[str, ...]:
+    """A run's row in the table of several."""
+    success = []
+    for ends in (run.evaluated("before")[:1], run.outcomes[-1:]):
+        success.append(rate(ends[0]["success"], ends[0]["ci95"]) if ends else ABSENT)
+    tiles = {key: value for key, value, _ in _tiles(run, None)}
+    numbers = [tiles.get(key, ABSENT) for key in ("env steps", "lag", "wall time")]
+    return name, *success, tiles["algorithm"], str(run.config.get("seed")), *numbers, status(run, now)
 
 
 def _curves(runs: Mapping[str, Run]) -> list[Chart]:

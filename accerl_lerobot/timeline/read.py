@@ -11,7 +11,7 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -103,16 +103,6 @@ def _training_windows(driver: Row) -> list[Window]:
     return windows
 
 
-class Part(NamedTuple):
-    """One file of a process."""
-
-    worker: str
-    number: tuple[int, int]  # numbers of the process and of the part
-    starts: np.ndarray  # int64 (n,), of each interval, nanoseconds by the calendar
-    ends: np.ndarray
-    states: np.ndarray
-
-
 def read_timeline(run_directory: Path) -> Timeline:
     """Reads what the workers of a run have left, on the axis of the calendar.
 
@@ -125,57 +115,50 @@ def read_timeline(run_directory: Path) -> Timeline:
         hint = "no timeline in it: it is no run of accerl train, or no worker has begun"
         raise InputError("runs", str(run_directory), hint)
     with reading("runs", str(run_directory), f"a file of {TIMELINE}/"):
-        first = min(int(part.starts[0]) for part in parts)
-        workers: dict[str, list[Part]] = {}
+        began = min(int(part.starts[0]) for part in parts)
+        workers: dict[str, list[Row]] = {}
         for part in parts:
             workers.setdefault(part.worker, []).append(part)
-        rows = [_row(worker, own, first) for worker, own in workers.items()]
+        rows = [_whole_row(own, began) for own in workers.values()]
         return Timeline(run=run_directory, rows=tuple(sorted(rows, key=_place)))
 
 
-def read_parts(folder: Path) -> list[Part]:
-    """All files of a timeline with an interval in them, in the order in which they were begun."""
+def read_parts(folder: Path) -> list[Row]:
+    """Every file of a timeline with an interval in it, by the nanoseconds of the calendar."""
     parts = []
-    for path in folder.glob(f"*{SUFFIX}"):
+    for path in sorted(folder.glob(f"*{SUFFIX}")):
         with contextlib.suppress(FileNotFoundError):  # its worker has begun another part meanwhile
             head, newline, data = path.read_bytes().partition(b"\n")
             if newline and len(data) >= 8:
                 parts.append(_part(path, head, data))
-    return sorted(parts, key=lambda part: part.number)
+    return parts
 
 
-def _part(path: Path, head: bytes, data: bytes) -> Part:
+def _part(path: Path, head: bytes, data: bytes) -> Row:
     try:
-        _, process, number = path.name.removesuffix(SUFFIX).rsplit(".", 2)
         content = json.loads(head)
         if content["timeline"] != FORMAT:
             raise ValueError(f"format {content['timeline']}, not {FORMAT}")
         entries = np.frombuffer(data[: len(data) // 8 * 8], "<u8")  # a killed process leaves half an entry
-        since = np.append(
-            np.array([content["at_ns"]], np.int64), (entries >> np.uint64(BITS)).astype(np.int64)
-        )
-        times = since + np.int64(content["wall_ns"])
+        noted = (entries >> np.uint64(BITS)).astype(np.int64)
+        times = np.concatenate([np.array([content["at_ns"]], np.int64), noted]) + np.int64(content["wall_ns"])
         states = np.append(STATES.index(content["state"]), entries[:-1] % 2**BITS).astype(np.uint8)
         changes = np.flatnonzero(np.diff(states, prepend=-1))  # beats are none
         ends = np.append(times[changes[1:]], times[-1])
-        worker = str(content["worker"])
-        return Part(worker, (int(process), int(number)), times[changes], ends, states[changes])
+        return Row(worker=str(content["worker"]), starts=times[changes], ends=ends, states=states[changes])
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         why = f"damaged ({brief(error)}); restore it, or remove it"
         raise InputError("runs", str(path), why) from error
 
 
-def _row(worker: str, parts: list[Part], first: int) -> Row:
-    starts, ends, states = [], [], []
-    for number, part in enumerate(parts):
-        # The last entries of a process that was being ended are cut where the next one begins.
-        limit = min((int(later.starts[0]) for later in parts[number + 1 :]), default=int(part.ends[-1]))
-        starts.append(np.minimum(part.starts, limit) - first)
-        ends.append(np.minimum(part.ends, limit) - first)
-        states.append(part.states)
-    return Row(
-        worker=worker, starts=np.concatenate(starts), ends=np.concatenate(ends), states=np.concatenate(states)
-    )
+def _whole_row(parts: list[Row], began: int) -> Row:
+    """All intervals of a worker; one that was being ended when the next process began is cut there."""
+    starts = np.concatenate([part.starts for part in parts]) - began
+    ends = np.concatenate([part.ends for part in parts]) - began
+    states = np.concatenate([part.states for part in parts])
+    order = np.argsort(starts, kind="stable")
+    cut = np.minimum(ends[order], np.append(starts[order][1:], ends.max()))
+    return Row(worker=parts[0].worker, starts=starts[order], ends=cut, states=states[order])
 
 
 def _place(row: Row) -> tuple[int, int, str]:

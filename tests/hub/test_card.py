@@ -21,8 +21,7 @@ TINY = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
 
 
 def card_of(folder: Path, kind: str, **fields: str) -> str:
-    files, own = stage(PushConfig(path=str(folder), repo_id="alice/door", **fields), folder, kind)
-    assert not own
+    files = stage(PushConfig(path=str(folder), repo_id="alice/door", **fields), folder, kind)
     return bytes(files["README.md"]).decode()
 
 
@@ -112,7 +111,7 @@ def test_a_validation_is_reported(tmp_path: Path):
 def test_the_users_own_card_is_left_alone(tmp_path: Path):
     folder = write_policy_folder(tmp_path / "policy")
     (folder / "README.md").write_text("# mine\n")
-    files, own = stage(PushConfig(path=str(folder), repo_id="a/b"), folder, "policy")
-    assert own and files["README.md"] == b"# mine\n"
+    files = stage(PushConfig(path=str(folder), repo_id="a/b"), folder, "policy")
+    assert files["README.md"] == folder / "README.md"
     (folder / "README.md").write_text(f"{MARK}\nold\n")  # ours, of an earlier push
     assert "old" not in card_of(folder, "policy")

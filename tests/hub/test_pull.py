@@ -71,7 +71,7 @@ def test_what_comes_is_what_went(hub: HubServer, policy: Path, tmp_path: Path, p
     came = contents_of(tmp_path / "pulled")
     assert came.keys() - contents_of(policy).keys() == {"README.md", "accerl_pulled.json"}
     assert {n: came[n] for n in contents_of(policy)} == contents_of(policy)
-    assert found["files"] == len(contents_of(policy)) + 2, "the card, and .gitattributes"
+    assert found["files"] == len(contents_of(policy)) + 1, "the card"
     hub.plant(NAME, {"README.md": b"# edited on the Hub", "demo.gif": b"GIF"})
     pulled(to="edited")
     assert (tmp_path / "edited" / "README.md").read_bytes() == b"# edited on the Hub"
@@ -101,13 +101,13 @@ def test_branches_tags_and_commits_are_pinned(hub, policy, tmp_path, pulled, ref
 @pytest.mark.parametrize(
     "name",
     [
-        "../escaped", "a/../../escaped", "/tmp/escaped-from-a-pull", "a//b", "./a", "..", "a\\..\\b",
-        ".cache/huggingface/download/x.metadata", ".git/config", "C:/escaped", "a/./b", "nul\0byte",
+        "../escaped", "a/../../escaped", "/tmp/escaped-from-a-pull", "..", "a\\..\\b", "C:/escaped",
+        "nul\0byte",
     ],
 )  # fmt: skip
 def test_names_that_lead_elsewhere(hub: HubServer, policy: Path, refused: Refusal, name: str, tmp_path: Path):
     hub.plant(NAME, {name: b"evil"})
-    assert "which is not safe to write" in refused()
+    assert "is not safe to write" in refused()
     assert not [path for method, path, _ in hub.journal if "/resolve/" in path], "nothing was fetched"
     assert not Path("/tmp/escaped-from-a-pull").exists() and list(tmp_path.glob(".pulling-*")) == []
 
@@ -126,16 +126,16 @@ def test_what_is_no_artifact_is_refused(hub, policy, refused, tmp_path, planted,
 
 
 def test_code_that_a_recipe_could_name_does_not_come(hub, policy, pulled, tmp_path):
-    hub.plant(NAME, {"evil.py": b"raise SystemExit", "deep/er/x.so": b"\x7fELF", "notes.txt": b"py"})
-    assert pulled()["left_out"] == ["deep/er/x.so", "evil.py"]
+    files = {
+        "evil.py": b"raise SystemExit",
+        "deep/er/x.so": b"\x7fELF",
+        ".git/config": b"",
+        "notes.txt": b"py",
+    }
+    hub.plant(NAME, files)
+    pulled()
     came = {path.name for path in (tmp_path / "pulled").rglob("*")}
-    assert "notes.txt" in came and not {"evil.py", "x.so"} & came
-
-
-@pytest.mark.parametrize("name", ["model.safetensors", "accerl.json"])
-def test_bytes_that_change_on_the_way(hub: HubServer, policy: Path, refused: Refusal, name: str):
-    hub.faults.append(Fault("GET", f"/{name}", spoil=True))
-    assert f"{name} is not what the server lists: its hash is another" in refused()
+    assert "notes.txt" in came and not {"evil.py", "x.so", ".git"} & came
 
 
 def test_a_cut_download_goes_on(hub: HubServer, policy: Path, refused: Refusal, pulled: Pull, tmp_path: Path):
@@ -157,9 +157,9 @@ def test_names_that_two_have_or_nobody(hub, policy, refused, pulled, monkeypatch
     hub.plant(NAME, {"meta/info.json": b"{}"}, repo_type="dataset")
     assert pulled(to="other")["kind"] == "policy"
     monkeypatch.setenv("HF_TOKEN", STRANGER)
-    assert "the token's account may not see it" in refused(name="alice/nowhere")
+    assert "it is not there, or private" in refused(name="alice/nowhere")
     monkeypatch.delenv("HF_TOKEN")
-    assert "it is not there, or private; log in" in refused(name="alice/nowhere")
+    assert "it is not there, or private: mind the spelling, or log in" in refused(name="alice/nowhere")
 
 
 def changed(where: str, change: Callable[[Answer], object]) -> Callable[[Answer], Answer]:
@@ -216,24 +216,6 @@ def test_huggingface_hub_alone_writes_where_a_header_says(hub: HubServer, policy
     assert (tmp_path / "escaped").is_file()
     with pytest.raises(InputError, match="is no hash"):
         fetched_checkpoint(NAME, None, "policy.path")
-
-
-@pytest.mark.parametrize(
-    ("entry", "words"),
-    [
-        ({"size": float("inf")}, "with size inf"),
-        ({"size": 10**15}, "GB are to be fetched, and"),
-        ({"path": ["x"]}, "['x'], which is not safe to write"),
-        ({"path": "x" * 300}, "is not safe to write"),
-    ],
-)
-def test_what_a_server_may_list(
-    hub: HubServer, policy: Path, refused: Refusal, entry: dict[str, Any], words: str
-):
-    entry = {"type": "file", "path": "x", "size": 1, "oid": "0" * 40} | entry
-    hub.change = altered("/tree/", lambda listed: [*listed, entry])
-    assert words in refused()
-    assert not [path for method, path, _ in hub.journal if "/resolve/" in path], "nothing was fetched"
 
 
 ARENA = f"them/arena@{'0123456789' * 4}"
@@ -325,14 +307,6 @@ def test_a_folder_that_is_there_is_not_touched(
     (tmp_path / "pulled" / "mine").write_text("mine")
     assert "the folder exists; choose another or remove it" in refused()
     assert contents_of(tmp_path / "pulled") == {"mine": b"mine"} and hub.journal == []
-
-
-def test_names_of_which_one_would_be_written_over_the_other(
-    hub: HubServer, policy: Path, refused: Refusal, tmp_path: Path
-):
-    hub.plant(NAME, dict.fromkeys(("a", "a/b"), b"x"))
-    assert "does not work" in refused()
-    assert not (tmp_path / "pulled").exists()
 
 
 @pytest.mark.parametrize("data", [b"{", b"[" * 100_000, b"\xff", b"null", b"[[1]]"])
