@@ -38,7 +38,7 @@ class Fault:
     """Something that goes wrong with requests of a method whose path has `match` in it, so many `times`.
 
     Either a `status` is answered, which `says` something; or nothing happens for `hang_s`, `cut_after` bytes
-    of the body are read, and the connection is cut; or one byte of the answer is another (`spoil`).
+    of the body are read, and the connection is cut.
     """
 
     method: str
@@ -47,7 +47,6 @@ class Fault:
     says: str = "as it was told to"
     cut_after: int = -1
     hang_s: float = 0.0
-    spoil: bool = False
     times: int = 1
 
 
@@ -219,8 +218,6 @@ class Handler(BaseHTTPRequestHandler):
 
     def _send(self, status: int, data: bytes, headers: dict[str, str]) -> None:
         self._note(unquote(urlsplit(self.path).path), status)
-        if self.fault is not None and self.fault.spoil and data:
-            data = data[:-1] + bytes([data[-1] ^ 1])
         headers = {"Content-Length": str(len(data))} | headers
         answer = Answer(unquote(urlsplit(self.path).path), status, headers, data)
         if self.server.change is not None:
@@ -295,14 +292,10 @@ class Handler(BaseHTTPRequestHandler):
         self._json({"url": f"{self.server.url}/{key[1]}", "name": key[1]})
 
     def _api(self, repo: Repo, repo_id: str, verb: str | None, rest: str | None, body: bytes) -> None:
-        if verb == "refs":
-            refs = {
-                what: [{"name": n, "ref": f"refs/{n}", "targetCommit": c} for n, c in named.items()]
-                for what, named in (("branches", repo.branches), ("tags", repo.tags), ("converts", {}))
-            }
-            return self._json(refs)
         if verb == "tag" and self.command == "DELETE":
-            return self._json(repo.tags.pop(str(rest)))
+            if rest not in repo.tags:
+                raise RefusedError(404, "RevisionNotFound", "Invalid rev id")
+            return self._json(repo.tags.pop(rest))
         commit = repo.resolve(rest or "main")
         if commit is None:
             raise RefusedError(404, "RevisionNotFound", "Invalid rev id")

@@ -188,7 +188,7 @@ def _warnings_of_imagination(run: Run) -> Iterator[str]:
 
 def _evaluations(run: Run) -> list[tuple[str, ...]]:
     """Group, env steps, task, success and episodes of every evaluation."""
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for e in run.evaluations:
         tasks = dict(e.get("tasks") or {})
         if len(tasks) != 1:
