@@ -72,64 +72,69 @@ def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
     Returns:
         ``episodes``, ``frames``, ``successes``, and ``left_out``, those that played otherwise than the run's.
     """
-    run, root = Path(str(config.path)).expanduser(), record.check_free(config.root)
-    wanted, picks_all = config.pick == "successes", config.pick == "all"
-    episodes = whole_episodes(read_journal(run / EPISODES))
-    chosen = [parts for parts in episodes if picks_all or parts[-1].success is wanted]
-    if not chosen:
+    run = Path(str(config.path)).expanduser()
+    root = record.check_free(config.root)
+    episodes = list(whole_episodes(read_journal(run / EPISODES)))
+    if config.pick != "all":
+        wanted = config.pick == "successes"
+        episodes = [parts for parts in episodes if parts[-1].success is wanted]
+    if not episodes:
         hint = f"no whole episode in its {EPISODES} of those asked for ({config.pick})"
         raise InputError("path", str(run), hint)
-    with record.appearing(root) as partial:
-        tally = _write(config, chosen, partial, console)
+    cost = _decision_cost(run)
+    with closing(make_environment(config.env)) as environment:
+        spec = environment.spec
+    for parts in episodes:
+        task = parts[0].origin.task
+        if task not in spec.tasks:
+            raise InputError("env.task", task, f"{EPISODES} has this task, and env has {spec.tasks}")
+    record.check_instruction(spec, config.env)
+    tally = {"episodes": 0, "frames": 0, "successes": 0, "left_out": 0}
+    version = {VERSION: {"dtype": "int64", "shape": (1,), "names": None}}
+    with (
+        record.appearing(root) as folder,
+        console.stage("replaying episodes", total=len(episodes)) as stage,
+        record.simulated(config.env, partial(_replay, cost), episodes) as repeated,
+    ):
+        with record.new_dataset(folder, config.repo_id, spec, config.env, version) as dataset:
+            for number, (episode, parts) in enumerate(zip(repeated, episodes, strict=True), start=1):
+                stage.update(number, f"{tally['successes']} successes")
+                if episode is None:
+                    tally["left_out"] += 1
+                    continue
+                versions = np.concatenate([np.repeat(part.versions, part.steps) for part in parts])
+                record.save_episode(dataset, episode, tally, {VERSION: versions[:, None].astype(np.int64)})
         if not tally["episodes"]:
             hint = "none of its episodes could be repeated: this environment is not deterministic"
             raise InputError("path", str(run), hint)
         about = {"export": {"path": run.name, "pick": config.pick}, **tally}
-        (partial / SIDECAR).write_text(json.dumps(about, indent=2) + "\n")
-    return tally
-
-
-def _write(
-    config: ExportConfig, chosen: list[list[JournalEntry]], root: Path, console: Console
-) -> dict[str, int]:
-    with closing(make_environment(config.env)) as environment:
-        spec = environment.spec
-    if others := {parts[0].origin.task for parts in chosen} - {*spec.tasks}:
-        raise InputError("env.task", sorted(others)[0], f"{EPISODES} has this task, and env has {spec.tasks}")
-    record.check_instruction(spec, config.env)
-    tally = {"episodes": 0, "frames": 0, "successes": 0, "left_out": 0}
-    version = {VERSION: {"dtype": "int64", "shape": (1,), "names": None}}
-    stored = read_recipe(Path(str(config.path)).expanduser() / CONFIG).get("rollout")
-    stored = stored if isinstance(stored, dict) else {}
-    if isinstance(judge := stored.get("reward_model"), dict) and judge.get("path"):
-        hint = "rollout.reward_model told its successes, which a repeated episode does not have"
-        raise InputError("path", str(config.path), hint)
-    given = {k: v for k, v in stored.items() if k == "decision_cost"}
-    replay = partial(_replay, decode(RolloutConfig, given).decision_cost)
-    with (
-        console.stage("replaying episodes", total=len(chosen)) as stage,
-        record.simulated(config.env, replay, chosen) as repeated,
-        record.new_dataset(root, config.repo_id, spec, config.env, version) as dataset,
-    ):
-        for number, (episode, parts) in enumerate(zip(repeated, chosen, strict=True), start=1):
-            stage.update(number, f"{tally['successes']} successes")
-            if episode is None:
-                tally["left_out"] += 1
-                continue
-            versions = np.concatenate([np.repeat(part.versions, part.steps) for part in parts])
-            record.save_episode(dataset, episode, tally, {VERSION: versions[:, None].astype(np.int64)})
+        (folder / SIDECAR).write_text(json.dumps(about, indent=2) + "\n")
     if tally["left_out"]:
-        console.say(f"{tally['left_out']} of {len(chosen)} episodes differed from the run and are left out")
+        console.say(f"{tally['left_out']} of {len(episodes)} episodes differed from the run and are left out")
     return tally
+
+
+def _decision_cost(run: Path) -> float:
+    """The cost of a decision in a run, which the rewards of its journal have in them."""
+    rollout = read_recipe(run / CONFIG).get("rollout")
+    rollout = rollout if isinstance(rollout, dict) else {}
+    reward_model = rollout.get("reward_model")
+    if isinstance(reward_model, dict) and reward_model.get("path"):
+        hint = "rollout.reward_model told its successes, which a repeated episode does not have"
+        raise InputError("path", str(run), hint)
+    given = {"decision_cost": rollout["decision_cost"]} if "decision_cost" in rollout else {}
+    return decode(RolloutConfig, given).decision_cost
 
 
 def _replay(cost: float, parts: list[JournalEntry]) -> record.Episode | None:
     """An episode with an observation at every step; None if it differs from the journal."""
-    actions, origin = np.concatenate([part.actions for part in parts]), parts[0].origin
+    origin = parts[0].origin
+    actions = np.concatenate([part.actions for part in parts])
     episode = record.played(record.this_environment(), origin.task, origin.seed, actions)
     if len(episode) != len(actions) or episode.success != parts[-1].success:
         return None
     steps = np.concatenate([part.steps for part in parts])
-    rewards = np.add.reduceat(episode.rewards, np.concatenate([[0], np.cumsum(steps)[:-1]])) - cost
+    first = np.cumsum(steps) - steps  # env step with which each decision begins
+    rewards = np.add.reduceat(episode.rewards, first) - cost
     expected = np.concatenate([part.rewards for part in parts])
     return episode if np.allclose(rewards, expected, rtol=0, atol=TOLERANCE) else None
