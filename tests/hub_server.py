@@ -292,6 +292,9 @@ class Handler(BaseHTTPRequestHandler):
         self._json({"url": f"{self.server.url}/{key[1]}", "name": key[1]})
 
     def _api(self, repo: Repo, repo_id: str, verb: str | None, rest: str | None, body: bytes) -> None:
+        if verb == "refs":  # LeRobot asks for the tags of a dataset
+            tags = [{"name": n, "ref": f"refs/{n}", "targetCommit": c} for n, c in repo.tags.items()]
+            return self._json({"branches": [], "converts": [], "tags": tags})
         if verb == "tag" and self.command == "DELETE":
             if rest not in repo.tags:
                 raise RefusedError(404, "RevisionNotFound", "Invalid rev id")

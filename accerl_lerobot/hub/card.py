@@ -265,7 +265,7 @@ def _carried(files: Files, name: str) -> str:
 def lerobot_eval_command(policy: str, config: Mapping[str, Any], env: Mapping[str, Any]) -> str | None:
     """Stock LeRobot's evaluation of a policy with this config.json in this environment of a recipe."""
     stock = lerobot_eval_arguments(env)
-    if stock is None:
+    if not stock:
         return None
     flags = [f"--policy.path={policy}", *discovery(config.get("type")), *stock]
     return f"lerobot-eval {' '.join(flags)} --eval.n_episodes=50 --eval.batch_size=5"
