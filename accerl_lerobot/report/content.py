@@ -232,8 +232,8 @@ def _commands(run: Run) -> list[tuple[str, str]]:
     with reading("runs", str(run.path), f"{CHECKPOINTS}/{LAST}/{PRETRAINED}/config.json or {CONFIG}"):
         stock = lerobot_eval_command(str(policy), read_json(policy / "config.json"), run.section("env"))
     if stock:
-        rows.append(("evaluate it with LeRobot alone", stock))
-    rows.append(("publish it", f"accerl push --path={policy} --repo_id=USER/NAME"))
+        rows.append(("Evaluate the newest checkpoint with LeRobot alone:", stock))
+    rows.append(("Publish it:", f"accerl push --path={policy} --repo_id=USER/NAME"))
     return rows
 
 
