@@ -12,7 +12,7 @@ import yaml
 
 from accerl_lerobot import cli
 from accerl_lerobot.algorithms import GIPOConfig, PPOConfig
-from accerl_lerobot.cli.verbs import DemosRun, EvalRun, SFTRun, WorldModelRun
+from accerl_lerobot.cli.configs import DemosRun, EvalRun, SFTRun, WorldModelRun
 from accerl_lerobot.config import parsing
 from accerl_lerobot.config.ranges import Positive, Range, Share
 from accerl_lerobot.demos.backbone import BackboneConfig

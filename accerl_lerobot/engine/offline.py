@@ -29,7 +29,7 @@ from accerl_lerobot.metrics import MetricsLog, plain
 from accerl_lerobot.world_model.config import SimulatorStateConfig, StateModelConfig, default_state_model
 
 if TYPE_CHECKING:
-    from accerl_lerobot.cli.verbs import OfflineRun
+    from accerl_lerobot.cli.configs import OfflineRun
 
 logger = logging.getLogger(__name__)
 

@@ -32,7 +32,7 @@ from accerl_lerobot.world_model.contract import WorldModelSpec, new_model
 from accerl_lerobot.world_model.data import Episode
 
 if TYPE_CHECKING:
-    from accerl_lerobot.cli.verbs import WorldModelRun
+    from accerl_lerobot.cli.configs import WorldModelRun
 
 LOG_EVERY = 20  # steps between two lines of training losses
 METRICS = "metrics.jsonl"

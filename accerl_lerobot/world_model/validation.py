@@ -47,7 +47,7 @@ from accerl_lerobot.world_model.rollout_eval import (
 from accerl_lerobot.world_model.success_model import SuccessPairsRewardModel
 
 if TYPE_CHECKING:
-    from accerl_lerobot.cli.verbs import WorldModelEvalRun
+    from accerl_lerobot.cli.configs import WorldModelEvalRun
 
 CHANGED = 16  # a pixel counts as changed if one of its colours differs by more, of 255
 PREVIEW_ROWS, SCALE, FPS = 4, 3, 4  # windows in a video, its enlargement, and its chunks per second

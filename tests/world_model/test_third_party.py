@@ -19,7 +19,7 @@ import torch
 from torch import nn
 
 from accerl_lerobot import cli, console
-from accerl_lerobot.cli.verbs import WorldModelEvalRun, WorldModelRun
+from accerl_lerobot.cli.configs import WorldModelEvalRun, WorldModelRun
 from accerl_lerobot.engine.config import parse
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
