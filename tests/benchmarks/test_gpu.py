@@ -13,7 +13,7 @@ import torch
 from accerl_lerobot.errors import InputError
 from benchmarks import gpu
 from benchmarks.gpu import BenchGpuConfig, bench_gpu, table
-from tests.bench.test_bench import small
+from tests.benchmarks.test_machine import small
 
 __all__ = ["small"]
 
