@@ -56,7 +56,7 @@ def test_what_was_learnt_from_recorded_episodes_is_not_said_to_be_learnt_online(
     recipe.write_text(yaml.safe_dump(fields))
     text = card_of(policy, "policy")
     assert "A LeRobot policy improved on recorded episodes, made with" in text
-    assert "accerl eval" not in text and "accerl train" not in text and "accerl offline" in text
+    assert "accerl eval" not in text and "accerl train" not in text
     assert "A LeRobot policy, made with" in card_of(write_policy_folder(tmp_path / "bare"), "policy")
 
 
