@@ -175,7 +175,9 @@ def _check_base(folder: Path) -> None:
     """Refuses an adapter of a policy that is on this machine, or that it does not name."""
     base = card.read_json(folder / card.ADAPTER_CONFIG).get("base_model_name_or_path")
     if not re.fullmatch(card.REPO_ID, str(base)) or Path(str(base)).exists():
-        why = f"it is an adapter of {base!r}, which others cannot load; push that policy first, then write its"
+        why = (
+            f"it is an adapter of {base!r}, which others cannot load; push that policy first, then write its"
+        )
         hint = f"{why} name on the Hub into {card.ADAPTER_CONFIG} as base_model_name_or_path"
         raise InputError("path", str(folder), hint)
 
