@@ -59,8 +59,9 @@ def export_config(arguments: list[str]) -> ExportConfig:
         raise InputError("path", None, "name the folder of an accerl train run")
     run = expanded(str(path), "path")
     check_folder(run, FileSource("path", str(run)))
-    if not (run / CONFIG).is_file():
-        raise InputError("path", str(run), f"no run in it: there is no {CONFIG}")
+    for file in (CONFIG, EPISODES):
+        if not (run / file).is_file():
+            raise InputError("path", str(run), f"no accerl train run in it: there is no {file}")
     recipe = [f"--config_path={run / CONFIG}"]
     config: ExportConfig = parse(ExportConfig, recipe + arguments, recipe_class=RunConfig)
     return config

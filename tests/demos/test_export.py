@@ -115,11 +115,16 @@ def test_episodes_that_cannot_be_repeated_are_left_out(run, tmp_path, capsys):
 def test_bad_input(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     for options, message in (
         (["--root=" + str(tmp_path)], "the folder exists; choose another or remove it"),
-        (["--path=" + str(tmp_path), "--root=new"], "no run in it: there is no config.yaml"),
+        (["--path=" + str(tmp_path), "--root=new"], "no accerl train run in it: there is no config.yaml"),
         (["--repo_id=name"], "use the form owner/name"),
     ):
         arguments = {"--path": str(run), "--root": str(tmp_path / "new")}
         arguments |= dict(option.split("=", 1) for option in options)
         assert main(["export", *(f"{key}={value}" for key, value in arguments.items())]) == 2
         assert message in capsys.readouterr().err
+    other = tmp_path / "world_model_run"
+    other.mkdir()
+    (other / "config.yaml").write_text("device: auto\n")
+    assert exported(other, tmp_path / "new") == 2
+    assert "no accerl train run in it: there is no episodes.jsonl" in capsys.readouterr().err
     assert main(["export"]) == 2 and "path=None: name the folder" in capsys.readouterr().err
