@@ -216,7 +216,7 @@ def test_a_finished_run_goes_back_to_an_earlier_checkpoint(
     (run / "wandb").mkdir()
     (run / "wandb" / "debug-core.log").symlink_to(tmp_path / "elsewhere")  # as its client does
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
-    monkeypatch.setattr(preflight, "check_world", failing)
+    monkeypatch.setattr(preflight, "check_environment", failing)
     assert go_on(run, config="checkpoints/000010/config.yaml") == 2
     assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
     monkeypatch.undo()
