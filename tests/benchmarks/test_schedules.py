@@ -97,7 +97,7 @@ def test_a_recipe_is_measured_under_two_schedules(tiny_checkpoint: Path, tmp_pat
     recipe.write_text(
         "env: {type: simulated, max_steps: 16}\n"
         "rollout: {workers: 1, environments: 4, segment_length: 3}\n"
-        "replay: {capacity: 64, min_decisions: 16, ahead: 32, samples_per_insert: 2.0}\n"
+        "replay: {capacity: 64, min_decisions: 16, max_unlearned_decisions: 32, samples_per_insert: 2.0}\n"
         "trainer: {updates: 12, batch_decisions: 16, warmup_updates: 0, value_warmup_updates: 0}\n"
     )
     config = BenchThroughputConfig(
