@@ -187,7 +187,7 @@ class TestResources:
         assert each <= pictures[1] - pictures[0] < 1.1 * each
 
     def test_lag_is_that_of_the_formula(self) -> None:
-        """⌊⌈r⌉ (max(max_unlearned_decisions, min) + 2·in_flight + capacity) / batch⌋ − 1; with Ray one pickup, one prefetch."""
+        """⌊⌈r⌉ (max(unlearned, min) + 2·in_flight + capacity) / batch⌋ − 1; with Ray a pickup, a prefetch."""
         replay = {
             "capacity": 1024,
             "max_unlearned_decisions": 256,
