@@ -279,9 +279,7 @@ def test_an_off_policy_algorithm_needs_a_policy_that_imitates_a_chunk():
     act.use_relative_actions = True
     with pytest.raises(InputError, match=r"^policy\.use_relative_actions=True: algorithm\.type=awr keeps"):
         check_imitates(AWRConfig(), PolicyConfig(path="x"), act)
-    with pytest.raises(
-        InputError, match=r"^policy\.sampler\.type='tokens': .*use chunk_noise, flow or"
-    ):
+    with pytest.raises(InputError, match=r"^policy\.sampler\.type='tokens': .*use chunk_noise, flow or"):
         check_imitates(AWRConfig(), PolicyConfig(path="x"), SimpleNamespace(type="pi0_fast"))
 
 
