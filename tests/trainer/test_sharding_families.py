@@ -21,7 +21,6 @@ from accerl_lerobot.checkpoint.tensors import whole
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.config import TuningConfig
-from accerl_lerobot.policies.saving import copy_weights
 from accerl_lerobot.testing import perturb
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.ranks import Ranks
@@ -67,7 +66,7 @@ def learn(case: Case, folder: Path, config: TrainerConfig, group: Ranks) -> dict
             for name, p in adapter.trainable().items()
         }
         metrics.append(update.step(batch))
-        saved = copy_weights(adapter).policy if case.kind == "smolvla" else {}
+        saved = adapter.copy_weights().policy if case.kind == "smolvla" else {}
         return {
             "metrics": metrics,
             "gradients": gradients,
