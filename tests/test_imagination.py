@@ -19,7 +19,7 @@ from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import RunConfig
-from accerl_lerobot.engine.imagination import EnvironmentLearningWorker, ImaginationWorker
+from accerl_lerobot.engine.imagination import ImaginationWorker, WorldModelLearningWorker
 from accerl_lerobot.engine.local import LocalEngine
 from accerl_lerobot.engine.loop import Progress
 from accerl_lerobot.engine.run import execute
@@ -244,7 +244,7 @@ def test_it_runs_asynchronously(tiny_checkpoint: Path, world_model: Path, tmp_pa
     assert {"recovery", "compute", "transport", "wait_in"} <= spent["world-model learning"].keys()
 
 
-@pytest.mark.parametrize("kind", [ImaginationWorker, EnvironmentLearningWorker])
+@pytest.mark.parametrize("kind", [ImaginationWorker, WorldModelLearningWorker])
 def test_one_that_hangs_is_found_when_it_is_saved(kind: type, tmp_path: Path):
     """And not after the minutes that large files may take; `benchmarks.faults` does it to a whole run."""
     worker, held = object.__new__(kind), threading.Lock()

@@ -318,7 +318,7 @@ class ImaginationWorker(_Worker):
             self._core.swap(self._promoted.pop())
 
 
-class EnvironmentLearningWorker(_Worker):
+class WorldModelLearningWorker(_Worker):
     """The worker that trains the world model."""
 
     name, state_name = WORLD_LEARNING, "world_learner"

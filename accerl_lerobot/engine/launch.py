@@ -244,9 +244,9 @@ class RayEngine(Engine):
         stores = (c.replay, c.seed, imagined, c.rollout.episodes > 0, state, c.folder, timeline)
         self._replay = make("replay", ReplayWorker, 1000, *stores)
         if imagination.share:
-            from accerl_lerobot.engine.imagination import EnvironmentLearningWorker, ImaginationWorker
+            from accerl_lerobot.engine.imagination import ImaginationWorker, WorldModelLearningWorker
 
-            for kind in (ImaginationWorker, EnvironmentLearningWorker)[: 1 + imagination.learns]:
+            for kind in (ImaginationWorker, WorldModelLearningWorker)[: 1 + imagination.learns]:
                 self._imagining.append(make(kind.name, kind, 4, c, state, timeline))
         self._rollouts.start(plan)
         for worker, reference in [(w, w.actor.ready.remote()) for w in self._everyone()]:

@@ -97,20 +97,18 @@ def _adapter(config: OfflineRun, wanted: dict[str, tuple[int, ...]]) -> Any:
 
     if not isinstance(config.algorithm, ChunkCriticConfig):
         return load_adapter(config.policy)
+    model = _state_model(config, ENVIRONMENT_STATE in wanted)
     numbers = math.prod(wanted[ENVIRONMENT_STATE]) if ENVIRONMENT_STATE in wanted else 0
-    model = config.world_model or default_state_model(numbers > 0)
     return with_teacher(load_adapter, model, numbers, config.algorithm.teacher_episodes, config.policy)
 
 
-def _reads_environment_state(config: OfflineRun, offered: bool) -> bool:
-    """True if critic and teacher see the simulator's state, which a dataset may have `offered`."""
-    if not isinstance(config.algorithm, ChunkCriticConfig):
-        return False
+def _state_model(config: OfflineRun, offered: bool) -> StateModelConfig:
+    """State that critic and teacher see; refuses the simulator's if the dataset has not `offered` it."""
     model: StateModelConfig = config.world_model or default_state_model(offered)
     if isinstance(model, SimulatorStateConfig) and not offered:
         hint = f"the dataset has no {ENVIRONMENT_STATE}; use latent"
         raise InputError("world_model.type", model.type, hint)
-    return offered
+    return model
 
 
 def _check(config: OfflineRun, policy: Any, meta: Any) -> dict[str, tuple[int, ...]]:
@@ -135,7 +133,8 @@ def _check(config: OfflineRun, policy: Any, meta: Any) -> dict[str, tuple[int, .
         hint = f"its episodes are labelled neither by {SUCCESS} nor {REWARD}; use accerl sft"
         raise InputError("dataset.repo_id", config.dataset.repo_id, hint)
     shapes, read = dataset_shapes(meta), policy_features(policy).shapes.keys() | {ACTION}
-    if _reads_environment_state(config, ENVIRONMENT_STATE in shapes):
+    if isinstance(config.algorithm, ChunkCriticConfig):
+        _state_model(config, ENVIRONMENT_STATE in shapes)
         read |= {ENVIRONMENT_STATE}
     return {name: shape for name, shape in shapes.items() if renames.get(name, name) in read}
 

@@ -187,14 +187,18 @@ class Processing:
     rename_map: dict[str, str]
 
     def prepare(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> dict[str, Tensor]:
-        """Normalises and tokenises. Images go from uint8 (..., H, W, 3) to float (..., 3, H, W) in [0, 1]."""
-        batch: dict[str, Any] = {"task": list(tasks)}
+        """Normalised and tokenised observations."""
+        return self.preprocessor({"task": list(tasks), **self.tensors(observations)})
+
+    def tensors(self, observations: dict[str, np.ndarray]) -> dict[str, Tensor]:
+        """By the policy's names; images go from uint8 (..., H, W, 3) to float (..., 3, H, W) in [0, 1]."""
+        batch: dict[str, Tensor] = {}
         for key, array in observations.items():
             tensor = torch.from_numpy(np.ascontiguousarray(array)).to(self.device)
             if key.startswith(IMAGES):
                 tensor = tensor.movedim(-1, -3).contiguous().float() / 255.0
             batch[self.rename_map.get(key, key)] = tensor
-        return self.preprocessor(batch)
+        return batch
 
     def unnormalise(self, chunk: Tensor) -> Tensor:
         """(B, K, A) from normalised to environment units."""

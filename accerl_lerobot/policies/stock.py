@@ -30,7 +30,6 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Decision, Request, Segment, stack_observations
 from accerl_lerobot.policies import saving
 from accerl_lerobot.policies.adapter import (
-    IMAGES,
     Evaluation,
     PolicyAdapter,
     Processing,
@@ -275,14 +274,10 @@ class StockAdapter(PolicyAdapter):
             outside = (rows < 0) | (rows >= chunk.shape[1])
             batch[f"{ACTION}_is_pad"] = outside.expand(count, -1)
         steps = config.observation_delta_indices
-        for name, array in observations.items():
-            tensor = torch.from_numpy(np.ascontiguousarray(array)).to(self.device)
-            if name.startswith(IMAGES):
-                tensor = tensor.movedim(-1, -3).contiguous().float() / 255.0
-            key = self.processing.rename_map.get(name, name)
+        for key, tensor in self.processing.tensors(observations).items():
+            batch[key] = tensor
             if steps is not None:
                 batch[f"{key}_is_pad"] = torch.zeros(count, len(steps), dtype=torch.bool, device=self.device)
-                tensor = tensor if config.n_obs_steps > 1 else tensor[:, None]
-            batch[key] = tensor
+                batch[key] = tensor if config.n_obs_steps > 1 else tensor[:, None]
         prepared: dict[str, Any] = self.processing.preprocessor(batch)
         return prepared

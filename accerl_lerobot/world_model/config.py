@@ -84,7 +84,7 @@ class LearnableModelConfig(Section, draccus.ChoiceRegistry, section="world_model
         >>> @LearnableModelConfig.register_subclass("mine")
         ... @dataclass(frozen=True, kw_only=True)
         ... class MyModelConfig(LearnableModelConfig):
-        ...     make = "my_package.model:MyEnvironmentModel"
+        ...     make = "my_package.model:MyWorldModel"
         ...     width: int = 64
     """
 

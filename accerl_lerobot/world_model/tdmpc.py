@@ -53,13 +53,16 @@ class TDMPCModel(StateModel):
         # What it normalises by, measured: LeRobot's normalisations are all affine.
         with torch.no_grad():
             zero, one = (processing.normalise(torch.full((1, 1, spec.chunk[1]), x))[0, 0] for x in (0.0, 1.0))
-            self.action_zero, self.action_scale = _fixed(zero), _fixed(one - zero)
+            scale = one - zero
+            if spec.units is not None:  # of the policy's normalised actions
+                first, each = (torch.from_numpy(part) for part in spec.units)
+                zero, scale = zero + scale * first, scale * each
+            self.action_zero, self.action_scale = _fixed(zero), _fixed(scale)
             if self.numbers:
                 ends = np.stack([np.zeros(self.numbers, np.float32), np.ones(self.numbers, np.float32)])
                 seen = {STATE: ends} | self._blank(2)
                 low, high = processing.prepare(seen, ["", ""])[STATE]
                 self.state_zero, self.state_scale = _fixed(low), _fixed(high - low)
-        self.units = [_fixed(torch.as_tensor(part)) for part in spec.units] if spec.units else None
 
     @property
     def learns(self) -> bool:
@@ -80,19 +83,12 @@ class TDMPCModel(StateModel):
             target = self.slow(self._read(transitions.following, shift=True))
         latent = self.encoder(self._read(transitions.observations, shift=True))
         value = self.value(latent)[:, 0]
-        for action in self._actions(transitions.chunk).unbind(1):
+        for action in (self.action_zero + self.action_scale * transitions.chunk).unbind(1):
             latent = self.dynamics(torch.cat([latent, action], 1))
         consistency = functional.mse_loss(latent, target)
         returns = functional.mse_loss(value, transitions.returns)
         metrics = {"consistency": float(consistency.detach()), "return": float(returns.detach())}
         return self.config.consistency_coeff * consistency + RETURN * returns, metrics
-
-    def _actions(self, chunk: Tensor) -> Tensor:
-        """Chunks (B, K, A) of the run's normalised units in those of TD-MPC."""
-        if self.units is not None:
-            zero, scale = self.units
-            chunk = zero + scale * chunk
-        return self.action_zero + self.action_scale * chunk
 
     def _read(self, observations: Observations, shift: bool = False) -> dict[str, Tensor]:
         """Inputs of TD-MPC's encoder."""

@@ -23,7 +23,7 @@ from accerl_lerobot import errors
 from accerl_lerobot.checkpoint.tensors import copied
 from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, open_clock
-from accerl_lerobot.world_model.state_learner import StateLearner
+from accerl_lerobot.world_model.state_learner import BATCH, StateLearner
 from accerl_lerobot.world_model.states import Observations, StateModel, Transitions
 
 WORLD_MODEL_WORKER = "world model"
@@ -103,7 +103,8 @@ class RemoteStateLearner:
         self._actor, self._timeout_s = actor, timeout_s
         self._first_steps = learner.model.first_steps
         self._submitted = self._count = learner.count
-        self._pending: deque[tuple[Any, float]] = deque()  # a call, and when it was made
+        self._pending: deque[Any] = deque()  # calls without an answer, in their order
+        self._since = 0.0  # when the worker began with the first of them, at the latest
         self._made: list[dict[str, float]] = []
         self._weights: dict[str, Any] = copied(learner.model)
         model = learner.model.cpu().eval()
@@ -123,15 +124,14 @@ class RemoteStateLearner:
         return self._count >= self._first_steps
 
     def submit(self, transitions: Transitions, numbers: Observations) -> None:
-        from accerl_lerobot.world_model.state_learner import BATCH
-
+        if not self._pending:
+            self._since = time.monotonic()
         self._submitted += len(transitions.tasks) // BATCH
-        self._pending.append((self._actor.learn.remote(transitions, numbers), time.monotonic()))
+        self._pending.append(self._actor.learn.remote(transitions, numbers))
 
     def wait(self) -> None:
         while self._pending:
-            self._receive(self._answer(self._pending[0][0]))
-            self._pending.popleft()
+            self._receive(self._answer(self._pending[0]))
 
     def collect(self) -> list[dict[str, float]]:
         self._take()
@@ -149,14 +149,16 @@ class RemoteStateLearner:
         """Receive what is ready.
 
         Raises:
-            TimeoutError: the oldest call has had no answer for too long.
+            TimeoutError: there has been no answer for too long.
         """
-        while self._pending and ray.wait([self._pending[0][0]], timeout=0)[0]:
-            self._receive(ray.get(self._pending.popleft()[0]))
-        if self._pending and time.monotonic() - self._pending[0][1] > self._timeout_s:
+        while self._pending and ray.wait([self._pending[0]], timeout=0)[0]:
+            self._receive(ray.get(self._pending[0]))
+        if self._pending and time.monotonic() - self._since > self._timeout_s:
             raise TimeoutError(f"the world-model worker has not answered for {self._timeout_s:g} s")
 
     def _receive(self, learned: Learned) -> None:
+        self._pending.popleft()
+        self._since = time.monotonic()
         self._made += learned.metrics
         self._count, self._weights = learned.steps, learned.weights
 

@@ -29,13 +29,14 @@ from tests.world_model.test_latent import NUMBERS, model, transitions
 
 
 class Calls:
-    """Ray in this process: a call is made when its answer is asked for, or once it is `due`."""
+    """Ray in this process: a call is made when its answer is asked for; so many answers are `due`."""
 
     def __init__(self) -> None:
-        self.due = True
+        self.due = 10**6
 
     def wait(self, references: list[Any], timeout: float) -> tuple[list[Any], list[Any]]:
-        return (references, []) if self.due else ([], references)
+        self.due -= 1
+        return (references, []) if self.due >= 0 else ([], references)
 
     def get(self, reference: Any, timeout: float | None = None) -> Any:
         return reference()
@@ -86,7 +87,7 @@ def test_nobody_waits_while_steps_are_under_way(calls: Calls, monkeypatch: pytes
     now = [0.0]
     monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
     _, there = learners(timeout_s=10.0)
-    calls.due = False
+    calls.due = 0
     there.submit(transitions(BATCH, seed=1), NUMBERS)
     assert there.busy and there.collect() == []
     now[0] = 11.0
@@ -94,6 +95,21 @@ def test_nobody_waits_while_steps_are_under_way(calls: Calls, monkeypatch: pytes
         there.collect()
     there.wait()
     assert len(there.collect()) == 1 and not there.busy
+
+
+def test_calls_in_a_queue_have_a_timeout_each(calls: Calls, monkeypatch: pytest.MonkeyPatch):
+    now = [0.0]
+    monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
+    _, there = learners(timeout_s=10.0)
+    for _ in range(2):
+        there.submit(transitions(BATCH, seed=1), NUMBERS)
+    now[0], calls.due = 9.0, 1
+    assert there.busy and len(there.collect()) == 1
+    now[0] = 18.0
+    assert there.busy, "the second one began when the first had ended"
+    now[0] = 20.0
+    with pytest.raises(TimeoutError):
+        there.collect()
 
 
 def test_what_is_learned_is_read_with_its_weights():
