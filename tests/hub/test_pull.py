@@ -232,6 +232,7 @@ def test_no_recipe_that_was_pulled_lets_code_run(hub, policy, pulled, tmp_path, 
     capsys.readouterr()
     run = tmp_path / "pulled" / "accerl_run"
     (run / ".lock").touch()
+    (run / "episodes.jsonl").touch()
     for verb in (["train"], ["train", "--resume=true"], ["eval"], ["doctor"]):
         assert cli.main([*verb, f"--config_path={run / 'config.yaml'}"]) in (1, 2)
         assert "a file cannot allow this, only the command line can" in "".join(capsys.readouterr())
