@@ -3,9 +3,10 @@
 
 Every process that a guarded process starts, directly or through Ray, multiprocessing or another library,
 inherits a mark in its environment. When the parent has ended (SIGKILL included), the guardian kills all
-processes with this mark, or with open files in a registered folder, and removes these folders. It runs in a
-session of its own, so neither Ctrl-C nor the end of a terminal reaches it. Python's resource trackers are
-left alone: they unlink semaphores and end by themselves once the processes that use these are gone.
+processes with this mark and what is below them, and removes registered folders. It runs in a session of its
+own, so neither Ctrl-C nor the end of a terminal reaches it. Python's resource trackers are left alone: they
+unlink semaphores and end by themselves once the processes that use these are gone. So do Ray's agents, which
+wipe their environment, once their raylet is gone.
 """
 
 from __future__ import annotations
@@ -21,7 +22,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +40,7 @@ _owner = 0
 
 
 def start() -> None:
-    """Starts this process's guardian, unless it has one."""
+    """Start this process's guardian, unless it has one."""
     global _process, _owner
     if _owner == os.getpid():
         return
@@ -61,15 +61,13 @@ def start() -> None:
 
 
 def remove(folder: Path) -> None:
-    """Has a folder removed when this process has ended, if it is still there."""
+    """Have a folder removed when this process has ended, if it is still there."""
     _tell(folder=str(folder.absolute()))
 
 
-def explain(cause: str = "", hint: str = "") -> None:
-    """Sets the line that is printed if this process ends abruptly; empty: as it was. Without a hint there
-    is none, and without a cause it was killed.
-    """
-    _tell(**{key: text for key, text in (("cause", cause), ("hint", hint)) if text})
+def explain(hint: str) -> None:
+    """Set the line that is printed if this process is killed; without a hint there is none."""
+    _tell(hint=hint)
 
 
 def _tell(**message: Any) -> None:
@@ -88,55 +86,62 @@ def _dismiss(owner: int) -> None:
         _process.wait(END_S + LOOK_S)
 
 
-def left_behind(identity: str, folders: Sequence[str]) -> list[psutil.Process]:
-    """Living processes with this mark, or of those folders, but those that end by themselves."""
-
-    def is_ours(process: psutil.Process) -> bool:
-        if variables := process.environ():
-            return identity in variables.get(MARK, "").split()
-        # Ray's agents wipe their environment when they change their title; they keep their logs open.
-        return any(file.path.startswith(f"{folder}/") for file in process.open_files() for folder in folders)
-
-    left = []
+def left_behind(identity: str) -> list[psutil.Process]:
+    """Living processes with this mark and all below them, but those that end by themselves."""
+    left: set[psutil.Process] = set()
     for process in psutil.process_iter():
         with contextlib.suppress(psutil.Error):  # it has ended meanwhile, or is of another user
-            ends = any(end in word for end in SELF_ENDING for word in process.cmdline()[:5])
-            if is_ours(process) and process.status() != psutil.STATUS_ZOMBIE and not ends:
-                left.append(process)
-    return left
+            if identity in process.environ().get(MARK, "").split():
+                left |= {process, *process.children(recursive=True)}
+    return [process for process in left if not _ends_by_itself(process)]
 
 
-def _listen(parent: int) -> dict[str, Any]:
-    told: dict[str, Any] = {"folders": [], "cause": "", "hint": "", "bye": False}
-    text = b""
-    while not told["bye"]:
+def _ends_by_itself(process: psutil.Process) -> bool:
+    try:
+        if process.status() == psutil.STATUS_ZOMBIE:
+            return True
+        return any(end in word for end in SELF_ENDING for word in process.cmdline()[:5])
+    except psutil.Error:
+        return True
+
+
+def _listen(parent: int) -> tuple[list[Path], str]:
+    """Messages until the parent has ended: the folders to remove, and the line to print."""
+    folders: list[Path] = []
+    hint, text = "", b""
+    while True:
         if not select.select([0], [], [], LOOK_S)[0]:
             if os.getppid() != parent:
-                break
+                return folders, hint
             continue
-        if not (more := os.read(0, 65536)):
-            break
+        more = os.read(0, 65536)
+        if not more:
+            return folders, hint
         *lines, text = (text + more).split(b"\n")
         for message in map(json.loads, lines):
-            told["folders"] += [folder] if (folder := message.pop("folder", None)) else []
-            told |= message
-    return told
+            if "folder" in message:
+                folders.append(Path(message["folder"]))
+            if "bye" in message:
+                return folders, ""
+            hint = message.get("hint", hint)
 
 
 def main(identity: str) -> None:
-    """Waits for the end of the parent, then ends and removes what it has left."""
-    told = _listen(os.getppid())
-    if told["hint"] and not told["bye"]:
-        cause = told["cause"] or "the process was killed"
-        sys.stderr.write(f"accerl: {cause}; {told['hint']}\n")
+    """Wait for the end of the parent, then end and remove what it has left."""
+    folders, hint = _listen(os.getppid())
+    if hint:
+        sys.stderr.write(f"accerl: the process was killed; {hint}\n")
         sys.stderr.flush()
     deadline = time.monotonic() + END_S
-    while time.monotonic() < deadline and (left := left_behind(identity, told["folders"])):
+    while time.monotonic() < deadline:
+        left = left_behind(identity)
+        if not left:
+            break
         for process in left:
             with contextlib.suppress(psutil.Error):
                 process.kill()
         psutil.wait_procs(left, timeout=0.5)
-    for folder in told["folders"]:
+    for folder in folders:
         shutil.rmtree(folder, ignore_errors=True)
 
 

@@ -29,7 +29,6 @@ from benchmarks.soak import BenchSoakConfig
 from benchmarks.third_party import BenchThirdPartyConfig
 from benchmarks.throughput import BenchThroughputConfig
 from benchmarks.transport import BenchTransportConfig
-from benchmarks.weights import BenchWeightsConfig
 
 CONFIGS: dict[str, type[Any]] = {
     "environment": BenchEnvironmentConfig,
@@ -45,7 +44,6 @@ CONFIGS: dict[str, type[Any]] = {
     "scaling": BenchScalingConfig,
     "batching": BenchBatchingConfig,
     "transport": BenchTransportConfig,
-    "weights": BenchWeightsConfig,
     "gpu": BenchGpuConfig,
     "third_party": BenchThirdPartyConfig,
 }

@@ -28,7 +28,6 @@ from accerl_lerobot.checkpoint.layout import CHECKPOINTS, LAST, PRETRAINED, SUMM
 from accerl_lerobot.config.ranges import Range, Repeats, Section, Seed, Steps
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import RunConfig, encode, parse
-from accerl_lerobot.engine.ray_session import RAY_PROCESSES
 from accerl_lerobot.errors import InputError, check_absent, make_folder
 from accerl_lerobot.evaluation import Rate
 from benchmarks.audit import audit_segments, audit_updates
@@ -41,7 +40,7 @@ from benchmarks.victims import CLASSES, DRIVER, EVERYTHING, LIGHT, TRAIN, Victim
 
 IMAGINING = ("imagination", "world-model learning")
 """Targets that are there where anything is imagined."""
-TARGETS = (*CLASSES, *RAY_PROCESSES, DRIVER, EVERYTHING)
+TARGETS = (*CLASSES, DRIVER, EVERYTHING)
 GRACE_S = 60.0
 """How long a run may take to stop when it is asked to."""
 LATEST = 0.9
@@ -69,9 +68,9 @@ class BenchFaultsConfig(Section):
         "driver",
         "everything",
     )
-    """Processes to strike: these, and Ray's own: gcs_server, raylet, dashboard agent, runtime env agent and
-    log monitor; where anything is imagined, imagination and world-model learning too. driver: the run's own
-    process, which is gone on with by its command line. everything: it and all below it, at once."""
+    """Processes to strike: these, and where anything is imagined, imagination and world-model learning too.
+    driver: the run's own process, which is gone on with by its command line. everything: it and all below it,
+    at once."""
     faults: tuple[str, ...] = FAULTS
     """kill, stop: SIGKILL and SIGSTOP, at a point or at any moment. exception, exit (with code 0), hang (of
     one thread), nan, nans (in as many updates in a row as end the trainer), full (the disk), torn (a file of

@@ -16,7 +16,6 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from accerl_lerobot.engine.ray_session import RAY_PROCESSES, REQUIRED
 from accerl_lerobot.errors import MAX_NONFINITE
 from benchmarks.audit import audit_updates
 from benchmarks.fault_injection import FULL, NAN, POINTS, TORN, inject, proof, withdraw
@@ -145,7 +144,7 @@ def _befall(
 def _recover(victim: Victim, target: str, fault: str, pid: int, count: int) -> None:
     """Waits until the run has, with as many processes of the target as before."""
     last = max(victim.updates(), default=0)
-    if fault == NAN or target in RAY_PROCESSES.keys() - set(REQUIRED):
+    if fault == NAN:
         victim.await_update(last + SPARE, START_S)
     elif target in (DRIVER, EVERYTHING):
         try:

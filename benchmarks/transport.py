@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cost of asking inference for a decision: Ray, shared memory, and the lower bound of any transport.
+"""Cost of asking inference for a decision: Ray, the package's sockets, and the lower bound of any transport.
 
     python -m benchmarks transport --output_dir=outputs/transport
 
@@ -29,7 +29,7 @@ from benchmarks.records import as_markdown, write
 from benchmarks.study import named
 from benchmarks.tables import as_table, host, ranged, spread
 
-RAY, SHARED_MEMORY, SLOT = "ray", "shared_memory", "slot"
+RAY, SOCKET, SLOT = "ray", "socket", "slot"
 IMAGES = {"12 KB": (1, 64, 4), "301 KB": (2, 224, 8)}
 """Observation → cameras, their height and width, numbers of the state: our MetaWorld's, and a VLA's."""
 CHUNK, ACTIONS, LATENT = 50, 7, 32
@@ -110,7 +110,7 @@ def bench_transport(config: BenchTransportConfig) -> dict[str, Any]:
 
 def _measure(crowd: Any, config: BenchTransportConfig, size: str, callers: int, tell: Any) -> list[Any]:
     """All arms of one size and number of callers, forth and back; see `bench_transport`."""
-    arms = (RAY, SHARED_MEMORY, SLOT)[: 3 if callers == 1 else 2]
+    arms = (RAY, SOCKET, SLOT)[: 3 if callers == 1 else 2]
     blocks: dict[str, list[tuple[float, float, float]]] = {arm: [] for arm in arms}
     for arm in arms:
         crowd.measure(arm, size, callers, max(10, config.calls // 4))  # everything is warm after that

@@ -13,16 +13,15 @@ import socket
 import threading
 import time
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import ray
 
 from accerl_lerobot.engine.ray_session import start_ray
 from accerl_lerobot.experience import Decision, Request
-from accerl_lerobot.transport.contract import Client
-from accerl_lerobot.transport.endpoint import Endpoint
-from accerl_lerobot.transport.shared_memory import Address, SharedMemoryServer, new_socket
-from benchmarks.transport import RAY, SHARED_MEMORY, SLOT, decision, request_of
+from accerl_lerobot.transport.connection import Address, Client, Server
+from benchmarks.transport import RAY, SLOT, decision, request_of
 
 LONG_S = 120.0
 """Seconds after which an end counts as hung."""
@@ -37,10 +36,8 @@ class Answering:
         self._decision = decision()
 
     async def listen(self) -> Address:
-        """Serves shared memory on a thread, as inference does."""
-        server = SharedMemoryServer(
-            lambda asked: asked.answer([self._decision] * len(asked.message)), copy=False
-        )
+        """Serves sockets on a thread, as inference does."""
+        server = Server(lambda asked: asked.answer([self._decision] * len(asked.message)))
 
         def serve() -> None:
             while True:
@@ -51,7 +48,7 @@ class Answering:
 
     async def floor(self) -> str:
         """Name of a socket that sends bytes back."""
-        name, listener = secrets.token_hex(16), new_socket()
+        name, listener = secrets.token_hex(16), socket.socket(socket.AF_UNIX)
         listener.bind(f"\0{name}")
         listener.listen(1)
 
@@ -71,14 +68,19 @@ class Answering:
 class Calling:
     """One caller, which becomes a Ray actor; `floor` names the socket of `Answering.floor`, if it has one."""
 
-    def __init__(self, endpoints: dict[str, Endpoint], floor: str | None) -> None:
-        self._callers = {arm: endpoint.connect() for arm, endpoint in endpoints.items()}
+    def __init__(self, service: Any, address: Address, floor: str | None) -> None:
+        self._service, self._client = service, Client("answering", address)
         self._token = None if floor is None else _connected(floor)
 
     def measure(self, arm: str, size: str, seed: int, calls: int, begin: float) -> tuple[list[float], float]:
         """Seconds of each call, and the moment of the last one's end, on `time.monotonic`."""
         message, seconds = [request_of(size, seed)], []
-        call = self._slot(message[0]) if arm == SLOT else lambda: _one(self._callers[arm], message)
+        if arm == SLOT:
+            call = self._slot(message[0])
+        elif arm == RAY:
+            call = lambda: ray.get(self._service.decide.remote(message), timeout=LONG_S)  # noqa: E731
+        else:
+            call = lambda: _one(self._client, message)  # noqa: E731
         time.sleep(max(0.0, begin - time.monotonic()))
         for _ in range(calls):
             started = time.perf_counter()
@@ -103,7 +105,7 @@ class Calling:
 
 
 def _connected(name: str) -> socket.socket:
-    token = new_socket()
+    token = socket.socket(socket.AF_UNIX)
     token.settimeout(LONG_S)
     token.connect(f"\0{name}")
     return token
@@ -128,11 +130,11 @@ class Crowd:
             start_ray()
         self._service = ray.remote(Answering).options(num_cpus=0, max_concurrency=1000).remote()
         address = ray.get(self._service.listen.remote(), timeout=LONG_S)
-        way = {"name": "answering", "method": self._service.decide}
-        ends = {RAY: Endpoint(**way), SHARED_MEMORY: Endpoint(**way, address=address)}
         actor = ray.remote(Calling).options(num_cpus=0)
         floor = ray.get(self._service.floor.remote(), timeout=LONG_S)
-        self._callers = [actor.remote(ends, None if i else floor) for i in range(self._count)]
+        self._callers = [
+            actor.remote(self._service, address, None if i else floor) for i in range(self._count)
+        ]
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 from accerl_lerobot.checkpoint.layout import CONFIG
-from accerl_lerobot.engine.ray_session import RAY_PROCESSES, process_kind
 from accerl_lerobot.metrics import METRICS
 from benchmarks.fault_injection import environment
 from benchmarks.study import last_words
@@ -72,8 +71,6 @@ class Victim:
         """Processes of a target, as they are now."""
         if target in (DRIVER, EVERYTHING):
             return [self.process.pid] if self.process.poll() is None else []
-        if target in RAY_PROCESSES:
-            return [p for p in descendants(self.process.pid) if process_kind(_command(p)) == target]
         name = f"ray::{CLASSES[target]}"
         found = {pid for pid in descendants(self.process.pid) if title(pid).startswith(name)}
         # What a worker forks has its name, too, until it becomes something else.

@@ -22,9 +22,9 @@ from accerl_lerobot.inference.batcher import Batcher
 from accerl_lerobot.rollout.runner import EpisodePlans
 from accerl_lerobot.rollout.worker import Report, RolloutWorker
 from accerl_lerobot.trainer.peers import LearnerSettings
-from accerl_lerobot.transport.endpoint import Endpoint
-from accerl_lerobot.transport.shared_memory import Address, serve_on_loop
-from accerl_lerobot.transport.weights import WeightPublisher, WeightUpdate
+from accerl_lerobot.transport.connection import Address, Server, ServiceStoppedError, serve_on_loop
+from accerl_lerobot.transport.endpoint import node_address
+from accerl_lerobot.transport.weights import WeightPublisher
 
 NO_WEIGHTS = "a path without weights"
 HANGS = "hangs"  # a folder that whoever writes into it hangs
@@ -32,38 +32,47 @@ FULL = "full"  # a folder that nothing can be written into
 
 
 class LightInference:
-    """Answers at once with noise drawn from each request's seed; on request breaks at the next weights."""
+    """Answers at once with noise drawn from each request's seed; on request breaks at the next decision."""
 
-    def __init__(self, *_: Any) -> None:
+    def __init__(self, *arguments: Any) -> None:
+        self._name, in_cluster = arguments[-2:]
+        self._host = node_address(in_cluster)
         self._broken: asyncio.Future[None] = asyncio.get_event_loop().create_future()
         self._version, self._failing = 0, False
+        self._server: Server | None = None
 
-    async def ready(self) -> int:
+    async def ready(self, trainer: Any = None) -> int:
+        if trainer is not None:
+            version, _ = await trainer.newer_than.remote(self._name, -1)
+            self._version = max(0, version)
+            await self.follow(trainer, version)
         return os.getpid()
 
+    async def follow(self, trainer: Any, version: int = -1) -> None:
+        async def follow(version: int) -> None:
+            while True:
+                version, _ = await trainer.newer_than.remote(self._name, version)
+                self._version = max(0, version)
+
+        self._following = asyncio.create_task(follow(version))
+
     async def serve(self) -> None:
-        try:
-            await self._broken
-        finally:
-            await asyncio.sleep(0.5)  # the trainer, which hears of it at once, notices before the engine
+        await self._broken
 
     async def listen(self) -> Address:
-        return serve_on_loop(self.receive).address
+        if self._server is None:
+            self._server = serve_on_loop(self.decide, self._host)
+        return self._server.address
 
     async def fail(self) -> None:
         self._failing = True
 
-    async def receive(self, message: list[Request] | WeightUpdate) -> list[Decision] | None:
-        from accerl_lerobot.transport.contract import ServiceStoppedError
-
-        if isinstance(message, WeightUpdate) and self._failing and not self._broken.done():
+    async def decide(self, requests: list[Request]) -> list[Decision]:
+        if self._failing and not self._broken.done():
             self._broken.set_exception(ArithmeticError("the forward pass fell over"))
         if self._broken.done():
             raise ServiceStoppedError("the inference service has stopped")
-        if isinstance(message, WeightUpdate):
-            self._version = message.version
-            return None
-        return [_decision(request, self._version) for request in message]
+        return [_decision(request, self._version) for request in requests]
 
     async def metrics(self) -> dict[str, float]:
         return Batcher(1, 0.0).metrics() | {"busy_share": 0.0, "version": float(self._version)}
@@ -77,9 +86,10 @@ def _decision(request: Request, version: int) -> Decision:
 class FalteringRollout(RolloutWorker):
     """The first process in the first seat fails when it is to report for the third time."""
 
-    def __init__(self, env: Any, config: Any, plans: EpisodePlans, *others: Any) -> None:
-        super().__init__(env, config, plans, *others)
-        self._left = 2 if plans.worker == plans.incarnation == 0 else 1_000_000
+    def ready(self, plans: EpisodePlans | None = None) -> int:
+        if plans is not None:
+            self._left = 2 if plans.worker == plans.incarnation == 0 else 1_000_000
+        return super().ready(plans)
 
     def report(self, *arguments: Any) -> Report:
         self._left -= 1
@@ -104,7 +114,7 @@ class WarningRollout(RolloutWorker):
 class LightTrainer:
     """Takes batches and learns nothing from them but what they were; breaks or idles on request."""
 
-    def __init__(self, settings: LearnerSettings, *_: Any) -> None:
+    def __init__(self, settings: LearnerSettings, *others: Any) -> None:
         if settings.policy.path == NO_WEIGHTS:
             raise FileNotFoundError("no weights there")
         self._config, state = settings.trainer, settings.state
@@ -112,7 +122,7 @@ class LightTrainer:
         self._lock = threading.Lock()
         self._failure: str | None = None
         self._idle = False
-        self._publishing = threading.Event()
+        self._publisher = WeightPublisher(others[-1], put=lambda tensors: None)
         self._ledger: list[dict[str, int]] = []  # keys of each update's segments, and their decisions
         if state is not None:
             self._ledger = snapshot.load(state / "trainer")["ledger"]
@@ -126,12 +136,11 @@ class LightTrainer:
     def idle(self) -> None:
         self._idle = True
 
-    def run(self, replay: Any, readers: list[Endpoint]) -> int:
+    def run(self, replay: Any) -> int:
         import ray
 
-        self._publisher = publisher = WeightPublisher(readers)
+        publisher = self._publisher
         publisher.publish(len(self._ledger), {})
-        self._publishing.set()
         n = self._config.batch_decisions
         upcoming = replay.sample.remote(n, len(self._ledger))
         while len(self._ledger) < self._config.updates:
@@ -150,11 +159,8 @@ class LightTrainer:
             publisher.flush()
         return self._config.updates
 
-    def join(self, reader: Endpoint) -> int:
-        assert self._publishing.wait(60)
-        newest = len(self._ledger)
-        self._publisher.add(reader)
-        return newest
+    def newer_than(self, reader: str, version: int) -> tuple[int, list[Any]]:
+        return self._publisher.newer_than(reader, version)
 
     def metrics(self) -> list[dict[str, float]]:
         with self._lock:

@@ -22,7 +22,7 @@ from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.imagination import ImaginationWorker, WorldModelLearningWorker
 from accerl_lerobot.engine.local import LocalEngine
 from accerl_lerobot.engine.loop import Progress
-from accerl_lerobot.engine.run import execute
+from accerl_lerobot.engine.run import Run
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.experience import IMAGINED, REAL, Segment
 from accerl_lerobot.rollout.runner import RolloutConfig
@@ -292,6 +292,6 @@ def test_what_does_not_fit_is_refused_before_the_run_begins(
 def test_the_summary_says_what_was_imagined(tiny_checkpoint: Path, tmp_path: Path):
     config = imagining(tiny_checkpoint, model="oracle")
     config = replace(config, launch=replace(config.launch, engine="local"))
-    summary = execute(config, tmp_path, Console())
+    summary = Run(config, tmp_path, Console()).execute()
     assert summary["episodes_explored"] == 6 and summary["imagination"]["decisions"] > 0
     assert summary["updates"] == 12

@@ -15,18 +15,19 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import psutil
 import pytest
 import ray
 
 from accerl_lerobot import errors
-from accerl_lerobot.engine import launch, replicas
+from accerl_lerobot.engine import supervision
 from accerl_lerobot.engine.config import LaunchConfig
-from accerl_lerobot.engine.launch import RayEngine, end_all
+from accerl_lerobot.engine.launch import RayEngine
 from accerl_lerobot.engine.loop import Progress
-from accerl_lerobot.engine.replicas import WorkerSlot
 from accerl_lerobot.engine.stopping import WorkerError, pause_s
+from accerl_lerobot.engine.supervision import Worker, end_all
 from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.inference import worker as inference_worker
 from accerl_lerobot.inference.worker import InferenceConfig
@@ -34,7 +35,6 @@ from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.rollout import worker as rollout_worker
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.transport.shared_memory import available
 from benchmarks.simulated_environment import LatencyConfig
 from benchmarks.victims import alive
 from tests.light_workers import FULL, HANGS, NO_WEIGHTS, FalteringRollout, LightInference, WarningRollout
@@ -251,9 +251,7 @@ def hit(one: RayEngine, number: signal.Signals) -> Callable[[str], None]:
     return lambda name: os.kill(one.pids()[name], number)
 
 
-@pytest.mark.parametrize("shared", [pytest.param(False, marks=pytest.mark.slow), True])
-def test_an_inference_that_is_killed_is_replaced_alone(engine, shared: bool, monkeypatch):
-    monkeypatch.setattr(replicas, "available", lambda: shared and available())
+def test_an_inference_that_is_killed_is_replaced_alone(engine):
     launched = LaunchConfig(stall_s=120.0)
     one = engine(env=HARD, rollout=TWO, trainer=ENDLESS, launch=launched)
     lose_inference(one, hit(one, signal.SIGKILL))
@@ -272,8 +270,8 @@ def test_while_one_of_two_hangs_the_other_goes_on(engine):
 @pytest.mark.slow
 def test_an_exception_in_the_inference_service_is_survived_as_often_as_it_may_be_and_then_its_own(engine):
     one = engine(env=HARD, rollout=TWO, trainer=ENDLESS, launch=LaunchConfig(max_restarts=1))
-    lose_inference(one, lambda name: ray.get(next(one._inference.workers()).actor.fail.remote()))
-    ray.get(next(one._inference.workers()).actor.fail.remote())
+    lose_inference(one, lambda name: ray.get(one._inference[0].actor.fail.remote()))
+    ray.get(one._inference[0].actor.fail.remote())
     text = until_failure(one)
     assert text.startswith("inference worker failed for good after 1 restarts:")
     assert "the forward pass fell over" in text and "serve" in text
@@ -290,21 +288,23 @@ def test_the_pause_before_another_start_grows_and_has_an_end():
     assert [pause_s(restarts) for restarts in (0, 1, 2, 3, 4, 5, 1000)] == [0, 1, 2, 4, 8, 8, 8]
 
 
-class NoRoom(LightInference):
-    """Has no memory to start in."""
-
-    def __init__(self, *_: Any) -> None:
-        raise MemoryError("no room for the policy")
-
-
 @pytest.mark.slow
-def test_an_inference_that_does_not_start_again_ends_the_run(engine, monkeypatch):
-    one = engine(trainer=ENDLESS, launch=LaunchConfig(max_restarts=2))
+def test_an_inference_that_does_not_start_again_ends_the_engine(engine, monkeypatch, tmp_path: Path):
+    note = tmp_path / "started"
+
+    class StartsOnce(LightInference):
+        def __init__(self, *arguments: Any) -> None:
+            super().__init__(*arguments)
+            if note.exists():
+                raise MemoryError("no room for the policy")
+            note.touch()
+
+    monkeypatch.setattr(inference_worker, "InferenceWorker", StartsOnce)
+    one = engine(trainer=ENDLESS)
     until_training(one)
-    monkeypatch.setattr(inference_worker, "InferenceWorker", NoRoom)
     os.kill(one.pids()["inference"], signal.SIGKILL)
     text = until_failure(one)
-    assert text.startswith("inference worker failed for good after 2 restarts:")
+    assert text.startswith("inference worker did not start again:")
     assert "no room for the policy" in text
 
 
@@ -356,10 +356,10 @@ def test_a_run_in_which_nothing_moves_ends(engine):
 
 
 class Stand:
-    """Stands in for `ray`: every reference is its own answer, and nobody is killed."""
+    """Stands in for `ray`: there are no warnings, and nobody is killed."""
 
-    def get(self, reference: Any, timeout: float) -> Any:
-        return reference
+    def wait(self, references: list[Any], **_: Any) -> tuple[list[Any], list[Any]]:
+        return [], references
 
     def kill(self, actor: Any) -> None:
         pass
@@ -367,12 +367,11 @@ class Stand:
 
 @pytest.mark.parametrize("here", [True, False])
 def test_only_a_process_of_this_node_is_ended_by_its_number(here: bool, monkeypatch: pytest.MonkeyPatch):
-    for module in (launch, replicas):
-        monkeypatch.setattr(module, "ray", Stand())
-    monkeypatch.setattr(launch, "GONE_S", 0.2)
+    monkeypatch.setattr(supervision, "ray", Stand())
+    monkeypatch.setattr(supervision, "GONE_S", 0.2)
     with subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"]) as process:
-        worker = WorkerSlot("somebody")
-        worker.await_start(process.pid, 1.0, here)
+        worker = Worker("somebody", MagicMock(), here)
+        worker.started(process.pid)
         assert (worker.process == psutil.Process(process.pid)) is here
         end_all([worker])
         assert (process.poll() is not None) is here

@@ -28,7 +28,7 @@ PACKAGE = ROOT / "accerl_lerobot"
 
 HEADER = "# SPDX-License-Identifier: Apache-2.0\n"
 LONGEST_FILE = 600
-ENGINE = {"launch.py", "placement.py", "ray_session.py", "replicas.py"}
+ENGINE = {"launch.py", "placement.py", "ray_session.py", "supervision.py"}
 SHELLS = ENGINE | {"doctor.py", "worker.py", "imagination.py", "peers.py", "endpoint.py"}
 """Files that may import Ray; all others are testable without it."""
 DISTRIBUTED = {"rendezvous.py", "ranks.py", "sharding.py", "tensors.py"}

@@ -54,7 +54,7 @@ def test_nothing_committed_is_lost_or_doubled_and_no_update_made_twice(engine, t
     history = until(first, 20)
     saved = first.save(tmp_path)
     assert updates(history) + [u["update"] for u in saved.updates] == [i + 1.0 for i in range(saved.version)]
-    counters = first._rollouts.counters()
+    counters = first.poll().rollout
     until(first, saved.version + 10)  # what comes after the checkpoint is to be forgotten
     first.close()
 

@@ -49,7 +49,7 @@ def local_run(checkpoint: Path, output_dir: Path | None, **sections: Any) -> Run
 def finished(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Finished:
     config = local_run(tiny_checkpoint, tmp_path_factory.mktemp("outputs") / "run")
     directory = run.make_output_dir(config)
-    return Finished(config, directory, run.execute(config, directory, Console()))
+    return Finished(config, directory, run.Run(config, directory, Console()).execute())
 
 
 def records(directory: Path, kind: str) -> list[dict[str, Any]]:
@@ -81,7 +81,7 @@ def test_the_evaluation_before_can_be_left_out_and_a_run_without_success_says_so
         evaluation=EvaluationConfig(episodes=4, before=False, videos=0),
     )
     directory = run.make_output_dir(config)
-    summary = run.execute(config, directory, Console())
+    summary = run.Run(config, directory, Console()).execute()
     assert [r["group"] for r in records(directory, "evaluation")] == ["after"]
     assert summary["success_before"] is summary["ci95_before"] is None and summary["n_after"] == 4
     (told,) = [m for m in caplog.messages if "exploring episodes succeeded" in m]
@@ -148,7 +148,7 @@ def test_checkpoints_by_time(tiny_checkpoint: Path, tmp_path: Path):
     for seconds, versions in ((1e-9, {0, 1, 2, 3}), (1e9, {0, 3})):
         config = local_run(tiny_checkpoint, tmp_path / str(seconds), **fields, save_every_s=seconds)
         directory = run.make_output_dir(config)
-        run.execute(config, directory, Console())
+        run.Run(config, directory, Console()).execute()
         found = (directory / "checkpoints").iterdir()
         assert {int(path.name) for path in found if not path.is_symlink()} == versions
 
@@ -232,7 +232,7 @@ def test_an_evaluation_that_ends_after_training_is_not_lost(
 ):
     config = local_run(tiny_checkpoint, tmp_path, save_every_updates=0)
     engine = scripted(monkeypatch, config)
-    summary = run.execute(config, tmp_path, Console())
+    summary = run.Run(config, tmp_path, Console()).execute()
     found = records(tmp_path, "evaluation")
     assert [r["group"] for r in found] == ["before", "during-1", "during-2", "after"]
     assert [r["n"] for r in found] == [8, 4, 4, 8]
@@ -287,7 +287,7 @@ def test_after_the_loss_of_a_worker_the_run_goes_on_from_its_last_checkpoint(
 ):
     config = local_run(tiny_checkpoint, tmp_path)
     made = losing(monkeypatch, config, [7, 11, 11])
-    summary = run.execute(config, tmp_path, Console())
+    summary = run.Run(config, tmp_path, Console()).execute()
     assert len(made) == 4 and all(engine.closed for engine in made) and summary["updates"] == 12
     assert [r["update"] for r in records(tmp_path, "train")] == list(range(1, 13)), "none twice"
     said = capsys.readouterr().err
@@ -303,7 +303,7 @@ def test_a_worker_that_is_lost_again_and_again_ends_the_run(
     config = local_run(tiny_checkpoint, tmp_path, launch=LaunchConfig(engine="local", max_restarts=2))
     made = losing(monkeypatch, config, [7, 7, 7, 7])
     with pytest.raises(WorkerError, match="Killed"):
-        run.execute(config, tmp_path, Console())
+        run.Run(config, tmp_path, Console()).execute()
     assert len(made) == 3 and all(engine.closed for engine in made)
 
 
@@ -314,7 +314,7 @@ def test_a_run_that_gets_further_each_time_is_not_stuck(
     launch = LaunchConfig(engine="local", max_restarts=1)
     config = local_run(tiny_checkpoint, tmp_path, launch=launch)
     made = losing(monkeypatch, config, [6, 7, 8, 9])
-    summary = run.execute(config, tmp_path, Console())
+    summary = run.Run(config, tmp_path, Console()).execute()
     assert len(made) == 5 and summary["updates"] == 12
     assert capsys.readouterr().err.count("(1 of 1 times)") == 4
     assert [r["update"] for r in records(tmp_path, "train")] == list(range(1, 13)), "none twice"
@@ -326,7 +326,7 @@ def test_without_a_checkpoint_there_is_nothing_to_go_on_from(
     config = local_run(tiny_checkpoint, tmp_path, save_every_updates=0, save_every_s=0.0)
     made = losing(monkeypatch, config, [7])
     with pytest.raises(WorkerError, match="Killed"):
-        run.execute(config, tmp_path, Console())
+        run.Run(config, tmp_path, Console()).execute()
     assert len(made) == 1 and made[0].closed
 
 
@@ -338,7 +338,7 @@ def test_a_run_that_fails_closes_the_engine_and_keeps_its_own_error(
     engine = scripted(monkeypatch, config)
     monkeypatch.setattr(engine, "train", lambda: (_ for _ in ()).throw(error))
     with pytest.raises(type(error)) as caught:
-        run.execute(config, tmp_path, Console())
+        run.Run(config, tmp_path, Console()).execute()
     assert caught.value is error and engine.closed
     assert len(records(tmp_path, "evaluation")) == 1, "what was measured before is kept"
     assert not (tmp_path / "summary.json").exists()

@@ -4,9 +4,8 @@
     NAME.json           the tree: dicts, lists, tuples, numbers, texts, known kinds of things
     NAME.safetensors    its arrays and tensors, by number
 
-Messages through shared memory are such a tree and its arrays, too. Nothing in either is ever executed: at
-worst it is refused. A tree may hold, beside plain values, NumPy arrays, torch tensors, NumPy's default
-generator, and dataclasses and named tuples that were registered with `kind`.
+Nothing in it is ever executed: at worst it is refused. A tree may hold, beside plain values, NumPy arrays,
+torch tensors, NumPy's default generator, and dataclasses and named tuples that were registered with `kind`.
 """
 
 from __future__ import annotations

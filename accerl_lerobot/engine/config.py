@@ -50,9 +50,9 @@ class LaunchConfig(Section, section="launch"):
     must ask for a token, which is looked for where Ray does: RAY_AUTH_TOKEN, RAY_AUTH_TOKEN_PATH,
     ``~/.ray/auth_token``. None: a private Ray on this machine."""
     placement: dict[str, str] = field(default_factory=dict)
-    """Role (trainer, world_model, inference, imagination or rollout) → nodes of its workers: a number as
-    ``accerl doctor`` prints it, 0 being the node where the run is started; the name of a custom resource, as
-    in ``ray start --resources='{"simulators": 1}'``; or all. Not given: node 0, where replay always is."""
+    """Role (trainer, world_model, inference, imagination or rollout) → nodes of its workers: those with a
+    resource, as in ``ray start --resources='{"simulators": 1}'`` or Ray's own ``node:10.0.0.2``; or all. Not
+    given: the node where the run is started, where replay always is."""
     schedule: Schedule = ASYNCHRONOUS
     """asynchronous: no worker waits for another. synchronous: a batch is collected, by all environments in
     lock step, then learned from. overlap: the next one is collected meanwhile. The last two are for measuring
@@ -76,14 +76,14 @@ class LaunchConfig(Section, section="launch"):
                     raise InputError(f"launch.{name}", value, hint)
         for role, nodes in self.placement.items():
             if role not in ROLES or not nodes.strip():
-                hint = f"use one of {', '.join(ROLES)}, and a node's number, a resource, or all"
+                hint = f"use one of {', '.join(ROLES)}, and a resource of nodes, or all"
                 raise InputError(f"launch.placement.{role}", nodes, hint)
         if self.address is not None and self.address != "auto":
             host, _, port = self.address.rpartition(":")
             if not host or not port.isdecimal() or not 0 < int(port) < 65536:
                 hint = "use HOST:PORT as ray start --head prints it, or auto"
                 raise InputError("launch.address", self.address, hint)
-        if self.address is None and not {"0"}.issuperset(self.placement.values()):
+        if self.address is None and self.placement:
             hint = "a private Ray has one node; add --launch.address=auto, or leave the field out"
             raise InputError("launch.placement", self.placement, hint)
 

@@ -1,5 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The interface of an engine, and what a run does with it: evaluation, training, checkpoints and records."""
+"""The run: evaluate, train, save, evaluate again; and the interface of the engines that do the work.
+
+    environments ◄──► rollout ◄──► inference ◄───── weights ─────┐
+                         │                                       │
+                         └──segments──► replay ──batches──► trainer
+
+    loop        consumes              produces            waits for                   ends
+    rollout     decisions, orders     segments, results   decisions; room in replay   with the run
+    inference   requests, weights     decisions           a batch, or `max_wait_s`    with the run
+    replay      segments              batches             new data; for rollouts,     with the trainer
+                                                          the trainer to catch up
+    trainer     batches               weights             a batch                     after its updates
+    run         reports of the four   evaluations,        the next report             after the last
+                                      checkpoints                                     evaluation
+
+The four are processes in `launch`, and take turns in one process in `local`. With imagined rollouts there are
+two more, see `imagination`.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +27,7 @@ import shutil
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -140,7 +158,7 @@ class Times:
     """Seconds of a run; `started` is when this process began, on `time.monotonic`."""
 
     started: float
-    warm_s: float  # warm start
+    warm_s: float = 0.0  # warm start
     rl_s: float = 0.0  # training, in earlier processes
     before_s: float | None = 0.0  # all, in earlier processes; None: the checkpoint has it
     furthest: int = 0  # latest update made in this process, lost or not
@@ -184,27 +202,74 @@ class Loop:
 
     def run(self, state: Path | None) -> dict[str, Any]:
         """Do the run, or the rest of it; returns the summary."""
-        evaluation = self.config.evaluation
-        filmed: list[EpisodeResult] = []
-        if state is not None:
-            self._began_at = state.parent.name
-            self._restore(snapshot.load(state / layout.RUN_STATE), layout.saved_version(state))
-            if (self.directory / f"{FILMED}.json").is_file():
-                filmed = snapshot.load(self.directory / FILMED)
-        else:
-            if evaluation.before:
-                self.before, filmed = self._evaluate("before", 0.0)
-                snapshot.save(self.directory / FILMED, [result for result in filmed if result.frames])
-                self.base = self.engine.poll().rollout
-            if self.config.save_every_updates or self.config.save_every_s:
-                self._save()
-        last = self._train()
-        self.steps = self._steps(last)
+        filmed = self._begin() if state is None else self._resume(state)
+        self.engine.train()
+        self.times.clock.enter(TRAINING)
+        self._training_since = self._saved_at = time.monotonic()
+        with self._training_stage() as stage:
+            while True:
+                progress = self.engine.poll()
+                self._record(progress)
+                stage.update(progress.version, self._status(progress))
+                if progress.done:
+                    break
+                if self._evaluation_is_due(progress):
+                    self._plan(self.config.evaluation.episodes_during, f"during-{self.evaluated}")
+                if self._save_is_due(progress) or self.stop.asked is not None:
+                    self._save()
+                self.stop.check()
+        self.times.rl_s, self._training_since = self._rl_s, None
+        self.steps = self._steps(progress)
         self._save()
         self._check_hope(1)
         after, results = self._evaluate("after", self.steps)
-        summary = plain(self._summary(after, last))
+        summary: dict[str, Any] = plain(self._summary(after, progress))
         layout.write_atomically(self.directory / layout.SUMMARY, json.dumps(summary, indent=2) + "\n")
+        self._draw(after, filmed, results)
+        layout.prune(self.directory / layout.CHECKPOINTS)  # it has ended
+        return summary
+
+    def _begin(self) -> list[EpisodeResult]:
+        """Evaluate before training, and save; returns the episodes of the evaluation."""
+        filmed: list[EpisodeResult] = []
+        if self.config.evaluation.before:
+            self.before, filmed = self._evaluate("before", 0.0)
+            snapshot.save(self.directory / FILMED, [result for result in filmed if result.frames])
+            self.base = self.engine.poll().rollout
+        if self.config.save_every_updates or self.config.save_every_s:
+            self._save()
+        return filmed
+
+    def _resume(self, state: Path) -> list[EpisodeResult]:
+        """Restore what the checkpoint has; returns the filmed episodes of the evaluation before."""
+        self._began_at = state.parent.name
+        self._restore(snapshot.load(state / layout.RUN_STATE), layout.saved_version(state))
+        if not (self.directory / f"{FILMED}.json").is_file():
+            return []
+        filmed: list[EpisodeResult] = snapshot.load(self.directory / FILMED)
+        return filmed
+
+    def _training_stage(self) -> AbstractContextManager[Any]:
+        config = self.config
+        return self.console.stage(f"RL ({config.algorithm.type})", total=config.trainer.updates)
+
+    def _evaluation_is_due(self, progress: Progress) -> bool:
+        """True once for each number of updates after which rollout workers evaluate beside exploring."""
+        every = self.config.evaluation.every_updates
+        if not every or progress.version // every <= self.evaluated:
+            return False
+        self.evaluated = progress.version // every
+        self.during[f"during-{self.evaluated}"] = []
+        return True
+
+    def _save_is_due(self, progress: Progress) -> bool:
+        updates, seconds = self.config.save_every_updates, self.config.save_every_s
+        if seconds and time.monotonic() - self._saved_at > seconds:
+            return True
+        return bool(updates) and progress.version // updates > self.saved
+
+    def _draw(self, after: dict[str, Any], filmed: list[EpisodeResult], results: list[EpisodeResult]) -> None:
+        """Write the run's pictures and its film."""
         success_curve(self.directory / "success_curve.png", self.evaluations, self.curve)
         if len(after["tasks"]) > 1:
             ends = {"before": self.before, "after": after}
@@ -219,8 +284,6 @@ class Loop:
             before_after(film, (filmed, self.before), (results, after), fps=20)
         for left in self.directory.glob(f"{FILMED}.*"):
             left.unlink()
-        layout.prune(self.directory / layout.CHECKPOINTS)  # it has ended
-        return dict(summary)
 
     def _state(self) -> dict[str, Any]:
         spent = {"rl_s": self._rl_s, "wall_s": self.times.wall_s, "warm_s": self.times.warm_s}
@@ -263,32 +326,6 @@ class Loop:
             "tasks": list(self.tasks),
             "seed": self.config.seed,
         }
-
-    def _train(self) -> Progress:
-        config = self.config
-        self.engine.train()
-        self.times.clock.enter(TRAINING)
-        self._training_since = self._saved_at = time.monotonic()
-        with self.console.stage(f"RL ({config.algorithm.type})", total=config.trainer.updates) as stage:
-            while True:
-                progress = self.engine.poll()
-                self._record(progress)
-                stage.update(progress.version, self._status(progress))
-                if progress.done:
-                    self.times.rl_s, self._training_since = self._rl_s, None
-                    return progress
-                every = config.evaluation.every_updates
-                if every and progress.version // every > self.evaluated:
-                    self.evaluated = progress.version // every
-                    group = f"during-{self.evaluated}"
-                    self.during[group] = []
-                    self._plan(config.evaluation.episodes_during, group)
-                updates, seconds = config.save_every_updates, config.save_every_s
-                due = seconds and time.monotonic() - self._saved_at > seconds
-                due = due or (updates and progress.version // updates > self.saved)
-                if due or self.stop.asked is not None:
-                    self._save()
-                self.stop.check()
 
     def _check_hope(self, episodes: int) -> None:
         """Tells once if none of at least so many exploring episodes has succeeded."""

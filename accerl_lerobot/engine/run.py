@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """One run from start to summary: demonstrations → SFT → evaluation → asynchronous RL → evaluation.
 
-``docs/cli.md`` lists the files of a run's folder.
+`loop` has the run itself, its processes and what each of them waits for. ``docs/cli.md`` lists the files of a
+run's folder.
 
 `train`, `resume`, `evaluate` and `load_policy` are the Python interface, imported from `accerl_lerobot`.
 Recording and Ray start processes that import the main module again, so a script calls `train` under
@@ -20,7 +21,7 @@ import shutil
 import sys
 import time
 from collections.abc import Mapping
-from contextlib import redirect_stdout
+from contextlib import closing, redirect_stdout
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,13 +30,14 @@ import numpy as np
 import yaml
 
 from accerl_lerobot import guardian
-from accerl_lerobot.algorithms import ChunkCriticConfig, GIPOConfig, OffPolicyConfig
+from accerl_lerobot.algorithms import GIPOConfig
 from accerl_lerobot.checkpoint import layout
 from accerl_lerobot.config.parsing import as_text
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.record import REPO_ID, record_demos
 from accerl_lerobot.engine import ray_session, resuming
+from accerl_lerobot.engine.adapter import demonstrations_of, make_adapter
 from accerl_lerobot.engine.config import RunConfig, encode, parse
 from accerl_lerobot.engine.loop import Engine, Loop, Times, run_plans
 from accerl_lerobot.engine.placement import check_placement
@@ -54,14 +56,13 @@ from accerl_lerobot.errors import (
 from accerl_lerobot.evaluation import Rate, evaluation_plans
 from accerl_lerobot.experience import Observation, Request
 from accerl_lerobot.metrics import MetricsLog
-from accerl_lerobot.policies.config import Load, PolicyConfig, env_steps_seen, loader
+from accerl_lerobot.policies.config import Load, PolicyConfig, env_steps_seen
 from accerl_lerobot.rollout.runner import EpisodeResult
 from accerl_lerobot.seeds import noise_seed
 from accerl_lerobot.timeline import RECOVERY, open_clock
 
 if TYPE_CHECKING:
     from accerl_lerobot.demos.sft import SFTConfig
-    from accerl_lerobot.engine.ray_session import RaySession
     from accerl_lerobot.envs import EnvironmentSpec
     from accerl_lerobot.policies.adapter import LeRobotAdapter
     from accerl_lerobot.policies.stock import StockAdapter
@@ -91,47 +92,26 @@ def start(
     config: RunConfig, console: Console, recipe: Path | None = None, load: Load | None = None
 ) -> tuple[Path, dict[str, Any]]:
     """Do a new run, or with ``config.resume`` the rest of the one whose config is `recipe`."""
-    wanted, spec, given = None, None, config.resume or config.policy.path is not None
-    with ray_session.opened(config.launch, now=given) as session:  # not before SFT
+    with ray_session.opened(config.launch, now=config.resume or config.policy.path is not None):
         if config.resume:
-            directory, wanted = resuming.resumed_run(recipe, config)
+            directory, resume_from = resuming.resumed_run(recipe, config)
+            run = Run(config, directory, console, resume_from, load)
         else:
+            spec = None
             if load is None:
                 from accerl_lerobot.policies.loading import pinned
 
                 spec, _ = check_start(config, console.say)  # before there is a folder
                 config = replace(config, policy=pinned(config.policy))
-            directory = make_output_dir(config)
-        console.say(f"run {directory}")
-        how = resuming.resume_command(directory, config)
-        guardian.explain(hint=printable(f"to resume: {how}"))
-        try:
-            with (
-                redirect_stdout(sys.stderr),
-                kept_traceback(directory),
-                resuming.locked(directory, "config_path", "another process resumes it"),
-            ):
-                return directory, execute(config, directory, console, wanted, load, session, spec)
-        except InputError:
-            if wanted is None:
-                discard_unused(directory)
-            raise
-        except BaseException as error:
-            if is_full(error):
-                console.say(f"the disk of {directory} is full; free some space, then {how}")
-            elif isinstance(error, WorkerError) and error.brief:
-                console.say(f"{error}; to resume: {how}")
-            elif not isinstance(error, StoppedError):
-                verb = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
-                console.say(f"{verb}; to resume: {how}")
-            raise
+            run = Run(config, make_output_dir(config), console, None, load, spec)
+        return run.directory, run.do()
 
 
 def play_evaluation(config: RunConfig, console: Console, filmed: int = 0) -> list[EpisodeResult]:
     """Play the evaluation episodes of a run with LeRobot's sampler, on seeds that are never trained on."""
     from accerl_lerobot.policies.loading import load_acting, pinned
 
-    with ray_session.opened(config.launch, now=True) as session:
+    with ray_session.opened(config.launch):
         check_device(config)
         check_memory(config)
         spec = check_environment(config.env, config.rollout.reward_model)
@@ -139,8 +119,8 @@ def play_evaluation(config: RunConfig, console: Console, filmed: int = 0) -> lis
         history = check_policy(config, spec)
         # Nothing is learnt, whatever the recipe says.
         config = replace(config, algorithm=GIPOConfig(), world_model=None)
-        engine = make_engine(config, spec.tasks, history, load=load_acting, session=session)
-        with contextlib.closing(engine):
+        engine = make_engine(config, spec.tasks, history, load=load_acting)
+        with closing(engine):
             count = config.evaluation.episodes
             engine.plan(evaluation_plans(spec.tasks, count, "eval", seed=config.seed, filmed=filmed))
             return run_plans(engine, count, "eval", console)
@@ -152,18 +132,11 @@ def make_engine(
     history: int,
     state: Path | None = None,
     load: Load | None = None,
-    session: RaySession | None = None,
 ) -> Engine:
     """The engine that ``launch.engine`` names; see `RayEngine` for the arguments."""
-    if isinstance(config.algorithm, ChunkCriticConfig):
-        from accerl_lerobot.policies.teacher import with_teacher
-
-        size, share = history * config.env.state_size, config.algorithm.teacher_episodes
-        load = functools.partial(with_teacher, loader(load), config.state_model, size, share)
-    if isinstance(config.algorithm, OffPolicyConfig) and (dataset := demonstrations_of(config)) is not None:
-        from accerl_lerobot.trainer.demonstrations import with_demonstrations
-
-        load = functools.partial(with_demonstrations, loader(load), dataset, config.rollout.decision_cost)
+    load = functools.partial(
+        make_adapter, config, demonstrations_of(config), history * config.env.state_size, load
+    )
     if config.launch.engine == "local":
         from accerl_lerobot.engine.local import LocalEngine
 
@@ -171,17 +144,7 @@ def make_engine(
     ray_session.prepare(joins=config.launch.address is not None)
     from accerl_lerobot.engine.launch import RayEngine
 
-    return RayEngine(config, tasks, history, state, load, session)
-
-
-def demonstrations_of(config: RunConfig) -> DatasetConfig | None:
-    """The dataset that the run was given, or has recorded; None without one."""
-    if config.dataset.repo_id is not None:
-        root = config.dataset.root
-        return replace(config.dataset, root=None if root is None else str(Path(root).expanduser().absolute()))
-    if config.folder is None or not (config.folder / layout.DEMOS).is_dir():
-        return None
-    return replace(config.dataset, repo_id=REPO_ID, root=str(config.folder / layout.DEMOS))
+    return RayEngine(config, tasks, history, state, load)
 
 
 def fine_tune(
@@ -226,65 +189,115 @@ def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfi
     return resuming.improving(config, path)
 
 
-def execute(
-    config: RunConfig,
-    directory: Path,
-    console: Console,
-    wanted: str | None = None,
-    load: Load | None = None,
-    session: RaySession | None = None,
-    spec: EnvironmentSpec | None = None,
-) -> dict[str, Any]:
-    """Do all phases and return the summary, which is also in ``summary.json``; `spec`: of a checked run."""
-    started = time.monotonic()
-    checkpoint = None if wanted is None else resuming.checkpoint_of(directory, wanted, console)
-    text = yaml.safe_dump(encode(replace(config, resume=False)), sort_keys=False)
-    if wanted is None:  # first: whatever fails from here on, the run can be resumed
-        layout.write_atomically(directory / layout.CONFIG, text)
-    if checkpoint is not None:
-        config = resuming.continued(config, directory, checkpoint)
-    if wanted is not None and load is None:
-        spec, _ = check_start(config)
-    spec = spec or check_environment(config.env)
-    check_placement(replace(config, output_dir=str(directory)))
-    if config.imagination.share:
-        from accerl_lerobot.engine.imagination import check_imagination
+@dataclass(eq=False)
+class Run:
+    """One run, or the rest of it. Its config becomes more definite phase by phase.
 
-        check_imagination(config)
-    if wanted is not None:  # only now: a resume that is refused leaves the run as it was
-        layout.write_atomically(directory / layout.CONFIG, text)
-    if checkpoint is not None:
-        layout.go_back_to(checkpoint)
-        console.say(f"going on from {checkpoint}")
-    else:
-        config = warm_start(config, directory, console)
-    config, before_s = replace(config, output_dir=str(directory)), 0.0 if checkpoint is None else None
-    times = Times(started=started, warm_s=time.monotonic() - started, before_s=before_s)
-    with contextlib.ExitStack() as stack:  # flushes the log, whatever fails
-        stop = stack.enter_context(Stopping(resuming.resume_command(directory, config)))
-        times.clock = stack.enter_context(contextlib.closing(open_clock(config.timeline_folder, "driver")))
-        log = stack.enter_context(contextlib.closing(MetricsLog(directory, config.wandb, encode(config))))
-        recovery = resuming.Recovery(config.launch.max_restarts)
-        while True:  # a run, or what is left of it, by one set of workers
-            history = 1 if load is not None else check_policy(config, spec, own=True)
-            state = None if checkpoint is None else checkpoint / layout.TRAINING_STATE
-            try:
-                with console.stage("starting workers"), stop.at_once():
-                    engine = make_engine(config, spec.tasks, history, state, load, session)
-                with contextlib.closing(engine):
-                    loop = Loop(config, directory, console, log, engine, spec.tasks, times, stop)
-                    return loop.run(state)
-            except Exception as error:
-                lost = "" if session is None else session.lost  # whatever error that has led to
-                loss = WorkerError(lost) if lost else error
-                if not isinstance(loss, WorkerError):
-                    raise
-                times.clock.enter(RECOVERY)
-                stop.check()
-                checkpoint = recovery.next(directory / layout.CHECKPOINTS, console, loss, times.furthest)
-                stop.check()
-                layout.go_back_to(checkpoint)
-                config = resuming.continued(config, directory, checkpoint)
+    Phases: checks, warm start (demonstrations and SFT), practice (an engine, and the loop around it).
+    """
+
+    config: RunConfig
+    directory: Path
+    console: Console
+    resume_from: str | None = None  # name of the checkpoint; None: a new run
+    load: Load | None = None  # loads the policy; None: a LeRobot checkpoint
+    spec: EnvironmentSpec | None = None  # of a new run that has been checked
+
+    def do(self) -> dict[str, Any]:
+        """`execute`, in a folder that is locked meanwhile; says how to resume whatever ends the run."""
+        how = resuming.resume_command(self.directory, self.config)
+        self.console.say(f"run {self.directory}")
+        guardian.explain(hint=printable(f"to resume: {how}"))
+        try:
+            with (
+                redirect_stdout(sys.stderr),
+                kept_traceback(self.directory),
+                resuming.locked(self.directory, "config_path", "another process resumes it"),
+            ):
+                return self.execute()
+        except InputError:
+            if self.resume_from is None:
+                discard_unused(self.directory)
+            raise
+        except BaseException as error:
+            if is_full(error):
+                self.console.say(f"the disk of {self.directory} is full; free some space, then {how}")
+            elif isinstance(error, WorkerError) and error.brief:
+                self.console.say(f"{error}; to resume: {how}")
+            elif not isinstance(error, StoppedError):
+                verb = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
+                self.console.say(f"{verb}; to resume: {how}")
+            raise
+
+    def execute(self) -> dict[str, Any]:
+        """Do all phases; returns the summary, which is also in ``summary.json``."""
+        times = Times(started=time.monotonic())
+        checkpoint = None
+        text = yaml.safe_dump(encode(replace(self.config, resume=False)), sort_keys=False)
+        if self.resume_from is None:  # first: whatever fails from here on, the run can be resumed
+            layout.write_atomically(self.directory / layout.CONFIG, text)
+        else:
+            checkpoint = resuming.checkpoint_of(self.directory, self.resume_from, self.console)
+        if checkpoint is not None:
+            self.config = resuming.continued(self.config, self.directory, checkpoint)
+        self.check()
+        if self.resume_from is not None:  # only now: a resume that is refused leaves the run as it was
+            layout.write_atomically(self.directory / layout.CONFIG, text)
+        if checkpoint is None:
+            self.config = warm_start(self.config, self.directory, self.console)
+        else:
+            layout.go_back_to(checkpoint)
+            self.console.say(f"going on from {checkpoint}")
+            times.before_s = None
+        times.warm_s = time.monotonic() - times.started
+        self.config = replace(self.config, output_dir=str(self.directory))
+        return self.practise(checkpoint, times)
+
+    def check(self) -> None:
+        """Refuse what could not go well, before anything long."""
+        if self.resume_from is not None and self.load is None:
+            self.spec, _ = check_start(self.config)
+        if self.spec is None:
+            self.spec = check_environment(self.config.env)
+        check_placement(replace(self.config, output_dir=str(self.directory)))
+        if self.config.imagination.share:
+            from accerl_lerobot.engine.imagination import check_imagination
+
+            check_imagination(self.config)
+
+    def practise(self, checkpoint: Path | None, times: Times) -> dict[str, Any]:
+        """Evaluate, train and evaluate by one engine after another, each from the last checkpoint."""
+        recovery = resuming.Recovery(self.config.launch.max_restarts)
+        with contextlib.ExitStack() as stack:  # flushes the log, whatever fails
+            stop = stack.enter_context(Stopping(resuming.resume_command(self.directory, self.config)))
+            times.clock = stack.enter_context(closing(open_clock(self.config.timeline_folder, "driver")))
+            log = MetricsLog(self.directory, self.config.wandb, encode(self.config))
+            stack.enter_context(closing(log))
+            while True:
+                try:
+                    return self._practise_once(checkpoint, times, stop, log)
+                except WorkerError as loss:
+                    times.clock.enter(RECOVERY)
+                    stop.check()
+                    checkpoints = self.directory / layout.CHECKPOINTS
+                    checkpoint = recovery.next(checkpoints, self.console, loss, times.furthest)
+                    stop.check()
+                    layout.go_back_to(checkpoint)
+                    self.config = resuming.continued(self.config, self.directory, checkpoint)
+
+    def _practise_once(
+        self, checkpoint: Path | None, times: Times, stop: Stopping, log: MetricsLog
+    ) -> dict[str, Any]:
+        """The run, or what is left of it, by one set of workers."""
+        assert self.spec is not None
+        history = 1 if self.load is not None else check_policy(self.config, self.spec, own=True)
+        state = None if checkpoint is None else checkpoint / layout.TRAINING_STATE
+        with self.console.stage("starting workers"), stop.at_once():
+            engine = make_engine(self.config, self.spec.tasks, history, state, self.load)
+        with closing(engine):
+            return Loop(
+                self.config, self.directory, self.console, log, engine, self.spec.tasks, times, stop
+            ).run(state)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,39 +3,15 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
 SIGNALS = (signal.SIGTERM, signal.SIGINT)
 LONGEST_PAUSE_S = 8.0
-_pipe: tuple[int, int] | None = None
-"""Where C code notes signals, also while the main thread hangs and Python handles none."""
-_arrived = False
-
-
-def arrived() -> bool:
-    """True if one of `SIGNALS` has come since a context of this module was entered."""
-    global _arrived
-    with suppress(OSError):  # none has come
-        numbers = b"" if _pipe is None else os.read(_pipe[0], 64)
-        _arrived = _arrived or any(number in numbers for number in SIGNALS)
-    return _arrived
-
-
-def _listen() -> None:
-    global _pipe, _arrived
-    if _pipe is None:
-        _pipe = os.pipe()
-        for end in _pipe:
-            os.set_blocking(end, False)
-    signal.set_wakeup_fd(_pipe[1], warn_on_full_buffer=False)
-    arrived()
-    _arrived = False
 
 
 def pause_s(restarts: int) -> float:
@@ -76,7 +52,6 @@ def interrupted() -> Iterator[None]:
         yield
         return
     before = signal.signal(signal.SIGTERM, end)
-    _listen()
     try:
         yield
     finally:
@@ -112,11 +87,9 @@ def deferred() -> Iterator[None]:
 
 
 def _cancel_alarms(left: threading.Event) -> None:
-    ended = False
-    while not ended:
-        ended = left.wait(1.0)
-        if arrived():
-            signal.alarm(0)
+    while not left.wait(1.0):
+        signal.alarm(0)
+    signal.alarm(0)
 
 
 class Stopping:
@@ -130,7 +103,6 @@ class Stopping:
     def __enter__(self) -> Stopping:
         if threading.current_thread() is threading.main_thread():  # Python allows it nowhere else
             self._before = {number: signal.signal(number, self._note) for number in SIGNALS}
-            _listen()
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -1,23 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
 """The inference process: one device answers many environments.
 
-A batch is decided when it is full or its oldest request has waited `max_wait_s`. Published weights are taken
-in between batches, so none sees two versions, and each decision is stamped with its own. An exception fails
-all requests and ends the process, which has no state but weights; the engine starts another one.
+consumes    requests for decisions, and the newest weights that the trainer has published
+produces    decisions, each stamped with the version of its weights
+waits for   a full batch, or until its oldest request has waited `max_wait_s`
+ends        with the run; an exception fails all requests, and Ray restarts the process, whose only state is
+            weights
 
-One thread waits for clients and for the batcher's clock at once, runs the forward pass and replies. Ray's
-calls come in on the event loop beside it, which only hands them over.
+Weights are swapped in between batches, so no batch sees two versions. One thread waits for clients and for
+the batcher's clock at once, runs the forward pass and replies. Ray's calls and weights come in on the event
+loop beside it.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import time
 from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -25,14 +29,13 @@ from accerl_lerobot import errors
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import WEIGHTS
 from accerl_lerobot.config.ranges import Range, Section, Threads
-from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.inference.batcher import Batcher
 from accerl_lerobot.policies.config import Load, PolicyConfig, loader
 from accerl_lerobot.timeline import COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
-from accerl_lerobot.transport.contract import PendingRequest, Server, stopped
-from accerl_lerobot.transport.shared_memory import Address, SharedMemoryServer
-from accerl_lerobot.transport.weights import WeightUpdate
+from accerl_lerobot.transport.connection import Address, PendingRequest, Server
+from accerl_lerobot.transport.endpoint import node_address
+from accerl_lerobot.transport.weights import Tensors
 
 LOOK_S = 1.0  # longest wait of the serving thread before it checks whether it should end
 
@@ -63,46 +66,59 @@ class InferenceWorker:
         load: Load | None = None,
         timeline: Path | None = None,
         name: str = "inference",
+        in_cluster: bool = False,
     ) -> None:
         errors.collect_warnings()
+        self._name = name
         self._clock = open_clock(timeline, name)
         import torch
 
         torch.set_num_threads(config.num_threads)
         self._adapter = loader(load)(policy)
         self._batcher: Batcher[PendingRequest] = Batcher(config.max_batch, config.max_wait_s)
-        self._server = Server(self._take)
+        self._server = Server(self._take, node_address(in_cluster))
         self._version = version
         if state is not None:
             self._adapter.load_trainable(snapshot.load(state / WEIGHTS))
-        self._newest = -1  # version of the last weights that were published to it
-        self._published: list[PendingRequest] = []  # weights that have come since the last batch
+        self._published: deque[tuple[int, Tensors]] = deque(maxlen=1)  # to be used from the next batch on
+        self._applied = asyncio.Event()
+        self._following: asyncio.Task[None] | None = None
         self._lock_step: deque[int] = deque(maxlen=1)
-        self._failure: BaseException | None = None
         self._over = False
         self._iteration: float | None = None  # start of the serving thread's last one, while it lives
         self._busy_s = self._busy_told_s = 0.0
         self._since = time.monotonic()
         self._clock.enter(WAIT_IN)
 
-    async def ready(self) -> int:
+    async def ready(self, trainer: Any = None) -> int:
+        """The process id, once the newest weights are loaded of a `trainer` that has begun."""
+        if trainer is not None:
+            version, references = await trainer.newer_than.remote(self._name, -1)
+            if references:
+                self._adapter.load_trainable(await references[0])
+                self._version = version
+            await self.follow(trainer, version)
         return os.getpid()
 
     async def listen(self) -> Address:
-        """Offer shared memory to clients; its address. Called before `serve`."""
-        self._server = server = SharedMemoryServer(self._take, copy=False)
-        return server.address
+        return self._server.address
 
-    async def receive(self, message: list[Request] | WeightUpdate) -> list[Decision] | None:
-        """Answer a client's requests, in order, as part of some batch; or use weights from the next batch on.
+    async def follow(self, trainer: Any, version: int = -1) -> None:
+        """Use the weights of a trainer from now on, the newest whenever those before have been applied."""
+        self._loop = asyncio.get_running_loop()
+        self._following = asyncio.create_task(self._follow(trainer, version))
 
-        A `ServiceStoppedError` if `serve` has failed, before or after this call began.
-        """
-        answer = self._server.call(message)
-        if self._failure is not None:  # after the call, as `serve` hands over once more when it fails
-            raise stopped(self._failure)
-        decisions: list[Decision] | None = await asyncio.wrap_future(answer)
-        return decisions
+    async def _follow(self, trainer: Any, version: int) -> None:
+        from ray.exceptions import RayError  # not above: a config is read before Ray is imported
+
+        with contextlib.suppress(RayError):  # a lost trainer is the engine's to deal with
+            while True:
+                version, references = await trainer.newer_than.remote(self._name, version)
+                if references:
+                    self._applied.clear()
+                    self._published.append((version, await references[0]))
+                    self._server.wake()
+                    await self._applied.wait()
 
     async def lock_step(self, observations: int) -> None:
         self._lock_step.append(observations)
@@ -142,9 +158,8 @@ class InferenceWorker:
                     self._serve_batch(batch)
                     batch = []
         except BaseException as error:
-            self._failure, self._iteration = error, None
+            self._iteration = None
             self._server.poll(0.0)
-            batch += self._published
             while len(self._batcher):
                 batch += self._batcher.take(time.monotonic())
             for asked in batch:
@@ -153,24 +168,18 @@ class InferenceWorker:
             raise
 
     def _take(self, asked: PendingRequest) -> None:
-        if isinstance(asked.message, WeightUpdate):
-            self._published.append(asked)
-        else:
-            self._batcher.add(asked, asked.sent)
+        self._batcher.add(asked, asked.sent)
 
     def _swap(self) -> None:
-        """Use the newest weights that have come, if they are newer than those of now."""
+        """Use the weights that have come."""
         if not self._published:
             return
-        update: WeightUpdate = max((asked.message for asked in self._published), key=lambda u: u.version)
-        if update.version > self._newest:
-            self._clock.enter(WEIGHT_SYNC)
-            self._adapter.load_trainable(update.tensors)
-            self._newest = self._version = update.version
-            fault_point("inference.swapped")
-        for asked in self._published:
-            asked.answer(None)
-        self._published.clear()
+        version, tensors = self._published.popleft()
+        self._clock.enter(WEIGHT_SYNC)
+        self._adapter.load_trainable(tensors)
+        self._version = version
+        fault_point("inference.swapped")
+        self._loop.call_soon_threadsafe(self._applied.set)
 
     def _serve_batch(self, batch: list[PendingRequest]) -> None:
         batch = [asked for asked in batch if not asked.gone()]

@@ -240,7 +240,7 @@ class LeRobotAdapter(PolicyAdapter):
         self.teacher: Teacher | None = None
         """Acts in its place in part of the exploring episodes; given by `teacher.with_teacher`."""
         self.demonstrations: Callable[[Segment], Iterator[Segment]] | None = None
-        """Remembered by off-policy learning from the start; set by `demonstrations.with_demonstrations`."""
+        """Remembered by off-policy learning from the start; set by `engine.adapter.make_adapter`."""
 
     def encode(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Encoded:
         """Reads raw observations, each (B, ...), and B instructions, for the family; differentiable."""

@@ -26,8 +26,8 @@ from accerl_lerobot.replay.buffer import MixedReplay
 from accerl_lerobot.replay.journal import EPISODES, Journal
 from accerl_lerobot.replay.pacing import ReplayConfig, Schedule, Turns
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, open_clock
-from accerl_lerobot.transport.contract import stopped
-from accerl_lerobot.transport.shared_memory import Address, serve_on_loop
+from accerl_lerobot.transport.connection import Address, Server, serve_on_loop, stopped
+from accerl_lerobot.transport.endpoint import node_address
 
 IN_TRANSIT = 1024
 """Newest real segments that are kept for the workers that imagine, which ask several times a second."""
@@ -54,6 +54,7 @@ class ReplayWorker:
         state: Path | None = None,
         directory: Path | None = None,
         timeline: Path | None = None,
+        in_cluster: bool = False,
     ) -> None:
         errors.collect_warnings()
         self._clock = open_clock(timeline, "replay")
@@ -68,6 +69,8 @@ class ReplayWorker:
         self._turns = Turns()
         self._batch = 0  # decisions the trainer asked for last
         self._closed = False
+        self._in_cluster = in_cluster
+        self._server: Server | None = None
         self._failure: Exception | None = None
         if state is not None:
             saved = snapshot.load(state / "replay")
@@ -82,8 +85,10 @@ class ReplayWorker:
         return os.getpid()
 
     async def listen(self) -> Address:
-        """Offers shared memory to those who insert, and says where."""
-        return serve_on_loop(self.insert).address
+        """Where `insert` is reached by other processes."""
+        if self._server is None:
+            self._server = serve_on_loop(self.insert, node_address(self._in_cluster))
+        return self._server.address
 
     async def run(self) -> None:
         """Lasts until `close`; that it ends earlier is how the engine learns of this process's death."""

@@ -1,10 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The rollout process: steps its environments while other observations wait for a decision.
 
-It waits only when every environment has an observation under way, and pauses exploring while replay does not
-take segments. It outlives inference, whose successor is asked again what has not been answered. An
-environment that raises ends `run`, and the engine starts another process. Imports neither torch nor LeRobot,
-unless its environment does.
+consumes    decisions, and orders: planned episodes, and whether to explore
+produces    segments of exploring episodes for replay, and results of episodes
+waits for   decisions, if every environment has an observation under way; pauses exploring while replay does
+            not take segments
+ends        with the run; an environment that raises ends `run`, and Ray restarts the process
+
+It outlives inference, whose successor is asked again what has not been answered. Imports neither torch nor
+LeRobot, unless its environment does.
 """
 
 from __future__ import annotations
@@ -60,13 +64,15 @@ class RolloutWorker:
         self,
         env: EnvConfig,
         config: RolloutConfig,
-        plans: EpisodePlans,
+        name: str = "rollout 0",
         history: int = 1,
         timeline: Path | None = None,
     ) -> None:
         errors.collect_warnings()
-        self._clock = open_clock(timeline, f"rollout {plans.worker}")
-        self._plans, self._spent = plans, False
+        # A node that does not see the run's folder would write a timeline that nobody finds.
+        seen = timeline is not None and timeline.parent.is_dir()
+        self._clock = open_clock(timeline if seen else None, name)
+        self._config, self._spent = config, False
         self._max_pending = MAX_PENDING
         # Shared by the two threads: appending to and popping from a deque is atomic.
         self._results: deque[EpisodeResult] = deque()
@@ -74,33 +80,27 @@ class RolloutWorker:
         self._active: tuple[float, bool] | None = None  # since when the thread does what, see `Report`
         self._moves = 0
         self._outbox: list[Segment] = []
-        self._deciding = ReconnectingClient("inference")
-        environments = [
+        self._environments = [
             make_environment(env, history, config.reward_model) for _ in range(config.environments)
         ]
-        callbacks = self._outbox.append, self._end
-        name = f"rollout{plans.worker}.{plans.incarnation}"
-        self._runner = RolloutRunner(environments, self._next, config, name, *callbacks)
         self._clock.enter(WAIT_IN)
 
-    def ready(self) -> int:
+    def ready(self, plans: EpisodePlans | None = None) -> int:
+        """Take the episodes of this process, before `report` and `run` are called; its id."""
+        if plans is not None:
+            self._plans = plans
+            name = f"rollout{plans.worker}.{plans.incarnation}"
+            callbacks = self._outbox.append, self._end
+            self._runner = RolloutRunner(self._environments, self._next, self._config, name, *callbacks)
         return os.getpid()
 
-    def report(
-        self,
-        training: bool,
-        plans: list[EpisodePlan],
-        in_turn: bool = False,
-        inference: Endpoint | None = None,
-    ) -> Report:
+    def report(self, training: bool, plans: list[EpisodePlan], in_turn: bool = False) -> Report:
         """Takes orders and reports. One call at a time, so that orders cannot overtake each other.
 
-        From now on it explores if `training`, once the `plans` have been played, waits for replay after each
-        segment if `in_turn`, and asks `inference`; None: whom it has asked before.
+        From now on it explores if `training`, once the `plans` have been played, and waits for replay after
+        each segment if `in_turn`.
         """
         self._clock.beat()
-        if inference is not None:
-            self._deciding.move(inference)
         self._plans.queue(plans)
         self._max_pending = 1 if in_turn else MAX_PENDING
         (self._training.set if training else self._training.clear)()
@@ -118,7 +118,7 @@ class RolloutWorker:
 
     def run(self, inference: Endpoint, replay: Endpoint) -> None:
         """Steps environments until the process ends."""
-        deciding, storing = self._deciding, replay.connect()
+        deciding, storing = ReconnectingClient("inference"), replay.connect()
         deciding.move(inference)
         idle = list(range(len(self._runner)))
         due: dict[int, Request] = {}

@@ -6,7 +6,6 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterator
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,22 +14,12 @@ from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos.dataset_files import open_metadata, opened
 from accerl_lerobot.demos.episodes import check_images, numbers, observations, read_labels
 from accerl_lerobot.experience import Segment, SegmentStart
-from accerl_lerobot.policies.config import Load, PolicyConfig
 from accerl_lerobot.policies.features import dataset_shapes
 
 logger = logging.getLogger(__name__)
 
 ROWS, FRAMES = 5000, 20_000
 """Decisions, and env steps, that are read at most; of short datasets, decisions that begin at every step."""
-
-
-def with_demonstrations(
-    load: Load, dataset: DatasetConfig, decision_cost: float, config: PolicyConfig
-) -> Any:
-    """Loads a policy whose trainer remembers demonstrations."""
-    adapter: Any = load(config)
-    adapter.demonstrations = partial(demonstrations, dataset, decision_cost)
-    return adapter
 
 
 def unlike(meta: Any, wanted: dict[str, tuple[int, ...]]) -> str | None:

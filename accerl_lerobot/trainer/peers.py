@@ -4,21 +4,19 @@
     replay ──batch──► rank 0 ──its reference──► ranks 1, 2 …
                         ◄── torch.distributed: values, gradients, parts of weights ──►
 
-What takes all ranks is done within `Peers.joining`: the others are told, do the same, and are waited for. One
-that dies or hangs ends the wait, after `SHARE` of ``launch.stall_s`` at the latest, and the error names it.
+What takes all ranks is done within `Peers.joining`: the others are told, do the same, and are waited for. A
+rank that is lost ends the wait, after `SHARE` of ``launch.stall_s`` at the latest, and with it the trainer.
 """
 
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import ray
-from ray.exceptions import RayActorError, RayError
 
 from accerl_lerobot import errors
 from accerl_lerobot.algorithms import AlgorithmConfig
@@ -35,13 +33,7 @@ if TYPE_CHECKING:
 
 LOAD_S = 600.0  # how long a rank may take to load its policy
 SHARE = 0.4
-"""Share of ``launch.stall_s`` for which a rank waits for the others, so that the lost one is named first."""
-PATIENCE = 0.9  # share of that after which the first rank has waited for another
-BLAME_S = 10.0  # how long to wait for the failure that the first rank's own is the consequence of
-
-
-class RankError(RuntimeError):
-    """A rank is lost, or was not there in time."""
+"""Share of ``launch.stall_s`` for which a rank waits for the others, so that the trainer ends by itself."""
 
 
 class LearnerSettings(NamedTuple):
@@ -136,7 +128,7 @@ class Peers:
         if not self._actors:
             return settings.begin(adapter, ranks.ALONE)
         # Actors of one thread: by then they have loaded their policies.
-        nodes = _collect("node", [actor.node.remote() for actor in self._actors], LOAD_S)
+        nodes = ray.get([actor.node.remote() for actor in self._actors], timeout=LOAD_S)
         address = ranks.LOOPBACK
         if set(nodes) != {str(ray.get_runtime_context().get_node_id())}:
             address = ray.util.get_node_ip_address()
@@ -148,59 +140,11 @@ class Peers:
 
     @contextmanager
     def joining(self, method: str, *arguments: Any) -> Iterator[None]:
-        """They do `method` while the first rank does its part inside.
-
-        Raises:
-            RankError: one of them failed, with its traceback, or was not there in time.
-        """
+        """They do `method` while the first rank does its part inside; an error of theirs is raised here."""
         calls = [getattr(actor, method).remote(*arguments) for actor in self._actors]
-        began = time.monotonic()
-        try:
-            yield
-        except Exception as error:
-            # Who waits for the first rank is silent too: it is another's silence only if it was waited for.
-            waited = time.monotonic() - began > PATIENCE * self._timeout_s
-            if calls and (lost := _failure(method, calls, silence=waited, own=error)) is not None:
-                raise lost from error
-            raise
-        if calls:
-            _collect(method, calls, self._timeout_s)
+        yield
+        ray.get(calls, timeout=self._timeout_s)
 
     def lending(self, method: str) -> AbstractContextManager[None]:
         """As `joining`, for what takes all ranks only where each keeps a part of the weights."""
         return self.joining(method) if self._config.zero else nullcontext()
-
-
-def _collect(method: str, calls: list[Any], timeout_s: float) -> list[Any]:
-    try:
-        return list(ray.get(calls, timeout=timeout_s))
-    except RayError as error:  # no answer in time is one, too
-        raise _failure(method, calls) or error from error
-
-
-def _failure(
-    method: str, calls: list[Any], silence: bool = True, own: Exception | None = None
-) -> RankError | None:
-    """The others' fault, if any: first of the dead, then, if `silence` is one, of the silent, then the rest.
-
-    `own` is what the first rank has raised; what all ranks raise alike is not theirs.
-    """
-    done, silent = ray.wait(calls, num_returns=len(calls), timeout=BLAME_S)
-    failures: dict[Any, RayError] = {}
-    for call in done:
-        try:
-            ray.get(call)
-        except RayError as error:
-            failures[call] = error
-    # A process that is gone made the others fail; what they say of it is only that it is gone.
-    guilty = [call for call, error in failures.items() if isinstance(error, RayActorError)]
-    if not guilty and silent and silence:
-        names = ", ".join(f"rank {calls.index(call) + 1}" for call in silent)
-        return RankError(f"trainer {names} did not do {method}: no answer")
-    alike = {
-        call for call, error in failures.items() if own and type(getattr(error, "cause", 0)) is type(own)
-    }
-    guilty += [call for call in failures if call not in alike]
-    if not guilty:
-        return None
-    return RankError(f"trainer rank {calls.index(guilty[0]) + 1} failed in {method}:\n{failures[guilty[0]]}")

@@ -2,8 +2,7 @@
 """The trainer process: the run's clock.
 
 consumes    batches of segments from replay, the next one drawn while the current one is learned from
-produces    weights, published after each update without waiting for more than a copy of them;
-            to readers that come later as well, even after the last update
+produces    weights, published after each update for the replicas that ask, also after the last update
 waits for   a batch
 ends        after `updates` updates, or when replay is closed
 """
@@ -28,18 +27,14 @@ from accerl_lerobot.replay.pacing import ASYNCHRONOUS, Schedule
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
 from accerl_lerobot.trainer.batch import save_batch_if_not_finite
 from accerl_lerobot.trainer.peers import LearnerSettings, Peers
-from accerl_lerobot.transport.endpoint import Endpoint
 from accerl_lerobot.transport.weights import PublishDelay, WeightPublisher
-
-FIRST_S = 120.0  # timeout for the first weights to be published
-RESEND_S = 0.2  # interval at which busy replicas get the newest weights while the trainer waits for a batch
 
 
 class TrainerWorker:
     """Becomes a threaded Ray actor in `launch`: `run` on one thread, everything else beside it.
 
     The run's `directory` is for batches that nothing could be learnt from; `world_model` is the handle of a
-    `WorldModelWorker`, where the algorithm learns on its states.
+    `WorldModelWorker`, where the algorithm learns on its states; `readers` are the inference replicas.
     """
 
     def __init__(
@@ -49,6 +44,7 @@ class TrainerWorker:
         peers: Sequence[Any] = (),
         directory: Path | None = None,
         world_model: Any = None,
+        readers: Sequence[str] = (),
     ) -> None:
         errors.collect_warnings()
         self._clock = open_clock(timeline, "trainer")
@@ -63,9 +59,7 @@ class TrainerWorker:
         self._lock = threading.Lock()
         self._kept: Any = None
         self._in_turn = False
-        self._publisher: WeightPublisher | None = None
-        self._publishing = threading.Event()  # set once the first weights have been published
-        self._handed_over = -1  # version of the weights that were published last
+        self._publisher = WeightPublisher(readers, ray.put)
         self._history: deque[dict[str, float]] = deque()  # filled on one thread, emptied on another
         self._clock.enter(WAIT_IN)
 
@@ -73,44 +67,30 @@ class TrainerWorker:
         """Answers once the policy is loaded; returns this process's id."""
         return os.getpid()
 
-    def run(self, replay: Any, readers: list[Endpoint]) -> int:
-        """Trains; returns the number of updates made."""
+    def run(self, replay: Any) -> int:
+        """Train; returns the number of updates made."""
         self._clock.enter(WEIGHT_SYNC)
-        publisher = WeightPublisher(readers)
-        try:
-            # A checkpoint need not hold a critic: all start from this one.
-            with self._lock:
-                self._publish(publisher, PublishDelay(0), last=False)
-            self._publisher = publisher
-            self._publishing.set()
-            self._train(replay, publisher)
-            self._clock.enter(WEIGHT_SYNC)
-            publisher.flush()
-        except BaseException:
-            publisher.close()
-            raise
-        finally:
-            self._clock.enter(WAIT_IN)
+        # A checkpoint need not hold a critic: all start from this one.
+        with self._lock:
+            self._publish(PublishDelay(0), last=False)
+        self._train(replay)
+        self._clock.enter(WEIGHT_SYNC)
+        self._publisher.flush()
+        self._clock.enter(WAIT_IN)
         return self._update.version
 
-    def join(self, reader: Endpoint) -> int:
-        """Has another replica receive the weights, none older than the version that is returned."""
-        if not self._publishing.wait(FIRST_S):
-            raise TimeoutError(f"the trainer has published no weights for {FIRST_S:g} s")
-        assert self._publisher is not None
-        with self._lock:  # the newest set is sent from where it was published from
-            self._publisher.add(reader)
-            return self._handed_over
+    def newer_than(self, reader: str, version: int) -> tuple[int, list[Any]]:
+        """The newest weights for a replica that has applied `version`; see `WeightPublisher`."""
+        return self._publisher.newer_than(reader, version)
 
-    def _train(self, replay: Any, publisher: WeightPublisher) -> None:
+    def _train(self, replay: Any) -> None:
         held = PublishDelay(self._config.hold_back)
         n, config = self._config.batch_decisions, self._config
         upcoming = replay.sample.remote(n, self._update.version)
         asked = time.monotonic()
         while self._update.version < config.updates:
             self._clock.enter(WAIT_IN)
-            while not ray.wait([upcoming], timeout=RESEND_S)[0]:
-                publisher.resend()
+            ray.wait([upcoming], timeout=None)
             self._clock.enter(TRANSPORT)
             batch, segments = upcoming, ray.get(upcoming)
             if not segments:
@@ -130,28 +110,27 @@ class TrainerWorker:
                     metrics = self._update.step(segments)
                 updated = time.monotonic()
                 self._clock.enter(WEIGHT_SYNC)
-                self._publish(publisher, held, last=self._update.version == config.updates)
+                self._publish(held, last=self._update.version == config.updates)
                 if self._in_turn:
-                    publisher.flush()
+                    self._publisher.flush()
                 metrics |= {"update": float(self._update.version), "wait_s": waited}
                 metrics |= {"update_s": updated - started, "publish_s": time.monotonic() - updated}
                 self._history.append(metrics)
             asked = time.monotonic()
             replay.learnt.remote()
         with self._lock:
-            if self._handed_over < self._update.version:
+            if self._publisher.version < self._update.version:
                 # It has ended early, and what is evaluated is to be what is saved.
-                self._publish(publisher, held, last=True)
+                self._publish(held, last=True)
 
-    def _publish(self, publisher: WeightPublisher, held: PublishDelay, last: bool) -> None:
+    def _publish(self, held: PublishDelay, last: bool) -> None:
         """Hands the weights of now over, or those that are old enough."""
         adapter = self._update.adapter
         with self._peers.lending("lend_weights"):
             weights = adapter.export_trainable() if self._config.hold_back else adapter.view_trainable()
         for version, tensors in held.push(self._update.version, weights, last=last):
             fault_point("trainer.publish")
-            publisher.publish(version, tensors)
-            self._handed_over = version
+            self._publisher.publish(version, tensors)
 
     def metrics(self) -> list[dict[str, float]]:
         """One record per update since the last call."""

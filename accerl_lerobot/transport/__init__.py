@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages between workers: shared memory on a node, Ray between nodes."""
+"""Messages between workers over sockets, and weights through Ray's object store."""

@@ -1,120 +1,68 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Weights from the trainer to inference replicas: messages that are answered once they are applied.
+"""Weights from the trainer to inference replicas, through Ray's object store.
 
-Each set is copied once per replica, into shared memory or Ray's object store, and nobody is waited for: a
-slow replica skips versions.
+The trainer puts each set into the store once. A replica asks for the newest one whenever it has applied the
+one before, so a slow replica skips versions and the trainer waits for nobody.
 """
 
 from __future__ import annotations
 
-import logging
-import time
+import threading
 from collections import deque
-from collections.abc import Iterable
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from collections.abc import Callable, Iterable
+from typing import Any
 
 import numpy as np
 
-from accerl_lerobot.checkpoint.snapshot import kind
-from accerl_lerobot.transport.contract import Client, ServiceStoppedError
-from accerl_lerobot.transport.endpoint import Endpoint
-
-logger = logging.getLogger(__name__)
-
 FLUSH_S = 300.0  # timeout for all replicas together: a forward pass and a copy of the weights
-UNDER_WAY = 2  # sets on their way to a replica at most: one that it applies, and the next
+ASK_S = 10.0  # how long a replica's question for newer weights waits before it is answered with nothing
 
 Tensors = dict[str, np.ndarray]  # parameter name → array; dtype and shape arrive as they were sent
 
 
-@kind
-class WeightUpdate(NamedTuple):
-    """All trained weights of one version."""
-
-    version: int
-    tensors: Tensors
-
-
-@dataclass(eq=False)
-class _Reader:
-    endpoint: Endpoint
-    client: Client
-    under_way: set[int] = field(default_factory=set)  # tickets of sets that it has not applied yet
-    sent: int | None = None  # version of the last one
-
-
 class WeightPublisher:
-    """Sends the newest weights to all replicas. One that fails is ended, and the engine replaces it.
+    """Keeps the newest weights for the replicas, which ask from other threads.
 
-    Published tensors must not change before `flush` has returned, as `resend` and `add` send them too.
+    Args:
+        readers: names of the replicas that `flush` waits for.
+        put: copies tensors into the store; returns the reference that replicas get.
     """
 
-    def __init__(self, readers: Iterable[Endpoint] = ()) -> None:
-        self._readers: list[_Reader] = []
-        self._newest: WeightUpdate | None = None
-        for reader in readers:
-            self.add(reader)
-
-    def add(self, endpoint: Endpoint) -> None:
-        """Send to another replica, the newest set at once."""
-        try:
-            reader = _Reader(endpoint, endpoint.connect())
-        except ServiceStoppedError as error:
-            _end(endpoint, error)
-            return
-        if self._advance(reader):
-            self._readers.append(reader)  # another thread may flush meanwhile
+    def __init__(self, readers: Iterable[str], put: Callable[[Tensors], Any]) -> None:
+        self._put = put
+        self._changed = threading.Condition()
+        self._applied = dict.fromkeys(readers, -1)
+        self.version, self._reference = -1, None
 
     def publish(self, version: int, tensors: Tensors) -> None:
-        """Copy a set to every replica that has applied the one before the last."""
-        self._newest = WeightUpdate(version, tensors)
-        self.resend()
+        """Copy a set; the tensors may change afterwards."""
+        reference = self._put(tensors)
+        with self._changed:
+            self.version, self._reference = version, reference
+            self._changed.notify_all()
 
-    def resend(self) -> None:
-        """Copy the newest set to replicas that were busy when it was published."""
-        for reader in list(self._readers):
-            if not self._advance(reader):
-                self._readers.remove(reader)
+    def newer_than(self, reader: str, version: int) -> tuple[int, list[Any]]:
+        """Note that a replica has applied a version; returns the newest one and its reference.
+
+        The list is empty if there was none within `ASK_S`. Ray would replace a reference outside of a list by
+        the tensors.
+        """
+        with self._changed:
+            self._applied[reader] = version
+            self._changed.notify_all()
+            if not self._changed.wait_for(lambda: self.version > version, ASK_S):
+                return version, []
+            return self.version, [self._reference]
 
     def flush(self, timeout_s: float = FLUSH_S) -> None:
         """Wait until every replica has applied the newest set."""
-        deadline = time.monotonic() + timeout_s
-        while late := [reader for reader in self._readers if reader.under_way or self._is_behind(reader)]:
-            if (left := deadline - time.monotonic()) <= 0:
-                names = ", ".join(reader.endpoint.name for reader in late)
-                raise TimeoutError(f"weights not applied within {timeout_s:g} s by {names}")
-            if not self._advance(late[0], left):
-                self._readers.remove(late[0])
 
-    def close(self) -> None:
-        for reader in self._readers:
-            reader.client.close()
-        self._readers.clear()
+        def late() -> list[str]:
+            return [name for name, version in self._applied.items() if version < self.version]
 
-    def _is_behind(self, reader: _Reader) -> bool:
-        return self._newest is not None and reader.sent != self._newest.version
-
-    def _advance(self, reader: _Reader, wait_s: float = 0.0) -> bool:
-        """Hear what a replica has applied, and send the newest set if there is room; False: it is gone."""
-        try:
-            if reader.under_way:
-                reader.under_way -= {ticket for ticket, _ in reader.client.done(wait_s)}
-            if self._is_behind(reader) and len(reader.under_way) < UNDER_WAY:
-                assert self._newest is not None
-                reader.under_way.add(reader.client.send(self._newest))
-                reader.sent = self._newest.version
-        except ServiceStoppedError as error:
-            reader.client.close()
-            _end(reader.endpoint, error)
-            return False
-        return True
-
-
-def _end(endpoint: Endpoint, error: Exception) -> None:
-    """End a replica that may be alive and out of reach: with old weights it would serve for ever."""
-    logger.warning("%s does not get weights any more: %s", endpoint.name, error)
-    endpoint.kill()
+        with self._changed:
+            if not self._changed.wait_for(lambda: not late(), timeout_s):
+                raise TimeoutError(f"weights not applied within {timeout_s:g} s by {', '.join(late())}")
 
 
 class PublishDelay:

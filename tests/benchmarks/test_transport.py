@@ -6,14 +6,10 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import pytest
-
-from accerl_lerobot.transport.shared_memory import available
-from benchmarks.transport import RAY, SHARED_MEMORY, SLOT, BenchTransportConfig, bench_transport, table
+from benchmarks.transport import RAY, SLOT, SOCKET, BenchTransportConfig, bench_transport, table
 from tests.runs import printed
 
 
-@pytest.mark.skipif(not available(), reason="no memfd, epoll and eventfd here")
 def test_all_arms_in_turns(light_ray: None, tmp_path: Path):
     folder = tmp_path / "transport"
     config = BenchTransportConfig(
@@ -22,8 +18,8 @@ def test_all_arms_in_turns(light_ray: None, tmp_path: Path):
     result = bench_transport(config)
     assert json.loads((folder / "transport.json").read_text()) == json.loads(json.dumps(result))
     found = {(row["callers"], row["arm"]): row for row in result["results"]}
-    assert list(found) == [(1, RAY), (1, SHARED_MEMORY), (1, SLOT), (2, RAY), (2, SHARED_MEMORY)]
+    assert list(found) == [(1, RAY), (1, SOCKET), (1, SLOT), (2, RAY), (2, SOCKET)]
     for row in found.values():
         assert len(row["p50_us"]["blocks"]) == len(row["calls_per_s"]["blocks"]) == 2
         assert 0 < row["p50_us"]["min"] <= row["p50_us"]["median"] <= row["p99_us"]["max"]
-    assert "shared_memory" in printed(table(result))
+    assert "socket" in printed(table(result))

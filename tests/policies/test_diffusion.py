@@ -135,7 +135,7 @@ def config_for(path: Path, output_dir: Path, **sections: object) -> RunConfig:
 
 def test_a_run_asks_the_policy_how_far_it_looks_back(looking: Path, tmp_path: Path):
     config = config_for(looking, tmp_path / "run")
-    summary = run.execute(config, run.make_output_dir(config), Console())
+    summary = run.Run(config, run.make_output_dir(config), Console()).execute()
     assert summary["updates"] == 3 and summary["n_after"] == 4 and summary["ratio_max_dev"] < 1
 
 

@@ -13,7 +13,7 @@ import pytest
 from accerl_lerobot.experience import IMAGINED, Segment
 from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.replay.worker import ReplayWorker
-from accerl_lerobot.transport.contract import ServiceStoppedError
+from accerl_lerobot.transport.connection import ServiceStoppedError
 from tests.replay.segments import make_segment
 
 CONFIG = ReplayConfig(capacity=64, min_decisions=8, max_unlearned_decisions=8, samples_per_insert=1.0)

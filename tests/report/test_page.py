@@ -49,7 +49,7 @@ def test_a_run_that_was_really_made(tiny_checkpoint: Path, tmp_path: Path) -> No
     evaluation = EvaluationConfig(episodes=8, every_updates=6, episodes_during=4, videos=1)
     launch, directory = LaunchConfig(engine="local"), tmp_path / "run"
     config = tiny_run(tiny_checkpoint, evaluation=evaluation, launch=launch, output_dir=str(directory))
-    run.execute(config, run.make_output_dir(config), Console())
+    run.Run(config, run.make_output_dir(config), Console()).execute()
     seen = page_of(directory)
     summary = json.loads((directory / "summary.json").read_text())
     after, (low, high) = summary["success_after"], (f"{100 * end:.0f}" for end in summary["ci95_after"])

@@ -18,7 +18,8 @@ from accerl_lerobot.experience import Decision, Request, Segment
 from accerl_lerobot.rollout import worker as module
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodePlans, EpisodeResult, RolloutConfig
 from accerl_lerobot.rollout.worker import MAX_PENDING, RolloutWorker
-from accerl_lerobot.transport.contract import ServiceStoppedError
+from accerl_lerobot.transport import endpoint
+from accerl_lerobot.transport.connection import ServiceStoppedError
 from tests.rollout.environments import evaluate
 from tests.runs import HANGS_S
 from tests.transport.played import played
@@ -38,7 +39,8 @@ class Stage:
     """A worker whose loop runs on a thread; `inference` answers at once, `replay` as the test says."""
 
     def __init__(self, config: RolloutConfig, insert: Callable[[list[Segment]], Any]) -> None:
-        self.worker = RolloutWorker(WORLD, config, EpisodePlans(("match",), 0, None))
+        self.worker = RolloutWorker(WORLD, config)
+        self.worker.ready(EpisodePlans(("match",), 0, None))
         self.episodes: list[EpisodeResult] = []
         self.explored = 0
         self.over = False
@@ -185,12 +187,11 @@ def test_an_insert_that_fails_ends_the_worker(stage):
     assert isinstance(one.failure, OSError)
 
 
-def test_a_worker_outlives_its_inference_and_plays_what_it_would_have_played(stage):
-    """Decisions are of their requests alone; the service is lost with requests under way, and replaced."""
-
-    def broken(requests: list[Request]) -> list[Decision]:
-        raise ServiceStoppedError("the forward pass fell over")
-
+def test_a_worker_outlives_its_inference_and_plays_what_it_would_have_played(
+    stage, monkeypatch: pytest.MonkeyPatch
+):
+    """Decisions are of their requests alone; the service is lost with requests under way, and comes back."""
+    monkeypatch.setattr(endpoint, "RETRY_S", 0.05)
     played_out = []
     for lost in (False, True):
         one = stage(lambda segments: True)
@@ -200,11 +201,8 @@ def test_a_worker_outlives_its_inference_and_plays_what_it_would_have_played(sta
         one.order(False, planned(12))
         if lost:
             one.until(lambda one=one: len(one.held or []) >= 2, training=False)
-            one.worker._deciding.move(played(broken))  # on another thread than the one that asks
-            one.until(lambda one=one: one.worker._deciding._client is None, training=False)
-            assert one.order(False) and one.evaluated == []
-            one.held = None
-            one.worker.report(False, [], False, played(one._decide))
+            lost_requests, one.held = one.held, None
+            lost_requests[0][0].set_exception(ServiceStoppedError("the forward pass fell over"))
         one.until(lambda one=one: len(one.evaluated) == 12, training=False)
         results = sorted(one.evaluated, key=lambda result: result.plan.index)
         played_out.append([(r.plan, r.success, r.episode_return, r.decisions) for r in results])
@@ -224,7 +222,8 @@ def test_a_world_that_hangs_shows_in_the_report(stage, monkeypatch: pytest.Monke
 
 def test_who_has_not_been_set_to_work_does_not_hang():
     """Others may take long to start."""
-    worker = RolloutWorker(WORLD, RolloutConfig(environments=1), EpisodePlans(("match",), 0, None))
+    worker = RolloutWorker(WORLD, RolloutConfig(environments=1))
+    worker.ready(EpisodePlans(("match",), 0, None))
     time.sleep(0.05)
     report = worker.report(True, [])
     assert (report.busy_s, report.in_environment) == (0.0, False)

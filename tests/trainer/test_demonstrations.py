@@ -28,7 +28,7 @@ from accerl_lerobot.policies.teacher import with_teacher
 from accerl_lerobot.trainer import demonstrations as module
 from accerl_lerobot.trainer.chunk_critic import ChunkCriticUpdate
 from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.trainer.demonstrations import demonstrations, recorded, with_demonstrations
+from accerl_lerobot.trainer.demonstrations import demonstrations, recorded
 from accerl_lerobot.world_model.config import SimulatorStateConfig
 from tests.replay.segments import make_segment
 from tests.runs import tiny_run
@@ -141,7 +141,8 @@ def test_the_memory_begins_with_them_and_is_restored_without(
 ):
     load = partial(with_teacher, load_adapter, SimulatorStateConfig(), ENV.state_size, 0.5)
     policy = PolicyConfig(path=str(tiny_checkpoint), device="cpu")
-    adapter = with_demonstrations(load, dataset, COST, policy)
+    adapter = load(policy)
+    adapter.demonstrations = partial(demonstrations, dataset, COST)
     config = TrainerConfig(value_warmup_updates=100)
     update = ChunkCriticUpdate(adapter, ChunkCriticConfig(), config)
     rows = sum(map(len, demonstrations(dataset, COST, like)))

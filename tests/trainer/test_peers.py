@@ -12,9 +12,8 @@ from typing import Any
 import pytest
 import ray
 
-from accerl_lerobot.trainer import peers as module
 from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.trainer.peers import Peers, RankError
+from accerl_lerobot.trainer.peers import Peers
 
 THREE = TrainerConfig(ranks=3)
 WAIT_S = 2.0
@@ -52,8 +51,7 @@ class Split:
 
 
 @pytest.fixture
-def peers(light_ray: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str, str], Peers]]:
-    monkeypatch.setattr(module, "BLAME_S", 1.0)
+def peers(light_ray: None) -> Iterator[Callable[[str, str], Peers]]:
     actors: list[Any] = []
 
     def make(first: str, second: str) -> Peers:
@@ -75,40 +73,16 @@ def test_they_have_done_it_when_the_first_goes_on(peers: Callable[[str, str], Pe
 
 
 @pytest.mark.parametrize(
-    ("how", "says"),
-    [
-        ("fails", r"^trainer rank 2 failed in step:\n(.|\n)*the gradient fell over"),
-        ("dies", r"^trainer rank 2 failed in step:\n(.|\n)*died"),
-        ("hangs", r"^trainer rank 2 did not do step: no answer$"),
-    ],
+    ("how", "error"), [("fails", "the gradient fell over"), ("dies", "died"), ("hangs", "Get timed out")]
 )
-def test_who_is_lost_is_named(peers: Callable[[str, str], Peers], how: str, says: str):
-    with pytest.raises(RankError, match=says), peers("fine", how).joining("step", ""):
+def test_a_rank_that_is_lost_ends_the_wait(peers: Callable[[str, str], Peers], how: str, error: str):
+    with pytest.raises(ray.exceptions.RayError, match=error), peers("fine", how).joining("step", ""):
         pass
 
 
-@pytest.mark.parametrize(("how", "says"), [("dies", "rank 2 failed in step"), ("hangs", "rank 2 did not do")])
-def test_one_that_is_gone_is_named_and_not_those_that_fail_for_it(
-    peers: Callable[[str, str], Peers], how: str, says: str
-):
-    """A collective that breaks breaks for all: what rank 1 and the first one say of it is of no use."""
-    with pytest.raises(RankError, match=says) as lost, peers("fails", how).joining("step", ""):
-        if how == "hangs":
-            time.sleep(WAIT_S)  # as a collective does
-        raise RuntimeError("connection closed by peer")
-    assert "connection closed by peer" in str(lost.value.__cause__)
-
-
-@pytest.mark.parametrize("others", ["fine", "hangs"])
-def test_what_the_first_does_wrong_is_its_own(peers: Callable[[str, str], Peers], others: str):
-    """Also while the others wait for it in a collective."""
-    with pytest.raises(KeyError, match="mine"), peers(others, others).joining("step", ""):
+def test_an_error_of_the_first_is_its_own(peers: Callable[[str, str], Peers]):
+    with pytest.raises(KeyError, match="mine"), peers("hangs", "hangs").joining("step", ""):
         raise KeyError("mine")
-
-
-def test_what_all_do_wrong_is_told_as_the_first_one_s(peers: Callable[[str, str], Peers]):
-    with pytest.raises(ArithmeticError, match="not finite"), peers("fails", "fails").joining("step", ""):
-        raise ArithmeticError("not finite")
 
 
 def test_ranks_talk_over_the_interface_that_has_the_address(monkeypatch: pytest.MonkeyPatch):

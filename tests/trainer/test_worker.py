@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -23,9 +23,8 @@ from accerl_lerobot.trainer import worker as module
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.peers import LearnerSettings
 from accerl_lerobot.trainer.worker import TrainerWorker
-from accerl_lerobot.transport.weights import WeightPublisher, WeightUpdate
+from accerl_lerobot.transport.weights import WeightPublisher
 from tests.trainer.linear import LinearAdapter, make_segments
-from tests.transport.played import played
 
 
 def copied(tensors: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -38,25 +37,33 @@ def handle(**methods: Callable[..., Any]) -> Any:
     return SimpleNamespace(**{name: SimpleNamespace(remote=method) for name, method in methods.items()})
 
 
+class NotingPublisher(WeightPublisher):
+    """Keeps all that was published."""
+
+    def __init__(self, readers: Sequence[str], put: Callable[..., Any]) -> None:
+        super().__init__(readers, put)
+        self.received: list[tuple[int, dict[str, np.ndarray]]] = []
+
+    def publish(self, version: int, tensors: dict[str, np.ndarray]) -> None:
+        super().publish(version, tensors)
+        self.received.append((version, copied(tensors)))
+
+
 class Stage:
-    """A trainer, a replay that counts what it is asked for, and a reader that keeps what it is sent."""
+    """A trainer, a replay that counts what it is asked for, and a publisher that keeps what it is given."""
 
     def __init__(self, batches: int = 1000, directory: Path | None = None, **config: Any) -> None:
         self.asked: list[tuple[int, int]] = []
-        self.received: list[tuple[int, dict[str, np.ndarray]]] = []
         self.replay = handle(sample=self._sample, learnt=lambda: None)
-        self.reader = played(self._receive)
         self._batches = batches
         defaults = {"updates": 6, "batch_decisions": 7, "warmup_updates": 0, "value_warmup_updates": 0}
         trainer = TrainerConfig(**{**defaults, **config})
         settings = LearnerSettings(PolicyConfig(path="nowhere"), GIPOConfig(), trainer, 0)
         self.worker = TrainerWorker(settings, directory=directory)
+        self.received = self.worker._publisher.received  # type: ignore[attr-defined]
 
     def run(self) -> int:
-        return self.worker.run(self.replay, [self.reader])
-
-    def _receive(self, update: WeightUpdate) -> None:
-        self.received.append((update.version, copied(update.tensors)))
+        return self.worker.run(self.replay)
 
     def _sample(self, decisions: int, version: int) -> list[Segment]:
         self.asked.append((decisions, version))
@@ -66,10 +73,10 @@ class Stage:
 @pytest.fixture(autouse=True)
 def _without_ray(monkeypatch: pytest.MonkeyPatch) -> None:
     local = SimpleNamespace(
-        get=lambda reference: reference, wait=lambda references, timeout: (references, [])
+        get=lambda reference: reference, put=copied, wait=lambda references, timeout: (references, [])
     )
     monkeypatch.setattr(module, "ray", local)
-    monkeypatch.setattr(module, "FIRST_S", 0.05)
+    monkeypatch.setattr(module, "WeightPublisher", NotingPublisher)
     monkeypatch.setattr(loading, "load_adapter", lambda policy: LinearAdapter())
 
 
@@ -181,11 +188,9 @@ def test_in_turn_the_wait_for_a_batch_does_not_hold_that_for_the_readers(monkeyp
     assert flushed == [0, 1, 2, 3], "each version before its record is complete, and the last once more"
 
 
-def test_a_reader_that_comes_later_gets_the_weights_of_now_even_after_the_last_update():
+def test_a_replica_gets_the_newest_weights_even_after_the_last_update():
     stage = Stage(updates=3)
-    with pytest.raises(TimeoutError, match="has published no weights"):
-        stage.worker.join(stage.reader)
     stage.run()
-    received: list[int] = []
-    assert stage.worker.join(played(lambda update: received.append(update.version))) == 3
-    assert received == [3]
+    version, (tensors,) = stage.worker.newer_than("inference", -1)
+    assert version == 3
+    assert all(np.array_equal(tensors[name], last) for name, last in stage.received[-1][1].items())

@@ -7,15 +7,14 @@ from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from typing import Any
 
-from accerl_lerobot.transport.contract import Client
 from accerl_lerobot.transport.endpoint import Endpoint
 
 
-class PlayedClient(Client):
+class PlayedClient:
     """Replies are what a function returns, or what is put into a future that it returns."""
 
     def __init__(self, name: str, answer: Callable[[Any], Any]) -> None:
-        super().__init__(name)
+        self.name = name
         self._answer = answer
         self._under_way: dict[int, Future[Any]] = {}
         self._sent = 0
@@ -42,10 +41,10 @@ class PlayedClient(Client):
 class PlayedEndpoint(Endpoint):
     """Leads to a function of the test."""
 
-    def connect(self) -> Client:
-        return PlayedClient(self.name, self.method)
+    def connect(self, timeout_s: float = 0.0) -> Any:
+        return PlayedClient(self.name, self.actor)
 
 
 def played(answer: Callable[[Any], Any]) -> Endpoint:
     """An endpoint at which `answer` replies."""
-    return PlayedEndpoint(name="played", method=answer)
+    return PlayedEndpoint(name="played", actor=answer)

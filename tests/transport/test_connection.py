@@ -1,0 +1,263 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Messages over sockets: the promises at the top of `transport.connection`, over Unix sockets and TCP."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from accerl_lerobot.experience import Decision, Request
+from accerl_lerobot.transport import connection
+from accerl_lerobot.transport.connection import Address, Client, PendingRequest, Server, ServiceStoppedError
+from tests.replay.segments import make_segment
+
+LONG_S = 120.0
+HOSTS = [pytest.param(None, id="unix"), pytest.param("127.0.0.1", id="tcp")]
+
+
+class Service:
+    """A service on a thread, which echoes, holds or fails as a message says."""
+
+    def __init__(self, host: str | None = None) -> None:
+        self.held: list[PendingRequest] = []
+        self.server = Server(self._take, host)
+        self.over = False
+        self._thread = threading.Thread(target=self._serve)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        while not self.over:
+            self.server.poll(1.0)
+
+    def _take(self, request: PendingRequest) -> None:
+        what, value = request.message
+        if what == "hold":
+            self.held.append(request)
+        elif what == "fail":
+            request.fail(ArithmeticError(value))
+        else:
+            request.answer(value)
+        if what == "release":
+            for held in self.held:
+                held.answer(held.message[1])
+
+    def close(self) -> None:
+        self.over = True
+        self.server.wake()
+        self._thread.join()
+        self.server.close()
+
+
+@pytest.fixture(params=HOSTS)
+def service(request: pytest.FixtureRequest) -> Iterator[Service]:
+    made = Service(request.param)
+    yield made
+    made.close()
+
+
+def ask(client: Client, *messages: Any) -> list[Any]:
+    """Replies in the order of the messages."""
+    tickets = [client.send(message) for message in messages]
+    replies: dict[int, Any] = {}
+    while len(replies) < len(tickets):
+        more = client.done(LONG_S)
+        assert more, "it takes too long"
+        replies |= more
+    return [replies[ticket] for ticket in tickets]
+
+
+def same(a: Any, b: Any) -> bool:
+    """True if two messages are equal, types, dtypes and shapes included."""
+    if type(a) is not type(b):
+        return False
+    if isinstance(a, np.ndarray | np.generic):
+        return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
+    if isinstance(a, dict):
+        return list(a) == list(b) and all(same(a[key], b[key]) for key in a)
+    if isinstance(a, list | tuple):
+        return len(a) == len(b) and all(map(same, a, b))
+    return same(vars(a), vars(b)) if hasattr(a, "__dict__") else bool(a == b or a != a)
+
+
+def messages() -> list[Any]:
+    draw = np.random.default_rng(0)
+    image = draw.integers(0, 255, (96, 64, 3)).astype(np.uint8)
+    chunk = draw.normal(size=(4, 2)).astype(np.float32)
+    arrays = {
+        "strided": image[::2, :, 1],
+        "turned": np.arange(12_000, dtype=np.float64).reshape(30, 400).T,
+        "none": np.zeros((0, 3), np.float32),
+        "scalar": np.array(0.5, np.float16),
+        "other way round": np.arange(3000, dtype=">i4"),
+    }
+    observation = {"observation.images.front": image, "observation.state": chunk, "task": "öffne 🚪"}
+    return [
+        arrays,
+        [Request(observation=observation, noise_seed=2**63 + 5), Request(observation={}, noise_seed=0)],
+        [Decision(chunk=chunk, latent={"x": chunk}, log_prob=chunk[0], version=2**40)],
+        [make_segment("a", 3), make_segment("b", 2, world_version=7)],
+        [True, None, 1, -0.0, float("inf"), "", (1, [2, {3: {}}])],
+    ]
+
+
+def test_what_is_sent_arrives_whole_and_can_be_written_to(service: Service):
+    client = Client("service", service.server.address)
+    for message in messages():
+        (reply,) = ask(client, ("echo", message))
+        assert same(reply, message), message
+    (reply,) = ask(client, ("echo", np.zeros(100_000)))
+    reply += 1
+    client.close()
+
+
+def test_replies_go_to_the_messages_they_answer_and_to_their_client(service: Service):
+    clients = [Client("service", service.server.address) for _ in range(3)]
+    late = clients[0].send(("hold", "late"))
+    assert ask(clients[0], *(("echo", i) for i in range(8))) == list(range(8))
+    assert ask(clients[1], ("echo", "other")) == ["other"]
+    clients[1].close()
+    clients[1].close()
+    assert ask(clients[2], ("release", None), ("echo", 1)) == [None, 1]
+    assert clients[0].done(LONG_S) == [(late, "late")] and clients[0].done(0.0) == []
+
+
+def test_what_was_sent_stays_when_the_caller_changes_it(service: Service):
+    client, array = Client("service", service.server.address), np.arange(1_000_000)
+    ticket = client.send(("echo", array))
+    array[:] = -1
+    replies = []
+    while not replies:
+        replies = client.done(LONG_S)
+    assert replies[0][0] == ticket
+    np.testing.assert_array_equal(replies[0][1], np.arange(1_000_000))
+
+
+def test_messages_grow_and_shrink_and_many_large_ones_are_under_way(service: Service):
+    client = Client("service", service.server.address)
+    for size in (10, 300_000, 70, 5_000_000, 0):
+        (reply,) = ask(client, ("echo", np.full(size, 3, np.uint8)))
+        assert reply.shape == (size,) and (reply == 3).all()
+    # Neither end waits for the other to read first.
+    replies = ask(client, *(("echo", np.full(400_000, i, np.uint8)) for i in range(20)))
+    assert [int(reply[0]) for reply in replies] == list(range(20))
+
+
+def test_no_end_waits_for_one_that_reads_nothing(monkeypatch: pytest.MonkeyPatch):
+    """A message to a service that has stopped, and a reply to such a client, are kept."""
+    monkeypatch.setattr(connection, "SEND_S", 0.05)
+    requests: list[PendingRequest] = []
+    server = Server(requests.append)
+    client = Client("service", server.address)
+    large = np.arange(3_000_000)
+    started = time.monotonic()
+    client.send(large)
+    assert client.done(0.01) == [] and time.monotonic() - started < LONG_S
+    while not requests:
+        server.poll(0.01)
+        client.done(0.0)
+    requests[0].answer(large)
+    replies: list[Any] = []
+    while not replies:
+        server.poll(0.01)
+        replies = client.done(0.0)
+    np.testing.assert_array_equal(replies[0][1], large)
+    server.close()
+
+
+def test_a_failure_says_what_it_was(service: Service):
+    client = Client("service", service.server.address)
+    client.send(("fail", "it fell over"))
+    with pytest.raises(ServiceStoppedError, match=r"service: .*it fell over"):
+        client.done(LONG_S)
+
+
+def test_a_service_that_closes_is_noticed_and_refuses_new_clients():
+    service = Service()
+    client = Client("service", service.server.address)
+    client.send(("hold", 1))
+    ask(Client("service", service.server.address), ("echo", 1))
+    service.close()
+    for call in (lambda: client.done(LONG_S), lambda: client.send(("echo", 1)), lambda: client.done(LONG_S)):
+        with pytest.raises(ServiceStoppedError, match="service is gone"):
+            call()
+    with pytest.raises(ServiceStoppedError, match="service cannot be connected to"):
+        Client("service", service.server.address)
+
+
+def held(address: Address, asked: Any) -> None:
+    client = Client("service", address)
+    client.send(("hold", np.zeros(100_000)))
+    ask(client, ("echo", None))
+    asked.set()
+    time.sleep(600)
+
+
+def test_what_a_killed_client_had_asked_is_forgotten(service: Service):
+    context = multiprocessing.get_context("spawn")
+    asked = context.Event()
+    process = context.Process(target=held, args=(service.server.address, asked))
+    process.start()
+    assert asked.wait(LONG_S) and process.pid is not None
+    (request,) = service.held
+    assert not request.gone()
+    os.kill(process.pid, signal.SIGKILL)
+    process.join()
+    deadline = time.monotonic() + LONG_S
+    while not request.gone() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    request.answer("nobody is there")
+    assert request.gone() and ask(Client("other", service.server.address), ("echo", 1)) == [1]
+
+
+def test_who_does_not_know_the_key_is_refused_before_anything_is_read(service: Service):
+    address = service.server.address
+    with pytest.raises(ServiceStoppedError, match="cannot be connected to"):
+        Client("service", Address(address.at, b"another key"))
+    family = socket.AF_UNIX if isinstance(address.at, str) else socket.AF_INET
+    with socket.socket(family) as end:
+        end.connect(address.at)
+        end.sendall(b"cos\nsystem\n(S'exit'\ntR." * 100)
+        assert ask(Client("service", address), ("echo", 1)) == [1]
+
+
+def test_a_message_is_as_old_as_its_sender_says_if_that_can_be(monkeypatch: pytest.MonkeyPatch):
+    taken: list[PendingRequest] = []
+    server = Server(taken.append)
+    clients = [Client("service", server.address) for _ in range(2)]
+    for client in clients:
+        client.send("a first one")
+    while len(taken) < 2:
+        server.poll(1.0)
+    taken.clear()
+    for client in (*clients, *clients):
+        client.send("now")
+    monkeypatch.setattr(connection.time, "monotonic", lambda now=time.monotonic: now() - 1e6)
+    clients[0].send("of a node that has just been started")
+    monkeypatch.undo()
+    while len(taken) < 5:
+        server.poll(1.0)
+    assert all(0 <= time.monotonic() - request.sent < 60 for request in taken)
+    times = [request.sent for request in taken if request.message == "now"]
+    assert times == sorted(times)
+    server.close()
+
+
+def test_threads_of_the_same_process_wake_it():
+    server = Server(lambda request: None)
+    wake: Callable[[], None] = server.wake
+    threading.Timer(0.05, wake).start()
+    started = time.monotonic()
+    server.poll(LONG_S)
+    for _ in range(100_000):
+        server.wake()  # never waits
+    assert time.monotonic() - started < LONG_S
+    server.close()
