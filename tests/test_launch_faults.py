@@ -370,7 +370,8 @@ def test_only_a_process_of_this_node_is_ended_by_its_number(here: bool, monkeypa
     monkeypatch.setattr(supervision, "ray", Stand())
     monkeypatch.setattr(supervision, "GONE_S", 0.2)
     with subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"]) as process:
-        worker = Worker("somebody", MagicMock(), here)
+        actor = type("Actor", (), {"__ray_call__": MagicMock()})()
+        worker = Worker("somebody", actor, here)
         worker.started(process.pid)
         assert (worker.process == psutil.Process(process.pid)) is here
         end_all([worker])

@@ -44,6 +44,7 @@ WORKERS = {
     "OMP_WAIT_POLICY": "PASSIVE",
     "TOKENIZERS_PARALLELISM": "false",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+    "RAY_IGNORE_UNHANDLED_ERRORS": "1",  # the engine looks at the end of every worker itself
 }
 FORWARDED = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE", "ACCERL_ONE_POLICY")
 """Environment variables that workers on other nodes get besides `WORKERS`, where they are set here."""
