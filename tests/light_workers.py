@@ -40,6 +40,7 @@ class LightInference:
         self._broken: asyncio.Future[None] = asyncio.get_event_loop().create_future()
         self._version, self._failing = 0, False
         self._server: Server | None = None
+        self._serving = asyncio.Event()
 
     async def ready(self, trainer: Any = None) -> int:
         if trainer is not None:
@@ -57,6 +58,7 @@ class LightInference:
         self._following = asyncio.create_task(follow(version))
 
     async def serve(self) -> None:
+        self._serving.set()
         await self._broken
 
     async def listen(self) -> Address:
@@ -68,6 +70,7 @@ class LightInference:
         self._failing = True
 
     async def decide(self, requests: list[Request]) -> list[Decision]:
+        await self._serving.wait()
         if self._failing and not self._broken.done():
             self._broken.set_exception(ArithmeticError("the forward pass fell over"))
         if self._broken.done():

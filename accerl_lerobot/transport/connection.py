@@ -269,6 +269,7 @@ class Server:
         self._selector = selectors.DefaultSelector()
         self._selector.register(self._woken, selectors.EVENT_READ)
         self._streams: set[Stream] = set()
+        self._closed = False
         # On a thread, as a stranger might connect and then not say a word.
         threading.Thread(target=self._accept, daemon=True).start()
 
@@ -304,6 +305,8 @@ class Server:
         with contextlib.suppress(OSError):
             self._listener.shutdown(socket.SHUT_RDWR)  # ends the thread that accepts
         self._listener.close()
+        self._closed = True
+        self._close_accepted()
         for stream in list(self._streams):
             self._drop(stream)
 
@@ -318,6 +321,14 @@ class Server:
             except (OSError, EOFError, AuthenticationError):
                 continue  # it does not know the key, or has gone again
             self.wake()
+            if self._closed:
+                self._close_accepted()
+
+    def _close_accepted(self) -> None:
+        """Close connections that `poll` has not taken over."""
+        with contextlib.suppress(queue.Empty):
+            while True:
+                self._accepted.get_nowait().close()
 
     def _receive(self, stream: Any) -> list[PendingRequest]:
         try:

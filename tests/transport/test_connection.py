@@ -193,6 +193,14 @@ def test_a_service_that_closes_is_noticed_and_refuses_new_clients():
         Client("service", service.server.address)
 
 
+def test_a_client_that_was_not_served_yet_notices_the_end_too():
+    server = Server(lambda request: None)
+    client = Client("service", server.address)
+    server.close()
+    with pytest.raises(ServiceStoppedError, match="service is gone"):
+        client.done(LONG_S)
+
+
 def held(address: Address, asked: Any) -> None:
     client = Client("service", address)
     client.send(("hold", np.zeros(100_000)))
