@@ -29,7 +29,7 @@ CLASSES = {
     "trainer": "TrainerWorker",
     "trainer rank": "TrainerRank",
     "imagination": "ImaginationWorker",
-    "world-model learning": "EnvironmentLearningWorker",
+    "world-model learning": "WorldModelLearningWorker",
 }
 """Target → how Ray calls its processes."""
 DRIVER, EVERYTHING = "driver", "everything"
