@@ -50,7 +50,8 @@ class Placement:
             here = NodeAffinitySchedulingStrategy(self._this_node, soft=False)
             return options | {"scheduling_strategy": here}
         if selector == ALL:
-            return options | {"scheduling_strategy": "SPREAD"}
+            # Ray chooses the node of a worker that takes nothing by chance.
+            return options | {"num_cpus": PART, "scheduling_strategy": "SPREAD"}
         return options | {"resources": {selector: PART}}
 
     def is_here(self, role: str) -> bool:
