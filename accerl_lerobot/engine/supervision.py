@@ -38,6 +38,7 @@ WARNINGS_S, LAST_WARNINGS_S = 5.0, 1.0
 """Interval at which a worker hands over its warnings, and how long its last ones are waited for."""
 GONE_S = 3.0  # how long to wait for a killed process
 ROLLOUT = "rollout"  # name of the rollout workers' part of a checkpoint
+FINAL = (RayTaskError, ActorDiedError)  # errors after which another process would not start either
 RESTARTED = {"max_restarts": -1}
 """Options of an actor that Ray restarts; `RestartedWorker` ends it after too many restarts."""
 
@@ -186,20 +187,20 @@ class RestartedWorker(Worker):
         """Begin the long call of a restarted process once it is ready."""
         if self._starting is None:
             return
-        if not ray.wait([self._starting], timeout=0)[0]:
-            waited = time.monotonic() - self._asked
-            if waited > self.start_timeout(limit):
-                raise WorkerError(f"{self.name} worker did not start again within {waited:.0f} s")
-            return
-        reference, self._starting = self._starting, None
         try:
-            pid = ray.get(reference)
+            pid = ray.get(self._starting, timeout=0)
         except RayError as error:
-            if isinstance(error, RayTaskError | ActorDiedError) or not isinstance(error, RayActorError):
+            waits, waited = isinstance(error, GetTimeoutError), time.monotonic() - self._asked
+            if not waits and (isinstance(error, FINAL) or not isinstance(error, RayActorError)):
                 raise WorkerError(f"{self.name} worker did not start again:\n{error}") from error
-            self._ask_ready()  # the process before was on its way out
+            if waited > self.start_timeout(limit):
+                raise WorkerError(f"{self.name} worker did not start again within {waited:.0f} s") from error
+            if not waits:
+                self._ask_ready()  # the process before was on its way out, or the new one has died
             return
-        if self.process is not None and pid == self.process.pid:
+        self._starting = None
+        if self.process is not None and pid == self.process.pid:  # Ray had only lost sight of it
+            self._end_process()
             self._ask_ready()
             return
         self.started(pid)
