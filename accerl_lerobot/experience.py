@@ -95,7 +95,6 @@ class Segment:
     origin: (
         SegmentStart  # where it begins; of an imagined one, the real observation that it was imagined from
     )
-    world_version: int | None = None  # version of the world model that imagined it, in gradient steps
 
     def __len__(self) -> int:
         return len(self.reward)

@@ -36,11 +36,9 @@ from benchmarks.study import (
 )
 
 ARMS = {
-    "none": ("--imagination.share=0",),
-    "learned": ("--imagination.model=learned", "--imagination.learn.steps_per_episode=5"),
-    "frozen": ("--imagination.model=learned", "--imagination.learn.steps_per_episode=0"),
-    "shuffled": ("--imagination.model=shuffled", "--imagination.learn.steps_per_episode=0"),
-    "oracle": ("--imagination.model=oracle",),
+    "none": ("--imagination.environments=0",),
+    "learned": ("--imagination.learn.steps_per_episode=5",),
+    "frozen": ("--imagination.learn.steps_per_episode=0",),
 }
 """Options of each arm."""
 SPARE = 1.25
@@ -59,8 +57,8 @@ class BenchEfficiencyConfig(StudyConfig):
     seeds: tuple[Seed, ...] = (0, 1, 2, 3, 4)
     """Each a warm start of its own."""
     arms: tuple[Annotated[str, Pattern("|".join(ARMS), " or ".join(ARMS))], ...] = tuple(ARMS)
-    """Compared world models: none, learned (is trained on), frozen (is not), oracle (a simulator), and
-    the placebo shuffled (gets other actions)."""
+    """Compared arms: none (nothing is imagined), learned (the world model goes on to learn), frozen (it does
+    not)."""
     budgets: tuple[Annotated[int, Range("[1, 1000000]")], ...] = (16, 64, 256)
     """Real episodes of a cell, ``rollout.episodes``."""
     decisions: Annotated[int, Range("[1, 100000]")] = 15
@@ -82,9 +80,10 @@ def cells(config: BenchEfficiencyConfig, recipe: RunConfig) -> list[Cell]:
     for seed in config.seeds:
         for budget in config.budgets:
             for arm in config.arms:
-                share = 0.0 if arm == "none" else recipe.imagination.share
-                drawn = SPARE * updates * recipe.trainer.batch_decisions * (1 - share)
+                drawn = SPARE * updates * recipe.trainer.batch_decisions
                 uses = max(1, math.ceil(drawn / (budget * config.decisions)))
+                if arm != "none":  # imagined decisions make up the rest
+                    uses = math.ceil(recipe.replay.samples_per_insert)
                 chosen = (
                     *ARMS[arm],
                     f"--rollout.episodes={budget}",
@@ -110,12 +109,12 @@ def bench_efficiency(config: BenchEfficiencyConfig) -> dict[str, Any]:
         env steps, updates, and what was imagined) and ``groups`` (arm, budget, what `together` and
         `over_none` give, and means of real episodes and env steps and of updates).
     """
-    from accerl_lerobot.engine.imagination import check_imagination
+    from accerl_lerobot.world_model.imagined import check_imagination
 
     recipe = parse(RunConfig, [f"--config_path={config.recipe}"])
     study, console = Study(config, cells(config, recipe)), Console()
     for run in study.runs[: len(config.arms)]:
-        if run.imagination.share:
+        if run.imagination.environments:
             check_imagination(replace(study.starts[run.seed], imagination=run.imagination))
     result = compare(config, study.run(console))
     write(study.root, "efficiency", result, markdown(result), draw)
@@ -125,7 +124,7 @@ def bench_efficiency(config: BenchEfficiencyConfig) -> dict[str, Any]:
 
 def compare(config: BenchEfficiencyConfig, results: Results) -> dict[str, Any]:
     """The study's numbers from the summaries of its runs; see `bench_efficiency`."""
-    rows = results.table(("episodes_explored", "env_steps", "updates", "rl_s", "imagination"))
+    rows = results.table(("episodes_explored", "env_steps", "updates", "rl_s", "imagined_episodes"))
     groups = []
     for arm in config.arms:
         for budget in config.budgets:

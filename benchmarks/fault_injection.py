@@ -51,16 +51,12 @@ POINTS: dict[str, tuple[str, ...]] = {
     "trainer.publish": CRASHES,
     "trainer.write": (*SAVING, FULL),
     "rank.step": CRASHES,
-    "imagination.step": CRASHES,
-    "learning.step": CRASHES,
+    "world_model.learn": CRASHES,
     "driver.metrics": (*UNWATCHED, FULL),
     "driver.save": (*UNWATCHED, FULL),
     "driver.files": UNWATCHED,
     "driver.renamed": (*UNWATCHED, TORN),
-} | {
-    f"{role}.timeline": (FULL,)
-    for role in ("rollout", "inference", "replay", "trainer", "imagination", "learning", "driver")
-}
+} | {f"{role}.timeline": (FULL,) for role in ("rollout", "inference", "replay", "trainer", "driver")}
 """Point → what can be made to happen there. What stands before the dot is whose it is; ``trainer.loss`` and
 ``trainer.backward`` are reached by all of its ranks."""
 _ARMED, _TAKEN = ".armed", ".taken"

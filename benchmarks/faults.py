@@ -38,8 +38,8 @@ from benchmarks.study import last_words
 from benchmarks.tables import as_table, host
 from benchmarks.victims import CLASSES, DRIVER, EVERYTHING, LIGHT, TRAIN, Victim, alive
 
-IMAGINING = ("imagination", "world-model learning")
-"""Targets that are there where anything is imagined."""
+IMAGINING = "world-model learning"
+"""Target that is there where the world model of imagined environments learns."""
 TARGETS = (*CLASSES, DRIVER, EVERYTHING)
 GRACE_S = 60.0
 """How long a run may take to stop when it is asked to."""
@@ -68,7 +68,7 @@ class BenchFaultsConfig(Section):
         "driver",
         "everything",
     )
-    """Processes to strike: these, and where anything is imagined, imagination and world-model learning too.
+    """Processes to strike: these, and where a run imagines, world-model learning too.
     driver: the run's own process, which is gone on with by its command line. everything: it and all below it,
     at once."""
     faults: tuple[str, ...] = FAULTS
@@ -130,9 +130,8 @@ def recipe_of(config: BenchFaultsConfig) -> RunConfig:
         recipe = light_config(updates=ENDLESS, stall_s=config.stall_s)
     else:
         recipe = parse(RunConfig, [f"--config_path={config.recipe}"])
-    for target in IMAGINING:
-        if target in config.targets and not recipe.imagination.share:
-            raise InputError("targets", target, "nothing is imagined in this recipe")
+    if IMAGINING in config.targets and not recipe.imagination.learns:
+        raise InputError("targets", IMAGINING, "no imagined environment's world model learns in this recipe")
     if "trainer rank" in config.targets and config.recipe is not None and recipe.trainer.ranks < 2:
         raise InputError("targets", "trainer rank", "the trainer of this recipe is one process")
     return recipe

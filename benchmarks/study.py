@@ -183,7 +183,7 @@ class Study:
             if revision := pinned(policy).revision:
                 self.common.append(f"--policy.revision={revision}")
         self.starts = {
-            seed: self._parse(seed, ["--trainer.updates=0", "--imagination.share=0"], self.start(seed))
+            seed: self._parse(seed, ["--trainer.updates=0", "--imagination.environments=0"], self.start(seed))
             for seed in config.seeds
         }
         self.runs = [self._of(cell) for cell in self.cells]

@@ -28,8 +28,7 @@ CLASSES = {
     "replay": "ReplayWorker",
     "trainer": "TrainerWorker",
     "trainer rank": "TrainerRank",
-    "imagination": "ImaginationWorker",
-    "world-model learning": "WorldModelLearningWorker",
+    "world-model learning": "OnlineLearningWorker",
 }
 """Target → how Ray calls its processes."""
 DRIVER, EVERYTHING = "driver", "everything"

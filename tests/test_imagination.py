@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from accerl_lerobot.engine.imagination import ImaginationWorker, WorldModelLearningWorker
 
 from accerl_lerobot import cli
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import RunConfig
-from accerl_lerobot.engine.imagination import ImaginationWorker, WorldModelLearningWorker
 from accerl_lerobot.engine.local import LocalEngine
 from accerl_lerobot.engine.loop import Progress
 from accerl_lerobot.engine.run import Run

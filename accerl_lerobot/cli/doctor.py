@@ -229,12 +229,12 @@ def resources(config: RunConfig | None, history: int = 1) -> Iterator[Check]:
 
 def imagination(config: RunConfig) -> Iterator[Check]:
     """Imagination settings against the environment and the policy."""
-    from accerl_lerobot.engine.imagination import check_imagination
+    from accerl_lerobot.world_model.imagined import check_imagination
 
-    share = config.imagination.share
-    if share:
+    count = config.imagination.environments
+    if count:
         check_imagination(config)
-        yield Check("imagination", OK, f"{share:.0%} of every batch; world model: {config.imagination.model}")
+        yield Check("imagination", OK, f"{count} imagined environments per rollout process")
 
 
 def placement(config: RunConfig) -> Iterator[Check]:

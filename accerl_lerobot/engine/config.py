@@ -36,7 +36,7 @@ from accerl_lerobot.world_model.config import (
 __all__ = ["DatasetConfig", "LaunchConfig", "RunConfig", "decode", "encode", "parse"]
 
 
-ROLES = ("trainer", "world_model", "inference", "imagination", "rollout")
+ROLES = ("trainer", "world_model", "inference", "rollout")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +50,7 @@ class LaunchConfig(Section, section="launch"):
     must ask for a token, which is looked for where Ray does: RAY_AUTH_TOKEN, RAY_AUTH_TOKEN_PATH,
     ``~/.ray/auth_token``. None: a private Ray on this machine."""
     placement: dict[str, str] = field(default_factory=dict)
-    """Role (trainer, world_model, inference, imagination or rollout) → nodes of its workers: those with a
+    """Role (trainer, world_model, inference or rollout) → nodes of its workers: those with a
     resource, as in ``ray start --resources='{"simulators": 1}'`` or Ray's own ``node:10.0.0.2``; or all. Not
     given: the node where the run is started, where replay always is."""
     schedule: Schedule = ASYNCHRONOUS
@@ -179,14 +179,13 @@ class RunConfig(Section):
             raise InputError("inference.workers", self.inference.workers, hint)
         batch, length = self.trainer.batch_decisions, self.rollout.segment_length
         if self.trainer.updates:
-            # `engine.imagination` checks that a whole imagined rollout fits too.
             self.replay.check(batch_decisions=batch, segment_decisions=length)
-        share = self.imagination.share
-        if share and not 0 < round(share * batch) < batch:
-            hint = f"that is {round(share * batch)} of the trainer.batch_decisions={batch}; leave both some"
-            raise InputError("imagination.share", share, hint)
-        if self.launch.schedule != ASYNCHRONOUS and (share or self.rollout.episodes):
-            hint = "use asynchronous, or leave out imagination.share and rollout.episodes"
+        imagined = self.imagination.environments
+        if imagined and 0 < self.rollout.episodes < self.rollout.workers:
+            hint = f"each of {self.rollout.workers} rollout workers needs a real episode to imagine from"
+            raise InputError("rollout.episodes", self.rollout.episodes, f"{hint}; use that many, or more")
+        if self.launch.schedule != ASYNCHRONOUS and (imagined or self.rollout.episodes):
+            hint = "use asynchronous, or leave out imagination.environments and rollout.episodes"
             raise InputError("launch.schedule", self.launch.schedule, hint)
 
     def _check_off_policy(self) -> None:
@@ -202,7 +201,7 @@ class RunConfig(Section):
         for name, value, wanted, why in (
             ("replay.samples_per_insert", self.replay.samples_per_insert, 1.0, "draws from its own memory"),
             ("trainer.ranks", self.trainer.ranks, 1, "is learnt by one process"),
-            ("imagination.share", self.imagination.share, 0.0, "learns from real episodes only"),
+            ("imagination.environments", self.imagination.environments, 0, "learns from real episodes only"),
         ):
             if value != wanted:
                 raise InputError(name, value, f"{only} {why}; use {wanted}")
@@ -212,7 +211,6 @@ def lag_limits(config: RunConfig) -> tuple[int, int]:
     """The largest lag under this recipe, and what its pace alone would allow; in updates."""
     early = 1 if config.launch.engine == "ray" else 0  # publications under way, and batches drawn early
     batch, in_flight = config.trainer.batch_decisions, config.rollout.in_flight
-    batch = max(1, batch - round(config.imagination.share * batch))  # real decisions
     counts = {"batch_decisions": batch, "in_flight": in_flight, "prefetch": early}
     counts["pickup"] = early + config.trainer.hold_back
     of_pace = lag_bound(replace(config.replay, max_lag=10**9), **counts)

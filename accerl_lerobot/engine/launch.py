@@ -46,6 +46,7 @@ from accerl_lerobot.policies.config import Load
 from accerl_lerobot.replay.pacing import ASYNCHRONOUS, Schedule
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.transport.connection import ServiceStoppedError
+from accerl_lerobot.world_model.config import WORLD_LEARNING
 
 logger = logging.getLogger(__name__)
 
@@ -90,10 +91,11 @@ class RayEngine(Engine):
         self._rollouts: list[RolloutSlot] = []
         self._inference: list[InferenceReplica] = []
         self._others: list[Worker] = []
-        self._imagining: list[Worker] = []  # the one that imagines, and the world model's trainer
+        self._world_learner: Worker | None = None  # trains the world model of imagined environments
+        self._world: tuple[int, Any] = (0, None)  # its newest version, and the reference of both
         self._updates: list[dict[str, float]] = []
         self._schedule: Schedule = ASYNCHRONOUS
-        self._training = self._real_ended = self._done = self._closed = False
+        self._training = self._collected = self._done = self._closed = False
         self._last_change = time.monotonic()
         self._last_state: tuple[object, ...] = ()
         self._owns_ray = not ray.is_initialized()
@@ -118,11 +120,6 @@ class RayEngine(Engine):
             replica.trainer = self._trainer.actor
             if not replica.is_starting:
                 replica.call("follow", self._trainer.actor, timeout=self._limit)
-        # The last replica: the first ones may have one rollout worker more.
-        asks: tuple[Any, ...] = (self._inference[-1].endpoint, self._replay.endpoint)
-        for worker in self._imagining:
-            worker.work = worker.actor.run.remote(*asks, self._replay.actor)
-            asks = (worker.actor,)  # the learner of the world model talks to the one that imagines
 
     def follow(self, schedule: Schedule) -> None:
         """Change the schedule of collecting and learning, see `replay.pacing`."""
@@ -147,6 +144,7 @@ class RayEngine(Engine):
             slot.ask_report(self._training and not self._done, self._schedule != ASYNCHRONOUS)
         self._await_end()
         episodes = self._listen()
+        self._hand_over_world()
         self._supervise()
         updates, self._updates = self._updates, []
         if updates:
@@ -161,7 +159,7 @@ class RayEngine(Engine):
             rollout=dict(total_counters(self._rollouts)),
             replay=self._replay.last_answer or {},
             inference=merge_metrics(served) | {"restarts": float(restarts)},
-            imagination={k: v for w in self._imagining for k, v in (w.last_answer or {}).items()},
+            world_model=(self._world_learner.last_answer or {}) if self._world_learner else {},
         )
         self._check_moving(progress)
         return progress
@@ -173,11 +171,10 @@ class RayEngine(Engine):
         reported = self._updates + (self._hear(self._trainer, self._limit) or [])
         self._updates = []
         version, records = self._trainer.call("hold", timeout=self._limit)  # it waits for an update at most
-        # At once, so that little comes in that was decided by weights of later updates. The imaginer may
-        # know of more than replay then; it is told anew of what comes after.
+        # At once, so that little comes in that was decided by weights of later updates.
         self._replay.call("save", state, version, timeout=self._limit)
-        for worker in reversed(self._imagining):
-            worker.call("save", directory, timeout=self._limit)
+        if self._world_learner is not None:
+            self._world_learner.call("save", directory, timeout=self._limit)
         self._trainer.call("write", directory, timeout=self._limit)
         save_rollouts(state, self._rollouts)
         self._last_change = time.monotonic()
@@ -237,23 +234,24 @@ class RayEngine(Engine):
             arguments = (c.seed, c.trainer.num_threads, timeline)
             world_model = add(WORLD_MODEL_WORKER, WorldModelWorker, "world_model", 4, *arguments).actor
         replicas = numbered("inference", c.inference.workers)
-        learning = (learner, timeline, ranks, c.folder, world_model, replicas)
+        if imagination.learns:
+            from accerl_lerobot.world_model.online import OnlineLearningWorker
+
+            self._world_learner = add(
+                WORLD_LEARNING, OnlineLearningWorker, "world_model", 4, c, state, timeline
+            )
+        online = self._world_learner.actor if self._world_learner else None
+        learning = (learner, timeline, ranks, c.folder, world_model, replicas, online)
         self._trainer = add("trainer", TrainerWorker, "trainer", 4 + len(replicas), *learning)
         deciding = (c.policy, c.inference, self._version, state, load, timeline)
         for name in replicas:
             actor = make(InferenceWorker, "inference", 1000, *deciding, name, in_cluster, **RESTARTED)
             is_here = placement.is_here("inference")
             self._inference.append(InferenceReplica(name, actor, c.launch.max_restarts, is_here))
-        imagined = imagination.imagined_replay(c.replay) if imagination.share else None
-        stores = (c.replay, c.seed, imagined, c.rollout.episodes > 0, state, c.folder, timeline, in_cluster)
+        stores = (c.replay, c.seed, state, c.folder, timeline, in_cluster)
         self._replay = add("replay", ReplayWorker, "replay", 1000, *stores)
-        if imagination.share:
-            from accerl_lerobot.engine.imagination import ImaginationWorker, WorldModelLearningWorker
-
-            for kind in (ImaginationWorker, WorldModelLearningWorker)[: 1 + imagination.learns]:
-                self._imagining.append(add(kind.name, kind, "imagination", 4, c, state, timeline))
         for index in range(c.rollout.workers):
-            collecting = (c.env, c.rollout, f"rollout {index}", history, timeline)
+            collecting = (c.env, c.rollout, f"rollout {index}", history, timeline, imagination)
             actor = make(RolloutWorker, "rollout", 4, *collecting, **RESTARTED, **NO_HUB_TOKEN)
             self._rollouts.append(RolloutSlot(index, actor, c, tasks, placement.is_here("rollout")))
         if state is not None:
@@ -297,7 +295,7 @@ class RayEngine(Engine):
             return
         if worker is self._trainer:
             self._finish(int(result))
-        elif not (self._done and worker in (self._replay, *self._imagining)):
+        elif not (self._done and worker is self._replay):
             raise WorkerError(f"{worker.name} worker ended without being asked to")
 
     def _blame(self) -> None:
@@ -326,10 +324,22 @@ class RayEngine(Engine):
                 self._updates += answer or []
             elif answer is not None and isinstance(worker, RolloutSlot):
                 episodes += worker.take(answer)
-        if not self._real_ended and all(slot.spent for slot in self._rollouts):
-            self._real_ended = True
-            self._replay.call("change", real_ended=True, timeout=self._limit)
+        imagining = self._config.imagination.environments > 0
+        if not self._collected and not imagining and all(slot.spent for slot in self._rollouts):
+            self._collected = True
+            self._replay.call("end", timeout=self._limit)
         return episodes
+
+    def _hand_over_world(self) -> None:
+        """Give a new version of the world model to the rollout workers."""
+        learner = self._world_learner
+        if learner is None or not learner.last_answer or learner.last_answer["version"] <= self._world[0]:
+            return
+        self._world = int(learner.last_answer["version"]), learner.actor.weights.remote()
+        for slot in self._rollouts:
+            slot.world = self._world[1]
+            if not slot.is_starting:
+                slot.actor.imagine_with.remote(slot.world)
 
     def _hear(self, worker: Worker, timeout: float = 0.0) -> Any:
         try:
@@ -355,10 +365,9 @@ class RayEngine(Engine):
 
     def _check_moving(self, progress: Progress) -> None:
         """End a run in which every worker answers and nothing moves."""
-        imagined = tuple(progress.imagination.get(k) for k in ("decisions", "learn_steps", "validation_s"))
         reports = [slot.last_answer for slot in self._rollouts if slot.last_answer is not None]
         moves = sum(report.moves for report in reports)
-        state = (progress.version, moves, progress.rollout["restarts"], imagined)
+        state = (progress.version, moves, progress.rollout["restarts"])
         now = time.monotonic()
         outstanding = any(slot.outstanding for slot in self._rollouts)
         waiting = outstanding or (self._training and not self._done)

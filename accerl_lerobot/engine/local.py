@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The engine in one process, without Ray: the same parts, called in turn, deterministic for a seed.
 
-Every poll all environments and all imagined rollouts get a decision and step it, and there is one update, as
+Every poll all environments, real and imagined, get a decision and step it, and there is one update, as
 the pace allows. For tests and debugging. Weights reach the acting policy at once, so the lag comes from
 replay alone, unless `trainer.hold_back` asks for more.
 """
@@ -12,25 +12,25 @@ import logging
 from collections import deque
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from accerl_lerobot.checkpoint import snapshot
-from accerl_lerobot.checkpoint.layout import PRETRAINED, TRAINING_STATE, WEIGHTS, WORLD_MODEL
+from accerl_lerobot.checkpoint.layout import PRETRAINED, TRAINING_STATE, WEIGHTS
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.loop import Engine, Progress, Saved
 from accerl_lerobot.envs import make_environment
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import IMAGINED, REAL, Request, Segment
+from accerl_lerobot.experience import REAL, Observation, Request, Segment
 from accerl_lerobot.policies.config import Load, loader
-from accerl_lerobot.replay.buffer import MixedReplay
+from accerl_lerobot.replay.buffer import Replay
 from accerl_lerobot.replay.journal import EPISODES, Journal
-from accerl_lerobot.rollout.runner import EpisodePlan, EpisodePlans, EpisodeResult, RolloutRunner
+from accerl_lerobot.rollout.runner import MOST_STARTS, EpisodePlan, EpisodePlans, EpisodeResult, RolloutRunner
 from accerl_lerobot.seeds import global_generators, restore_global_generators
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, WEIGHT_SYNC, open_clock
 from accerl_lerobot.trainer.batch import save_batch_if_not_finite
 from accerl_lerobot.transport.weights import PublishDelay
-from accerl_lerobot.world_model.config import IMAGINATION
 
 logger = logging.getLogger(__name__)
 
@@ -63,17 +63,8 @@ class LocalEngine(Engine):
         if config.trainer.hold_back:
             self._acting = loader(load)(config.policy)
             self._acting.load_trainable(self._adapter.export_trainable())
-        imagination = config.imagination
         journal = None if config.folder is None else Journal(config.folder / EPISODES)
-        imagined, counted = imagination.imagined_replay(config.replay), config.rollout.episodes > 0
-        self._replay = MixedReplay(config.replay, imagined, imagination.share, counted, journal)
-        self._imagination = self._world_learner = None
-        if imagination.share:
-            from accerl_lerobot.engine.imagination import make_imagination, make_learner
-
-            self._imagination = make_imagination(config, self._replay.insert)
-            if imagination.learns:
-                self._world_learner = make_learner(config)
+        self._replay = Replay(config.replay, journal)
         self._rng = np.random.default_rng(config.seed)
         self._episodes: list[EpisodeResult] = []
         self._training = False
@@ -82,14 +73,22 @@ class LocalEngine(Engine):
         environments = [
             make_environment(config.env, history, config.rollout.reward_model) for _ in range(count)
         ]
+        starts: deque[tuple[str, Observation]] = deque(maxlen=MOST_STARTS)
+        self._world: Any = None
+        self._world_learner: Any = None
+        if config.imagination.environments:
+            from accerl_lerobot.world_model.imagined import imagined_environments
+            from accerl_lerobot.world_model.online import make_learner
+
+            imagined = config.imagination.environments * config.rollout.workers
+            spec = environments[0].spec
+            self._world, more = imagined_environments(config.imagination, imagined, spec, starts)
+            environments += more
+            if config.imagination.learns:
+                self._world_learner = make_learner(config)
         self._plans = EpisodePlans(tasks, config.seed, config.rollout.episodes or None)
         self._runner = RolloutRunner(
-            environments,
-            lambda: self._plans.next(self._exploring),
-            config.rollout,
-            "local",
-            self._outbox.append,
-            self._end,
+            environments, self._next, config.rollout, "local", self._outbox.append, self._end, starts
         )
         if state is not None:
             self._restore(state)
@@ -107,7 +106,6 @@ class LocalEngine(Engine):
         self._act()
         self._store()
         self._learn_world()
-        self._imagine()
         updates = []
         n = self._config.trainer.batch_decisions
         if self._exploring and self._replay.may_sample(n):
@@ -118,8 +116,7 @@ class LocalEngine(Engine):
                 self._publish()
         self._clock.enter(WAIT_IN)
         episodes, self._episodes[:] = list(self._episodes), []
-        parts = (part for part in (self._imagination, self._world_learner) if part is not None)
-        imagined = {name: value for part in parts for name, value in part.metrics().items()}
+        learner = self._world_learner
         return Progress(
             version=self._update.version,
             done=self._training and not self._exploring,
@@ -127,7 +124,7 @@ class LocalEngine(Engine):
             episodes=episodes,
             rollout={k: float(v) for k, v in asdict(self._runner.counters).items()},
             replay=self._replay.metrics(),
-            imagination=imagined,
+            world_model={} if learner is None else learner.metrics(),
             inference={"version": float(self._acting_version)},
         )
 
@@ -149,10 +146,12 @@ class LocalEngine(Engine):
             "runner": self._runner.state(),
         }
         snapshot.save(state / LOCAL, engine)
-        if self._imagination is not None:
-            learner = None if self._world_learner is None else self._world_learner.state()
-            snapshot.save(state / IMAGINATION, {"imagination": self._imagination.state(), "learner": learner})
-            self._imagination.save_promoted(directory / WORLD_MODEL)
+        if self._world_learner is not None:
+            from accerl_lerobot.world_model.online import ONLINE, save_online
+
+            acting = {"version": self._world.version, "weights": self._world.tensors()}
+            snapshot.save(state / ONLINE, {"learner": self._world_learner.state(), "acting": acting})
+            save_online(directory, self._world_learner)
         self._clock.enter(WAIT_IN)
         return Saved(self._update.version, [])
 
@@ -172,21 +171,25 @@ class LocalEngine(Engine):
         self._outbox.extend(engine["outbox"])
         self._plans.restore(engine["plans"])
         self._runner.restore(engine["runner"])
-        if self._imagination is not None:
-            imagined = snapshot.load(directory / IMAGINATION)
-            self._imagination.restore(imagined["imagination"])
-            if self._world_learner is not None:
-                self._world_learner.restore(imagined["learner"])
+        if self._world_learner is not None:
+            from accerl_lerobot.world_model.online import ONLINE
+
+            saved = snapshot.load(directory / ONLINE)
+            self._world_learner.restore(saved["learner"])
+            self._world.load(saved["acting"]["version"], saved["acting"]["weights"])
         restore_global_generators(engine["generators"])
 
     def close(self) -> None:
         try:
             self._clock.close()
             self._runner.close()
-            if self._imagination is not None:
-                self._imagination.close()
         except Exception:
             logger.exception("could not close all environments")
+
+    def _next(self, source: str) -> EpisodePlan | None:
+        if source == REAL:
+            return self._plans.next(self._exploring)
+        return self._plans.next_imagined(self._exploring, self._runner.starts)
 
     def _end(self, result: EpisodeResult) -> None:
         self._plans.ended(result)
@@ -213,30 +216,14 @@ class LocalEngine(Engine):
             for slot, decision in zip(due, decisions, strict=True):
                 runner.advance(slot, decision)
 
-    def _imagine(self) -> None:
-        """One decision in every imagined rollout, if any is wanted."""
-        if self._imagination is None or not self._training:
-            return
-        learner, on = self._world_learner, self._imagination.on
-        awaited = learner is not None and learner.may_promote(self._replay.real_ended)
-        self._replay.share = self._config.imagination.share if on else 0.0
-        self._replay.awaited = on or awaited
-        if not self._exploring:
-            return
-        if self._replay.may_insert(IMAGINED) and (requests := self._imagination.requests()):
-            self._imagination.advance(self._acting.decide(requests, self._acting_version))
-
     def _learn_world(self) -> None:
-        """One gradient step of the world model, or its validation, if either is due."""
-        learner, last = self._world_learner, self._replay.real_ended
-        if learner is None or self._imagination is None or not self._training:
+        """One gradient step of the world model, if one is due; its environments use it once none is."""
+        learner = self._world_learner
+        if learner is None or not self._training or learner.pending_steps < 1:
             return
-        if learner.pending_steps >= 1:
-            learner.step()
-        elif learner.validation_due(last) and (promotion := learner.promote(last)):
-            self._imagination.swap(promotion)
-            learner.mark_served()
-        self._replay.held = learner.validation_due(last=False) and not last
+        learner.step()
+        if learner.pending_steps < 1:
+            self._world.load(learner.version, learner.world.tensors())
 
     def _publish(self) -> None:
         """Give weights to the acting policy, which is the trainer's own unless they are delayed."""
@@ -252,13 +239,9 @@ class LocalEngine(Engine):
             self._acting_version = number
 
     def _store(self) -> None:
-        while self._outbox and self._replay.may_insert(REAL):
+        while self._outbox and self._replay.may_insert():
             segment = self._outbox.popleft()
-            if not self._replay.insert(segment):
-                continue
-            if self._imagination is not None:
-                self._imagination.remember(segment)
-            if self._world_learner is not None:
+            if self._replay.insert(segment) and self._world_learner is not None:
                 self._world_learner.add(segment)
-        if self._plans.spent and not self._outbox and not self._runner.exploring:
-            self._replay.real_ended = True
+        if self._world is None and self._plans.spent and not self._outbox and not self._runner.exploring:
+            self._replay.ended = True

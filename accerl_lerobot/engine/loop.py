@@ -14,8 +14,9 @@
     run         reports of the four   evaluations,        the next report             after the last
                                       checkpoints                                     evaluation
 
-The four are processes in `launch`, and take turns in one process in `local`. With imagined rollouts there are
-two more, see `imagination`.
+The four are processes in `launch`, and take turns in one process in `local`. Where a world model learns in
+the run, it has a process too: `world_model.worker` for the state of critic and teacher, `world_model.online`
+for imagined environments, which rollout workers step like real ones.
 """
 
 from __future__ import annotations
@@ -47,6 +48,7 @@ from accerl_lerobot.evaluation import (
     success_curve,
     summarise,
 )
+from accerl_lerobot.experience import IMAGINED, REAL
 from accerl_lerobot.metrics import MetricsLog, plain
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.timeline import CHECKPOINT, EVALUATION, TRAINING, Clock, NoClock
@@ -59,8 +61,8 @@ HOPELESS = 50  # exploring episodes without a success after which the user is to
 RECENT = 100  # exploring episodes over which the training success of the curve is averaged
 COUNTERS = ("decisions", "episodes", "dropped_nonfinite", "dropped_episodes")  # of a runner, in the summary
 _STATE = (
-    "before", "evaluations", "curve", "recent", "explored", "won", "note", "lags", "lag_max", "mismatch_max",
-    "during", "base", "steps", "evaluated", "saved",
+    "before", "evaluations", "curve", "recent", "imagined", "explored", "won", "note", "lags", "lag_max",
+    "mismatch_max", "during", "base", "steps", "evaluated", "saved",
 )  # fmt: skip
 
 
@@ -77,7 +79,7 @@ class Progress:
     """Counters over all rollout workers since the run began."""
     replay: dict[str, float] = field(default_factory=dict)
     inference: dict[str, float] = field(default_factory=dict)
-    imagination: dict[str, float] = field(default_factory=dict)  # empty where nothing is imagined
+    world_model: dict[str, float] = field(default_factory=dict)  # empty where no imagined one learns
 
 
 class Saved(NamedTuple):
@@ -187,6 +189,7 @@ class Loop:
         self.evaluations: list[dict[str, Any]] = []
         self.curve: list[tuple[float, float]] = []
         self.recent: list[bool] = []
+        self.imagined: list[bool] = []  # the same, of imagined episodes
         self.explored = self.won = 0  # exploring episodes that have ended, and successes among them
         self.note = ""  # of the last of them that had one, see `EpisodeResult`
         self.lags: list[float] = []
@@ -321,7 +324,8 @@ class Loop:
             "rl_s": self.times.rl_s,
             "episodes_explored": self.explored,
             "note": self.note,
-            "imagination": last.imagination,
+            "imagined_decisions": int(self._since(last, "imagined_decisions")),
+            "imagined_episodes": int(self._since(last, "imagined_episodes")),
             "algorithm": self.config.algorithm.type,
             "tasks": list(self.tasks),
             "seed": self.config.seed,
@@ -355,7 +359,9 @@ class Loop:
     def _record(self, progress: Progress) -> None:
         self.times.clock.beat()
         self._record_updates(progress.updates)
-        explored = [e for e in progress.episodes if e.plan.explore]
+        explored = [e for e in progress.episodes if e.plan.explore and e.plan.source == REAL]
+        imagined = [e.success for e in progress.episodes if e.plan.source == IMAGINED]
+        self.imagined = (self.imagined + imagined)[-RECENT:]
         self.explored += len(explored)
         self.won += sum(e.success for e in explored)
         _warn_of_notes(progress.episodes)
@@ -366,14 +372,16 @@ class Loop:
         # The first episodes to end are the short ones, which are successes.
         if explored and len(self.recent) >= RECENT // 4 and math.isinf(self.steps):  # it is training
             self.curve.append((self._steps(progress), share))
-        # Imagination and learning go on once all real episodes have been played.
+        # Imagined episodes and learning go on once all real episodes have been played.
         if explored or any(metrics["update"] % RECORD_EVERY == 0 for metrics in progress.updates):
             values = progress.rollout | {"success_exploring": share}
+            if self.imagined:
+                values["success_imagined"] = float(np.mean(self.imagined))
             if explored:
                 sums = np.sum([(e.episode_return, e.steps, e.decisions) for e in explored], axis=0)
                 names = ("episode_return", "episode_steps", "episode_decisions")
                 values |= dict(zip(names, sums / len(explored), strict=True))
-            for part in ("replay", "inference", "imagination"):
+            for part in ("replay", "inference", "world_model"):
                 values |= {f"{part}_{k}": v for k, v in getattr(progress, part).items()}
             self.log.write("rollout", progress.version, values)
         for episode in progress.episodes:

@@ -29,12 +29,10 @@ class Placement:
     def __init__(self, config: RunConfig, nodes: list[dict[str, float]], this_node: str = "") -> None:
         """`nodes` are the resources of each node, this one first; `this_node` is Ray's id of that."""
         self._nodes, self._this_node, self._selectors = nodes, this_node, config.launch.placement
-        imagining = bool(config.imagination.share) + config.imagination.learns
         self._workers = {
             "trainer": config.trainer.ranks,
-            "world_model": int(learns_states(config)),
+            "world_model": int(learns_states(config) or config.imagination.learns),
             "inference": config.inference.workers,
-            "imagination": imagining,
             "rollout": config.rollout.workers,
         }
         self._check_resources()

@@ -260,8 +260,8 @@ class Run:
         if self.spec is None:
             self.spec = check_environment(self.config.env)
         check_placement(replace(self.config, output_dir=str(self.directory)))
-        if self.config.imagination.share:
-            from accerl_lerobot.engine.imagination import check_imagination
+        if self.config.imagination.environments:
+            from accerl_lerobot.world_model.imagined import check_imagination
 
             check_imagination(self.config)
 

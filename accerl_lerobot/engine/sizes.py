@@ -53,8 +53,8 @@ def memory_parts_gib(config: RunConfig, history: int = 1) -> dict[str, float]:
     )  # as shared by a process's environments
     pictures = history * observation_bytes(config) / GIB
     loaded = 2 + config.trainer.ranks  # the driver, inference and the trainer each load torch
-    imagination = config.imagination  # a second store, and one or two processes that load torch
-    workers = 0.0 if local else (1 + imagination.learns) * POLICY_PROCESS_GIB
+    imagination = config.imagination  # rollout processes load torch too, and one more process learns
+    imagining = rollout.workers * (imagination.environments > 0) + imagination.learns
     longest = config.env.max_steps or MAX_STEPS
     frames = min(films.videos, films.episodes) * longest / FILM[1]
     return {
@@ -65,7 +65,7 @@ def memory_parts_gib(config: RunConfig, history: int = 1) -> dict[str, float]:
         "rollout.segment_length": rollout.in_flight * pictures,
         "replay.capacity": config.replay.capacity * pictures,
         "algorithm.memory": config.remembered * pictures,
-        "imagination.share": 0.0 if not imagination.share else config.replay.capacity * pictures + workers,
+        "imagination.environments": 0.0 if local else imagining * POLICY_PROCESS_GIB,
         "evaluation.videos": frames * 3 * FILM[0] ** 2 / GIB,
     }
 

@@ -26,6 +26,7 @@ from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.stopping import WorkerError
 from accerl_lerobot.errors import InputError, last_exception
+from accerl_lerobot.experience import REAL
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodePlans, EpisodeResult, budgets, incarnation_after
 from accerl_lerobot.rollout.worker import Report
 from accerl_lerobot.transport.endpoint import Endpoint
@@ -237,6 +238,7 @@ class RolloutSlot(RestartedWorker):
         self.past: Counter[str] = Counter()  # counters of processes that have ended
         self.budget = budgets(config.rollout)[index]
         self.spent = self.budget == 0  # True if replay has all episodes of the budget
+        self.world: Any = None  # reference of a version of the world model, and its weights
         self._unsent: list[EpisodePlan] = []
         self._tasks, self._seed, self._environments = tasks, config.seed, config.rollout.environments
 
@@ -256,13 +258,16 @@ class RolloutSlot(RestartedWorker):
         return (EpisodePlans(self._tasks, self._seed, self.budget, self.index, self.incarnation),)
 
     def begin(self) -> None:
+        if self.world is not None:
+            self.actor.imagine_with.remote(self.world)
         self.at_work(self.actor.run.remote(*self.services))
 
     def take(self, report: Report) -> list[EpisodeResult]:
         """Note a report; the episodes in it."""
         self.spent = report.spent
         if self.budget is not None:
-            self.budget -= sum(episode.plan.explore for episode in report.episodes)
+            plans = [episode.plan for episode in report.episodes]
+            self.budget -= sum(plan.explore and plan.source == REAL for plan in plans)
         known = self.outstanding
         return [e for e in report.episodes if known.pop((e.plan.group, e.plan.index), None) or e.plan.explore]
 

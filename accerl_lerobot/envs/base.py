@@ -24,7 +24,7 @@ from accerl_lerobot.config.parsing import encoded_defaults
 from accerl_lerobot.config.ranges import Range, Section, registered_name
 from accerl_lerobot.envs.graphics import start_graphics
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Observation
+from accerl_lerobot.experience import ENVIRONMENT_STATE, REAL, TASK, Observation
 from accerl_lerobot.seeds import EVAL_SEEDS
 
 
@@ -76,6 +76,8 @@ class Environment(ABC):
     """
 
     spec: EnvironmentSpec
+    source: ClassVar[str] = REAL
+    """Source of the segments that are collected in it: ``real`` or ``imagined``."""
 
     @abstractmethod
     def reset(self, seed: int, task: str) -> Observation:
@@ -91,6 +93,14 @@ class Environment(ABC):
     @abstractmethod
     def render(self, height: int, width: int) -> np.ndarray:
         """A frame for people, uint8 (height, width, 3); does not change the state."""
+
+    def state(self) -> Any:
+        """The episode under way, for `restore`; None where doing it again brings it back."""
+        return None
+
+    def restore(self, state: Any) -> None:
+        """Goes on with the episode of a `state`."""
+        raise NotImplementedError
 
     def close(self) -> None:  # noqa: B027 - most environments hold nothing
         """Frees the simulator. Safe to call twice."""

@@ -25,7 +25,6 @@ DRAWS = 1024
 """Last draws that are remembered, to be taken back in `Replay.state`: a trainer draws one batch ahead, and
 goes on while it is saved."""
 BATCH_SHARE = 0.5  # share of a batch that is one, when no more will come
-FILL_SHARE = 0.9  # share of the real store up to which it is filled without anything being drawn
 
 
 @kind
@@ -35,6 +34,7 @@ class ReplayCounters:
 
     inserted_segments: int = 0
     inserted_decisions: int = 0
+    inserted_imagined: int = 0  # those of the decisions that are imagined
     evicted_segments: int = 0
     evicted_decisions: int = 0
     evicted_unused: int = 0
@@ -43,6 +43,7 @@ class ReplayCounters:
     retired_unused: int = 0
     dropped_nonfinite: int = 0  # segments refused because they hold a NaN or an infinity
     trained_decisions: int = 0  # drawn by the trainer, repetitions counted
+    trained_imagined: int = 0
     unique_decisions: int = 0  # drawn at least once
 
 
@@ -57,6 +58,7 @@ class _Entry:
 
     def __post_init__(self) -> None:
         self.size, self.oldest = len(self.segment), int(self.segment.version.min())
+        self.imagined = self.segment.source != REAL
 
     @property
     def available(self) -> bool:
@@ -64,10 +66,15 @@ class _Entry:
 
 
 class Replay:
-    """Segments in, batches of segments out; no clock, no process, no policy."""
+    """Segments in, batches of segments out; no clock, no process, no policy.
 
-    def __init__(self, config: ReplayConfig) -> None:
+    Real segments that are stored are noted in the `journal`.
+    """
+
+    def __init__(self, config: ReplayConfig, journal: Journal | None = None) -> None:
         self.config, self.counters = config, ReplayCounters()
+        self.ended = False  # True if no segment will come any more
+        self._journal = journal
         self.stored_decisions = 0
         self.available_decisions = 0  # decisions of the segments with draws left
         self._entries: deque[_Entry] = deque()  # oldest first
@@ -84,8 +91,17 @@ class Replay:
         return self.config.may_insert(self.stored_decisions, self.available_decisions)
 
     def may_sample(self, batch_decisions: int) -> bool:
-        """True if the trainer should draw a batch now; `sample` itself does not wait for the warm start."""
+        """True if the trainer should draw a batch now; `sample` itself does not wait for the warm start.
+
+        Once all segments have come, few decisions may be less than a batch: then they are one.
+        """
+        if self.ended:
+            return self.available_decisions >= BATCH_SHARE * batch_decisions
         return self.config.may_sample(self.stored_decisions, self.available_decisions, batch_decisions)
+
+    def exhausted(self, batch_decisions: int) -> bool:
+        """True if there is no batch and never will be."""
+        return self.ended and not self.may_sample(batch_decisions)
 
     def insert(self, segment: Segment) -> bool:
         """Stores a segment, by reference, and evicts the oldest ones if room is needed.
@@ -102,6 +118,11 @@ class Replay:
         self._add(_Entry(segment, draws))
         self.counters.inserted_segments += 1
         self.counters.inserted_decisions += n
+        if segment.source == REAL:
+            if self._journal is not None:
+                self._journal.write(segment)
+        else:
+            self.counters.inserted_imagined += n
         return True
 
     def sample(self, num_decisions: int, trainer_version: int, rng: np.random.Generator) -> list[Segment]:
@@ -112,6 +133,8 @@ class Replay:
         although `may_sample` held, when segments were too old: try again later.
         """
         self.retire(trainer_version)
+        if self.ended and self.may_sample(num_decisions):
+            num_decisions = min(num_decisions, self.available_decisions)
         if self.available_decisions < num_decisions:
             return []
         available = [entry for entry in self._entries if entry.available]
@@ -119,6 +142,7 @@ class Replay:
         drawn: list[_Entry] = []
         for entry in sorted(shuffled, key=lambda entry: entry.uses):
             self.counters.trained_decisions += entry.size
+            self.counters.trained_imagined += entry.size if entry.imagined else 0
             self.counters.unique_decisions += 0 if entry.uses else entry.size
             entry.uses += 1
             self.available_decisions -= 0 if entry.available else entry.size
@@ -147,18 +171,24 @@ class Replay:
         counters = replace(self.counters)
         for entry, count in back.items():
             counters.trained_decisions -= count * entry.size
+            counters.trained_imagined -= count * entry.size if entry.imagined else 0
             if count == entry.uses:
                 counters.unique_decisions -= entry.size
                 if entry.left:
                     vars(counters)[f"{entry.left}_unused"] += 1
         entries = [{"segment": e.segment, "draws": e.draws, "uses": e.uses - back[e]} for e in self._entries]
-        return {"counters": counters, "entries": entries, "remainder": self._remainder}
+        journal = None if self._journal is None else self._journal.save()
+        state = {"counters": counters, "entries": entries, "remainder": self._remainder}
+        return state | {"ended": self.ended, "journal": journal}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Resumes from `state`, before the first insert."""
         self.counters, self._remainder = state["counters"], state["remainder"]
-        for held in state["entries"]:
-            self._add(_Entry(**held))
+        self.ended = state["ended"]
+        for entry in state["entries"]:
+            self._add(_Entry(**entry))
+        if self._journal is not None and state["journal"] is not None:
+            self._journal.cut(state["journal"])
 
     def retire(self, trainer_version: int) -> None:
         """Takes out what is too old for a trainer that has made so many updates."""
@@ -185,110 +215,3 @@ def is_finite(segment: Segment) -> bool:
     """True if no floating-point number of the segment is a NaN or an infinity."""
     arrays = [segment.log_prob, segment.reward, *segment.latent.values(), *segment.observations.values()]
     return all(bool(np.isfinite(a).all()) for a in arrays if np.issubdtype(a.dtype, np.inexact))
-
-
-class MixedReplay:
-    """Real and imagined experience side by side, each with its own size and pace.
-
-    A batch takes its imagined share from one store and the rest from the other, and is drawn only when both
-    can give. Two things end that:
-
-    * the real episodes that were paid for have all been collected (`real_ended`): from then on a batch takes
-      what draws they have left, and imagined ones for the rest;
-    * nothing is imagined, yet or any more (`share` is 0): a batch is real. But where real episodes are
-      counted (`patient`), they are not used up while a world model is learnt that is to imagine from them: as
-      long as there is room for more of them, they are let in and there is no batch.
-
-    When neither can give, and neither ever will, the replay is *exhausted*. Real segments that are stored are
-    noted in the journal.
-    """
-
-    def __init__(
-        self,
-        real: ReplayConfig,
-        imagined: ReplayConfig,
-        share: float,
-        patient: bool = False,
-        journal: Journal | None = None,
-    ) -> None:
-        self._patient, self._journal = patient, journal
-        self.real, self.imagined, self.share = Replay(real), Replay(imagined), share
-        self.real_ended = False  # True if no real segment will come any more
-        self.awaited = share > 0  # True if anything may be imagined later on, although nothing is now
-        self.held = False
-        """True if real episodes, if they are counted, wait: what is here is to be learnt from first."""
-
-    def may_insert(self, source: str = REAL) -> bool:
-        if source != REAL:
-            return self.imagined.may_insert()
-        return not (self.held and self._patient) and (self.real.may_insert() or self._waits)
-
-    def insert(self, segment: Segment) -> bool:
-        if segment.source != REAL:
-            return self.imagined.insert(segment)
-        stored = self.real.insert(segment)
-        if stored and self._journal is not None:
-            self._journal.write(segment)
-        return stored
-
-    def may_sample(self, batch_decisions: int) -> bool:
-        return self._parts(batch_decisions) is not None
-
-    def exhausted(self, batch_decisions: int) -> bool:
-        """True if there is no batch and never will be."""
-        hopeless = self.real_ended and not self.share and not self.awaited
-        return hopeless and not self.may_sample(batch_decisions)
-
-    def sample(self, num_decisions: int, trainer_version: int, rng: np.random.Generator) -> list[Segment]:
-        """See `Replay.sample`: empty, with nothing counted as used, if a part cannot be had."""
-        self.real.retire(trainer_version)
-        self.imagined.retire(trainer_version)
-        real, imagined = self._parts(num_decisions) or (0, 0)
-        drawn = self.real.sample(real, trainer_version, rng) if real else []
-        return drawn + (self.imagined.sample(imagined, trainer_version, rng) if imagined else [])
-
-    def state(self, version: int | None = None) -> dict[str, Any]:
-        return {
-            "real": self.real.state(version),
-            "imagined": self.imagined.state(version),
-            "journal": None if self._journal is None else self._journal.save(),
-            **{name: getattr(self, name) for name in _STATE},
-        }
-
-    def restore(self, state: dict[str, Any]) -> None:
-        self.real.restore(state["real"])
-        self.imagined.restore(state["imagined"])
-        for name in _STATE:
-            setattr(self, name, state[name])
-        if self._journal is not None and state["journal"] is not None:
-            self._journal.cut(state["journal"])
-
-    def metrics(self) -> dict[str, float]:
-        """Metrics of the real store, and as ``imagined_…`` of the other where anything is imagined."""
-        if not (self.share or self.awaited or self.imagined.counters.inserted_segments):
-            return self.real.metrics()
-        imagined = {f"imagined_{k}": v for k, v in self.imagined.metrics().items()}
-        return self.real.metrics() | imagined | {"imagined_share": self.share}
-
-    @property
-    def _waits(self) -> bool:
-        has_space = self.real.stored_decisions < FILL_SHARE * self.real.config.capacity
-        return self._patient and self.awaited and not self.share and has_space
-
-    def _parts(self, batch: int) -> tuple[int, int] | None:
-        """Decisions to draw from either store; None if one of them cannot give its part."""
-        if self._waits:
-            return None
-        real, left = batch - round(self.share * batch), self.real.available_decisions
-        if self.real_ended and not self.share:
-            # Few episodes may be less than a batch: then they are one.
-            return (min(batch, left), 0) if left >= BATCH_SHARE * batch else None
-        if self.real_ended:
-            real = min(real, left)
-        elif real and not self.real.may_sample(real):
-            return None
-        imagined = batch - real
-        return None if imagined and not self.imagined.may_sample(imagined) else (real, imagined)
-
-
-_STATE = ("share", "real_ended", "awaited", "held")

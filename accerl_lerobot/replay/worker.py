@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The replay process, between rollout workers, imagination and the trainer.
+"""The replay process, between rollout workers and the trainer.
 
 `insert` waits until rollouts are not too far ahead, and `sample` for enough that is new; where they take
 turns, each waits for the other too. `close` ends all waits.
@@ -10,36 +10,22 @@ from __future__ import annotations
 import asyncio
 import copy
 import os
-from collections import deque
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 
 from accerl_lerobot import errors
 from accerl_lerobot.checkpoint import snapshot
-from accerl_lerobot.experience import REAL, Segment
+from accerl_lerobot.experience import Segment
 from accerl_lerobot.fault_points import fault_point
-from accerl_lerobot.replay.buffer import MixedReplay
+from accerl_lerobot.replay.buffer import Replay
 from accerl_lerobot.replay.journal import EPISODES, Journal
 from accerl_lerobot.replay.pacing import ReplayConfig, Schedule, Turns
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, open_clock
 from accerl_lerobot.transport.connection import Address, Server, serve_on_loop, stopped
 from accerl_lerobot.transport.endpoint import node_address
-
-IN_TRANSIT = 1024
-"""Newest real segments that are kept for the workers that imagine, which ask several times a second."""
-
-
-class News(NamedTuple):
-    """Answer to workers that imagine: real segments, and the cursor to ask with the next time."""
-
-    segments: list[Segment]
-    cursor: int
-    ended: bool  # no more will come
-    closed: bool  # the run is over
 
 
 class ReplayWorker:
@@ -49,8 +35,6 @@ class ReplayWorker:
         self,
         config: ReplayConfig,
         seed: int,
-        imagined: ReplayConfig | None = None,
-        patient: bool = False,
         state: Path | None = None,
         directory: Path | None = None,
         timeline: Path | None = None,
@@ -59,11 +43,7 @@ class ReplayWorker:
         errors.collect_warnings()
         self._clock = open_clock(timeline, "replay")
         journal = None if directory is None else Journal(directory / EPISODES)
-        self._replay = MixedReplay(config, imagined or ReplayConfig(), 0.0, patient, journal)
-        # Nothing is imagined until the worker says so.
-        self._replay.awaited = imagined is not None
-        self._real: deque[Segment] = deque(maxlen=IN_TRANSIT if imagined else 0)
-        self._real_count = 0
+        self._replay = Replay(config, journal)
         self._rng = np.random.default_rng(seed)
         self._changed = asyncio.Condition()
         self._turns = Turns()
@@ -76,9 +56,6 @@ class ReplayWorker:
             saved = snapshot.load(state / "replay")
             self._replay.restore(saved["replay"])
             self._rng = saved["rng"]
-            # The worker that imagines was saved before, and may not have been told of the last ones.
-            self._real.extend(self._replay.real.segments)
-            self._real_count = saved["real_count"]
         self._clock.enter(WAIT_IN)
 
     async def ready(self) -> int:
@@ -98,22 +75,19 @@ class ReplayWorker:
                 raise self._failure
 
     async def insert(self, segments: list[Segment]) -> bool:
-        """Stores segments of one source once the pace allows it; returns when more may be collected.
+        """Stores segments once the pace allows it; returns when more may be collected.
 
         False when the run is over and they were not stored. A `ServiceStoppedError` if storing has failed,
         now or before; `run` says why.
         """
-        source = segments[0].source
         async with self._changed:
-            await self._changed.wait_for(lambda: self._closed or self._replay.may_insert(source))
+            await self._changed.wait_for(lambda: self._closed or self._replay.may_insert())
             if self._closed:
                 return False
             with self._working():
                 for segment in segments:
                     fault_point("replay.insert")
-                    if self._replay.insert(segment) and source == REAL:
-                        self._real.append(segment)
-                        self._real_count += 1
+                    self._replay.insert(segment)
             await self._changed.wait_for(lambda: self._closed or self._turns.may_collect(self._ready))
         return True
 
@@ -150,16 +124,10 @@ class ReplayWorker:
         async with self._changing():
             self._turns.schedule = schedule
 
-    async def news(self, cursor: int) -> News:
-        """Real segments since the `cursor`-th; those that nobody asked for in time are left out."""
-        new = max(0, min(self._real_count - cursor, len(self._real)))
-        segments = list(self._real)[len(self._real) - new :]
-        return News(segments, self._real_count, self._replay.real_ended, self._closed)
-
-    async def change(self, **state: Any) -> None:
-        """Set ``share``, ``awaited``, ``held`` or ``real_ended`` of `MixedReplay`."""
+    async def end(self) -> None:
+        """Note that no segment will come any more."""
         async with self._changing():
-            vars(self._replay).update(state)
+            self._replay.ended = True
 
     async def save(self, directory: Path, version: int) -> None:
         """Writes its part of ``training_state``, as it was when the trainer had made `version` updates."""
@@ -167,11 +135,7 @@ class ReplayWorker:
             raise self._failure
         self._clock.enter(CHECKPOINT)
         fault_point("replay.save")
-        state = {
-            "replay": self._replay.state(version),
-            "rng": copy.deepcopy(self._rng),
-            "real_count": self._real_count,
-        }
+        state = {"replay": self._replay.state(version), "rng": copy.deepcopy(self._rng)}
         self._clock.enter(WAIT_IN)
         await asyncio.to_thread(snapshot.save, directory / "replay", state)
 

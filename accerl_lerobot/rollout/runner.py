@@ -23,13 +23,23 @@ from accerl_lerobot.config.ranges import NonNegative, Range, Section, Steps
 from accerl_lerobot.envs.base import ChunkResult, Environment
 from accerl_lerobot.envs.reward_model import JudgedEnvironment, RewardModelConfig
 from accerl_lerobot.errors import InputError, for_viewing, warn_once
-from accerl_lerobot.experience import REAL, TASK, Decision, Observation, Request, Segment, SegmentStart
+from accerl_lerobot.experience import (
+    IMAGINED,
+    REAL,
+    TASK,
+    Decision,
+    Observation,
+    Request,
+    Segment,
+    SegmentStart,
+)
 from accerl_lerobot.seeds import noise_seed, train_seed
 
 STARTS_PER_INCARNATION = 1000
 """By how much a restarted worker skips ahead in its training seeds, so as not to repeat its episodes."""
 LEAST_SHARE = 0.1  # how often a task that never fails is explored, compared with one that always does
 RECENT = 20  # episodes of a task that tell how often it fails now
+MOST_STARTS = 256  # newest real episodes at whose first observation imagined ones start
 MOST_DROPPED = 20  # episodes in a row that may be dropped before the environment counts as broken
 
 
@@ -129,8 +139,8 @@ class RolloutConfig(Section, section="rollout"):
     decision_cost: NonNegative = 0.01
     """Subtracted from the reward of every decision, so that faster is better."""
     episodes: Steps = 0
-    """Exploring episodes in all; 0: as many as the updates need. Once they are played, learning goes on while
-    replay has something to give, which is little unless more is imagined, and then ends."""
+    """Real exploring episodes in all; 0: as many as the updates need. Once they are played, learning goes on
+    while replay has something to give, which is little unless more is imagined, and then ends."""
     reward_model: RewardModelConfig = field(default_factory=RewardModelConfig)
     """The model that tells success, where the environment does not."""
 
@@ -151,6 +161,7 @@ class EpisodePlan:
     """True: sample and learn from it. False: LeRobot's stock sampler, for evaluation; no segment is made."""
     index: int = 0  # position in the evaluation it belongs to
     group: str = "train"  # which evaluation it belongs to
+    source: str = REAL  # ``imagined``: it is run in an `Environment` of that source, and not counted
     film: tuple[int, int] | None = None
     """Side in pixels and env steps per frame of a video for people; None: none. It executes a chunk in parts,
     which changes nothing else."""
@@ -184,6 +195,7 @@ class EpisodePlans:
         self.worker, self.incarnation = worker, incarnation
         self._tasks, self._seed, self._budget = tasks, seed, budget
         self.starts = incarnation * STARTS_PER_INCARNATION  # where it is in the worker's seeds
+        self.imagined = self.starts  # the same, of imagined episodes
         # Filled and emptied on different threads: appending to and popping from a deque is atomic.
         self._queued: deque[EpisodePlan] = deque()
         self._failing = dict.fromkeys(tasks, 1.0)
@@ -209,9 +221,18 @@ class EpisodePlans:
         self._owed[task] -= 1
         return EpisodePlan(task=task, seed=train_seed(self._seed, self.worker, number), explore=True)
 
+    def next_imagined(self, exploring: bool, starts: Sequence[tuple[str, Observation]]) -> EpisodePlan | None:
+        """The same for an imagined environment; `starts` are the tasks and first observations to begin at."""
+        if not exploring or not starts:
+            return None
+        number, self.imagined = self.imagined, self.imagined + 1
+        seed = train_seed(self._seed, self.worker, number)
+        task, _ = starts[seed % len(starts)]
+        return EpisodePlan(task=task, seed=seed, explore=True, group=IMAGINED, source=IMAGINED)
+
     def ended(self, result: EpisodeResult) -> None:
         """Tasks that fail more are explored more."""
-        if result.plan.explore:
+        if result.plan.explore and result.plan.source == REAL:
             task = result.plan.task
             self._failing[task] += ((not result.success) - self._failing[task]) / RECENT
 
@@ -221,11 +242,12 @@ class EpisodePlans:
         return self._budget is not None and self._budget <= 0
 
     def state(self) -> dict[str, Any]:
-        state = {"budget": self._budget, "starts": self.starts, "queued": list(self._queued)}
+        state: dict[str, Any] = {"budget": self._budget, "starts": self.starts, "imagined": self.imagined}
+        state |= {"queued": list(self._queued)}
         return state | {"failing": dict(self._failing), "owed": dict(self._owed)}
 
     def restore(self, state: dict[str, Any]) -> None:
-        self._budget, self.starts = state["budget"], state["starts"]
+        self._budget, self.starts, self.imagined = state["budget"], state["starts"], state["imagined"]
         self._queued.extend(state["queued"])
         self._failing, self._owed = dict(state["failing"]), dict(state["owed"])
 
@@ -257,23 +279,27 @@ class Counters:
     episodes: int = 0
     dropped_nonfinite: int = 0  # decisions thrown away because the environment returned NaN or infinity
     dropped_episodes: int = 0  # episodes that ended so
+    imagined_decisions: int = 0  # those and the next are in no other counter
+    imagined_episodes: int = 0
 
 
 @dataclass(eq=False)
 class RolloutRunner:
     """Drives a set of environments, one per slot, through planned episodes.
 
-    `next_plan` is called for each new episode; None leaves the slot idle until `start` is called again.
-    `name`, unique per incarnation of a worker, is the prefix of its segments' keys. `on_segment` receives
-    finished segments of exploring episodes, `on_episode` every finished episode.
+    `next_plan` is called for each new episode, with the source of the slot's environment; None leaves the
+    slot idle until `start` is called again. `name`, unique per incarnation of a worker, is the prefix of its
+    segments' keys. `on_segment` receives finished segments of exploring episodes, `on_episode` every finished
+    episode. `starts` takes the tasks and first observations of real exploring episodes.
     """
 
     environments: Sequence[Environment]
-    next_plan: Callable[[], EpisodePlan | None]
+    next_plan: Callable[[str], EpisodePlan | None]
     config: RolloutConfig
     name: str
     on_segment: Callable[[Segment], object]
     on_episode: Callable[[EpisodeResult], object]
+    starts: deque[tuple[str, Observation]] = field(default_factory=lambda: deque(maxlen=MOST_STARTS))
 
     def __post_init__(self) -> None:
         self.counters = Counters()
@@ -286,21 +312,26 @@ class RolloutRunner:
 
     @property
     def exploring(self) -> bool:
-        return any(episode is not None and episode.plan.explore for episode in self._episodes)
+        """True while a real exploring episode is under way."""
+        plans = [episode.plan for episode in self._episodes if episode is not None]
+        return any(plan.explore and plan.source == REAL for plan in plans)
 
     def start(self, slot: int) -> Request | None:
         """Begins the next planned episode in `slot`; None when nothing is planned."""
-        plan = self.next_plan()
+        environment = self.environments[slot]
+        plan = self.next_plan(environment.source)
         if plan is None:
             self._episodes[slot] = None
             return None
-        observation = self.environments[slot].reset(plan.seed, plan.task)
+        observation = environment.reset(plan.seed, plan.task)
         origin = SegmentStart(plan.task, plan.seed, decision=0)
-        limit = self.environments[slot].spec.max_steps
-        builder = SegmentBuilder([observation], self.config.segment_length, origin, limit)
+        limit = environment.spec.max_steps
+        builder = SegmentBuilder([observation], self.config.segment_length, origin, limit, plan.source)
         episode = self._episodes[slot] = ActiveEpisode(plan, builder)
         if bad := nonfinite(observation):
             return self._drop(slot, episode, f"{bad} of the first observation")
+        if plan.explore and plan.source == REAL:
+            self.starts.append((plan.task, observation))
         return episode.request()
 
     def advance(self, slot: int, decision: Decision) -> Request | None:
@@ -309,8 +340,11 @@ class RolloutRunner:
         assert episode is not None
         result = _execute(environment, episode, decision.chunk)
         episode.chunks.append(decision.chunk)
-        self.counters.env_steps += result.steps
-        self.counters.decisions += 1
+        if environment.source == REAL:
+            self.counters.env_steps += result.steps
+            self.counters.decisions += 1
+        else:
+            self.counters.imagined_decisions += 1
         bad = nonfinite({"the reward": result.rewards, **result.observation})
         if bad or result.info.get("nonfinite"):
             self.counters.dropped_nonfinite += len(episode.builder.taken) + 1
@@ -354,15 +388,26 @@ class RolloutRunner:
         return None if episode is None else episode.request()
 
     def state(self) -> dict[str, Any]:
-        episodes = list(self._episodes)
-        return {"counters": replace(self.counters), "sequence": self._sequence, "episodes": episodes}
+        return {
+            "counters": replace(self.counters),
+            "sequence": self._sequence,
+            "episodes": list(self._episodes),
+            "environments": [environment.state() for environment in self.environments],
+            "starts": list(self.starts),
+        }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Resumes from `state`: environments are brought back by doing again what was done in them."""
+        """Resumes from `state`: environments without a state are brought back by doing it all again."""
         self.counters, self._sequence = state["counters"], state["sequence"]
         self._episodes = state["episodes"]
-        for environment, episode in zip(self.environments, self._episodes, strict=True):
+        self.starts.extend(state["starts"])
+        for environment, episode, kept in zip(
+            self.environments, self._episodes, state["environments"], strict=True
+        ):
             if episode is None:
+                continue
+            if kept is not None:
+                environment.restore(kept)
                 continue
             plan, latest = episode.plan, episode.builder.latest
             observation = environment.reset(plan.seed, plan.task)
@@ -380,7 +425,10 @@ class RolloutRunner:
             environment.close()
 
     def _finish(self, episode: ActiveEpisode, success: bool, note: str) -> None:
-        self.counters.episodes += 1
+        if episode.plan.source == REAL:
+            self.counters.episodes += 1
+        else:
+            self.counters.imagined_episodes += 1
         versions = episode.versions or [0]
         result = EpisodeResult(
             plan=episode.plan,

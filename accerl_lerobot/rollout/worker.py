@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The rollout process: steps its environments while other observations wait for a decision.
 
-consumes    decisions, and orders: planned episodes, and whether to explore
+consumes    decisions, and orders: planned episodes, and whether to explore; versions of the world model that
+            its imagined environments predict by, where there are any
 produces    segments of exploring episodes for replay, and results of episodes
 waits for   decisions, if every environment has an observation under way; pauses exploring while replay does
             not take segments
@@ -19,22 +20,27 @@ import time
 from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from accerl_lerobot import errors
 from accerl_lerobot.envs import EnvConfig, make_environment
-from accerl_lerobot.experience import Decision, Request, Segment
+from accerl_lerobot.experience import REAL, Decision, Observation, Request, Segment
 from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.rollout.runner import (
+    MOST_STARTS,
     EpisodePlan,
     EpisodePlans,
     EpisodeResult,
     RolloutConfig,
     RolloutRunner,
 )
-from accerl_lerobot.timeline import COMPUTE, TRANSPORT, WAIT_IN, WAIT_OUT, open_clock
+from accerl_lerobot.timeline import COMPUTE, TRANSPORT, WAIT_IN, WAIT_OUT, WEIGHT_SYNC, open_clock
 from accerl_lerobot.transport.endpoint import Endpoint, ReconnectingClient
+
+if TYPE_CHECKING:
+    from accerl_lerobot.world_model.config import ImaginationConfig
 
 PARTS = 2
 """A worker's environments are asked for in so many parts: one is stepped while the other's decisions are
@@ -67,6 +73,7 @@ class RolloutWorker:
         name: str = "rollout 0",
         history: int = 1,
         timeline: Path | None = None,
+        imagination: ImaginationConfig | None = None,
     ) -> None:
         errors.collect_warnings()
         # A node that does not see the run's folder would write a timeline that nobody finds.
@@ -83,6 +90,11 @@ class RolloutWorker:
         self._environments = [
             make_environment(env, history, config.reward_model) for _ in range(config.environments)
         ]
+        self._starts: deque[tuple[str, Observation]] = deque(maxlen=MOST_STARTS)
+        self._world: Any = None  # an `ImaginedWorld`
+        self._new_world: deque[tuple[int, Any]] = deque(maxlen=1)
+        if imagination is not None and imagination.environments:
+            self._imagine(imagination)
         self._clock.enter(WAIT_IN)
 
     def ready(self, plans: EpisodePlans | None = None) -> int:
@@ -91,8 +103,15 @@ class RolloutWorker:
             self._plans = plans
             name = f"rollout{plans.worker}.{plans.incarnation}"
             callbacks = self._outbox.append, self._end
-            self._runner = RolloutRunner(self._environments, self._next, self._config, name, *callbacks)
+            self._starts.clear()
+            self._runner = RolloutRunner(
+                self._environments, self._next, self._config, name, *callbacks, self._starts
+            )
         return os.getpid()
+
+    def imagine_with(self, newest: tuple[int, Any]) -> None:
+        """Use this version of the world model, and its weights, from the next chunk on."""
+        self._new_world.append(newest)
 
     def report(self, training: bool, plans: list[EpisodePlan], in_turn: bool = False) -> Report:
         """Takes orders and reports. One call at a time, so that orders cannot overtake each other.
@@ -124,6 +143,7 @@ class RolloutWorker:
         due: dict[int, Request] = {}
         under_way: dict[int, list[int]] = {}
         pending: set[int] = set()  # tickets of messages to replay
+        pending_real: set[int] = set()  # those with real segments
         size = max(1, len(self._runner) // PARTS)
         patience = 0.0
         while True:
@@ -133,9 +153,16 @@ class RolloutWorker:
                 self._clock.enter(TRANSPORT)
                 if fault_point("rollout.send"):
                     self._outbox[0].reward = self._outbox[0].reward * np.float32(np.nan)
-                pending.add(storing.send(self._outbox[:size]))
+                ticket = storing.send(self._outbox[:size])
+                pending.add(ticket)
+                if any(segment.source == REAL for segment in self._outbox[:size]):
+                    pending_real.add(ticket)
                 del self._outbox[:size]
-            self._spent = self._plans.spent and not self._runner.exploring and not pending
+            pending_real &= pending
+            self._spent = self._plans.spent and not self._runner.exploring and not pending_real
+            if self._new_world:
+                self._clock.enter(WEIGHT_SYNC)
+                self._world.load(*self._new_world.popleft())
             if not self._training.is_set():  # so that planned episodes need not wait for exploring ones
                 idle += [slot for slot, request in due.items() if request.explore]
                 due = {slot: request for slot, request in due.items() if not request.explore}
@@ -155,11 +182,26 @@ class RolloutWorker:
                     if not self._step(slot, decision, due):
                         idle.append(slot)
 
-    def _next(self) -> EpisodePlan | None:
-        plan = self._plans.next(exploring=self._training.is_set())
+    def _next(self, source: str) -> EpisodePlan | None:
+        exploring = self._training.is_set()
+        if source == REAL:
+            plan = self._plans.next(exploring)
+        else:
+            plan = self._plans.next_imagined(exploring, self._starts)
         if plan is not None:
             self._clock.enter(COMPUTE)
         return plan
+
+    def _imagine(self, config: ImaginationConfig) -> None:
+        """Add the imagined environments."""
+        import torch
+
+        from accerl_lerobot.world_model.imagined import imagined_environments
+
+        torch.set_num_threads(1)
+        spec = self._environments[0].spec
+        self._world, imagined = imagined_environments(config, config.environments, spec, self._starts)
+        self._environments += imagined
 
     def _end(self, result: EpisodeResult) -> None:
         self._plans.ended(result)

@@ -35,7 +35,6 @@ ROLES = (
     "driver",
     "local",
     "rollout",
-    "imagination",
     "inference",
     "replay",
     "trainer",

@@ -34,7 +34,8 @@ class TrainerWorker:
     """Becomes a threaded Ray actor in `launch`: `run` on one thread, everything else beside it.
 
     The run's `directory` is for batches that nothing could be learnt from; `world_model` is the handle of a
-    `WorldModelWorker`, where the algorithm learns on its states; `readers` are the inference replicas.
+    `WorldModelWorker`, where the algorithm learns on its states; `readers` are the inference replicas;
+    `online` is the handle of an `OnlineLearningWorker`, which gets the batches too.
     """
 
     def __init__(
@@ -45,6 +46,7 @@ class TrainerWorker:
         directory: Path | None = None,
         world_model: Any = None,
         readers: Sequence[str] = (),
+        online: Any = None,
     ) -> None:
         errors.collect_warnings()
         self._clock = open_clock(timeline, "trainer")
@@ -56,6 +58,7 @@ class TrainerWorker:
 
             assert isinstance(self._update, ChunkCriticUpdate)
             self._update.learn_states_in(world_model, settings.timeout_s)
+        self._online = online
         self._lock = threading.Lock()
         self._kept: Any = None
         self._in_turn = False
@@ -96,6 +99,8 @@ class TrainerWorker:
             if not segments:
                 break
             waited = time.monotonic() - asked
+            if self._online is not None:
+                self._online.learn.remote(batch)
             if self._update.version + 1 < config.updates:
                 upcoming = replay.sample.remote(n, self._update.version + 1)
             self._clock.enter(CHECKPOINT)

@@ -4,18 +4,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
-from typing import Annotated, ClassVar, Literal
+from dataclasses import dataclass, field
+from typing import Annotated, ClassVar
 
 import draccus
 
 from accerl_lerobot.config.ranges import DatasetConfig, LearningRate, Range, Section, registered_name
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.replay.pacing import ReplayConfig
 
 PIXELS = "pixels"  # the type of our own class of learned world models
 SPACE_TO_DEPTH = 4  # side of the pixel blocks that become channels in its network
-IMAGINATION = "imagination"  # name of the worker that imagines, and of its state
+IMAGINATION = "imagination"  # name of the config section
 WORLD_LEARNING = "world-model learning"  # name of the worker that trains the world model
 
 
@@ -211,71 +210,32 @@ class OnlineLearnConfig(Section, section="imagination.learn"):
     """Training of the world model on the policy's episodes during a run."""
 
     steps_per_episode: Annotated[float, Range("[0, 1000000]")] = 5.0
-    """Gradient steps of world model and success model each, per real episode; 0: both stay as they are.
-    Otherwise nothing is imagined before they have passed validation on the policy's own episodes."""
+    """Gradient steps of world model and success model each, per real episode; 0: both stay as they are."""
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
-    """Dataset of the pre-training, or both merged: the model trains on the episodes it already knows, and is
-    validated on those that were held out. Of another dataset it trains on all episodes."""
-
-    held_out: ClassVar[float] = 0.2
-    """Share of real episodes held out for validation."""
-    validate_every: ClassVar[int] = 16
-    """Real episodes between two validations; where episodes are counted, their collection waits for it."""
-    validation: ClassVar[ValidationConfig] = ValidationConfig(
-        max_windows=120, depth=4, auroc=0.6, false_success=0.5, recall=0.3, false_positives=0.3
-    )
-    """Checks that a model must pass to be used. A dozen held-out episodes say little; beyond that, the kill
-    switch watches."""
+    """Dataset of the pre-training, or both merged: half of each batch is from the episodes that the model was
+    trained on."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImaginationConfig(Section, section="imagination"):
-    """Learning from imagined rollouts."""
+    """Learning from imagined episodes, in environments that a world model predicts."""
 
-    share: Annotated[float, Range("[0, 1)")] = 0.0
-    """Share of the decisions of a batch that are imagined; 0: none."""
-    model: Literal["learned", "shuffled", "oracle"] = "learned"
-    """World model. learned: the one in `path`. oracle: a simulator, the best there can be. shuffled (the
-    learned one, given another rollout's actions): a placebo, whose gain is not the world model's."""
+    environments: Annotated[int, Range("[0, 1000]")] = 0
+    """Imagined environments per rollout process, beside ``rollout.environments`` real ones; 0: none."""
     path: str | None = None
-    """The folder ``world_model`` that ``accerl world-model`` has written; oracle needs none."""
+    """The folder ``world_model`` that ``accerl world-model`` has written."""
     discover_packages_path: str | None = None
     """Package to import that registers the type of the world model in `path`, where that is not one of ours;
     every machine of the cluster needs it."""
     learn: OnlineLearnConfig = field(default_factory=OnlineLearnConfig)
 
-    rollouts: ClassVar[int] = 32
-    """Imagined rollouts at a time, as one batch."""
-    samples_per_insert: ClassVar[float] = 2.0
-    """How often an imagined decision is trained on, on average; see `imagined_replay`."""
-    max_uncertainty: ClassVar[float] = 2.0
-    """Uncertainty above which a rollout ends before a prediction; 1 is training data's 95th percentile."""
-    memory: ClassVar[int] = 256
-    """Newest real episodes at whose resets rollouts start."""
-    max_gap: ClassVar[float] = 0.5
-    """The kill switch: largest difference of the success rates, imagined less real."""
-    window: ClassVar[int] = 100
-    """Imagined rollouts over which the gap is measured. When as many in a row end at once because the model
-    is too uncertain, nothing is imagined any more either."""
-    min_real_episodes: ClassVar[int] = 16
-    """Real episodes required before the gap is evaluated."""
-
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.share and self.path is None and self.needs_path:
+        if self.environments and self.path is None:
             hint = "give the folder world_model that accerl world-model has written"
             raise InputError("imagination.path", None, hint)
-
-    def imagined_replay(self, replay: ReplayConfig) -> ReplayConfig:
-        """Size and pace of the replay buffer of imagined segments, from those of the run's."""
-        return replace(replay, min_decisions=1, samples_per_insert=self.samples_per_insert)
-
-    @property
-    def needs_path(self) -> bool:
-        """True if `model` is built from the world model in `path`."""
-        return self.model != "oracle"
 
     @property
     def learns(self) -> bool:
         """True if the world model is trained on during the run."""
-        return self.share > 0 and self.needs_path and self.learn.steps_per_episode > 0
+        return self.environments > 0 and self.learn.steps_per_episode > 0

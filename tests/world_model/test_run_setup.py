@@ -10,11 +10,12 @@ from typing import Any
 
 import pytest
 import torch
+from accerl_lerobot.engine.imagination import check_imagination, make_imagination, make_learner
+from accerl_lerobot.world_model.reference import OracleModel, ShuffledModel
 
 from accerl_lerobot.demos.record import DemosConfig, record_demos
 from accerl_lerobot.demos.sft import SFTConfig
 from accerl_lerobot.engine.config import DatasetConfig, RunConfig
-from accerl_lerobot.engine.imagination import check_imagination, make_imagination, make_learner
 from accerl_lerobot.engine.preflight import check_start
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
@@ -28,7 +29,6 @@ from accerl_lerobot.world_model.learners import new_success_model
 from accerl_lerobot.world_model.online import Promotion
 from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.pretrain import world_spec
-from accerl_lerobot.world_model.reference import OracleModel, ShuffledModel
 from accerl_lerobot.world_model.store import (
     HELD_OUT,
     LEARNT,
