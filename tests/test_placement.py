@@ -48,7 +48,7 @@ def run(
         trainer=TrainerConfig(updates=1, batch_decisions=16, ranks=ranks),
         inference=InferenceConfig(workers=services),
         rollout=RolloutConfig(workers=max(rollouts, services), environments=1, segment_length=3),
-        imagination=ImaginationConfig(share=0.5 if imagining else 0.0, model="oracle"),
+        imagination=ImaginationConfig(environments=2 if imagining else 0, path="nowhere"),
         launch=LaunchConfig(address="auto", placement=placement),
     )
 
@@ -56,7 +56,7 @@ def run(
 def gpus(nodes: Nodes, config: RunConfig) -> dict[str, float]:
     """Share of a GPU of each role's workers."""
     placement = Placement(config, nodes, "a" * 56)
-    roles = ("trainer", "inference", "imagination", "rollout", "replay")
+    roles = ("trainer", "inference", "world_model", "rollout", "replay")
     return {role: round(placement.options(role)["num_gpus"], 6) for role in roles}
 
 
@@ -75,17 +75,17 @@ def test_a_policy_on_the_cpu_leaves_gpus_alone():
 
 def test_each_role_goes_where_it_is_sent_and_shares_what_is_there():
     nodes = cluster((8, 2), (8, 1), (64, 0), (32, 0), n2="sim", n3="sim")
-    sites = {"imagination": "node:10.0.0.2", "rollout": "sim"}
+    sites = {"world_model": "node:10.0.0.2", "rollout": "sim"}
     config = run(ranks=2, services=2, rollouts=6, imagining=True, **sites)
     assert gpus(nodes, config) == {
-        "trainer": 0.6, "inference": 0.4, "imagination": 1.0, "rollout": 0.0, "replay": 0.0
+        "trainer": 0.6, "inference": 0.4, "world_model": 1.0, "rollout": 0.0, "replay": 0.0
     }  # fmt: skip
     placement = Placement(config, nodes, "a" * 56)
     assert placement.options("rollout")["resources"].keys() == {"sim"} and not placement.is_here("rollout")
     assert placement.rows() == [
         "2 trainer × 0.6 GPU on this node",
+        "1 world_model × 1 GPU on nodes with node:10.0.0.2",
         "2 inference × 0.4 GPU on this node",
-        "1 imagination × 1 GPU on nodes with node:10.0.0.2",
         "6 rollout on nodes with sim",
         "1 replay on this node",
     ]

@@ -29,7 +29,7 @@ PACKAGE = ROOT / "accerl_lerobot"
 HEADER = "# SPDX-License-Identifier: Apache-2.0\n"
 LONGEST_FILE = 600
 ENGINE = {"launch.py", "placement.py", "ray_session.py", "supervision.py"}
-SHELLS = ENGINE | {"doctor.py", "worker.py", "imagination.py", "peers.py", "endpoint.py"}
+SHELLS = ENGINE | {"doctor.py", "worker.py", "online.py", "peers.py", "endpoint.py"}
 """Files that may import Ray; all others are testable without it."""
 DISTRIBUTED = {"rendezvous.py", "ranks.py", "sharding.py", "tensors.py"}
 """Files that may know of other processes of a `torch.distributed` group."""

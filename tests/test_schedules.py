@@ -230,4 +230,4 @@ def test_schedules_that_cannot_be_are_refused():
     with pytest.raises(InputError, match=r"launch\.schedule.*rollout\.episodes"):
         RunConfig(launch=launch, rollout=RolloutConfig(episodes=8))
     with pytest.raises(InputError, match=r"launch\.schedule.*imagination"):
-        RunConfig(launch=launch, imagination=ImaginationConfig(share=0.5, path="somewhere"))
+        RunConfig(launch=launch, imagination=ImaginationConfig(environments=4, path="somewhere"))

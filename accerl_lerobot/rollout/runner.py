@@ -281,6 +281,7 @@ class Counters:
     dropped_episodes: int = 0  # episodes that ended so
     imagined_decisions: int = 0  # those and the next are in no other counter
     imagined_episodes: int = 0
+    imagined_uncertain: int = 0  # imagined episodes that ended because the world model was too uncertain
 
 
 @dataclass(eq=False)
@@ -345,6 +346,7 @@ class RolloutRunner:
             self.counters.decisions += 1
         else:
             self.counters.imagined_decisions += 1
+            self.counters.imagined_uncertain += bool(result.info.get("uncertain"))
         bad = nonfinite({"the reward": result.rewards, **result.observation})
         if bad or result.info.get("nonfinite"):
             self.counters.dropped_nonfinite += len(episode.builder.taken) + 1

@@ -19,7 +19,7 @@ from tests.runs import tiny_run
 def recipe(tmp_path: Path, checkpoint: Path) -> str:
     path = tmp_path / "recipe.yaml"
     content = encode(tiny_run(checkpoint))
-    content["imagination"] |= {"share": 0.5, "path": "nowhere"}
+    content["imagination"] |= {"environments": 4, "path": "nowhere"}
     path.write_text(yaml.safe_dump(content))
     return str(path)
 
@@ -28,7 +28,7 @@ def small(tmp_path: Path, checkpoint: Path, **options: Any) -> BenchEfficiencyCo
     defaults = {
         "recipe": recipe(tmp_path, checkpoint),
         "output_dir": str(tmp_path / "study"),
-        "arms": ("none", "oracle"),
+        "arms": ("none", "frozen"),
         "budgets": (4, 8),
         "seeds": (3, 4),
         "updates": 4,
@@ -41,7 +41,7 @@ def small(tmp_path: Path, checkpoint: Path, **options: Any) -> BenchEfficiencyCo
 def a_summary(success: float, explored: int = 4) -> dict[str, Any]:
     return {
         "success_after": success, "n_after": 10, "env_steps": 100, "updates": 4, "rl_s": 1.0,
-        "episodes_explored": explored, "imagination": {"rollouts": 3.0},
+        "episodes_explored": explored, "imagined_episodes": 3,
     }  # fmt: skip
 
 
@@ -49,7 +49,7 @@ def a_summary(success: float, explored: int = 4) -> dict[str, Any]:
 def result(tmp_path: Path, tiny_checkpoint: Path) -> dict[str, Any]:
     config = small(tmp_path, tiny_checkpoint)
     made = cells(config, parse(RunConfig, [f"--config_path={config.recipe}"]))
-    success = {("none", 4): 0.1, ("none", 8): 0.5, ("oracle", 4): 0.8, ("oracle", 8): 1.0}
+    success = {("none", 4): 0.1, ("none", 8): 0.5, ("frozen", 4): 0.8, ("frozen", 8): 1.0}
     runs = [
         (cell, a_summary(success[cell.of["arm"], cell.of["budget"]], cell.of["budget"] - (cell.seed == 4)))
         for cell in made

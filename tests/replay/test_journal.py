@@ -13,7 +13,7 @@ import pytest
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, Segment, SegmentStart
-from accerl_lerobot.replay.buffer import MixedReplay
+from accerl_lerobot.replay.buffer import Replay
 from accerl_lerobot.replay.journal import Journal, read_journal, whole_episodes
 from accerl_lerobot.replay.pacing import ReplayConfig
 from tests.replay.segments import make_segment
@@ -52,7 +52,7 @@ def test_what_is_written_is_read(tmp_path: Path):
 def test_only_what_replay_stores_is_written_and_a_cut_forgets(tmp_path: Path):
     path = tmp_path / "episodes.jsonl"
     config = ReplayConfig(capacity=40, min_decisions=4, max_unlearned_decisions=20)
-    replay = MixedReplay(config, config, 0.5, journal=Journal(path))
+    replay = Replay(config, Journal(path))
     broken = part("c", 3, 0)
     broken.reward[0] = np.nan
     for segment in (part("a", 1, 0), broken, part("d", 1, 0, source=IMAGINED)):
@@ -60,12 +60,12 @@ def test_only_what_replay_stores_is_written_and_a_cut_forgets(tmp_path: Path):
     assert [d.key for d in read_journal(path)] == ["a"]
     state = replay.state()
     replay.insert(part("b", 2, 0))
-    again = MixedReplay(config, config, 0.5, journal=Journal(path))
+    again = Replay(config, Journal(path))
     again.restore(state)
     again.insert(part("e", 4, 0))
     assert [d.key for d in read_journal(path)] == ["a", "e"]
     path.write_bytes(b"")  # lost, as after a pull without it
-    late = MixedReplay(config, config, 0.5, journal=Journal(path))
+    late = Replay(config, Journal(path))
     late.restore(state)
     late.insert(part("f", 4, 0))
     assert [d.key for d in read_journal(path)] == ["f"]

@@ -66,11 +66,9 @@ def test_lag_bound_by_hand() -> None:
         capacity=100, min_decisions=10, samples_per_insert=2.0, max_unlearned_decisions=30, max_lag=9
     )
     assert lag_bound(capped, **arguments) == 9
-    of_32 = SimpleNamespace(batch_decisions=32, hold_back=4)  # 24 of them imagined
     sections = {
-        "trainer": of_32,
+        "trainer": SimpleNamespace(batch_decisions=8, hold_back=4),
         "rollout": SimpleNamespace(in_flight=12),
-        "imagination": SimpleNamespace(share=0.75),
     }
     config: Any = SimpleNamespace(replay=capped, launch=SimpleNamespace(engine="local"), **sections)
     assert lag_limits(config) == (9, 4 + 37)

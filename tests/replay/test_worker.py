@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 
-from accerl_lerobot.experience import IMAGINED, Segment
 from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.replay.worker import ReplayWorker
 from accerl_lerobot.transport.connection import ServiceStoppedError
@@ -34,11 +33,6 @@ async def waits(task: asyncio.Task[Any]) -> bool:
     for _ in range(20):
         await asyncio.sleep(0)
     return not task.done()
-
-
-def make_imagined(key: str) -> Segment:
-    """One that finds the door open."""
-    return make_segment(key, 8, source=IMAGINED)
 
 
 def start(call: Awaitable[Any]) -> asyncio.Task[Any]:
@@ -120,12 +114,12 @@ def test_what_breaks_in_here_ends_this_worker_and_blames_nobody_else(broken: str
         assert await waits(start(worker.insert([make_segment("b", 8)])))
         setattr(worker._replay, broken, fall_over)
         with pytest.raises(ServiceStoppedError, match="no space left"):
-            await (worker.sample(BATCH, 0) if broken == "sample" else worker.insert([make_imagined("c")]))
+            await (worker.sample(BATCH, 0) if broken == "sample" else worker.insert([make_segment("c", 8)]))
         for refused in (running, worker.save(Path("nowhere"), 1)):  # no checkpoint of what is half done
             with pytest.raises(OSError, match="no space left"):
                 await refused
         with pytest.raises(ServiceStoppedError, match="no space left"):
-            await worker.insert([make_imagined("d")])
+            await worker.insert([make_segment("d", 8)])
 
     play(scene)
 
@@ -148,14 +142,13 @@ def test_close_releases_everyone_and_stores_nothing_more():
     play(scene)
 
 
-def test_news_is_real_experience_alone():
-    async def scene(_: ReplayWorker) -> None:
-        worker = ReplayWorker(CONFIG, seed=0, imagined=CONFIG)
+def test_the_end_of_collection_gives_a_smaller_batch():
+    async def scene(worker: ReplayWorker) -> None:
         await worker.insert([make_segment("a", 8)])
-        await worker.insert([make_imagined("d")])
-        news = await worker.news(0)
-        assert [s.key for s in news.segments] == ["a"] and news.cursor == 1 and not news.ended
-        await worker.change(real_ended=True)
-        assert (await worker.news(1)).ended
+        sampling = start(worker.sample(16, 0))
+        assert await waits(sampling)
+        await worker.end()
+        assert [segment.key for segment in await sampling] == ["a"]
+        assert await worker.sample(16, 1) == []
 
     play(scene)

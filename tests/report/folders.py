@@ -42,7 +42,7 @@ def metaworld(**fields: Any) -> RunConfig:
 
 def imagining() -> RunConfig:
     """The same with imagined rollouts."""
-    return run_config(imagination=ImaginationConfig(share=0.5, model="oracle"))
+    return run_config(imagination=ImaginationConfig(environments=4, path="somewhere"))
 
 
 def write_run(
@@ -126,13 +126,10 @@ def summary(config: RunConfig, evaluations: Sequence[dict[str, Any]], tasks: Seq
     }  # fmt: skip
 
 
-def imagined(on: float = 1.0) -> dict[str, Any]:
+def imagined(success: float = 0.6) -> dict[str, Any]:
     """Numbers of the workers where something is imagined."""
     return {
-        "imagination_rollouts": 100.0, "imagination_decisions": 700.0, "imagination_successes": 60.0,
-        "imagination_uncertain": 3.0, "imagination_success": 0.6, "imagination_success_imagined": 0.7,
-        "imagination_success_real": 0.4, "imagination_on": on, "imagination_promoted": 1.0,
-        "imagination_rejected": 2.0, "imagination_learn_episodes": 30.0, "replay_imagined_share": 0.5,
-        "replay_trained_decisions": 100.0, "replay_imagined_trained_decisions": 300.0,
-        "imagination_check_skill_changed_first": 0.7,
+        "imagined_episodes": 100.0, "imagined_decisions": 700.0, "success_imagined": success,
+        "world_model_learn_episodes": 30.0, "world_model_learn_steps": 150.0, "world_model_version": 150.0,
+        "replay_trained_decisions": 400.0, "replay_trained_imagined": 300.0,
     }  # fmt: skip

@@ -186,9 +186,14 @@ def test_a_run_that_died_before_its_first_record(tmp_path: Path) -> None:
 
 def test_imagined_rollouts(tmp_path: Path) -> None:
     text = page_of(write_run(tmp_path / "on", config=imagining(), rollout=imagined())).text
-    assert "Imagined rollouts" in text and "imagined 60 % → 60 % real 40 % → 40 %" in text
-    off = page_of(write_run(tmp_path / "off", config=imagining(), rollout=imagined(on=0.0))).text
-    assert "Imagination was switched off: 70 % success imagined, 40 % in reality." in off
+    assert "Imagined rollouts" in text and "imagined 60 % → 60 %" in text
+    far = page_of(write_run(tmp_path / "far", config=imagining(), rollout=imagined(success=1.0))).text
+    assert "Imagined episodes succeed far more often than real ones, 100 % and" in far
+    none = imagined() | {"imagined_episodes": 0.0}
+    assert (
+        "No episode was imagined to its end."
+        in page_of(write_run(tmp_path / "none imagined", config=imagining(), rollout=none)).text
+    )
     assert "Imagined rollouts" not in page_of(write_run(tmp_path / "none")).text
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,25 +13,20 @@ import torch
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.experience import IMAGINED, Segment
 from accerl_lerobot.world_model import online
-from accerl_lerobot.world_model.config import OnlineLearnConfig, PixelModelConfig, ValidationConfig
-from accerl_lerobot.world_model.data import model_arrays
+from accerl_lerobot.world_model.config import OnlineLearnConfig, PixelModelConfig
+from accerl_lerobot.world_model.data import Episode, model_arrays
+from accerl_lerobot.world_model.imagined import ImaginedWorld
 from accerl_lerobot.world_model.learners import new_success_model
 from accerl_lerobot.world_model.online import OnlineLearner, episode_from_segments, episode_weights
 from accerl_lerobot.world_model.pixels import PixelWorldModel
-from accerl_lerobot.world_model.store import HELD_OUT, THRESHOLD
-from tests.runs import adjusted
 from tests.world_model.real_segments import SPEC, K, real_episode
 
 
-def learner(**config: Any) -> OnlineLearner:
+def learner(steps_per_episode: float = 2.0, offline: Sequence[Episode] = ()) -> OnlineLearner:
     torch.manual_seed(0)
-    held_out = config.pop("held_out_offline", [])
-    known = config.pop("offline", []) + held_out, {episode.key: HELD_OUT for episode in held_out}
-    fields: dict[str, Any] = {"steps_per_episode": 2.0, "validate_every": 4, "held_out": 0.25}
-    fields |= {"validation": ValidationConfig(depth=2)} | config
-    learn = adjusted(OnlineLearnConfig, **fields)(steps_per_episode=fields.pop("steps_per_episode"))
     model = PixelWorldModel(SPEC, PixelModelConfig(channels=(8, 8)))
-    made = OnlineLearner(model, new_success_model(K), learn, *known, seed=0)
+    world = ImaginedWorld(model, new_success_model(K))
+    made = OnlineLearner(world, OnlineLearnConfig(steps_per_episode=steps_per_episode), offline, seed=0)
     made.given = model  # type: ignore[attr-defined]
     return made
 
@@ -54,47 +49,42 @@ def test_a_segment_is_a_stretch_of_experience():
     assert not failure.success and failure.own
 
 
-def test_some_episodes_are_held_out_and_steps_are_pending_for_all():
+def test_steps_are_pending_for_each_episode_up_to_a_limit():
     made = learner()
-    for segment in episodes(*[False] * 8):
+    for segment in episodes(*[False] * 20):
         made.add(segment)
-    assert len(made._held) == 2 and len(made._learnt) == 6 and made.pending_steps == 8, (
-        "as validate_every episodes bring"
-    )
-    kept = {e.frames.tobytes() for e in made._held}
-    assert not kept & {e.frames.tobytes() for e in made._learnt}
+        made.add(segment)  # as one that is drawn twice
+    assert len(made._learnt) == 20 and made.pending_steps == 2 * online.MOST_PENDING
 
 
 def test_episodes_are_put_together_from_their_segments():
-    made, parts = learner(held_out=0.5), {seed: real_episode(seed, length=1) for seed in (1, 2)}
+    made, parts = learner(), {seed: real_episode(seed, length=1) for seed in (1, 2)}
     assert [len(p) for p in parts.values()] == [4, 4]
     for order in ([0, 2, 1], [3, 0, 1]):
         for seed in (1, 2):
             made.add(parts[seed][order.pop(0)])
-    assert not made._learnt and not made._held and made.pending_steps == 0, "neither is complete"
+    assert not made._learnt and made.pending_steps == 0, "neither is complete"
     for i in range(4):
         for seed in (1, 2):
             made.add(parts[seed][i])
-    assert len(made._learnt) == len(made._held) == 1 and made.pending_steps == 4
+    assert len(made._learnt) == 2 and made.pending_steps == 4
     whole = episode_from_segments(real_episode(1), SPEC)
     for name in ("frames", "times", "state", "actions"):
         assert np.array_equal(getattr(made._learnt[0], name), getattr(whole, name))
 
 
-def test_imagined_segments_are_refused():
+def test_imagined_segments_are_left_out():
     [segment] = real_episode(1)
-    with pytest.raises(ValueError, match=f"real segments, and {segment.key} is imagined"):
-        learner().add(replace(segment, source=IMAGINED))
+    made = learner()
+    made.add(replace(segment, source=IMAGINED))
+    assert not made._learnt
 
 
-def test_less_than_a_step_in_a_validation_s_time_is_made_later():
-    made = learner(steps_per_episode=0.05, validate_every=4)
+def test_less_than_a_step_an_episode_is_made_later():
+    made = learner(steps_per_episode=0.05)
     for segment in episodes(*[False] * 4):
         made.add(segment)
-    assert made.pending_steps == pytest.approx(0.2) and not made.validation_due(last=False)
-    for segment in episodes(*[False] * 16):
-        made.add(segment)
-    assert made.pending_steps == pytest.approx(1.0)
+    assert made.pending_steps == pytest.approx(0.2)
 
 
 def test_what_never_ends_is_forgotten(monkeypatch: pytest.MonkeyPatch):
@@ -125,18 +115,16 @@ def test_without_a_success_only_the_world_is_learnt():
     made = learner()
     made.add(episodes(False)[0])
     assert "image" in (metrics := made.step()) and not any(k.startswith("success") for k in metrics)
-    assert learner().step() == {}, "nothing to learn from"
 
 
 def test_a_share_of_every_batch_is_from_the_dataset_it_began_with():
     offline = [episode_from_segments([s], SPEC) for s in episodes(False, True)]
     made = learner(offline=offline)
-    assert {p.episode for p in made._draw()} <= {0, 1}, "nothing else is known yet"
     for segment in episodes(*[False] * 4):
         made.add(segment)
     for _ in range(20):
         drawn = [p.episode for p in made._draw()]
-        assert sum(e < 2 for e in drawn) == 8 and max(drawn) < 2 + 3
+        assert sum(e < 2 for e in drawn) == 8 and max(drawn) < 2 + 4
 
 
 def test_new_and_failed_episodes_are_drawn_more_often():
@@ -149,113 +137,27 @@ def test_new_and_failed_episodes_are_drawn_more_often():
     assert episode_weights([True]).tolist() == [1]
 
 
-def passes(monkeypatch: pytest.MonkeyPatch, *outcomes: bool) -> list[list[bool]]:
-    """Trials end so; returns which episodes of each are the policy's own."""
-    results, tried = list(outcomes), []
-
-    def trial(model: Any, held: Any, *rest: Any) -> dict[str, Any]:
-        tried.append([e.own for e in held])
-        return {"passed": results.pop(0), "checks": {"auroc": {"value": 0.5}}}
-
-    monkeypatch.setattr(online, "validate", trial)
-    return tried
-
-
-def test_what_passes_is_promoted_and_what_does_not_is_not(monkeypatch: pytest.MonkeyPatch):
-    demo = [replace(episode_from_segments([s], SPEC), own=False) for s in episodes(True)]
-    made = learner(held_out_offline=demo)
-    tried = passes(monkeypatch, False, True)
-    assert not made.validation_due(last=False)
-    for number, segment in enumerate(episodes(*[False] * 8)):
-        made.add(segment)
-        while made.pending_steps >= 1:
-            assert not made.validation_due(last=True), "what it owes comes first, if there is time"
-            made.step()
-        assert made.validation_due(last=False) is (number in (3, 7))
-        if number == 3:
-            assert made.promote(last=False) is None and made.metrics()["rejected"] == 1
-        if number == 7:
-            promotion = made.promote(last=False)
-            assert promotion is not None and promotion.version == made.version == 16
-            assert not any(p.requires_grad for p in promotion.model.parameters())
-            assert not promotion.success.training
-            chosen_on = {key for key, role in promotion.roles.items() if role == THRESHOLD}
-            assert chosen_on == {episode.key for episode in made._held}, (
-                "they are no judges of this threshold"
-            )
-    assert tried == [[False, True], [False, True, True]]
-    assert made.metrics()["check_auroc"] == 0.5 and made.metrics()["promoted"] == 1
-    assert made.pending_steps == 0
+def test_it_goes_on_from_its_state(tmp_path: Path):
+    one = learner()
+    for segment in episodes(False, True):
+        one.add(segment)
+    one.step()
+    snapshot.save(tmp_path / "learner", one.state())
+    other = learner()
+    other.restore(snapshot.load(tmp_path / "learner"))
+    assert other.pending_steps == one.pending_steps == 3 and other.version == 1
+    assert one.step() == other.step()
+    ours, theirs = one.world.tensors(), other.world.tensors()
+    assert all(np.array_equal(ours[name], theirs[name]) for name in ours)
 
 
-def test_after_the_last_episode_it_learns_on_until_it_passes_or_is_given_up(monkeypatch: pytest.MonkeyPatch):
+def test_what_it_learned_is_taken_over_by_a_world_that_imagines():
     made = learner()
-    monkeypatch.setattr(online, "FINAL_VALIDATIONS", 3)
-    passes(monkeypatch, False, False, False)
-    for segment in episodes(False, True, False, False):
-        made.add(segment)
-    tries = 0
-    while made.may_promote(last=True):
-        if made.pending_steps >= 1:
-            made.step()
-        else:
-            assert made.validation_due(last=True)
-            made.promote(last=True)
-            tries += 1
-    assert tries == 3 and made.may_promote(last=False) and not made.validation_due(last=True)
-    assert made.version == 8 + 2 * 8 and made.pending_steps == 0, (
-        "as many steps as validate_every episodes bring"
-    )
-
-
-def test_after_the_last_episode_one_that_serves_is_tried_once_more(monkeypatch: pytest.MonkeyPatch):
-    made = learner()
-    passes(monkeypatch, True, True)
-    for segment in episodes(*[False] * 4):
-        made.add(segment)
-    while made.pending_steps >= 1:
-        made.step()
-    assert made.promote(last=False) is not None
-    assert not made.may_promote(last=True), "nothing is new"
-    made.add(episodes(False)[0])
-    while made.pending_steps >= 1:
-        made.step()
-    assert (
-        made.validation_due(last=True)
-        and made.promote(last=True) is not None
-        and not made.may_promote(last=True)
-    )
-
-
-def test_a_validation_whose_outcome_nobody_has_yet_is_made_again_by_who_goes_on(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-):
-    """A checkpoint may be written during a trial, or before what has passed serves."""
-    passes(monkeypatch, False, True)
-    made = learner(validate_every=2)
-    states: list[dict[str, Any]] = []
-    scale = online.fit_uncertainty_scale
-    monkeypatch.setattr(online, "fit_uncertainty_scale", lambda *a: states.append(made.state()) or scale(*a))
-
-    def gone_on(state: dict[str, Any]) -> OnlineLearner:
-        snapshot.save(tmp_path / "learner", state)
-        again = learner(validate_every=2)
-        again.restore(snapshot.load(tmp_path / "learner"))
-        return again
-
-    for segment in episodes(False, True, False, True):
-        made.add(segment)
-    made.step()
-    assert made.promote(last=False) is None and not made.validation_due(last=False)
-    assert gone_on(states[0]).validation_due(last=False), "it was in the middle of its trial"
-    assert not gone_on(made.state()).validation_due(last=False), "it has failed, and knows it"
     for segment in episodes(False, True):
         made.add(segment)
-    assert made.promote(last=False) is not None
-    again = gone_on(made.state())
-    assert again.validation_due(last=False) and again.promoted == 0, "nobody rollouts of it yet"
-    made.mark_served()
-    again = gone_on(made.state())
-    assert not again.validation_due(last=False) and again.promoted == 1
-    for one, other in zip(made._learner.model.parameters(), again._learner.model.parameters(), strict=True):
-        assert torch.equal(one, other)
+    made.step()
+    world = learner().world
+    world.load(made.version, made.world.tensors())
+    assert world.version == 1
+    taken = world.tensors()
+    assert all(np.array_equal(value, taken[name]) for name, value in made.world.tensors().items())

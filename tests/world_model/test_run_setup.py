@@ -6,12 +6,9 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
-from accerl_lerobot.engine.imagination import check_imagination, make_imagination, make_learner
-from accerl_lerobot.world_model.reference import OracleModel, ShuffledModel
 
 from accerl_lerobot.demos.record import DemosConfig, record_demos
 from accerl_lerobot.demos.sft import SFTConfig
@@ -25,20 +22,12 @@ from accerl_lerobot.world_model.config import (
     PixelModelConfig,
     WorldModelConfig,
 )
+from accerl_lerobot.world_model.imagined import check_imagination
 from accerl_lerobot.world_model.learners import new_success_model
-from accerl_lerobot.world_model.online import Promotion
+from accerl_lerobot.world_model.online import make_learner
 from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.pretrain import world_spec
-from accerl_lerobot.world_model.store import (
-    HELD_OUT,
-    LEARNT,
-    THRESHOLD,
-    load_failed,
-    load_roles,
-    note_failed,
-    save_world_model,
-)
-from accerl_lerobot.world_model.success_model import SuccessPairsRewardModel
+from accerl_lerobot.world_model.store import HELD_OUT, LEARNT, THRESHOLD, note_failed, save_world_model
 from tests.runs import tiny_run
 
 ENV = SimulatedConfig(max_steps=16, hold=8)
@@ -61,22 +50,8 @@ def run(checkpoint: Path, folder: Path, learn: OnlineLearnConfig, roles: dict[st
     config = PixelModelConfig(channels=(8, 8))
     spec = world_spec(WorldModelConfig(chunk=4, image_size=32, model=config), ENV)
     save_world_model(folder, PixelWorldModel(spec, config), new_success_model(4), roles)
-    imagination = ImaginationConfig(share=0.5, path=str(folder), learn=learn)
+    imagination = ImaginationConfig(environments=4, path=str(folder), learn=learn)
     return tiny_run(checkpoint, env=ENV, imagination=imagination)
-
-
-@pytest.mark.parametrize(
-    ("name", "made"), [("learned", PixelWorldModel), ("shuffled", ShuffledModel), ("oracle", OracleModel)]
-)
-def test_what_a_run_can_imagine_with(name: Any, made: type, tiny_checkpoint: Path, tmp_path: Path):
-    config = run(tiny_checkpoint, tmp_path / "model", OnlineLearnConfig(), {})
-    imagination = make_imagination(
-        replace(config, imagination=replace(config.imagination, model=name)), lambda segment: None
-    )
-    model, success = imagination._model, imagination._success
-    assert type(model) is made and (success is None) is (name == "oracle")
-    learnt = model.model if isinstance(model, ShuffledModel) else model
-    assert isinstance(learnt, PixelWorldModel) is imagination.config.learns
 
 
 def test_it_goes_on_with_what_it_has_learned_from_and_never_with_what_was_held_out(
@@ -85,30 +60,13 @@ def test_it_goes_on_with_what_it_has_learned_from_and_never_with_what_was_held_o
     learn = OnlineLearnConfig(dataset=dataset)
     config = run(tiny_checkpoint, tmp_path / "none", learn, {})
     learner = make_learner(config)
-    assert (len(learner._offline), len(learner._held_offline)) == (9, 0), "of unknown ones it takes all"
+    assert len(learner._offline) == 9, "of unknown ones it takes all"
     assert not any(e.own for e in learner._offline), "a validation is about this run's own failures"
 
     keys = [episode.key for episode in learner._offline]
     roles = dict.fromkeys(keys[:2], LEARNT) | dict.fromkeys(keys[2:5], HELD_OUT) | {keys[5]: THRESHOLD}
     learner = make_learner(run(tiny_checkpoint, tmp_path / "some", learn, roles | {"elsewhere": LEARNT}))
-    assert [e.key for e in learner._held_offline] == keys[2:6]
     assert [e.key for e in learner._offline] == keys[:2] + keys[6:]
-    assert learner._roles == dict.fromkeys(keys, LEARNT) | dict.fromkeys(keys[2:6], HELD_OUT) | {
-        "elsewhere": LEARNT
-    }
-
-
-def test_what_is_promoted_says_what_it_has_learned_from(tiny_checkpoint: Path, tmp_path: Path):
-    config = run(tiny_checkpoint, tmp_path / "model", OnlineLearnConfig(), {})
-    imagination = make_imagination(config, lambda segment: None)
-    model, success = imagination._model, imagination._success
-    assert isinstance(model, PixelWorldModel) and isinstance(success, SuccessPairsRewardModel)
-    imagination.swap(Promotion(model, success, 7, {"a": LEARNT}))
-    success.config.device = "cuda:3"  # as where it imagines; a machine that resumes may have none
-    imagination.save_promoted(tmp_path / "promoted")
-    saved = json.loads((tmp_path / "promoted" / "success_model" / "config.json").read_text())
-    assert saved["device"] == "cpu" and success.config.device == "cuda:3"
-    assert load_roles(tmp_path / "promoted") == {"a": LEARNT} and load_failed(tmp_path / "promoted") == []
 
 
 def test_what_would_be_fine_tuned_is_looked_at_before(tiny_checkpoint: Path, tmp_path: Path):
@@ -138,7 +96,6 @@ def test_what_would_be_fine_tuned_is_looked_at_before(tiny_checkpoint: Path, tmp
             "failed its validation (recall, online.auroc) and is used all the same",
         ),
         ([], 0, None),
-        (["recall"], 5, None),
     ],
 )
 def test_a_model_that_failed_its_validation_is_not_used_silently(
@@ -154,7 +111,9 @@ def test_a_model_that_failed_its_validation_is_not_used_silently(
     if failed is not None:
         note_failed(tmp_path / "model", failed)
     check_imagination(config)
-    logged = [record.getMessage() for record in caplog.records if record.name.endswith("engine.imagination")]
+    logged = [
+        record.getMessage() for record in caplog.records if record.name.endswith("world_model.imagined")
+    ]
     assert len(logged) == (told is not None) and all(str(told) in line for line in logged)
 
 

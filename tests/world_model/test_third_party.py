@@ -19,6 +19,7 @@ import torch
 from torch import nn
 
 from accerl_lerobot import cli, console
+from accerl_lerobot.checkpoint.layout import WORLD_MODEL
 from accerl_lerobot.cli.configs import WorldModelEvalRun, WorldModelRun
 from accerl_lerobot.engine.config import parse
 from accerl_lerobot.envs import SimulatedConfig
@@ -26,10 +27,11 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.config import LearnableModelConfig, WorldModelConfig
 from accerl_lerobot.world_model.contract import LearnableWorldModel, new_model
 from accerl_lerobot.world_model.learners import Learner, new_success_model
+from accerl_lerobot.world_model.online import save_online
 from accerl_lerobot.world_model.pretrain import world_spec
 from accerl_lerobot.world_model.store import load_world_model, save_world_model
 from tests.runs import drive, replacing
-from tests.test_imagination import decisions, imagining, learning, run_locally
+from tests.test_imagination import imagining, run_locally
 from tests.world_model.test_pixels import SPEC, dots, windows
 from tests.world_model.test_pretrain import arguments, recorded
 
@@ -153,17 +155,13 @@ class BareConfig(LearnableModelConfig):
     """Says nothing of its class."""
 
 
-def test_it_goes_on_learning_in_a_run_and_is_saved_when_promoted(tiny_checkpoint: Path, tmp_path: Path):
-    learn = learning()
-    path = str(saved(tmp_path / "w", gain=3.0))
-    config = imagining(tiny_checkpoint, path=path, discover_packages_path=PACKAGE, learn=learn, episodes=24)
-    history, batches, engine = run_locally(config)
-    imagined = [s for batch in batches for s in batch if decisions([s], "imagined")]
-    assert history[-1].imagination["promoted"] >= 1 and imagined
-    assert all(s.world_version for s in imagined), "the one it began with never imagined"
-    assert engine._imagination is not None
-    engine._imagination.save_promoted(tmp_path / "promoted")
-    before, after = (load_world_model(tmp_path / name)[0] for name in ("w", "promoted"))
+def test_it_imagines_and_goes_on_learning_in_a_run(tiny_checkpoint: Path, tmp_path: Path):
+    config = imagining(tiny_checkpoint, saved(tmp_path / "w", gain=3.0), episodes=24)
+    named = replace(config.imagination, discover_packages_path=PACKAGE)
+    history, _, engine = run_locally(replace(config, imagination=named))
+    assert history[-1].replay["trained_imagined"] > 0
+    save_online(tmp_path, engine._world_learner)
+    before, after = (load_world_model(tmp_path / name)[0] for name in ("w", WORLD_MODEL))
     assert name_of(after) == "LinearWorldModel" and after.config == linear(gain=3.0)
     moved = after.get_parameter("motion.weight") - before.get_parameter("motion.weight")
     assert float(moved.abs().max()) > 0
@@ -173,16 +171,16 @@ def test_it_goes_on_learning_in_a_run_and_is_saved_when_promoted(tiny_checkpoint
 def test_in_processes_of_their_own_they_find_it_too(tiny_checkpoint: Path, tmp_path: Path):
     from accerl_lerobot.engine.launch import RayEngine
 
-    learn = learning()
-    named = {"path": str(saved(tmp_path / "w")), "discover_packages_path": PACKAGE}
-    config = imagining(tiny_checkpoint, learn=learn, episodes=24, **named)
-    engine = RayEngine(replace(config, output_dir=str(tmp_path / "run")), ("match",))
+    config = imagining(tiny_checkpoint, saved(tmp_path / "w"), episodes=24)
+    named = replace(config.imagination, discover_packages_path=PACKAGE)
+    config = replace(config, imagination=named, output_dir=str(tmp_path / "run"))
+    engine = RayEngine(config, ("match",))
     try:
         engine.train()
         last = drive(engine)[-1]
     finally:
         engine.close()
-    assert last.version == 12 and last.imagination["promoted"] >= 1 and last.imagination["rollouts"] > 0
+    assert last.version == 12 and last.world_model["learn_steps"] > 0 < last.replay["trained_imagined"]
 
 
 class Moody(LearnableWorldModel):
