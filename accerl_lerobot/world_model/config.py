@@ -157,22 +157,15 @@ class ValidationConfig(Section, section="world_model.validation"):
     """Env steps between two windows of an episode."""
     max_windows: Annotated[int, Range("[1, 1000000]")] = 400
     """Windows at most, drawn at random."""
-    skill_first: float = 0.3
+    skill: float = 0.3
     """The skill on changed pixels after one chunk must exceed this."""
-    skill_last: float = 0.0
-    """The skill after `depth` chunks must exceed this, on changed pixels and on all pixels."""
     sensitivity: float = 1.2
     """The lower end of the sensitivity's interval after one chunk must exceed this."""
     auroc: float = 0.9
     """The lower end of the interval of the AUROC of rollouts' outcomes must exceed this."""
-    false_success: float = 0.25
-    """Largest share of imagined rollouts that may be classified as successes although they cannot be: with
-    the executed actions of episodes that failed, and without any action."""
     false_positives: Annotated[float, Range("[0, 1)")] = 0.1
     """Largest share of failures above the success threshold when it is chosen. Of the thresholds that keep
     to it, the one that best separates successes from failures is taken."""
-    recall: float = 0.3
-    """The share of successes whose imagined rollout is classified as one must exceed this."""
 
 
 @dataclass(frozen=True, kw_only=True)

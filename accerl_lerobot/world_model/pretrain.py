@@ -94,19 +94,15 @@ def pretrain(run: WorldModelRun, directory: Path, console: Console) -> dict[str,
     success.eval()
     seconds = time.monotonic() - started
 
-    # The threshold is chosen on the policy's failures, where there are any, as demonstrations fail otherwise.
-    *others, fresh = held_out
-    roles = {e.key: store.HELD_OUT for name in others for e in held_out[name]}
-    roles |= {e.key: store.THRESHOLD for e in held_out[fresh]} | {e.key: store.LEARNT for e in learnt}
+    roles = {e.key: store.HELD_OUT for e in held} | {e.key: store.LEARNT for e in learnt}
     store.save_world_model(directory / "world_model", serving, success, roles)
     with console.stage("validation"):
-        found = validation.validate_datasets(
-            serving, held_out, config.validation, success, fresh=fresh, seed=run.seed
-        )
+        found = validation.validate_datasets(serving, held_out, config.validation, success, run.seed)
         validation.preview_videos(directory, serving, held_out, config.validation, run.seed)
     failed = (name for name, check in found["checks"].items() if not check["holds"])
     store.note_failed(directory / "world_model", failed)
-    success.config.threshold = found["datasets"][fresh]["threshold"]
+    # The threshold is chosen on the policy's failures, where there are any, as demonstrations fail otherwise.
+    success.config.threshold = list(found["datasets"].values())[-1]["threshold"]
     success.save_pretrained(directory / "world_model" / store.SUCCESS)
     counts = {"learnt": data.count_episodes(learnt), "held_out": data.count_episodes(held)}
     return found | counts | {"seconds": seconds}

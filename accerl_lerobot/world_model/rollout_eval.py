@@ -11,7 +11,7 @@ Shapes: M rollouts, D depths in chunks; see `data.py` for the others.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -23,7 +23,6 @@ from accerl_lerobot.world_model.data import Episode, WindowStart, cut_windows, h
 from accerl_lerobot.world_model.success_model import SuccessPairsRewardModel
 
 BATCH = 64  # rollouts at once
-FOLDS = 4  # folds of the episodes, see `outcome_metrics`
 DRAWS = 1000  # resamples of an interval
 
 
@@ -124,7 +123,6 @@ class Scores(NamedTuple):
     """Scores of M rollouts."""
 
     imagined: np.ndarray  # highest P(success) with the executed actions, until the real success
-    idle: np.ndarray  # highest P(success) without any action, until the longest episode's end
     achieved: np.ndarray  # bool, True if the real episode achieved the task
     episode: np.ndarray  # int64, index of the episode
     own: np.ndarray  # bool, see `Episode`
@@ -149,24 +147,15 @@ def score_episodes(
     at = subsample(episodes, at, config.max_windows, rng)
     depth = max(-(-len(episode) // chunk) for episode in episodes)
     windows, predictions, executed = replay(model, episodes, at, depth)
-    # Without actions, every rollout has as much time as the longest episode.
-    begun = np.array([int(episodes[e].times[f]) // chunk for e, f in at])
-    left = np.arange(depth) < (depth - begun)[:, None]
-    idle = predict(model, windows, np.zeros_like(windows.actions), lengths=left.sum(1))
-
     codes = task_codes(windows.task)
-
-    def best(path: np.ndarray, counted: np.ndarray) -> np.ndarray:
-        highest = np.zeros(len(at))
-        for d in range(depth):
-            rows = np.flatnonzero(counted[:, d])
-            probability = success.probabilities(path[rows, d], path[rows, d + 1], codes[rows])
-            highest[rows] = np.maximum(highest[rows], probability)
-        return highest
-
+    highest = np.zeros(len(at))
+    for d in range(depth):
+        rows = np.flatnonzero(executed[:, d])
+        frames = predictions.frames[rows]
+        probability = success.probabilities(frames[:, d], frames[:, d + 1], codes[rows])
+        highest[rows] = np.maximum(highest[rows], probability)
     return Scores(
-        imagined=best(predictions.frames, executed),
-        idle=best(idle.frames, left),
+        imagined=highest,
         achieved=(windows.success & executed).any(1),
         episode=windows.episode,
         own=np.array([episodes[e].own for e in windows.episode], bool),
@@ -205,39 +194,6 @@ def choose_threshold(scores: Scores, config: ValidationConfig) -> float | None:
     candidates = sorted({least, *np.nextafter(failures[failures >= least], np.inf).tolist()})
     gains = [(successes > t).mean() - (failures > t).mean() for t in candidates]
     return min(float(candidates[int(np.argmax(gains))]), 1 - 1e-6)
-
-
-def outcome_metrics(
-    scores: Scores, config: ValidationConfig, threshold: float | None = None
-) -> dict[str, Any]:
-    """Compares the outcomes of imagined rollouts with the real ones.
-
-    Where `threshold` is None, that of each fold of the episodes is chosen on the others.
-
-    Returns:
-        Numbers of ``rollouts``, ``successes`` and ``failures``; ``auroc``; shares above the threshold:
-        ``false_success`` of failures, ``false_success_idle`` of all without any action, ``recall`` of
-        successes.
-    """
-    failed = scores.of_own(~scores.achieved)
-    thresholds = np.full(len(scores.achieved), 0.5 if threshold is None else threshold)
-    fold = np.unique(scores.episode, return_inverse=True)[1] % FOLDS
-    for i in range(FOLDS if threshold is None else 0):
-        others = Scores(*(part[fold != i] for part in scores))
-        thresholds[fold == i] = choose_threshold(others, config) or 0.5
-
-    def share(values: np.ndarray, of: np.ndarray) -> float:
-        return float((values[of] > thresholds[of]).mean()) if of.any() else float("nan")
-
-    return {
-        "rollouts": len(scores.achieved),
-        "successes": int(scores.achieved.sum()),
-        "failures": int(failed.sum()),
-        "auroc": bootstrap(scores.episode, lambda of: auroc(scores.imagined[of], scores.achieved[of])),
-        "false_success": share(scores.imagined, failed),
-        "false_success_idle": share(scores.idle, np.ones(len(failed), bool)),
-        "recall": share(scores.imagined, scores.achieved),
-    }
 
 
 def bootstrap(groups: np.ndarray, statistic: Callable[[np.ndarray], float]) -> dict[str, float]:

@@ -38,8 +38,7 @@ from accerl_lerobot.world_model.contract import Context, LearnableWorldModel, Wo
 from accerl_lerobot.world_model.success_model import SuccessPairsRewardModel
 
 CONFIG, WEIGHTS, SUCCESS = "config.json", "model.safetensors", "success_model"
-LEARNT, HELD_OUT, THRESHOLD = "learnt", "held out", "threshold"
-"""Roles of episodes: the model was trained on it; it was held out; the threshold was chosen on it, too."""
+LEARNT, HELD_OUT = "learnt", "held out"  # roles of episodes: trained on, or not
 
 
 def save_world_model(

@@ -37,9 +37,9 @@ from accerl_lerobot.world_model.config import ValidationConfig
 from accerl_lerobot.world_model.contract import LearnableWorldModel, Windows, WorldModel
 from accerl_lerobot.world_model.data import DATASET, ONLINE, Episode, WindowStart
 from accerl_lerobot.world_model.rollout_eval import (
+    auroc,
     bootstrap,
     choose_threshold,
-    outcome_metrics,
     predict,
     score_episodes,
     subsample,
@@ -124,20 +124,16 @@ def validate(
     config: ValidationConfig,
     success: SuccessPairsRewardModel,
     seed: int = 0,
-    threshold: float | None = None,
 ) -> dict[str, Any]:
     """Validates a model on episodes that it was not trained on.
 
-    Where `threshold` is None, that of each fold of the episodes is chosen on the others.
-
     Returns:
         ``depths``: a row per depth with estimates of skill and sensitivity, and errors of the state;
-        ``outcomes``, see `outcome_metrics`; ``threshold``: the given one, or one chosen on all episodes;
-        ``checks``: each with its value and whether it holds; numbers of ``episodes`` and ``env_steps``.
+        ``threshold`` of the success model, chosen on these episodes; ``checks``: each with its value and
+        whether it holds; numbers of ``episodes`` and ``env_steps``.
     """
     rng = np.random.default_rng((seed, 1))
     scores = score_episodes(model, success, episodes, config, seed)
-    outcomes = outcome_metrics(scores, config, threshold)
     windows = validation_windows(episodes, model, config, seed)
     predicted = predict(model, windows, windows.actions)
     shuffled = predict(model, windows, data.shuffle_actions(windows, rng).actions).frames
@@ -154,45 +150,27 @@ def validate(
             error = partial(squared_errors, target=real)
             row["skill"] = skill(error(made), error(newest), groups)
             row["skill_changed"] = skill(error(made, mask=moved), error(newest, mask=moved), groups)
-            row["sensitivity_shuffled"] = sensitivity(error(made), error(shuffled[fits, depth]), groups)
+            row["sensitivity"] = sensitivity(error(made), error(shuffled[fits, depth]), groups)
             if model.spec.state_dim:
                 state = windows.state[fits, now + depth]
                 row["state_error"] = float(np.abs(predicted.robot[fits, depth - 1] - state).mean())
         rows.append(row)
-    checks = _checks(rows, config, outcomes)
+    nothing = {"value": math.nan, "low": math.nan}
+    outcomes = bootstrap(scores.episode, lambda of: auroc(scores.imagined[of], scores.achieved[of]))
+    values = {
+        "skill": (rows[0].get("skill_changed", nothing)["value"], config.skill),
+        "sensitivity": (rows[0].get("sensitivity", nothing)["low"], config.sensitivity),
+        "auroc": (outcomes["low"], config.auroc),
+    }
+    checks = {
+        name: {"value": value, "above": bound, "holds": bool(value > bound)}  # NaN passes nothing
+        for name, (value, bound) in values.items()
+    }
     return data.count_episodes(episodes) | {
         "depths": rows,
-        "outcomes": outcomes,
-        "threshold": choose_threshold(scores, config) or 0.5 if threshold is None else threshold,
+        "threshold": choose_threshold(scores, config) or 0.5,
         "checks": checks,
         "passed": all(check["holds"] for check in checks.values()),
-    }
-
-
-def _checks(
-    rows: list[dict[str, Any]], config: ValidationConfig, outcomes: dict[str, Any]
-) -> dict[str, dict[str, Any]]:
-    def at(depth: int, key: str, part: str = "value") -> float:
-        return float(rows[depth][key][part]) if key in rows[depth] else float("nan")
-
-    bounds = {
-        "skill_changed_first": (at(0, "skill_changed"), "above", config.skill_first),
-        "skill_changed_last": (at(-1, "skill_changed"), "above", config.skill_last),
-        "skill_last": (at(-1, "skill"), "above", config.skill_last),
-        "sensitivity_low": (at(0, "sensitivity_shuffled", "low"), "above", config.sensitivity),
-        "auroc": (outcomes["auroc"]["low"], "above", config.auroc),
-        "false_success": (outcomes["false_success"], "at most", config.false_success),
-        "false_success_idle": (outcomes["false_success_idle"], "at most", config.false_success),
-        "recall": (outcomes["recall"], "above", config.recall),
-    }
-    # NaN passes nothing.
-    return {
-        name: {
-            "value": value,
-            "wanted": f"{how} {bound}",
-            "holds": bool(value > bound if how == "above" else value <= bound),
-        }
-        for name, (value, how, bound) in bounds.items()
     }
 
 
@@ -221,43 +199,33 @@ def validate_datasets(
     datasets: dict[str, list[Episode]],
     config: ValidationConfig,
     success: SuccessPairsRewardModel,
-    *,
-    fresh: str | None,
-    threshold: float | None = None,
     seed: int = 0,
 ) -> dict[str, Any]:
     """Validates a world model on each dataset, by its name.
-
-    On the dataset `fresh` the success threshold is chosen: of each fold, on the others. All other datasets
-    are classified by `threshold`; None: the one that is chosen on all of `fresh`.
 
     Returns:
         ``datasets``: name → what `validate` returns; ``checks``: those of the first, and of the others as
         ``<dataset>.<check>``; ``passed``: True if all hold.
     """
-    results: dict[str, dict[str, Any]] = {}
-    for name in sorted(datasets, key=lambda name: name != fresh):
-        given = None if name == fresh else threshold
-        results[name] = validate(model, datasets[name], config, success, seed, given)
-        threshold = results[name]["threshold"] if threshold is None else threshold
+    results = {name: validate(model, of, config, success, seed) for name, of in datasets.items()}
     checks = {
-        check if name == DATASET else f"{name}.{check}": held
-        for name in datasets
-        for check, held in results[name]["checks"].items()
+        check if name == DATASET else f"{name}.{check}": outcome
+        for name, result in results.items()
+        for check, outcome in result["checks"].items()
     }
     passed = all(check["holds"] for check in checks.values())
-    return {"passed": passed, "checks": checks, "datasets": {name: results[name] for name in datasets}}
+    return {"passed": passed, "checks": checks, "datasets": results}
 
 
 def checks_table(found: dict[str, Any]) -> Table:
     """Results of `validate_datasets`: a row per check, a column per dataset."""
-    table = Table("check", "wanted", *found["datasets"], title="passed" if found["passed"] else "FAILED")
+    table = Table("check", "above", *found["datasets"], title="passed" if found["passed"] else "FAILED")
     results = list(found["datasets"].values())
     table.add_row("episodes", "", *(str(one["episodes"]) for one in results))
     for name, check in results[0]["checks"].items():
         held = [one["checks"][name] for one in results]
         cells = (f"{one['value']:.2f}{'' if one['holds'] else ' FAILS'}" for one in held)
-        table.add_row(name, check["wanted"], *cells)
+        table.add_row(name, f"{check['above']:g}", *cells)
     return table
 
 
@@ -267,7 +235,7 @@ def evaluate(config: WorldModelEvalRun, directory: Path, console: Console) -> di
     path = Path(str(config.path)).expanduser()
     store.rehearse_world_model(path, config.discover_packages_path)
     model, success = store.load_world_model(path, config.discover_packages_path)
-    roles, fresh = store.load_roles(path), None
+    roles = store.load_roles(path)
     with console.stage("episodes"):
         named = {DATASET: config.dataset, ONLINE: config.online}
         datasets = data.load_datasets(named, model.spec)
@@ -278,10 +246,7 @@ def evaluate(config: WorldModelEvalRun, directory: Path, console: Console) -> di
             raise InputError(f"{name}.repo_id", named[name].repo_id, hint)
         if trained_on := len(episodes) - len(kept):
             console.say(f"{name}: trained on {trained_on} episodes of it, evaluated on the other {len(kept)}")
-        if any(roles.get(episode.key) == store.THRESHOLD for episode in kept):
-            fresh = name
         datasets[name] = kept
     with console.stage("validation"):
         preview_videos(directory, model.to(device), datasets, config.validation, config.seed)
-        known = {"fresh": fresh, "threshold": success.config.threshold, "seed": config.seed}
-        return validate_datasets(model, datasets, config.validation, success.to(device), **known)
+        return validate_datasets(model, datasets, config.validation, success.to(device), config.seed)

@@ -99,7 +99,7 @@ def test_stock_lerobot_and_a_plugin_policy(tmp_path: Path, monkeypatch: pytest.M
 def test_a_validation_is_reported(tmp_path: Path):
     write_json(tmp_path / "world_model" / "config.json", {"spec": {}, "model": {}})
     checks = {
-        "auroc": {"value": 0.97123, "wanted": "above 0.9", "holds": True},
+        "auroc": {"value": 0.97123, "above": 0.9, "holds": True},
         "recall": {"value": 0.1, "holds": False},
     }
     write_json(tmp_path / "validation.json", {"passed": False, "checks": checks})

@@ -27,7 +27,7 @@ from accerl_lerobot.world_model.learners import new_success_model
 from accerl_lerobot.world_model.online import make_learner
 from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.pretrain import world_spec
-from accerl_lerobot.world_model.store import HELD_OUT, LEARNT, THRESHOLD, note_failed, save_world_model
+from accerl_lerobot.world_model.store import HELD_OUT, LEARNT, note_failed, save_world_model
 from tests.runs import tiny_run
 
 ENV = SimulatedConfig(max_steps=16, hold=8)
@@ -64,7 +64,7 @@ def test_it_goes_on_with_what_it_has_learned_from_and_never_with_what_was_held_o
     assert not any(e.own for e in learner._offline), "a validation is about this run's own failures"
 
     keys = [episode.key for episode in learner._offline]
-    roles = dict.fromkeys(keys[:2], LEARNT) | dict.fromkeys(keys[2:5], HELD_OUT) | {keys[5]: THRESHOLD}
+    roles = dict.fromkeys(keys[:2], LEARNT) | dict.fromkeys(keys[2:5], HELD_OUT) | {keys[5]: HELD_OUT}
     learner = make_learner(run(tiny_checkpoint, tmp_path / "some", learn, roles | {"elsewhere": LEARNT}))
     assert [e.key for e in learner._offline] == keys[:2] + keys[6:]
 
