@@ -54,9 +54,9 @@ def audit_segments(run: Path) -> dict[str, Any]:
         keys = Counter(segment.key for segment in read_journal(cut))
     finally:
         cut.unlink(missing_ok=True)
-    counters: ReplayCounters = saved["real"]["counters"]
+    counters: ReplayCounters = saved["counters"]
     counted = counters.inserted_segments
-    stored = {entry["segment"].key for entry in saved["real"]["entries"]}
+    stored = {entry["segment"].key for entry in saved["entries"]}
     return {
         "saved": checkpoint.name,
         "segments": counted,

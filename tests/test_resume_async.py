@@ -59,7 +59,7 @@ def test_nothing_committed_is_lost_or_doubled_and_no_update_made_twice(engine, t
     first.close()
 
     state = tmp_path / TRAINING_STATE
-    cut = snapshot.load(state / "replay")["replay"]["real"]
+    cut = snapshot.load(state / "replay")["replay"]
     ledger = snapshot.load(state / "trainer")["ledger"]
     assert len(ledger) == saved.version
     uses = Counter(key for keys in ledger for key in keys)
@@ -103,7 +103,7 @@ def test_episodes_that_were_paid_for_are_played_once(engine, tmp_path: Path):
     episodes = []
     for progress in polls(second):
         episodes += progress.episodes
-        if second._real_ended:
+        if second._collected:
             break
     # Episodes that were under way are begun anew; one that had ended but not been told of counts as such.
     assert len(played) + len(episodes) == 40

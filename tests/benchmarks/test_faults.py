@@ -15,7 +15,7 @@ import pytest
 
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import CHECKPOINTS, TRAINING_STATE, save_checkpoint
-from accerl_lerobot.replay.buffer import MixedReplay
+from accerl_lerobot.replay.buffer import Replay
 from accerl_lerobot.replay.journal import EPISODES, Journal
 from accerl_lerobot.replay.pacing import ReplayConfig
 from benchmarks.audit import audit_segments, audit_updates
@@ -94,7 +94,7 @@ def kept(tmp_path: Path) -> Path:
     run.mkdir()
     journal = Journal(run / EPISODES)
     sizes = ReplayConfig(capacity=12, min_decisions=4, max_unlearned_decisions=4)
-    replay = MixedReplay(sizes, sizes, 0.0, journal=journal)
+    replay = Replay(sizes, journal)
     for key in "abcd":  # the first has left when the last comes
         replay.insert(make_segment(key))
 

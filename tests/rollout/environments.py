@@ -100,7 +100,7 @@ class Recorder:
         self.segments: list[Segment] = []
         self.results: list[EpisodeResult] = []
         self.runner = RolloutRunner(
-            environments, lambda: self.plans.pop(0) if self.plans else None, config, name,
+            environments, lambda source: self.plans.pop(0) if self.plans else None, config, name,
             self.segments.append, self.results.append,
         )  # fmt: skip
 
