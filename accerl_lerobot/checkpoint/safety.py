@@ -25,7 +25,6 @@ from accerl_lerobot.errors import InputError
 
 MIB = 1024**2
 JSON_MOST = 4 * MIB  # bytes of a JSON file, unless it is one that is known to be larger
-READ_MOST = 64 * MIB  # bytes that are read of a safetensors file before it is opened again
 PART_MOST, PATH_MOST = 255, 1024  # bytes of one part of a file's name, and of all of it
 PICKLES = (".bin", ".pt", ".pth", ".pkl", ".pickle", ".ckpt")
 """Endings of files that PyTorch unpickles, which may run whatever their author wished."""
@@ -193,22 +192,14 @@ def tensor_shapes(path: Path, origin: FileSource) -> dict[str, tuple[str, tuple[
 def read_tensors(path: Path, origin: FileSource) -> Iterator[tuple[str, Any]]:
     """Name and PyTorch tensor, one after the other, of a safetensors file; NaN and infinity are refused.
 
-    A tensor is a view of the file, so that none is in memory twice. The file is opened again now and then:
-    what has been read of it counts as memory of this process until it is closed.
+    A tensor is a view of the file, so that none is in memory twice.
     """
-    shapes, read = tensor_shapes(path, origin), 0
-    with contextlib.ExitStack() as stack:
-        file = stack.enter_context(opened(path, origin, "pt"))
-        for name in shapes:
+    with opened(path, origin, "pt") as file:
+        for name in file.keys():  # noqa: SIM118
             tensor = file.get_tensor(name)
             if not _finite(tensor):
                 raise origin.refuse(path.name, f"{_shown(name)} holds NaN or infinity; train it again")
             yield name, tensor
-            read += tensor.nbytes
-            del tensor
-            if read > READ_MOST:
-                stack.close()
-                file, read = stack.enter_context(opened(path, origin, "pt")), 0
 
 
 def _finite(tensor: Any) -> bool:
