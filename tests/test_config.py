@@ -133,7 +133,6 @@ MISTAKES: list[tuple[list[str], str]] = [
     (["--policy.push_to_hub=false"], "policy.push_to_hub=False: the name is LeRobot's; leave it out"),
     (["--env.discover_packages_path=a/b"], "env.discover_packages_path='a/b': use the name of a package"),
     (["--seed=1", "--seed=2"], "seed=2: it is set to 1 already; give it once"),
-    (["--job_name=" + "x" * 5000], "job_name='xxx"),
     (["--trainer..lr=1"], "argument='--trainer..lr=1': write --section.field=value"),
     (["here.yaml", "there.yaml"], "argument='there.yaml': write --section.field=value"),
     (["--config_path=here.yaml", "--config_path=there.yaml"], "config_path='there.yaml': there is here.yaml"),
