@@ -131,7 +131,7 @@ MISTAKES: list[tuple[list[str], str]] = [
     (["--sft.policy.chunk_size=5"], "sft.policy={'chunk_size': 5}: name LeRobot's policy type, e.g."),
     (["--steps=3"], "steps=3: the name is LeRobot's; use trainer.updates or sft.steps"),
     (["--policy.push_to_hub=false"], "policy.push_to_hub=False: the name is LeRobot's; leave it out"),
-    (["--env.discover_packages_path=a/b"], "env.discover_packages_path='a/b': use the name of a package"),
+    (["--env.discover_packages_path=a/b"], "env.discover_packages_path='a/b': cannot be imported"),
     (["--seed=1", "--seed=2"], "seed=2: it is set to 1 already; give it once"),
     (["--trainer..lr=1"], "argument='--trainer..lr=1': write --section.field=value"),
     (["here.yaml", "there.yaml"], "argument='there.yaml': write --section.field=value"),

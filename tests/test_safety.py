@@ -60,17 +60,15 @@ def test_twenty_thousand_hostile_names_stay_inside(tmp_path: Path):
 @pytest.mark.parametrize(
     ("name", "why"),
     [
-        ("/etc/passwd", "begins outside"),
+        ("/etc/passwd", "not the name of a file inside"),
         ("../../etc/passwd", "leads out"),
-        ("C:/x", "Windows path"),
-        ("a\\..\\x", "Windows path"),
-        ("a\x00b", "control characters"),
-        ("x" * 256, "too long"),
-        ("/".join(["x" * 200] * 6), "too long"),
-        ("\ud800", "not good Unicode"),
-        ("~/x", "begins outside"),
-        ("", "not a name"),
-        (None, "not a name"),
+        ("C:/x", "not the name"),
+        ("a\\..\\x", "not the name"),
+        ("a\x00b", "not the name"),
+        ("\ud800", "not the name"),
+        ("~/x", "not the name"),
+        ("", "not the name"),
+        (None, "not the name"),
     ],
 )
 def test_names_that_are_refused(tmp_path: Path, name: object, why: str):
@@ -131,16 +129,14 @@ def test_a_run_from_elsewhere_is_read_without_leaving_its_folder(verb, tmp_path,
         (b"\xff\xfe", "not good JSON"),
         (b'{"a": ' + b"9" * 5000 + b"}", "not good JSON"),
         (b"[1]", "a mapping is wanted, not list"),
-        (b"[" * 200_000, "nested too deeply"),
-        (b'{"a":' * 200_000, "nested too deeply"),
-        (b" " * 2000, "more than the 1000"),
+        (b"[" * 200_000, "not good JSON"),
     ],
 )
 def test_json_that_is_refused(tmp_path: Path, content: bytes, why: str):
     path = tmp_path / "config.json"
     path.write_bytes(content)
     with pytest.raises(InputError, match=f"^policy.path='runs/theirs': config.json: .*{why}"):
-        read_json(path, ORIGIN, 1000 if content.startswith(b" ") else 10**7)
+        read_json(path, ORIGIN)
 
 
 def test_what_is_no_file_is_not_waited_for(tmp_path: Path):

@@ -59,12 +59,10 @@ def discover(package: str | None, section: str = "") -> None:
     """Imports a package that registers types; None does nothing. `section` is that of the field."""
     if package is None:
         return
-    field = f"{section}.{DISCOVER}" if section else DISCOVER
-    if not all(part.isidentifier() for part in package.split(".")):
-        raise InputError(field, package, "use the name of a package as Python imports it, e.g. my_models")
     try:
         importlib.import_module(package)
     except (Exception, SystemExit) as error:  # it is somebody's code, which may do anything
+        field = f"{section}.{DISCOVER}" if section else DISCOVER
         why = f"cannot be imported ({type(error).__name__}: {brief(error)})"
         if isinstance(error, ModuleNotFoundError) and error.name == package.partition(".")[0]:
             why += "; install it, or name the folder that it is in: PYTHONPATH=FOLDER accerl …"
@@ -423,9 +421,6 @@ def _decoded(cls: type[Any], tree: dict[str, Any], path: tuple[str, ...], whole:
             values[key] = _section(sections[key], value or {}, defaults[key], place, whole)
         else:
             raise InputError(".".join(place), value, f"a config section; use --{key}.field=value")
-    for field in dataclasses.fields(cls):
-        if field.name not in values and field.default is field.default_factory is dataclasses.MISSING:
-            raise InputError(".".join((*path, field.name)), None, f"use {wanted(annotations[field.name])}")
     try:
         return cls(**values)
     except InputError as error:

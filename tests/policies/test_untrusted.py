@@ -95,10 +95,10 @@ def test_backbones_are_not_fetched_from_just_anywhere(copied: Path):
             "./secret",
             "a/b/c",
             "https://example.com/x",
+            7,
         ),
         "leads elsewhere": ("/a/../secret",),
         "may not name": ("/somewhere/secret",),
-        "a name is wanted": (7, "a\x00"),
     }
     for why, names in refusals.items():
         for name in names:
@@ -125,15 +125,6 @@ def test_attention_is_not_fetched_as_compiled_code(copied: Path, key: str):
     content = {"model_type": "smolvlm", "text_config": {key: "them/kernels"}}
     (copied / BACKBONE / "config.json").write_text(json.dumps(content))
     refused(copied, f"{key} names code on the Hub")
-
-
-@pytest.mark.parametrize(
-    ("text", "why"),
-    [("[]", "a mapping is wanted"), ('{"sampler": 7}', "accerl.json: sampler"), ("{", "not good JSON")],
-)
-def test_what_is_ours_is_checked_too(copied: Path, text: str, why: str):
-    (copied / "accerl.json").write_text(text)
-    refused(copied, why)
 
 
 def test_a_critic_of_another_size(copied: Path):
@@ -193,7 +184,7 @@ def test_code_on_the_hub_is_refused(theirs: Repository):
     with guarded("policy"), pytest.raises(InputError) as caught:
         load(theirs.name, trust_remote_code=True)
     assert str(caught.value).startswith("policy.trust_remote_code=") and "their_code.py" in str(caught.value)
-    assert "commit in policy.trust_remote_code" in caught.value.hint
+    assert "name its commit in policy.trust_remote_code" in caught.value.hint
     assert not theirs.marker.exists()
 
 
