@@ -244,7 +244,7 @@ def put_in_order(meta: Any, origin: FileSource) -> None:
         if len(numbers) < meta.total_episodes:
             why = f"{len(numbers)} episodes, and {INFO} says {meta.total_episodes}; {AGAIN}"
             raise origin.refuse(EPISODES, why)
-        if numbers.tolist() != order.tolist():
+        if (numbers != numbers[order]).any():
             meta.episodes = meta.episodes.select(order)
     for camera in meta.camera_keys:
         feature = meta.features[camera]

@@ -40,7 +40,7 @@ from accerl_lerobot.world_model.data import load_datasets, open_datasets
 from accerl_lerobot.world_model.online import OnlineLearner, Promotion
 from accerl_lerobot.world_model.reference import OracleModel, ShuffledModel, learned_part
 from accerl_lerobot.world_model.rollouts import Imagination
-from accerl_lerobot.world_model.store import load_failed, load_roles, load_world_model, rehearse_world_model
+from accerl_lerobot.world_model.store import check_predicts, load_failed, load_roles, load_world_model
 from accerl_lerobot.world_model.success_model import SuccessPairsRewardModel
 
 logger = logging.getLogger(__name__)
@@ -103,7 +103,7 @@ def _load(
 ) -> tuple[EnvironmentSpec, WorldModel, SuccessPairsRewardModel | None]:
     """The environment, and the models, which are checked to fit it and LeRobot's config of the policy.
 
-    Files that nobody has loaded before are tried in a child process (`first`). Oracles have no success model.
+    A world model that nobody has loaded before predicts a chunk (`first`). Oracles have no success model.
     """
     imagination, executed = config.imagination, getattr(policy, "n_action_steps", 1)
     if (reward := getattr(config.env, "reward", "success")) != "success":
@@ -126,9 +126,9 @@ def _load(
         return spec, oracle, None
     device = resolve_device(config.policy.device)
     path, package = Path(str(imagination.path)).expanduser(), imagination.discover_packages_path
-    if first:
-        rehearse_world_model(path, package, section=IMAGINATION)
     learned, success = load_world_model(path, package, section=IMAGINATION)
+    if first:
+        check_predicts(path, learned, success, section=IMAGINATION)
     check_fit(learned.spec, spec, executed)
     if first:  # the driver keeps off the GPU
         return spec, learned, success

@@ -140,9 +140,10 @@ def _filled[M: torch.nn.Module](what: str, make: Callable[[], M], directory: Pat
     return model.requires_grad_(False).eval()
 
 
-def rehearse_world_model(directory: Path, package: str | None = None, *, section: str = "") -> None:
-    """Loads a world model and predicts a chunk, before a run relies on it."""
-    model, success = load_world_model(directory, package, section=section)
+def check_predicts(
+    directory: Path, model: LearnableWorldModel, success: SuccessPairsRewardModel, *, section: str = ""
+) -> None:
+    """Predicts a chunk with a world model that was loaded from `directory`, before a run relies on it."""
     try:
         with torch.random.fork_rng(devices=[]):
             _predict_once(model, success)

@@ -28,10 +28,10 @@ from accerl_lerobot.world_model.learners import new_success_model
 from accerl_lerobot.world_model.store import (
     LEARNT,
     THRESHOLD,
+    check_predicts,
     load_failed,
     load_roles,
     load_world_model,
-    rehearse_world_model,
     save_world_model,
 )
 from tests.runs import replacing
@@ -204,10 +204,11 @@ def test_what_cannot_be_loaded(tmp_path: Path, harm: str, why: str):
 def test_one_that_predicts_nothing_is_refused_before_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     folder = tmp_path / "w"
     save_world_model(folder, model(), new_success_model(2).eval())
-    rehearse_world_model(folder)
+    loaded = load_world_model(folder)
+    check_predicts(folder, *loaded)
     monkeypatch.setattr(pixels.PixelWorldModel, "step", lambda *_: 1 / 0)
     with pytest.raises(InputError, match=r"^path=.*config.json: it predicts nothing \(division by zero\)"):
-        rehearse_world_model(folder)
+        check_predicts(folder, *loaded)
 
 
 def test_a_device_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
