@@ -18,8 +18,9 @@ from torch import nn
 from accerl_lerobot.checkpoint.layout import BACKBONE
 from accerl_lerobot.checkpoint.safety import FileSource
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.policies import loading
 from accerl_lerobot.policies.config import PolicyConfig
-from accerl_lerobot.policies.loading import load_adapter
+from accerl_lerobot.policies.loading import load_adapter, rehearsed_config
 from accerl_lerobot.policies.saving import save_pretrained
 from accerl_lerobot.policies.untrusted import Unfilled, check_checkpoint, guarded
 from tests.hub_cache import cached_repo
@@ -125,6 +126,25 @@ def test_attention_is_not_fetched_as_compiled_code(copied: Path, key: str):
     content = {"model_type": "smolvlm", "text_config": {key: "them/kernels"}}
     (copied / BACKBONE / "config.json").write_text(json.dumps(content))
     refused(copied, f"{key} names code on the Hub")
+
+
+@pytest.mark.parametrize(
+    "content", [{"steps": [7]}, {"steps": 7}, {"steps": [{"registry_name": "x", "config": 7}]}]
+)
+def test_files_that_lerobot_has_not_saved_are_one_line(copied: Path, content: dict[str, Any]):
+    (copied / PRE).write_text(json.dumps(content))
+    refused(copied, "not a checkpoint that LeRobot has saved|did not load")
+
+
+def test_a_checkpoint_is_rehearsed_once_and_draws_no_random_number(
+    good: Path, monkeypatch: pytest.MonkeyPatch
+):
+    config = PolicyConfig(path=str(good), device="cpu")
+    before = torch.get_rng_state()
+    assert rehearsed_config(config).type == "act"
+    assert torch.equal(torch.get_rng_state(), before)
+    monkeypatch.setattr(loading, "rehearsed", None)
+    assert rehearsed_config(config).type == "act"
 
 
 def test_a_critic_of_another_size(copied: Path):
