@@ -4,11 +4,12 @@
 import os
 import subprocess
 import sys
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
 
-from accerl_lerobot.policies.deferred import OURS
+from accerl_lerobot.policies.deferred import OURS, _distributions
 
 CODE = """
 import sys
@@ -37,3 +38,9 @@ def test_whoever_calls_us_has_all_of_lerobot(tiny_checkpoint: Path, monkeypatch:
     monkeypatch.delenv(OURS, raising=False)
     code = CODE.replace('["smolvla"]', '["smolvla", "act", "groot"]')
     subprocess.run([sys.executable, "-c", code, str(tiny_checkpoint)], check=True, timeout=300)
+
+
+def test_distributions_are_those_that_python_finds():
+    """And those of files that are listed and missing, which Python leaves out."""
+    ours, pythons = ({k: sorted(v) for k, v in f().items()} for f in (_distributions, packages_distributions))
+    assert {package: ours[package] for package in pythons} == pythons and len(pythons) > 50
