@@ -204,6 +204,7 @@ class TestConsent:
             ("sft: {extra_args: [--a=x]}", "'--sft.extra_args=[\"--a=x\"]'"),
             ("sft: {policy: {discover_packages_path: os}}", "--sft.policy.discover_packages_path=os"),
             ("sft: {policy: {vision.trust_remote_code: 1}}", "--sft.policy.vision.trust_remote_code=1"),
+            ("sft: {policy: {vision.extra_args: {a: 1}}}", "'--sft.policy.vision.extra_args={\"a\": 1}'"),
             ("env: {type: lerobot, trust_remote_code: true}", "--env.trust_remote_code=true"),
             (f"env: {{type: lerobot, kwargs: {{hub_path: {ARENA}}}}}", f"--env.kwargs.hub_path={ARENA}"),
             ("imagination: {discover_packages_path: os}", "--imagination.discover_packages_path=os"),

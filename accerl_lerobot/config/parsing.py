@@ -167,10 +167,11 @@ def _leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any]]:
     if isinstance(tree, list):
         tree = dict(enumerate(tree))
     for key, value in tree.items() if isinstance(tree, dict) else ():
-        if isinstance(value, (dict, list)) and key not in CONSENT:
-            yield from _leaves(value, f"{path}{key}.")
+        name = f"{path}{key}"  # a key may have dots itself
+        if isinstance(value, (dict, list)) and name.rpartition(".")[2] not in CONSENT:
+            yield from _leaves(value, f"{name}.")
         else:
-            yield f"{path}{key}", value
+            yield name, value
 
 
 def decode(config_class: type[Any], tree: dict[str, Any]) -> Any:

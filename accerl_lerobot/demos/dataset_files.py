@@ -24,22 +24,15 @@ from unittest.mock import patch
 
 import numpy as np
 
-from accerl_lerobot.checkpoint.safety import (
-    FileSource,
-    brief,
-    check_name,
-    matching_files,
-    read_json,
-    unsafe_name,
-)
+from accerl_lerobot.checkpoint.safety import FileSource, brief, check_name, read_json, safe_join, unsafe_name
 from accerl_lerobot.errors import InputError, causes, expanded
 
 if TYPE_CHECKING:
     from accerl_lerobot.config.ranges import DatasetConfig
 
 INFO, TASKS, EPISODES, DATA = "meta/info.json", "meta/tasks.parquet", "meta/episodes", "data"
-FILES = ("meta", "meta/**/*", "data", "data/**/*", "videos", "videos/**/*")
-"""Patterns of the files and folders that LeRobot reads."""
+FOLDERS = ("meta", "data", "videos")
+"""Folders of a dataset in which LeRobot reads files."""
 IMAGES = ("PNG", "JPEG", "TIFF")
 """Pillow's names of the formats that are decoded; LeRobot stores depth as TIFF."""
 INDEX = r"\{(chunk_index|file_index)(:0?[1-9]?d)?\}"
@@ -147,7 +140,7 @@ def checked(origin: FileSource, whole: bool = False) -> Iterator[None]:
         put_in_order(self, origin)
 
     def checked_data(self: Any) -> Any:
-        matching_files(Path(self.root), FILES, origin)
+        checked_files(Path(self.root), origin)
         try:
             rows = load_data(self)
         except (FileNotFoundError, NotADirectoryError):
@@ -190,6 +183,17 @@ def checked(origin: FileSource, whole: bool = False) -> Iterator[None]:
         yield
 
 
+def checked_files(root: Path, origin: FileSource) -> dict[str, Path]:
+    """All that LeRobot may read, by its name in the dataset; a link that leads out is refused."""
+    found: dict[str, Path] = {}
+    for folder in FOLDERS:
+        safe_join(root, folder, origin)
+        for path in sorted((root / folder).rglob("*")):
+            name = path.relative_to(root).as_posix()
+            found[name] = safe_join(root, name, origin)
+    return found
+
+
 def check_metadata(root: Path, origin: FileSource) -> None:
     """Refuses metadata of an old version, or that would have LeRobot read outside the folder.
 
@@ -198,7 +202,7 @@ def check_metadata(root: Path, origin: FileSource) -> None:
     """
     from lerobot.datasets.utils import CompatibilityError
 
-    files = matching_files(root, FILES, origin)
+    files = checked_files(root, origin)
     if INFO not in files:
         return
     info = read_json(files[INFO], origin)

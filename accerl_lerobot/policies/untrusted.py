@@ -90,9 +90,9 @@ def check_checkpoint(folder: Path, origin: FileSource, *, fetched: bool = False)
 
     One that was `fetched` from the Hub must not name folders of this machine.
     """
-    weights = ADAPTER if is_adapter(folder) else WEIGHTS
-    for name in (CONFIG, *PROCESSORS, weights, VALUE_HEAD, FAMILY, OURS, BACKBONE):
+    for name in (CONFIG, ADAPTER_CONFIG, *PROCESSORS, WEIGHTS, ADAPTER, VALUE_HEAD, FAMILY, OURS, BACKBONE):
         safe_join(folder, name, origin)
+    weights = ADAPTER if is_adapter(folder) else WEIGHTS
     config = read_json(folder / CONFIG, origin)
     for key, own in CONFIG_FOLDERS.items():
         check_name(config.get(key), folder / own, f"{CONFIG}: {key}", origin)
