@@ -121,7 +121,7 @@ def is_adapter(folder: Path) -> bool:
 def check_processor(folder: Path, name: str, origin: FileSource) -> None:
     """Checks a processor file: only LeRobot's registered steps, with state files in this folder."""
     for step in read_json(folder / name, origin).get("steps", []):
-        kind, options = step.get("registry_name"), step.get("config", {})
+        kind, options = step.get("registry_name"), dict(step.get("config", {}))
         if not isinstance(kind, str) or "class" in step:
             hint = "only steps with a registry_name are loaded: LeRobot would import and call this class"
             raise origin.refuse(f"{name}: {str(step.get('class'))[:60]}", hint)
