@@ -9,6 +9,7 @@ same tensors of the same shapes.
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import logging
 from collections.abc import Callable, Iterator, Sequence
@@ -151,11 +152,14 @@ def rehearsed[T](
     imitates: bool = False,
     learns: bool = False,
 ) -> T:
-    """Result of `task` with the policy of `policy_sizes`, whose weights are not read."""
+    """Result of `task` with the policy of `policy_sizes`, whose weights are not read.
+
+    What LeRobot prints is dropped: the standard output of a command is its result.
+    """
     precision = precision_on(resolve_device(config.device), config.precision)
     config = replace(config, device="cpu", precision=precision)
     load = partial(load_adapter, explores=False) if imitates else partial(load_acting, learns=learns)
-    with torch.random.fork_rng(devices=[]):
+    with contextlib.redirect_stdout(io.StringIO()), torch.random.fork_rng(devices=[]):
         return task(load(config, rehearsal=True, fine_tuned=fine_tuned))
 
 
