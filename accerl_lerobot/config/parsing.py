@@ -452,8 +452,9 @@ def _section(
 
 def _changed_defaults(default: Any) -> dict[str, Any]:
     """Fields in which the default of a section differs from its class's own."""
-    usual = encoded_defaults(type(default))
-    return {name: value for name, value in encode(default).items() if value != usual.get(name, value)}
+    usual = defaults_of(type(default))
+    changed = {name for name, value in usual.items() if getattr(default, name) != value}
+    return {name: value for name, value in encode(default).items() if name in changed}
 
 
 def _no_choice(kind: Any, choices: dict[str, type[Any]], path: tuple[str, ...]) -> InputError:
