@@ -153,7 +153,7 @@ def test_episodes_whose_borders_contradict_the_rows_are_refused(tmp_path: Path):
         return table
 
     rewrite(tmp_path / "data/meta/episodes/chunk-000/file-000.parquet", move_border)
-    message = "data: row 6 is of episode 1, and meta/episodes says that it has rows 8 to 11; get"
+    message = "data: row 6 is of episode 1, and by meta/episodes of episode 0; get"
     with pytest.raises(InputError, match=message), opened(dataset, open_metadata(dataset)):
         pass
 

@@ -188,7 +188,7 @@ def test_a_run_that_fell_over_goes_on_from_its_last_whole_checkpoint(
         file.write('{"kind": "train", "upd')  # the last line, too
     assert go_on(run) == 0
     said = " ".join(capsys.readouterr().err.split())
-    assert "passed over checkpoint 000010: training_state/replay.safetensors has" in said
+    assert "passed over checkpoint 000010: training_state/replay.safetensors is not what was written" in said
     assert "going on from" in said and "000005" in said
     assert records(run) == records(whole) and summary(run) == summary(whole) and files(run) == files(whole)
 

@@ -3,12 +3,10 @@
 
 from __future__ import annotations
 
-import json
 import os
 import random
-import subprocess
-import sys
 import threading
+from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path, PureWindowsPath
 
@@ -17,12 +15,22 @@ import pytest
 from safetensors.numpy import save_file
 
 from accerl_lerobot import cli
-from accerl_lerobot.checkpoint import safety
 from accerl_lerobot.checkpoint.safety import FileSource, read_json, read_tensors, safe_join, tensor_shapes
 from accerl_lerobot.errors import InputError
-from tests.hostile import hostile_names
 
 ORIGIN = FileSource("policy.path", "runs/theirs")
+NAMES = (
+    "..", ".", "", "/", "//", "\\", "a", "data", "C:", "C:\\", "~", "~root", "\x00", "\n", "\x7f", "\ud800",
+    "%2e%2e", "..;", "...", " ", "x" * 256, "é" * 128, "file.parquet", "CON", "{chunk_index}", "$HOME", "-rf",
+)  # fmt: skip
+
+
+def hostile_names(rng: random.Random) -> Iterator[str]:
+    """Names that are put together of `NAMES`, without end."""
+    while True:
+        parts = [rng.choice(NAMES) for _ in range(rng.choice((1, 2, 2, 3, 5, 400)))]
+        first = rng.choice(("", "/", "./", "../", "\\\\host\\", "file://"))
+        yield first + rng.choice(("/", "/", "\\")).join(parts)
 
 
 def test_twenty_thousand_hostile_names_stay_inside(tmp_path: Path):
@@ -52,17 +60,15 @@ def test_twenty_thousand_hostile_names_stay_inside(tmp_path: Path):
 @pytest.mark.parametrize(
     ("name", "why"),
     [
-        ("/etc/passwd", "begins outside"),
+        ("/etc/passwd", "not the name of a file inside"),
         ("../../etc/passwd", "leads out"),
-        ("C:/x", "Windows path"),
-        ("a\\..\\x", "Windows path"),
-        ("a\x00b", "control characters"),
-        ("x" * 256, "too long"),
-        ("/".join(["x" * 200] * 6), "too long"),
-        ("\ud800", "not good Unicode"),
-        ("~/x", "begins outside"),
-        ("", "not a name"),
-        (None, "not a name"),
+        ("C:/x", "not the name"),
+        ("a\\..\\x", "not the name"),
+        ("a\x00b", "not the name"),
+        ("\ud800", "not the name"),
+        ("~/x", "not the name"),
+        ("", "not the name"),
+        (None, "not the name"),
     ],
 )
 def test_names_that_are_refused(tmp_path: Path, name: object, why: str):
@@ -123,16 +129,14 @@ def test_a_run_from_elsewhere_is_read_without_leaving_its_folder(verb, tmp_path,
         (b"\xff\xfe", "not good JSON"),
         (b'{"a": ' + b"9" * 5000 + b"}", "not good JSON"),
         (b"[1]", "a mapping is wanted, not list"),
-        (b"[" * 200_000, "nested too deeply"),
-        (b'{"a":' * 200_000, "nested too deeply"),
-        (b" " * 2000, "more than the 1000"),
+        (b"[" * 200_000, "not good JSON"),
     ],
 )
 def test_json_that_is_refused(tmp_path: Path, content: bytes, why: str):
     path = tmp_path / "config.json"
     path.write_bytes(content)
     with pytest.raises(InputError, match=f"^policy.path='runs/theirs': config.json: .*{why}"):
-        read_json(path, ORIGIN, 1000 if content.startswith(b" ") else 10**7)
+        read_json(path, ORIGIN)
 
 
 def test_what_is_no_file_is_not_waited_for(tmp_path: Path):
@@ -173,34 +177,3 @@ def test_tensors_hold_numbers(tmp_path: Path, value: float):
     read = read_tensors(tmp_path / "x.safetensors", ORIGIN)
     with pytest.raises(InputError, match="x.safetensors: c holds NaN or infinity; train it again$"):
         list(read)
-
-
-def test_a_file_is_read_in_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(safety, "READ_MOST", 8)
-    arrays = {f"t{i}": np.full((i, 2), i, np.float32) for i in range(6)}
-    save_file(arrays, tmp_path / "x.safetensors")
-    found = dict(read_tensors(tmp_path / "x.safetensors", ORIGIN))
-    assert found.keys() == arrays.keys()
-    assert all(np.array_equal(found[name].numpy(), array) for name, array in arrays.items())
-
-
-TIMES = 30  # factor on the shares of `tests.hostile`: about 24,000 files, of which about 140 are loaded
-
-
-@pytest.mark.slow
-def test_many_changed_files(tmp_path: Path):
-    """Each is good or refused in a line: no other error, no file, no hang, no memory beyond a limit."""
-    command = [sys.executable, "-m", "tests.hostile", "0", str(tmp_path), str(TIMES)]
-    root = Path(__file__).parents[1]
-    done = subprocess.run(
-        command, cwd=root, capture_output=True, text=True, errors="replace", timeout=600, check=False
-    )
-    assert done.returncode == 0, done.stderr[-4000:]
-    found = json.loads(done.stdout.splitlines()[-1])
-    outcomes: dict[str, int] = found["outcomes"]
-    assert sum(outcomes.values()) >= 23_000
-    assert sum(n for name, n in outcomes.items() if name.startswith(("load ", "open "))) >= 140
-    kinds = {name.rpartition(" ")[0] for name in outcomes}
-    assert all(outcomes.get(f"{kind} refused", 0) > 0 for kind in kinds), "a check that never refuses"
-    assert sum(n for name, n in outcomes.items() if name.endswith(" good")) > 5_000
-    assert found["written"] == []

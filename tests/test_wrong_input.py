@@ -47,7 +47,7 @@ RECIPES = [
     "trainer: {betas: {a: 1}}\n", "seed: 1e400\n", "sft: {policy: 3}\n",
     "sft: {policy: {type: 3, chunk_size: [1]}}\n", "policy: {rename_map: [a, b]}\n", "seed: !!float x\n",
     "a: &a\n  b: *a\n", "[" * 20_000, "a:\n" + "".join(" " * n + "a:\n" for n in range(1, 400)),
-    "seed: 1\n" * 200_000, "\ufeff\ufeffseed: 1", "seed: \ud83d\n",
+    "\ufeff\ufeffseed: 1", "seed: \ud83d\n",
     _bomb("[1, 1]", "[{}]"), _bomb("{k: 1}", "{{<<: [{}]}}"),
 ]  # fmt: skip
 

@@ -24,14 +24,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from accerl_lerobot.checkpoint.safety import (
-    MIB,
-    FileSource,
-    leads_out,
-    read_json,
-    safe_join,
-    texts_in,
-)  # fmt: skip
+from accerl_lerobot.checkpoint.safety import FileSource, brief, leads_out, read_json, safe_join, texts_in
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.fault_points import fault_point
 
@@ -45,7 +38,6 @@ RUN_STATE, WEIGHTS = "run", "weights"
 """Names of states in `TRAINING_STATE`: the progress of the run, and the exact trained weights."""
 STEP = "training_step.json"
 FORMAT = 2  # format of the manifest and the training state; another one is refused
-MANIFEST_MOST = 64 * MIB
 AWAY = "LOCAL"  # replaces the folders above a file of the machine that pushed it
 BACKBONE = "backbone"  # folder beside the weights with the vision-language backbone's config and tokenisers
 FAST = f"{BACKBONE}/fast"  # folder with the tokeniser of actions, where a policy has one
@@ -163,31 +155,25 @@ def write_manifest(directory: Path) -> None:
 
 def read_manifest(directory: Path) -> dict[str, Any]:
     """The content of a manifest, not checked any further."""
-    return read_json(directory / MANIFEST, FileSource("config_path", str(directory)), MANIFEST_MOST)
+    return read_json(directory / MANIFEST, FileSource("config_path", str(directory)))
 
 
 def defect(directory: Path) -> str | None:
     """The first difference between a checkpoint and its manifest; None if every byte is as it was written."""
-    if not (directory / MANIFEST).is_file():
-        return f"it has no {MANIFEST}"
     try:
         manifest = read_manifest(directory)
         if manifest["format"] != FORMAT:
             return f"its format is {manifest['format']}, and this accerl reads {FORMAT}"
-        files = {str(file): (int(v["size"]), str(v["sha256"])) for file, v in manifest["files"].items()}
-    except (InputError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
-        return f"its {MANIFEST} is broken ({' '.join(str(error).split())[-80:]})"
-    for file, (size, sha256) in files.items():
-        try:
-            path = safe_join(directory, file, FileSource("config_path", str(directory)))
-        except InputError:
-            return f"its {MANIFEST} names {file!r}, outside of it"
-        if not path.is_file():
-            return f"{file} is missing"
-        if path.stat().st_size != size:
-            return f"{file} has {path.stat().st_size} bytes, not {size}"
-        if digest(path) != sha256:
-            return f"{file} is not what was written"
+        for name, written in manifest["files"].items():
+            path = safe_join(directory, name, FileSource("config_path", str(directory)))
+            if not path.is_file():
+                return f"{name} is missing"
+            if path.stat().st_size != written["size"] or digest(path) != written["sha256"]:
+                return f"{name} is not what was written"
+    except InputError as error:
+        return f"its {MANIFEST} is broken ({error.hint})"
+    except Exception as error:  # it may hold anything
+        return f"its {MANIFEST} is broken ({brief(error)})"
     return None
 
 
@@ -213,9 +199,8 @@ def newest_whole(checkpoints: Path, wanted: str = LAST) -> tuple[Path, list[str]
         if why is None:
             return path, skipped
         skipped.append(f"{path.name}: {why}")
-    reasons = "; ".join(skipped) or "there is none"
-    hint = f"no checkpoint here can be resumed ({reasons}); start a new run from a policy: --policy.path"
-    raise InputError("config_path", str(checkpoints), hint)
+    hint = f"no checkpoint here can be resumed ({'; '.join(skipped) or 'there is none'})"
+    raise InputError("config_path", str(checkpoints), f"{hint}; start a new run from a policy: --policy.path")
 
 
 def saved_version(state: Path) -> int:
@@ -228,21 +213,29 @@ def prune(checkpoints: Path, *, needed: str | None = None) -> None:
     The weights of the one named `needed` are kept too, although it cannot be resumed from any more: an
     inference replica that is lost starts again where all workers did.
     """
-    having = [path for path in _numbered(checkpoints) if (path / TRAINING_STATE).is_dir()]
-    for path in having[:-KEEP]:
+    resumable = [path for path in _numbered(checkpoints) if (path / TRAINING_STATE).is_dir()]
+    for path in resumable[:-KEEP]:
         # The manifest first: a checkpoint whose files are half removed would count as broken.
         with contextlib.suppress(InputError, KeyError, AttributeError):
-            manifest = read_manifest(path)
-            kept = {k: v for k, v in manifest["files"].items() if Path(k).parts[0] != TRAINING_STATE}
-            if kept != manifest["files"]:
-                text = json.dumps(manifest | {"files": kept}, indent=2) + "\n"
-                write_atomically(path / MANIFEST, text)
+            _forget_training_state(path)
         if path.name != needed:
             shutil.rmtree(path / TRAINING_STATE)
             continue
         for file in (path / TRAINING_STATE).iterdir():
-            if file.stem != WEIGHTS:
-                shutil.rmtree(file) if file.is_dir() else file.unlink()
+            if file.is_dir():
+                shutil.rmtree(file)
+            elif file.stem != WEIGHTS:
+                file.unlink()
+
+
+def _forget_training_state(checkpoint: Path) -> None:
+    """Removes the training state from a checkpoint's manifest."""
+    manifest = read_manifest(checkpoint)
+    names = [name for name in manifest["files"] if name.startswith(f"{TRAINING_STATE}/")]
+    for name in names:
+        del manifest["files"][name]
+    if names:
+        write_atomically(checkpoint / MANIFEST, json.dumps(manifest, indent=2) + "\n")
 
 
 def _numbered(checkpoints: Path) -> list[Path]:
@@ -300,17 +293,17 @@ def check_names(folder: Path, origin: FileSource) -> None:
 
     The name of a backbone or tokeniser that lies in the folder is accepted: it is not read.
     """
-    for path in sorted(path for path in folder.rglob("*") if any(map(path.match, NAMING))):
-        if path.name == NOT_READ or not path.is_file():
+    for path in sorted(folder.rglob("*")):
+        if path.name == NOT_READ or not path.is_file() or not any(map(path.match, NAMING)):
             continue
-        name, is_json = path.relative_to(folder).as_posix(), path.suffix == ".json"
-        content = read_json(path, origin)
+        content, is_json = read_json(path, origin), path.suffix == ".json"
         places = places_of_names(content, content) if is_json and path.parent == folder else []
-        replaced = {(id(fields), key) for fields, key, own in places if (folder / own).is_dir()}
+        beside = [(fields, key) for fields, key, own in places if (folder / own).is_dir()]
         for fields, key, text in texts_in(content):
-            if key in RECORDED or (id(fields), key) in replaced:
+            if key in RECORDED or any(fields is one and key == other for one, other in beside):
                 continue
-            if leads_out(text) or is_json and key.endswith(LOOKED_UP) and os.path.exists(text):
+            if leads_out(text) or (is_json and key.endswith(LOOKED_UP) and os.path.exists(text)):
+                name = path.relative_to(folder).as_posix()
                 why = f"{text[:80]!r} is a place on this machine, which files from elsewhere may not name"
                 raise origin.refuse(f"{name}: {key}", f"{why}; a copy of a backbone goes into {BACKBONE}/")
 

@@ -24,16 +24,12 @@ from safetensors import SafetensorError, safe_open
 from accerl_lerobot.errors import InputError
 
 MIB = 1024**2
-JSON_MOST = 4 * MIB  # bytes of a JSON file, unless it is one that is known to be larger
-READ_MOST = 64 * MIB  # bytes that are read of a safetensors file before it is opened again
-PART_MOST, PATH_MOST = 255, 1024  # bytes of one part of a file's name, and of all of it
 PICKLES = (".bin", ".pt", ".pth", ".pkl", ".pickle", ".ckpt")
 """Endings of files that PyTorch unpickles, which may run whatever their author wished."""
 REVISION = re.compile(r"[0-9a-f]{40}")
 HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]{0,95}(/[A-Za-z0-9][\w.-]{0,95})?", re.ASCII)
-_DRIVE = re.compile(r"[A-Za-z]:")
+_INSIDE = re.compile(r"(?![~/]|[A-Za-z]:)[^\\\x00-\x1f\x7f\ud800-\udfff]+")
 _ABSOLUTE = re.compile(r"(~[^/\s]*)?/[\w.]|[A-Za-z]:[\\/]|file:|~$")
-_CONTROL = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
 
 
 @dataclass(frozen=True)
@@ -41,7 +37,7 @@ class FileSource:
     """Where files came from, as the user named it.
 
     Example:
-        >>> raise Origin("policy.path", "runs/a").refuse("config.json", "it is empty; save it again")
+        >>> raise FileSource("policy.path", "runs/a").refuse("config.json", "it is empty; save it again")
         Traceback (most recent call last):
         accerl_lerobot.errors.InputError: policy.path='runs/a': config.json: it is empty; save it again
     """
@@ -59,21 +55,23 @@ def safe_join(root: Path, name: object, origin: FileSource) -> Path:
 
     Links may point within `root`, and in the Hub's cache to its blobs.
     """
-    if why := unsafe_name(name):
-        raise origin.refuse(str(name)[:PATH_MOST], f"{why}; only files inside the folder are read")
+    why = unsafe_name(name)
+    if why:
+        raise origin.refuse(str(name), f"{why}; only files inside the folder are read")
     path = root / str(name)
     _check_link(path, root, str(name), origin)
     return path
 
 
 def _check_link(path: Path, root: Path, name: str, origin: FileSource) -> None:
+    homes = [root.resolve()]
+    cache = homes[0].parent.parent
+    if homes[0].parent.name == "snapshots" and cache.name.startswith(("models--", "datasets--")):
+        homes.append(cache / "blobs")
     try:
-        real, home = path.resolve(), root.resolve()
-    except (OSError, RuntimeError, ValueError) as error:
+        real = path.resolve()
+    except (OSError, RuntimeError) as error:
         raise origin.refuse(name, "its links go in a circle; put the file itself there") from error
-    homes = [home]
-    if home.parent.name == "snapshots" and re.match(r"(models|datasets)--", home.parent.parent.name):
-        homes.append(home.parent.parent / "blobs")
     if not any(real.is_relative_to(home) for home in homes):
         raise origin.refuse(name, "a link that leads out of the folder; put the file itself there")
 
@@ -84,9 +82,11 @@ def matching_files(root: Path, patterns: Iterable[str], origin: FileSource) -> d
     A ``*`` stands for a part of one name. A link that leads out of `root` is refused.
     """
     found: dict[str, Path] = {}
-    for path in (path for pattern in patterns for path in sorted(root.glob(pattern))):
-        name = path.relative_to(root).as_posix()
-        if not any(part.startswith(".") for part in name.split("/")):
+    for pattern in patterns:
+        for path in sorted(root.glob(pattern)):
+            name = path.relative_to(root).as_posix()
+            if name.startswith(".") or "/." in name:
+                continue
             _check_link(path, root, name, origin)
             if path.is_file():
                 found[name] = path
@@ -98,25 +98,21 @@ def leads_out(text: str) -> bool:
     return _ABSOLUTE.match(text) is not None or ".." in re.split(r"[\\/]", text)
 
 
-def texts_in(content: Any) -> Iterator[tuple[dict[str, Any], str, str]]:
-    """(mapping, key, text) of every text below a key of JSON or YAML, those in lists included."""
-    parts, seen = [content], set()
-    while parts:
-        part = parts.pop()
-        if id(part) in seen or not isinstance(part, dict):
-            continue
-        seen.add(id(part))
-        for key, value in part.items():
-            values = [value]
-            while values:
-                value = values.pop()
-                if isinstance(value, list) and id(value) not in seen:
-                    seen.add(id(value))
-                    values += value
-                elif isinstance(value, str):
-                    yield part, str(key), value
-                elif isinstance(value, dict):
-                    parts.append(value)
+def texts_in(
+    content: Any, holder: dict[str, Any] | None = None, key: str = ""
+) -> Iterator[tuple[dict[str, Any], str, str]]:
+    """(mapping, key, text) of every text below a key of JSON or YAML, those in lists included.
+
+    `holder` and `key` are those under which `content` stands.
+    """
+    if isinstance(content, dict):
+        for name, value in content.items():
+            yield from texts_in(value, content, str(name))
+    elif isinstance(content, list):
+        for value in content:
+            yield from texts_in(value, holder, key)
+    elif isinstance(content, str) and holder is not None:
+        yield holder, key, content
 
 
 def check_folder(folder: Path, origin: FileSource) -> None:
@@ -136,10 +132,9 @@ def check_folder(folder: Path, origin: FileSource) -> None:
 
 
 def check_name(name: object, what: str, origin: FileSource) -> None:
-    """A name that will become part of a path, such as a camera's; more than one part is refused."""
-    why = unsafe_name(name) or ("it has a slash in it" if "/" in str(name) else "")
-    if why:
-        raise origin.refuse(what, f"the name {_shown(str(name))!r} cannot be part of a path: {why}")
+    """Refuses a name that will become one part of a path, such as a camera's, and may not."""
+    if unsafe_name(name) or "/" in str(name):
+        raise origin.refuse(what, f"the name {_shown(str(name))!r} cannot be part of a path")
 
 
 def file_size(path: Path, origin: FileSource) -> int:
@@ -153,20 +148,16 @@ def file_size(path: Path, origin: FileSource) -> int:
     return found.st_size
 
 
-def read_json(path: Path, origin: FileSource, most: int = JSON_MOST) -> dict[str, Any]:
-    """The mapping in a JSON file, or a YAML one by its suffix, of at most `most` bytes."""
+def read_json(path: Path, origin: FileSource) -> dict[str, Any]:
+    """The mapping in a JSON file, or a YAML one by its suffix."""
     parse, language = (yaml.safe_load, "YAML") if path.suffix == ".yaml" else (json.loads, "JSON")
-    if (size := file_size(path, origin)) > most:
-        hint = f"{size} bytes, more than the {most} that such a file may have; it is not what it says"
-        raise origin.refuse(path.name, hint)
+    file_size(path, origin)
     try:
-        with path.open("rb") as file:
-            content = parse(file.read(most + 1).decode())
+        content = parse(path.read_bytes().decode())
     except OSError as error:
         raise origin.refuse(path.name, f"cannot be read ({error.strerror})") from error
     except (RecursionError, ValueError, yaml.YAMLError) as error:
-        why = "it is nested too deeply" if isinstance(error, RecursionError) else brief(error)
-        raise origin.refuse(path.name, f"not good {language} ({why})") from error
+        raise origin.refuse(path.name, f"not good {language} ({brief(error)})") from error
     if not isinstance(content, dict):
         raise origin.refuse(path.name, f"a mapping is wanted, not {type(content).__name__}")
     return content
@@ -193,22 +184,14 @@ def tensor_shapes(path: Path, origin: FileSource) -> dict[str, tuple[str, tuple[
 def read_tensors(path: Path, origin: FileSource) -> Iterator[tuple[str, Any]]:
     """Name and PyTorch tensor, one after the other, of a safetensors file; NaN and infinity are refused.
 
-    A tensor is a view of the file, so that none is in memory twice. The file is opened again now and then:
-    what has been read of it counts as memory of this process until it is closed.
+    A tensor is a view of the file, so that none is in memory twice.
     """
-    shapes, read = tensor_shapes(path, origin), 0
-    with contextlib.ExitStack() as stack:
-        file = stack.enter_context(opened(path, origin, "pt"))
-        for name in shapes:
+    with opened(path, origin, "pt") as file:
+        for name in file.keys():  # noqa: SIM118
             tensor = file.get_tensor(name)
             if not _finite(tensor):
                 raise origin.refuse(path.name, f"{_shown(name)} holds NaN or infinity; train it again")
             yield name, tensor
-            read += tensor.nbytes
-            del tensor
-            if read > READ_MOST:
-                stack.close()
-                file, read = stack.enter_context(opened(path, origin, "pt")), 0
 
 
 def _finite(tensor: Any) -> bool:
@@ -237,20 +220,10 @@ def brief(error: BaseException) -> str:
 
 def unsafe_name(name: object) -> str:
     """The reason why a name must not be joined to a folder; empty if it may."""
-    if not isinstance(name, str) or not name:
-        return "not a name"
-    if _CONTROL.search(name):
-        return "it has control characters, or is not good Unicode"
-    if len(name.encode()) > PATH_MOST or any(len(part.encode()) > PART_MOST for part in name.split("/")):
-        return "too long"
-    if "\\" in name or _DRIVE.match(name):
-        return "a Windows path"
-    if name.startswith(("/", "~")):
-        return "it begins outside the folder"
+    if not isinstance(name, str) or not _INSIDE.fullmatch(name):
+        return "not the name of a file inside a folder"
     parts = PurePosixPath(name).parts
-    if ".." in parts or not parts:
-        return "it leads out of the folder"
-    return ""
+    return "it leads out of the folder" if ".." in parts or not parts else ""
 
 
 def _shown(text: str) -> str:

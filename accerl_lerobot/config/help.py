@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from accerl_lerobot.config.parsing import TYPE, choices_of, section_of
-from accerl_lerobot.config.ranges import annotations_of, default_of, range_in_words
+from accerl_lerobot.config.parsing import TYPE, choices_of, sections_of
+from accerl_lerobot.config.ranges import annotations_of, defaults_of, range_in_words
 from accerl_lerobot.errors import InputError
 
 WIDTH = 110
@@ -46,13 +46,12 @@ def help_text(command: str, config_class: type[Any], what: str, section: str = "
 
     `what` says in one line what the command does; `section` is that of ``--help=SECTION``, or ``all``.
     """
-    listed = _listed(config_class)
-    sections = {name: section_of(annotation) for name, annotation in annotations_of(config_class).items()}
+    listed, sections = _listed(config_class), sections_of(config_class)
     if section not in ("", "all"):
         inside = [line for line in listed if f"{line.name}.".startswith(f"{section}.")]
         if not inside:
-            names = ", ".join(name for name, kind in sections.items() if kind is not None)
-            raise InputError("--help", section, f"use all or one of {names}" if names else "use all")
+            hint = f"use all or one of {', '.join(sections)}" if sections else "use all"
+            raise InputError("--help", section, hint)
         return "\n".join(_in_full(inside))
     head = [
         f"usage: {command} {_bare(config_class)} [--section.field=value …]",
@@ -67,8 +66,7 @@ def help_text(command: str, config_class: type[Any], what: str, section: str = "
     head += [_in_brief(usual[name]) for name in COMMON if name in usual]
     head += ["", f"more: {command} --help=all, or --help=SECTION:"]
     for name, kind in sections.items():
-        if kind is not None:
-            head.append(f"  {name:12}{' | '.join(choices_of(kind)) or _summary(kind)}"[:WIDTH])
+        head.append(f"  {name:12}{' | '.join(choices_of(kind)) or _summary(kind)}"[:WIDTH])
     return "\n".join(head)
 
 
@@ -108,26 +106,36 @@ def _listed(cls: type[Any], prefix: str = "", usual: Any = None, all_types: bool
 
     Of a choice, all types, or, with `all_types` off, the default one and the choice itself as a field.
     """
-    annotations, texts, fields, sections = annotations_of(cls), docstrings(cls), list[Line](), list[Line]()
-    for field in dataclasses.fields(cls):
-        annotation, name = annotations[field.name], f"{prefix}{field.name}"
-        section, default = section_of(annotation), getattr(usual, field.name, default_of(field))
-        if section is None:
-            fields.append(Line(name, shown(default), texts[field.name], range_in_words(annotation)))
-        elif not (choices := choices_of(section)):
-            note = "" if default is not None else " (off unless given)"
-            sections.append(Line(name, None, f"{name}{note}: {_summary(section)}"))
-            sections += _listed(section, f"{name}.", default)
-        elif all_types:
-            for kind, subclass in choices.items():
-                own = default if getattr(default, TYPE, None) == kind else None
-                note = "" if own is None else " (default)"
-                sections.append(Line(name, None, f"{name}.{TYPE}={kind}{note}: {_summary(subclass)}"))
-                sections += _listed(subclass, f"{name}.", own)
-        elif default is not None:
-            sections.append(Line(f"{name}.{TYPE}", getattr(default, TYPE), "", " | ".join(choices)))
-            sections += _listed(type(default), f"{name}.", default, all_types=False)
-    return fields + sections
+    texts, defaults, sections = docstrings(cls), defaults_of(cls), sections_of(cls)
+    fields: list[Line] = []
+    below: list[Line] = []
+    for name, annotation in annotations_of(cls).items():
+        default = getattr(usual, name, defaults[name])
+        if name in sections:
+            below += _section(sections[name], f"{prefix}{name}", default, all_types)
+        else:
+            line = Line(f"{prefix}{name}", shown(default), texts[name], range_in_words(annotation))
+            fields.append(line)
+    return fields + below
+
+
+def _section(section: type[Any], name: str, default: Any, all_types: bool) -> list[Line]:
+    """Headings and fields of a section, see `_listed`."""
+    choices, chosen = choices_of(section), getattr(default, TYPE, None)
+    if not choices:
+        note = " (off unless given)" if default is None else ""
+        heading = Line(name, None, f"{name}{note}: {_summary(section)}")
+        return [heading, *_listed(section, f"{name}.", default)]
+    lines: list[Line] = []
+    if all_types:
+        for kind, subclass in choices.items():
+            note = " (default)" if kind == chosen else ""
+            lines.append(Line(name, None, f"{name}.{TYPE}={kind}{note}: {_summary(subclass)}"))
+            lines += _listed(subclass, f"{name}.", default if kind == chosen else None)
+    elif default is not None:
+        lines.append(Line(f"{name}.{TYPE}", chosen, "", " | ".join(choices)))
+        lines += _listed(type(default), f"{name}.", default, all_types=False)
+    return lines
 
 
 def _in_full(listed: list[Line]) -> list[str]:

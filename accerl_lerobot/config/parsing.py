@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Command lines and recipes into configs, and every mistake in them into one line.
 
-LeRobot's conventions, decoded by LeRobot's own draccus. Reading and merging is done here and not by draccus's
-argument parser, for four reasons: a field of a choice (``--algorithm.sigma``) needs no second
-``--algorithm.type``, unknown keys are named together with what they resemble, a key that stands twice in a
-file is refused instead of winning silently, and every verb can read the recipe of a whole run and take the
-sections it needs.
+The conventions are LeRobot's: dotted flags, sections, and a ``type`` that chooses one config of several.
+Reading and merging is done here and not by draccus's argument parser, for four reasons. A field of a choice
+(``--algorithm.sigma``) needs no second ``--algorithm.type``. An unknown key is named together with what it
+resembles. A key that stands twice in a file is refused. Every verb can read the recipe of a whole run and
+take the sections it needs.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import datetime
 import difflib
 import gc
 import importlib
@@ -23,7 +24,7 @@ import sys
 import typing
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import draccus
 import yaml
@@ -31,16 +32,7 @@ import yaml
 from accerl_lerobot.checkpoint.layout import CONFIG
 from accerl_lerobot.checkpoint.safety import brief
 from accerl_lerobot.config.lerobot import FLAGS, hint_for
-from accerl_lerobot.config.ranges import (
-    annotations_of,
-    check,
-    default_of,
-    fits,
-    is_optional,
-    is_union,
-    unmarked,
-    wanted,
-)
+from accerl_lerobot.config.ranges import annotations_of, defaults_of, fits, is_optional, is_union, wanted
 from accerl_lerobot.errors import InputError, expanded
 
 DISCOVER = "discover_packages_path"
@@ -67,12 +59,10 @@ def discover(package: str | None, section: str = "") -> None:
     """Imports a package that registers types; None does nothing. `section` is that of the field."""
     if package is None:
         return
-    field = f"{section}.{DISCOVER}" if section else DISCOVER
-    if not all(part.isidentifier() for part in package.split(".")):
-        raise InputError(field, package, "use the name of a package as Python imports it, e.g. my_models")
     try:
         importlib.import_module(package)
     except (Exception, SystemExit) as error:  # it is somebody's code, which may do anything
+        field = f"{section}.{DISCOVER}" if section else DISCOVER
         why = f"cannot be imported ({type(error).__name__}: {brief(error)})"
         if isinstance(error, ModuleNotFoundError) and error.name == package.partition(".")[0]:
             why += "; install it, or name the folder that it is in: PYTHONPATH=FOLDER accerl …"
@@ -99,7 +89,6 @@ def not_imported(package: str, error: BaseException) -> str:
     return f"{package} is installed and cannot be imported ({type(error).__name__}: {brief(error)})"
 
 
-LARGEST_RECIPE = 2**18  # bytes of a recipe at most
 LEROBOTS_FILES = ("config.json", "train_config.json")  # of a policy's folder, taken for recipes by mistake
 RECIPES = "recipes"
 TYPE = "type"  # the key that picks one config of several, as in ``env.type``
@@ -113,6 +102,9 @@ CONSENT = {"trust_remote_code", "hub_path", DISCOVER, "extra_args", "address"}
 further arguments of ``lerobot-train``, or from a Ray cluster, which exchanges pickles with the run. Only the
 command line can set them. A recipe may have come with the very code that it would allow."""
 UNSET: tuple[Any, ...] = (None, False, "", [], {})
+SYNTAX = "write --section.field=value"
+PLAIN = (int, float, str, bool, type(None), dict, list, Any)
+"""Kinds of values that YAML makes."""
 
 
 def parse(config_class: type[Any], arguments: list[str], *, recipe_class: type[Any] | None = None) -> Any:
@@ -128,23 +120,28 @@ def parse(config_class: type[Any], arguments: list[str], *, recipe_class: type[A
     path, given = read_arguments(arguments, getattr(config_class, "BARE", None))
     tree = {} if path is None else read_recipe(path)
     if recipe_class is not None:
-        # A run's own config is a recipe too, and its folder is taken.
-        other = _names(recipe_class) - _names(config_class) | {"output_dir"}
-        # A section that has types in a run and none here is another one of the same name.
-        kinds = _sections(recipe_class), _sections(config_class)
-        other |= {
-            name
-            for name in kinds[0].keys() & kinds[1].keys()
-            if kinds[0][name] is not kinds[1][name] and TYPE in (tree.get(name) or {})
-        }
-        tree = {key: value for key, value in tree.items() if key not in other}
+        tree = _for_verb(tree, config_class, recipe_class)
     register_types(config_class, given)
     merged = _overridden(config_class, tree, given)
-    if from_file := consents(merged, given):
+    from_file = consents(merged, given)
+    for name, value in from_file.items():
         flags = consent_flags(from_file)
         hint = f"a file cannot allow this, only the command line can: if you trust it, add {flags}"
-        raise InputError(next(iter(from_file)), next(iter(from_file.values())), hint)
+        raise InputError(name, value, hint)
     return decode(config_class, merged)
+
+
+def _for_verb(tree: dict[str, Any], config_class: type[Any], recipe_class: type[Any]) -> dict[str, Any]:
+    """The part of a run's recipe that is for the config of another verb."""
+    known, taken, left = annotations_of(recipe_class), annotations_of(config_class), {}
+    for key, value in tree.items():
+        if key in known and (key not in taken or key == "output_dir"):
+            continue  # a run's own config is a recipe too, and its folder is taken
+        chosen = isinstance(value, dict) and TYPE in value
+        if chosen and key in known and section_of(known[key]) is not section_of(taken[key]):
+            continue  # a section that has types in a run and none here is another one of the same name
+        left[key] = value
+    return left
 
 
 def consents(tree: Any, given: Any = None) -> dict[str, Any]:
@@ -153,11 +150,11 @@ def consents(tree: Any, given: Any = None) -> dict[str, Any]:
     Fields that the command line sets as well, in `given`, are left out.
     """
     asked = {name for name, _ in _leaves(given)}
-    return {
-        name: value
-        for name, value in _leaves(tree)
-        if name.rpartition(".")[2] in CONSENT and value not in UNSET and name not in asked
-    }
+    found = {}
+    for name, value in _leaves(tree):
+        if name.rpartition(".")[2] in CONSENT and value not in UNSET and name not in asked:
+            found[name] = value
+    return found
 
 
 def consent_flags(consented: dict[str, Any]) -> str:
@@ -167,9 +164,10 @@ def consent_flags(consented: dict[str, Any]) -> str:
 
 def _leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any]]:
     """Dotted name and value of everything in a tree that is not looked into."""
-    entries = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
-    for key, value in entries:
-        name = f"{path}{key}"
+    if isinstance(tree, list):
+        tree = dict(enumerate(tree))
+    for key, value in tree.items() if isinstance(tree, dict) else ():
+        name = f"{path}{key}"  # a key may have dots itself
         if isinstance(value, (dict, list)) and name.rpartition(".")[2] not in CONSENT:
             yield from _leaves(value, f"{name}.")
         else:
@@ -192,64 +190,65 @@ def read_arguments(arguments: list[str], bare: str | None = None) -> tuple[Path 
 
     Bare arguments are entries of the list that `bare` names; without it, the one there may be is the recipe.
     """
-    path: str | None = None
+    paths: list[str] = []
     given: dict[str, Any] = {}
     entries: list[str] = []
     rest = list(arguments)
     while rest:
         argument = rest.pop(0)
-        if argument.startswith("--"):
-            key, equals, value = argument[2:].partition("=")
-            if not equals:
-                if not rest or rest[0].startswith("--"):
-                    raise InputError(key or "--", "", f"give it a value: --{key}=…")
-                value = rest.pop(0)
-        elif bare is not None:
-            entries.append(argument)
+        if not argument.startswith("--"):
+            if bare is None and (paths or given):
+                raise InputError("argument", argument, SYNTAX)
+            (paths if bare is None else entries).append(argument)
             continue
-        elif path is None and not given:
-            key, value = "config_path", argument
-        else:
-            raise InputError("argument", argument, "write --section.field=value")
+        key, equals, value = argument[2:].partition("=")
+        if not equals:
+            if not rest or rest[0].startswith("--"):
+                raise InputError(key or "--", "", f"give it a value: --{key}=…")
+            value = rest.pop(0)
         if key == "config_path":
-            if path is not None:
-                raise InputError("config_path", value, f"there is {path} already; give one recipe")
-            path = value
+            paths.append(value)
+        elif all(key.split(".")):
+            _set(given, key, _value(value))
         else:
-            if not all(names := key.split(".")):
-                raise InputError("argument", argument, "write --section.field=value")
-            _set(given, names, _value(value), key)
+            raise InputError("argument", argument, SYNTAX)
+    if len(paths) > 1:
+        raise InputError("config_path", paths[1], f"there is {paths[0]} already; give one recipe")
     if bare is not None and entries:
         if bare in given:
             raise InputError(bare, given[bare], f"leave out --{bare} or {entries[0]}: name them in one way")
         given[bare] = entries
-    return (None if path is None else _recipe_path(expanded(path, "config_path"))), given
+    return (_recipe_path(expanded(paths[0], "config_path")) if paths else None), given
 
 
 def _recipe_path(path: Path) -> Path:
     """A recipe, that of a run for its folder, or that of a checkpoint for its folder or its policy's."""
-    places = (path / CONFIG, path.parent / CONFIG)
-    return next((place for place in places if place.is_file()), path) if path.is_dir() else path
+    for place in (path / CONFIG, path.parent / CONFIG):
+        if path.is_dir() and place.is_file():
+            return place
+    return path
 
 
 def shipped_recipes() -> dict[str, Path]:
     """Recipes of this package by name: beside its code in a wheel, in ``recipes/`` of the repository."""
     package = Path(__file__).parents[1]
-    folder = next((f for f in (package / RECIPES, package.parent / RECIPES) if f.is_dir()), None)
-    return {} if folder is None else {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+    for folder in (package / RECIPES, package.parent / RECIPES):
+        if folder.is_dir():
+            return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+    return {}
 
 
 def read_recipe(path: Path) -> dict[str, Any]:
     """The tree in a YAML (or JSON) file, or in one of `shipped_recipes`."""
+    shipped = shipped_recipes()
     if not path.is_file():
-        shipped = shipped_recipes()
         bare = path.stem if str(path.parent) == RECIPES else str(path)  # as in the repository
         path = shipped.get(bare, path)
     if path.is_dir():
         hint = f"a folder without {CONFIG}, so no run or checkpoint; name a recipe"
         raise InputError("config_path", str(path), hint)
     if not path.is_file():
-        names = [*(str(p) for p in path.parent.glob("*.y*ml")), *shipped]
+        names = [*map(str, path.parent.glob("*.y*ml")), *shipped]
         near = difflib.get_close_matches(str(path), names, n=3)
         hint = f"did you mean {' or '.join(near)}" if near else f"this package has {', '.join(shipped)}"
         raise InputError("config_path", str(path), f"no such file; {hint}")
@@ -258,14 +257,10 @@ def read_recipe(path: Path) -> dict[str, Any]:
             "LeRobot wrote it; resume a run with RUN/config.yaml, and name a policy's folder by policy.path"
         )
         raise InputError("config_path", str(path), hint)
-    if (size := path.stat().st_size) > LARGEST_RECIPE:
-        raise InputError("config_path", str(path), f"{size:,} bytes; a recipe has a few thousand")
     try:
         tree = _load_yaml(path.read_text())
     except (yaml.YAMLError, ValueError) as error:
         raise InputError("config_path", str(path), f"not good YAML: {_where(error)}") from error
-    except OSError as error:
-        raise InputError("config_path", str(path), f"cannot be read: {error.strerror}") from error
     if not isinstance(tree, dict | None):
         raise InputError("config_path", str(path), "a recipe is a mapping such as 'env: {type: metaworld}'")
     return tree or {}
@@ -273,14 +268,16 @@ def read_recipe(path: Path) -> dict[str, Any]:
 
 def section_of(annotation: Any) -> type[Any] | None:
     """The config class behind a field's annotation, ``X`` or ``X | None``; None for a plain value."""
-    options = (
-        [a for a in typing.get_args(annotation) if a is not type(None)]
-        if is_union(annotation)
-        else [annotation]
-    )
-    if len(options) == 1 and isinstance(options[0], type) and dataclasses.is_dataclass(options[0]):
-        return options[0]
-    return None
+    options = set(typing.get_args(annotation)) if is_union(annotation) else {annotation}
+    options -= {type(None)}
+    section = options.pop() if len(options) == 1 else None
+    return section if isinstance(section, type) and dataclasses.is_dataclass(section) else None
+
+
+def sections_of(cls: type[Any]) -> dict[str, type[Any]]:
+    """Field → config class, of the fields that are sections."""
+    found = {name: section_of(annotation) for name, annotation in annotations_of(cls).items()}
+    return {name: section for name, section in found.items() if section is not None}
 
 
 def choices_of(section: type[Any]) -> dict[str, type[Any]]:
@@ -293,21 +290,20 @@ class _Loader(yaml.SafeLoader):
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         if self.check_event(yaml.AliasEvent):
-            problem = "an alias; write the value itself"
-            raise yaml.constructor.ConstructorError(None, None, problem, self.peek_event().start_mark)
+            raise _problem("an alias; write the value itself", self.peek_event().start_mark)
         return super().compose_node(parent, index)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen = set()
-        for key_node, _ in node.value:
-            if not isinstance(key_node, yaml.ScalarNode):
-                raise yaml.constructor.ConstructorError(None, None, "a key is not text", key_node.start_mark)
-            if key_node.value in seen:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"{key_node.value} is given twice", key_node.start_mark
-                )
-            seen.add(key_node.value)
+        for key, _ in node.value:
+            if key.value in seen:
+                raise _problem(f"{key.value} is given twice", key.start_mark)
+            seen.add(key.value)
         return super().construct_mapping(node, deep)
+
+
+def _problem(words: str, mark: Any) -> yaml.YAMLError:
+    return yaml.constructor.ConstructorError(None, None, words, mark)
 
 
 def _load_yaml(text: str) -> Any:
@@ -325,6 +321,7 @@ def as_text(value: Any) -> str:
 
 
 def _where(error: Exception) -> str:
+    """The line and the problem of an error of YAML's, or its words."""
     mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
     return str(error) if mark is None or problem is None else f"line {mark.line + 1}: {problem}"
 
@@ -337,15 +334,17 @@ def _value(text: str) -> Any:
         return text
 
 
-def _set(tree: dict[str, Any], keys: list[str], value: Any, dotted: str) -> None:
-    for key in keys[:-1]:
-        below = tree.setdefault(key, {})
+def _set(tree: dict[str, Any], dotted: str, value: Any) -> None:
+    """Adds a value of the command line to a tree, once."""
+    *sections, name = dotted.split(".")
+    for section in sections:
+        below = tree.setdefault(section, {})
         if not isinstance(below, dict):
-            raise InputError(dotted, value, f"{key} is set to {below!r} already")
+            raise InputError(dotted, value, f"{section} is set to {below!r} already")
         tree = below
-    if keys[-1] in tree:
-        raise InputError(dotted, value, f"it is set to {tree[keys[-1]]!r} already; give it once")
-    tree[keys[-1]] = value
+    if name in tree:
+        raise InputError(dotted, value, f"it is set to {tree[name]!r} already; give it once")
+    tree[name] = value
 
 
 def _overridden(config_class: type[Any], tree: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
@@ -356,45 +355,44 @@ def _overridden(config_class: type[Any], tree: dict[str, Any], given: dict[str, 
     former type that the new one does not take are dropped too: a run's config holds them, chosen or not.
     """
     merged = _merged(tree, given)
-    annotations = annotations_of(config_class)
-    for field in dataclasses.fields(config_class):
-        section, over, under = (
-            section_of(annotations[field.name]),
-            given.get(field.name),
-            tree.get(field.name),
-        )
-        if section is None or not isinstance(over, dict) or not isinstance(under, dict):
+    defaults = defaults_of(config_class)
+    for name, section in sections_of(config_class).items():
+        over, under = given.get(name), tree.get(name)
+        if not isinstance(over, dict) or not isinstance(under, dict):
             continue
-        before = under.get(TYPE, _default_type(field))
-        now = over.get(TYPE, before)
-        kinds = choices_of(section)
-        kind = kinds.get(str(now), section)
-        if now != before and kind is not section:
-            usual = encoded_defaults(kinds.get(str(before), section))
-            taken = annotations_of(kind)
-            under = {
-                name: value
-                for name, value in under.items()
-                if name in taken and (value != usual.get(name) or fits(taken[name], value))
-            }
-        merged[field.name] = _overridden(kind, under, over)
+        former = under.get(TYPE, getattr(defaults[name], TYPE, None))
+        chosen = over.get(TYPE, former)
+        choices = choices_of(section)
+        kind = choices.get(str(chosen), section)
+        if chosen != former and kind is not section:
+            under = _taken(under, choices.get(str(former), section), kind)
+        merged[name] = _overridden(kind, under, over)
     return merged
+
+
+def _taken(tree: dict[str, Any], former: type[Any], kind: type[Any]) -> dict[str, Any]:
+    """The fields of a section that a config of another type takes over."""
+    usual, annotations, kept = encoded_defaults(former), annotations_of(kind), {}
+    for name, value in tree.items():
+        if name in annotations and (value != usual.get(name) or fits(annotations[name], value)):
+            kept[name] = value
+    return kept
 
 
 def encoded_defaults(cls: type[Any]) -> dict[str, Any]:
     """Field → default, as a file has it."""
-    return {field.name: draccus.encode(default_of(field)) for field in dataclasses.fields(cls)}
+    return {name: draccus.encode(default) for name, default in defaults_of(cls).items()}
 
 
 def register_types(cls: type[Any], tree: dict[str, Any], path: tuple[str, ...] = ()) -> None:
     """Imports the packages that register types of what is to be decoded, as LeRobot's parser does."""
     for field in dataclasses.fields(cls):
-        value, section = tree.get(field.name), section_of(annotations_of(cls)[field.name])
-        if field.metadata.get(REGISTERS) and value is not None:
+        if field.metadata.get(REGISTERS) and tree.get(field.name) is not None:
             field.metadata.get(PREPARES, bool)()
-            discover(str(value), ".".join(path))
-        elif section is not None and isinstance(value, dict):
-            register_types(section, value, (*path, field.name))
+            discover(str(tree[field.name]), ".".join(path))
+    for name, section in sections_of(cls).items():
+        if isinstance(tree.get(name), dict):
+            register_types(section, tree[name], (*path, name))
 
 
 def _merged(tree: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
@@ -406,96 +404,106 @@ def _merged(tree: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
 
 
 def _decoded(cls: type[Any], tree: dict[str, Any], path: tuple[str, ...], whole: type[Any]) -> Any:
-    """A config section, once all keys in `tree` are known to exist and all values fit."""
-    annotations, by_name = annotations_of(cls), {field.name: field for field in dataclasses.fields(cls)}
+    """A config section, once all keys in `tree` are known to exist and all values fit.
+
+    `path` is where the section stands in the config `whole`.
+    """
+    annotations, sections, defaults = annotations_of(cls), sections_of(cls), defaults_of(cls)
     values = {}
     for key, value in tree.items():
-        here = (*path, str(key))
-        if key not in by_name:
-            raise _unknown(str(key), value, path, list(by_name), whole)
-        section = section_of(annotations[key])
-        if section is None:
-            values[key] = _leaf(annotations[key], value, ".".join(here))
+        place = (*path, str(key))
+        if key not in annotations:
+            raise _unknown(str(key), value, path, list(annotations), whole)
+        if key not in sections:
+            values[key] = _leaf(annotations[key], value, ".".join(place))
         elif value is None and is_optional(annotations[key]):
             values[key] = None
-        elif not isinstance(value, dict | None):
-            raise InputError(".".join(here), value, f"a config section; use --{here[-1]}.field=value")
+        elif isinstance(value, dict | None):
+            values[key] = _section(sections[key], value or {}, defaults[key], place, whole)
         else:
-            values[key] = _section(section, value or {}, here, by_name[key], whole)
-    for field in by_name.values():
-        if field.name not in values and field.default is field.default_factory is dataclasses.MISSING:
-            raise InputError(".".join((*path, field.name)), None, f"use {wanted(annotations[field.name])}")
+            raise InputError(".".join(place), value, f"a config section; use --{key}.field=value")
     try:
         return cls(**values)
     except InputError as error:
         # A section that stands in several places, such as a replay, has one name for itself.
-        usual, actual = (f"{name}." for name in (getattr(cls, "SECTION", ""), ".".join(path)))
+        usual, actual = f"{getattr(cls, 'SECTION', '')}.", f"{'.'.join(path)}."
         if usual in (".", actual) or not error.field.startswith(usual):
             raise
-        moved = f"{actual}{error.field.removeprefix(usual)}"
-        raise InputError(moved, error.value, error.hint.replace(usual, actual)) from error
+        field_name = actual + error.field.removeprefix(usual)
+        raise InputError(field_name, error.value, error.hint.replace(usual, actual)) from error
     except (TypeError, ValueError) as error:  # of a class that is not ours
         raise InputError(".".join(path) or "config", type(error).__name__, str(error)) from error
 
 
 def _section(
-    section: type[Any], value: dict[str, Any], here: tuple[str, ...], field: Any, whole: type[Any]
+    section: type[Any], value: dict[str, Any], default: Any, path: tuple[str, ...], whole: type[Any]
 ) -> Any:
-    choices, usual = choices_of(section), _default_type(field)
-    if not choices:
-        return _decoded(section, _merged(_apart(field, section), value), here, whole)
-    kind = value.get(TYPE, usual)
-    if not isinstance(kind, str) or kind not in choices:
-        near = difflib.get_close_matches(str(kind), choices, n=1)
-        hint = f"did you mean {near[0]}? Otherwise " if near else ""
-        hint += f"use one of {', '.join(sorted(choices))}"
-        if here == ("env",):
-            hint += f"; one of LeRobot's own is --env.type=lerobot --env.name={kind}"
-        raise InputError(".".join((*here, TYPE)), kind, hint)
-    rest = {k: v for k, v in value.items() if k != TYPE}
-    if kind == usual:
-        rest = _merged(_apart(field, choices[kind]), rest)
-    return _decoded(choices[kind], rest, here, whole)
+    """A section of the type that `value` names, or of its default's; fields not given are its default's."""
+    choices, value = choices_of(section), dict(value)
+    if choices:
+        kind = value.pop(TYPE, getattr(default, TYPE, None))
+        if not isinstance(kind, str) or kind not in choices:
+            raise _no_choice(kind, choices, path)
+        section = choices[kind]
+    if type(default) is section:
+        value = _merged(_changed_defaults(default), value)
+    return _decoded(section, value, path, whole)
+
+
+def _changed_defaults(default: Any) -> dict[str, Any]:
+    """Fields in which the default of a section differs from its class's own."""
+    usual = defaults_of(type(default))
+    changed = {name for name, value in usual.items() if getattr(default, name) != value}
+    return {name: value for name, value in encode(default).items() if name in changed}
+
+
+def _no_choice(kind: Any, choices: dict[str, type[Any]], path: tuple[str, ...]) -> InputError:
+    near = difflib.get_close_matches(str(kind), choices, n=1)
+    hint = f"did you mean {near[0]}? Otherwise " if near else ""
+    hint += f"use one of {', '.join(sorted(choices))}"
+    if path == ("env",):
+        hint += f"; one of LeRobot's own is --env.type=lerobot --env.name={kind}"
+    return InputError(".".join((*path, TYPE)), kind, hint)
 
 
 def _leaf(annotation: Any, value: Any, field: str) -> Any:
-    """A plain value, decoded by draccus unless draccus would quietly turn it into something else.
-
-    ``a,b`` and a lone value are the list that the field holds.
-    """
-    plain = unmarked(annotation)
-    kinds = set(typing.get_args(plain)) if is_union(plain) else {plain}
-    entries = [typing.get_args(kind)[0] for kind in kinds if typing.get_origin(kind) in (list, tuple)]
-    entry = entries[0] if len(entries) == 1 else None
-    if entry is not None and isinstance(value, str):  # draccus would take text letter by letter
-        parts = [part.strip() for part in value.split(",")]
-        value = parts if entry is str else [_value(part) for part in parts]
-    elif entry is not None and isinstance(value, (bool, int, float)):
-        value = [value]
-    wrong = (
-        (value is None and plain is not Any and not is_optional(plain))
-        or (isinstance(value, bool) and not kinds & {bool, Any})
-        or (isinstance(value, (list, dict)) and kinds <= {str, int, float, bool, type(None)})
-    )
-    if isinstance(value, list) and entry not in (None, bool, Any):
-        wrong |= any(isinstance(v, bool) for v in value)
-    try:
-        decoded = None if wrong else draccus.decode(plain, value)
-    except Exception:  # whatever draccus raises, the value does not fit
-        wrong = True
-    if wrong:
+    """A plain value, refused under the name `field` if it does not fit."""
+    made = _converted(annotation, value)
+    if not fits(annotation, made):
         raise InputError(field, value, f"use {wanted(annotation)}")
-    check(annotation, decoded, field)
-    return decoded
+    return made
 
 
-def _apart(field: Any, section: type[Any]) -> dict[str, Any]:
-    """Differences of a field's default of a section from the section's own class.
+def _converted(kind: Any, value: Any) -> Any:
+    """A value of YAML's as its annotation has it, or as it is if nothing but its type would have to change.
 
-    draccus takes the class's word for all that is not given, so one field given would change the others.
+    ``a,b`` and a lone value are the list that a field holds.
     """
-    default = None if field.default_factory is dataclasses.MISSING else field.default_factory()
-    return {} if default is None or default == section() else encode(default)
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin is Annotated:
+        return _converted(arguments[0], value)
+    if is_union(kind):
+        made = [(one, _converted(one, value)) for one in arguments]
+        return next((result for one, result in made if fits(one, result)), value)
+    if origin in (list, tuple):
+        if isinstance(value, str):
+            parts = [part.strip() for part in value.split(",")]
+            value = parts if arguments[0] is str else [_value(part) for part in parts]
+        elif isinstance(value, (bool, int, float)):
+            value = [value]
+        return origin(_converted(arguments[0], v) for v in value) if isinstance(value, list) else value
+    if origin is dict and isinstance(value, dict):
+        return {str(key): _converted(arguments[1], entry) for key, entry in value.items()}
+    if isinstance(value, bool) or value is None:
+        return value
+    if kind is str and isinstance(value, (int, float, datetime.date)):
+        return str(value)
+    if kind in (int, float) and isinstance(value, (str, int)) or isinstance(kind, type) and kind not in PLAIN:
+        try:
+            return draccus.decode(kind, value)
+        except Exception:  # whatever draccus raises, the value does not fit
+            return value
+    return value
 
 
 def dotted_fields(cls: type[Any]) -> Iterator[str]:
@@ -503,65 +511,38 @@ def dotted_fields(cls: type[Any]) -> Iterator[str]:
     return (name for name, _ in _fields(cls))
 
 
-def _fields(cls: type[Any], path: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
+def _fields(cls: type[Any], path: str = "") -> Iterator[tuple[str, Any]]:
     """Dotted name and annotation of every field."""
-    annotations = annotations_of(cls)
-    for field in dataclasses.fields(cls):
-        section, here = section_of(annotations[field.name]), (*path, field.name)
-        if section is None:
-            yield ".".join(here), annotations[field.name]
+    sections = sections_of(cls)
+    for name, annotation in annotations_of(cls).items():
+        if name not in sections:
+            yield f"{path}{name}", annotation
             continue
-        for kind in choices_of(section).values() or (section,):
-            yield from _fields(kind, here)
+        for kind in choices_of(sections[name]).values() or (sections[name],):
+            yield from _fields(kind, f"{path}{name}.")
 
 
 def _unknown(key: str, value: Any, path: tuple[str, ...], names: list[str], whole: type[Any]) -> InputError:
     """The error for a field that a config does not have: what it resembles, or where it belongs."""
-    if len(key) > LONGEST_KEY:
-        return InputError(key[:LONGEST_KEY], value, "no such field")
-    here = leaf_name = ".".join((*path, key))
+    key = key[:LONGEST_KEY]
+    name = full_name = ".".join((*path, key))
     leaf = value
     while isinstance(leaf, dict) and leaf:
         below, leaf = next(iter(leaf.items()))
-        leaf_name += f".{below}"
+        full_name += f".{below}"
     annotations = dict(_fields(whole))
-    near = [".".join((*path, name)) for name in difflib.get_close_matches(key, names, n=3)]
+    near = [".".join((*path, other)) for other in difflib.get_close_matches(key, names, n=3)]
     # Only what is no misspelling is of a section of LeRobot's.
-    lerobot_name = leaf_name in FLAGS or here in FLAGS or not near
-    if lerobot_name and (hint := hint_for(leaf_name, leaf, annotations.keys())):
-        return InputError(leaf_name, leaf, f"the name is LeRobot's; {hint}")
+    if full_name in FLAGS or name in FLAGS or not near:
+        hint = hint_for(full_name, leaf, annotations.keys())
+        if hint is not None:
+            return InputError(full_name, leaf, f"the name is LeRobot's; {hint}")
     # The same name elsewhere, where the value would fit or no section was named.
-    near += [
-        name
-        for name, kind in annotations.items()
-        if name.rpartition(".")[2] == key and name != here and (not path or _takes(kind, value))
-    ]
+    for other, annotation in annotations.items():
+        same = other.rpartition(".")[2] == key and other != name
+        if same and (not path or fits(annotation, _converted(annotation, value))):
+            near.append(other)
+    if near:
+        return InputError(name, value, f"no such field; did you mean {' or '.join(dict.fromkeys(near[:4]))}?")
     where = f"{'.'.join(path)} has" if path else "there are"
-    hint = f"did you mean {' or '.join(dict.fromkeys(near[:4]))}?" if near else f"{where} {', '.join(names)}"
-    return InputError(here, value, f"no such field; {hint}")
-
-
-def _takes(annotation: Any, value: Any) -> bool:
-    try:
-        _leaf(annotation, value, "")
-    except InputError:
-        return False
-    return True
-
-
-def _sections(cls: type[Any]) -> dict[str, type[Any]]:
-    """Field → class, of the fields that are sections."""
-    found = {name: section_of(annotation) for name, annotation in annotations_of(cls).items()}
-    return {name: section for name, section in found.items() if section is not None}
-
-
-def _names(cls: type[Any]) -> set[str]:
-    return {field.name for field in dataclasses.fields(cls)}
-
-
-def _default_type(field: Any) -> str | None:
-    """The type a choice has when nobody names one: that of the field's default."""
-    if field.default_factory is dataclasses.MISSING:
-        return None
-    kind: str | None = getattr(field.default_factory(), TYPE, None)
-    return kind
+    return InputError(name, value, f"no such field; {where} {', '.join(names)}")

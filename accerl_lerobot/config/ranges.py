@@ -22,7 +22,6 @@ import types
 import typing
 from collections.abc import Hashable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 from accerl_lerobot.errors import InputError
@@ -78,7 +77,6 @@ Commit = Annotated[str, Pattern(r"[0-9a-f]{40}", "the 40 hexadecimal digits of a
 
 registered_name = property(lambda section: str(section.get_choice_name(section.__class__)))
 """Name under which a section's class is registered: its `type`."""
-LONGEST_TEXT = 4096  # characters of a text; no path is longer
 
 
 class Section:
@@ -133,23 +131,21 @@ def _hints_of(cls: Any) -> dict[str, Any]:
     return {field.name: annotations[field.name] for field in dataclasses.fields(cls)}
 
 
-def default_of(field: Any) -> Any:
-    """Default of a field of a dataclass; None if it has none."""
-    if field.default is not dataclasses.MISSING:
-        return field.default
-    return None if field.default_factory is dataclasses.MISSING else field.default_factory()
+def defaults_of(cls: type[Any]) -> dict[str, Any]:
+    """Field name → default; None where there is none."""
+    defaults: dict[str, Any] = {}
+    for field in dataclasses.fields(cls):
+        if field.default is not dataclasses.MISSING:
+            defaults[field.name] = field.default
+        elif field.default_factory is not dataclasses.MISSING:
+            defaults[field.name] = field.default_factory()
+        else:
+            defaults[field.name] = None
+    return defaults
 
 
 def check(annotation: Any, value: Any, field: str) -> None:
     """Refuses a value that does not fit an annotation."""
-    for text in value if isinstance(value, (list, tuple)) else (value,):
-        if isinstance(text, str) and (len(text) > LONGEST_TEXT or "\0" in text):
-            raise InputError(field, value, f"use at most {LONGEST_TEXT:,} characters, none of them NUL")
-        if isinstance(text, str) and text.startswith("~"):
-            try:
-                Path(text).expanduser()
-            except RuntimeError as error:
-                raise InputError(field, value, "there is no such user; name a path in full") from error
     if not fits(annotation, value):
         raise InputError(field, value, f"use {wanted(annotation)}")
 
@@ -164,17 +160,19 @@ def fits(annotation: Any, value: Any) -> bool:
         return any(fits(kind, value) for kind in arguments)
     if origin is typing.Literal:
         return value in arguments
+    if origin is dict:
+        return isinstance(value, dict) and all(fits(arguments[1], entry) for entry in value.values())
     if origin in (list, tuple):
         if not isinstance(value, (list, tuple)):
             return False
-        if origin is list or Ellipsis in arguments:
-            return all(fits(arguments[0], entry) for entry in value)
-        return len(value) == len(arguments) and all(map(fits, arguments, value))
+        if origin is tuple and Ellipsis not in arguments and len(value) != len(arguments):
+            return False
+        return all(fits(arguments[0], entry) for entry in value)
     if annotation in (int, float):
         return _is_number(annotation, value) and math.isfinite(value)
-    if annotation in (bool, str, type(None)):
-        return isinstance(value, annotation)
-    return True
+    if annotation is Any or not isinstance(annotation, type) or dataclasses.is_dataclass(annotation):
+        return True
+    return isinstance(value, annotation)
 
 
 def _is_number(kind: type, value: Any) -> bool:

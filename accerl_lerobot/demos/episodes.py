@@ -55,20 +55,22 @@ def read_labels(data: Any, dataset: DatasetConfig, one_task: bool = True) -> lis
     found = []
     for rows in np.split(order, ends):
         index = int(episode[rows[0]])
-        names = tuple(texts[int(i)] for i in dict.fromkeys(task[rows].tolist()))
+        numbers_of_tasks = dict.fromkeys(task[rows].tolist())
+        names = tuple(texts[int(number)] for number in numbers_of_tasks)
         if one_task and len(names) > 1:
             hint = f"its instruction changes from {names[0]!r} to {names[1]!r}, and one is read here"
             raise origin.refuse(f"episode {index}", f"{hint}; split the episode, or use accerl sft")
-        at = None
+        given = None if rewards is None else rewards[rows].astype(np.float32)
+        success_at = None
         if flags is not None:
-            at = step_of_success(flags[rows])
-        elif rewards is not None:
-            at = step_of_reward(rewards[rows])
-        if at is None and rewards is not None:
-            hint = f"{REWARD} is above 0 at steps that do not end it, so that it tells no success"
-            raise origin.refuse(f"episode {index}", f"{hint}; {LABEL}")
-        own = None if rewards is None else rewards[rows].astype(np.float32)
-        found.append(EpisodeLabels(index=index, rows=rows, tasks=names, rewards=own, success_at=at))
+            success_at = step_of_success(flags[rows])
+        elif given is not None:
+            success_at = step_of_reward(given)
+            if success_at is None:
+                hint = f"{REWARD} is above 0 at steps that do not end it, so that it tells no success"
+                raise origin.refuse(f"episode {index}", f"{hint}; {LABEL}")
+        labels = EpisodeLabels(index=index, rows=rows, tasks=names, rewards=given, success_at=success_at)
+        found.append(labels)
     return found
 
 

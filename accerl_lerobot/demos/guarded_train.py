@@ -59,9 +59,10 @@ def query_rows(reader: Any, wanted: dict[str, list[int]]) -> dict[str, torch.Ten
 
     LeRobot 0.6.1 decodes these rows' images to read an action chunk, here seven times as long.
     """
-    row_of, found = reader._absolute_to_relative_idx, {}
+    row_of = reader._absolute_to_relative_idx
+    found = {}
     for key in wanted.keys() - set(reader._meta.video_keys):
-        rows = wanted[key] if row_of is None else [row_of[i] for i in wanted[key]]
+        rows = wanted[key] if row_of is None else [row_of[index] for index in wanted[key]]
         found[key] = torch.stack(_column(reader.hf_dataset, key)[rows][key])
     return found
 
@@ -104,12 +105,11 @@ def _adapted(stock: Any) -> Any:
         # LeRobot 0.6.1 renames the dataset's features and not their statistics.
         train.meta.stats = rename_stats(train.meta.stats, cfg.rename_map)
         fixed = not cfg.dataset.image_transforms.enable and not cfg.dataset.streaming
-        # Depth stays float; see `_small`.
-        item = sum(
-            (4 if key in train.meta.depth_keys else 1) * math.prod(train.meta.features[key]["shape"])
-            for key in train.meta.camera_keys
-        )
-        if fixed and len(train) * item * cfg.policy.n_obs_steps <= MAX_BYTES:
+        item_bytes = 0
+        for camera in train.meta.camera_keys:
+            pixel_bytes = 4 if camera in train.meta.depth_keys else 1  # depth stays float, see `_small`
+            item_bytes += pixel_bytes * math.prod(train.meta.features[camera]["shape"])
+        if fixed and len(train) * item_bytes * cfg.policy.n_obs_steps <= MAX_BYTES:
             train = CachedDataset(train)
         return train, evaluation
 
@@ -123,14 +123,17 @@ def main() -> None:
 
     from accerl_lerobot.policies.vla import data_only
 
-    def given(prefix: str) -> str | None:
-        return next((a.removeprefix(prefix) for a in sys.argv[1:] if a.startswith(prefix)), None)
-
-    code, root, name = given(TRUST), given("--dataset.root="), given("--dataset.repo_id=")
-    origin = FileSource("dataset.repo_id", name) if root is None else FileSource("dataset.root", root)
+    given: dict[str, str] = {}
+    for argument in sys.argv[1:]:
+        name, equals, value = argument.partition("=")
+        given.setdefault(name + equals, value)
+    code, root = given.get(TRUST), given.get("--dataset.root=")
+    origin = FileSource("dataset.root", root)
+    if root is None:
+        origin = FileSource("dataset.repo_id", given.get("--dataset.repo_id="))
     lerobot_train.make_train_eval_datasets = _adapted(lerobot_train.make_train_eval_datasets)
     DatasetReader._query_hf_dataset = query_rows
-    discover(given(PACKAGE), "policy")
+    discover(given.get(PACKAGE), "policy")
     sys.argv[1:] = [a for a in sys.argv[1:] if not a.startswith((TRUST, PACKAGE))]
     answer: dict[str, Any] = {}
     errors.collect_warnings()

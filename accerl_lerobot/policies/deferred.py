@@ -77,9 +77,9 @@ def _distributions() -> dict[str, list[str]]:
     for distribution in importlib.metadata.distributions():
         names = set((distribution.read_text("top_level.txt") or "").split())
         if not names:
-            files = [line.split(",")[0] for line in (distribution.read_text("RECORD") or "").splitlines()]
-            tops = {file.partition("/")[::2] for file in files}
-            names = {head if rest else inspect.getmodulename(head) or "." for head, rest in tops}
+            for line in (distribution.read_text("RECORD") or "").splitlines():
+                folder, slash, _ = line.split(",")[0].partition("/")
+                names.add(folder if slash else inspect.getmodulename(folder) or ".")
         for name in names:
             if "." not in name:
                 found.setdefault(name, []).append(distribution.metadata["Name"])
@@ -87,6 +87,6 @@ def _distributions() -> dict[str, list[str]]:
 
 
 if os.environ.get(OURS):  # now, as much of LeRobot imports the policies or diffusers
-    # transformers and diffusers each ask for them, 0.5 s each time.
+    # transformers and diffusers each ask for them. Python's own function takes a second longer, each time.
     importlib.metadata.packages_distributions = functools.cache(_distributions)
     sys.meta_path.insert(0, _Finder)

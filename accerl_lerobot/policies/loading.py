@@ -9,9 +9,9 @@ same tensors of the same shapes.
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import logging
-import string
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -23,12 +23,11 @@ import torch
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 
-from accerl_lerobot.checkpoint.isolation import rehearse
 from accerl_lerobot.checkpoint.layout import BACKBONE, CONFIG_FOLDERS, STEP_FOLDERS
 from accerl_lerobot.checkpoint.safety import FileSource, brief, read_json, read_tensors, tensor_shapes
 from accerl_lerobot.config.parsing import discover, imported
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import TASK, stack_observations
+from accerl_lerobot.experience import stack_observations
 from accerl_lerobot.policies import untrusted
 from accerl_lerobot.policies.adapter import LeRobotAdapter, Processing, ValueHead
 from accerl_lerobot.policies.config import (
@@ -53,7 +52,6 @@ from accerl_lerobot.policies.stock import StockAdapter
 logger = logging.getLogger(__name__)
 
 ACTS_MOST = 10**9  # parameters of a policy that acts in a rehearsal; π0's four billion would take minutes
-TEXT = f"Put the red cube on the plate {string.printable}"  # a tokeniser can be slow on some characters only
 
 
 class Sizes(NamedTuple):
@@ -63,7 +61,7 @@ class Sizes(NamedTuple):
     trained: int
 
 
-_rehearsed: dict[str, Sizes] = {}  # checkpoints and configs that need no other rehearsal in this process
+_rehearsed: dict[tuple[Any, ...], Sizes] = {}  # of checkpoints and configs that need no other rehearsal
 
 
 def resolve_device(name: str, field: str = "policy.device") -> torch.device:
@@ -125,28 +123,25 @@ def learning_config(config: PolicyConfig, *, fine_tuned: bool = False, imitates:
 def policy_sizes(
     config: PolicyConfig, *, fine_tuned: bool = False, imitates: bool = False, learns: bool = False
 ) -> Sizes:
-    """`Sizes` of a checkpoint's policy, which has been loaded and has acted once in a child process.
+    """`Sizes` of a checkpoint's policy, which has been loaded on the CPU and has acted once.
 
-    One that `imitates`, of a type without a likelihood, computes LeRobot's training loss there too. If it is
-    to be `fine_tuned`, statistics that it lacks are no reason to refuse it; if it `learns`, an option that
-    has no exact likelihood is one.
-
-    The child has limits of memory and time (`isolation`), and it does not read the weights. Networks of more
-    than `ACTS_MOST` numbers are built and do not act.
+    One that `imitates`, of a type without a likelihood, computes LeRobot's training loss too. If it is to be
+    `fine_tuned`, statistics that it lacks are no reason to refuse it. If it `learns`, an option that has no
+    exact likelihood is one. A checkpoint whose files have not changed since is not loaded again.
 
     Raises:
-        InputError: see `load_lerobot_config`, `load_adapter` and `isolation.rehearse`.
+        InputError: see `load_lerobot_config` and `load_adapter`.
     """
-    folder = _checkpoint_folder(config)
-    _registered_type(config, folder)  # before the fork: it imports the policy's code
-    files = [(str(path), path.stat()) for path in sorted(folder.rglob("*")) if path.is_file()]
-    how = {"fine_tuned": fine_tuned, "imitates": imitates, "learns": learns}
-    of_files = [(path, stat.st_size, stat.st_mtime_ns) for path, stat in files]
-    acts, key = (repr((config, asked, of_files)) for asked in (how | {"learns": False}, how))
-    if key not in _rehearsed:
-        sizes = rehearsed(replace(config, precision="fp32"), sizes_of, **how)
-        _rehearsed[acts] = _rehearsed[key] = Sizes(*sizes)
-    return _rehearsed[key]
+    files = [path for path in sorted(_checkpoint_folder(config).rglob("*")) if path.is_file()]
+    state = repr([(str(path), path.stat().st_mtime_ns) for path in files])
+    key = (repr(config), state, fine_tuned, imitates)
+    for learning in (learns, True):  # a policy that can learn can act
+        if (*key, learning) in _rehearsed:
+            return _rehearsed[*key, learning]
+    sizes = rehearsed(
+        replace(config, precision="fp32"), sizes_of, fine_tuned=fine_tuned, imitates=imitates, learns=learns
+    )
+    return _rehearsed.setdefault((*key, learns), sizes)
 
 
 def rehearsed[T](
@@ -157,17 +152,15 @@ def rehearsed[T](
     imitates: bool = False,
     learns: bool = False,
 ) -> T:
-    """Result, which JSON can hold, of `task` with the policy of `policy_sizes`, in a child process."""
+    """Result of `task` with the policy of `policy_sizes`, whose weights are not read.
+
+    What LeRobot prints is dropped: the standard output of a command is its result.
+    """
     precision = precision_on(resolve_device(config.device), config.precision)
-    there = replace(config, device="cpu", precision=precision)
-    origin = FileSource("policy.path", config.path)
-    folder = weights_folder(_checkpoint_folder(config), origin)  # its size sets the limits
-
-    def act() -> T:
-        load = partial(load_adapter, explores=False) if imitates else partial(load_acting, learns=learns)
-        return task(load(there, rehearsal=True, fine_tuned=fine_tuned))
-
-    return rehearse(act, folder, origin)
+    config = replace(config, device="cpu", precision=precision)
+    load = partial(load_adapter, explores=False) if imitates else partial(load_acting, learns=learns)
+    with contextlib.redirect_stdout(io.StringIO()), torch.random.fork_rng(devices=[]):
+        return task(load(config, rehearsal=True, fine_tuned=fine_tuned))
 
 
 def sizes_of(adapter: Any) -> Sizes:
@@ -245,8 +238,7 @@ def load_adapter(
         if not rehearsal:
             adapter.self_check(*stack_observations(requests))
         elif sum(parameter.numel() for parameter in policy.parameters()) <= ACTS_MOST:
-            observation = requests[0].observation | {TASK: TEXT}
-            adapter.decide([replace(requests[0], observation=observation)], 0)
+            adapter.decide(requests[:1], 0)
         tune(policy, config.tuning, model.backbone, model.idle)
     return adapter
 

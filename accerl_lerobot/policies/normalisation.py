@@ -18,18 +18,11 @@ from torch import Tensor
 
 from accerl_lerobot.checkpoint.layout import PREPROCESSOR
 from accerl_lerobot.checkpoint.safety import FileSource, read_tensors, tensor_shapes
-from accerl_lerobot.policies.features import ACTION, STATE, pads, policy_features
+from accerl_lerobot.policies.features import ACTION, STATE, STATISTICS, pads, policy_features
 from accerl_lerobot.policies.untrusted import PROCESSORS
 
 logger = logging.getLogger(__name__)
 
-NUMBERS = {
-    "MEAN_STD": ("mean", "std"),
-    "MIN_MAX": ("min", "max"),
-    "QUANTILES": ("q01", "q99"),
-    "QUANTILE10": ("q10", "q90"),
-}
-"""Normalisation of LeRobot → the statistics that it needs."""
 NORMALISERS = ("normalizer_processor", "unnormalizer_processor")
 FINE_TUNE = "fine-tuning it on a dataset (sft.init_path) computes new ones"
 
@@ -52,15 +45,16 @@ def correct_inputs(lerobot_config: Any, folder: Path, origin: FileSource) -> Non
     for step in stored_steps(folder):
         renames |= step.get("config", {}).get("rename_map", {})
         if step["registry_name"] == "normalizer_processor" and "state_file" in step:
-            stored = tensor_shapes(folder / step["state_file"], origin)
-            seen |= {
-                k.removesuffix(".mean"): shape for k, (_, shape) in stored.items() if k.endswith(".mean")
-            }
-    seen = {renames.get(name, name): shape for name, shape in seen.items()}
+            for key, (_, shape) in tensor_shapes(folder / step["state_file"], origin).items():
+                name, _, statistic = key.rpartition(".")
+                if statistic == "mean":
+                    seen[renames.get(name, name)] = shape
     inputs = lerobot_config.input_features
-    cameras = {name for name, shape in policy_features(lerobot_config).shapes.items() if len(shape) == 3}
-    for name in cameras - seen.keys() if cameras & seen.keys() else ():
-        del inputs[name]
+    shapes = policy_features(lerobot_config).shapes
+    cameras = {name for name, shape in shapes.items() if len(shape) == 3}
+    if cameras & seen.keys():
+        for name in cameras - seen.keys():
+            del inputs[name]
     if STATE in inputs and STATE in seen:
         inputs[STATE] = replace(inputs[STATE], shape=seen[STATE])
 
@@ -73,19 +67,20 @@ def check_statistics(
     If they are `replaced` by those of a training to come, they have to be finite only.
     """
     features = {**(lerobot_config.input_features or {}), **(lerobot_config.output_features or {})}
-    for name in PROCESSORS:
-        renamed: dict[str, str] = {}
-        for step in stored_steps(folder, name):
+    for processor in PROCESSORS:
+        originals: dict[str, str] = {}
+        for step in stored_steps(folder, processor):
             options, file = step.get("config", {}), step.get("state_file")
-            renamed |= {new: old for old, new in options.get("rename_map", {}).items()}
+            for old, new in options.get("rename_map", {}).items():
+                originals[new] = old
             state = dict(read_tensors(folder / file, origin)) if file is not None else {}
             if step["registry_name"] not in NORMALISERS or replaced:
                 continue
             for key in _normalised(step["registry_name"], options, features):
-                mode = options.get("norm_map", {}).get(features[key].type.value, "IDENTITY")
+                mode = options.get("norm_map", {}).get(features[key].type.value)
                 # Of an input that LeRobot's trainer renamed it took no statistics: it was trained as it is.
-                if mode in NUMBERS and f"{renamed.get(key)}.{NUMBERS[mode][0]}" not in state:
-                    _check_feature(key, features[key], mode, state, origin, file or name)
+                if mode in STATISTICS and f"{originals.get(key)}.{STATISTICS[mode][0]}" not in state:
+                    _check_feature(key, features[key], mode, state, origin, file or processor)
 
 
 def _normalised(step: str, options: dict[str, Any], features: dict[str, Any]) -> list[str]:
@@ -99,28 +94,32 @@ def _normalised(step: str, options: dict[str, Any], features: dict[str, Any]) ->
 def _check_feature(
     key: str, feature: Any, mode: str, state: dict[str, Tensor], origin: FileSource, file: str
 ) -> None:
-    picture = feature.type.name == "VISUAL"
-    found = {name: state[f"{key}.{name}"] for name in NUMBERS[mode] if f"{key}.{name}" in state}
+    picture, names = feature.type.name == "VISUAL", STATISTICS[mode]
+    found = [state[f"{key}.{name}"] for name in names if f"{key}.{name}" in state]
     if len(found) < 2:
-        numbers = " and ".join(NUMBERS[mode])
         has = sorted({name.rpartition(".")[0] for name in state})
-        why = f"no {numbers} of {key}, by which the policy normalises; it has {', '.join(has[:6]) or 'none'}"
+        why = f"no {' and '.join(names)} of {key}, by which the policy normalises"
+        why += f"; it has {', '.join(has[:6]) or 'none'}"
         if picture and not any("image" in name for name in has):
             logger.warning("%s; pictures go in as they are", origin.refuse(file, why))
             return
         raise origin.refuse(file, f"{why}; {FINE_TUNE}")
-    shape = tuple(feature.shape)
-    for name, value in found.items():
-        size = (-1, 1, 1) if picture and value.ndim == 1 else value.shape
-        try:
-            fits = torch.broadcast_shapes(value.reshape(size).shape, shape) == shape
-        except RuntimeError:
-            fits = False
-        if not fits:
-            sizes = f"of shape {tuple(value.shape)}, where the policy has {shape}"
+    for name, value in zip(names, found, strict=True):
+        if not _fits(value, tuple(feature.shape), picture):
+            sizes = f"of shape {tuple(value.shape)}, where the policy has {tuple(feature.shape)}"
             raise origin.refuse(file, f"{key}.{name} is {sizes}; {FINE_TUNE}")
-    low, high = found.values()
+    low, high = found
     spread = high if mode == "MEAN_STD" else high - low
-    if bool((spread < 0).any()) or picture and not bool(spread.all()):
-        names = "std" if mode == "MEAN_STD" else f"{' to '.join(NUMBERS[mode])}"
-        raise origin.refuse(file, f"{names} of {key} is not above 0, and is divided by; {FINE_TUNE}")
+    if (spread < 0).any() or (picture and not spread.all()):
+        divisor = "std" if mode == "MEAN_STD" else " to ".join(names)
+        raise origin.refuse(file, f"{divisor} of {key} is not above 0, and is divided by; {FINE_TUNE}")
+
+
+def _fits(value: Tensor, shape: tuple[int, ...], picture: bool) -> bool:
+    """True if a statistic can be applied to a feature of this shape; one of a picture is for each channel."""
+    if picture and value.ndim == 1:
+        value = value.reshape(-1, 1, 1)
+    try:
+        return torch.broadcast_shapes(value.shape, shape) == shape
+    except RuntimeError:
+        return False

@@ -11,7 +11,6 @@ the functions through which all of that goes, whoever is the caller.
 from __future__ import annotations
 
 import contextlib
-import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -40,6 +39,7 @@ from accerl_lerobot.checkpoint.safety import (
     read_json,
     safe_join,
     tensor_shapes,
+    texts_in,
 )  # fmt: skip
 from accerl_lerobot.errors import InputError, causes
 
@@ -76,7 +76,12 @@ def fetched_checkpoint(path: str, revision: str | None, field: str) -> Path:
             raise InputError(field, path, hint) from error
     if not (folder / CONFIG).is_file():
         raise InputError(field, path, "no config.json there; give the folder named pretrained_model")
-    check_checkpoint(folder, FileSource(field, path), fetched=not local)
+    try:
+        check_checkpoint(folder, FileSource(field, path), fetched=not local)
+    except InputError:
+        raise
+    except Exception as error:  # its files may hold anything
+        raise InputError(field, path, f"not a checkpoint that LeRobot has saved ({brief(error)})") from error
     return folder
 
 
@@ -85,23 +90,21 @@ def check_checkpoint(folder: Path, origin: FileSource, *, fetched: bool = False)
 
     One that was `fetched` from the Hub must not name folders of this machine.
     """
-    config = read_json(safe_join(folder, CONFIG, origin), origin)
+    for name in (CONFIG, ADAPTER_CONFIG, *PROCESSORS, WEIGHTS, ADAPTER, VALUE_HEAD, FAMILY, OURS, BACKBONE):
+        safe_join(folder, name, origin)
+    weights = ADAPTER if is_adapter(folder) else WEIGHTS
+    config = read_json(folder / CONFIG, origin)
     for key, own in CONFIG_FOLDERS.items():
         check_name(config.get(key), folder / own, f"{CONFIG}: {key}", origin)
     for name in PROCESSORS:
-        if safe_join(folder, name, origin).exists():
+        if (folder / name).exists():
             check_processor(folder, name, origin)
-    weights = ADAPTER if is_adapter(folder) else WEIGHTS
     check_not_pickled(folder, weights, origin)
-    for name in (weights, VALUE_HEAD, FAMILY):
-        if safe_join(folder, name, origin).exists():
-            shapes = tensor_shapes(folder / name, origin)
-            if not (folder / PREPROCESSOR).exists() and any(map(BEFORE_PROCESSORS.match, shapes)):
-                convert = f"python -m {MIGRATION} --pretrained-path={origin.value} --output-dir=NEW"
-                why = "holds the statistics, as LeRobot saved them before it had processors"
-                raise origin.refuse(name, f"{why}; convert it, and use what {convert} writes")
-    if safe_join(folder, OURS, origin).exists():
-        check_ours(read_json(folder / OURS, origin), origin)
+    stored = tensor_shapes(folder / weights, origin)
+    if not (folder / PREPROCESSOR).exists() and any(map(BEFORE_PROCESSORS.match, stored)):
+        convert = f"python -m {MIGRATION} --pretrained-path={origin.value} --output-dir=NEW"
+        why = "holds the statistics, as LeRobot saved them before it had processors"
+        raise origin.refuse(weights, f"{why}; convert it, and use what {convert} writes")
     _check_beside(folder, origin)
     if fetched:
         check_names(folder, origin)
@@ -115,30 +118,18 @@ def is_adapter(folder: Path) -> bool:
     return bool(config.get("use_peft")) or not (folder / WEIGHTS).is_file()
 
 
-def check_ours(ours: dict[str, Any], origin: FileSource) -> None:
-    for key in ("sampler", "rename_map"):
-        if not isinstance(ours.get(key, {}), dict):
-            raise origin.refuse(f"{OURS}: {key}", "a mapping is wanted; remove the file to start without it")
-
-
 def check_processor(folder: Path, name: str, origin: FileSource) -> None:
     """Checks a processor file: only LeRobot's registered steps, with state files in this folder."""
-    steps = read_json(folder / name, origin).get("steps")
-    if not isinstance(steps, list):
-        raise origin.refuse(name, "a list of steps is wanted")
-    for step in steps:
-        if not isinstance(step, dict) or not isinstance(step.get("config", {}), dict):
-            raise origin.refuse(name, "a step is a mapping with a mapping named config")
-        kind = step.get("registry_name")
+    for step in read_json(folder / name, origin).get("steps", []):
+        kind, options = step.get("registry_name"), dict(step.get("config", {}))
         if not isinstance(kind, str) or "class" in step:
             hint = "only steps with a registry_name are loaded: LeRobot would import and call this class"
             raise origin.refuse(f"{name}: {str(step.get('class'))[:60]}", hint)
         if "state_file" in step:
-            tensor_shapes(safe_join(folder, step["state_file"], origin), origin)
+            safe_join(folder, step["state_file"], origin)
         if kind in STEP_FOLDERS:
             option, own = STEP_FOLDERS[kind]
-            named = step.get("config", {}).get(option)
-            check_name(named, folder / own, f"{name}: {option}", origin)
+            check_name(options.get(option), folder / own, f"{name}: {option}", origin)
 
 
 def check_name(name: Any, own: Path, what: str, origin: FileSource) -> None:
@@ -146,30 +137,26 @@ def check_name(name: Any, own: Path, what: str, origin: FileSource) -> None:
 
     `own` is the checkpoint's own folder of it; `what` says file and key, for the error.
     """
-    if name is None:
+    if name is None or (isinstance(name, str) and HUB_ID.fullmatch(name)):
         return
-    if not isinstance(name, str) or len(name) > 1024 or "\x00" in name:
-        raise origin.refuse(what, "a name is wanted")
-    if Path(name).is_absolute():
-        if ".." in Path(name).parts and not own.is_dir():
-            raise origin.refuse(what, f"{name[:80]!r} leads elsewhere; name the folder without ..")
-    elif not HUB_ID.fullmatch(name):
-        raise origin.refuse(what, f"{name[:80]!r} is neither a Hub id nor an absolute path")
+    if not isinstance(name, str) or not Path(name).is_absolute():
+        raise origin.refuse(what, f"{str(name)[:80]!r} is neither a Hub id nor an absolute path")
+    if ".." in Path(name).parts and not own.is_dir():
+        raise origin.refuse(what, f"{name[:80]!r} leads elsewhere; name the folder without ..")
 
 
 def _check_beside(folder: Path, origin: FileSource) -> None:
     """The backbone's own folder: links, what is no file, attention that is compiled code on the Hub."""
-    for directory, _, files in os.walk(safe_join(folder, BACKBONE, origin)):
-        for path in (Path(directory, name) for name in files):
-            name = path.relative_to(folder).as_posix()
-            file_size(safe_join(folder, name, origin), origin)
-            parts: list[Any] = [read_json(path, origin)] if path.name == CONFIG else []
-            while parts:
-                part = parts.pop()
-                for key, value in part.items() if isinstance(part, dict) else ():
-                    if "attn_implementation" in key and "/" in str(value):
-                        raise origin.refuse(name, f"{key} names code on the Hub; use sdpa or eager")
-                parts += part.values() if isinstance(part, dict) else part if isinstance(part, list) else ()
+    for path in sorted((folder / BACKBONE).rglob("*")):
+        name = path.relative_to(folder).as_posix()
+        safe_join(folder, name, origin)
+        if path.is_dir():
+            continue
+        file_size(path, origin)
+        content = read_json(path, origin) if path.name == CONFIG else {}
+        for _, key, text in texts_in(content):
+            if "attn_implementation" in key and "/" in text:
+                raise origin.refuse(name, f"{key} names code on the Hub; use sdpa or eager")
 
 
 @contextlib.contextmanager
@@ -183,35 +170,30 @@ def guarded(section: str, commit: str | None = None) -> Iterator[None]:
     fetch, look, load = dynamic.get_cached_module_file, dynamic.check_imports, torch.load
 
     def fetch_pinned(name: Any, *arguments: Any, **options: Any) -> Any:
-        pinned = {} if commit is None else {"revision": commit}
-        return fetch(name, *arguments, **options | pinned)
+        if commit is not None:
+            options["revision"] = commit
+        return fetch(name, *arguments, **options)
 
     def look_first(file: Any) -> Any:  # transformers does so before it copies code to where it is run
-        snapshot = Path(file).parent
-        pinned = commit is not None and f"snapshots/{commit}/" in Path(file).as_posix()
-        if not pinned:
-            hint = (
-                "code that came with a model, which would run with your rights; read it, then name its "
-                f"commit in {section}.trust_remote_code"
-            )
-            raise InputError(f"{section}.trust_remote_code", f"{snapshot.name}/{Path(file).name}", hint)
-        return look(file)
+        path = Path(file)
+        if commit is not None and f"snapshots/{commit}/" in path.as_posix():
+            return look(file)
+        hint = "code that came with a model, which would run with your rights; read it, then name its commit"
+        field = f"{section}.trust_remote_code"
+        raise InputError(field, f"{path.parent.name}/{path.name}", f"{hint} in {field}")
 
     def load_known(file: Any, *arguments: Any, **options: Any) -> Any:
         # torchvision's weights are fetched into this folder by PyTorch, and compared with their hash.
-        known = isinstance(file, (str, Path)) and Path(file).resolve().is_relative_to(
-            Path(torch.hub.get_dir()).resolve()
-        )
-        if not known:
-            hint = "a pickle, which may run code when it is loaded; convert it to safetensors"
-            raise InputError(f"{section}.path", str(file)[:200], f"{hint} where you trust it")
-        return load(file, *arguments, **options | {"weights_only": True})
+        home = Path(torch.hub.get_dir()).resolve()
+        if isinstance(file, (str, Path)) and Path(file).resolve().is_relative_to(home):
+            return load(file, *arguments, **options | {"weights_only": True})
+        hint = "a pickle, which may run code when it is loaded; convert it to safetensors where you trust it"
+        raise InputError(f"{section}.path", str(file)[:200], hint)
 
-    # Without a time-out of 0 it would ask the terminal.
     wrapped: dict[str, Any] = {
         "get_cached_module_file": fetch_pinned,
         "check_imports": look_first,
-        "TIME_OUT_REMOTE_CODE": 0,
+        "TIME_OUT_REMOTE_CODE": 0,  # otherwise it would ask the terminal
     }
     with patch.multiple(dynamic, **wrapped), patch.object(torch, "load", load_known):
         yield

@@ -33,7 +33,7 @@ from accerl_lerobot.world_model.contract import (
     WorldModelSpec,
 )
 from accerl_lerobot.world_model.data import model_arrays, open_datasets, resize
-from accerl_lerobot.world_model.store import load_failed, load_world_model, rehearse_world_model
+from accerl_lerobot.world_model.store import check_predicts, load_failed, load_world_model
 from accerl_lerobot.world_model.success_model import SuccessPairsRewardModel
 
 if TYPE_CHECKING:
@@ -206,8 +206,8 @@ def check_imagination(config: RunConfig) -> None:
     with closing(make_environment(config.env)) as environment:
         spec = environment.spec
     path = Path(str(imagination.path)).expanduser()
-    rehearse_world_model(path, imagination.discover_packages_path, section=IMAGINATION)
     world = load_world(imagination)
+    check_predicts(path, world.model, world.success, section=IMAGINATION)
     check_fit(world.model.spec, spec, getattr(policy, "n_action_steps", 1))
     if imagination.learns:
         open_datasets({LEARN: imagination.learn.dataset}, world.model.spec)

@@ -19,7 +19,6 @@ import torch
 from lerobot.configs.rewards import RewardModelConfig
 from safetensors.torch import save_file
 
-from accerl_lerobot.checkpoint.isolation import rehearse
 from accerl_lerobot.checkpoint.layout import write_atomically
 from accerl_lerobot.checkpoint.safety import (
     FileSource,
@@ -131,8 +130,6 @@ def _filled[M: torch.nn.Module](what: str, make: Callable[[], M], directory: Pat
         with Unfilled():
             model = make()
         model.load_state_dict(dict(read_tensors(weights, origin)))
-    except MemoryError:  # `isolation` has a line of its own for it
-        raise
     except Exception as error:  # the files may hold anything
         ours = input_error(error)  # draccus wraps what a config refuses
         if ours is None:
@@ -142,12 +139,15 @@ def _filled[M: torch.nn.Module](what: str, make: Callable[[], M], directory: Pat
     return model.requires_grad_(False).eval()
 
 
-def rehearse_world_model(directory: Path, package: str | None = None, *, section: str = "") -> None:
-    """Loads a world model and predicts a chunk in a child process with limits, see `isolation`."""
-    origin = _origin(directory, section)
-    discover(package, section)  # before the fork: the caller needs it too
-    read_json(safe_join(directory, CONFIG, origin), origin)
-    rehearse(lambda: _predict_once(*load_world_model(directory, package, section=section)), directory, origin)
+def check_predicts(
+    directory: Path, model: LearnableWorldModel, success: SuccessPairsRewardModel, *, section: str = ""
+) -> None:
+    """Predicts a chunk with a world model that was loaded from `directory`, before a run relies on it."""
+    try:
+        with torch.random.fork_rng(devices=[]):
+            _predict_once(model, success)
+    except Exception as error:  # its config may ask for anything
+        raise _origin(directory, section).refuse(CONFIG, f"it predicts nothing ({brief(error)})") from error
 
 
 @torch.no_grad()

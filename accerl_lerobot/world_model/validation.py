@@ -233,8 +233,8 @@ def evaluate(config: WorldModelEvalRun, directory: Path, console: Console) -> di
     """Evaluates a saved world model on episodes that it was not trained on, see `validate_datasets`."""
     device = resolve_device(config.device, "device")
     path = Path(str(config.path)).expanduser()
-    store.rehearse_world_model(path, config.discover_packages_path)
     model, success = store.load_world_model(path, config.discover_packages_path)
+    store.check_predicts(path, model, success)
     roles = store.load_roles(path)
     with console.stage("episodes"):
         named = {DATASET: config.dataset, ONLINE: config.online}

@@ -14,20 +14,12 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 
 from accerl_lerobot.checkpoint.safety import FileSource
 from accerl_lerobot.config.ranges import DatasetConfig
-from accerl_lerobot.demos.dataset_files import (
-    check_data,
-    check_metadata,
-    checked,
-    open_metadata,
-    opened,
-    task_texts,
-)
+from accerl_lerobot.demos.dataset_files import check_metadata, checked, open_metadata, opened, task_texts
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.hub.card import recognise
 from accerl_lerobot.policies.features import dataset_features
@@ -63,8 +55,7 @@ def refused(root: Path, why: str) -> str:
 
 
 def test_the_committed_one_passes_offline():
-    check_metadata(ROOT, ORIGIN, whole=True)
-    check_data(ROOT, ORIGIN)
+    check_metadata(ROOT, ORIGIN)
     meta = open_metadata(DatasetConfig(repo_id="accerl/metaworld_tiny", root=str(ROOT)))
     assert meta.total_frames == 365 and task_texts(meta) == ["Open a drawer"]
 
@@ -98,7 +89,6 @@ def test_another_format_version(copied: Path, version: str):
         ("data_path", "../../{chunk_index}/{file_index}.parquet"),
         ("data_path", "{chunk_index:999999999}"),
         ("data_path", "{chunk_index"),
-        ("data_path", None),
         ("video_path", "../{video_key}.mp4"),
         ("video_path", "{video_key[0]}"),
     ],
@@ -108,46 +98,18 @@ def test_templates(copied: Path, key: str, template: str):
     refused(copied, f"meta/info.json: {key}: ")
 
 
-def feature(dtype: Any = "float32", shape: Any = (4,), **more: Any) -> dict[str, Any]:
-    return {"dtype": dtype, "shape": list(shape) if isinstance(shape, tuple) else shape, "names": None} | more
-
-
 @pytest.mark.parametrize(
     ("changes", "why"),
     [
-        ({"total_frames": -1}, "an episode from frame 0 to "),
         ({"total_episodes": 9}, "4 episodes, and meta/info.json says 9"),
         ({"chunks_size": 0}, "chunks_size must be positive"),
-        ({"features": {}}, "features"),
-        ({"features": {"../../x": feature()}}, "cannot be part of a path"),
-        ({"features": {"a": feature(None)}}, "a mapping with dtype and shape"),
-        ({"features": {"a": feature(shape=(0,))}}, "shape"),
-        ({"features": {"a": feature("image", (10**5, 10**5, 3))}}, "shape"),
+        ({"features": {"../../x": {"dtype": "float32", "shape": [4]}}}, "cannot be part of a path"),
         ({"total_episodes": 0, "total_tasks": 0, "total_frames": 365}, "it has no episodes, or no tasks"),
     ],
 )
 def test_what_info_may_say(copied: Path, changes: dict[str, Any], why: str):
     edit(copied, **changes)
     refused(copied, f"meta.*{why}")
-
-
-@pytest.mark.parametrize(
-    ("column", "value"),
-    [
-        ("dataset_to_index", 10**9),
-        ("dataset_from_index", -1),
-        ("data/chunk_index", -1),
-        ("data/chunk_index", "../../x"),
-    ],
-)
-def test_where_episodes_are(copied: Path, column: str, value: Any):
-    def change(table: pa.Table) -> pa.Table:
-        others = table.column(column).to_pylist()[1:]
-        values = [value] + [type(value)(x) if isinstance(value, (str, float)) else x for x in others]
-        return table.set_column(table.schema.get_field_index(column), column, pa.array(values))
-
-    rewrite(copied / EPISODES, change)
-    refused(copied, "meta/episodes/chunk-000/file-000.parquet: ")
 
 
 def test_columns_that_would_open_other_files(copied: Path, tmp_path: Path):
@@ -165,15 +127,6 @@ def test_columns_that_would_open_other_files(copied: Path, tmp_path: Path):
 
     rewrite(copied / EPISODES, change)
     refused(copied, "columns of kind Image, which name other files")
-
-
-def test_a_million_equal_rows_in_a_few_bytes(copied: Path):
-    codes = pa.DictionaryArray.from_arrays(pa.array(np.zeros(10**6, np.int32)), pa.array(["x" * 60_000]))
-    table = pa.table({"task_index": np.zeros(10**6, np.int64), "task": codes})
-    pq.write_table(table, copied / "meta/tasks.parquet", store_schema=False)
-    assert (copied / "meta/tasks.parquet").stat().st_size < 12 * 2**20, "and 60 GB once it is read"
-    edit(copied, total_tasks=10**6)
-    refused(copied, "takes more than .* MiB beside the libraries")
 
 
 def data_with(root: Path, images: list[dict[str, Any]]) -> None:
@@ -247,22 +200,16 @@ def test_a_picture_does_not_start_a_program(copied: Path, tmp_path: Path, monkey
     assert not mark.exists()
 
 
-def test_links_out_of_the_folder(copied: Path, tmp_path: Path):
-    for part in ("meta/info.json", "meta/tasks.parquet", EPISODES):
-        (copied / part).rename(tmp_path / "outside")
-        (copied / part).symlink_to(tmp_path / "outside")
-        refused(copied, "a link that leads out of the folder")
-        (copied / part).unlink()
-        (tmp_path / "outside").rename(copied / part)
-    (copied / "data/chunk-000").rename(tmp_path / "elsewhere")
-    (copied / "data/chunk-000").symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(InputError, match="a link that leads out of the folder"):
-        check_data(copied, ORIGIN)
-    (copied / "data/chunk-000").unlink()
-    (tmp_path / "elsewhere").rename(copied / "data/chunk-000")
-    (copied / "videos").symlink_to(tmp_path)
-    with pytest.raises(InputError, match="videos: a link that leads out of the folder"):
-        check_data(copied, ORIGIN)
+@pytest.mark.parametrize(
+    "part", ["meta/info.json", "meta/tasks.parquet", EPISODES, "data/chunk-000", "videos"]
+)
+def test_links_out_of_the_folder(copied: Path, tmp_path: Path, part: str):
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    if (copied / part).exists():
+        outside = (copied / part).rename(outside / "it")
+    (copied / part).symlink_to(outside)
+    refused(copied, "a link that leads out of the folder")
 
 
 def column(name: str, values: Callable[[list[Any]], Any]) -> Callable[[pa.Table], pa.Table]:
@@ -280,7 +227,10 @@ def column(name: str, values: Callable[[list[Any]], Any]) -> Callable[[pa.Table]
     [
         (lambda t: t.slice(0, 300), "300 rows, and meta/info.json says 365 frames"),
         (column("task_index", lambda v: pa.array([99, *v])), "task_index=99, and there are 1"),
-        (column("episode_index", lambda v: pa.array([4, *v])), "episode_index=4, and there are 4"),
+        (
+            column("episode_index", lambda v: pa.array([4, *v])),
+            "row 0 is of episode 4, and by meta/episodes of",
+        ),
         (column("action", lambda v: pa.array([[0.0], *v], pa.list_(pa.float32()))), "LeRobot cannot load it"),
         (column("frame_index", lambda v: pa.array([None, *v])), "frame_index has a number"),
         (lambda t: t.take([1, 0, *range(2, 365)]), "its rows are not in the order of their index"),
@@ -298,7 +248,7 @@ def test_rows_are_what_their_features_say(copied: Path, change: Callable[[pa.Tab
 @pytest.mark.parametrize("part", ["meta/tasks.parquet", EPISODES])
 def test_a_local_dataset_is_not_completed_from_the_hub(copied: Path, part: str):
     (copied / part).unlink()
-    refused(copied, "is missing; give the whole folder|0 episodes, and meta/info.json says 4")
+    refused(copied, "give the whole folder")
 
 
 def test_one_from_the_hub_is_checked_as_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

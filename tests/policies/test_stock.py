@@ -132,7 +132,7 @@ def test_what_cannot_learn_is_evaluated_and_refused_in_one_line(written: Any, tm
     ):
         assert cli.main([*train, *policies[kind], f"--algorithm.type={algorithm}"]) == 2
         error = capsys.readouterr().err.strip().splitlines()[-1]
-        field = "policy.temporal_ensemble_coeff='0.1'" if kind == "act" else f"policy.type='{kind}'"
+        field = "policy.temporal_ensemble_coeff=0.1" if kind == "act" else f"policy.type='{kind}'"
         assert re.search(f"{field}: {why}", error), error
     assert not (tmp_path / "new").exists()
 

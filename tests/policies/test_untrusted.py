@@ -18,8 +18,9 @@ from torch import nn
 from accerl_lerobot.checkpoint.layout import BACKBONE
 from accerl_lerobot.checkpoint.safety import FileSource
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.policies import loading
 from accerl_lerobot.policies.config import PolicyConfig
-from accerl_lerobot.policies.loading import load_adapter
+from accerl_lerobot.policies.loading import load_adapter, rehearsed, rehearsed_config
 from accerl_lerobot.policies.saving import save_pretrained
 from accerl_lerobot.policies.untrusted import Unfilled, check_checkpoint, guarded
 from tests.hub_cache import cached_repo
@@ -95,10 +96,10 @@ def test_backbones_are_not_fetched_from_just_anywhere(copied: Path):
             "./secret",
             "a/b/c",
             "https://example.com/x",
+            7,
         ),
         "leads elsewhere": ("/a/../secret",),
         "may not name": ("/somewhere/secret",),
-        "a name is wanted": (7, "a\x00"),
     }
     for why, names in refusals.items():
         for name in names:
@@ -128,12 +129,24 @@ def test_attention_is_not_fetched_as_compiled_code(copied: Path, key: str):
 
 
 @pytest.mark.parametrize(
-    ("text", "why"),
-    [("[]", "a mapping is wanted"), ('{"sampler": 7}', "accerl.json: sampler"), ("{", "not good JSON")],
+    "content", [{"steps": [7]}, {"steps": 7}, {"steps": [{"registry_name": "x", "config": 7}]}]
 )
-def test_what_is_ours_is_checked_too(copied: Path, text: str, why: str):
-    (copied / "accerl.json").write_text(text)
-    refused(copied, why)
+def test_files_that_lerobot_has_not_saved_are_one_line(copied: Path, content: dict[str, Any]):
+    (copied / PRE).write_text(json.dumps(content))
+    refused(copied, "not a checkpoint that LeRobot has saved")
+
+
+def test_a_checkpoint_is_rehearsed_once_without_a_random_number_or_a_word(
+    good: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    config = PolicyConfig(path=str(good), device="cpu")
+    before = torch.get_rng_state()
+    assert rehearsed_config(config).type == "act"
+    assert torch.equal(torch.get_rng_state(), before)
+    rehearsed(config, lambda adapter: sys.stdout.write("a word of LeRobot's"))
+    assert capsys.readouterr().out == ""
+    monkeypatch.setattr(loading, "rehearsed", None)
+    assert rehearsed_config(config).type == "act"
 
 
 def test_a_critic_of_another_size(copied: Path):
@@ -193,7 +206,7 @@ def test_code_on_the_hub_is_refused(theirs: Repository):
     with guarded("policy"), pytest.raises(InputError) as caught:
         load(theirs.name, trust_remote_code=True)
     assert str(caught.value).startswith("policy.trust_remote_code=") and "their_code.py" in str(caught.value)
-    assert "commit in policy.trust_remote_code" in caught.value.hint
+    assert "name its commit in policy.trust_remote_code" in caught.value.hint
     assert not theirs.marker.exists()
 
 

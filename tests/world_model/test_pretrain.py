@@ -15,13 +15,12 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from accerl_lerobot import cli
-from accerl_lerobot.checkpoint import isolation
 from accerl_lerobot.cli.configs import WorldModelEvalRun, WorldModelRun
 from accerl_lerobot.demos.record import DemosConfig, record_demos
 from accerl_lerobot.engine.config import DatasetConfig
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.world_model import learners, pretrain, validation
+from accerl_lerobot.world_model import learners, pixels, pretrain, validation
 from accerl_lerobot.world_model.config import PixelModelConfig, WorldModelConfig
 from accerl_lerobot.world_model.contract import new_model
 from accerl_lerobot.world_model.data import DATASET, ONLINE, load_datasets
@@ -29,10 +28,10 @@ from accerl_lerobot.world_model.learners import new_success_model
 from accerl_lerobot.world_model.store import (
     HELD_OUT,
     LEARNT,
+    check_predicts,
     load_failed,
     load_roles,
     load_world_model,
-    rehearse_world_model,
     save_world_model,
 )
 from tests.runs import replacing
@@ -201,23 +200,14 @@ def test_what_cannot_be_loaded(tmp_path: Path, harm: str, why: str):
         load_world_model(folder)
 
 
-@pytest.mark.parametrize(
-    ("where", "name", "value"),
-    [("spec", "image_size", [2**18, 2**18]), ("model", "channels", [65536] * 9), ("model", "steps", 10**9)],
-)
-def test_what_nobody_could_load_is_found_in_a_child_process(
-    tmp_path: Path, where: str, name: str, value: object, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setattr(isolation, "CPU_S", 3)
-    save_world_model(tmp_path / "w", model(), new_success_model(2).eval())
-    rehearse_world_model(tmp_path / "w")
-    file = tmp_path / "w" / "config.json"
-    content = json.loads(file.read_text())
-    content[where][name] = value
-    file.write_text(json.dumps(content))
-    with pytest.raises(InputError) as caught:
-        rehearse_world_model(tmp_path / "w")
-    assert str(caught.value).startswith("path=") and "\n" not in str(caught.value)
+def test_one_that_predicts_nothing_is_refused_before_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    folder = tmp_path / "w"
+    save_world_model(folder, model(), new_success_model(2).eval())
+    loaded = load_world_model(folder)
+    check_predicts(folder, *loaded)
+    monkeypatch.setattr(pixels.PixelWorldModel, "step", lambda *_: 1 / 0)
+    with pytest.raises(InputError, match=r"^path=.*config.json: it predicts nothing \(division by zero\)"):
+        check_predicts(folder, *loaded)
 
 
 def test_a_device_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
