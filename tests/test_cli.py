@@ -13,7 +13,7 @@ import sys
 import time
 import traceback
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 import yaml
@@ -22,9 +22,12 @@ from rich.table import Table
 from accerl_lerobot import cli
 from accerl_lerobot.cli import verbs
 from accerl_lerobot.console import Console
-from accerl_lerobot.engine.config import RunConfig, encode
+from accerl_lerobot.engine.config import encode
 from accerl_lerobot.engine.stopping import WorkerError
 from accerl_lerobot.errors import InputError, kept_traceback, last_exception, one_line
+
+if TYPE_CHECKING:
+    from accerl_lerobot.engine.run import Run
 
 ROOT = Path(__file__).parents[1]
 QUICKSTART = ROOT / "recipes" / "quickstart.yaml"
@@ -182,14 +185,14 @@ class TestTrain:
     def test_prints_the_summary(self, arguments, tmp_path, capsys, monkeypatch):
         seen: dict[str, Any] = {}
 
-        def train(config: RunConfig, directory: Path, console: Any, *_: Any) -> dict[str, Any]:
-            seen.update(config=config, directory=directory)
+        def execute(run: Run) -> dict[str, Any]:
+            seen.update(config=run.config, directory=run.directory)
             before = {"success_before": 0.25, "ci95_before": [0.2, 0.3], "tasks_before": {"a": 1}}
             after = {"success_after": 0.75, "ci95_after": [0.7, 0.8], "n_after": 100, "seeds": [1, 2]}
             counts = {"episodes": 412, "env_steps": 43210, "updates": 9, "wall_s": 279.0}
             return before | after | counts
 
-        monkeypatch.setattr("accerl_lerobot.engine.run.execute", train)
+        monkeypatch.setattr("accerl_lerobot.engine.run.Run.execute", execute)
         assert cli.main([*arguments, "--trainer.lr=1e-5"]) == 0
         out, err = capsys.readouterr()
         policy = tmp_path / "run/checkpoints/last/pretrained_model"
@@ -212,13 +215,13 @@ class TestTrain:
     def test_a_refused_run_leaves_no_folder_unless_work_was_done(
         self, work, arguments, tmp_path, monkeypatch
     ):
-        def train(config: RunConfig, directory: Path, console: Any, *_: Any) -> dict[str, Any]:
-            (directory / "config.yaml").write_text("seed: 0\n")
+        def execute(run: Run) -> dict[str, Any]:
+            (run.directory / "config.yaml").write_text("seed: 0\n")
             if work:
-                (directory / "demos").mkdir()
+                (run.directory / "demos").mkdir()
             raise InputError("MUJOCO_GL", "", "install it")
 
-        monkeypatch.setattr("accerl_lerobot.engine.run.execute", train)
+        monkeypatch.setattr("accerl_lerobot.engine.run.Run.execute", execute)
         assert cli.main(arguments) == 2
         assert (tmp_path / "run").exists() is work
 
@@ -283,17 +286,16 @@ def test_a_verb_that_is_asked_to_stop_ends_what_it_has_started(monkeypatch: pyte
     [
         (OSError(errno.ENOSPC, "full"), "the disk of {run} is full; free some space, then {how}"),
         (WorkerError("replay:\n  OSError: No space left on device"), "the disk of {run} is full; free some"),
-        (WorkerError("Ray's raylet has died"), "Ray's raylet has died; to resume: {how}"),
+        (WorkerError("a worker is lost"), "a worker is lost; to resume: {how}"),
     ],
 )
 def test_a_run_that_cannot_go_on_ends_with_one_line(error, said, tmp_path, monkeypatch, capsys):
-    from accerl_lerobot.engine import run
     from benchmarks.light_run import light_config, light_policy
 
-    def fails(*arguments: object) -> None:
+    def fails(run: Run) -> None:
         raise error
 
-    monkeypatch.setattr(run, "execute", fails)
+    monkeypatch.setattr("accerl_lerobot.engine.run.Run.execute", fails)
     recipe, folder = tmp_path / "light.yaml", tmp_path / "run"
     recipe.write_text(yaml.safe_dump(encode(light_config(updates=1))))
     assert verbs.train([f"--config_path={recipe}", f"--output_dir={folder}"], light_policy()) == 1

@@ -146,7 +146,8 @@ def test_a_world_without_a_history_is_refused_in_words(looking: Path):
 
 
 def test_a_rollout_process_asks_with_the_history():
-    worker = RolloutWorker(WORLD, RolloutConfig(environments=1), EpisodePlans(("match",), 0, None), OBSERVED)
+    worker = RolloutWorker(WORLD, RolloutConfig(environments=1), history=OBSERVED)
+    worker.ready(EpisodePlans(("match",), 0, None))
     asked: list[Request] = []
 
     def decide(due: list[Request]) -> list[Request]:
