@@ -22,6 +22,7 @@ from accerl_lerobot.checkpoint.safety import brief
 from accerl_lerobot.engine import sizes
 from accerl_lerobot.engine.config import lag_limits
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.machine import GIB, memory_gib
 
 if TYPE_CHECKING:
     from accerl_lerobot.engine.config import RunConfig
@@ -144,7 +145,7 @@ def libraries(config: RunConfig | None) -> Iterator[Check]:
     if not torch.cuda.is_available():
         yield Check("gpu", OK, "none")
         return
-    gib = torch.cuda.get_device_properties(0).total_memory / sizes.GIB
+    gib = torch.cuda.get_device_properties(0).total_memory / GIB
     text = f"{torch.cuda.device_count()} × {torch.cuda.get_device_name(0)}, {gib:.0f} GiB each"
     need = 0.0 if config is None else _learning_gib(config)
     if need > gib:
@@ -163,7 +164,7 @@ def _learning_gib(config: RunConfig) -> float:
     if config.policy.path is None or resolve_device(config.policy.device).type == "cpu":
         return 0.0
     policy = policy_sizes(config.policy)
-    return 4 * (policy.policy + policy.trained * sizes.trained_copies(config)) / sizes.GIB
+    return 4 * (policy.policy + policy.trained * sizes.trained_copies(config)) / GIB
 
 
 def _importing(error: Exception) -> str:
@@ -207,7 +208,7 @@ def resources(config: RunConfig | None, history: int = 1) -> Iterator[Check]:
         elif max(config.trainer.num_threads, config.inference.num_threads) > cores:
             status, text = WARN, f"{text}: lower trainer.num_threads and inference.num_threads to {cores}"
     yield Check("cpu", status, text)
-    free = sizes.memory_gib("MemAvailable")
+    free = memory_gib("MemAvailable")
     if free is not None:
         text, status = f"{free:.1f} GiB free", OK
         if config is not None:
@@ -220,7 +221,7 @@ def resources(config: RunConfig | None, history: int = 1) -> Iterator[Check]:
                     "or use a smaller policy"
                 )
         yield Check("memory", status, text)
-    disk = shutil.disk_usage(Path.cwd()).free / sizes.GIB
+    disk = shutil.disk_usage(Path.cwd()).free / GIB
     if disk < DISK_GIB:
         yield Check("disk", WARN, f"{disk:.0f} GiB free here; a run may need {DISK_GIB:.0f}")
     else:

@@ -74,7 +74,7 @@ def demos(arguments: list[str]) -> int:
     config: DemosRun = parse(DemosRun, arguments, recipe_class=RunConfig)
     from accerl_lerobot.demos.record import record_demos
     from accerl_lerobot.engine.preflight import check_environment
-    from accerl_lerobot.engine.sizes import check_disk
+    from accerl_lerobot.machine import check_disk
 
     with redirect_stdout(sys.stderr):
         check_disk(config.root, "root")
@@ -93,7 +93,7 @@ def sft(arguments: list[str]) -> int:
         raise InputError("sft.steps", 0, "use at least 1")
     from accerl_lerobot.engine.preflight import check_environment, check_training_data, sft_policy
     from accerl_lerobot.engine.run import fine_tune, make_output_dir
-    from accerl_lerobot.engine.sizes import check_disk
+    from accerl_lerobot.machine import check_disk
     from accerl_lerobot.policies.loading import resolve_device
 
     device = str(resolve_device(config.device, "device"))

@@ -39,6 +39,7 @@ from accerl_lerobot.envs.metaworld import MetaWorld, expert_name
 from accerl_lerobot.envs.simulated import SimulatedEnvironment
 from accerl_lerobot.errors import InputError, check_absent, expanded
 from accerl_lerobot.experience import ENVIRONMENT_STATE, REWARD, SUCCESS
+from accerl_lerobot.machine import SIMULATOR_GIB, memory_gib
 from accerl_lerobot.seeds import demo_seed
 
 REPO_ID = "accerl/demos"  # name of a recorded dataset, which is where its folder is
@@ -234,8 +235,6 @@ def simulated[Item, Result](
 
     The first are already under way when the context is entered; few finished ones wait in memory.
     """
-    from accerl_lerobot.engine.sizes import SIMULATOR_GIB, memory_gib
-
     # Each process comes to hold a simulator of every task.
     each = len(getattr(env_config, "tasks", ("one",))) * SIMULATOR_GIB.get(env_config.type, 0.1)
     cores, fitting = len(os.sched_getaffinity(0)), (memory_gib("MemAvailable") or math.inf) / each

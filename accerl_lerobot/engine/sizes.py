@@ -1,28 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Memory and disk space of a run: rough estimates, and refusals of what this machine cannot hold."""
+"""Memory of a run: rough estimates, and refusals of what this machine cannot hold."""
 
 from __future__ import annotations
 
-import contextlib
-import shutil
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from accerl_lerobot.algorithms import RatioConfig
 from accerl_lerobot.envs.gym_env import MAX_STEPS
-from accerl_lerobot.errors import InputError, expanded
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.machine import GIB, SIMULATOR_GIB, memory_gib
 
 if TYPE_CHECKING:
     from accerl_lerobot.engine.config import RunConfig
 
-GIB = 2**30
 POLICY_PROCESS_GIB, ROLLOUT_PROCESS_GIB, RAY_GIB = 1.2, 0.4, 0.7
-SIMULATOR_GIB = {"metaworld": 0.17, "libero": 0.17}
 """Resident memory without a policy's weights, see `policy_gib`: a process with torch and LeRobot, a
-rollout process without its environments, Ray's own processes, and, by type of environment, the simulator of
-one task with its renderers."""
+rollout process without its environments, and Ray's own processes."""
 ABSURD = 2  # times this machine's memory that a rough estimate may be; ``accerl doctor`` warns long before
-DISK_BYTES = 2**29  # disk space that demonstrations, checkpoints and videos take at least
 
 
 def check_memory(config: RunConfig) -> None:
@@ -96,27 +90,3 @@ def policy_gib(config: RunConfig) -> float:
 def trained_copies(config: RunConfig) -> int:
     """Copies of the trained weights that a trainer keeps: gradient, Adam's two moments, weights to probe."""
     return 3 + (isinstance(config.algorithm, RatioConfig) and config.trainer.probe_every > 0)
-
-
-def memory_gib(entry: str) -> float | None:
-    """``MemTotal`` or ``MemAvailable`` of this machine within its container's limit; None: unknown."""
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-    except OSError:
-        return None
-    found = next((1024.0 * int(line.split()[1]) for line in lines if line.startswith(f"{entry}:")), 0.0)
-    group = Path("/sys/fs/cgroup")
-    with contextlib.suppress(OSError, ValueError):  # no such file, or no limit
-        limit, taken = (int((group / f"memory.{name}").read_text()) for name in ("max", "current"))
-        found = min(found, limit - taken * (entry == "MemAvailable"))
-    return found / GIB
-
-
-def check_disk(folder: str | None, field: str = "output_dir") -> None:
-    """Refuse a folder on a disk with less free space than any run takes; blames `field`."""
-    path = expanded(folder or ".", field).absolute()
-    while not path.exists():
-        path = path.parent
-    if (free := shutil.disk_usage(path).free) < DISK_BYTES:
-        hint = f"{free / GIB:.2f} GiB are free on this disk, and {DISK_BYTES / GIB:.1f} are needed at least"
-        raise InputError(field, folder, f"{hint}; make room or choose another")

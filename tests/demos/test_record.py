@@ -194,7 +194,7 @@ def test_no_more_simulators_than_memory_for_them(
 
     monkeypatch.setattr(record, "simulators", counted)
     monkeypatch.setattr(record.os, "sched_getaffinity", lambda _: {0, 1})
-    monkeypatch.setattr("accerl_lerobot.engine.sizes.memory_gib", lambda entry: free)
+    monkeypatch.setattr("accerl_lerobot.demos.record.memory_gib", lambda entry: free)
     config = MetaWorldConfig(task="reach-v3,push-v3")  # 0.34 GiB in each process
     with record.simulated(config, abs, [-1, 2, -3]) as results:
         assert list(results) == [1, 2, 3]
