@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Memory and disk space of this machine."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+from pathlib import Path
+
+from accerl_lerobot.errors import InputError, expanded
+
+GIB = 2**30
+SIMULATOR_GIB = {"metaworld": 0.17, "libero": 0.17}
+"""Memory of the simulator of one task with its renderers, by type of environment."""
+DISK_BYTES = 2**29  # disk space that demonstrations, checkpoints and videos take at least
+
+
+def memory_gib(entry: str) -> float | None:
+    """``MemTotal`` or ``MemAvailable`` of this machine within its container's limit; None: unknown."""
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+    except OSError:
+        return None
+    found = next((1024.0 * int(line.split()[1]) for line in lines if line.startswith(f"{entry}:")), 0.0)
+    group = Path("/sys/fs/cgroup")
+    with contextlib.suppress(OSError, ValueError):  # no such file, or no limit
+        limit, taken = (int((group / f"memory.{name}").read_text()) for name in ("max", "current"))
+        found = min(found, limit - taken * (entry == "MemAvailable"))
+    return found / GIB
+
+
+def check_disk(folder: str | None, field: str = "output_dir") -> None:
+    """Refuse a folder on a disk with less free space than any run takes; blames `field`."""
+    path = expanded(folder or ".", field).absolute()
+    while not path.exists():
+        path = path.parent
+    if (free := shutil.disk_usage(path).free) < DISK_BYTES:
+        hint = f"{free / GIB:.2f} GiB are free on this disk, and {DISK_BYTES / GIB:.1f} are needed at least"
+        raise InputError(field, folder, f"{hint}; make room or choose another")
