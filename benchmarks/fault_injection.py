@@ -51,7 +51,7 @@ POINTS: dict[str, tuple[str, ...]] = {
     "trainer.publish": CRASHES,
     "trainer.write": (*SAVING, FULL),
     "rank.step": CRASHES,
-    "world_model.learn": CRASHES,
+    "learning.step": CRASHES,
     "driver.metrics": (*UNWATCHED, FULL),
     "driver.save": (*UNWATCHED, FULL),
     "driver.files": UNWATCHED,

@@ -29,7 +29,7 @@ NANS = "nans"
 FAULTS = ("kill", "stop", "exception", "exit", "hang", NAN, NANS, FULL, TORN)
 ANYWHERE = "anywhere"
 """Place of a fault that comes from outside."""
-PREFIX = {"trainer rank": "rank", "world-model learning": "world_model"}
+PREFIX = {"trainer rank": "rank", "world-model learning": "learning"}
 """Target → what its points' names begin with, where that is not its own name."""
 VISITS = 3
 """A fault happens at one of so many visits of its point."""

@@ -125,7 +125,7 @@ class LightTrainer:
         self._lock = threading.Lock()
         self._failure: str | None = None
         self._idle = False
-        self._publisher = WeightPublisher(others[-1], put=lambda tensors: None)
+        self._publisher = WeightPublisher(others[-2], put=lambda tensors: None)
         self._ledger: list[dict[str, int]] = []  # keys of each update's segments, and their decisions
         if state is not None:
             self._ledger = snapshot.load(state / "trainer")["ledger"]

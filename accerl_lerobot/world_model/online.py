@@ -275,7 +275,7 @@ class OnlineLearningWorker:
         while self._inbox:
             self._learner.add(self._inbox.popleft())
         while self._learner.pending_steps >= 1:
-            fault_point("world_model.learn")
+            fault_point("learning.step")
             self._learner.step()
         if self._learner.version > self._newest[0]:
             self._newest = self._learner.version, self._learner.world.tensors()

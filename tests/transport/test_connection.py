@@ -104,7 +104,7 @@ def messages() -> list[Any]:
         arrays,
         [Request(observation=observation, noise_seed=2**63 + 5), Request(observation={}, noise_seed=0)],
         [Decision(chunk=chunk, latent={"x": chunk}, log_prob=chunk[0], version=2**40)],
-        [make_segment("a", 3), make_segment("b", 2, world_version=7)],
+        [make_segment("a", 3), make_segment("b", 2)],
         [True, None, 1, -0.0, float("inf"), "", (1, [2, {3: {}}])],
     ]
 
