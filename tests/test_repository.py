@@ -28,6 +28,7 @@ PACKAGE = ROOT / "accerl_lerobot"
 
 HEADER = "# SPDX-License-Identifier: Apache-2.0\n"
 LONGEST_FILE = 600
+MOST_EXPRESSIONS, MOST_FILES = 77_400, 143
 ENGINE = {"launch.py", "placement.py", "ray_session.py", "supervision.py"}
 SHELLS = ENGINE | {"doctor.py", "worker.py", "online.py", "peers.py", "endpoint.py"}
 """Files that may import Ray; all others are testable without it."""
@@ -102,6 +103,36 @@ def test_packages_form_layers() -> None:
     while free := {unit for unit, others in needs.items() if not others & needs.keys()}:
         needs = {unit: others for unit, others in needs.items() if unit not in free}
     assert needs == {}
+
+
+def test_no_import_circle() -> None:
+    """No module needs itself by way of others, imports inside functions and for type checking included."""
+    files = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in sources()}
+    files = {name.removesuffix(".__init__"): path for name, path in files.items()}
+    needs = {name: set(imports(path)) & files.keys() - {name} for name, path in files.items()}
+    for name, path in files.items():  # a package that is named on the way to one of its modules is not needed
+        full = {found for found in imports(path) if found in files}
+        needs[name] -= {found for found in full if any(other.startswith(f"{found}.") for other in full)}
+    while free := {name for name, others in needs.items() if not others & needs.keys()}:
+        needs = {name: others for name, others in needs.items() if name not in free}
+    assert needs == {}
+
+
+def test_the_package_does_not_grow() -> None:
+    """Lower these bounds whenever the package allows it."""
+    kinds = (
+        ast.Name,
+        ast.Attribute,
+        ast.Call,
+        ast.BinOp,
+        ast.BoolOp,
+        ast.UnaryOp,
+        ast.Compare,
+        ast.Subscript,
+    )
+    nodes = [node for path in sources() for node in ast.walk(ast.parse(path.read_text()))]
+    assert sum(isinstance(node, kinds) for node in nodes) <= MOST_EXPRESSIONS
+    assert len(sources()) <= MOST_FILES
 
 
 def test_docstrings_begin_with_a_noun_or_a_verb() -> None:

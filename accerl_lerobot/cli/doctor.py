@@ -19,10 +19,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from accerl_lerobot.checkpoint.safety import brief
+from accerl_lerobot.config.machine import GIB, memory_gib
 from accerl_lerobot.engine import sizes
 from accerl_lerobot.engine.config import lag_limits
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.machine import GIB, memory_gib
 
 if TYPE_CHECKING:
     from accerl_lerobot.engine.config import RunConfig

@@ -72,9 +72,9 @@ def train(arguments: list[str], load: Load | None = None) -> int:
 def demos(arguments: list[str]) -> int:
     """``accerl demos``."""
     config: DemosRun = parse(DemosRun, arguments, recipe_class=RunConfig)
+    from accerl_lerobot.config.machine import check_disk
     from accerl_lerobot.demos.record import record_demos
     from accerl_lerobot.engine.preflight import check_environment
-    from accerl_lerobot.machine import check_disk
 
     with redirect_stdout(sys.stderr):
         check_disk(config.root, "root")
@@ -91,9 +91,9 @@ def sft(arguments: list[str]) -> int:
         raise InputError("dataset.repo_id", None, NO_DATASET)
     if config.sft.steps == 0:
         raise InputError("sft.steps", 0, "use at least 1")
+    from accerl_lerobot.config.machine import check_disk
     from accerl_lerobot.engine.preflight import check_environment, check_training_data, sft_policy
     from accerl_lerobot.engine.run import fine_tune, make_output_dir
-    from accerl_lerobot.machine import check_disk
     from accerl_lerobot.policies.loading import resolve_device
 
     device = str(resolve_device(config.device, "device"))

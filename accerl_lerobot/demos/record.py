@@ -30,6 +30,7 @@ import draccus
 import numpy as np
 
 from accerl_lerobot import errors, guardian
+from accerl_lerobot.config.machine import SIMULATOR_GIB, memory_gib
 from accerl_lerobot.config.parsing import imported
 from accerl_lerobot.config.ranges import Range, Section, Share
 from accerl_lerobot.console import Console
@@ -39,7 +40,6 @@ from accerl_lerobot.envs.metaworld import MetaWorld, expert_name
 from accerl_lerobot.envs.simulated import SimulatedEnvironment
 from accerl_lerobot.errors import InputError, check_absent, expanded
 from accerl_lerobot.experience import ENVIRONMENT_STATE, REWARD, SUCCESS
-from accerl_lerobot.machine import SIMULATOR_GIB, memory_gib
 from accerl_lerobot.seeds import demo_seed
 
 REPO_ID = "accerl/demos"  # name of a recorded dataset, which is where its folder is

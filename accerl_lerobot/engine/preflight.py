@@ -24,6 +24,7 @@ import yaml
 
 from accerl_lerobot.algorithms import AWRConfig, ChunkCriticConfig, LossInputs, OffPolicyConfig, RatioConfig
 from accerl_lerobot.checkpoint.safety import brief
+from accerl_lerobot.config.machine import check_disk
 from accerl_lerobot.engine.sizes import check_memory
 from accerl_lerobot.envs import (
     EnvConfig,
@@ -35,7 +36,6 @@ from accerl_lerobot.envs import (
 )
 from accerl_lerobot.errors import InputError, causes, check_absent, expanded
 from accerl_lerobot.experience import Observation
-from accerl_lerobot.machine import check_disk
 from accerl_lerobot.policies.features import (
     ACTION,
     ENV_STATE,

@@ -6,9 +6,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from accerl_lerobot.algorithms import RatioConfig
+from accerl_lerobot.config.machine import GIB, SIMULATOR_GIB, memory_gib
 from accerl_lerobot.envs.gym_env import MAX_STEPS
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.machine import GIB, SIMULATOR_GIB, memory_gib
 
 if TYPE_CHECKING:
     from accerl_lerobot.engine.config import RunConfig
