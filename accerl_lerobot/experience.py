@@ -92,9 +92,7 @@ class Segment:
     success: bool  # True if the episode had succeeded when the segment ended
     key: str  # worker, incarnation, sequence number
     source: str = REAL  # ``real`` or ``imagined``
-    origin: (
-        SegmentStart  # where it begins; of an imagined one, the real observation that it was imagined from
-    )
+    origin: SegmentStart  # where it begins; of an imagined one, task and seed of its plan
 
     def __len__(self) -> int:
         return len(self.reward)

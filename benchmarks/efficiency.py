@@ -3,8 +3,8 @@
 
     python -m benchmarks efficiency --recipe=recipes/imagination.yaml --budgets=16,64,256
 
-Every cell may collect so many real episodes, and makes as many updates as any other unless its imagination
-is switched off; where nothing is imagined, each real decision is used so much more often.
+Every cell may collect so many real episodes, and makes as many updates as any other; where nothing is
+imagined, each real decision is used so much more often.
 """
 
 from __future__ import annotations

@@ -5,12 +5,14 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 import torch
 
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig
+from accerl_lerobot.engine.launch import InferenceReplica
 from accerl_lerobot.engine.placement import Placement
 from accerl_lerobot.engine.run import Run
 from accerl_lerobot.errors import InputError
@@ -78,13 +80,13 @@ def test_each_role_goes_where_it_is_sent_and_shares_what_is_there():
     sites = {"world_model": "node:10.0.0.2", "rollout": "sim"}
     config = run(ranks=2, services=2, rollouts=6, imagining=True, **sites)
     assert gpus(nodes, config) == {
-        "trainer": 0.6, "inference": 0.4, "world_model": 1.0, "rollout": 0.0, "replay": 0.0
+        "trainer": 0.6, "inference": 0.4, "world_model": 0.0, "rollout": 0.0, "replay": 0.0
     }  # fmt: skip
     placement = Placement(config, nodes, "a" * 56)
     assert placement.options("rollout")["resources"].keys() == {"sim"} and not placement.is_here("rollout")
     assert placement.rows() == [
         "2 trainer × 0.6 GPU on this node",
-        "1 world_model × 1 GPU on nodes with node:10.0.0.2",
+        "1 world_model on nodes with node:10.0.0.2",
         "2 inference × 0.4 GPU on this node",
         "6 rollout on nodes with sim",
         "1 replay on this node",
@@ -131,3 +133,15 @@ def test_a_run_that_does_not_fit_does_not_begin(tmp_path: Path, monkeypatch: pyt
     ):
         Run(config, tmp_path, Console()).execute()
     assert [path.name for path in tmp_path.iterdir()] == ["config.yaml"]
+
+
+def test_a_replica_that_was_restarted_when_training_began_follows_the_trainer():
+    for trainer_first in (True, False):
+        actor, trainer = MagicMock(), MagicMock()
+        replica = InferenceReplica("inference", actor, 3)
+        if trainer_first:
+            replica.trainer = trainer
+        assert replica.ready_arguments() == ((trainer,) if trainer_first else ())
+        replica.trainer = trainer
+        replica.begin()
+        assert actor.follow.remote.called is not trainer_first

@@ -4,7 +4,7 @@
     checkpoints/NNNNNN/
       pretrained_model/     loaded by stock LeRobot
       training_state/       needed to resume, see `snapshot`; `training_step.json` is LeRobot's
-      world_model/          the world model in use, where one was promoted in the run
+      world_model/          the world model of imagined environments, where it learns in the run
       config.yaml           the run's config
       manifest.json         size and SHA-256 of all of these
     checkpoints/last        the newest
@@ -37,7 +37,7 @@ WRITING, REPLACED = ".writing-", ".replaced-"
 RUN_STATE, WEIGHTS = "run", "weights"
 """Names of states in `TRAINING_STATE`: the progress of the run, and the exact trained weights."""
 STEP = "training_step.json"
-FORMAT = 2  # format of the manifest and the training state; another one is refused
+FORMAT = 3  # format of the manifest and the training state; another one is refused
 AWAY = "LOCAL"  # replaces the folders above a file of the machine that pushed it
 BACKBONE = "backbone"  # folder beside the weights with the vision-language backbone's config and tokenisers
 FAST = f"{BACKBONE}/fast"  # folder with the tokeniser of actions, where a policy has one

@@ -210,7 +210,9 @@ class RunConfig(Section):
 def lag_limits(config: RunConfig) -> tuple[int, int]:
     """The largest lag under this recipe, and what its pace alone would allow; in updates."""
     early = 1 if config.launch.engine == "ray" else 0  # publications under way, and batches drawn early
-    batch, in_flight = config.trainer.batch_decisions, config.rollout.in_flight
+    batch, rollout = config.trainer.batch_decisions, config.rollout
+    environments = rollout.environments + config.imagination.environments
+    in_flight = replace(rollout, environments=environments).in_flight
     counts = {"batch_decisions": batch, "in_flight": in_flight, "prefetch": early}
     counts["pickup"] = early + config.trainer.hold_back
     of_pace = lag_bound(replace(config.replay, max_lag=10**9), **counts)

@@ -58,13 +58,17 @@ class InferenceReplica(RestartedWorker):
     """An inference replica; a restart loses nothing, as a request carries its noise and clients ask again."""
 
     trainer: Any = None  # handle of the trainer, once it publishes weights
+    follows = False  # True if its process was told of the trainer when it began
     together = 0  # observations that are decided in lock step; 0: as they come
 
     def ready_arguments(self) -> tuple[Any, ...]:
-        return () if self.trainer is None else (self.trainer,)
+        self.follows = self.trainer is not None
+        return (self.trainer,) if self.follows else ()
 
     def begin(self) -> None:
         self.at_work(self.actor.serve.remote())
+        if self.trainer is not None and not self.follows:  # training began while it was restarted
+            self.actor.follow.remote(self.trainer)
         if self.together:
             self.actor.lock_step.remote(self.together)
 
@@ -118,8 +122,8 @@ class RayEngine(Engine):
         self._trainer.work = self._trainer.actor.run.remote(self._replay.actor)
         for replica in self._inference:
             replica.trainer = self._trainer.actor
-            if not replica.is_starting:
-                replica.call("follow", self._trainer.actor, timeout=self._limit)
+            if not replica.is_starting:  # one that has died unnoticed is restarted, and follows then
+                replica.actor.follow.remote(self._trainer.actor)
 
     def follow(self, schedule: Schedule) -> None:
         """Change the schedule of collecting and learning, see `replay.pacing`."""

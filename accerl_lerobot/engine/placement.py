@@ -35,6 +35,8 @@ class Placement:
             "inference": config.inference.workers,
             "rollout": config.rollout.workers,
         }
+        # The world model of imagined environments predicts and learns on processors.
+        self._on_cpu = {"rollout"} if learns_states(config) else {"rollout", "world_model"}
         self._check_resources()
         self._shares = {} if config.policy.device == "cpu" else self._gpu_shares(config)
 
@@ -88,7 +90,7 @@ class Placement:
         shares: dict[str, float] = {}
         groups: dict[str | None, list[str]] = {}
         for role, count in self._workers.items():
-            if count and role != "rollout":
+            if count and role not in self._on_cpu:
                 groups.setdefault(self._selectors.get(role), []).append(role)
         for selector, roles in groups.items():
             gpus = sum(node.get("GPU", 0.0) for node in self._on(selector))

@@ -60,6 +60,7 @@ from accerl_lerobot.policies.config import Load, PolicyConfig, env_steps_seen
 from accerl_lerobot.rollout.runner import EpisodeResult
 from accerl_lerobot.seeds import noise_seed
 from accerl_lerobot.timeline import RECOVERY, open_clock
+from accerl_lerobot.world_model.config import ImaginationConfig
 
 if TYPE_CHECKING:
     from accerl_lerobot.demos.sft import SFTConfig
@@ -118,7 +119,7 @@ def play_evaluation(config: RunConfig, console: Console, filmed: int = 0) -> lis
         config = replace(config, policy=pinned(config.policy))
         history = check_policy(config, spec)
         # Nothing is learnt, whatever the recipe says.
-        config = replace(config, algorithm=GIPOConfig(), world_model=None)
+        config = replace(config, algorithm=GIPOConfig(), world_model=None, imagination=ImaginationConfig())
         engine = make_engine(config, spec.tasks, history, load=load_acting)
         with closing(engine):
             count = config.evaluation.episodes

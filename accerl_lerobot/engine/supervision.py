@@ -38,6 +38,7 @@ STEADY_S = 30.0  # a worker that has run for so long starts counting restarts an
 WARNINGS_S, LAST_WARNINGS_S = 5.0, 1.0
 """Interval at which a worker hands over its warnings, and how long its last ones are waited for."""
 GONE_S = 3.0  # how long to wait for a killed process
+MOST_BEGUN = 16  # real episodes whose resets a restarted rollout process repeats, if it imagines
 ROLLOUT = "rollout"  # name of the rollout workers' part of a checkpoint
 FINAL = (RayTaskError, ActorDiedError)  # errors after which another process would not start either
 RESTARTED = {"max_restarts": -1}
@@ -238,6 +239,7 @@ class RolloutSlot(RestartedWorker):
         self.past: Counter[str] = Counter()  # counters of processes that have ended
         self.budget = budgets(config.rollout)[index]
         self.spent = self.budget == 0  # True if replay has all episodes of the budget
+        self.begun: list[tuple[str, int]] = []  # newest real episodes, for imagined ones to begin like them
         self.world: Any = None  # reference of a version of the world model, and its weights
         self._unsent: list[EpisodePlan] = []
         self._tasks, self._seed, self._environments = tasks, config.seed, config.rollout.environments
@@ -255,7 +257,8 @@ class RolloutSlot(RestartedWorker):
         return incarnation_after(self.incarnation, 0 if self.last_answer is None else self.last_answer.starts)
 
     def ready_arguments(self) -> tuple[Any, ...]:
-        return (EpisodePlans(self._tasks, self._seed, self.budget, self.index, self.incarnation),)
+        plans = EpisodePlans(self._tasks, self._seed, self.budget, self.index, self.incarnation)
+        return plans, self.begun
 
     def begin(self) -> None:
         if self.world is not None:
@@ -265,9 +268,11 @@ class RolloutSlot(RestartedWorker):
     def take(self, report: Report) -> list[EpisodeResult]:
         """Note a report; the episodes in it."""
         self.spent = report.spent
+        plans = [episode.plan for episode in report.episodes]
+        real = [(plan.task, plan.seed) for plan in plans if plan.explore and plan.source == REAL]
+        self.begun = (self.begun + real)[-MOST_BEGUN:]
         if self.budget is not None:
-            plans = [episode.plan for episode in report.episodes]
-            self.budget -= sum(plan.explore and plan.source == REAL for plan in plans)
+            self.budget -= len(real)
         known = self.outstanding
         return [e for e in report.episodes if known.pop((e.plan.group, e.plan.index), None) or e.plan.explore]
 
@@ -306,7 +311,8 @@ def save_rollouts(directory: Path, workers: Sequence[RolloutSlot]) -> None:
     slots = []
     for worker in workers:
         outstanding, incarnation = list(worker.outstanding.values()), worker.next_incarnation - 1
-        slots.append({"incarnation": incarnation, "budget": worker.budget, "outstanding": outstanding})
+        slot = {"incarnation": incarnation, "budget": worker.budget, "outstanding": outstanding}
+        slots.append(slot | {"begun": worker.begun})
     snapshot.save(directory / ROLLOUT, {"past": dict(total_counters(workers)), "slots": slots})
 
 
@@ -322,6 +328,7 @@ def restore_rollouts(directory: Path, workers: Sequence[RolloutSlot]) -> None:
     workers[0].past = Counter(saved["past"])
     for worker, slot in zip(workers, saved["slots"], strict=True):
         worker.incarnation, worker.budget = slot["incarnation"] + 1, slot["budget"]
+        worker.begun = slot["begun"]
         worker.spent = worker.budget == 0
         worker.assign(slot["outstanding"])
 

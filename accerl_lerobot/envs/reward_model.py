@@ -58,9 +58,9 @@ def load_judge(config: RewardModelConfig) -> Callable[[Observation], bool]:
     names = [path.name for path in folder.glob("*_preprocessor.json")]
     if len(names) != 1:
         raise origin.refuse("*_preprocessor.json", f"{len(names)} of them; lerobot-train writes one")
-    untrusted.check_processor(folder, names[0], origin)
     import_plugins(*PLUGINS)
     try:
+        untrusted.check_processor(folder, names[0], origin)
         trusted = config.trust_remote_code
         with untrusted.guarded(REWARD_MODEL, trusted), contextlib.redirect_stdout(sys.stderr):
             theirs = LeRobotConfig.from_pretrained(folder)

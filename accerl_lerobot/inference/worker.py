@@ -106,6 +106,8 @@ class InferenceWorker:
     async def follow(self, trainer: Any, version: int = -1) -> None:
         """Use the weights of a trainer from now on, the newest whenever those before have been applied."""
         self._loop = asyncio.get_running_loop()
+        if self._following is not None:
+            self._following.cancel()
         self._following = asyncio.create_task(self._follow(trainer, version))
 
     async def _follow(self, trainer: Any, version: int) -> None:

@@ -70,7 +70,7 @@ class StockAdapter(PolicyAdapter):
         self.teacher: Teacher | None = None
         """Acts in its place in part of the exploring episodes; given by `teacher.with_teacher`."""
         self.demonstrations: Callable[[Segment], Iterator[Segment]] | None = None
-        """Remembered by off-policy learning from the start; set by `demonstrations.with_demonstrations`."""
+        """Remembered by off-policy learning from the start; set by `adapter.make_adapter`."""
         self._episodes: OrderedDict[tuple[int, str], Any] = OrderedDict()
         self._takes_batches = True
 

@@ -18,6 +18,7 @@ import os
 import threading
 import time
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -97,13 +98,18 @@ class RolloutWorker:
             self._imagine(imagination)
         self._clock.enter(WAIT_IN)
 
-    def ready(self, plans: EpisodePlans | None = None) -> int:
-        """Take the episodes of this process, before `report` and `run` are called; its id."""
+    def ready(self, plans: EpisodePlans | None = None, begun: Sequence[tuple[str, int]] = ()) -> int:
+        """Take the episodes of this process, before `report` and `run` are called; its id.
+
+        `begun` are tasks and seeds of real episodes of the process before, where imagined ones may begin.
+        """
         if plans is not None:
             self._plans = plans
             name = f"rollout{plans.worker}.{plans.incarnation}"
             callbacks = self._outbox.append, self._end
             self._starts.clear()
+            for task, seed in begun if self._world is not None else ():
+                self._starts.append((task, self._environments[0].reset(seed, task)))
             self._runner = RolloutRunner(
                 self._environments, self._next, self._config, name, *callbacks, self._starts
             )

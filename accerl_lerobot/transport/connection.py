@@ -42,7 +42,7 @@ import numpy as np
 
 CONNECT_S = 10  # timeout for connecting to a service, and for each step of proving the key
 IN_PIECES = 4096  # bytes from which on an array is not copied into the pickle
-BACKLOG = 64  # clients that may wait to be accepted
+BACKLOG = 1024  # clients that may wait to be accepted
 SEND_S = 0.05  # how long `Client.send` waits for the service to read, before it leaves the rest to `done`
 OLDEST_S = 60.0  # largest age of a message that is believed; clocks of other nodes differ
 _HEAD = struct.Struct("<II")
@@ -302,10 +302,10 @@ class Server:
 
     def close(self) -> None:
         """End all connections."""
+        self._closed = True
         with contextlib.suppress(OSError):
             self._listener.shutdown(socket.SHUT_RDWR)  # ends the thread that accepts
         self._listener.close()
-        self._closed = True
         self._close_accepted()
         for stream in list(self._streams):
             self._drop(stream)
@@ -315,14 +315,21 @@ class Server:
             try:
                 end, _ = self._listener.accept()
             except OSError:
-                return  # the service is closed
-            try:
-                self._accepted.put(_proved(end, deliver_challenge, answer_challenge, key=self.address.key))
-            except (OSError, EOFError, AuthenticationError):
-                continue  # it does not know the key, or has gone again
-            self.wake()
-            if self._closed:
-                self._close_accepted()
+                if self._closed:
+                    return
+                time.sleep(0.1)  # such as too many open files
+                continue
+            threading.Thread(target=self._welcome, args=(end,), daemon=True).start()
+
+    def _welcome(self, end: socket.socket) -> None:
+        """Take a client in that knows the key."""
+        try:
+            self._accepted.put(_proved(end, deliver_challenge, answer_challenge, key=self.address.key))
+        except (OSError, EOFError, AuthenticationError):
+            return  # it does not know the key, or has gone again
+        self.wake()
+        if self._closed:
+            self._close_accepted()
 
     def _close_accepted(self) -> None:
         """Close connections that `poll` has not taken over."""

@@ -5,9 +5,9 @@
     prediction = model.step(state, actions, seeds)    # .frames, .robot; the next step starts at .state
 
 A learned one has a `loss` too; `pixels.py` has ours, and ``docs/world_model.md`` says how to add another.
-`reference.py` has others. Success is classified by another model, see `learners.py`.
+Success is classified by another model, see `learners.py`.
 
-States are dicts of tensors with the batch in front, so that rows can be selected and replaced; their other
+States are dicts of tensors with the batch in front, so that rows can be selected; their other
 sizes stay the same from step to step.
 
 Shapes: B batch, L frames of context, V cameras, H×W pixels, S robot state dims, K env steps of a chunk, A
@@ -39,14 +39,6 @@ def select_rows(state: State, chosen: Sequence[int] | np.ndarray) -> State:
     return {key: tensor[chosen] for key, tensor in state.items()}
 
 
-def replace_rows(state: State, at: list[int], fresh: State) -> State:
-    """Replaces rows of the batch."""
-    return {
-        key: old.index_copy(0, torch.tensor(at, device=old.device), fresh[key].to(old.device))
-        for key, old in state.items()
-    }
-
-
 Size = Annotated[int, Range("[1, 1000000]")]
 
 
@@ -72,8 +64,6 @@ class Prediction:
     frames: Tensor  # uint8 (B, V, H, W, 3)
     robot: Tensor  # float32 (B, S), in the environment's units
     uncertainty: Tensor  # float32 (B,), ≥ 0; 1: the 95th percentile on training data; NaN: the model has none
-    success: Tensor | None = None  # float32 (B,), P(the task is achieved); None: a success model says
-    done: Tensor | None = None  # bool (B,), True where the episode is over; None: only a success ends it
 
 
 class Context(NamedTuple):
@@ -101,21 +91,14 @@ def context_of(windows: Windows, rows: slice = slice(None)) -> Context:
     )
 
 
-class Reset(NamedTuple):
-    """Arguments of the `Environment.reset` at which a rollout starts, for models that repeat it."""
-
-    task: str
-    seed: int
-
-
 class WorldModel(ABC):
     """A model that predicts observations from actions."""
 
     spec: WorldModelSpec
 
     @abstractmethod
-    def begin(self, context: Context, tasks: Sequence[str], resets: Sequence[Reset] | None = None) -> State:
-        """Starts B rollouts at their last real observations, or at resets of the environment."""
+    def begin(self, context: Context, tasks: Sequence[str]) -> State:
+        """Starts B rollouts at their last real observations."""
 
     @abstractmethod
     def step(self, state: State, actions: Tensor, seeds: Sequence[int]) -> Prediction:

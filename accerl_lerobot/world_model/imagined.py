@@ -112,6 +112,7 @@ class ImaginedEnvironment(Environment):
         self._seed = self._steps = 0
         self._done = True
         self._frames = np.zeros((0, 0, 0, 3), np.uint8)
+        self._robot = np.zeros(0, np.float32)
         self._state: State = {}
 
     def reset(self, seed: int, task: str) -> Observation:
@@ -119,7 +120,7 @@ class ImaginedEnvironment(Environment):
         arrays = {name: np.asarray(value)[None] for name, value in first.items() if name != TASK}
         frames, robot = model_arrays(arrays, self._world.model.spec)
         self._task, self._seed, self._steps, self._done = str(first[TASK]), seed, 0, False
-        self._frames = frames[0]
+        self._frames, self._robot = frames[0], robot[0]
         self._state = self._world.begin(frames[0], robot[0], self._task)
         return self._observation(robot[0])
 
@@ -132,8 +133,10 @@ class ImaginedEnvironment(Environment):
         frames, robot = prediction.frames[0].cpu().numpy(), prediction.robot[0].cpu().numpy()
         probability = self._world.succeeds(self._frames, frames, self._task)
         uncertain = float(prediction.uncertainty[0]) > MAX_UNCERTAINTY  # NaN: the model has none
+        if not (np.isfinite(robot).all() and math.isfinite(probability)):
+            uncertain, frames, robot = True, self._frames, self._robot  # the model has diverged
         success = not uncertain and probability > self._world.success.config.threshold
-        self._state, self._frames = prediction.state, frames
+        self._state, self._frames, self._robot = prediction.state, frames, robot
         self._steps += len(actions)
         late = self._steps >= self.spec.max_steps
         self._done = success or uncertain or late
@@ -145,14 +148,14 @@ class ImaginedEnvironment(Environment):
             terminated=success,
             truncated=self._done and not success,
             success=success,
-            info={"uncertain": float(uncertain)} | ({} if math.isfinite(probability) else {"nonfinite": 1.0}),
+            info={"uncertain": float(uncertain)},
         )
 
     def render(self, height: int, width: int) -> np.ndarray:
         return resize(self._frames[:1], (height, width))[0]
 
     def state(self) -> Any:
-        names = ("_task", "_seed", "_steps", "_done", "_frames", "_state")
+        names = ("_task", "_seed", "_steps", "_done", "_frames", "_robot", "_state")
         return {name: getattr(self, name) for name in names}
 
     def restore(self, state: Any) -> None:

@@ -14,7 +14,7 @@ import math
 import os
 import threading
 from collections import OrderedDict, deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -80,6 +80,7 @@ class OnlineLearner:
 
     Args:
         known: episodes of the pre-training, in whose windows it goes on to be trained.
+        roles: what the saved world model knows of episodes, by their keys, see `store`.
         longest: chunks of an imagined episode at most.
     """
 
@@ -88,10 +89,12 @@ class OnlineLearner:
         world: ImaginedWorld,
         config: OnlineLearnConfig,
         known: Sequence[Episode] = (),
+        roles: Mapping[str, str] | None = None,
         longest: int = 15,
         seed: int = 0,
     ) -> None:
         self.config = config
+        self.roles = dict(roles or {}) | {episode.key: LEARNT for episode in known}
         self.pending_steps = 0.0  # gradient steps that are due
         training = WorldModelConfig(
             learn=LearnConfig(steps=ENDLESS, batch=BATCH, lr=LEARNING_RATE),
@@ -127,7 +130,10 @@ class OnlineLearner:
         parts = self._completed(segment)
         if parts is None or (parts[-1].success and not parts[-1].terminated):
             return  # incomplete, or the step of its success is unknown
-        self._learnt.append(episode_from_segments(parts, self._learner.model.spec))
+        episode = episode_from_segments(parts, self._learner.model.spec)
+        self._learnt.append(episode)
+        self.roles[episode.key] = LEARNT
+        self._examples = None
         with contextlib.suppress(ValueError):  # so far there may be only one kind of outcome
             self._examples = Examples(self._episodes, self._learner.model.spec.chunk)
         most = MOST_PENDING * self.config.steps_per_episode
@@ -146,6 +152,7 @@ class OnlineLearner:
         """Copies all that `restore` needs."""
         return {
             "pending_steps": self.pending_steps,
+            "roles": dict(self.roles),
             "learner": self._learner.state(),
             "success": self._success.state(),
             "learnt": list(self._learnt),
@@ -157,6 +164,7 @@ class OnlineLearner:
     def restore(self, state: dict[str, Any]) -> None:
         """Continues from a `state`."""
         self.pending_steps, self._rng = state["pending_steps"], state["rng"]
+        self.roles = state["roles"]
         self._learner.restore(state["learner"])
         self._success.restore(state["success"])
         self._learnt.extend(state["learnt"])
@@ -216,17 +224,18 @@ def make_learner(config: RunConfig) -> OnlineLearner:
     """
     world, imagination = load_world(config.imagination), config.imagination
     path = Path(str(imagination.path)).expanduser()
-    held_out = {key for key, role in load_roles(path).items() if role != LEARNT}
+    roles = load_roles(path)
+    held_out = {key for key, role in roles.items() if role != LEARNT}
     known = load_datasets({LEARN: imagination.learn.dataset}, world.model.spec).get(LEARN, [])
     known = [episode for episode in known if episode.key not in held_out]
     longest = math.ceil(config.env.max_steps / world.model.spec.chunk)
-    return OnlineLearner(world, imagination.learn, known, longest, config.seed)
+    return OnlineLearner(world, imagination.learn, known, roles, longest, config.seed)
 
 
 def save_online(directory: Path, learner: OnlineLearner) -> None:
     """Writes the learned models into a checkpoint, as ``accerl world-model`` writes them."""
     world = learner.world
-    save_world_model(directory / WORLD_MODEL, world.model, world.success)
+    save_world_model(directory / WORLD_MODEL, world.model, world.success, learner.roles)
 
 
 class OnlineLearningWorker:
@@ -248,7 +257,8 @@ class OnlineLearningWorker:
         self._learner = make_learner(config)
         if state is not None:
             self._learner.restore(snapshot.load(state / ONLINE))
-        self._lock = threading.Lock()  # held while the learner changes
+        self._lock = threading.Lock()  # held while the learner changes, for one step at a time
+        self._learning = threading.Lock()  # held by the call that makes the steps
         self._inbox: deque[Segment] = deque()
         self._failure: Exception | None = None
         self._newest = self._learner.version, self._learner.world.tensors()
@@ -260,7 +270,7 @@ class OnlineLearningWorker:
     def learn(self, batch: list[Segment]) -> None:
         """Make the steps that are due with these segments; if some are under way, leave it to them."""
         self._inbox.extend(segment for segment in batch if segment.source == REAL)
-        while self._inbox and self._lock.acquire(blocking=False):
+        while self._inbox and self._learning.acquire(blocking=False):
             try:
                 self._clock.enter(COMPUTE)
                 self._learn()
@@ -269,14 +279,16 @@ class OnlineLearningWorker:
                 return
             finally:
                 self._clock.enter(WAIT_IN)
-                self._lock.release()
+                self._learning.release()
 
     def _learn(self) -> None:
         while self._inbox:
-            self._learner.add(self._inbox.popleft())
+            with self._lock:
+                self._learner.add(self._inbox.popleft())
         while self._learner.pending_steps >= 1:
             fault_point("learning.step")
-            self._learner.step()
+            with self._lock:
+                self._learner.step()
         if self._learner.version > self._newest[0]:
             self._newest = self._learner.version, self._learner.world.tensors()
 

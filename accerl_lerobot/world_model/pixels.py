@@ -27,7 +27,6 @@ from accerl_lerobot.world_model.contract import (
     Context,
     LearnableWorldModel,
     Prediction,
-    Reset,
     State,
     Windows,
     WorldModelSpec,
@@ -78,7 +77,7 @@ class PixelWorldModel(LearnableWorldModel):
         change = float(np.sqrt(np.square(frames[:, 1] - frames[:, 0]).mean()))
         self.change.fill_(max(change, 1e-3))
 
-    def begin(self, context: Context, tasks: Sequence[str], resets: Sequence[Reset] | None = None) -> State:
+    def begin(self, context: Context, tasks: Sequence[str]) -> State:
         given = context._asdict() | {TASK: torch.from_numpy(task_codes(tasks))}
         state = {name: x.to(self.change.device) for name, x in given.items()}
         return state | {"anchor": state["frames"][:, -1]}

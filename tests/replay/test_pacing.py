@@ -13,6 +13,7 @@ from accerl_lerobot.engine.config import lag_limits
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.replay.buffer import Replay
 from accerl_lerobot.replay.pacing import ReplayConfig, draws_for, lag_bound
+from accerl_lerobot.rollout.runner import RolloutConfig
 from tests.replay.segments import assert_books_balance, make_segment
 
 CONFIG = ReplayConfig(capacity=100, min_decisions=10, samples_per_insert=2.0, max_unlearned_decisions=30)
@@ -68,7 +69,8 @@ def test_lag_bound_by_hand() -> None:
     assert lag_bound(capped, **arguments) == 9
     sections = {
         "trainer": SimpleNamespace(batch_decisions=8, hold_back=4),
-        "rollout": SimpleNamespace(in_flight=12),
+        "rollout": RolloutConfig(environments=1, segment_length=4),
+        "imagination": SimpleNamespace(environments=2),
     }
     config: Any = SimpleNamespace(replay=capped, launch=SimpleNamespace(engine="local"), **sections)
     assert lag_limits(config) == (9, 4 + 37)

@@ -18,7 +18,6 @@ from accerl_lerobot.world_model.contract import (
     Context,
     LearnableWorldModel,
     Prediction,
-    Reset,
     State,
     Windows,
     WorldModelSpec,
@@ -58,7 +57,7 @@ class LinearWorldModel(LearnableWorldModel):
         moved = windows.state[:, now + 1] - windows.state[:, now]
         self.scale.copy_(torch.from_numpy(moved.std(0)).clamp(min=1e-3))
 
-    def begin(self, context: Context, tasks: Sequence[str], resets: Sequence[Reset] | None = None) -> State:
+    def begin(self, context: Context, tasks: Sequence[str]) -> State:
         """See the base class."""
         seen = {"frames": context.frames[:, -1], "robot": context.robot[:, -1]}
         return {name: tensor.to(self.scale.device) for name, tensor in seen.items()}

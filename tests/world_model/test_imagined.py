@@ -113,10 +113,13 @@ def test_where_the_world_model_is_too_uncertain_it_ends_as_a_failure():
     assert result.truncated and not result.success and result.info["uncertain"] == 1.0
 
 
-def test_a_probability_that_is_no_number_is_told():
-    made = environment(CountingWorld(broken_at=1))
+def test_where_the_models_diverge_it_ends_as_a_failure_at_the_last_observation():
+    made = environment(CountingWorld(broken_at=2))
     made.reset(0, "match")
-    assert made.step_chunk(CHUNK).info["nonfinite"] == 1.0
+    made.step_chunk(CHUNK)
+    result = made.step_chunk(CHUNK)
+    assert result.truncated and not result.success and result.info["uncertain"] == 1.0
+    assert result.observation[CAMERA].max() == 8 and result.observation["observation.state"][0] == 4.0
 
 
 def test_an_episode_under_way_goes_on_from_its_state():

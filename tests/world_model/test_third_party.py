@@ -29,7 +29,7 @@ from accerl_lerobot.world_model.contract import LearnableWorldModel, new_model
 from accerl_lerobot.world_model.learners import Learner, new_success_model
 from accerl_lerobot.world_model.online import save_online
 from accerl_lerobot.world_model.pretrain import world_spec
-from accerl_lerobot.world_model.store import load_world_model, save_world_model
+from accerl_lerobot.world_model.store import LEARNT, load_roles, load_world_model, save_world_model
 from tests.runs import drive, replacing
 from tests.test_imagination import imagining, run_locally
 from tests.world_model.test_pixels import SPEC, dots, windows
@@ -161,6 +161,8 @@ def test_it_imagines_and_goes_on_learning_in_a_run(tiny_checkpoint: Path, tmp_pa
     history, _, engine = run_locally(replace(config, imagination=named))
     assert history[-1].replay["trained_imagined"] > 0
     save_online(tmp_path, engine._world_learner)
+    roles = load_roles(tmp_path / WORLD_MODEL)
+    assert len(roles) == history[-1].world_model["learn_episodes"] and set(roles.values()) == {LEARNT}
     before, after = (load_world_model(tmp_path / name)[0] for name in ("w", WORLD_MODEL))
     assert name_of(after) == "LinearWorldModel" and after.config == linear(gain=3.0)
     moved = after.get_parameter("motion.weight") - before.get_parameter("motion.weight")
@@ -195,7 +197,7 @@ class Moody(LearnableWorldModel):
     def fit_statistics(self, windows: Any) -> None:
         """It has none."""
 
-    def begin(self, context: Any, tasks: Any, resets: Any = None) -> Any:
+    def begin(self, context: Any, tasks: Any) -> Any:
         """See the base class."""
 
     def step(self, state: Any, actions: Any, seeds: Any) -> Any:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from accerl_lerobot.world_model.config import SuccessLearnConfig, ValidationConfig, WorldModelConfig
-from accerl_lerobot.world_model.contract import Context, Prediction, Reset, State, WorldModel
+from accerl_lerobot.world_model.contract import Context, Prediction, State, WorldModel
 from accerl_lerobot.world_model.data import Episode, shuffle_actions
 from accerl_lerobot.world_model.learners import Examples, SuccessLearner, new_success_model
 from accerl_lerobot.world_model.rollout_eval import auroc, bootstrap, match_cut_lengths, predict
@@ -37,7 +37,7 @@ class Deterministic(WorldModel):
         self.spec, self.kind = SPEC, kind
         self.calls: list[int] = []
 
-    def begin(self, context: Context, tasks: Sequence[str], resets: Sequence[Reset] | None = None) -> State:
+    def begin(self, context: Context, tasks: Sequence[str]) -> State:
         assert len(tasks) == len(context.frames)
         return {"frames": context.frames[:, -1], "robot": context.robot[:, -1]}
 
