@@ -23,7 +23,7 @@ from huggingface_hub.utils import filter_repo_objects
 
 from accerl_lerobot.checkpoint import layout
 from accerl_lerobot.checkpoint.safety import FileSource, matching_files
-from accerl_lerobot.errors import InputError, reading
+from accerl_lerobot.errors import InputError, expanded, reading
 from accerl_lerobot.hub import card
 from accerl_lerobot.hub.errors import LOGIN, hub_errors
 
@@ -40,7 +40,7 @@ def push(config: card.PushConfig) -> dict[str, Any]:
 
     If it is refused, or fails, the repository is as before.
     """
-    folder = Path(config.path).expanduser()
+    folder = expanded(config.path, "path")
     artifact = card.recognise(folder)
     with reading("path", config.path, "a file of it, or of its run,"):
         files = stage(config, folder, artifact)

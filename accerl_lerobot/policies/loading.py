@@ -26,7 +26,7 @@ from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from accerl_lerobot.checkpoint.layout import BACKBONE, CONFIG_FOLDERS, STEP_FOLDERS
 from accerl_lerobot.checkpoint.safety import FileSource, brief, read_json, read_tensors, tensor_shapes
 from accerl_lerobot.config.parsing import discover, imported
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.errors import InputError, expanded
 from accerl_lerobot.experience import stack_observations
 from accerl_lerobot.policies import untrusted
 from accerl_lerobot.policies.adapter import LeRobotAdapter, Processing, ValueHead
@@ -322,7 +322,7 @@ def _checkpoint_folder(config: PolicyConfig) -> Path:
 
 def pinned(config: PolicyConfig) -> PolicyConfig:
     """With the commit that a Hub checkpoint has now, which all processes and a resumed run then load."""
-    local = config.path is None or Path(config.path).expanduser().exists()
+    local = config.path is None or expanded(config.path, "policy.path").exists()
     return config if local else replace(config, revision=_checkpoint_folder(config).name)
 
 

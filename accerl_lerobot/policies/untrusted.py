@@ -41,7 +41,7 @@ from accerl_lerobot.checkpoint.safety import (
     tensor_shapes,
     texts_in,
 )  # fmt: skip
-from accerl_lerobot.errors import InputError, causes
+from accerl_lerobot.errors import InputError, causes, expanded
 
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
 ADAPTER_CONFIG, ADAPTER = "adapter_config.json", "adapter_model.safetensors"
@@ -66,7 +66,7 @@ def fetched_checkpoint(path: str, revision: str | None, field: str) -> Path:
     from accerl_lerobot.hub.errors import guard_client
 
     guard_client()
-    folder = Path(path).expanduser()
+    folder = expanded(path, field)
     local = folder.exists()
     if not local and not path.startswith((".", "/", "~")):
         try:

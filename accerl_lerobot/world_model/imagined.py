@@ -22,7 +22,7 @@ import torch
 
 from accerl_lerobot.envs import make_environment
 from accerl_lerobot.envs.base import ChunkResult, Environment, EnvironmentSpec, checked_actions
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.errors import InputError, expanded
 from accerl_lerobot.experience import IMAGINED, TASK, Observation, task_codes
 from accerl_lerobot.world_model.config import IMAGINATION, ImaginationConfig
 from accerl_lerobot.world_model.contract import (
@@ -175,7 +175,7 @@ class ImaginedEnvironment(Environment):
 
 def load_world(config: ImaginationConfig) -> ImaginedWorld:
     """The world that ``imagination.path`` has, on the CPU."""
-    path = Path(str(config.path)).expanduser()
+    path = expanded(str(config.path), f"{IMAGINATION}.path")
     return ImaginedWorld(*load_world_model(path, config.discover_packages_path, section=IMAGINATION))
 
 
@@ -208,7 +208,7 @@ def check_imagination(config: RunConfig) -> None:
         raise InputError("policy.n_obs_steps", policy.n_obs_steps, f"{hint} policy with 1, or no imagination")
     with closing(make_environment(config.env)) as environment:
         spec = environment.spec
-    path = Path(str(imagination.path)).expanduser()
+    path = expanded(str(imagination.path), f"{IMAGINATION}.path")
     world = load_world(imagination)
     check_predicts(path, world.model, world.success, section=IMAGINATION)
     check_fit(world.model.spec, spec, getattr(policy, "n_action_steps", 1))

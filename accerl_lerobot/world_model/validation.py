@@ -29,7 +29,7 @@ import numpy as np
 from rich.table import Table
 
 from accerl_lerobot.console import Console
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.errors import InputError, expanded
 from accerl_lerobot.evaluation import write_video
 from accerl_lerobot.policies.loading import resolve_device
 from accerl_lerobot.world_model import data, store
@@ -232,7 +232,7 @@ def checks_table(found: dict[str, Any]) -> Table:
 def evaluate(config: WorldModelEvalRun, directory: Path, console: Console) -> dict[str, Any]:
     """Evaluates a saved world model on episodes that it was not trained on, see `validate_datasets`."""
     device = resolve_device(config.device, "device")
-    path = Path(str(config.path)).expanduser()
+    path = expanded(str(config.path), "path")
     model, success = store.load_world_model(path, config.discover_packages_path)
     store.check_predicts(path, model, success)
     roles = store.load_roles(path)
