@@ -89,10 +89,10 @@ def _decision(request: Request, version: int) -> Decision:
 class FalteringRollout(RolloutWorker):
     """The first process in the first seat fails when it is to report for the third time."""
 
-    def ready(self, plans: EpisodePlans | None = None) -> int:
+    def ready(self, plans: EpisodePlans | None = None, *arguments: Any) -> int:
         if plans is not None:
             self._left = 2 if plans.worker == plans.incarnation == 0 else 1_000_000
-        return super().ready(plans)
+        return super().ready(plans, *arguments)
 
     def report(self, *arguments: Any) -> Report:
         self._left -= 1
