@@ -31,7 +31,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Observation
 from accerl_lerobot.policies.config import PLUGINS, POLICIES, PolicyConfig
 from accerl_lerobot.policies.flow import FlowFamily
-from accerl_lerobot.policies.loading import load_adapter, rehearsed_config
+from accerl_lerobot.policies.loading import dry_run_config, load_adapter
 from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.testing import check_policy
@@ -174,13 +174,13 @@ def test_a_file_alone_imports_no_package(checkpoint: Path, tmp_path: Path):
         parse(RunConfig, [f"--config_path={recipe}"])
     assert PACKAGE not in sys.modules
     config = parse(RunConfig, [f"--config_path={recipe}", FLAG]).policy
-    assert rehearsed_config(config).type == POLICY
+    assert dry_run_config(config).type == POLICY
 
 
 def test_a_package_that_is_not_there(checkpoint: Path):
     config = replace(named(checkpoint), discover_packages_path="no_such_package")
     with pytest.raises(InputError, match=r"^policy\.discover_packages_path='no_such_package': cannot be imp"):
-        rehearsed_config(config)
+        dry_run_config(config)
 
 
 def test_help_knows_types_of_a_package_that_is_named(capsys: pytest.CaptureFixture[str]):

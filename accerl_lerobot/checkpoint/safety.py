@@ -23,7 +23,6 @@ from safetensors import SafetensorError, safe_open
 
 from accerl_lerobot.errors import InputError
 
-MIB = 1024**2
 PICKLES = (".bin", ".pt", ".pth", ".pkl", ".pickle", ".ckpt")
 """Endings of files that PyTorch unpickles, which may run whatever their author wished."""
 REVISION = re.compile(r"[0-9a-f]{40}")

@@ -4,7 +4,7 @@
 LeRobot fills the templates of ``meta/info.json`` in with `str.format` and joins the result to the folder.
 Where an image's ``bytes`` are missing, Hugging Face's `datasets` opens the file or address that its ``path``
 names. Pillow has Ghostscript draw PostScript. In the context of `checked`, LeRobot's own classes refuse all
-of this, whoever calls them.
+of this.
 
 LeRobot looks up tasks and episodes by their rows. `put_in_order` sorts the rows by the index that names them.
 Statistics and columns are checked in `policies.features` and `demos.episodes`, which know what is read. Any

@@ -96,7 +96,7 @@ class RayEngine(Engine):
         self._inference: list[InferenceReplica] = []
         self._others: list[Worker] = []
         self._world_learner: Worker | None = None  # trains the world model of imagined environments
-        self._world: tuple[int, Any] = (0, None)  # its newest version, and the reference of both
+        self._world_version = 0  # of the models that the rollout workers were given last
         self._updates: list[dict[str, float]] = []
         self._schedule: Schedule = ASYNCHRONOUS
         self._training = self._collected = self._done = self._closed = False
@@ -337,13 +337,15 @@ class RayEngine(Engine):
     def _hand_over_world(self) -> None:
         """Give a new version of the world model to the rollout workers."""
         learner = self._world_learner
-        if learner is None or not learner.last_answer or learner.last_answer["version"] <= self._world[0]:
+        answer = None if learner is None else learner.last_answer
+        if learner is None or not answer or answer["version"] <= self._world_version:
             return
-        self._world = int(learner.last_answer["version"]), learner.actor.weights.remote()
+        self._world_version = int(answer["version"])
+        newest = learner.actor.weights.remote()
         for slot in self._rollouts:
-            slot.world = self._world[1]
+            slot.world = newest
             if not slot.is_starting:
-                slot.actor.imagine_with.remote(slot.world)
+                slot.actor.imagine_with.remote(newest)
 
     def _hear(self, worker: Worker, timeout: float = 0.0) -> Any:
         try:

@@ -147,9 +147,10 @@ class LocalEngine(Engine):
         }
         snapshot.save(state / LOCAL, engine)
         if self._world_learner is not None:
+            from accerl_lerobot.checkpoint.tensors import copied
             from accerl_lerobot.world_model.online import ONLINE, save_online
 
-            acting = {"version": self._world.version, "weights": self._world.tensors()}
+            acting = {"version": self._world.version, "weights": copied(self._world)}
             snapshot.save(state / ONLINE, {"learner": self._world_learner.state(), "acting": acting})
             save_online(directory, self._world_learner)
         self._clock.enter(WAIT_IN)
@@ -223,7 +224,7 @@ class LocalEngine(Engine):
             return
         learner.step()
         if learner.pending_steps < 1:
-            self._world.load(learner.version, learner.world.tensors())
+            self._world.load(learner.version, learner.world.state_dict())
 
     def _publish(self) -> None:
         """Give weights to the acting policy, which is the trainer's own unless they are delayed."""

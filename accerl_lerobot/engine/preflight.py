@@ -124,9 +124,9 @@ def check_policy(config: RunConfig, spec: EnvironmentSpec, *, own: bool = False)
     Its files are not tried first if the run has done so, or written them itself (`own`).
     """
     from accerl_lerobot.policies.config import env_steps_seen
-    from accerl_lerobot.policies.loading import load_lerobot_config, rehearsed_config
+    from accerl_lerobot.policies.loading import dry_run_config, load_lerobot_config
 
-    policy = (load_lerobot_config if own else rehearsed_config)(config.policy)
+    policy = (load_lerobot_config if own else dry_run_config)(config.policy)
     needed, offered, renames = policy_features(policy), env_features(spec), config.policy.rename_map
     check_features(needed, offered, renames, "policy.path", config.policy.path)
     return env_steps_seen(policy, learns=isinstance(config.algorithm, OffPolicyConfig))

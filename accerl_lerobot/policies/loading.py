@@ -51,7 +51,7 @@ from accerl_lerobot.policies.stock import StockAdapter
 
 logger = logging.getLogger(__name__)
 
-ACTS_MOST = 10**9  # parameters of a policy that acts in a rehearsal; π0's four billion would take minutes
+ACTS_MOST = 10**9  # parameters of a policy that acts in a dry run; π0's four billion would take minutes
 
 
 class Sizes(NamedTuple):
@@ -61,7 +61,7 @@ class Sizes(NamedTuple):
     trained: int
 
 
-_rehearsed: dict[tuple[Any, ...], Sizes] = {}  # of checkpoints and configs that need no other rehearsal
+_dry_runs: dict[tuple[Any, ...], Sizes] = {}  # of checkpoints and configs that need no other dry run
 
 
 def resolve_device(name: str, field: str = "policy.device") -> torch.device:
@@ -106,14 +106,14 @@ def load_lerobot_config(config: PolicyConfig) -> Any:
     return lerobot_config
 
 
-def rehearsed_config(config: PolicyConfig, *, fine_tuned: bool = False) -> Any:
+def dry_run_config(config: PolicyConfig, *, fine_tuned: bool = False) -> Any:
     """`load_lerobot_config` of a checkpoint that has passed `policy_sizes`."""
     policy_sizes(config, fine_tuned=fine_tuned)
     return load_lerobot_config(config)
 
 
 def learning_config(config: PolicyConfig, *, fine_tuned: bool = False, imitates: bool = False) -> Any:
-    """`rehearsed_config` of a policy that learns, by LeRobot's training loss if it `imitates`."""
+    """`dry_run_config` of a policy that learns, by LeRobot's training loss if it `imitates`."""
     policy_sizes(config, fine_tuned=fine_tuned, imitates=imitates, learns=True)
     lerobot_config = load_lerobot_config(config)
     sampler_config(config, lerobot_config.type, prefix=f"{config.path} is of this type: ")
@@ -136,15 +136,15 @@ def policy_sizes(
     state = repr([(str(path), path.stat().st_mtime_ns) for path in files])
     key = (repr(config), state, fine_tuned, imitates)
     for learning in (learns, True):  # a policy that can learn can act
-        if (*key, learning) in _rehearsed:
-            return _rehearsed[*key, learning]
-    sizes = rehearsed(
+        if (*key, learning) in _dry_runs:
+            return _dry_runs[*key, learning]
+    sizes = dry_run(
         replace(config, precision="fp32"), sizes_of, fine_tuned=fine_tuned, imitates=imitates, learns=learns
     )
-    return _rehearsed.setdefault((*key, learns), sizes)
+    return _dry_runs.setdefault((*key, learns), sizes)
 
 
-def rehearsed[T](
+def dry_run[T](
     config: PolicyConfig,
     task: Callable[[Any], T],
     *,
@@ -160,7 +160,7 @@ def rehearsed[T](
     config = replace(config, device="cpu", precision=precision)
     load = partial(load_adapter, explores=False) if imitates else partial(load_acting, learns=learns)
     with contextlib.redirect_stdout(io.StringIO()), torch.random.fork_rng(devices=[]):
-        return task(load(config, rehearsal=True, fine_tuned=fine_tuned))
+        return task(load(config, dry_run=True, fine_tuned=fine_tuned))
 
 
 def sizes_of(adapter: Any) -> Sizes:
@@ -169,7 +169,7 @@ def sizes_of(adapter: Any) -> Sizes:
 
 
 def load_acting(
-    config: PolicyConfig, *, rehearsal: bool = False, fine_tuned: bool = False, learns: bool = False
+    config: PolicyConfig, *, dry_run: bool = False, fine_tuned: bool = False, learns: bool = False
 ) -> LeRobotAdapter | StockAdapter:
     """A policy of any of LeRobot's types: by `load_adapter` if it has an exact likelihood, else to act only.
 
@@ -178,8 +178,8 @@ def load_acting(
     lerobot_config = load_lerobot_config(config)
     if lerobot_config.type in POLICIES:
         with contextlib.suppress(*(() if learns else (NoDensityError,))):
-            return load_adapter(config, rehearsal=rehearsal, fine_tuned=fine_tuned, explores=False)
-    return _stock_adapter(config, lerobot_config, None, rehearsal, fine_tuned)
+            return load_adapter(config, dry_run=dry_run, fine_tuned=fine_tuned, explores=False)
+    return _stock_adapter(config, lerobot_config, None, dry_run, fine_tuned)
 
 
 def load_network(config: PolicyConfig) -> tuple[Any, Processing]:
@@ -192,13 +192,13 @@ def _stock_adapter(
     config: PolicyConfig,
     lerobot_config: Any,
     sampler: ChunkNoiseConfig | None,
-    rehearsal: bool,
+    dry_run: bool,
     fine_tuned: bool,
 ) -> StockAdapter:
     """A policy of any type, which has acted once; with a `sampler` one that explores and learns."""
     known = POLICIES.get(lerobot_config.type)
     model_class: type[Model] | None = None if known is None else imported(known[0])
-    policy, processing, precision = _load_parts(config, lerobot_config, model_class, rehearsal, fine_tuned)
+    policy, processing, precision = _load_parts(config, lerobot_config, model_class, dry_run, fine_tuned)
     adapter = StockAdapter(policy, processing, precision, sampler)
     with _refusing(config, "it cannot act here"):
         if sampler is None:
@@ -210,11 +210,11 @@ def _stock_adapter(
 
 
 def load_adapter(
-    config: PolicyConfig, *, rehearsal: bool = False, fine_tuned: bool = False, explores: bool = True
+    config: PolicyConfig, *, dry_run: bool = False, fine_tuned: bool = False, explores: bool = True
 ) -> LeRobotAdapter | StockAdapter:
     """Loads policy, processors and critic; proves that the sampler is LeRobot's.
 
-    In a `rehearsal` the weights are not read, and a decision is made in place of that proof. `policy_sizes`
+    In a `dry_run` the weights are not read, and a decision is made in place of that proof. `policy_sizes`
     explains `fine_tuned`.
 
     Raises:
@@ -223,9 +223,9 @@ def load_adapter(
     lerobot_config = load_lerobot_config(config)
     sampler = sampler_config(config, lerobot_config.type, prefix=f"{config.path} is of this type: ")
     if isinstance(sampler, ChunkNoiseConfig):
-        return _stock_adapter(config, lerobot_config, sampler, rehearsal, fine_tuned)
+        return _stock_adapter(config, lerobot_config, sampler, dry_run, fine_tuned)
     model_class: type[Model] = imported(POLICIES[lerobot_config.type][0])
-    policy, processing, precision = _load_parts(config, lerobot_config, model_class, rehearsal, fine_tuned)
+    policy, processing, precision = _load_parts(config, lerobot_config, model_class, dry_run, fine_tuned)
     folder, origin = _checkpoint_folder(config), FileSource("policy.path", config.path)
     with _refusing(config, "it cannot act here"):
         model = model_class(policy)
@@ -235,7 +235,7 @@ def load_adapter(
         if (folder / untrusted.OURS).is_file():
             _load_ours(adapter, folder, origin, explores)
         requests = adapter.example_requests()
-        if not rehearsal:
+        if not dry_run:
             adapter.self_check(*stack_observations(requests))
         elif sum(parameter.numel() for parameter in policy.parameters()) <= ACTS_MOST:
             adapter.decide(requests[:1], 0)
@@ -247,7 +247,7 @@ def _load_parts(
     config: PolicyConfig,
     lerobot_config: Any,
     model_class: type[Model] | None,
-    rehearsal: bool,
+    dry_run: bool,
     fine_tuned: bool,
 ) -> tuple[Any, Processing, Precision]:
     """LeRobot's policy with the checkpoint's weights, its processors, and the precision it computes in."""
@@ -266,7 +266,7 @@ def _load_parts(
             policy = policy.float()
     base = weights_folder(folder, origin)
     unread = () if model_class is None else model_class.unread
-    load_weights(policy, unread, base / untrusted.WEIGHTS, config.path, read=not rehearsal)
+    load_weights(policy, unread, base / untrusted.WEIGHTS, config.path, read=not dry_run)
     if base != folder:
         with _refusing(config, "its adapter did not load"), untrusted.guarded("policy"):
             policy = merged(policy, folder, origin)

@@ -228,7 +228,7 @@ class EpisodePlans:
         number, self.imagined = self.imagined, self.imagined + 1
         seed = train_seed(self._seed, self.worker, number)
         task, _ = starts[seed % len(starts)]
-        return EpisodePlan(task=task, seed=seed, explore=True, group=IMAGINED, source=IMAGINED)
+        return EpisodePlan(task=task, seed=seed, explore=True, source=IMAGINED)
 
     def ended(self, result: EpisodeResult) -> None:
         """Tasks that fail more are explored more."""

@@ -77,7 +77,7 @@ class RolloutWorker:
         imagination: ImaginationConfig | None = None,
     ) -> None:
         errors.collect_warnings()
-        # A node that does not see the run's folder would write a timeline that nobody finds.
+        # A node that does not see the run's folder would write a timeline where it is not looked for.
         seen = timeline is not None and timeline.parent.is_dir()
         self._clock = open_clock(timeline if seen else None, name)
         self._config, self._spent = config, False
@@ -148,24 +148,21 @@ class RolloutWorker:
         idle = list(range(len(self._runner)))
         due: dict[int, Request] = {}
         under_way: dict[int, list[int]] = {}
-        pending: set[int] = set()  # tickets of messages to replay
-        pending_real: set[int] = set()  # those with real segments
+        pending: dict[int, bool] = {}  # tickets of messages to replay; True: with real segments
         size = max(1, len(self._runner) // PARTS)
         patience = 0.0
         while True:
             self._active = time.monotonic(), False
-            pending -= {ticket for ticket, _ in storing.done(patience)}
+            for ticket, _ in storing.done(patience):
+                pending.pop(ticket, None)
             while self._outbox:
                 self._clock.enter(TRANSPORT)
                 if fault_point("rollout.send"):
                     self._outbox[0].reward = self._outbox[0].reward * np.float32(np.nan)
-                ticket = storing.send(self._outbox[:size])
-                pending.add(ticket)
-                if any(segment.source == REAL for segment in self._outbox[:size]):
-                    pending_real.add(ticket)
+                is_real = any(segment.source == REAL for segment in self._outbox[:size])
+                pending[storing.send(self._outbox[:size])] = is_real
                 del self._outbox[:size]
-            pending_real &= pending
-            self._spent = self._plans.spent and not self._runner.exploring and not pending_real
+            self._spent = self._plans.spent and not self._runner.exploring and not any(pending.values())
             if self._new_world:
                 self._clock.enter(WEIGHT_SYNC)
                 self._world.load(*self._new_world.popleft())

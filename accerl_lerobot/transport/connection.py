@@ -270,7 +270,6 @@ class Server:
         self._selector.register(self._woken, selectors.EVENT_READ)
         self._streams: set[Stream] = set()
         self._closed = False
-        # On a thread, as a stranger might connect and then not say a word.
         threading.Thread(target=self._accept, daemon=True).start()
 
     def fileno(self) -> int:
@@ -319,6 +318,7 @@ class Server:
                     return
                 time.sleep(0.1)  # such as too many open files
                 continue
+            # On a thread, as a stranger might connect and then not say a word.
             threading.Thread(target=self._welcome, args=(end,), daemon=True).start()
 
     def _welcome(self, end: socket.socket) -> None:

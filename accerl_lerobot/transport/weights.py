@@ -2,7 +2,7 @@
 """Weights from the trainer to inference replicas, through Ray's object store.
 
 The trainer puts each set into the store once. A replica asks for the newest one whenever it has applied the
-one before, so a slow replica skips versions and the trainer waits for nobody.
+one before, so a slow replica skips versions and the trainer waits for none.
 """
 
 from __future__ import annotations

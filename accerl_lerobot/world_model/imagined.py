@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from torch import nn
 
 from accerl_lerobot.envs import make_environment
 from accerl_lerobot.envs.base import ChunkResult, Environment, EnvironmentSpec, checked_actions
@@ -45,13 +46,12 @@ LEARN = "imagination.learn.dataset"
 MAX_UNCERTAINTY = 2.0
 """Uncertainty above which an episode ends before a prediction; 1 is training data's 95th percentile."""
 
-Tensors = dict[str, np.ndarray]
 
-
-class ImaginedWorld:
+class ImaginedWorld(nn.Module):
     """World model and success model, which all imagined environments of a process share."""
 
     def __init__(self, model: LearnableWorldModel, success: SuccessPairsRewardModel) -> None:
+        super().__init__()
         self.model, self.success = model, success
         self.version = 0  # gradient steps that they have made in the run
 
@@ -78,20 +78,9 @@ class ImaginedWorld:
         """P(success) after a chunk, of the frames before and after it, uint8 (V, H, W, 3)."""
         return float(self.success.probabilities(before[None], after[None], task_codes([task]))[0])
 
-    def tensors(self) -> Tensors:
-        """Copies of all weights."""
-        return {
-            f"{name}.{key}": tensor.detach().cpu().numpy().copy()
-            for name, network in (("model", self.model), ("success", self.success))
-            for key, tensor in network.state_dict().items()
-        }
-
-    def load(self, version: int, tensors: Tensors) -> None:
-        """Take over weights, between two chunks; episodes under way go on."""
-        for name, network in (("model", self.model), ("success", self.success)):
-            prefix = f"{name}."
-            own = {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
-            network.load_state_dict({key: torch.from_numpy(np.array(value)) for key, value in own.items()})
+    def load(self, version: int, weights: dict[str, Any]) -> None:
+        """Take over the weights of another world, between two chunks; episodes under way go on."""
+        self.load_state_dict(weights)
         self.version = version
 
 

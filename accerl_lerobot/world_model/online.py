@@ -24,10 +24,13 @@ import numpy as np
 from accerl_lerobot import errors
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE, WORLD_MODEL
+from accerl_lerobot.checkpoint.tensors import copied
+from accerl_lerobot.errors import expanded
 from accerl_lerobot.experience import REAL, Segment
 from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, open_clock
 from accerl_lerobot.world_model.config import (
+    IMAGINATION,
     WORLD_LEARNING,
     LearnConfig,
     OnlineLearnConfig,
@@ -36,7 +39,7 @@ from accerl_lerobot.world_model.config import (
 )
 from accerl_lerobot.world_model.contract import WorldModelSpec
 from accerl_lerobot.world_model.data import Episode, WindowStart, load_datasets, model_arrays
-from accerl_lerobot.world_model.imagined import LEARN, ImaginedWorld, Tensors, load_world
+from accerl_lerobot.world_model.imagined import LEARN, ImaginedWorld, load_world
 from accerl_lerobot.world_model.learners import Examples, Learner, SuccessLearner
 from accerl_lerobot.world_model.store import LEARNT, load_roles, save_world_model
 
@@ -133,9 +136,7 @@ class OnlineLearner:
         episode = episode_from_segments(parts, self._learner.model.spec)
         self._learnt.append(episode)
         self.roles[episode.key] = LEARNT
-        self._examples = None
-        with contextlib.suppress(ValueError):  # so far there may be only one kind of outcome
-            self._examples = Examples(self._episodes, self._learner.model.spec.chunk)
+        self._take_examples()
         most = MOST_PENDING * self.config.steps_per_episode
         self.pending_steps = min(self.pending_steps + self.config.steps_per_episode, most)
 
@@ -170,8 +171,7 @@ class OnlineLearner:
         self._learnt.extend(state["learnt"])
         self._unfinished.update(state["unfinished"])
         self._seen.update(state["seen"])
-        with contextlib.suppress(ValueError):
-            self._examples = Examples(self._episodes, self._learner.model.spec.chunk)
+        self._take_examples()
 
     def metrics(self) -> dict[str, float]:
         return {"learn_steps": float(self.version), "learn_episodes": float(len(self._learnt))}
@@ -179,6 +179,12 @@ class OnlineLearner:
     @property
     def _episodes(self) -> list[Episode]:
         return [*self._offline, *self._learnt]
+
+    def _take_examples(self) -> None:
+        """Take the success model's examples from all episodes; none while there is one kind of outcome."""
+        self._examples = None
+        with contextlib.suppress(ValueError):
+            self._examples = Examples(self._episodes, self._learner.model.spec.chunk)
 
     def _completed(self, segment: Segment) -> list[Segment] | None:
         """The whole episode, in order, if it is complete with this segment."""
@@ -223,8 +229,7 @@ def make_learner(config: RunConfig) -> OnlineLearner:
     Of ``imagination.learn.dataset`` it is trained on the episodes that were not held out before.
     """
     world, imagination = load_world(config.imagination), config.imagination
-    path = Path(str(imagination.path)).expanduser()
-    roles = load_roles(path)
+    roles = load_roles(expanded(str(imagination.path), f"{IMAGINATION}.path"))
     held_out = {key for key, role in roles.items() if role != LEARNT}
     known = load_datasets({LEARN: imagination.learn.dataset}, world.model.spec).get(LEARN, [])
     known = [episode for episode in known if episode.key not in held_out]
@@ -243,7 +248,7 @@ class OnlineLearningWorker:
 
     consumes    the trainer's batches, of which it takes the real segments
     produces    versions of both models, which the driver hands to the rollout workers
-    waits for   a batch; nobody waits for it
+    waits for   a batch; no other process waits for it
     ends        with the run
     """
 
@@ -261,7 +266,7 @@ class OnlineLearningWorker:
         self._learning = threading.Lock()  # held by the call that makes the steps
         self._inbox: deque[Segment] = deque()
         self._failure: Exception | None = None
-        self._newest = self._learner.version, self._learner.world.tensors()
+        self._newest = self._learner.version, copied(self._learner.world)
         self._clock.enter(WAIT_IN)
 
     def ready(self) -> int:
@@ -290,7 +295,7 @@ class OnlineLearningWorker:
             with self._lock:
                 self._learner.step()
         if self._learner.version > self._newest[0]:
-            self._newest = self._learner.version, self._learner.world.tensors()
+            self._newest = self._learner.version, copied(self._learner.world)
 
     def metrics(self) -> dict[str, float]:
         """Counts; ``version`` is that of `weights`."""
@@ -299,7 +304,7 @@ class OnlineLearningWorker:
             raise self._failure
         return self._learner.metrics() | {"version": float(self._newest[0])}
 
-    def weights(self) -> tuple[int, Tensors]:
+    def weights(self) -> tuple[int, dict[str, Any]]:
         """The newest version and its weights."""
         return self._newest
 

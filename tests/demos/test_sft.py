@@ -29,7 +29,7 @@ from accerl_lerobot.envs import MetaWorldConfig, SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.features import policy_features
-from accerl_lerobot.policies.loading import rehearsed_config
+from accerl_lerobot.policies.loading import dry_run_config
 from tests.policies.checkpoints import edit_config, write_smolvla
 from tests.policies.tiny import adapter_at
 from tests.rounding import assert_close
@@ -126,7 +126,7 @@ def test_what_lerobot_fine_tunes_from_another_robot_s_policy_is_taken_for_what_i
     check_start(run)
     tuned = replace(policy, path=str(run_sft(config, LOCAL, tmp_path / "sft", seed=0)))
     assert len(json.loads((Path(tuned.path) / "config.json").read_text())["input_features"]) == 4
-    needed = policy_features(rehearsed_config(tuned)).shapes
+    needed = policy_features(dry_run_config(tuned)).shapes
     assert {name: len(shape) for name, shape in needed.items()} == {
         "observation.images.camera1": 3, "observation.state": 1, "action": 1,
     }  # fmt: skip

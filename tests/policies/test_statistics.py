@@ -15,7 +15,7 @@ from safetensors.torch import load_file, save_file
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import PolicyConfig
-from accerl_lerobot.policies.loading import load_adapter, rehearsed_config
+from accerl_lerobot.policies.loading import dry_run_config, load_adapter
 from tests.policies.checkpoints import write_act, write_smolvla
 
 Tensors = dict[str, torch.Tensor]
@@ -75,7 +75,7 @@ def without(part: str) -> Callable[[Tensors], Tensors]:
 )  # fmt: skip
 def test_statistics_that_do_not_fit_are_refused(edited: Any, kind: str, change: Any, which: str, why: str):
     config = edited(kind, change, which)
-    for load in (load_adapter, rehearsed_config):
+    for load in (load_adapter, dry_run_config):
         with pytest.raises(InputError, match=rf"policy.path='.*processor.safetensors: ?.*{why}") as caught:
             load(config)
         assert "\n" not in str(caught.value)
@@ -83,9 +83,9 @@ def test_statistics_that_do_not_fit_are_refused(edited: Any, kind: str, change: 
 
 def test_a_policy_that_is_to_be_fine_tuned_gets_new_statistics(edited: Any):
     config = edited("smolvla", under("so100.buffer."), "*normalizer")
-    assert rehearsed_config(config, fine_tuned=True).type == "smolvla"
+    assert dry_run_config(config, fine_tuned=True).type == "smolvla"
     with pytest.raises(InputError, match="sft.init_path"):
-        rehearsed_config(config)
+        dry_run_config(config)
 
 
 def test_pictures_that_were_never_normalised_are_accepted_with_a_warning(edited: Any, caplog: Any):

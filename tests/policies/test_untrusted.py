@@ -20,7 +20,7 @@ from accerl_lerobot.checkpoint.safety import FileSource
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies import loading
 from accerl_lerobot.policies.config import PolicyConfig
-from accerl_lerobot.policies.loading import load_adapter, rehearsed, rehearsed_config
+from accerl_lerobot.policies.loading import dry_run, dry_run_config, load_adapter
 from accerl_lerobot.policies.saving import save_pretrained
 from accerl_lerobot.policies.untrusted import Unfilled, check_checkpoint, guarded
 from tests.hub_cache import cached_repo
@@ -136,17 +136,17 @@ def test_files_that_lerobot_has_not_saved_are_one_line(copied: Path, content: di
     refused(copied, "not a checkpoint that LeRobot has saved")
 
 
-def test_a_checkpoint_is_rehearsed_once_without_a_random_number_or_a_word(
+def test_a_checkpoint_is_tried_once_without_a_random_number_or_a_word(
     good: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     config = PolicyConfig(path=str(good), device="cpu")
     before = torch.get_rng_state()
-    assert rehearsed_config(config).type == "act"
+    assert dry_run_config(config).type == "act"
     assert torch.equal(torch.get_rng_state(), before)
-    rehearsed(config, lambda adapter: sys.stdout.write("a word of LeRobot's"))
+    dry_run(config, lambda adapter: sys.stdout.write("a word of LeRobot's"))
     assert capsys.readouterr().out == ""
-    monkeypatch.setattr(loading, "rehearsed", None)
-    assert rehearsed_config(config).type == "act"
+    monkeypatch.setattr(loading, "dry_run", None)
+    assert dry_run_config(config).type == "act"
 
 
 def test_a_critic_of_another_size(copied: Path):

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from accerl_lerobot.checkpoint import snapshot
+from accerl_lerobot.checkpoint.tensors import copied
 from accerl_lerobot.experience import IMAGINED, Segment
 from accerl_lerobot.world_model import online
 from accerl_lerobot.world_model.config import OnlineLearnConfig, PixelModelConfig
@@ -147,7 +148,7 @@ def test_it_goes_on_from_its_state(tmp_path: Path):
     other.restore(snapshot.load(tmp_path / "learner"))
     assert other.pending_steps == one.pending_steps == 3 and other.version == 1
     assert one.step() == other.step()
-    ours, theirs = one.world.tensors(), other.world.tensors()
+    ours, theirs = copied(one.world), copied(other.world)
     assert all(np.array_equal(ours[name], theirs[name]) for name in ours)
 
 
@@ -157,7 +158,7 @@ def test_what_it_learned_is_taken_over_by_a_world_that_imagines():
         made.add(segment)
     made.step()
     world = learner().world
-    world.load(made.version, made.world.tensors())
+    world.load(made.version, copied(made.world))
     assert world.version == 1
-    taken = world.tensors()
-    assert all(np.array_equal(value, taken[name]) for name, value in made.world.tensors().items())
+    taken = copied(world)
+    assert all(np.array_equal(value, taken[name]) for name, value in copied(made.world).items())
