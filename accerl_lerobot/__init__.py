@@ -17,8 +17,10 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from accerl_lerobot.engine.config import RunConfig
-    from accerl_lerobot.engine.run import (
+    from accerl_lerobot.engines.config import RunConfig
+    from accerl_lerobot.engines.stopping import StoppedError
+    from accerl_lerobot.errors import InputError
+    from accerl_lerobot.run.train import (
         ActingPolicy,
         EvaluationResult,
         TrainResult,
@@ -28,8 +30,6 @@ if TYPE_CHECKING:
         resume,
         train,
     )
-    from accerl_lerobot.engine.stopping import StoppedError
-    from accerl_lerobot.errors import InputError
 
 __version__ = "0.1.0"
 __all__ = [

@@ -170,7 +170,7 @@ def _learning(config: BenchAsyncVsSyncConfig, console: Console) -> dict[str, Any
 
 
 def _success(updates: int, arm: Schedule, seed: int) -> float:
-    from accerl_lerobot.engine.launch import RayEngine
+    from accerl_lerobot.engines.ray_engine import RayEngine
 
     run = LEARNING.run_config(updates=updates, seed=seed)
     run = replace(run, launch=replace(run.launch, schedule=arm))

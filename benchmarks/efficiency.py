@@ -19,7 +19,7 @@ from rich.table import Table
 
 from accerl_lerobot.config.ranges import Pattern, Range, Seed
 from accerl_lerobot.console import Console
-from accerl_lerobot.engine.config import RunConfig, parse
+from accerl_lerobot.engines.config import RunConfig, parse
 from benchmarks.records import as_markdown, mean_interval, write
 from benchmarks.study import (
     INTERVALS,

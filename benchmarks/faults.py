@@ -27,7 +27,7 @@ from rich.table import Table
 from accerl_lerobot.checkpoint.layout import CHECKPOINTS, LAST, PRETRAINED, SUMMARY
 from accerl_lerobot.config.ranges import Range, Repeats, Section, Seed, Steps
 from accerl_lerobot.console import Console
-from accerl_lerobot.engine.config import RunConfig, encode, parse
+from accerl_lerobot.engines.config import RunConfig, encode, parse
 from accerl_lerobot.errors import InputError, check_absent, make_folder
 from accerl_lerobot.evaluation import Rate
 from benchmarks.audit import audit_segments, audit_updates

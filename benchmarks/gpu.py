@@ -22,7 +22,7 @@ from rich.table import Table
 from accerl_lerobot.config.ranges import Device, Range, Repeats, Section
 from accerl_lerobot.console import Console
 from accerl_lerobot.policies.config import TuningConfig
-from accerl_lerobot.trainer.footprint import PolicyMemory
+from benchmarks.footprint import PolicyMemory
 from benchmarks.policy import BenchPolicyConfig, bench_policy
 from benchmarks.records import as_markdown, output_folder, write
 from benchmarks.tables import as_table, host

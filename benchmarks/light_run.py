@@ -14,13 +14,13 @@ import logging
 import os
 import sys
 
-from accerl_lerobot.engine.config import LaunchConfig, RunConfig
+from accerl_lerobot.algorithms.config import TrainerConfig
+from accerl_lerobot.engines.config import LaunchConfig, RunConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.policies.config import Load, PolicyConfig
 from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
-from accerl_lerobot.trainer.config import TrainerConfig
 from benchmarks.simulated_environment import LatencyConfig
 
 BATCH = 16

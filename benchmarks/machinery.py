@@ -15,14 +15,14 @@ from typing import Annotated
 
 import numpy as np
 
+from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.config.ranges import NonNegative, Positive, Range, Section
-from accerl_lerobot.engine.config import LaunchConfig, RunConfig
+from accerl_lerobot.engines.config import LaunchConfig, RunConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.policies.config import Load
 from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
-from accerl_lerobot.trainer.config import TrainerConfig
 from benchmarks.simulated_environment import LatencyConfig, read_trace
 from benchmarks.throughput import Measured
 

@@ -72,7 +72,7 @@ def bench_policy(config: BenchPolicyConfig) -> dict[str, Any]:
     from accerl_lerobot.policies.loading import resolve_device, sizes_of
     from accerl_lerobot.policies.untrusted import Unfilled
     from accerl_lerobot.testing import stored
-    from accerl_lerobot.trainer.footprint import policy_memory
+    from benchmarks.footprint import policy_memory
 
     device = resolve_device("cpu" if config.memory_only else config.device, "device")
     on = torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu"
@@ -157,7 +157,7 @@ def _peak_gb(device: Any) -> float:
 
 
 def table(result: dict[str, Any]) -> Table:
-    from accerl_lerobot.trainer.footprint import PolicyMemory
+    from benchmarks.footprint import PolicyMemory
 
     config, parameters, batch = result["config"], result["parameters"], result["config"]["batch"]
     millions = [f"{parameters[which] / 1e6:,.0f} M" for which in ("all", "trained")]

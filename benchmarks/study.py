@@ -25,10 +25,10 @@ from accerl_lerobot.checkpoint.layout import CHECKPOINTS, CONFIG, DEMOS, LAST, P
 from accerl_lerobot.config.ranges import Range, Section, Seed, Steps
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.record import REPO_ID
-from accerl_lerobot.engine.config import RunConfig, encode, parse
-from accerl_lerobot.engine.resuming import locked
+from accerl_lerobot.engines.config import RunConfig, encode, parse
 from accerl_lerobot.errors import InputError, expanded
 from accerl_lerobot.evaluation import Rate, drawing
+from accerl_lerobot.run.resuming import locked
 from benchmarks.records import mean_interval
 from benchmarks.tables import as_table
 
@@ -198,7 +198,7 @@ class Study:
 
     def run(self, console: Console) -> Results:
         """Does the runs that are missing."""
-        from accerl_lerobot.engine.preflight import check_start
+        from accerl_lerobot.run.preflight import check_start
 
         for seed, start in self.starts.items():
             check_start(replace(start, resume=self.start(seed).exists()))  # what is there is gone on with

@@ -18,8 +18,8 @@ from rich.table import Table
 
 from accerl_lerobot.config.ranges import Positive, Repeats, Section
 from accerl_lerobot.console import Console
-from accerl_lerobot.engine.config import RunConfig, parse
-from accerl_lerobot.engine.loop import Progress
+from accerl_lerobot.engines.config import RunConfig, parse
+from accerl_lerobot.engines.contract import Progress
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import Load
 from accerl_lerobot.replay.pacing import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, Schedule
@@ -51,10 +51,10 @@ class Measured(AbstractContextManager["Measured"]):
     def __init__(
         self, config: RunConfig, tasks: tuple[str, ...], history: int = 1, load: Load | None = None
     ) -> None:
-        from accerl_lerobot.engine import ray_session
+        from accerl_lerobot.engines import ray_session
 
         ray_session.prepare()
-        from accerl_lerobot.engine.launch import RayEngine
+        from accerl_lerobot.engines.ray_engine import RayEngine
 
         self.engine = RayEngine(config, tasks, history, load=load)
         # Each decision is learned from so often: a block has whole rounds of updates.
@@ -137,7 +137,7 @@ class BenchThroughputConfig(Section):
 
 def bench_throughput(config: BenchThroughputConfig) -> dict[str, Any]:
     """Measures all schedules: env steps, decisions and updates per second, and the rest of `Block`."""
-    from accerl_lerobot.engine.preflight import check_environment, check_policy
+    from accerl_lerobot.run.preflight import check_environment, check_policy
 
     console = Console()
     fixed = ["--sft.steps=0", "--trainer.updates=1000000", "--trainer.final_lr_share=1"]

@@ -22,7 +22,7 @@ from rich.table import Table
 
 from accerl_lerobot.config.ranges import Pattern, Range, Repeats, Section, Seed
 from accerl_lerobot.console import Console
-from accerl_lerobot.engine import ray_session
+from accerl_lerobot.engines import ray_session
 from accerl_lerobot.errors import check_absent, make_folder
 from accerl_lerobot.experience import Decision, Request
 from benchmarks.records import as_markdown, write

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import ray
 
-from accerl_lerobot.engine.ray_session import start_ray
+from accerl_lerobot.engines.ray_session import start_ray
 from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.transport.connection import Address, Client, Server
 from benchmarks.transport import RAY, SLOT, decision, request_of

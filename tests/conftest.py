@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 if TYPE_CHECKING:
-    from accerl_lerobot.engine.launch import RayEngine
+    from accerl_lerobot.engines.ray_engine import RayEngine
 
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -22,7 +22,7 @@ EXAMPLE = str(Path(__file__).parents[1] / "docs" / "examples" / "lerobot_policy_
 sys.path.insert(0, EXAMPLE)
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (EXAMPLE, os.environ.get("PYTHONPATH"))))
 
-from accerl_lerobot.engine import ray_session  # noqa: E402
+from accerl_lerobot.engines import ray_session  # noqa: E402
 
 ray_session.prepare()
 
@@ -40,7 +40,7 @@ def light_ray() -> Iterator[None]:
     """Ray for the rest of the test session; engines that find it leave it running."""
     import ray
 
-    from accerl_lerobot.engine.ray_session import start_ray
+    from accerl_lerobot.engines.ray_session import start_ray
 
     if not ray.is_initialized():
         start_ray()
@@ -51,7 +51,7 @@ def light_ray() -> Iterator[None]:
 @pytest.fixture
 def light_engine(light_ray: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., RayEngine]]:
     """Makes asynchronous engines with stand-ins for inference and trainer, and closes them."""
-    from accerl_lerobot.engine import launch
+    from accerl_lerobot.engines import ray as launch
     from accerl_lerobot.inference import worker as inference
     from accerl_lerobot.trainer import worker as trainer
     from tests.light_workers import LightInference, LightTrainer

@@ -16,15 +16,15 @@ from rich.console import Console
 from rich.table import Table
 
 from accerl_lerobot.algorithms import AlgorithmConfig, RatioConfig
-from accerl_lerobot.engine.config import LaunchConfig, RunConfig
-from accerl_lerobot.engine.loop import Engine, Progress
-from accerl_lerobot.engine.run import make_engine
+from accerl_lerobot.algorithms.config import TrainerConfig
+from accerl_lerobot.engines.config import LaunchConfig, RunConfig
+from accerl_lerobot.engines.contract import Engine, Progress
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
-from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.run.train import make_engine
 
 HANGS_S = 240.0
 ALGORITHMS = [

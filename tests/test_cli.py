@@ -22,12 +22,12 @@ from rich.table import Table
 from accerl_lerobot import cli
 from accerl_lerobot.cli import verbs
 from accerl_lerobot.console import Console
-from accerl_lerobot.engine.config import encode
-from accerl_lerobot.engine.stopping import WorkerError
+from accerl_lerobot.engines.config import encode
+from accerl_lerobot.engines.stopping import WorkerError
 from accerl_lerobot.errors import InputError, kept_traceback, last_exception, one_line
 
 if TYPE_CHECKING:
-    from accerl_lerobot.engine.run import Run
+    from accerl_lerobot.run.train import Run
 
 ROOT = Path(__file__).parents[1]
 QUICKSTART = ROOT / "recipes" / "quickstart.yaml"
@@ -192,7 +192,7 @@ class TestTrain:
             counts = {"episodes": 412, "env_steps": 43210, "updates": 9, "wall_s": 279.0}
             return before | after | counts
 
-        monkeypatch.setattr("accerl_lerobot.engine.run.Run.execute", execute)
+        monkeypatch.setattr("accerl_lerobot.run.train.Run.execute", execute)
         assert cli.main([*arguments, "--trainer.lr=1e-5"]) == 0
         out, err = capsys.readouterr()
         policy = tmp_path / "run/checkpoints/last/pretrained_model"
@@ -221,7 +221,7 @@ class TestTrain:
                 (run.directory / "demos").mkdir()
             raise InputError("MUJOCO_GL", "", "install it")
 
-        monkeypatch.setattr("accerl_lerobot.engine.run.Run.execute", execute)
+        monkeypatch.setattr("accerl_lerobot.run.train.Run.execute", execute)
         assert cli.main(arguments) == 2
         assert (tmp_path / "run").exists() is work
 
@@ -295,7 +295,7 @@ def test_a_run_that_cannot_go_on_ends_with_one_line(error, said, tmp_path, monke
     def fails(run: Run) -> None:
         raise error
 
-    monkeypatch.setattr("accerl_lerobot.engine.run.Run.execute", fails)
+    monkeypatch.setattr("accerl_lerobot.run.train.Run.execute", fails)
     recipe, folder = tmp_path / "light.yaml", tmp_path / "run"
     recipe.write_text(yaml.safe_dump(encode(light_config(updates=1))))
     assert verbs.train([f"--config_path={recipe}", f"--output_dir={folder}"], light_policy()) == 1

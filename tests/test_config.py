@@ -17,11 +17,11 @@ from accerl_lerobot.config import parsing
 from accerl_lerobot.config.ranges import Positive, Range, Share
 from accerl_lerobot.demos.backbone import BackboneConfig
 from accerl_lerobot.demos.sft import SFTConfig
-from accerl_lerobot.engine import sizes
-from accerl_lerobot.engine.config import DatasetConfig, RunConfig, decode, encode, parse
-from accerl_lerobot.engine.preflight import check_sft_policy, check_start
+from accerl_lerobot.engines.config import DatasetConfig, RunConfig, decode, encode, parse
 from accerl_lerobot.envs import LeRobotEnvConfig, MetaWorldConfig, SimulatedConfig
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.run import sizes
+from accerl_lerobot.run.preflight import check_sft_policy, check_start
 
 ROOT = Path(__file__).parents[1]
 RECIPE = """

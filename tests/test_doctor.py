@@ -17,11 +17,11 @@ from safetensors import safe_open
 from accerl_lerobot import cli
 from accerl_lerobot.cli import doctor
 from accerl_lerobot.cli.doctor import FAIL, OK, WARN, Check
-from accerl_lerobot.engine import sizes as engine_sizes
-from accerl_lerobot.engine.config import RunConfig, decode
-from accerl_lerobot.engine.sizes import check_memory, memory_parts_gib, observation_bytes, policy_gib
+from accerl_lerobot.engines.config import RunConfig, decode
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.loading import policy_sizes
+from accerl_lerobot.run import sizes as engine_sizes
+from accerl_lerobot.run.sizes import check_memory, memory_parts_gib, observation_bytes, policy_gib
 
 QUICKSTART = Path(__file__).parents[1] / "recipes" / "quickstart.yaml"
 

@@ -23,9 +23,10 @@ from lerobot.configs.policies import PreTrainedConfig
 
 from accerl_lerobot import cli, load_policy
 from accerl_lerobot.algorithms import AlgorithmConfig
+from accerl_lerobot.algorithms.config import TrainerConfig
+from accerl_lerobot.algorithms.ratio_update import make_update
 from accerl_lerobot.config.parsing import parse
-from accerl_lerobot.engine.config import LaunchConfig, RunConfig
-from accerl_lerobot.engine.run import make_engine
+from accerl_lerobot.engines.config import LaunchConfig, RunConfig
 from accerl_lerobot.envs import SimulatedConfig, make_environment
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Observation
@@ -34,13 +35,12 @@ from accerl_lerobot.policies.flow import FlowFamily
 from accerl_lerobot.policies.loading import dry_run_config, load_adapter
 from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
+from accerl_lerobot.run.train import make_engine
 from accerl_lerobot.testing import check_policy
-from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.trainer.update import make_update
 from accerl_lerobot.world_model.config import StateModelConfig
+from tests.algorithms.test_chunk_critic import episode
 from tests.policies.checkpoints import write_policy
 from tests.runs import drive, pip_installed, tiny_run, trained
-from tests.trainer.test_chunk_critic import episode
 
 SOURCE = Path(__file__).parent / "packages" / "lerobot_policy_mlp_flow"
 PACKAGE, POLICY, ALGORITHM = SOURCE.name, "mlp_flow", "cispo"

@@ -18,7 +18,7 @@ import pytest
 from accerl_lerobot.cli.verbs import CONFIGS
 from accerl_lerobot.config import parsing
 from accerl_lerobot.config.lerobot import FLAGS
-from accerl_lerobot.engine.config import RunConfig, parse
+from accerl_lerobot.engines.config import RunConfig, parse
 from accerl_lerobot.errors import InputError
 
 NAME = r"[\w-]+(?:\.[\w-]+)*(?:=[\w.]+)?"

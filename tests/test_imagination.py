@@ -14,19 +14,19 @@ import pytest
 import torch
 
 from accerl_lerobot import cli
+from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE
 from accerl_lerobot.console import Console
-from accerl_lerobot.engine.config import RunConfig
-from accerl_lerobot.engine.local import LocalEngine
-from accerl_lerobot.engine.loop import Progress
-from accerl_lerobot.engine.run import Run
+from accerl_lerobot.engines.config import RunConfig
+from accerl_lerobot.engines.contract import Progress
+from accerl_lerobot.engines.local import LocalEngine
 from accerl_lerobot.envs import SimulatedConfig, make_environment
 from accerl_lerobot.experience import IMAGINED, REAL, Segment
 from accerl_lerobot.rollout.runner import EpisodePlans, RolloutConfig
 from accerl_lerobot.rollout.worker import RolloutWorker
+from accerl_lerobot.run.train import Run
 from accerl_lerobot.timeline.read import read_timeline
-from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.world_model.config import (
     ImaginationConfig,
     OnlineLearnConfig,
@@ -160,7 +160,7 @@ def test_a_run_that_was_left_goes_on_as_if_it_had_not(
 
 @pytest.mark.slow
 def test_it_runs_asynchronously(tiny_checkpoint: Path, world_model: Path, tmp_path: Path):
-    from accerl_lerobot.engine.launch import RayEngine
+    from accerl_lerobot.engines.ray_engine import RayEngine
 
     n = 20
     config = imagining(tiny_checkpoint, world_model, episodes=n)

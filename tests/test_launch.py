@@ -15,14 +15,14 @@ from pathlib import Path
 
 import pytest
 
+from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.checkpoint.layout import PRETRAINED
-from accerl_lerobot.engine.config import RunConfig
-from accerl_lerobot.engine.loop import Progress
+from accerl_lerobot.engines.config import RunConfig
+from accerl_lerobot.engines.contract import Progress
 from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.replay.pacing import ReplayConfig, lag_bound
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
 from accerl_lerobot.timeline.read import read_timeline
-from accerl_lerobot.trainer.config import TrainerConfig
 from benchmarks.simulated_environment import LatencyConfig
 from tests.runs import collect, polls, tiny_run
 from tests.timeline.test_engines import adds_up, gaps
@@ -57,7 +57,7 @@ class Story:
 
 @pytest.fixture(scope="module")
 def story(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Story]:
-    from accerl_lerobot.engine.launch import RayEngine
+    from accerl_lerobot.engines.ray_engine import RayEngine
 
     config = tiny_run(
         tiny_checkpoint,

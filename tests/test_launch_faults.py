@@ -22,19 +22,19 @@ import pytest
 import ray
 
 from accerl_lerobot import errors
-from accerl_lerobot.engine import supervision
-from accerl_lerobot.engine.config import LaunchConfig
-from accerl_lerobot.engine.launch import RayEngine
-from accerl_lerobot.engine.loop import Progress
-from accerl_lerobot.engine.stopping import WorkerError, pause_s
-from accerl_lerobot.engine.supervision import Worker, end_all
+from accerl_lerobot.algorithms.config import TrainerConfig
+from accerl_lerobot.engines import supervision
+from accerl_lerobot.engines.config import LaunchConfig
+from accerl_lerobot.engines.contract import Progress
+from accerl_lerobot.engines.ray_engine import RayEngine
+from accerl_lerobot.engines.stopping import WorkerError, pause_s
+from accerl_lerobot.engines.supervision import Worker, end_all
 from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.inference import worker as inference_worker
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.rollout import worker as rollout_worker
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
-from accerl_lerobot.trainer.config import TrainerConfig
 from benchmarks.simulated_environment import LatencyConfig
 from benchmarks.victims import alive
 from tests.light_workers import FULL, HANGS, NO_WEIGHTS, FalteringRollout, LightInference, WarningRollout

@@ -18,13 +18,13 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import PRETRAINED, STEP, TRAINING_STATE, WEIGHTS
-from accerl_lerobot.engine.config import LaunchConfig, RunConfig
-from accerl_lerobot.engine.launch import RayEngine
-from accerl_lerobot.engine.stopping import WorkerError
+from accerl_lerobot.engines.config import LaunchConfig, RunConfig
+from accerl_lerobot.engines.ray_engine import RayEngine
+from accerl_lerobot.engines.stopping import WorkerError
 from accerl_lerobot.evaluation import evaluation_plans
-from accerl_lerobot.trainer.config import TrainerConfig
 from tests.runs import collect, drive, polls, tiny_run
 from tests.test_ray_session import LOOPBACK, listening
 

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from accerl_lerobot.algorithms import AlgorithmConfig
-from accerl_lerobot.engine.config import RunConfig
-from accerl_lerobot.engine.local import LocalEngine
-from accerl_lerobot.engine.loop import Progress
+from accerl_lerobot.algorithms.config import TrainerConfig
+from accerl_lerobot.engines.config import RunConfig
+from accerl_lerobot.engines.contract import Progress
+from accerl_lerobot.engines.local import LocalEngine
 from accerl_lerobot.evaluation import evaluation_plans
-from accerl_lerobot.trainer.config import TrainerConfig
 from benchmarks.simulated_environment import LatencyConfig
 from tests.runs import ALGORITHMS, collect, drive, tiny_run
 

@@ -17,11 +17,11 @@ import pytest
 from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
 
 from accerl_lerobot.console import Console
-from accerl_lerobot.engine.config import RunConfig, parse
-from accerl_lerobot.engine.loop import Loop
-from accerl_lerobot.engine.run import make_engine
+from accerl_lerobot.engines.config import RunConfig, parse
 from accerl_lerobot.inference.batcher import Batcher
 from accerl_lerobot.metrics import MetricsLog, WandBConfig
+from accerl_lerobot.run.loop import Loop
+from accerl_lerobot.run.train import make_engine
 from accerl_lerobot.timeline import ROLES, STATES
 from accerl_lerobot.world_model.latent import LatentModel
 

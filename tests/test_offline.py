@@ -12,6 +12,7 @@ import pytest
 from lerobot.datasets.dataset_tools import add_features, delete_episodes, remove_feature
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from accerl_lerobot.algorithms import chunk_critic
 from accerl_lerobot.cli import main
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos.episodes import read_labels
@@ -20,7 +21,6 @@ from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.metrics import METRICS
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.loading import load_adapter
-from accerl_lerobot.trainer import chunk_critic
 from accerl_lerobot.world_model.latent import LatentModel
 
 

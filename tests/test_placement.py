@@ -10,16 +10,16 @@ from unittest.mock import MagicMock
 import pytest
 import torch
 
+from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.console import Console
-from accerl_lerobot.engine.config import LaunchConfig, RunConfig
-from accerl_lerobot.engine.launch import InferenceReplica
-from accerl_lerobot.engine.placement import Placement
-from accerl_lerobot.engine.run import Run
+from accerl_lerobot.engines.config import LaunchConfig, RunConfig
+from accerl_lerobot.engines.placement import Placement
+from accerl_lerobot.engines.ray_engine import InferenceReplica
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
-from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.run.train import Run
 from accerl_lerobot.world_model.config import ImaginationConfig
 from tests.runs import tiny_run
 

@@ -19,13 +19,6 @@ from accerl_lerobot import cli
 from accerl_lerobot.algorithms import AWRConfig, GIPOConfig, LossInputs, LossOutput, PPOConfig, RatioConfig
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos.sft import SFTConfig
-from accerl_lerobot.engine.preflight import (
-    _dataset_renames,
-    check_imitates,
-    check_loss,
-    check_sft_policy,
-    check_training_data,
-)
 from accerl_lerobot.envs import SimulatedConfig, make_environment
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import PolicyConfig
@@ -37,6 +30,13 @@ from accerl_lerobot.policies.features import (
     env_features,
     fine_tuned_features,
     policy_features,
+)
+from accerl_lerobot.run.preflight import (
+    _dataset_renames,
+    check_imitates,
+    check_loss,
+    check_sft_policy,
+    check_training_data,
 )
 from tests.policies.checkpoints import write_act, write_diffusion
 from tests.tiny_datasets import IMAGE, write_dataset

@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal
 
 import pytest
 
+from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.cli.verbs import CONFIGS
 from accerl_lerobot.config.parsing import choices_of, section_of
 from accerl_lerobot.config.ranges import (
@@ -29,13 +30,12 @@ from accerl_lerobot.config.ranges import (
 )
 from accerl_lerobot.demos.backbone import BackboneConfig
 from accerl_lerobot.demos.sft import SFTConfig
-from accerl_lerobot.engine.config import LaunchConfig
+from accerl_lerobot.engines.config import LaunchConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.hub.card import PullConfig
 from accerl_lerobot.policies.config import TuningConfig
 from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.timeline.read import TimelineConfig
-from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.world_model.config import PixelModelConfig, WorldModelConfig
 from benchmarks.__main__ import CONFIGS as BENCHMARKS
 from benchmarks.async_vs_sync import BenchAsyncVsSyncConfig

@@ -17,9 +17,9 @@ from unittest.mock import MagicMock
 import psutil
 import pytest
 
-from accerl_lerobot.engine import ray_session
-from accerl_lerobot.engine.config import LaunchConfig
-from accerl_lerobot.engine.stopping import WorkerError
+from accerl_lerobot.engines import ray_session
+from accerl_lerobot.engines.config import LaunchConfig
+from accerl_lerobot.engines.stopping import WorkerError
 from accerl_lerobot.errors import InputError
 
 TOKEN = "RAY_AUTH_TOKEN"
@@ -133,9 +133,9 @@ def test_a_client_without_the_token_is_refused_and_the_token_is_in_no_log(light_
 TOKENS = """
 import json, sys
 from pathlib import Path
-from accerl_lerobot.engine import ray_session
+from accerl_lerobot.engines import ray_session
 ray_session.prepare()
-from accerl_lerobot.engine.launch import RayEngine
+from accerl_lerobot.engines.ray_engine import RayEngine
 from accerl_lerobot.inference import worker as inference
 from accerl_lerobot.trainer import worker as trainer
 from tests.light_workers import LightInference, LightTrainer
@@ -184,8 +184,8 @@ def test_a_client_in_such_a_process_finds_no_token(tmp_path: Path):
 def test_a_ray_that_others_could_talk_to_is_not_started():
     """Ray first, `prepare` after: too late for what Ray reads when it is imported."""
     program = (
-        "import ray\nfrom accerl_lerobot.engine import ray_session\nray_session.prepare()\n"
-        "from accerl_lerobot.engine.ray_session import start_ray\nstart_ray()\n"
+        "import ray\nfrom accerl_lerobot.engines import ray_session\nray_session.prepare()\n"
+        "from accerl_lerobot.engines.ray_session import start_ray\nstart_ray()\n"
     )
     clean = {k: v for k, v in os.environ.items() if not k.startswith("RAY_")}
     done = subprocess.run(

@@ -20,7 +20,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from accerl_lerobot.cli import main
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos.dataset_files import open_metadata, opened
-from accerl_lerobot.engine.config import RunConfig, parse
+from accerl_lerobot.engines.config import RunConfig, parse
 from accerl_lerobot.envs import GymConfig, make_environment
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import PolicyConfig

@@ -18,22 +18,22 @@ import pytest
 import yaml
 
 from accerl_lerobot.algorithms import SelfImitationConfig
+from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.cli import main
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos import sft
 from accerl_lerobot.demos.record import DemosConfig
-from accerl_lerobot.engine import preflight, resuming
-from accerl_lerobot.engine import run as run_module
-from accerl_lerobot.engine.config import LaunchConfig, RunConfig, decode, encode
-from accerl_lerobot.engine.local import LocalEngine
-from accerl_lerobot.engine.resuming import resume_command
+from accerl_lerobot.engines.config import LaunchConfig, RunConfig, decode, encode
+from accerl_lerobot.engines.local import LocalEngine
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.policies.config import GaussianSamplerConfig, PolicyConfig
 from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
-from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.run import preflight, resuming
+from accerl_lerobot.run import train as run_module
+from accerl_lerobot.run.resuming import resume_command
 from tests.runs import tiny_run
 
 UPDATES = 14

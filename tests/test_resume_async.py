@@ -14,15 +14,15 @@ from typing import Any
 
 import pytest
 
+from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE
-from accerl_lerobot.engine.launch import RayEngine
-from accerl_lerobot.engine.loop import Progress
+from accerl_lerobot.engines.contract import Progress
+from accerl_lerobot.engines.ray_engine import RayEngine
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
-from accerl_lerobot.trainer.config import TrainerConfig
 from benchmarks.simulated_environment import LatencyConfig
 from tests.runs import drive, polls, until
 

@@ -12,19 +12,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from accerl_lerobot.algorithms import ChunkCriticConfig, SelfImitationConfig
+from accerl_lerobot.algorithms import ChunkCriticConfig, SelfImitationConfig, chunk_critic
+from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE
-from accerl_lerobot.engine.config import RunConfig
-from accerl_lerobot.engine.local import LocalEngine
-from accerl_lerobot.engine.loop import Progress
-from accerl_lerobot.engine.run import make_engine
+from accerl_lerobot.engines.config import RunConfig
+from accerl_lerobot.engines.contract import Progress
+from accerl_lerobot.engines.local import LocalEngine
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
-from accerl_lerobot.trainer import chunk_critic
-from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.run.train import make_engine
 from accerl_lerobot.world_model.latent import LatentModel
 from tests.runs import drive, tiny_run, until
 

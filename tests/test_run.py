@@ -10,19 +10,21 @@ from typing import Any
 
 import pytest
 
+from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.checkpoint.layout import saved_version
 from accerl_lerobot.console import Console
-from accerl_lerobot.engine import loop, resuming, run
-from accerl_lerobot.engine.config import LaunchConfig, RunConfig
-from accerl_lerobot.engine.loop import Engine, Progress, Saved, run_plans
-from accerl_lerobot.engine.preflight import check_start
-from accerl_lerobot.engine.stopping import WorkerError
+from accerl_lerobot.engines.config import LaunchConfig, RunConfig
+from accerl_lerobot.engines.contract import Engine, Progress, Saved
+from accerl_lerobot.engines.stopping import WorkerError
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import warn_once
 from accerl_lerobot.evaluation import EvaluationConfig, evaluation_plans
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
-from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.run import loop, resuming
+from accerl_lerobot.run import train as run
+from accerl_lerobot.run.loop import run_plans
+from accerl_lerobot.run.preflight import check_start
 from tests.runs import tiny_run
 
 

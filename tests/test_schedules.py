@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from accerl_lerobot.engine import launch
-from accerl_lerobot.engine.config import LaunchConfig, RunConfig
-from accerl_lerobot.engine.loop import Progress
+from accerl_lerobot.algorithms.config import TrainerConfig
+from accerl_lerobot.engines import ray as launch
+from accerl_lerobot.engines.config import LaunchConfig, RunConfig
+from accerl_lerobot.engines.contract import Progress
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.inference import worker as inference_worker
@@ -21,7 +22,6 @@ from accerl_lerobot.inference.batcher import merge_metrics
 from accerl_lerobot.inference.worker import InferenceConfig, InferenceWorker
 from accerl_lerobot.replay.pacing import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, ReplayConfig, Turns
 from accerl_lerobot.rollout.runner import RolloutConfig
-from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.world_model.config import ImaginationConfig
 from benchmarks.simulated_environment import LatencyConfig
 from benchmarks.simulated_policy import SimulatedPolicyConfig, load_simulated
@@ -149,7 +149,7 @@ def drive_counting(engine: Any) -> tuple[list[Progress], Counter[int]]:
 def test_a_run_in_turn(counted: None, schedule: Any):
     """Episodes of one segment each, of all four environments: a batch is exactly what they do in one
     round."""
-    from accerl_lerobot.engine.launch import RayEngine
+    from accerl_lerobot.engines.ray_engine import RayEngine
 
     load = functools.partial(load_simulated, SimulatedPolicyConfig(decide_ms=1.0, update_ms=30.0))
     engine = RayEngine(run_of(schedule), ("match",), load=load)
@@ -177,7 +177,7 @@ def test_a_run_in_turn(counted: None, schedule: Any):
 
 @pytest.mark.slow
 def test_several_services_share_the_worlds_out(counted: None):
-    from accerl_lerobot.engine.launch import RayEngine
+    from accerl_lerobot.engines.ray_engine import RayEngine
 
     run = run_of(SYNCHRONOUS)
     run = replace(

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from accerl_lerobot.engine.config import RunConfig
-from accerl_lerobot.engine.resuming import continued
-from accerl_lerobot.engine.stopping import StoppedError, Stopping, deferred
+from accerl_lerobot.engines.config import RunConfig
+from accerl_lerobot.engines.stopping import StoppedError, Stopping, deferred
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import PolicyConfig, TuningConfig
+from accerl_lerobot.run.resuming import continued
 
 
 def test_a_signal_is_noted_first_and_interrupts_when_it_comes_again():

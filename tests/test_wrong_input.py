@@ -126,7 +126,7 @@ def nothing_is_begun(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 
 def test_wrong_input_is_one_line_and_begins_nothing(nothing_is_begun, tmp_path, monkeypatch, capsys):
     from accerl_lerobot.cli import verbs
-    from accerl_lerobot.engine import preflight
+    from accerl_lerobot.run import preflight
 
     def right(*_: Any, **__: Any) -> None:
         raise StartedWork

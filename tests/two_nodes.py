@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from accerl_lerobot.engine import ray_session
+from accerl_lerobot.engines import ray_session
 
 ray_session.prepare()
 
@@ -26,16 +26,16 @@ import pytest  # noqa: E402
 import ray  # noqa: E402
 from ray.cluster_utils import Cluster  # noqa: E402
 
-from accerl_lerobot.engine import launch  # noqa: E402
-from accerl_lerobot.engine.config import LaunchConfig  # noqa: E402
-from accerl_lerobot.engine.launch import RayEngine  # noqa: E402
-from accerl_lerobot.engine.stopping import WorkerError  # noqa: E402
+from accerl_lerobot.algorithms.config import TrainerConfig  # noqa: E402
+from accerl_lerobot.engines import ray_engine  # noqa: E402
+from accerl_lerobot.engines.config import LaunchConfig  # noqa: E402
+from accerl_lerobot.engines.ray_engine import RayEngine  # noqa: E402
+from accerl_lerobot.engines.stopping import WorkerError  # noqa: E402
 from accerl_lerobot.errors import InputError  # noqa: E402
 from accerl_lerobot.evaluation import evaluation_plans  # noqa: E402
 from accerl_lerobot.inference import worker as inference_worker  # noqa: E402
 from accerl_lerobot.rollout.runner import RolloutConfig  # noqa: E402
 from accerl_lerobot.trainer import worker as trainer_worker  # noqa: E402
-from accerl_lerobot.trainer.config import TrainerConfig  # noqa: E402
 from benchmarks.simulated_environment import LatencyConfig  # noqa: E402
 from tests.light_workers import LightInference, LightTrainer  # noqa: E402
 from tests.runs import collect, drive, polls, tiny_run, until  # noqa: E402
@@ -162,7 +162,7 @@ def main() -> None:
         seconds[name] = round(time.monotonic() - began - sum(seconds.values()), 1)
 
     monkeypatch = pytest.MonkeyPatch()
-    monkeypatch.setattr(launch, "POLL_S", 0.1)
+    monkeypatch.setattr(ray_engine, "POLL_S", 0.1)
     monkeypatch.setattr(inference_worker, "InferenceWorker", LightInference)
     monkeypatch.setattr(trainer_worker, "TrainerWorker", LightTrainer)
     with two_nodes() as (made, second):

@@ -3,7 +3,7 @@
 
 To add one, register a config under `AlgorithmConfig`: a `RatioConfig` with a `loss` that ends in
 `objective.assemble`, as GIPO's does, or an `OffPolicyConfig` whose `update` names a subclass of
-`trainer.off_policy.OffPolicyUpdate`. In this package, import it below; in a package of your own, name that by
+`off_policy.OffPolicyUpdate`. In this package, import it below; in a package of your own, name that by
 ``--algorithm.discover_packages_path``. No file that this package imports pulls in torch, so a run can be
 parsed before torch is loaded.
 """

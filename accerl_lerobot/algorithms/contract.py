@@ -25,7 +25,7 @@ class AlgorithmConfig(Section, draccus.ChoiceRegistry, section="algorithm"):
 
     update: ClassVar[str]
     """``module:class`` of the trainer's updates, made from adapter, algorithm and `TrainerConfig`: a
-    `trainer.update.RatioUpdate`, which is given the ranks too, or `trainer.off_policy.OffPolicyUpdate`."""
+    `ratio_update.RatioUpdate`, which is given the ranks too, or `off_policy.OffPolicyUpdate`."""
 
     discover_packages_path: str | None = field(default=None, metadata={"registers": True})
     """Package to import that registers ``algorithm.type``, where that is not one of ours."""
@@ -39,7 +39,7 @@ class AlgorithmConfig(Section, draccus.ChoiceRegistry, section="algorithm"):
 class OffPolicyConfig(AlgorithmConfig):
     """Base of the algorithms that learn from a memory of all episodes and need no likelihood."""
 
-    update = "accerl_lerobot.trainer.off_policy:OffPolicyUpdate"
+    update = "accerl_lerobot.algorithms.off_policy:OffPolicyUpdate"
 
     policy_steps: NonNegative = 0.5
     """Gradient steps of the policy for each new decision, after ``trainer.value_warmup_updates``."""
@@ -68,7 +68,7 @@ class AWRConfig(OffPolicyConfig):
     late. In place of −log π stands the loss that LeRobot trains the policy with.
     """
 
-    update = "accerl_lerobot.trainer.off_policy:AWRUpdate"
+    update = "accerl_lerobot.algorithms.off_policy:AWRUpdate"
 
     beta: Annotated[float, Range("(0, inf]")] = 1.0
     """Temperature in standard deviations of the advantage; ``inf`` weighs all decisions alike."""
@@ -90,7 +90,7 @@ class ChunkCriticConfig(OffPolicyConfig):
     RLPD (2302.02948), Q-chunking (2507.07969).
     """
 
-    update = "accerl_lerobot.trainer.chunk_critic:ChunkCriticUpdate"
+    update = "accerl_lerobot.algorithms.chunk_critic:ChunkCriticUpdate"
 
     gamma: Share = 0.98
     """Discount per decision."""

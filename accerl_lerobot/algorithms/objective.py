@@ -179,7 +179,7 @@ def assemble(
 class RatioConfig(AlgorithmConfig):
     """Base of the objectives that weight decisions by their likelihood under new and old weights."""
 
-    update = "accerl_lerobot.trainer.update:RatioUpdate"
+    update = "accerl_lerobot.algorithms.ratio_update:RatioUpdate"
 
     lam: Share = 0.95
     """λ of GAE per decision: 0 trusts the critic, 1 the observed rewards."""

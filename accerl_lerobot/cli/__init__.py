@@ -13,7 +13,7 @@ import textwrap
 from collections.abc import Callable, Iterator
 
 from accerl_lerobot import __version__
-from accerl_lerobot.engine.stopping import TerminatedError, interrupted
+from accerl_lerobot.engines.stopping import TerminatedError, interrupted
 from accerl_lerobot.errors import InputError, Once, one_line, printable
 
 LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR")

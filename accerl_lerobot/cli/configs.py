@@ -6,10 +6,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from accerl_lerobot.algorithms import AlgorithmConfig, AWRConfig, ChunkCriticConfig, OffPolicyConfig
+from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.config.ranges import Device, NewFolder, Section, Seed
 from accerl_lerobot.demos.record import DemosConfig
 from accerl_lerobot.demos.sft import SFTConfig
-from accerl_lerobot.engine.config import DatasetConfig, LaunchConfig, no_use_for_states
+from accerl_lerobot.engines.config import DatasetConfig, LaunchConfig, no_use_for_states
 from accerl_lerobot.envs import EnvConfig, MetaWorldConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import EvaluationConfig
@@ -17,7 +18,6 @@ from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.metrics import WandBConfig
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
-from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.world_model.config import StateModelConfig, ValidationConfig, WorldModelConfig
 
 NO_DATASET = "name a LeRobotDataset, on the Hub or with dataset.root"

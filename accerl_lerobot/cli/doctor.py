@@ -20,12 +20,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from accerl_lerobot.checkpoint.safety import brief
 from accerl_lerobot.config.machine import GIB, memory_gib
-from accerl_lerobot.engine import sizes
-from accerl_lerobot.engine.config import lag_limits
+from accerl_lerobot.engines.config import lag_limits
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.run import sizes
 
 if TYPE_CHECKING:
-    from accerl_lerobot.engine.config import RunConfig
+    from accerl_lerobot.engines.config import RunConfig
 
 OK, WARN, FAIL = "ok", "warn", "FAIL"
 DISK_GIB = 2.0  # space that demonstrations, checkpoints and videos of a run may need
@@ -81,8 +81,8 @@ def main(arguments: list[str]) -> int:
 
 def _resolve(arguments: list[str]) -> tuple[RunConfig, int]:
     """The config of a command line, and its policy's ``n_obs_steps``."""
-    from accerl_lerobot.engine.config import RunConfig, parse
-    from accerl_lerobot.engine.preflight import check_start
+    from accerl_lerobot.engines.config import RunConfig, parse
+    from accerl_lerobot.run.preflight import check_start
 
     config: RunConfig = parse(RunConfig, arguments)
     _, history = check_start(config)
@@ -127,7 +127,7 @@ def packages() -> Check:
 
 def libraries(config: RunConfig | None) -> Iterator[Check]:
     """Ray, with the environment a run would give it, torch, and the GPUs that it sees."""
-    from accerl_lerobot.engine import ray_session
+    from accerl_lerobot.engines import ray_session
 
     try:
         ray_session.prepare(joins=config is not None and config.launch.address is not None)
@@ -240,7 +240,7 @@ def imagination(config: RunConfig) -> Iterator[Check]:
 
 def placement(config: RunConfig) -> Iterator[Check]:
     """Where each worker would run; the cluster is asked if one is to be joined."""
-    from accerl_lerobot.engine.placement import check_placement
+    from accerl_lerobot.engines.placement import check_placement
 
     return (Check("placement", OK, row) for row in check_placement(config))
 

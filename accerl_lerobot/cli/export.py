@@ -25,7 +25,7 @@ from accerl_lerobot.config.parsing import decode, parse, read_arguments, read_re
 from accerl_lerobot.config.ranges import DatasetName, NewFolder, Section
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos import record
-from accerl_lerobot.engine.config import RunConfig
+from accerl_lerobot.engines.config import RunConfig
 from accerl_lerobot.envs import EnvConfig, MetaWorldConfig, make_environment
 from accerl_lerobot.errors import InputError, expanded
 from accerl_lerobot.replay.journal import EPISODES, JournalEntry, read_journal, whole_episodes

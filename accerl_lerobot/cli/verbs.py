@@ -31,7 +31,7 @@ from accerl_lerobot.cli.configs import (
 from accerl_lerobot.cli.export import ExportConfig, export_config, export_episodes
 from accerl_lerobot.config.parsing import read_arguments
 from accerl_lerobot.console import Console, count, duration, number, rate
-from accerl_lerobot.engine.config import RunConfig, encode, parse
+from accerl_lerobot.engines.config import RunConfig, encode, parse
 from accerl_lerobot.errors import InputError, check_absent, expanded, is_full, kept_traceback, make_folder
 from accerl_lerobot.hub.card import PullConfig, PushConfig
 from accerl_lerobot.metrics import plain
@@ -49,8 +49,8 @@ OUTCOME = (
 def train(arguments: list[str], load: Load | None = None) -> int:
     """``accerl train``; `load` makes the policy's adapter, of LeRobot's checkpoint by default."""
     config: RunConfig = parse(RunConfig, arguments)
-    from accerl_lerobot.engine import run
-    from accerl_lerobot.engine.stopping import StoppedError, WorkerError
+    from accerl_lerobot.engines.stopping import StoppedError, WorkerError
+    from accerl_lerobot.run import train as run
 
     console = Console()
     try:
@@ -74,7 +74,7 @@ def demos(arguments: list[str]) -> int:
     config: DemosRun = parse(DemosRun, arguments, recipe_class=RunConfig)
     from accerl_lerobot.config.machine import check_disk
     from accerl_lerobot.demos.record import record_demos
-    from accerl_lerobot.engine.preflight import check_environment
+    from accerl_lerobot.run.preflight import check_environment
 
     with redirect_stdout(sys.stderr):
         check_disk(config.root, "root")
@@ -92,9 +92,9 @@ def sft(arguments: list[str]) -> int:
     if config.sft.steps == 0:
         raise InputError("sft.steps", 0, "use at least 1")
     from accerl_lerobot.config.machine import check_disk
-    from accerl_lerobot.engine.preflight import check_environment, check_training_data, sft_policy
-    from accerl_lerobot.engine.run import fine_tune, make_output_dir
     from accerl_lerobot.policies.loading import resolve_device
+    from accerl_lerobot.run.preflight import check_environment, check_training_data, sft_policy
+    from accerl_lerobot.run.train import fine_tune, make_output_dir
 
     device = str(resolve_device(config.device, "device"))
     policy = sft_policy(config.sft)
@@ -111,7 +111,7 @@ def sft(arguments: list[str]) -> int:
 def offline(arguments: list[str]) -> int:
     """``accerl offline``."""
     config: OfflineRun = parse(OfflineRun, arguments, recipe_class=RunConfig)
-    from accerl_lerobot.engine.offline import learn_offline
+    from accerl_lerobot.run.offline import learn_offline
 
     summary, directory, console = _in_new_folder(config, lambda *place: learn_offline(config, *place))
     losses = {
@@ -138,7 +138,7 @@ def _in_new_folder[Result](
     config: Any, work: Callable[[Path, Console], Result]
 ) -> tuple[Result, Path, Console]:
     """Does work in the folder that a config names, which goes if the input turns out to be bad."""
-    from accerl_lerobot.engine.run import discard_unused, make_output_dir
+    from accerl_lerobot.run.train import discard_unused, make_output_dir
 
     directory, console = make_output_dir(config), Console()
     console.say(f"run {directory}")
@@ -157,8 +157,8 @@ def evaluate(arguments: list[str]) -> int:
     out = expanded(config.output_dir, "output_dir") if config.output_dir else None
     if out is not None:
         check_absent(out)
-    from accerl_lerobot.engine import run
     from accerl_lerobot.evaluation import summarise, table, write_video
+    from accerl_lerobot.run import train as run
 
     sections = ("seed", "env", "policy", "rollout", "inference", "evaluation", "launch")
     whole = RunConfig(**{name: getattr(config, name) for name in sections})

@@ -2,7 +2,7 @@
 """The interface of a policy to the engine, π(chunk | observation) and V(observation), and LeRobot's adapter.
 
 `decide` acts, `evaluate` re-scores what was stored; both use one `encode` and one `Family`, so at equal
-weights the ratio is 1 up to rounding. `trainer.probe` measures that in a run; `self_check` compares with
+weights the ratio is 1 up to rounding. `algorithms.probe` measures that in a run; `self_check` compares with
 LeRobot.
 """
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A teacher that acts in part of the exploring episodes, on the states of a world model.
 
-It is learnt off-policy by `trainer.chunk_critic`, imitated by the policy, and never part of a checkpoint that
-LeRobot loads. `world_model.states` has the interface of the model.
+It is learnt off-policy by `algorithms.chunk_critic`, imitated by the policy, and never part of a
+checkpoint that LeRobot loads. `world_model.states` has the interface of the model.
 
 Shapes: M networks side by side, B rows, S numbers of a state, K actions of A dims.
 """

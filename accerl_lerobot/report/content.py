@@ -13,7 +13,7 @@ from accerl_lerobot.checkpoint.layout import CHECKPOINTS, CONFIG, LAST, PRETRAIN
 from accerl_lerobot.config.help import shown
 from accerl_lerobot.config.parsing import decode
 from accerl_lerobot.console import ABSENT, count, duration, number, percent, rate
-from accerl_lerobot.engine.config import RunConfig, lag_limits
+from accerl_lerobot.engines.config import RunConfig, lag_limits
 from accerl_lerobot.errors import ERROR_LOG, InputError, reading
 from accerl_lerobot.hub.card import lerobot_eval_command, read_json
 from accerl_lerobot.report.charts import Chart, Series, line

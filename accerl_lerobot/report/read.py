@@ -21,7 +21,7 @@ from accerl_lerobot.checkpoint.layout import CONFIG, SUMMARY
 from accerl_lerobot.checkpoint.safety import FileSource, check_folder, read_json
 from accerl_lerobot.config.parsing import encode, read_recipe
 from accerl_lerobot.console import ABSENT
-from accerl_lerobot.engine.config import RunConfig
+from accerl_lerobot.engines.config import RunConfig
 from accerl_lerobot.errors import ERROR_LOG, InputError
 from accerl_lerobot.metrics import METRICS
 

@@ -20,16 +20,16 @@ import ray
 
 from accerl_lerobot import errors
 from accerl_lerobot.algorithms import AlgorithmConfig
+from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import WEIGHTS
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.policies.config import Load, PolicyConfig, loader
-from accerl_lerobot.trainer.config import TrainerConfig
 
 if TYPE_CHECKING:
-    from accerl_lerobot.trainer.ranks import Ranks, Rendezvous
-    from accerl_lerobot.trainer.update import BaseUpdate
+    from accerl_lerobot.algorithms.ranks import Ranks, Rendezvous
+    from accerl_lerobot.algorithms.ratio_update import BaseUpdate
 
 LOAD_S = 600.0  # how long a rank may take to load its policy
 SHARE = 0.4
@@ -56,7 +56,7 @@ class LearnerSettings(NamedTuple):
 
     def begin(self, adapter: Any, ranks: Ranks) -> BaseUpdate:
         """The updates, from the state on; what ranks share out is shared out then."""
-        from accerl_lerobot.trainer.update import make_update
+        from accerl_lerobot.algorithms.ratio_update import make_update
 
         update = make_update(adapter, self.algorithm, self.trainer, ranks)
         if self.state is not None:
@@ -84,7 +84,7 @@ class TrainerRank:
         return {}
 
     def join(self, rendezvous: Rendezvous) -> None:
-        from accerl_lerobot.trainer import ranks
+        from accerl_lerobot.algorithms import ranks
 
         size, timeout_s = self._settings.trainer.ranks, self._settings.timeout_s
         here = rendezvous.address == ranks.LOOPBACK
@@ -122,7 +122,7 @@ class Peers:
 
     def begin(self, settings: LearnerSettings) -> BaseUpdate:
         """Loads the first rank's policy and meets the others, once they have loaded theirs."""
-        from accerl_lerobot.trainer import ranks
+        from accerl_lerobot.algorithms import ranks
 
         adapter = settings.adapter()
         if not self._actors:

@@ -20,12 +20,12 @@ from typing import Any
 import ray
 
 from accerl_lerobot import errors
+from accerl_lerobot.algorithms.batch import save_batch_if_not_finite
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import PRETRAINED, TRAINING_STATE, WEIGHTS
 from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.replay.pacing import ASYNCHRONOUS, Schedule
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
-from accerl_lerobot.trainer.batch import save_batch_if_not_finite
 from accerl_lerobot.trainer.peers import LearnerSettings, Peers
 from accerl_lerobot.transport.weights import PublishDelay, WeightPublisher
 
@@ -54,7 +54,7 @@ class TrainerWorker:
         self._peers = Peers(peers, self._config, settings.timeout_s)
         self._update = self._peers.begin(settings)
         if world_model is not None:
-            from accerl_lerobot.trainer.chunk_critic import ChunkCriticUpdate
+            from accerl_lerobot.algorithms.chunk_critic import ChunkCriticUpdate
 
             assert isinstance(self._update, ChunkCriticUpdate)
             self._update.learn_states_in(world_model, settings.timeout_s)

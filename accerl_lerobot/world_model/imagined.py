@@ -38,7 +38,7 @@ from accerl_lerobot.world_model.store import check_predicts, load_failed, load_w
 from accerl_lerobot.world_model.success_model import SuccessPairsRewardModel
 
 if TYPE_CHECKING:
-    from accerl_lerobot.engine.config import RunConfig
+    from accerl_lerobot.engines.config import RunConfig
 
 logger = logging.getLogger(__name__)
 
@@ -181,7 +181,7 @@ def check_imagination(config: RunConfig) -> None:
 
     It warns of one that is used as it is and has failed its validation.
     """
-    from accerl_lerobot.engine.preflight import policy_to_be
+    from accerl_lerobot.run.preflight import policy_to_be
 
     policy, imagination = policy_to_be(config), config.imagination
     if (reward := getattr(config.env, "reward", "success")) != "success":

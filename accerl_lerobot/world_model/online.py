@@ -44,7 +44,7 @@ from accerl_lerobot.world_model.learners import Examples, Learner, SuccessLearne
 from accerl_lerobot.world_model.store import LEARNT, load_roles, save_world_model
 
 if TYPE_CHECKING:
-    from accerl_lerobot.engine.config import RunConfig
+    from accerl_lerobot.engines.config import RunConfig
 
 BATCH, LEARNING_RATE = 16, 3e-4  # windows per gradient step, and the learning rate after the first steps
 OFFLINE, RECENT, FAILURES = 0.5, 0.7, 0.6

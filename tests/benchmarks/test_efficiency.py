@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import yaml
 
-from accerl_lerobot.engine.config import RunConfig, encode, parse
+from accerl_lerobot.engines.config import RunConfig, encode, parse
 from accerl_lerobot.evaluation import Rate
 from benchmarks import efficiency as bench
 from benchmarks.efficiency import BenchEfficiencyConfig, cells

@@ -12,7 +12,7 @@ import yaml
 
 from accerl_lerobot.cli import main
 from accerl_lerobot.demos.dataset_files import open_metadata
-from accerl_lerobot.engine.config import DatasetConfig, LaunchConfig, RunConfig, encode, parse
+from accerl_lerobot.engines.config import DatasetConfig, LaunchConfig, RunConfig, encode, parse
 from accerl_lerobot.envs import SimulatedConfig, make_environment
 from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.policies.features import check_features, dataset_features, env_features

@@ -23,13 +23,13 @@ from accerl_lerobot.demos import guarded_train, sft
 from accerl_lerobot.demos.backbone import BackboneConfig
 from accerl_lerobot.demos.record import DemosConfig, record_demos
 from accerl_lerobot.demos.sft import ANSWER, SFTConfig, picked, run_sft, sft_command
-from accerl_lerobot.engine.config import RunConfig
-from accerl_lerobot.engine.preflight import check_start
+from accerl_lerobot.engines.config import RunConfig
 from accerl_lerobot.envs import MetaWorldConfig, SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.features import policy_features
 from accerl_lerobot.policies.loading import dry_run_config
+from accerl_lerobot.run.preflight import check_start
 from tests.policies.checkpoints import edit_config, write_smolvla
 from tests.policies.tiny import adapter_at
 from tests.rounding import assert_close

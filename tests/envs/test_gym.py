@@ -19,11 +19,11 @@ import pytest
 from gymnasium import spaces
 
 from accerl_lerobot.config.parsing import parse
-from accerl_lerobot.engine.config import LaunchConfig, RunConfig
-from accerl_lerobot.engine.preflight import check_environment
+from accerl_lerobot.engines.config import LaunchConfig, RunConfig
 from accerl_lerobot.envs import GymConfig, graphics, make_environment
 from accerl_lerobot.envs.gym_env import GymEnvironment
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.run.preflight import check_environment
 from tests.runs import pip_installed, replacing, tiny_run, trained
 
 PACKAGE = Path(__file__).parents[1] / "packages" / "lerobot_env_reach"

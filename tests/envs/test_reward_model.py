@@ -19,13 +19,13 @@ from lerobot.rewards.classifier.modeling_classifier import Classifier
 from safetensors.torch import load_file, save_file
 from transformers import ResNetConfig, ResNetModel
 
-from accerl_lerobot.engine.config import LaunchConfig
-from accerl_lerobot.engine.preflight import check_environment, check_start
-from accerl_lerobot.engine.run import make_engine
+from accerl_lerobot.engines.config import LaunchConfig
 from accerl_lerobot.envs import JudgedEnvironment, RewardModelConfig, SimulatedConfig, make_environment
 from accerl_lerobot.envs.reward_model import load_judge
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.rollout.runner import RolloutConfig
+from accerl_lerobot.run.preflight import check_environment, check_start
+from accerl_lerobot.run.train import make_engine
 from tests.policies.checkpoints import write_smolvla
 from tests.runs import collect, tiny_run
 

@@ -11,7 +11,7 @@ import yaml
 from huggingface_hub import ModelCard
 
 from accerl_lerobot.cli.verbs import CONFIGS
-from accerl_lerobot.engine.config import RunConfig, parse
+from accerl_lerobot.engines.config import RunConfig, parse
 from accerl_lerobot.hub.card import MARK, PushConfig
 from accerl_lerobot.hub.push import stage
 from accerl_lerobot.policies.config import PLUGINS

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
+from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.console import Console
-from accerl_lerobot.engine import run
-from accerl_lerobot.engine.config import LaunchConfig, RunConfig
+from accerl_lerobot.engines.config import LaunchConfig, RunConfig
 from accerl_lerobot.envs import SimulatedConfig, make_environment
 from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.experience import TASK, Request, stack_observations
@@ -19,7 +19,7 @@ from accerl_lerobot.policies.config import DiffusionSamplerConfig, PolicyConfig
 from accerl_lerobot.policies.family import Family
 from accerl_lerobot.rollout.runner import EpisodePlans, RolloutConfig
 from accerl_lerobot.rollout.worker import RolloutWorker
-from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.run import train as run
 from tests.policies.checkpoints import write_diffusion
 from tests.policies.tiny import adapter_at, requests
 from tests.rounding import assert_close

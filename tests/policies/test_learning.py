@@ -17,8 +17,9 @@ import pytest
 import torch
 
 from accerl_lerobot.algorithms import GIPOConfig
-from accerl_lerobot.engine.local import LocalEngine
-from accerl_lerobot.engine.loop import Engine
+from accerl_lerobot.algorithms.config import TrainerConfig
+from accerl_lerobot.engines.contract import Engine
+from accerl_lerobot.engines.local import LocalEngine
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.policies.config import (
@@ -32,7 +33,6 @@ from accerl_lerobot.policies.config import (
 from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.testing import TOLERANCE
-from accerl_lerobot.trainer.config import TrainerConfig
 from tests.policies.checkpoints import write_act, write_bins, write_diffusion, write_smolvla
 from tests.policies.tiny_pi import write_pi
 from tests.runs import collect, drive, tiny_run

@@ -21,14 +21,14 @@ from safetensors.torch import load_file, save_file
 from accerl_lerobot import load_policy
 from accerl_lerobot.checkpoint.layout import BACKBONE, FAST, PRETRAINED, displaced, relocate, save_checkpoint
 from accerl_lerobot.demos.sft import SFTConfig
-from accerl_lerobot.engine.config import RunConfig, parse
-from accerl_lerobot.engine.preflight import sft_policy
+from accerl_lerobot.engines.config import RunConfig, parse
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE, stack_observations
 from accerl_lerobot.policies.config import FlowSamplerConfig, PolicyConfig, SamplerConfig
 from accerl_lerobot.policies.loading import load_adapter, load_lerobot_config, precision_on, resolve_device
 from accerl_lerobot.policies.saving import save_pretrained
 from accerl_lerobot.policies.untrusted import MIGRATION
+from accerl_lerobot.run.preflight import sft_policy
 from accerl_lerobot.testing import perturb
 from tests.hub_cache import cached_repo
 from tests.policies.cases import CASES

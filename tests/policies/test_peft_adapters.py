@@ -14,13 +14,13 @@ from safetensors.torch import load_file, save_file
 
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos.sft import SFTConfig, sft_command
-from accerl_lerobot.engine.preflight import sft_policy
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import stack_observations
 from accerl_lerobot.policies import peft_adapters
 from accerl_lerobot.policies.config import PolicyConfig, TuningConfig
 from accerl_lerobot.policies.loading import load_adapter, policy_sizes
 from accerl_lerobot.policies.saving import save_pretrained
+from accerl_lerobot.run.preflight import sft_policy
 from tests.policies.checkpoints import edit_config, write_smolvla
 from tests.policies.tiny import requests
 

@@ -20,10 +20,10 @@ from accerl_lerobot.checkpoint.layout import BACKBONE, PRETRAINED
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos.backbone import BackboneConfig
 from accerl_lerobot.demos.sft import SFTConfig, run_sft, sft_command
-from accerl_lerobot.engine.preflight import check_sft_policy
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import PLUGINS, PolicyConfig, discovery
 from accerl_lerobot.policies.saving import save_pretrained
+from accerl_lerobot.run.preflight import check_sft_policy
 from tests.policies.checkpoints import write_bins
 from tests.policies.tiny import adapter_at, requests
 from tests.rounding import assert_close

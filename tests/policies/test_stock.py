@@ -18,13 +18,13 @@ from lerobot.configs.policies import PreTrainedConfig
 from safetensors.torch import save_file
 
 from accerl_lerobot import cli, load_policy
+from accerl_lerobot.algorithms import chunk_critic
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Request, stack_observations
 from accerl_lerobot.policies.config import ChunkNoiseConfig, PolicyConfig
 from accerl_lerobot.policies.loading import load_acting, load_adapter
 from accerl_lerobot.policies.stock import StockAdapter
 from accerl_lerobot.seeds import noise_seed
-from accerl_lerobot.trainer import chunk_critic
 from tests.policies.checkpoints import write_act, write_diffusion, write_policy, write_smolvla
 from tests.policies.tiny import requests
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from accerl_lerobot.engine.config import lag_limits
+from accerl_lerobot.engines.config import lag_limits
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.replay.buffer import Replay
 from accerl_lerobot.replay.pacing import ReplayConfig, draws_for, lag_bound

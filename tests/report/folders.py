@@ -12,10 +12,10 @@ from typing import Any
 import yaml
 
 from accerl_lerobot.algorithms import PPOConfig
-from accerl_lerobot.engine.config import RunConfig, encode
+from accerl_lerobot.algorithms.config import TrainerConfig
+from accerl_lerobot.engines.config import RunConfig, encode
 from accerl_lerobot.envs import MetaWorldConfig, SimulatedConfig
 from accerl_lerobot.evaluation import Rate
-from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.world_model.config import ImaginationConfig
 
 EPISODES = 100

@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 
 from accerl_lerobot.console import Console
-from accerl_lerobot.engine import run
-from accerl_lerobot.engine.config import LaunchConfig
+from accerl_lerobot.engines.config import LaunchConfig
 from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.report import ReportConfig, write_report
 from accerl_lerobot.report.charts import Chart
 from accerl_lerobot.report.content import evaluated, exploring
 from accerl_lerobot.report.read import read_run
+from accerl_lerobot.run import train as run
 from accerl_lerobot.timeline import COMPUTE, RECOVERY, TRAINING, WAIT_IN
 from tests.report.folders import HOSTILE, imagined, imagining, metaworld, ppo, write_run
 from tests.report.html import Seen

@@ -14,7 +14,7 @@ from accerl_lerobot.config.parsing import read_recipe
 from accerl_lerobot.demos.backbone import BackboneConfig
 from accerl_lerobot.demos.record import DemosConfig
 from accerl_lerobot.demos.sft import SFTConfig
-from accerl_lerobot.engine.config import DatasetConfig, RunConfig, encode, parse
+from accerl_lerobot.engines.config import DatasetConfig, RunConfig, encode, parse
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.report.read import changed_fields, differences, flat
 from tests.report.folders import run_config

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from accerl_lerobot.engine.config import LaunchConfig
-from accerl_lerobot.engine.local import LocalEngine
+from accerl_lerobot.engines.config import LaunchConfig
+from accerl_lerobot.engines.local import LocalEngine
 from accerl_lerobot.timeline.read import Row, Timeline, read_timeline
 from tests.runs import drive, tiny_run
 

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import ray
 
-from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.trainer.peers import Peers
 
 THREE = TrainerConfig(ranks=3)
@@ -86,7 +86,7 @@ def test_an_error_of_the_first_is_its_own(peers: Callable[[str, str], Peers]):
 
 
 def test_ranks_talk_over_the_interface_that_has_the_address(monkeypatch: pytest.MonkeyPatch):
-    from accerl_lerobot.trainer import ranks as rendezvous
+    from accerl_lerobot.algorithms import ranks as rendezvous
 
     for name in ("GLOO_SOCKET_IFNAME", "NCCL_SOCKET_IFNAME"):
         monkeypatch.setenv(name, "")

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from accerl_lerobot.algorithms import GIPOConfig
+from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import PRETRAINED, TRAINING_STATE
 from accerl_lerobot.errors import NonFiniteError
@@ -20,11 +21,10 @@ from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies import loading
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.trainer import worker as module
-from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.peers import LearnerSettings
 from accerl_lerobot.trainer.worker import TrainerWorker
 from accerl_lerobot.transport.weights import WeightPublisher
-from tests.trainer.linear import LinearAdapter, make_segments
+from tests.algorithms.linear import LinearAdapter, make_segments
 
 
 def copied(tensors: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

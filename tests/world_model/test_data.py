@@ -14,7 +14,7 @@ from lerobot.datasets.dataset_tools import merge_datasets
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from accerl_lerobot.demos.record import DemosConfig, record_demos
-from accerl_lerobot.engine.config import DatasetConfig
+from accerl_lerobot.engines.config import DatasetConfig
 from accerl_lerobot.envs import SimulatedConfig, make_environment
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.contract import WorldModelSpec

@@ -17,7 +17,7 @@ from safetensors.torch import load_file, save_file
 from accerl_lerobot import cli
 from accerl_lerobot.cli.configs import WorldModelEvalRun, WorldModelRun
 from accerl_lerobot.demos.record import DemosConfig, record_demos
-from accerl_lerobot.engine.config import DatasetConfig
+from accerl_lerobot.engines.config import DatasetConfig
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model import learners, pixels, pretrain, validation

@@ -12,10 +12,10 @@ import torch
 
 from accerl_lerobot.demos.record import DemosConfig, record_demos
 from accerl_lerobot.demos.sft import SFTConfig
-from accerl_lerobot.engine.config import DatasetConfig, RunConfig
-from accerl_lerobot.engine.preflight import check_start
+from accerl_lerobot.engines.config import DatasetConfig, RunConfig
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.run.preflight import check_start
 from accerl_lerobot.world_model.config import (
     ImaginationConfig,
     OnlineLearnConfig,

@@ -21,7 +21,7 @@ from torch import nn
 from accerl_lerobot import cli, console
 from accerl_lerobot.checkpoint.layout import WORLD_MODEL
 from accerl_lerobot.cli.configs import WorldModelEvalRun, WorldModelRun
-from accerl_lerobot.engine.config import parse
+from accerl_lerobot.engines.config import parse
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.config import LearnableModelConfig, WorldModelConfig
@@ -171,7 +171,7 @@ def test_it_imagines_and_goes_on_learning_in_a_run(tiny_checkpoint: Path, tmp_pa
 
 @pytest.mark.slow
 def test_in_processes_of_their_own_they_find_it_too(tiny_checkpoint: Path, tmp_path: Path):
-    from accerl_lerobot.engine.launch import RayEngine
+    from accerl_lerobot.engines.ray_engine import RayEngine
 
     config = imagining(tiny_checkpoint, saved(tmp_path / "w"), episodes=24)
     named = replace(config.imagination, discover_packages_path=PACKAGE)

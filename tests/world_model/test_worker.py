@@ -12,14 +12,14 @@ import pytest
 import torch
 
 from accerl_lerobot.algorithms import ChunkCriticConfig
+from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import CHECKPOINTS, TRAINING_STATE, save_checkpoint, saved_version
-from accerl_lerobot.engine.loop import Engine
-from accerl_lerobot.engine.run import make_engine
-from accerl_lerobot.engine.stopping import WorkerError
+from accerl_lerobot.engines.contract import Engine
+from accerl_lerobot.engines.stopping import WorkerError
 from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
-from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.run.train import make_engine
 from accerl_lerobot.world_model import worker as module
 from accerl_lerobot.world_model.state_learner import BATCH, StateLearner
 from accerl_lerobot.world_model.worker import Learned, RemoteStateLearner, WorldModelWorker

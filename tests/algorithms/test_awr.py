@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from accerl_lerobot.algorithms import AWRConfig
-from accerl_lerobot.trainer.off_policy import weights
-from tests.trainer.test_chunk_critic import awr, episode, first_action, tried
+from accerl_lerobot.algorithms.off_policy import weights
+from tests.algorithms.test_chunk_critic import awr, episode, first_action, tried
 
 
 def test_weights_by_hand():

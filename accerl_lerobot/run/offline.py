@@ -40,9 +40,9 @@ COMPARED = 256  # decisions of successes, and of failures, whose imitation loss 
 
 def learn_offline(config: OfflineRun, directory: Path, console: Console) -> dict[str, Any]:
     """Learns, writes ``checkpoints/NNNNNN`` and ``summary.json`` into `directory`; returns the summary."""
+    from accerl_lerobot.algorithms.ratio_update import make_update
     from accerl_lerobot.demos.dataset_files import open_metadata
     from accerl_lerobot.policies.loading import learning_config
-    from accerl_lerobot.trainer.update import make_update
 
     started = time.monotonic()
     torch.manual_seed(config.seed)
@@ -113,7 +113,6 @@ def _state_model(config: OfflineRun, offered: bool) -> StateModelConfig:
 
 def _check(config: OfflineRun, policy: Any, meta: Any) -> dict[str, tuple[int, ...]]:
     """Shapes of the observations that the policy reads, by the dataset's names, and of ``action``."""
-    from accerl_lerobot.engine.preflight import check_imitates
     from accerl_lerobot.experience import REWARD, SUCCESS
     from accerl_lerobot.policies.features import (
         ACTION,
@@ -122,6 +121,7 @@ def _check(config: OfflineRun, policy: Any, meta: Any) -> dict[str, tuple[int, .
         dataset_shapes,
         policy_features,
     )
+    from accerl_lerobot.run.preflight import check_imitates
 
     check_imitates(config.algorithm, config.policy, policy)
     offered, renames = dataset_features(meta), config.policy.rename_map
@@ -143,8 +143,8 @@ def _remember(
     config: OfflineRun, update: Any, meta: Any, wanted: dict[str, tuple[int, ...]], console: Console
 ) -> dict[str, Any]:
     """Fills the memory; counts of what is in it."""
+    from accerl_lerobot.algorithms.demonstrations import recorded
     from accerl_lerobot.policies.config import executed_rows
-    from accerl_lerobot.trainer.demonstrations import recorded
 
     algorithm = config.algorithm
     assert isinstance(algorithm, OffPolicyConfig)

@@ -12,8 +12,11 @@ import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot.algorithms import AWRConfig, ChunkCriticConfig, SelfImitationConfig
-from accerl_lerobot.engine.preflight import check_start
+from accerl_lerobot.algorithms import AWRConfig, ChunkCriticConfig, SelfImitationConfig, chunk_critic
+from accerl_lerobot.algorithms.chunk_critic import ChunkCriticUpdate
+from accerl_lerobot.algorithms.config import TrainerConfig
+from accerl_lerobot.algorithms.off_policy import AWRUpdate, Memory, OffPolicyUpdate
+from accerl_lerobot.algorithms.ratio_update import make_update
 from accerl_lerobot.envs import SimulatedConfig, make_environment
 from accerl_lerobot.errors import InputError, NonFiniteError
 from accerl_lerobot.experience import (
@@ -34,12 +37,8 @@ from accerl_lerobot.policies.loading import load_adapter
 from accerl_lerobot.policies.teacher import Ensemble, Teacher, with_teacher
 from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
+from accerl_lerobot.run.preflight import check_start
 from accerl_lerobot.seeds import noise_seed
-from accerl_lerobot.trainer import chunk_critic
-from accerl_lerobot.trainer.chunk_critic import ChunkCriticUpdate
-from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.trainer.off_policy import AWRUpdate, Memory, OffPolicyUpdate
-from accerl_lerobot.trainer.update import make_update
 from accerl_lerobot.world_model.config import LatentConfig, SimulatorStateConfig
 from accerl_lerobot.world_model.latent import LatentModel
 from accerl_lerobot.world_model.states import SimulatorState, StateSpec

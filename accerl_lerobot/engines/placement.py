@@ -12,11 +12,11 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from accerl_lerobot.algorithms import ChunkCriticConfig
-from accerl_lerobot.engine.ray_session import opened
+from accerl_lerobot.engines.ray_session import opened
 from accerl_lerobot.errors import InputError
 
 if TYPE_CHECKING:
-    from accerl_lerobot.engine.config import RunConfig
+    from accerl_lerobot.engines.config import RunConfig
 
 SECTION = "launch.placement"
 ALL = "all"

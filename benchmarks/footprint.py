@@ -20,12 +20,12 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map_only
 
+from accerl_lerobot.algorithms.sharding import Watch, forget
 from accerl_lerobot.experience import stack_observations
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.family import Action
 from accerl_lerobot.policies.loading import sizes_of
 from accerl_lerobot.policies.stock import StockAdapter
-from accerl_lerobot.trainer.sharding import Watch, forget
 
 FAKED_FROM = 10**9
 """SmolVLA cannot be faked: its encoder indexes by a mask, whose shape does not say how many are True."""

@@ -16,16 +16,16 @@ import pytest
 import torch
 
 from accerl_lerobot.algorithms import GIPOConfig
+from accerl_lerobot.algorithms.batch import split_rows
+from accerl_lerobot.algorithms.config import TrainerConfig
+from accerl_lerobot.algorithms.ranks import Ranks
+from accerl_lerobot.algorithms.ratio_update import RatioUpdate
+from accerl_lerobot.algorithms.sharding import Watch, arrange
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.trainer.batch import split_rows
-from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.trainer.ranks import Ranks
-from accerl_lerobot.trainer.sharding import Watch, arrange
-from accerl_lerobot.trainer.update import RatioUpdate
 from tests.rounding import assert_close
-from tests.trainer import sharded
-from tests.trainer.linear import LinearAdapter
+from tests.algorithms import sharded
+from tests.algorithms.linear import LinearAdapter
 
 TOLERANCE = 1e-4
 SHARDINGS = ("ddp", "zero2", "zero3")

@@ -14,26 +14,26 @@ import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from accerl_lerobot.algorithms import AlgorithmConfig, ChunkCriticConfig, SelfImitationConfig
+from accerl_lerobot.algorithms import demonstrations as module
+from accerl_lerobot.algorithms.chunk_critic import ChunkCriticUpdate
+from accerl_lerobot.algorithms.config import TrainerConfig
+from accerl_lerobot.algorithms.demonstrations import demonstrations, recorded
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos.dataset_files import open_metadata
 from accerl_lerobot.demos.record import DemosConfig, record_demos
 from accerl_lerobot.demos.sft import SFTConfig, run_sft
-from accerl_lerobot.engine.preflight import _say_if_unlike, check_start
 from accerl_lerobot.envs import SimulatedConfig, make_environment
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE, Segment, SegmentStart
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.loading import load_adapter
 from accerl_lerobot.policies.teacher import with_teacher
-from accerl_lerobot.trainer import demonstrations as module
-from accerl_lerobot.trainer.chunk_critic import ChunkCriticUpdate
-from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.trainer.demonstrations import demonstrations, recorded
+from accerl_lerobot.run.preflight import _say_if_unlike, check_start
 from accerl_lerobot.world_model.config import SimulatorStateConfig
+from tests.algorithms.test_chunk_critic import SECTIONS
 from tests.replay.segments import make_segment
 from tests.runs import tiny_run
 from tests.tiny_datasets import labels, write_dataset
-from tests.trainer.test_chunk_critic import SECTIONS
 
 ENV = SimulatedConfig(max_steps=16, environment_state=True)
 K, COST = 4, 0.25

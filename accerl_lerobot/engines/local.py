@@ -16,10 +16,11 @@ from typing import Any
 
 import numpy as np
 
+from accerl_lerobot.algorithms.batch import save_batch_if_not_finite
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import PRETRAINED, TRAINING_STATE, WEIGHTS
-from accerl_lerobot.engine.config import RunConfig
-from accerl_lerobot.engine.loop import Engine, Progress, Saved
+from accerl_lerobot.engines.config import RunConfig
+from accerl_lerobot.engines.contract import Engine, Progress, Saved
 from accerl_lerobot.envs import make_environment
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import REAL, Observation, Request, Segment
@@ -29,7 +30,6 @@ from accerl_lerobot.replay.journal import EPISODES, Journal
 from accerl_lerobot.rollout.runner import MOST_STARTS, EpisodePlan, EpisodePlans, EpisodeResult, RolloutRunner
 from accerl_lerobot.seeds import global_generators, restore_global_generators
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, WEIGHT_SYNC, open_clock
-from accerl_lerobot.trainer.batch import save_batch_if_not_finite
 from accerl_lerobot.transport.weights import PublishDelay
 
 logger = logging.getLogger(__name__)
@@ -51,7 +51,7 @@ class LocalEngine(Engine):
         self._clock = open_clock(config.timeline_folder, LOCAL)
         import torch
 
-        from accerl_lerobot.trainer.update import make_update
+        from accerl_lerobot.algorithms.ratio_update import make_update
 
         torch.manual_seed(config.seed)
         torch.set_num_threads(config.trainer.num_threads)

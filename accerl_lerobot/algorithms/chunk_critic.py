@@ -25,14 +25,14 @@ import torch
 from torch import Tensor, nn
 
 from accerl_lerobot.algorithms import ChunkCriticConfig
+from accerl_lerobot.algorithms.config import TrainerConfig
+from accerl_lerobot.algorithms.off_policy import OffPolicyUpdate, drawn, mean
 from accerl_lerobot.checkpoint.tensors import copied, optimizer_state, restore_optimizer
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.family import Encoded, pooled
 from accerl_lerobot.policies.stock import StockAdapter
 from accerl_lerobot.policies.teacher import Ensemble, Teacher
-from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.trainer.off_policy import OffPolicyUpdate, drawn, mean
 from accerl_lerobot.world_model.state_learner import BATCH as TRANSITIONS
 from accerl_lerobot.world_model.state_learner import StateLearner
 from accerl_lerobot.world_model.states import Transitions

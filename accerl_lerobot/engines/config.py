@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from accerl_lerobot.algorithms import AlgorithmConfig, ChunkCriticConfig, GIPOConfig, OffPolicyConfig
+from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.config.parsing import decode, encode, parse
 from accerl_lerobot.config.ranges import DatasetConfig, NonNegative, Positive, Range, Section, Seed, Steps
 from accerl_lerobot.demos.record import DemosConfig
@@ -25,7 +26,6 @@ from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.replay.pacing import ASYNCHRONOUS, ReplayConfig, Schedule, lag_bound
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.timeline import TIMELINE
-from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.world_model.config import (
     ImaginationConfig,
     SimulatorStateConfig,

@@ -36,14 +36,11 @@ from accerl_lerobot.config.parsing import as_text
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.record import REPO_ID, record_demos
-from accerl_lerobot.engine import ray_session, resuming
-from accerl_lerobot.engine.adapter import demonstrations_of, make_adapter
-from accerl_lerobot.engine.config import RunConfig, encode, parse
-from accerl_lerobot.engine.loop import Engine, Loop, Times, run_plans
-from accerl_lerobot.engine.placement import check_placement
-from accerl_lerobot.engine.preflight import check_device, check_environment, check_policy, check_start
-from accerl_lerobot.engine.sizes import check_memory
-from accerl_lerobot.engine.stopping import StoppedError, Stopping, WorkerError
+from accerl_lerobot.engines import ray_session
+from accerl_lerobot.engines.config import RunConfig, encode, parse
+from accerl_lerobot.engines.contract import Engine
+from accerl_lerobot.engines.placement import check_placement
+from accerl_lerobot.engines.stopping import StoppedError, Stopping, WorkerError
 from accerl_lerobot.errors import (
     InputError,
     check_absent,
@@ -58,6 +55,11 @@ from accerl_lerobot.experience import Observation, Request
 from accerl_lerobot.metrics import MetricsLog
 from accerl_lerobot.policies.config import Load, PolicyConfig, env_steps_seen
 from accerl_lerobot.rollout.runner import EpisodeResult
+from accerl_lerobot.run import resuming
+from accerl_lerobot.run.adapter import demonstrations_of, make_adapter
+from accerl_lerobot.run.loop import Loop, Times, run_plans
+from accerl_lerobot.run.preflight import check_device, check_environment, check_policy, check_start
+from accerl_lerobot.run.sizes import check_memory
 from accerl_lerobot.seeds import noise_seed
 from accerl_lerobot.timeline import RECOVERY, open_clock
 from accerl_lerobot.world_model.config import ImaginationConfig
@@ -139,11 +141,11 @@ def make_engine(
         make_adapter, config, demonstrations_of(config), history * config.env.state_size, load
     )
     if config.launch.engine == "local":
-        from accerl_lerobot.engine.local import LocalEngine
+        from accerl_lerobot.engines.local import LocalEngine
 
         return LocalEngine(config, tasks, history, state, load)
     ray_session.prepare(joins=config.launch.address is not None)
-    from accerl_lerobot.engine.launch import RayEngine
+    from accerl_lerobot.engines.ray_engine import RayEngine
 
     return RayEngine(config, tasks, history, state, load)
 

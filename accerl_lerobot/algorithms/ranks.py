@@ -20,7 +20,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
-from accerl_lerobot.trainer.batch import split_rows
+from accerl_lerobot.algorithms.batch import split_rows
 
 
 class Ranks:

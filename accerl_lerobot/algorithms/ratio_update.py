@@ -22,7 +22,12 @@ from torch import Tensor
 
 from accerl_lerobot.algorithms import AlgorithmConfig, LossInputs, RatioConfig
 from accerl_lerobot.algorithms.advantages import decision_mask, gae, moments, normalise
+from accerl_lerobot.algorithms.batch import Batch, collate, pick, split_rows
+from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.algorithms.objective import lag_metrics, present, sample_metrics
+from accerl_lerobot.algorithms.probe import CRITIC_PREFIX, Probe
+from accerl_lerobot.algorithms.ranks import ALONE, Ranks
+from accerl_lerobot.algorithms.sharding import arrange
 from accerl_lerobot.checkpoint.tensors import optimizer_state, restore_optimizer, whole
 from accerl_lerobot.config.parsing import imported
 from accerl_lerobot.errors import MAX_NONFINITE, NonFiniteError
@@ -30,11 +35,6 @@ from accerl_lerobot.experience import Segment
 from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.policies.adapter import PolicyAdapter
 from accerl_lerobot.policies.teacher import TEACHER_PREFIX
-from accerl_lerobot.trainer.batch import Batch, collate, pick, split_rows
-from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.trainer.probe import CRITIC_PREFIX, Probe
-from accerl_lerobot.trainer.ranks import ALONE, Ranks
-from accerl_lerobot.trainer.sharding import arrange
 
 
 def make_update(

@@ -17,15 +17,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from accerl_lerobot.algorithms import AlgorithmConfig, GIPOConfig, PPOConfig
+from accerl_lerobot.algorithms import AlgorithmConfig, GIPOConfig, PPOConfig, ranks
+from accerl_lerobot.algorithms.config import TrainerConfig
+from accerl_lerobot.algorithms.ranks import LOOPBACK, Rendezvous, create, join, use_only
+from accerl_lerobot.algorithms.ratio_update import RatioUpdate
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies.adapter import Evaluation, PolicyAdapter
-from accerl_lerobot.trainer import ranks
-from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.trainer.ranks import LOOPBACK, Rendezvous, create, join, use_only
-from accerl_lerobot.trainer.update import RatioUpdate
-from tests.trainer.linear import STATE, STD, LinearAdapter, make_segments
+from tests.algorithms.linear import STATE, STD, LinearAdapter, make_segments
 
 TIMEOUT_S = 60.0
 

@@ -15,8 +15,8 @@ from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.config import PolicyConfig, TuningConfig
 from accerl_lerobot.policies.loading import load_adapter
 from accerl_lerobot.testing import stored
-from accerl_lerobot.trainer import footprint
-from accerl_lerobot.trainer.footprint import Counter, PolicyMemory, policy_memory
+from benchmarks import footprint
+from benchmarks.footprint import Counter, PolicyMemory, policy_memory
 from tests.policies.tiny_pi import small, write_pi
 
 MIB = 2**20
@@ -83,8 +83,8 @@ PROCESS = """
 import json, sys
 from pathlib import Path
 import torch
-from accerl_lerobot.trainer.footprint import policy_memory
-from tests.trainer.test_footprint import published, resident
+from benchmarks.footprint import policy_memory
+from tests.benchmarks.test_footprint import published, resident
 adapter, observations, latent = published(Path(sys.argv[1]))
 base = resident()
 adapter.evaluate(*observations, latent).log_prob.sum().backward()

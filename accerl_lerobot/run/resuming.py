@@ -19,8 +19,8 @@ from accerl_lerobot.checkpoint.safety import FileSource, check_folder, read_json
 from accerl_lerobot.config.parsing import consent_flags, consents, read_recipe
 from accerl_lerobot.config.ranges import Steps, check
 from accerl_lerobot.console import Console
-from accerl_lerobot.engine.config import RunConfig, decode, encode
-from accerl_lerobot.engine.stopping import WorkerError, pause_s
+from accerl_lerobot.engines.config import RunConfig, decode, encode
+from accerl_lerobot.engines.stopping import WorkerError, pause_s
 from accerl_lerobot.errors import InputError, is_full, make_folder, reading
 from accerl_lerobot.metrics import METRICS
 from accerl_lerobot.replay.journal import EPISODES

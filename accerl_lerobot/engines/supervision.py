@@ -23,8 +23,8 @@ from ray.exceptions import ActorDiedError, GetTimeoutError, RayActorError, RayEr
 
 from accerl_lerobot import errors
 from accerl_lerobot.checkpoint import snapshot
-from accerl_lerobot.engine.config import RunConfig
-from accerl_lerobot.engine.stopping import WorkerError
+from accerl_lerobot.engines.config import RunConfig
+from accerl_lerobot.engines.stopping import WorkerError
 from accerl_lerobot.errors import InputError, last_exception
 from accerl_lerobot.experience import REAL
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodePlans, EpisodeResult, budgets, incarnation_after

@@ -13,13 +13,13 @@ import pytest
 import torch
 
 from accerl_lerobot.algorithms import GIPOConfig
+from accerl_lerobot.algorithms.batch import collate
+from accerl_lerobot.algorithms.config import TrainerConfig
+from accerl_lerobot.algorithms.probe import Probe
+from accerl_lerobot.algorithms.ratio_update import RatioUpdate
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies.adapter import Evaluation
-from accerl_lerobot.trainer.batch import collate
-from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.trainer.probe import Probe
-from accerl_lerobot.trainer.update import RatioUpdate
-from tests.trainer.linear import LinearAdapter, decided_by, make_segments
+from tests.algorithms.linear import LinearAdapter, decided_by, make_segments
 
 CONFIG = TrainerConfig(
     updates=100, lr=5e-2, value_lr=1e-2, warmup_updates=0, value_warmup_updates=0, probe_every=3

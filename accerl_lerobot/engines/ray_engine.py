@@ -25,12 +25,12 @@ import ray
 from ray.exceptions import RayActorError, RayError, RayTaskError
 
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE, saved_version
-from accerl_lerobot.engine.config import RunConfig
-from accerl_lerobot.engine.loop import Engine, Progress, Saved
-from accerl_lerobot.engine.placement import learns_states, place_workers
-from accerl_lerobot.engine.ray_session import NO_HUB_TOKEN, start_ray
-from accerl_lerobot.engine.stopping import WorkerError
-from accerl_lerobot.engine.supervision import (
+from accerl_lerobot.engines.config import RunConfig
+from accerl_lerobot.engines.contract import Engine, Progress, Saved
+from accerl_lerobot.engines.placement import learns_states, place_workers
+from accerl_lerobot.engines.ray_session import NO_HUB_TOKEN, start_ray
+from accerl_lerobot.engines.stopping import WorkerError
+from accerl_lerobot.engines.supervision import (
     RESTARTED,
     RestartedWorker,
     RolloutSlot,

@@ -23,10 +23,10 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_leaves
 from torch.utils.checkpoint import checkpoint
 
+from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.checkpoint.tensors import in_parts
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.adapter import PolicyAdapter
-from accerl_lerobot.trainer.config import TrainerConfig
 
 
 def arrange(adapter: PolicyAdapter, config: TrainerConfig) -> None:

@@ -25,7 +25,6 @@ import yaml
 from accerl_lerobot.algorithms import AWRConfig, ChunkCriticConfig, LossInputs, OffPolicyConfig, RatioConfig
 from accerl_lerobot.checkpoint.safety import brief
 from accerl_lerobot.config.machine import check_disk
-from accerl_lerobot.engine.sizes import check_memory
 from accerl_lerobot.envs import (
     EnvConfig,
     EnvironmentSpec,
@@ -51,12 +50,13 @@ from accerl_lerobot.policies.features import (
     resizes,
 )
 from accerl_lerobot.rollout.runner import nonfinite
+from accerl_lerobot.run.sizes import check_memory
 from accerl_lerobot.world_model.config import SimulatorStateConfig
 
 if TYPE_CHECKING:
     from accerl_lerobot.algorithms import AlgorithmConfig
     from accerl_lerobot.demos.sft import SFTConfig
-    from accerl_lerobot.engine.config import DatasetConfig, RunConfig
+    from accerl_lerobot.engines.config import DatasetConfig, RunConfig
     from accerl_lerobot.metrics import WandBConfig
     from accerl_lerobot.policies.config import PolicyConfig
 
@@ -248,7 +248,7 @@ def _check_remembered(dataset: DatasetConfig, spec: EnvironmentSpec, meta: Any) 
 
 def _say_if_unlike(config: RunConfig, spec: EnvironmentSpec, meta: Any, history: int) -> bool:
     """Warn of a dataset that cannot be remembered, which is left out."""
-    from accerl_lerobot.trainer.demonstrations import unlike
+    from accerl_lerobot.algorithms.demonstrations import unlike
 
     wanted: dict[str, tuple[int, ...]] = {STATE: (spec.state_dim,), **spec.images}
     if config.env.state_size:

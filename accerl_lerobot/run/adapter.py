@@ -15,7 +15,7 @@ from accerl_lerobot.demos.record import REPO_ID
 from accerl_lerobot.policies.config import Load, PolicyConfig, loader
 
 if TYPE_CHECKING:
-    from accerl_lerobot.engine.config import RunConfig
+    from accerl_lerobot.engines.config import RunConfig
 
 
 def make_adapter(
@@ -38,7 +38,7 @@ def make_adapter(
     else:
         adapter = loader(load)(policy)
     if remembered is not None:
-        from accerl_lerobot.trainer.demonstrations import demonstrations
+        from accerl_lerobot.algorithms.demonstrations import demonstrations
 
         adapter.demonstrations = partial(demonstrations, remembered, config.rollout.decision_cost)
     return adapter

@@ -13,13 +13,13 @@ import pytest
 import torch
 
 from accerl_lerobot.algorithms import GIPOConfig, PPOConfig, RatioConfig
+from accerl_lerobot.algorithms.batch import collate
+from accerl_lerobot.algorithms.config import TrainerConfig
+from accerl_lerobot.algorithms.ratio_update import RatioUpdate
 from accerl_lerobot.errors import MAX_NONFINITE, NonFiniteError
 from accerl_lerobot.experience import Segment
-from accerl_lerobot.trainer.batch import collate
-from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.trainer.update import RatioUpdate
 from tests.rounding import assert_close
-from tests.trainer.linear import STATE, LinearAdapter, make_segments
+from tests.algorithms.linear import STATE, LinearAdapter, make_segments
 
 PLAIN = TrainerConfig(
     updates=100, lr=1e-2, value_lr=1e-2, warmup_updates=0, value_warmup_updates=0, grad_clip=1e9

@@ -26,11 +26,11 @@ from typing import TYPE_CHECKING
 
 from accerl_lerobot import guardian
 from accerl_lerobot.config.parsing import imported
-from accerl_lerobot.engine.stopping import WorkerError, deferred, pause_s
+from accerl_lerobot.engines.stopping import WorkerError, deferred, pause_s
 from accerl_lerobot.errors import InputError
 
 if TYPE_CHECKING:
-    from accerl_lerobot.engine.config import LaunchConfig
+    from accerl_lerobot.engines.config import LaunchConfig
 
 logger = logging.getLogger(__name__)
 

@@ -16,19 +16,19 @@ import pytest
 import torch
 
 from accerl_lerobot.algorithms import GIPOConfig
+from accerl_lerobot.algorithms.config import TrainerConfig
+from accerl_lerobot.algorithms.ranks import Ranks
+from accerl_lerobot.algorithms.ratio_update import RatioUpdate
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.tensors import whole
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.config import TuningConfig
 from accerl_lerobot.testing import perturb
-from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.trainer.ranks import Ranks
-from accerl_lerobot.trainer.update import RatioUpdate
 from tests.policies.cases import CASES as POLICIES
 from tests.policies.tiny import adapter_at, as_segment
 from tests.rounding import assert_close
-from tests.trainer.sharded import joined, leave
+from tests.algorithms.sharded import joined, leave
 
 DECISIONS = 5
 LEARNING = TrainerConfig(

@@ -18,14 +18,14 @@ from torch import Tensor
 
 from accerl_lerobot.algorithms import AWRConfig, OffPolicyConfig
 from accerl_lerobot.algorithms.advantages import STD_EPSILON
+from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.algorithms.objective import lag_metrics
+from accerl_lerobot.algorithms.ratio_update import BaseUpdate
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE, Segment
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.family import Encoded
 from accerl_lerobot.policies.stock import StockAdapter
-from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.trainer.update import BaseUpdate
 
 POLICY_BATCH = 64  # rows of one step of the policy
 CAP = 20.0  # largest weight of a decision in AWR, the paper's

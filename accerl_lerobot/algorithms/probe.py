@@ -16,12 +16,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from accerl_lerobot.algorithms.batch import Batch
+from accerl_lerobot.algorithms.config import TrainerConfig
+from accerl_lerobot.algorithms.ranks import ALONE, Ranks
+from accerl_lerobot.algorithms.sharding import swapped_in
 from accerl_lerobot.checkpoint.tensors import copy_of, part_of
 from accerl_lerobot.policies.adapter import PolicyAdapter
-from accerl_lerobot.trainer.batch import Batch
-from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.trainer.ranks import ALONE, Ranks
-from accerl_lerobot.trainer.sharding import swapped_in
 
 CRITIC_PREFIX = "value_head."  # how names of the critic's weights begin
 CLIP = 0.2  # PPO's usual range: a mismatch outside it would be clipped as if the policy had moved

@@ -11,7 +11,7 @@ from accerl_lerobot.envs.gym_env import MAX_STEPS
 from accerl_lerobot.errors import InputError
 
 if TYPE_CHECKING:
-    from accerl_lerobot.engine.config import RunConfig
+    from accerl_lerobot.engines.config import RunConfig
 
 POLICY_PROCESS_GIB, ROLLOUT_PROCESS_GIB, RAY_GIB = 1.2, 0.4, 0.7
 """Resident memory without a policy's weights, see `policy_gib`: a process with torch and LeRobot, a
