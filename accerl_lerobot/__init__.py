@@ -36,12 +36,12 @@ __all__ = [
     "ActingPolicy", "EvaluationResult", "InputError", "RunConfig", "StoppedError", "TrainResult",
     "evaluate", "load_config", "load_policy", "resume", "train",
 ]  # fmt: skip
-_ELSEWHERE = {"RunConfig": "engine.config", "StoppedError": "engine.stopping", "InputError": "errors"}
+_ELSEWHERE = {"RunConfig": "engines.config", "StoppedError": "engines.stopping", "InputError": "errors"}
 
 
 def __getattr__(name: str) -> Any:
     # At first use: workers and `accerl --help` import this package too, and need none of it.
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module = importlib.import_module(f"{__name__}.{_ELSEWHERE.get(name, 'engine.run')}")
+    module = importlib.import_module(f"{__name__}.{_ELSEWHERE.get(name, 'run.train')}")
     return getattr(module, name)

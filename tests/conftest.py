@@ -51,13 +51,13 @@ def light_ray() -> Iterator[None]:
 @pytest.fixture
 def light_engine(light_ray: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., RayEngine]]:
     """Makes asynchronous engines with stand-ins for inference and trainer, and closes them."""
-    from accerl_lerobot.engines import ray as launch
+    from accerl_lerobot.engines import ray_engine
     from accerl_lerobot.inference import worker as inference
     from accerl_lerobot.trainer import worker as trainer
     from tests.light_workers import LightInference, LightTrainer
     from tests.runs import tiny_run
 
-    monkeypatch.setattr(launch, "POLL_S", 0.05)
+    monkeypatch.setattr(ray_engine, "POLL_S", 0.05)
     monkeypatch.setattr(inference, "InferenceWorker", LightInference)
     monkeypatch.setattr(trainer, "TrainerWorker", LightTrainer)
     made: list[RayEngine] = []

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from accerl_lerobot.algorithms.config import TrainerConfig
-from accerl_lerobot.engines import ray as launch
+from accerl_lerobot.engines import ray_engine
 from accerl_lerobot.engines.config import LaunchConfig, RunConfig
 from accerl_lerobot.engines.contract import Progress
 from accerl_lerobot.errors import InputError
@@ -126,7 +126,7 @@ class CountingInference(InferenceWorker):
 
 @pytest.fixture
 def counted(light_ray: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(launch, "POLL_S", 0.05)
+    monkeypatch.setattr(ray_engine, "POLL_S", 0.05)
     monkeypatch.setattr(inference_worker, "InferenceWorker", CountingInference)
 
 
