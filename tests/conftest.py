@@ -63,7 +63,7 @@ def light_engine(light_ray: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[C
     made: list[RayEngine] = []
 
     def make(state: Path | None = None, **sections: Any) -> RayEngine:
-        made.append(launch.RayEngine(tiny_run(Path("nowhere"), **sections), ("match",), state=state))
+        made.append(ray_engine.RayEngine(tiny_run(Path("nowhere"), **sections), ("match",), state=state))
         return made[-1]
 
     yield make

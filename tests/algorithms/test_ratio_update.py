@@ -18,8 +18,8 @@ from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.algorithms.ratio_update import RatioUpdate
 from accerl_lerobot.errors import MAX_NONFINITE, NonFiniteError
 from accerl_lerobot.experience import Segment
-from tests.rounding import assert_close
 from tests.algorithms.linear import STATE, LinearAdapter, make_segments
+from tests.rounding import assert_close
 
 PLAIN = TrainerConfig(
     updates=100, lr=1e-2, value_lr=1e-2, warmup_updates=0, value_warmup_updates=0, grad_clip=1e9

@@ -23,9 +23,9 @@ from accerl_lerobot.algorithms.ratio_update import RatioUpdate
 from accerl_lerobot.algorithms.sharding import Watch, arrange
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.errors import InputError
-from tests.rounding import assert_close
 from tests.algorithms import sharded
 from tests.algorithms.linear import LinearAdapter
+from tests.rounding import assert_close
 
 TOLERANCE = 1e-4
 SHARDINGS = ("ddp", "zero2", "zero3")

@@ -25,10 +25,10 @@ from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.config import TuningConfig
 from accerl_lerobot.testing import perturb
+from tests.algorithms.sharded import joined, leave
 from tests.policies.cases import CASES as POLICIES
 from tests.policies.tiny import adapter_at, as_segment
 from tests.rounding import assert_close
-from tests.algorithms.sharded import joined, leave
 
 DECISIONS = 5
 LEARNING = TrainerConfig(
