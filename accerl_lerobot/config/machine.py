@@ -1,13 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Memory and disk space of this machine."""
+"""Memory, disk space and arithmetic of this machine."""
 
 from __future__ import annotations
 
 import contextlib
 import shutil
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from accerl_lerobot.errors import InputError, expanded
+
+if TYPE_CHECKING:
+    import torch
 
 GIB = 2**30
 SIMULATOR_GIB = {"metaworld": 0.17, "libero": 0.17}
@@ -37,3 +41,12 @@ def check_disk(folder: str | None, field: str = "output_dir") -> None:
     if (free := shutil.disk_usage(path).free) < DISK_BYTES:
         hint = f"{free / GIB:.2f} GiB are free on this disk, and {DISK_BYTES / GIB:.1f} are needed at least"
         raise InputError(field, folder, f"{hint}; make room or choose another")
+
+
+def computes_bf16(device: torch.device) -> bool:
+    """True if this device multiplies bf16 numbers itself, which is faster than float32 there."""
+    import torch
+
+    if device.type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    return device.type == "cpu" and torch.cpu._is_avx512_bf16_supported()

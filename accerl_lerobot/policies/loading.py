@@ -25,6 +25,7 @@ from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 
 from accerl_lerobot.checkpoint.layout import BACKBONE, CONFIG_FOLDERS, STEP_FOLDERS
 from accerl_lerobot.checkpoint.safety import FileSource, brief, read_json, read_tensors, tensor_shapes
+from accerl_lerobot.config.machine import computes_bf16
 from accerl_lerobot.config.parsing import discover, imported
 from accerl_lerobot.errors import InputError, expanded
 from accerl_lerobot.experience import stack_observations
@@ -79,9 +80,7 @@ def precision_on(device: torch.device, wanted: Precision) -> Precision:
     """fp32 or bf16: what is `wanted`, or, for ``auto``, bf16 where the device itself computes in it."""
     if wanted != "auto":
         return wanted
-    if device.type == "cuda":
-        return "bf16" if torch.cuda.is_bf16_supported(including_emulation=False) else "fp32"
-    return "bf16" if device.type == "cpu" and torch.cpu._is_avx512_bf16_supported() else "fp32"
+    return "bf16" if computes_bf16(device) else "fp32"
 
 
 def load_lerobot_config(config: PolicyConfig) -> Any:

@@ -32,7 +32,7 @@ class StateLearner:
     def __init__(self, model: StateModel) -> None:
         self.model = copy.deepcopy(model).train()
         learned = [parameter for parameter in self.model.parameters() if parameter.requires_grad]
-        self.optimizer = torch.optim.AdamW(learned, lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY)
+        self.optimizer = torch.optim.AdamW(learned, lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY, fused=True)
         self.count = 0  # steps made
         self._skipped_in_a_row = 0
         self._made: list[dict[str, float]] = []

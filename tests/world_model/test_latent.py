@@ -24,7 +24,7 @@ NUMBERS = {ROBOT: np.random.default_rng(0).standard_normal((100, 3)).astype(np.f
 
 def model(spec: StateSpec = SPEC, latents: int = 8) -> LatentModel:
     torch.manual_seed(0)
-    return LatentModel(spec, LatentConfig(latents=latents))
+    return LatentModel(spec, LatentConfig(latents=latents)).eval()  # in float32
 
 
 def dots(places: np.ndarray, robot: np.ndarray | None = None) -> Observations:
