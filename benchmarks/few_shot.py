@@ -9,19 +9,22 @@ that was stopped, and adds tasks, seeds or algorithms to one that is finished.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.table import Table
 
 from accerl_lerobot.config.ranges import Steps
 from accerl_lerobot.console import Console
-from accerl_lerobot.evaluation import Rate, success_by_task
+from accerl_lerobot.evaluation import Rate, drawing
 from benchmarks.records import as_markdown, mean_interval, output_folder, write
 from benchmarks.study import Cell, Study, StudyConfig, named
 from benchmarks.tables import as_table
 
+MAX_SLANTED = 12  # with more tasks than this, their names are vertical
 COLUMNS = ("task", "seed", "algorithm", "SFT", "after", "real episodes", "env steps")
 
 
@@ -114,6 +117,34 @@ def draw(path: Path, result: dict[str, Any]) -> None:
     for row in result["rows"]:
         arms.setdefault(row["algorithm"], {}).setdefault(row["task"], []).append(row["success"])
     success_by_task(path, arms)
+
+
+def success_by_task(path: Path, arms: Mapping[str, Mapping[str, Sequence[float]]]) -> None:
+    """Draws a group of bars per task, one bar per arm, the mean over policies; where several, they are dots.
+
+    `arms` is arm → task → success of each policy; the last arm sorts the tasks.
+    """
+    last = list(arms.values())[-1]
+
+    def order(task: str) -> tuple[float, str]:
+        return float(np.mean(last.get(task, 0.0))), task
+
+    tasks = sorted(set().union(*arms.values()), key=order)
+    with drawing(path) as axes:
+        for i, (name, success) in enumerate(arms.items()):
+            places = [tasks.index(task) + 0.8 * (i + 0.5) / len(arms) - 0.4 for task in success]
+            means = [float(np.mean(values)) for values in success.values()]
+            axes.bar(places, means, 0.75 / len(arms), color=f"C{i}", label=name)
+            for place, values in zip(places, success.values(), strict=True):
+                if len(values) > 1:
+                    axes.scatter([place] * len(values), values, s=10, color="black", zorder=3)
+        labels = [task.removesuffix("-v3") for task in tasks]
+        if len(tasks) > MAX_SLANTED:
+            axes.set_xticks(range(len(tasks)), labels, rotation=90, fontsize=6)
+        else:
+            axes.set_xticks(range(len(tasks)), labels, rotation=20, ha="right")
+        axes.set(ylabel="success", ylim=(0, 1.02))
+        axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1), ncols=len(arms))
 
 
 def _row(of: dict[str, Any], seed: int, start: dict[str, Any], summary: dict[str, Any]) -> dict[str, Any]:

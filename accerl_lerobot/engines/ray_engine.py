@@ -8,8 +8,8 @@
                           └──► trainer                          macro-asynchrony: no barrier, a measured lag
 
 The trainer is the clock: when it has made its updates the run is over. A rollout worker or inference replica
-that ends or hangs is restarted alone, see `supervision`; the loss of any other worker ends this engine with
-its traceback, and `run` makes another one from the last checkpoint. Every wait here has a timeout. Workers
+that ends or hangs is restarted alone, see `supervision`. The loss of any other worker ends this engine with
+its traceback, and `run` makes another engine from the last checkpoint. Every wait here has a timeout. Workers
 get handles of each other and never hold the engine.
 """
 
@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import ray
-from ray.exceptions import RayActorError, RayError, RayTaskError
+from ray.exceptions import RayError
 
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE, saved_version
 from accerl_lerobot.engines.config import RunConfig
@@ -36,8 +36,10 @@ from accerl_lerobot.engines.supervision import (
     RolloutSlot,
     Worker,
     end_all,
+    has_died,
     restore_rollouts,
     save_rollouts,
+    show_new_warnings,
     total_counters,
 )
 from accerl_lerobot.inference.batcher import merge_metrics
@@ -45,32 +47,21 @@ from accerl_lerobot.metrics import numbered
 from accerl_lerobot.policies.config import Load
 from accerl_lerobot.replay.pacing import ASYNCHRONOUS, Schedule
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
-from accerl_lerobot.transport.connection import ServiceStoppedError
 from accerl_lerobot.world_model.config import WORLD_LEARNING
 
 logger = logging.getLogger(__name__)
 
 POLL_S = 0.5
-BLAME_S = 10.0  # how long to wait for the failure that another is the consequence of
 
 
 class InferenceReplica(RestartedWorker):
     """An inference replica; a restart loses nothing, as a request carries its noise and clients ask again."""
 
     trainer: Any = None  # handle of the trainer, once it publishes weights
-    follows = False  # True if its process was told of the trainer when it began
     together = 0  # observations that are decided in lock step; 0: as they come
 
     def ready_arguments(self) -> tuple[Any, ...]:
-        self.follows = self.trainer is not None
-        return (self.trainer,) if self.follows else ()
-
-    def begin(self) -> None:
-        self.at_work(self.actor.serve.remote())
-        if self.trainer is not None and not self.follows:  # training began while it was restarted
-            self.actor.follow.remote(self.trainer)
-        if self.together:
-            self.actor.lock_step.remote(self.together)
+        return () if self.trainer is None else (self.trainer,)
 
 
 class RayEngine(Engine):
@@ -106,7 +97,10 @@ class RayEngine(Engine):
         try:
             if self._owns_ray:
                 start_ray(config.launch)
-            self._start(tasks, history, state, load)
+            self._place(tasks, history, state, load)
+            if state is not None:
+                restore_rollouts(state, self._rollouts)
+            self._await_start()
         except BaseException:
             self.close()
             raise
@@ -122,8 +116,8 @@ class RayEngine(Engine):
         self._trainer.work = self._trainer.actor.run.remote(self._replay.actor)
         for replica in self._inference:
             replica.trainer = self._trainer.actor
-            if not replica.is_starting:  # one that has died unnoticed is restarted, and follows then
-                replica.actor.follow.remote(self._trainer.actor)
+            if not replica.is_starting:  # a replica that has died unnoticed is restarted, and follows then
+                replica.actor.follow.remote(replica.trainer)
 
     def follow(self, schedule: Schedule) -> None:
         """Change the schedule of collecting and learning, see `replay.pacing`."""
@@ -141,11 +135,7 @@ class RayEngine(Engine):
                 replica.call("lock_step", replica.together, timeout=self._limit)
 
     def poll(self) -> Progress:
-        for worker in (*self._inference, *self._others):
-            if not (isinstance(worker, RestartedWorker) and worker.is_starting):
-                worker.ask("metrics")
-        for slot in self._rollouts:
-            slot.ask_report(self._training and not self._done, self._schedule != ASYNCHRONOUS)
+        self._ask()
         self._await_end()
         episodes = self._listen()
         self._hand_over_world()
@@ -172,8 +162,7 @@ class RayEngine(Engine):
         directory = directory.absolute()
         state = directory / TRAINING_STATE
         # Records that the trainer has sent come first: `hold` returns the rest, up to its version.
-        reported = self._updates + (self._hear(self._trainer, self._limit) or [])
-        self._updates = []
+        self._hear(self._trainer, self._limit)
         version, records = self._trainer.call("hold", timeout=self._limit)  # it waits for an update at most
         # At once, so that little comes in that was decided by weights of later updates.
         self._replay.call("save", state, version, timeout=self._limit)
@@ -182,7 +171,8 @@ class RayEngine(Engine):
         self._trainer.call("write", directory, timeout=self._limit)
         save_rollouts(state, self._rollouts)
         self._last_change = time.monotonic()
-        return Saved(version, reported + records)
+        updates, self._updates = self._updates + records, []
+        return Saved(version, updates)
 
     def close(self) -> None:
         if self._closed:
@@ -205,7 +195,8 @@ class RayEngine(Engine):
         yield from self._others
         yield from self._rollouts
 
-    def _start(self, tasks: tuple[str, ...], history: int, state: Path | None, load: Load | None) -> None:
+    def _place(self, tasks: tuple[str, ...], history: int, state: Path | None, load: Load | None) -> None:
+        """Create all workers."""
         from accerl_lerobot.inference.worker import InferenceWorker
         from accerl_lerobot.replay.worker import ReplayWorker
         from accerl_lerobot.rollout.worker import RolloutWorker
@@ -213,107 +204,119 @@ class RayEngine(Engine):
         from accerl_lerobot.trainer.worker import TrainerWorker
         from accerl_lerobot.world_model.worker import WORLD_MODEL_WORKER, WorldModelWorker
 
-        c, timeline, imagination = self._config, self._config.timeline_folder, self._config.imagination
-        placement, in_cluster = place_workers(c), c.launch.address is not None
+        config, timeline = self._config, self._config.timeline_folder
+        in_cluster = config.launch.address is not None
+        placement = place_workers(config)
         for row in placement.rows():
             logger.info("%s", row)
 
-        def make(kind: type, role: str, concurrency: int, *arguments: Any, **more: Any) -> Any:
-            options = placement.options(role) | {"max_concurrency": concurrency} | more
+        def actor(role: str, kind: type, concurrency: int, *arguments: Any, **options: Any) -> Any:
+            options |= placement.options(role) | {"max_concurrency": concurrency}
             return ray.remote(kind).options(**options).remote(*arguments)
 
-        def add(name: str, kind: type, role: str, concurrency: int, *arguments: Any) -> Worker:
-            actor = make(kind, role, concurrency, *arguments)
-            self._others.append(Worker(name, actor, placement.is_here(role)))
+        def add(name: str, *arguments: Any) -> Worker:
+            self._others.append(Worker(name, actor(*arguments)))
             return self._others[-1]
 
-        # The ranks first: Ray fills the GPU that is fullest, and each of them needs more than half of one.
-        learner = LearnerSettings(c.policy, c.algorithm, c.trainer, c.seed, state, load, SHARE * self._limit)
+        stores = (config.replay, config.seed, state, config.folder, timeline, in_cluster)
+        self._replay = add("replay", "replay", ReplayWorker, 1000, *stores)
+        # The ranks before others with a network: Ray fills the GPU that is fullest, and each rank needs more
+        # than half of one.
+        settings = LearnerSettings(
+            config.policy, config.algorithm, config.trainer, config.seed, state, load, SHARE * self._limit
+        )
         ranks = [
-            add(f"trainer rank {rank}", TrainerRank, "trainer", 1, rank, learner).actor
-            for rank in range(1, c.trainer.ranks)
+            add(f"trainer rank {rank}", "trainer", TrainerRank, 1, rank, settings).actor
+            for rank in range(1, config.trainer.ranks)
         ]
-        world_model = None
-        if learns_states(c):
-            arguments = (c.seed, c.trainer.num_threads, timeline)
-            world_model = add(WORLD_MODEL_WORKER, WorldModelWorker, "world_model", 4, *arguments).actor
-        replicas = numbered("inference", c.inference.workers)
-        if imagination.learns:
+        world_model = online = None
+        if learns_states(config):
+            learning = (config.seed, config.trainer.num_threads, timeline)
+            world_model = add(WORLD_MODEL_WORKER, "world_model", WorldModelWorker, 4, *learning).actor
+        if config.imagination.learns:
             from accerl_lerobot.world_model.online import OnlineLearningWorker
 
             self._world_learner = add(
-                WORLD_LEARNING, OnlineLearningWorker, "world_model", 4, c, state, timeline
+                WORLD_LEARNING, "world_model", OnlineLearningWorker, 4, config, state, timeline
             )
-        online = self._world_learner.actor if self._world_learner else None
-        learning = (learner, timeline, ranks, c.folder, world_model, replicas, online)
-        self._trainer = add("trainer", TrainerWorker, "trainer", 4 + len(replicas), *learning)
-        deciding = (c.policy, c.inference, self._version, state, load, timeline)
+            online = self._world_learner.actor
+        replicas = numbered("inference", config.inference.workers)
+        training = (settings, timeline, ranks, config.folder, world_model, replicas, online)
+        self._trainer = add("trainer", "trainer", TrainerWorker, 4 + len(replicas), *training)
         for name in replicas:
-            actor = make(InferenceWorker, "inference", 1000, *deciding, name, in_cluster, **RESTARTED)
-            is_here = placement.is_here("inference")
-            self._inference.append(InferenceReplica(name, actor, c.launch.max_restarts, is_here))
-        stores = (c.replay, c.seed, state, c.folder, timeline, in_cluster)
-        self._replay = add("replay", ReplayWorker, "replay", 1000, *stores)
-        for index in range(c.rollout.workers):
-            collecting = (c.env, c.rollout, f"rollout {index}", history, timeline, imagination)
-            actor = make(RolloutWorker, "rollout", 4, *collecting, **RESTARTED, **NO_HUB_TOKEN)
-            self._rollouts.append(RolloutSlot(index, actor, c, tasks, placement.is_here("rollout")))
-        if state is not None:
-            restore_rollouts(state, self._rollouts)
-        self._await_start()
+            deciding = (config.policy, config.inference, self._version, state, load, timeline, name)
+            handle = actor("inference", InferenceWorker, 1000, *deciding, in_cluster, **RESTARTED)
+            self._inference.append(InferenceReplica(name, handle, config.launch.max_restarts))
+        for index in range(config.rollout.workers):
+            name = f"rollout {index}"
+            collecting = (config.env, config.rollout, name, history, timeline, config.imagination)
+            handle = actor("rollout", RolloutWorker, 4, *collecting, **RESTARTED, **NO_HUB_TOKEN)
+            self._rollouts.append(RolloutSlot(index, handle, config, tasks))
 
     def _await_start(self) -> None:
         """Wait until all workers are ready, and have them begin."""
-        ready = []
-        for worker in self._everyone():
-            arguments = worker.ready_arguments() if isinstance(worker, RestartedWorker) else ()
-            ready.append((worker, worker.actor.ready.remote(*arguments)))
-        for worker, reference in ready:
-            worker.started(worker.result(reference, "ready", worker.start_timeout(self._limit)))
+        workers = list(self._everyone())
+        ready = [worker.actor.ready.remote(*worker.ready_arguments()) for worker in workers]
+        for worker, reference in zip(workers, ready, strict=True):
+            worker.pid = worker.result(reference, "ready", worker.start_timeout(self._limit))
         self._replay.work = self._replay.actor.run.remote()
         for slot in self._rollouts:
             replica = self._inference[slot.index % len(self._inference)]
             slot.services = (replica.endpoint, self._replay.endpoint)
-        for restarted in (*self._inference, *self._rollouts):
-            restarted.begin()
+        for worker in (*self._inference, *self._rollouts):
+            self._begin(worker)
+
+    def _begin(self, worker: RestartedWorker) -> None:
+        """Start the long call of a process that is ready."""
+        if isinstance(worker, RolloutSlot):
+            if worker.world is not None:
+                worker.actor.imagine_with.remote(worker.world)
+            worker.begin(worker.actor.run.remote(*worker.services))
+        elif isinstance(worker, InferenceReplica):
+            worker.begin(worker.actor.serve.remote())
+            if worker.trainer is not None:
+                worker.actor.follow.remote(worker.trainer)
+            if worker.together:
+                worker.actor.lock_step.remote(worker.together)
+
+    def _ask(self) -> None:
+        """Ask each worker that has answered for the next report."""
+        for worker in self._everyone():
+            if isinstance(worker, RestartedWorker) and worker.is_starting:
+                continue
+            if isinstance(worker, RolloutSlot):
+                worker.ask_report(self._training and not self._done, self._schedule != ASYNCHRONOUS)
+            else:
+                worker.ask("metrics")
 
     def _await_end(self) -> None:
         """Wait a little, and handle every worker whose long call has ended."""
         works = {worker.work: worker for worker in self._everyone() if worker.work is not None}
         if not ray.wait(list(works), num_returns=1, timeout=POLL_S)[0]:
             return
-        ended = set(ray.wait(list(works), num_returns=len(works), timeout=0)[0])
+        ended = ray.wait(list(works), num_returns=len(works), timeout=0)[0]
         for reference, worker in works.items():
-            if reference in ended and worker.work is reference:
-                self._ended(worker)
+            if reference in ended:
+                worker.work = None
+                try:
+                    result = ray.get(reference)
+                except RayError as error:
+                    worker.lost(error)
+                else:
+                    self._ended(worker, result)
 
-    def _ended(self, worker: Worker) -> None:
-        """Handle the end of a worker's long call: restart it, finish, or raise."""
-        reference, worker.work = worker.work, None
-        try:
-            result = ray.get(reference)
-        except RayError as error:
-            if isinstance(error, RayTaskError) and isinstance(error.cause, RayError | ServiceStoppedError):
-                self._blame()
-            worker.lost(error)
-            return
+    def _ended(self, worker: Worker, result: Any) -> None:
+        """Handle the end of a worker's long call that did not fail."""
         if worker is self._trainer:
             self._finish(int(result))
         elif not (self._done and worker is self._replay):
             raise WorkerError(f"{worker.name} worker ended without being asked to")
 
-    def _blame(self) -> None:
-        """A worker failed because of another one: raise that one's failure, if it comes."""
-        works = {w.work: w for w in self._others if w is not self._trainer and w.work is not None}
-        if works:
-            for reference in ray.wait(list(works), num_returns=1, timeout=BLAME_S)[0]:
-                self._ended(works[reference])
-
     def _finish(self, version: int) -> None:
         """The trainer has made its updates: complete its records and those of replay."""
         self._done, self._version = True, version
         self.follow(ASYNCHRONOUS)
-        self._updates += self._hear(self._trainer, self._limit) or []
+        self._hear(self._trainer, self._limit)
         self._updates += self._trainer.call("metrics", timeout=self._limit)
         self._replay.call("close", timeout=self._limit)
         self._hear(self._replay, self._limit)
@@ -324,15 +327,26 @@ class RayEngine(Engine):
         episodes: list[EpisodeResult] = []
         for worker in self._everyone():
             answer = self._hear(worker)
-            if worker is self._trainer:
-                self._updates += answer or []
-            elif answer is not None and isinstance(worker, RolloutSlot):
+            if answer is not None and isinstance(worker, RolloutSlot):
                 episodes += worker.take(answer)
         imagining = self._config.imagination.environments > 0
         if not self._collected and not imagining and all(slot.spent for slot in self._rollouts):
             self._collected = True
             self._replay.call("end", timeout=self._limit)
         return episodes
+
+    def _hear(self, worker: Worker, timeout: float = 0.0) -> Any:
+        """Take the answer to the last question, if it has come; records of updates are kept."""
+        try:
+            answer = worker.answer(timeout)
+        except RayError as error:
+            # Where a process has died, its long call has ended as well, which `_await_end` deals with.
+            if not (has_died(error) and isinstance(worker, RestartedWorker)):
+                worker.lost(error)
+            return None
+        if worker is self._trainer:
+            self._updates += answer or []
+        return answer
 
     def _hand_over_world(self) -> None:
         """Give a new version of the world model to the rollout workers."""
@@ -347,43 +361,30 @@ class RayEngine(Engine):
             if not slot.is_starting:
                 slot.actor.imagine_with.remote(newest)
 
-    def _hear(self, worker: Worker, timeout: float = 0.0) -> Any:
-        try:
-            return worker.answer(timeout)
-        except RayError as error:
-            # Where a process has died, its long call has ended as well, which `_await_end` deals with.
-            has_died = isinstance(error, RayActorError) and not isinstance(error, RayTaskError)
-            if not (has_died and isinstance(worker, RestartedWorker)):
-                worker.lost(error)
-            return None
-
     def _supervise(self) -> None:
         """Give up workers that hang, and go on with those that are being restarted."""
-        for worker in self._everyone():
-            worker.show_warnings()
+        show_new_warnings(list(self._everyone()))
         # Inference last: workers that wait for it are silent too.
         for worker in (*self._others, *self._rollouts, *self._inference):
             if isinstance(worker, RestartedWorker) and worker.is_starting:
-                worker.advance_start(self._limit)
                 self._last_change = time.monotonic()  # a restart has a timeout of its own
+                if worker.advance_start(self._limit):
+                    self._begin(worker)
             elif why := worker.hung(self._limit):
-                worker.lost(RuntimeError(why), f"{worker.name} worker {why}")
+                worker.lost(WorkerError(f"{worker.name} worker {why}"))
 
     def _check_moving(self, progress: Progress) -> None:
         """End a run in which every worker answers and nothing moves."""
-        reports = [slot.last_answer for slot in self._rollouts if slot.last_answer is not None]
-        moves = sum(report.moves for report in reports)
+        moves = sum(slot.last_answer.moves for slot in self._rollouts if slot.last_answer is not None)
         state = (progress.version, moves, progress.rollout["restarts"])
+        awaited = self._training and not self._done
+        if not awaited:
+            awaited = any(slot.outstanding for slot in self._rollouts)
         now = time.monotonic()
-        outstanding = any(slot.outstanding for slot in self._rollouts)
-        waiting = outstanding or (self._training and not self._done)
-        # Where one worker is to blame, that is found a moment later.
-        silent = max(worker.silent_s() for worker in self._everyone())
-        busy_s = max((report.busy_s for report in reports), default=0.0)
-        if state != self._last_state or not waiting:
+        if state != self._last_state or not awaited:
             self._last_state, self._last_change = state, now
-        elif now - self._last_change > self._limit and max(silent, busy_s) <= self._limit / 2:
+        elif now - self._last_change > 2 * self._limit:  # a single worker that hangs is found earlier
             raise WorkerError(
-                f"nothing moved for {self._limit:.0f} s: {progress.rollout}, {progress.replay}, "
+                f"nothing moved for {2 * self._limit:.0f} s: {progress.rollout}, {progress.replay}, "
                 f"{progress.inference}; raise launch.stall_s if a single step takes that long"
             )

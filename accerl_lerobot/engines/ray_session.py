@@ -2,8 +2,8 @@
 """The Ray of a run: a private one on this machine, or the cluster of ``launch.address``.
 
 A private Ray listens on the loopback interface and asks for a token that only this user's processes know. Its
-sockets and logs are in a folder of this user, which the guardian removes. A run that joins a cluster uses the
-user's token and leaves the cluster as it is.
+sockets and logs are in a folder that the guardian removes. A run that joins a cluster uses the user's token
+and leaves the cluster as it is.
 
 Ray reads its environment when it is imported. So nothing here imports it at the top, and `prepare` is called
 before anything does.
@@ -18,7 +18,6 @@ import secrets
 import socket
 import sys
 import tempfile
-import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -26,15 +25,14 @@ from typing import TYPE_CHECKING
 
 from accerl_lerobot import guardian
 from accerl_lerobot.config.parsing import imported
-from accerl_lerobot.engines.stopping import WorkerError, deferred, pause_s
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.engines.stopping import WorkerError, handled
+from accerl_lerobot.errors import InputError, in_one_line
 
 if TYPE_CHECKING:
     from accerl_lerobot.engines.config import LaunchConfig
 
 logger = logging.getLogger(__name__)
 
-FIELD = "launch.address"
 STARTS = 3  # attempts to start a private Ray, which gives up after 30 s; a busy machine may need more
 CONNECT_S = 5.0  # timeout for a TCP connection to a cluster
 
@@ -75,8 +73,9 @@ def prepare(joins: bool = False) -> None:
         os.environ.setdefault(key, value)
     if not os.environ.get("RAY_TMPDIR"):
         # Sockets and logs: Ray's own choice is a folder of all users, in which they stay.
-        os.environ["RAY_TMPDIR"] = tempfile.mkdtemp(prefix="accerl-", dir="/tmp")
-        guardian.remove(Path(os.environ["RAY_TMPDIR"]))
+        folder = tempfile.mkdtemp(prefix="accerl-", dir="/tmp")
+        os.environ["RAY_TMPDIR"] = folder
+        guardian.remove(Path(folder))
     if not any(os.environ.get(key) for key in _AUTH):
         os.environ["RAY_AUTH_MODE"] = "token"
         os.environ["RAY_AUTH_TOKEN"] = secrets.token_hex(32)
@@ -97,38 +96,39 @@ def forwarded_environment() -> dict[str, str]:
 
 def start_ray(launch: LaunchConfig | None = None) -> None:
     """Start a private Ray on this machine, or join the cluster of ``launch.address``."""
-    with deferred():
-        if launch is not None and launch.address is not None:
+    with handled():
+        if launch is None or launch.address is None:
+            _start_private()
+        else:
             _join(launch.address)
-            return
-        import ray
 
-        if not all(os.environ.get(key) for key in PRIVATE) or not any(os.environ.get(key) for key in _AUTH):
-            hint = "start a new process, or call ray_session.prepare() before Ray is imported"
-            raise RuntimeError(f"Ray has been imported, and would be open to others if started now: {hint}")
-        for attempt in range(1, STARTS + 1):
-            try:
-                ray.init(
-                    address="local",
-                    include_dashboard=False,
-                    _node_ip_address="127.0.0.1",
-                    log_to_driver=False,
-                    configure_logging=False,
-                )
-                return
-            except Exception as error:  # Ray raises a plain one when its start-up fails
-                ray.shutdown()
-                reason = " ".join(str(error).split())
-                if attempt == STARTS:
-                    raise WorkerError(f"Ray did not start in {attempt} attempts: {reason}") from error
-                logger.warning("Ray did not start and is started again: %s", reason)
-                time.sleep(pause_s(attempt))
+
+def _start_private() -> None:
+    import ray
+
+    if not all(os.environ.get(key) for key in PRIVATE) or not any(os.environ.get(key) for key in _AUTH):
+        hint = "start a new process, or call ray_session.prepare() before Ray is imported"
+        raise RuntimeError(f"Ray has been imported, and would be open to others if started now: {hint}")
+    for attempt in range(1, STARTS + 1):
+        try:
+            ray.init(
+                address="local",
+                include_dashboard=False,
+                _node_ip_address="127.0.0.1",
+                log_to_driver=False,
+                configure_logging=False,
+            )
+            return
+        except Exception as error:  # Ray raises a plain one when its start-up fails
+            ray.shutdown()
+            if attempt == STARTS:
+                raise WorkerError(f"Ray did not start: {in_one_line(error)}") from error
 
 
 def _join(address: str) -> None:
     if not has_token():
         hint = "there is no token; start the cluster with RAY_AUTH_MODE=token, and set RAY_AUTH_TOKEN_PATH"
-        raise InputError(FIELD, address, hint)
+        raise InputError("launch.address", address, hint)
     import ray
     from ray.exceptions import AuthenticationError
 
@@ -136,16 +136,12 @@ def _join(address: str) -> None:
         if address != "auto":  # Ray would try for minutes
             host, _, port = address.rpartition(":")
             socket.create_connection((host.strip("[]"), int(port)), CONNECT_S).close()
-        ray.init(
-            address=address,
-            log_to_driver=False,
-            configure_logging=False,
-            runtime_env={"env_vars": forwarded_environment()},
-        )
+        environment = {"env_vars": forwarded_environment()}
+        ray.init(address=address, log_to_driver=False, configure_logging=False, runtime_env=environment)
     except (RuntimeError, OSError, ValueError, AuthenticationError) as error:
-        reason = " ".join(str(error.__cause__ or error).split())[:300]
+        reason = in_one_line(error.__cause__ or error)[:300]
         hint = f"this process cannot join it; is it what ray start --head printed? {reason}"
-        raise InputError(FIELD, address, hint) from error
+        raise InputError("launch.address", address, hint) from error
 
 
 @contextlib.contextmanager
@@ -160,13 +156,14 @@ def opened(launch: LaunchConfig, now: bool = True) -> Iterator[None]:
     prepare(joins=launch.address is not None)
     import ray
 
-    there = ray.is_initialized()
+    if ray.is_initialized():
+        yield
+        return
     try:
-        if now and not there:
+        if now:
             with ThreadPoolExecutor(1) as pool:
                 pool.submit(imported, "accerl_lerobot.policies.loading:load_adapter")
                 start_ray(launch)
         yield
     finally:
-        if not there:
-            ray.shutdown()
+        ray.shutdown()

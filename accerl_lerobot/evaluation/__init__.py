@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -68,30 +68,29 @@ class Rate:
         return f"{100 * self.value:.1f} % [{100 * low:.1f}, {100 * high:.1f}] n={self.n}"
 
 
+def rate_of(results: Sequence[EpisodeResult]) -> Rate:
+    """Successes among episodes."""
+    return Rate(successes=sum(result.success for result in results), n=len(results))
+
+
+def by_task(results: Sequence[EpisodeResult]) -> dict[str, list[EpisodeResult]]:
+    """Task → its episodes, sorted by task."""
+    tasks = sorted({result.plan.task for result in results})
+    return {task: [result for result in results if result.plan.task == task] for task in tasks}
+
+
 def summarise(results: Sequence[EpisodeResult]) -> dict[str, Any]:
     """Success with its 95 % Wilson interval, in all and per task, as plain JSON types.
 
     Each task has the first and the last of its ``seeds``, and the ``failed_seeds`` among them. ``notes`` say
     why the success of some episodes may not be what happened.
     """
-    if not results:
-        raise ValueError("nothing to summarise: no episodes")
-    outcomes: dict[str, dict[int, bool]] = {}  # task → seed → success
-    for result in results:
-        outcomes.setdefault(result.plan.task, {})[result.plan.seed] = result.success
     tasks = {}
-    every: list[bool] = []
-    for name in sorted(outcomes):
-        seeds = outcomes[name]
-        every += seeds.values()
-        failed = sorted(seed for seed, success in seeds.items() if not success)
-        tasks[name] = {
-            **_rate(list(seeds.values())),
-            "seeds": [min(seeds), max(seeds)],
-            "failed_seeds": failed,
-        }
-    return {
-        **_rate(every),
+    for name, episodes in by_task(results).items():
+        seeds = sorted(episode.plan.seed for episode in episodes)
+        failed = sorted(episode.plan.seed for episode in episodes if not episode.success)
+        tasks[name] = _rate(episodes) | {"seeds": [seeds[0], seeds[-1]], "failed_seeds": failed}
+    return _rate(results) | {
         "return_mean": float(np.mean([result.episode_return for result in results])),
         "steps_mean": float(np.mean([result.steps for result in results])),
         "version_min": min(result.versions[0] for result in results),
@@ -110,16 +109,14 @@ def notes(results: Sequence[EpisodeResult]) -> list[str]:
 def table(summary: dict[str, Any], title: str) -> Table:
     """`summarise`'s numbers for the terminal."""
     out = Table("task", "success [95 % Wilson]", title=title)
-    rows = dict(summary["tasks"])
-    if len(rows) > 1:
-        rows["all"] = summary
+    rows = summary["tasks"] | ({"all": summary} if len(summary["tasks"]) > 1 else {})
     for name, entry in rows.items():
         out.add_row(name, str(Rate(successes=round(entry["success"] * entry["n"]), n=entry["n"])))
     return out
 
 
-def _rate(successes: Sequence[bool]) -> dict[str, Any]:
-    rate = Rate(successes=sum(successes), n=len(successes))
+def _rate(results: Sequence[EpisodeResult]) -> dict[str, Any]:
+    rate = rate_of(results)
     return {"success": rate.value, "n": rate.n, "ci95": list(rate.interval())}
 
 
@@ -158,7 +155,6 @@ def evaluation_plans(
 
 GAP = 4
 BORDER = 5
-MAX_SLANTED = 12  # with more tasks than this, their names are vertical
 
 
 @contextmanager
@@ -202,35 +198,6 @@ def success_curve(
         axes.legend(loc="lower right")
 
 
-@for_viewing("success_by_task.png")
-def success_by_task(path: Path, arms: Mapping[str, Mapping[str, Sequence[float]]]) -> None:
-    """Draws a group of bars per task, one bar per arm, the mean over policies; where several, they are dots.
-
-    `arms` is arm → task → success of each policy; the last arm sorts the tasks.
-    """
-    last = list(arms.values())[-1]
-
-    def order(task: str) -> tuple[float, str]:
-        return float(np.mean(last.get(task, 0.0))), task
-
-    tasks = sorted(set().union(*arms.values()), key=order)
-    with drawing(path) as axes:
-        for i, (name, success) in enumerate(arms.items()):
-            places = [tasks.index(task) + 0.8 * (i + 0.5) / len(arms) - 0.4 for task in success]
-            means = [float(np.mean(values)) for values in success.values()]
-            axes.bar(places, means, 0.75 / len(arms), color=f"C{i}", label=name)
-            for place, values in zip(places, success.values(), strict=True):
-                if len(values) > 1:
-                    axes.scatter([place] * len(values), values, s=10, color="black", zorder=3)
-        labels = [task.removesuffix("-v3") for task in tasks]
-        if len(tasks) > MAX_SLANTED:
-            axes.set_xticks(range(len(tasks)), labels, rotation=90, fontsize=6)
-        else:
-            axes.set_xticks(range(len(tasks)), labels, rotation=20, ha="right")
-        axes.set(ylabel="success", ylim=(0, 1.02))
-        axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1), ncols=len(arms))
-
-
 @for_viewing("film")
 def write_video(path: Path, rows: Sequence[Sequence[Sequence[np.ndarray]]], fps: int) -> None:
     """Writes rows of clips, of equal width, as MP4; a clip that ends early holds its last frame.
@@ -253,59 +220,29 @@ def write_video(path: Path, rows: Sequence[Sequence[Sequence[np.ndarray]]], fps:
 
 @for_viewing("film")
 def before_after(
-    path: Path,
-    before: tuple[Sequence[EpisodeResult], dict[str, Any] | None],
-    after: tuple[Sequence[EpisodeResult], dict[str, Any] | None],
-    fps: int,
+    path: Path, before: Sequence[EpisodeResult], after: Sequence[EpisodeResult], fps: int
 ) -> None:
     """Films the same episodes twice, before training on the left and after it on the right.
 
-    Above each half stand the evaluation's numbers; the frame of an episode that has ended is green for a
-    success and red for a failure. Nothing is written when no episode was filmed. `before` and `after` are
-    results of the same plans, and their summaries.
+    The frame of an episode that has ended is green for a success and red for a failure. Nothing is written
+    when no episode was filmed. `before` and `after` are results of the same plans.
     """
-    halves = [_filmed(results) for results, _ in (before, after)]
+    halves = [
+        {result.plan.index: result for result in results if result.frames} for results in (before, after)
+    ]
     both = sorted(halves[0].keys() & halves[1].keys())
     if not both:
         return
     blank = np.full_like(halves[0][both[0]].frames[0], 255)
+    gap = blank[:, : 2 * GAP]
     columns = math.ceil(math.sqrt(len(both)))
-    width = columns * (blank.shape[1] + GAP) - GAP
-    texts = [f"before RL: {_rate_text(before[1])}", f"after RL: {_rate_text(after[1])}"]
-    size = min(20, max(8, 2 * width // max(map(len, texts))))
-    left, right = (_caption(text, width, size) for text in texts)
-    rows = [[[left], [_gap(left)], [right]]]
+    rows = []
     for start in range(0, len(both), columns):
-        shown = both[start : start + columns]
-        missing = [[blank]] * (columns - len(shown))
-        clips = [[_with_outcome(half[index]) for index in shown] + missing for half in halves]
-        rows.append([*clips[0], [_gap(blank)], *clips[1]])
+        indices = both[start : start + columns]
+        left, right = ([_with_outcome(half[index]) for index in indices] for half in halves)
+        missing = [[blank]] * (columns - len(indices))
+        rows.append([*left, *missing, [gap], *right, *missing])
     write_video(path, rows, fps)
-
-
-def _filmed(results: Sequence[EpisodeResult]) -> dict[int, EpisodeResult]:
-    return {result.plan.index: result for result in results if result.frames}
-
-
-def _gap(beside: np.ndarray) -> np.ndarray:
-    """White between the halves, as high as a picture."""
-    return np.full((len(beside), 2 * GAP, 3), 255, np.uint8)
-
-
-def _rate_text(summary: dict[str, Any] | None) -> str:
-    if summary is None:
-        return "not evaluated"
-    low, high = summary["ci95"]
-    return f"{summary['success']:.0%} success [{low:.0%}, {high:.0%}], n = {summary['n']}"
-
-
-def _caption(text: str, width: int, size: int) -> np.ndarray:
-    """Black text, `size` pixels high, in a picture of this width."""
-    from PIL import Image, ImageDraw, ImageFont
-
-    image = Image.new("RGB", (width, size + 12), "white")
-    ImageDraw.Draw(image).text((4, 4), text, fill="black", font=ImageFont.load_default(size))
-    return np.asarray(image)
 
 
 def _with_outcome(result: EpisodeResult) -> list[np.ndarray]:

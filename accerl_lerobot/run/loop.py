@@ -14,9 +14,9 @@
     run         reports of the four   evaluations,        the next report             after the last
                                       checkpoints                                     evaluation
 
-The four are processes in `launch`, and take turns in one process in `local`. Where a world model learns in
-the run, it has a process too: `world_model.worker` for the state of critic and teacher, `world_model.online`
-for imagined environments, which rollout workers step like real ones.
+The four are processes in `ray_engine`, and take turns in one process in `local`. Where a world model learns
+in the run, it has a process too: `world_model.worker` for the state of critic and teacher,
+`world_model.online` for imagined environments, which rollout workers step like real ones.
 """
 
 from __future__ import annotations
@@ -26,9 +26,8 @@ import logging
 import math
 import shutil
 import time
-from collections.abc import Callable, Iterable
-from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -40,14 +39,7 @@ from accerl_lerobot.engines.config import RunConfig
 from accerl_lerobot.engines.contract import Engine, Progress
 from accerl_lerobot.engines.stopping import Stopping
 from accerl_lerobot.errors import warn_once
-from accerl_lerobot.evaluation import (
-    before_after,
-    evaluation_plans,
-    notes,
-    success_by_task,
-    success_curve,
-    summarise,
-)
+from accerl_lerobot.evaluation import before_after, evaluation_plans, success_curve, summarise
 from accerl_lerobot.experience import IMAGINED, REAL
 from accerl_lerobot.metrics import MetricsLog, plain
 from accerl_lerobot.rollout.runner import EpisodeResult
@@ -59,11 +51,10 @@ FILMED = ".before"  # name of the filmed episodes of the first evaluation, kept 
 RECORD_EVERY = 10  # updates between two records of the workers' counters when no episode ends
 HOPELESS = 50  # exploring episodes without a success after which the user is told
 RECENT = 100  # exploring episodes over which the training success of the curve is averaged
-COUNTERS = ("decisions", "episodes", "dropped_nonfinite", "dropped_episodes")  # of a runner, in the summary
-_STATE = (
-    "before", "evaluations", "curve", "recent", "imagined", "explored", "won", "note", "lags", "lag_max",
-    "mismatch_max", "during", "base", "steps", "evaluated", "saved",
-)  # fmt: skip
+RATE = ("success", "n", "ci95", "tasks")  # of an evaluation, in the summary
+COUNTERS = ("decisions", "episodes", "dropped_nonfinite", "dropped_episodes", "imagined_decisions",
+            "imagined_episodes")  # fmt: skip
+"""Counters of the rollout workers in the summary."""
 
 
 def run_plans(
@@ -78,17 +69,14 @@ def run_plans(
     with console.stage(f"evaluation ({group})", total=count) as stage:
         while len(results) < count:
             progress = engine.poll()
-            ended = [e for e in progress.episodes if e.plan.group == group]
-            _warn_of_notes(ended)
-            results += ended
+            _warn_of_notes(progress.episodes)
+            results += [episode for episode in progress.episodes if episode.plan.group == group]
             on_progress(progress)
             stage.update(len(results), f"{np.mean([r.success for r in results]):.0%}" if results else "")
-    for note in notes(results):  # their first words, as all of them were told with the first such episode
-        logger.warning("evaluation (%s), %s", group, ": ".join(note.split(": ")[:2]))
-    return sorted(results, key=lambda r: r.plan.index)
+    return sorted(results, key=lambda result: result.plan.index)
 
 
-def _warn_of_notes(episodes: Iterable[EpisodeResult]) -> None:
+def _warn_of_notes(episodes: list[EpisodeResult]) -> None:
     for episode in episodes:
         if episode.note:
             warn_once(episode.note)
@@ -100,254 +88,93 @@ class Times:
 
     started: float
     warm_s: float = 0.0  # warm start
-    rl_s: float = 0.0  # training, in earlier processes
+    rl_s: float = 0.0  # training, before `training_since`
+    training_since: float | None = None
     before_s: float | None = 0.0  # all, in earlier processes; None: the checkpoint has it
     furthest: int = 0  # latest update made in this process, lost or not
     clock: Clock = field(default_factory=NoClock)  # the driver's row of the timeline
 
-    @property
-    def wall_s(self) -> float:
-        return (self.before_s or 0.0) + time.monotonic() - self.started
+    def state(self) -> dict[str, float]:
+        """Seconds until now, as a checkpoint holds them."""
+        now = time.monotonic()
+        wall_s = (self.before_s or 0.0) + now - self.started
+        training_s = 0.0 if self.training_since is None else now - self.training_since
+        return {"rl_s": self.rl_s + training_s, "wall_s": wall_s, "warm_s": self.warm_s}
+
+    def restore(self, state: dict[str, float]) -> None:
+        self.rl_s, self.warm_s, self.training_since = state["rl_s"], state["warm_s"], None
+        if self.before_s is None:
+            self.before_s = state["wall_s"]
 
 
-@dataclass(eq=False)
-class Loop:
-    """Evaluates, trains, saves checkpoints, and writes the results; `stop` tells when to save and end."""
+@dataclass(kw_only=True)
+class RunState:
+    """Progress of a run, as a checkpoint holds it."""
 
-    config: RunConfig
-    directory: Path
-    console: Console
-    log: MetricsLog
-    engine: Engine
-    tasks: tuple[str, ...]
-    times: Times
-    stop: Stopping
+    before: dict[str, Any] | None = None  # the evaluation before training, where there was one
+    evaluations: list[dict[str, Any]] = field(default_factory=list)
+    during: dict[str, list[EpisodeResult]] = field(default_factory=dict)
+    """Evaluations while training, and their episodes so far."""
+    curve: list[tuple[float, float]] = field(default_factory=list)  # env steps, success of exploring episodes
+    recent: list[bool] = field(default_factory=list)  # success of the newest exploring episodes
+    imagined: list[bool] = field(default_factory=list)  # the same, of imagined episodes
+    explored: int = 0  # exploring episodes that have ended
+    won: int = 0  # successes among them
+    note: str = ""  # of the last of them that had one, see `EpisodeResult`
+    lags: list[float] = field(default_factory=list)
+    lag_max: float = 0.0
+    mismatch_max: float = 0.0
+    base: dict[str, float] = field(default_factory=dict)  # counters when training began
+    steps: float = math.inf  # env steps of the training, once it has ended
+    evaluated: int = 0  # evaluations that were due by the number of updates
+    saved: int = 0  # checkpoints that were due by it
 
-    def __post_init__(self) -> None:
-        self.before: dict[str, Any] | None = None  # the evaluation before training, where there was one
-        self.evaluations: list[dict[str, Any]] = []
-        self.curve: list[tuple[float, float]] = []
-        self.recent: list[bool] = []
-        self.imagined: list[bool] = []  # the same, of imagined episodes
-        self.explored = self.won = 0  # exploring episodes that have ended, and successes among them
-        self.note = ""  # of the last of them that had one, see `EpisodeResult`
-        self.lags: list[float] = []
-        self.lag_max = self.mismatch_max = 0.0
-        self.during: dict[str, list[EpisodeResult]] = {}
-        self.base: dict[str, float] = {}
-        self.steps = math.inf  # env steps of the training, once it has ended
-        self.evaluated = self.saved = 0  # evaluations and checkpoints that were due by the number of updates
-        self._began_at: str | None = None
-        self._training_since: float | None = None
-        self._saved_at = time.monotonic()
-        self._hopeless = False  # True once it has been said that no exploring episode succeeds
 
-    def run(self, state: Path | None) -> dict[str, Any]:
-        """Do the run, or the rest of it; returns the summary."""
-        filmed = self._begin() if state is None else self._resume(state)
-        self.engine.train()
-        self.times.clock.enter(TRAINING)
-        self._training_since = self._saved_at = time.monotonic()
-        with self._training_stage() as stage:
-            while True:
-                progress = self.engine.poll()
-                self._record(progress)
-                stage.update(progress.version, self._status(progress))
-                if progress.done:
-                    break
-                if self._evaluation_is_due(progress):
-                    self._plan(self.config.evaluation.episodes_during, f"during-{self.evaluated}")
-                if self._save_is_due(progress) or self.stop.asked is not None:
-                    self._save()
-                self.stop.check()
-        self.times.rl_s, self._training_since = self._rl_s, None
-        self.steps = self._steps(progress)
-        self._save()
-        self._check_hope(1)
-        after, results = self._evaluate("after", self.steps)
-        summary: dict[str, Any] = plain(self._summary(after, progress))
-        layout.write_atomically(self.directory / layout.SUMMARY, json.dumps(summary, indent=2) + "\n")
-        self._draw(after, filmed, results)
-        layout.prune(self.directory / layout.CHECKPOINTS)  # it has ended
-        return summary
+class Recorder:
+    """Counts and logs what an engine reports."""
 
-    def _begin(self) -> list[EpisodeResult]:
-        """Evaluate before training, and save; returns the episodes of the evaluation."""
-        filmed: list[EpisodeResult] = []
-        if self.config.evaluation.before:
-            self.before, filmed = self._evaluate("before", 0.0)
-            snapshot.save(self.directory / FILMED, [result for result in filmed if result.frames])
-            self.base = self.engine.poll().rollout
-        if self.config.save_every_updates or self.config.save_every_s:
-            self._save()
-        return filmed
+    def __init__(self, config: RunConfig, log: MetricsLog, console: Console, times: Times) -> None:
+        self.config, self.log, self.console, self.times = config, log, console, times
+        self.state = RunState()
 
-    def _resume(self, state: Path) -> list[EpisodeResult]:
-        """Restore what the checkpoint has; returns the filmed episodes of the evaluation before."""
-        self._began_at = state.parent.name
-        self._restore(snapshot.load(state / layout.RUN_STATE), layout.saved_version(state))
-        if not (self.directory / f"{FILMED}.json").is_file():
-            return []
-        filmed: list[EpisodeResult] = snapshot.load(self.directory / FILMED)
-        return filmed
-
-    def _training_stage(self) -> AbstractContextManager[Any]:
-        config = self.config
-        return self.console.stage(f"RL ({config.algorithm.type})", total=config.trainer.updates)
-
-    def _evaluation_is_due(self, progress: Progress) -> bool:
-        """True once for each number of updates after which rollout workers evaluate beside exploring."""
-        every = self.config.evaluation.every_updates
-        if not every or progress.version // every <= self.evaluated:
-            return False
-        self.evaluated = progress.version // every
-        self.during[f"during-{self.evaluated}"] = []
-        return True
-
-    def _save_is_due(self, progress: Progress) -> bool:
-        updates, seconds = self.config.save_every_updates, self.config.save_every_s
-        if seconds and time.monotonic() - self._saved_at > seconds:
-            return True
-        return bool(updates) and progress.version // updates > self.saved
-
-    def _draw(self, after: dict[str, Any], filmed: list[EpisodeResult], results: list[EpisodeResult]) -> None:
-        """Write the run's pictures and its film."""
-        success_curve(self.directory / "success_curve.png", self.evaluations, self.curve)
-        if len(after["tasks"]) > 1:
-            ends = {"before": self.before, "after": after}
-            arms = {
-                name: {task: [of["success"]] for task, of in end["tasks"].items()}
-                for name, end in ends.items()
-                if end is not None
-            }
-            success_by_task(self.directory / "success_by_task.png", arms)
-        if any(result.frames for result in filmed):
-            film = self.directory / "before_after.mp4"
-            before_after(film, (filmed, self.before), (results, after), fps=20)
-        for left in self.directory.glob(f"{FILMED}.*"):
-            left.unlink()
-
-    def _state(self) -> dict[str, Any]:
-        spent = {"rl_s": self._rl_s, "wall_s": self.times.wall_s, "warm_s": self.times.warm_s}
-        return {name: getattr(self, name) for name in _STATE} | {"log": self.log.state(), "times": spent}
-
-    def _restore(self, state: dict[str, Any], version: int) -> None:
-        for name in _STATE:
-            setattr(self, name, state[name])
-        self.log.restore(state["log"], version)
-        times = state["times"]
-        self.times.rl_s, self.times.warm_s = times["rl_s"], times["warm_s"]
-        if self.times.before_s is None:
-            self.times.before_s = times["wall_s"]
-        if version < self.config.trainer.updates:  # more are asked for than were when it ended
-            self.steps = math.inf
-        evaluate, save = self.config.evaluation.every_updates, self.config.save_every_updates
-        self.evaluated = min(self.evaluated, version // evaluate if evaluate else 0)
-        self.saved = min(self.saved, version // save if save else 0)
-
-    def _summary(self, after: dict[str, Any], last: Progress) -> dict[str, Any]:
-        before = self.before or {}
-        return {
-            **{f"{name}_before": before.get(name) for name in ("success", "n", "ci95", "tasks")},
-            **{f"{name}_after": after[name] for name in ("success", "n", "ci95", "tasks")},
-            "env_steps": int(self.steps),
-            **{k: int(self._since(last, k)) for k in COUNTERS},
-            "updates": last.version,
-            **{k: int(last.replay.get(k, 0)) for k in ("trained_decisions", "unique_decisions")},
-            "restarts": int(last.rollout.get("restarts", 0)),
-            "lag_mean": float(np.mean(self.lags)) if self.lags else 0.0,
-            "lag_max": self.lag_max,
-            "ratio_max_dev": self.mismatch_max,
-            "wall_s": self.times.wall_s,
-            "warm_start_s": self.times.warm_s,
-            "rl_s": self.times.rl_s,
-            "episodes_explored": self.explored,
-            "note": self.note,
-            "imagined_decisions": int(self._since(last, "imagined_decisions")),
-            "imagined_episodes": int(self._since(last, "imagined_episodes")),
-            "algorithm": self.config.algorithm.type,
-            "tasks": list(self.tasks),
-            "seed": self.config.seed,
-        }
-
-    def _check_hope(self, episodes: int) -> None:
-        """Tells once if none of at least so many exploring episodes has succeeded."""
-        if self.won or self._hopeless or self.explored < episodes:
-            return
-        self._hopeless = True
-        note = f" ({self.note})" if self.note else ""
-        logger.warning(
-            "none of %d exploring episodes succeeded%s; where success is the only reward there is nothing to "
-            "learn from: see env.success, and docs/troubleshooting.md",
-            self.explored, note,
-        )  # fmt: skip
-
-    @property
-    def _rl_s(self) -> float:
-        since = self._training_since
-        return self.times.rl_s + (0.0 if since is None else time.monotonic() - since)
-
-    def _record_updates(self, updates: list[dict[str, float]]) -> None:
-        for metrics in updates:
-            self.lags.append(metrics["lag_mean"])
-            self.lag_max = max(self.lag_max, metrics["lag_max"])
-            self.mismatch_max = max(self.mismatch_max, metrics.get("ratio_max_dev", 0.0))
-            self.log.write("train", int(metrics["update"]), metrics)
-            self.times.furthest = max(self.times.furthest, int(metrics["update"]))
-
-    def _record(self, progress: Progress) -> None:
+    def record(self, progress: Progress) -> None:
+        state = self.state
         self.times.clock.beat()
-        self._record_updates(progress.updates)
+        self.record_updates(progress.updates)
+        _warn_of_notes(progress.episodes)
         explored = [e for e in progress.episodes if e.plan.explore and e.plan.source == REAL]
         imagined = [e.success for e in progress.episodes if e.plan.source == IMAGINED]
-        self.imagined = (self.imagined + imagined)[-RECENT:]
-        self.explored += len(explored)
-        self.won += sum(e.success for e in explored)
-        _warn_of_notes(progress.episodes)
-        self.note = next((e.note for e in reversed(explored) if e.note), self.note)
-        self._check_hope(HOPELESS)
-        self.recent = (self.recent + [e.success for e in explored])[-RECENT:]
-        share = float(np.mean(self.recent)) if self.recent else math.nan
+        state.imagined = (state.imagined + imagined)[-RECENT:]
+        state.recent = (state.recent + [episode.success for episode in explored])[-RECENT:]
+        self._count(explored)
         # The first episodes to end are the short ones, which are successes.
-        if explored and len(self.recent) >= RECENT // 4 and math.isinf(self.steps):  # it is training
-            self.curve.append((self._steps(progress), share))
+        training = math.isinf(state.steps)
+        if explored and training and len(state.recent) >= RECENT // 4:
+            state.curve.append((self.env_steps(progress), float(np.mean(state.recent))))
         # Imagined episodes and learning go on once all real episodes have been played.
         if explored or any(metrics["update"] % RECORD_EVERY == 0 for metrics in progress.updates):
-            values = progress.rollout | {"success_exploring": share}
-            if self.imagined:
-                values["success_imagined"] = float(np.mean(self.imagined))
-            if explored:
-                sums = np.sum([(e.episode_return, e.steps, e.decisions) for e in explored], axis=0)
-                names = ("episode_return", "episode_steps", "episode_decisions")
-                values |= dict(zip(names, sums / len(explored), strict=True))
-            for part in ("replay", "inference", "world_model"):
-                values |= {f"{part}_{k}": v for k, v in getattr(progress, part).items()}
-            self.log.write("rollout", progress.version, values)
+            self._log_counters(progress, explored)
         for episode in progress.episodes:
-            if (results := self.during.get(group := episode.plan.group)) is not None:
+            results = state.during.get(episode.plan.group)
+            if results is not None:
                 results.append(episode)
                 if len(results) == self.config.evaluation.episodes_during:
-                    self._report(group, results, self._steps(progress), progress.version)
+                    self.report(episode.plan.group, results, self.env_steps(progress), progress.version)
 
-    def _plan(self, episodes: int, group: str, filmed: int = 0) -> None:
-        seed = self.config.seed
-        self.engine.plan(evaluation_plans(self.tasks, episodes, group, seed=seed, filmed=filmed))
+    def record_updates(self, updates: list[dict[str, float]]) -> None:
+        state = self.state
+        for metrics in updates:
+            version = int(metrics["update"])
+            state.lags.append(metrics["lag_mean"])
+            state.lag_max = max(state.lag_max, metrics["lag_max"])
+            state.mismatch_max = max(state.mismatch_max, metrics.get("ratio_max_dev", 0.0))
+            self.log.write("train", version, metrics)
+            self.times.furthest = max(self.times.furthest, version)
 
-    def _evaluate(self, group: str, steps: float) -> tuple[dict[str, Any], list[EpisodeResult]]:
-        self.times.clock.enter(EVALUATION)
-        episodes = self.config.evaluation.episodes
-        self._plan(episodes, group, filmed=self.config.evaluation.videos)
-        # An evaluation planned while training may end only now.
-        results = run_plans(self.engine, episodes, group, self.console, self._meanwhile)
-        return self._report(group, results, steps, results[0].versions[1]), results
-
-    def _meanwhile(self, progress: Progress) -> None:
-        self._record(progress)
-        self.stop.check()
-
-    def _report(self, group: str, results: list[EpisodeResult], steps: float, version: int) -> dict[str, Any]:
+    def report(self, group: str, results: list[EpisodeResult], steps: float, version: int) -> dict[str, Any]:
+        """Log an evaluation and say it; returns its summary."""
         summary = summarise(results) | {"env_steps": steps, "group": group}
-        self.evaluations.append(summary)
+        self.state.evaluations.append(summary)
         self.log.write("evaluation", version, summary)
         low, high = summary["ci95"]
         self.console.say(
@@ -356,37 +183,227 @@ class Loop:
         )
         return summary
 
-    def _save(self) -> None:
-        def write(folder: Path) -> int:
-            saved = self.engine.save(folder)
-            self._record_updates(saved.updates)
-            every = self.config.save_every_updates
-            self.saved = saved.version // every if every else 0
-            shutil.copyfile(self.directory / layout.CONFIG, folder / layout.CONFIG)
-            snapshot.save(folder / layout.TRAINING_STATE / layout.RUN_STATE, self._state())
-            return saved.version
+    def since(self, progress: Progress, key: str) -> float:
+        """A rollout counter since training began, evaluations meanwhile included."""
+        return progress.rollout.get(key, 0.0) - self.state.base.get(key, 0.0)
 
+    def env_steps(self, progress: Progress) -> float:
+        return min(self.state.steps, self.since(progress, "env_steps"))
+
+    def status(self, progress: Progress) -> str:
+        """The words beside the bar of training."""
+        state = self.state
+        success = f"{np.mean(state.recent):.0%} of {len(state.recent)}" if state.recent else "…"
+        lag = f"{state.lags[-1]:.0f}" if state.lags else "…"
+        decisions = self.since(progress, "decisions")
+        words = f"exploring success {success} · lag {lag} · {decisions:.0f} decisions"
+        if dropped := self.since(progress, "dropped_episodes"):
+            words += f" · {dropped:.0f} episodes dropped"
+        if state.evaluations:
+            newest = state.evaluations[-1]
+            words += f" · evaluation {newest['success']:.0%} at update {newest['version_max']}"
+        return words
+
+    def warn_if_hopeless(self) -> None:
+        """Tell if no exploring episode has succeeded."""
+        if not self.state.won:
+            note = f" ({self.state.note})" if self.state.note else ""
+            logger.warning(
+                "none of %d exploring episodes succeeded%s; where success is the only reward there is "
+                "nothing to learn from: see env.success, and docs/troubleshooting.md",
+                self.state.explored, note,
+            )  # fmt: skip
+
+    def _count(self, explored: list[EpisodeResult]) -> None:
+        state, before = self.state, self.state.explored
+        for episode in explored:
+            state.explored += 1
+            state.won += episode.success
+            state.note = episode.note or state.note
+        if before < HOPELESS <= state.explored:
+            self.warn_if_hopeless()
+
+    def _log_counters(self, progress: Progress, explored: list[EpisodeResult]) -> None:
+        state = self.state
+        values = dict(progress.rollout)
+        values["success_exploring"] = float(np.mean(state.recent)) if state.recent else math.nan
+        if state.imagined:
+            values["success_imagined"] = float(np.mean(state.imagined))
+        if explored:
+            values["episode_return"] = float(np.mean([episode.episode_return for episode in explored]))
+            values["episode_steps"] = float(np.mean([episode.steps for episode in explored]))
+            values["episode_decisions"] = float(np.mean([episode.decisions for episode in explored]))
+        for part in ("replay", "inference", "world_model"):
+            numbers = getattr(progress, part)
+            values |= {f"{part}_{name}": value for name, value in numbers.items()}
+        self.log.write("rollout", progress.version, values)
+
+
+class Loop:
+    """Evaluates, trains, saves checkpoints, and writes the results; `stop` tells when to save and end."""
+
+    def __init__(
+        self,
+        config: RunConfig,
+        directory: Path,
+        engine: Engine,
+        tasks: tuple[str, ...],
+        recorder: Recorder,
+        stop: Stopping,
+    ) -> None:
+        self.config, self.directory = config, directory
+        self.engine, self.tasks, self.stop = engine, tasks, stop
+        self.recorder = recorder
+        self.state, self.times, self.console = recorder.state, recorder.times, recorder.console
+        self._checkpoints = directory / layout.CHECKPOINTS
+        self._began_at: str | None = None  # name of the checkpoint that this engine has begun from
+        self._saved_at = time.monotonic()
+
+    def run(self, state: Path | None) -> dict[str, Any]:
+        """Do the run, or the rest of it from a ``training_state``; returns the summary."""
+        filmed = self._begin() if state is None else self._resume(state)
+        progress = self._train()
+        self._save()
+        if self.state.explored < HOPELESS:
+            self.recorder.warn_if_hopeless()
+        after, results = self._evaluate("after", self.state.steps)
+        summary: dict[str, Any] = plain(self._summary(after, progress))
+        layout.write_atomically(self.directory / layout.SUMMARY, json.dumps(summary, indent=2) + "\n")
+        self._draw(filmed, results)
+        layout.prune(self._checkpoints)  # it has ended
+        return summary
+
+    def _begin(self) -> list[EpisodeResult]:
+        """Evaluate before training, and save; returns the episodes of the evaluation."""
+        filmed: list[EpisodeResult] = []
+        if self.config.evaluation.before:
+            self.state.before, filmed = self._evaluate("before", 0.0)
+            snapshot.save(self.directory / FILMED, [result for result in filmed if result.frames])
+            self.state.base = self.engine.poll().rollout
+        if self.config.save_every_updates or self.config.save_every_s:
+            self._save()
+        return filmed
+
+    def _resume(self, folder: Path) -> list[EpisodeResult]:
+        """Restore the state of a checkpoint; returns the filmed episodes of the evaluation before."""
+        state, version = self.state, layout.saved_version(folder)
+        self._began_at = folder.parent.name
+        saved = snapshot.load(folder / layout.RUN_STATE)
+        for each in fields(RunState):
+            setattr(state, each.name, saved[each.name])
+        self.recorder.log.restore(saved["log"], version)
+        self.times.restore(saved["times"])
+        if version < self.config.trainer.updates:  # more are asked for than were when it ended
+            state.steps = math.inf
+        state.evaluated = min(state.evaluated, _multiples(version, self.config.evaluation.every_updates))
+        state.saved = min(state.saved, _multiples(version, self.config.save_every_updates))
+        if not (self.directory / f"{FILMED}.json").is_file():
+            return []
+        filmed: list[EpisodeResult] = snapshot.load(self.directory / FILMED)
+        return filmed
+
+    def _train(self) -> Progress:
+        """Poll until all updates are made, evaluate and save when it is due; returns the last report."""
+        config, times = self.config, self.times
+        self.engine.train()
+        times.clock.enter(TRAINING)
+        times.training_since = self._saved_at = time.monotonic()
+        with self.console.stage(f"RL ({config.algorithm.type})", total=config.trainer.updates) as stage:
+            while True:
+                progress = self.engine.poll()
+                self.recorder.record(progress)
+                stage.update(progress.version, self.recorder.status(progress))
+                if progress.done:
+                    break
+                if _multiples(progress.version, config.evaluation.every_updates) > self.state.evaluated:
+                    self._evaluate_meanwhile(progress.version)
+                if self._save_is_due(progress) or self.stop.asked is not None:
+                    self._save()
+                self.stop.check()
+        times.rl_s, times.training_since = times.state()["rl_s"], None
+        self.state.steps = self.recorder.env_steps(progress)
+        return progress
+
+    def _plan(self, episodes: int, group: str, filmed: int = 0) -> None:
+        seed = self.config.seed
+        self.engine.plan(evaluation_plans(self.tasks, episodes, group, seed=seed, filmed=filmed))
+
+    def _evaluate(self, group: str, steps: float) -> tuple[dict[str, Any], list[EpisodeResult]]:
+        """Wait for an evaluation; its summary and episodes."""
+        self.times.clock.enter(EVALUATION)
+        episodes = self.config.evaluation.episodes
+        self._plan(episodes, group, filmed=self.config.evaluation.videos)
+        # An evaluation planned while training may end only now.
+        results = run_plans(self.engine, episodes, group, self.console, self._meanwhile)
+        return self.recorder.report(group, results, steps, results[0].versions[1]), results
+
+    def _meanwhile(self, progress: Progress) -> None:
+        self.recorder.record(progress)
+        self.stop.check()
+
+    def _evaluate_meanwhile(self, version: int) -> None:
+        """Queue an evaluation that rollout workers play beside exploring."""
+        self.state.evaluated = _multiples(version, self.config.evaluation.every_updates)
+        group = f"during-{self.state.evaluated}"
+        self.state.during[group] = []
+        self._plan(self.config.evaluation.episodes_during, group)
+
+    def _save_is_due(self, progress: Progress) -> bool:
+        seconds = self.config.save_every_s
+        if seconds and time.monotonic() - self._saved_at > seconds:
+            return True
+        return _multiples(progress.version, self.config.save_every_updates) > self.state.saved
+
+    def _save(self) -> None:
         with self.times.clock.during(CHECKPOINT):
-            path = layout.save_checkpoint(self.directory / layout.CHECKPOINTS, write)
-        layout.prune(self.directory / layout.CHECKPOINTS, needed=self._began_at)
+            path = layout.save_checkpoint(self._checkpoints, self._write)
+        layout.prune(self._checkpoints, needed=self._began_at)
         self._saved_at = time.monotonic()
         self.console.say(f"checkpoint {path / layout.PRETRAINED}")
 
-    def _since(self, progress: Progress, key: str) -> float:
-        """A rollout counter since training began, evaluations meanwhile included."""
-        return progress.rollout.get(key, 0.0) - self.base.get(key, 0.0)
+    def _write(self, folder: Path) -> int:
+        """Fill the folder of a checkpoint; returns its number of updates."""
+        saved = self.engine.save(folder)
+        self.recorder.record_updates(saved.updates)
+        self.state.saved = _multiples(saved.version, self.config.save_every_updates)
+        shutil.copyfile(self.directory / layout.CONFIG, folder / layout.CONFIG)
+        state = vars(self.state) | {"log": self.recorder.log.state(), "times": self.times.state()}
+        snapshot.save(folder / layout.TRAINING_STATE / layout.RUN_STATE, state)
+        return saved.version
 
-    def _steps(self, progress: Progress) -> float:
-        return min(self.steps, self._since(progress, "env_steps"))
+    def _draw(self, filmed: list[EpisodeResult], results: list[EpisodeResult]) -> None:
+        """Write the run's pictures and its film."""
+        success_curve(self.directory / "success_curve.png", self.state.evaluations, self.state.curve)
+        before_after(self.directory / "before_after.mp4", filmed, results, fps=20)
+        for left in self.directory.glob(f"{FILMED}.*"):
+            left.unlink()
 
-    def _status(self, progress: Progress) -> str:
-        success = f"{np.mean(self.recent):.0%} of {len(self.recent)}" if self.recent else "…"
-        lag = f"{self.lags[-1]:.0f}" if self.lags else "…"
-        decisions = f"{self._since(progress, 'decisions'):.0f} decisions"
-        words = f"exploring success {success} · lag {lag} · {decisions}"
-        if dropped := self._since(progress, "dropped_episodes"):
-            words += f" · {dropped:.0f} episodes dropped"
-        if self.evaluations:
-            newest = self.evaluations[-1]
-            words += f" · evaluation {newest['success']:.0%} at update {newest['version_max']}"
-        return words
+    def _summary(self, after: dict[str, Any], last: Progress) -> dict[str, Any]:
+        state, times = self.state, self.times.state()
+        before = state.before or {}
+        return {
+            **{f"{name}_before": before.get(name) for name in RATE},
+            **{f"{name}_after": after[name] for name in RATE},
+            "env_steps": int(state.steps),
+            **{name: int(self.recorder.since(last, name)) for name in COUNTERS},
+            "updates": last.version,
+            "trained_decisions": int(last.replay.get("trained_decisions", 0)),
+            "unique_decisions": int(last.replay.get("unique_decisions", 0)),
+            "restarts": int(last.rollout.get("restarts", 0)),
+            "lag_mean": float(np.mean(state.lags)) if state.lags else 0.0,
+            "lag_max": state.lag_max,
+            "ratio_max_dev": state.mismatch_max,
+            "wall_s": times["wall_s"],
+            "warm_start_s": times["warm_s"],
+            "rl_s": times["rl_s"],
+            "episodes_explored": state.explored,
+            "note": state.note,
+            "algorithm": self.config.algorithm.type,
+            "tasks": list(self.tasks),
+            "seed": self.config.seed,
+        }
+
+
+def _multiples(number: int, every: int) -> int:
+    """How many multiples of `every` have been reached; 0 if that is 0."""
+    return number // every if every else 0

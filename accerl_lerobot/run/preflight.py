@@ -9,21 +9,18 @@ from __future__ import annotations
 import contextlib
 import copy
 import difflib
-import json
 import logging
 import math
 import os
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import draccus
 import numpy as np
-import yaml
 
-from accerl_lerobot.algorithms import AWRConfig, ChunkCriticConfig, LossInputs, OffPolicyConfig, RatioConfig
-from accerl_lerobot.checkpoint.safety import brief
+from accerl_lerobot.algorithms import AWRConfig, ChunkCriticConfig, OffPolicyConfig, RatioConfig
 from accerl_lerobot.config.machine import check_disk
 from accerl_lerobot.envs import (
     EnvConfig,
@@ -33,7 +30,7 @@ from accerl_lerobot.envs import (
     environment_error,
     make_environment,
 )
-from accerl_lerobot.errors import InputError, causes, check_absent, expanded
+from accerl_lerobot.errors import InputError, causes
 from accerl_lerobot.experience import Observation
 from accerl_lerobot.policies.features import (
     ACTION,
@@ -42,7 +39,6 @@ from accerl_lerobot.policies.features import (
     Features,
     check_actions,
     check_features,
-    check_statistics,
     dataset_features,
     env_features,
     fine_tuned_features,
@@ -61,13 +57,6 @@ if TYPE_CHECKING:
     from accerl_lerobot.policies.config import PolicyConfig
 
 logger = logging.getLogger(__name__)
-
-MEANINGS = {
-    "rename_map": "a mapping from the dataset's names to the policy's",
-    "dataset.use_imagenet_stats": "true or false",
-    "dataset.episodes": "a list of numbers such as [0, 1]",
-}
-"""Arguments of ``lerobot-train`` that are looked at here → their values, in words."""
 
 SLOW_S = 30.0  # an environment that takes longer to reset, such as a robot, is reset only once to be checked
 VISIBLE = 25  # levels of a pixel that rendering alone does not change
@@ -96,12 +85,13 @@ def check_environment(env: EnvConfig, reward_model: RewardModelConfig | None = N
 
 def _compare_starts(first: Observation, other: Observation, again: Observation) -> None:
     """Warn if starts do not follow from their seeds: `again` has the seed of `first`, `other` another."""
-    if not all(_same(first[key], again[key]) for key in first):
+    arrays = [key for key, value in first.items() if not isinstance(value, str)]
+    if not all(_same(first[key], again[key]) for key in arrays):
         logger.warning(
             "the environment's reset ignores its seed: the same seed gives different first observations. No "
             "episode can be repeated, and success before and after training is measured on different starts"
         )
-    elif all(np.array_equal(first[key], other[key]) for key in first):
+    elif all(np.array_equal(first[key], other[key]) for key in arrays):
         logger.warning(
             "all episodes have the same start: the first observations of different seeds are equal. An "
             "evaluation of any number of episodes measures one start (n=1); see if an option of the "
@@ -109,13 +99,10 @@ def _compare_starts(first: Observation, other: Observation, again: Observation) 
         )
 
 
-def _same(one: np.ndarray | str, two: np.ndarray | str) -> bool:
-    """True if two values of an observation are equal but for rounding and noise of rendering."""
-    if isinstance(one, str) or isinstance(two, str):
-        return one == two
-    if one.dtype == np.uint8:
-        return one.shape == two.shape and bool((np.abs(one.astype(int) - two) <= VISIBLE).all())
-    return one.shape == two.shape and np.allclose(one, two, rtol=1e-4, atol=1e-5)
+def _same(one: Any, two: Any) -> bool:
+    """True if two arrays of an observation are equal but for rounding and noise of rendering."""
+    slack = VISIBLE if one.dtype == np.uint8 else 1e-5
+    return one.shape == two.shape and np.allclose(one.astype(float), two, rtol=1e-4, atol=slack)
 
 
 def check_policy(config: RunConfig, spec: EnvironmentSpec, *, own: bool = False) -> int:
@@ -141,37 +128,17 @@ def check_device(config: RunConfig) -> None:
         raise InputError("policy.device", config.policy.device, hint)
 
 
-def check_loss(algorithm: RatioConfig) -> None:
-    """Refuse an objective, which may be somebody's own, that gives no gradient on a small batch."""
-    import torch
-
-    new, old, ones = torch.zeros(3, 2, requires_grad=True), torch.zeros(3, 2), torch.ones(3)
-    rest = {"advantage": ones, "value": ones.clone().requires_grad_(), "returns": ones, "entropy": ones}
-    try:
-        output = algorithm.loss(LossInputs(log_prob_new=new, log_prob_old=old, **rest))
-        output.loss.backward()
-        sorted(output.metrics)
-        if new.grad is None or not new.grad.isfinite().all():
-            raise ValueError("no finite gradient reaches log_prob_new")
-    except Exception as error:
-        why = f"its loss fails on a small batch ({type(error).__name__}: {brief(error)})"
-        raise InputError("algorithm.type", algorithm.type, why) from error
-
-
 def check_start(config: RunConfig, say: Callable[[str], object] = str) -> tuple[EnvironmentSpec, int]:
     """Refuse a run that could not begin, or whose outcome could not be used, as far as can be told; returns
     what the environment offers, and the policy's ``n_obs_steps``."""
     from accerl_lerobot.demos.dataset_files import open_metadata
-    from accerl_lerobot.policies.config import check_likelihood, executed_rows, sampler_config
+    from accerl_lerobot.policies.config import check_likelihood, sampler_config
 
-    if config.output_dir is not None and not config.resume:
-        check_absent(expanded(config.output_dir, "output_dir"))
+    algorithm = config.algorithm
     if config.policy.path is None and not config.sft.steps:
         hint = "give a LeRobot checkpoint, or sft.steps > 0 to make one; the recipe quickstart does"
         raise InputError("policy.path", None, hint)
     check_device(config)
-    if isinstance(config.algorithm, RatioConfig):
-        check_loss(config.algorithm)
     if 0 < config.trainer.updates <= config.trainer.value_warmup_updates:
         logger.warning(
             "the policy will not change: the first trainer.value_warmup_updates=%d are the critic's alone, "
@@ -181,38 +148,43 @@ def check_start(config: RunConfig, say: Callable[[str], object] = str) -> tuple[
     check_wandb(config.wandb)
     say("looking at policy, environment and data …")
     policy = policy_to_be(config)
-    if isinstance(config.algorithm, RatioConfig):
+    if isinstance(algorithm, RatioConfig):
         new = config.policy.path is None and config.sft.init_path is None
-        field, sampler = (
-            "sft.policy.type" if new else "policy.type",
-            sampler_config(config.policy, policy.type),
-        )
-        check_likelihood(config.algorithm.type, sampler, policy.type, field)
+        field = "sft.policy.type" if new else "policy.type"
+        check_likelihood(algorithm.type, sampler_config(config.policy, policy.type), policy.type, field)
     check_memory(config)
     spec = check_environment(config.env, config.rollout.reward_model)
-    off_policy = isinstance(config.algorithm, OffPolicyConfig)
-    if off_policy:
-        check_imitates(config.algorithm, config.policy, policy)
-        decisions = math.ceil(spec.max_steps / executed_rows(policy))
-        if config.rollout.segment_length < decisions:
-            why = f"algorithm.type={config.algorithm.type} looks at whole episodes; use at least {decisions}"
-            raise InputError("rollout.segment_length", config.rollout.segment_length, why)
-        if isinstance(config.algorithm, ChunkCriticConfig):
-            check_state_model(config, policy, decisions, say)
-    renames, offered = config.policy.rename_map, env_features(spec)
-    if config.policy.path is not None:
-        check_features(policy_features(policy), offered, renames, "policy.path", config.policy.path)
-        # Off-policy learning remembers its episodes; others have no use for a dataset then.
-        remembered = off_policy and config.dataset.repo_id is not None
-        meta = open_metadata(config.dataset) if remembered else None
-    else:
+    renames, history, meta = config.policy.rename_map, int(policy.n_obs_steps), None
+    if config.policy.path is None:
         trained = policy if config.sft.init_path is None else sft_policy(config.sft)
         meta = check_training_data(config.sft, config.dataset, trained, spec, renames)
-    history = int(policy.n_obs_steps)
-    if off_policy and meta is not None and not _say_if_unlike(config, spec, meta, history):
-        _check_remembered(config.dataset, spec, meta)
+    else:
+        needed = policy_features(policy)
+        check_features(needed, env_features(spec), renames, "policy.path", config.policy.path)
+    if isinstance(algorithm, OffPolicyConfig):
+        check_off_policy(config, policy, spec, say)
+        if meta is None and config.dataset.repo_id is not None:
+            meta = open_metadata(config.dataset)
+        if meta is not None:
+            _check_remembered(config, spec, meta, history)
     check_disk(config.output_dir)
     return spec, history
+
+
+def check_off_policy(
+    config: RunConfig, policy: Any, spec: EnvironmentSpec, say: Callable[[str], object]
+) -> None:
+    """Refuse a policy, segments or states that an off-policy algorithm cannot learn from."""
+    from accerl_lerobot.policies.config import executed_rows
+
+    algorithm = config.algorithm
+    check_imitates(algorithm, config.policy, policy)
+    decisions = math.ceil(spec.max_steps / executed_rows(policy))
+    if config.rollout.segment_length < decisions:
+        why = f"algorithm.type={algorithm.type} looks at whole episodes; use at least {decisions}"
+        raise InputError("rollout.segment_length", config.rollout.segment_length, why)
+    if isinstance(algorithm, ChunkCriticConfig):
+        check_state_model(config, policy, decisions, say)
 
 
 def check_state_model(config: RunConfig, policy: Any, decisions: int, say: Callable[[str], object]) -> None:
@@ -234,30 +206,26 @@ def check_state_model(config: RunConfig, policy: Any, decisions: int, say: Calla
         raise InputError("world_model.type", model.type, hint)
 
 
-def _check_remembered(dataset: DatasetConfig, spec: EnvironmentSpec, meta: Any) -> None:
-    """Compare a dataset that joins the memory with the environment, and read its labels."""
+def _check_remembered(config: RunConfig, spec: EnvironmentSpec, meta: Any, history: int) -> None:
+    """Compare a dataset that joins the memory with the environment, or warn that it does not join."""
+    from accerl_lerobot.algorithms.demonstrations import unlike
     from accerl_lerobot.demos.dataset_files import opened
     from accerl_lerobot.demos.episodes import numbers, read_labels
 
-    about = "dataset.repo_id", dataset.repo_id
+    dataset, about = config.dataset, ("dataset.repo_id", config.dataset.repo_id)
+    shapes: dict[str, tuple[int, ...]] = {STATE: (spec.state_dim,), **spec.images}
+    if config.env.state_size:
+        shapes[ENV_STATE] = (config.env.state_size,)
+    if history > 1:
+        shapes = {name: (history, *shape) for name, shape in shapes.items()}
+    why = unlike(meta, shapes | {ACTION: (spec.action_dim,)})
+    if why is not None:
+        logger.warning("%s does not join the memory: %s", dataset.repo_id, why)
+        return
     check_features(replace(dataset_features(meta), shapes={}), env_features(spec), {}, *about)
     with opened(dataset, meta) as data:
         read_labels(data, dataset)
         check_actions(numbers(data, ACTION, dataset), spec, *about)
-
-
-def _say_if_unlike(config: RunConfig, spec: EnvironmentSpec, meta: Any, history: int) -> bool:
-    """Warn of a dataset that cannot be remembered, which is left out."""
-    from accerl_lerobot.algorithms.demonstrations import unlike
-
-    wanted: dict[str, tuple[int, ...]] = {STATE: (spec.state_dim,), **spec.images}
-    if config.env.state_size:
-        wanted[ENV_STATE] = (config.env.state_size,)
-    if history > 1:
-        wanted = {name: (history, *shape) for name, shape in wanted.items()}
-    if (why := unlike(meta, wanted | {ACTION: (spec.action_dim,)})) is not None:
-        logger.warning("%s does not join the memory: %s", config.dataset.repo_id, why)
-    return why is not None
 
 
 def check_training_data(
@@ -268,134 +236,49 @@ def check_training_data(
     rename_map: dict[str, str],
 ) -> Any:
     """Compare dataset, policy and environment of an SFT; returns the dataset's metadata, if there is one."""
-    from accerl_lerobot.demos.dataset_files import open_metadata
+    from accerl_lerobot.demos.dataset_files import open_metadata, opened
+    from accerl_lerobot.demos.episodes import numbers
+    from accerl_lerobot.demos.sft import picked
 
     meta = None if dataset.repo_id is None else open_metadata(dataset)
     offered = None if spec is None else env_features(spec)
     about: tuple[str, Any] = "dataset.repo_id", dataset.repo_id
     data = None if meta is None else replace(dataset_features(meta), any_size=resizes(policy))
     source = data or offered  # without a dataset, demonstrations of the environment
-    if source is None:
-        return None
-    renames = _dataset_renames(sft)
-    if sft.init_path is not None:
-        reader: tuple[str, Any] = "sft.init_path", sft.init_path
-        needs = fine_tuned_features(policy, source, renames)
-    else:
-        reader, renames = ("sft.policy.input_features", list(policy.input_features or ())), {}
+    if source is None or any("rename_map" in argument for argument in sft.extra_args):
+        return meta  # with names of its own, LeRobot compares dataset and policy
+    if sft.init_path is None:
         needs = _new_policy_features(policy, source, about)
-    if offered is not None and (sft.init_path is not None or data is not None or policy.input_features):
-        at = about if sft.init_path is None else reader
-        hint = _inputs_hint(data, offered.shapes) if data is not None and sft.init_path is None else ""
-        check_features(needs, offered, rename_map, *at, hint=hint)
-    if data is not None:
-        known = {name: new for name, new in renames.items() if name in data.shapes}
-        check_features(replace(needs, tasks=()), data, known, *reader, "dataset")
+        _check_new_policy(policy, needs, sft)
+    else:
+        needs = fine_tuned_features(policy, source, {})
+    if sft.init_path is not None and data is not None:
+        check_features(replace(needs, tasks=()), data, {}, "sft.init_path", sft.init_path, "dataset")
+    if offered is not None:
+        reader = about if sft.init_path is None else ("sft.init_path", sft.init_path)
+        hint = "; or name fewer in sft.policy.input_features" if sft.init_path is None else ""
+        check_features(needs, offered, rename_map, *reader, hint=hint)
     if offered is not None and data is not None and sft.init_path is not None:
         # Its cameras may have names of their own.
-        vectors = {k: shape for k, shape in data.shapes.items() if k in (STATE, ACTION)}
+        vectors = {name: shape for name, shape in data.shapes.items() if name in (STATE, ACTION)}
         check_features(replace(data, shapes=vectors), offered, {}, *about)
     for name, most in ((STATE, "max_state_dim"), (ACTION, "max_action_dim")):
         limit, size = getattr(policy, most, None), needs.shapes.get(name, (0,))[0]
         if limit is not None and limit < size:
             raise InputError(f"sft.policy.{most}", limit, f"{name} has {size} numbers; use at least that")
-    if sft.init_path is None:
-        _check_new_policy(policy, needs, sft)
-    if meta is not None:
-        _check_values(sft, dataset, policy, meta, needs, renames, spec)
+    if meta is not None and spec is not None:
+        with opened(dataset, meta, picked(dataset, sft.pick)) as read:
+            check_actions(numbers(read, ACTION, dataset), spec, *about)
     return meta
 
 
 def _new_policy_features(policy: Any, source: Features, about: tuple[str, Any]) -> Features:
     """Features of the source that a new policy reads: those that it names, or all of them."""
-    named = policy_features(policy).shapes.keys()
-    if ACTION in source.unusable or (STATE in source.unusable and (not named or STATE in named)):
-        name = ACTION if ACTION in source.unusable else STATE
-        raise InputError(*about, f"no {name} for a policy: {source.unusable[name]}")
     if ACTION not in source.shapes:
-        raise InputError(*about, f"no {ACTION}, so that there is nothing to imitate; name another dataset")
-    shapes = policy_features(policy).shapes if named else source.shapes
-    gray = [name for name, shape in shapes.items() if len(shape) == 3 and shape[0] != 3]
-    if gray and not named:
-        why = f"{gray[0]} has {shapes[gray[0]][0]} channels, and policies read pictures of 3 channels"
-        raise InputError(*about, why + _inputs_hint(source, shapes.keys() - set(gray)))
+        why = source.unusable.get(ACTION, "there is nothing to imitate; name another dataset")
+        raise InputError(*about, f"no {ACTION} for a policy: {why}")
+    shapes = policy_features(policy).shapes or source.shapes
     return replace(source, shapes=shapes | {ACTION: source.shapes[ACTION]})
-
-
-def _inputs_hint(data: Features, names: Collection[str]) -> str:
-    """How a new policy reads only those of a dataset's features that have these names."""
-    kinds = {STATE: "STATE", ENV_STATE: "ENV"}
-    inputs = {
-        name: {"type": kinds.get(name, "VISUAL"), "shape": list(shape)}
-        for name, shape in data.shapes.items()
-        if name in names and name != ACTION
-    }
-    text = f"; or have the policy read less: --sft.policy.input_features='{json.dumps(inputs)}'"
-    return text if inputs else ""
-
-
-def _check_values(
-    sft: SFTConfig,
-    dataset: DatasetConfig,
-    policy: Any,
-    meta: Any,
-    needs: Features,
-    renames: dict[str, str],
-    spec: EnvironmentSpec | None,
-) -> None:
-    """Check statistics and numbers that a policy is trained on."""
-    from lerobot.datasets.factory import IMAGENET_STATS
-
-    from accerl_lerobot.demos.dataset_files import opened
-    from accerl_lerobot.demos.episodes import check_images, numbers
-    from accerl_lerobot.demos.sft import picked
-
-    about = "dataset.repo_id", dataset.repo_id
-    originals = {new: name for name, new in renames.items()}
-    episodes = _extra_argument(sft, "dataset.episodes", [])
-    if episodes and sft.pick != "all":
-        hint = "--dataset.episodes in sft.extra_args names the episodes already; use sft.pick=all"
-        raise InputError("sft.pick", sft.pick, hint)
-    if missing := [index for index in episodes if index not in range(meta.total_episodes)]:
-        hint = f"--dataset.episodes: no episode {missing[0]}; the dataset has {meta.total_episodes} from 0"
-        raise InputError("sft.extra_args", sft.extra_args, hint)
-    episodes = episodes or picked(dataset, sft.pick)
-    read = {originals.get(name, name) for name in needs.shapes}
-    shapes = {name: shape for name, shape in dataset_features(meta).shapes.items() if name in read}
-    images = {name: shape for name, shape in shapes.items() if len(shape) == 3}
-    with opened(dataset, meta, episodes) as data:
-        check_images(data, images, dataset)
-        for name in shapes.keys() - images.keys():
-            values = numbers(data, name, dataset)
-            if name == ACTION and spec is not None:
-                check_actions(values, spec, *about)
-    stats = {renames.get(name, name): dict(own) for name, own in meta.stats.items()}
-    if _extra_argument(sft, "dataset.use_imagenet_stats", True):
-        for camera in set(meta.camera_keys) - set(meta.depth_keys):
-            stats[renames.get(camera, camera)] |= IMAGENET_STATS
-    root = "" if dataset.root is None else f" --root={dataset.root}"
-    tool = f"lerobot-edit-dataset --repo_id={dataset.repo_id}{root} --new_root=NEW --new_repo_id=NEW/NEW"
-    recompute = f"compute them: {tool} --operation.type=recompute_stats"
-    check_statistics(policy, needs, stats, *about, recompute)
-
-
-def _extra_argument(sft: SFTConfig, name: str, default: Any) -> Any:
-    """The value of an argument of ``lerobot-train`` in ``sft.extra_args``; it has the type of `default`."""
-    flags = " ".join(sft.extra_args).split(f"--{name}")[1:]
-    given = [flag[1:].partition(" --")[0] for flag in flags]
-    try:
-        found = yaml.safe_load(given[-1]) if given else default
-    except yaml.YAMLError:
-        found = None
-    if not isinstance(found, type(default)):
-        hint = f"--{name} is {MEANINGS[name]}"
-        raise InputError("sft.extra_args", given[-1], hint)
-    return found
-
-
-def _dataset_renames(sft: SFTConfig) -> dict[str, str]:
-    """``lerobot-train``'s ``--rename_map``: the dataset's names → the policy's."""
-    return dict(_extra_argument(sft, "rename_map", {}))
 
 
 def _check_new_policy(policy: Any, source: Features, sft: SFTConfig) -> None:
@@ -403,12 +286,11 @@ def _check_new_policy(policy: Any, source: Features, sft: SFTConfig) -> None:
     from lerobot.configs.types import FeatureType, PolicyFeature
 
     kinds = {STATE: FeatureType.STATE, ENV_STATE: FeatureType.ENV, ACTION: FeatureType.ACTION}
-    features = {
-        name: PolicyFeature(type=kinds.get(name, FeatureType.VISUAL), shape=shape)
-        for name, shape in source.shapes.items()
-    }
+    features = {}
+    for name, shape in source.shapes.items():
+        features[name] = PolicyFeature(type=kinds.get(name, FeatureType.VISUAL), shape=shape)
     policy = copy.deepcopy(policy)
-    policy.output_features = {ACTION: features.pop(ACTION)} if ACTION in features else {}
+    policy.output_features = {ACTION: features.pop(ACTION)}
     policy.input_features = policy.input_features or features
     try:
         policy.validate_features()
@@ -491,9 +373,10 @@ def check_sft_policy(config: SFTConfig) -> Any:
         return draccus.decode(PreTrainedConfig.get_choice_class(kind), {"device": "cpu"} | fields)
     except draccus.utils.DraccusException as error:
         chain: list[Any] = list(causes(error))
-        where = next((e.key_path[0] for e in chain if getattr(e, "key_path", ())), None)
-        name, given = ("sft.policy", fields) if where is None else (f"sft.policy.{where}", fields.get(where))
-        raise InputError(name, given, f"LeRobot says: {' '.join(str(chain[-1]).split())}") from error
+        keys = [link.key_path[0] for link in chain if getattr(link, "key_path", ())]
+        field = f"sft.policy.{keys[0]}" if keys else "sft.policy"
+        value = fields.get(keys[0]) if keys else fields
+        raise InputError(field, value, f"LeRobot says: {brief(chain[-1])}") from error
 
 
 def sft_policy(config: SFTConfig) -> Any:

@@ -12,7 +12,6 @@ Recording and Ray start processes that import the main module again, so a script
 
 from __future__ import annotations
 
-import contextlib
 import datetime
 import functools
 import json
@@ -40,7 +39,7 @@ from accerl_lerobot.engines import ray_session
 from accerl_lerobot.engines.config import RunConfig, encode, parse
 from accerl_lerobot.engines.contract import Engine
 from accerl_lerobot.engines.placement import check_placement
-from accerl_lerobot.engines.stopping import StoppedError, Stopping, WorkerError
+from accerl_lerobot.engines.stopping import StoppedError, Stopping, WorkerError, handled
 from accerl_lerobot.errors import (
     InputError,
     check_absent,
@@ -50,14 +49,14 @@ from accerl_lerobot.errors import (
     make_folder,
     printable,
 )
-from accerl_lerobot.evaluation import Rate, evaluation_plans
+from accerl_lerobot.evaluation import Rate, by_task, evaluation_plans, rate_of
 from accerl_lerobot.experience import Observation, Request
 from accerl_lerobot.metrics import MetricsLog
 from accerl_lerobot.policies.config import Load, PolicyConfig, env_steps_seen
 from accerl_lerobot.rollout.runner import EpisodeResult
 from accerl_lerobot.run import resuming
 from accerl_lerobot.run.adapter import demonstrations_of, make_adapter
-from accerl_lerobot.run.loop import Loop, Times, run_plans
+from accerl_lerobot.run.loop import Loop, Recorder, Times, run_plans
 from accerl_lerobot.run.preflight import check_device, check_environment, check_policy, check_start
 from accerl_lerobot.run.sizes import check_memory
 from accerl_lerobot.seeds import noise_seed
@@ -66,7 +65,6 @@ from accerl_lerobot.world_model.config import ImaginationConfig
 
 if TYPE_CHECKING:
     from accerl_lerobot.demos.sft import SFTConfig
-    from accerl_lerobot.envs import EnvironmentSpec
     from accerl_lerobot.policies.adapter import LeRobotAdapter
     from accerl_lerobot.policies.stock import StockAdapter
 
@@ -100,13 +98,7 @@ def start(
             directory, resume_from = resuming.resumed_run(recipe, config)
             run = Run(config, directory, console, resume_from, load)
         else:
-            spec = None
-            if load is None:
-                from accerl_lerobot.policies.loading import pinned
-
-                spec, _ = check_start(config, console.say)  # before there is a folder
-                config = replace(config, policy=pinned(config.policy))
-            run = Run(config, make_output_dir(config), console, None, load, spec)
+            run = Run(config, make_output_dir(config), console, load=load)
         return run.directory, run.do()
 
 
@@ -192,25 +184,33 @@ def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfi
     return resuming.improving(config, path)
 
 
-@dataclass(eq=False)
 class Run:
     """One run, or the rest of it. Its config becomes more definite phase by phase.
 
     Phases: checks, warm start (demonstrations and SFT), practice (an engine, and the loop around it).
+
+    Args:
+        resume_from: name of the checkpoint; None: a new run.
+        load: loads the policy; None: a LeRobot checkpoint.
     """
 
-    config: RunConfig
-    directory: Path
-    console: Console
-    resume_from: str | None = None  # name of the checkpoint; None: a new run
-    load: Load | None = None  # loads the policy; None: a LeRobot checkpoint
-    spec: EnvironmentSpec | None = None  # of a new run that has been checked
+    def __init__(
+        self,
+        config: RunConfig,
+        directory: Path,
+        console: Console,
+        resume_from: str | None = None,
+        load: Load | None = None,
+    ) -> None:
+        self.config, self.directory, self.console = config, directory, console
+        self.resume_from, self.load = resume_from, load
+        self.times = Times(started=time.monotonic())
+        self.how = resuming.resume_command(directory, config)
 
     def do(self) -> dict[str, Any]:
         """`execute`, in a folder that is locked meanwhile; says how to resume whatever ends the run."""
-        how = resuming.resume_command(self.directory, self.config)
         self.console.say(f"run {self.directory}")
-        guardian.explain(hint=printable(f"to resume: {how}"))
+        guardian.explain(hint=printable(f"to resume: {self.how}"))
         try:
             with (
                 redirect_stdout(sys.stderr),
@@ -222,85 +222,97 @@ class Run:
             if self.resume_from is None:
                 discard_unused(self.directory)
             raise
+        except StoppedError:
+            raise
         except BaseException as error:
+            reason = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
             if is_full(error):
-                self.console.say(f"the disk of {self.directory} is full; free some space, then {how}")
+                reason = f"the disk of {self.directory} is full"
             elif isinstance(error, WorkerError) and error.brief:
-                self.console.say(f"{error}; to resume: {how}")
-            elif not isinstance(error, StoppedError):
-                verb = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
-                self.console.say(f"{verb}; to resume: {how}")
+                reason = str(error)
+            self.console.say(f"{reason}; to resume: {self.how}")
             raise
 
     def execute(self) -> dict[str, Any]:
         """Do all phases; returns the summary, which is also in ``summary.json``."""
-        times = Times(started=time.monotonic())
-        checkpoint = None
-        text = yaml.safe_dump(encode(replace(self.config, resume=False)), sort_keys=False)
-        if self.resume_from is None:  # first: whatever fails from here on, the run can be resumed
-            layout.write_atomically(self.directory / layout.CONFIG, text)
-        else:
-            checkpoint = resuming.checkpoint_of(self.directory, self.resume_from, self.console)
+        checkpoint = self.find_checkpoint()
+        recipe = self.config
         if checkpoint is not None:
-            self.config = resuming.continued(self.config, self.directory, checkpoint)
+            self.config = resuming.continued(recipe, self.directory, checkpoint)
         self.check()
-        if self.resume_from is not None:  # only now: a resume that is refused leaves the run as it was
-            layout.write_atomically(self.directory / layout.CONFIG, text)
+        self.keep(recipe)
         if checkpoint is None:
             self.config = warm_start(self.config, self.directory, self.console)
         else:
-            layout.go_back_to(checkpoint)
-            self.console.say(f"going on from {checkpoint}")
-            times.before_s = None
-        times.warm_s = time.monotonic() - times.started
+            self.go_back_to(checkpoint)
+        self.times.warm_s = time.monotonic() - self.times.started
         self.config = replace(self.config, output_dir=str(self.directory))
-        return self.practise(checkpoint, times)
+        return self.practise(checkpoint)
+
+    def find_checkpoint(self) -> Path | None:
+        """The checkpoint to resume from, if there is one."""
+        if self.resume_from is None:
+            return None
+        return resuming.checkpoint_of(self.directory, self.resume_from, self.console)
 
     def check(self) -> None:
-        """Refuse what could not go well, before anything long."""
-        if self.resume_from is not None and self.load is None:
-            self.spec, _ = check_start(self.config)
-        if self.spec is None:
-            self.spec = check_environment(self.config.env)
-        check_placement(replace(self.config, output_dir=str(self.directory)))
-        if self.config.imagination.environments:
+        """Refuse a run that could not go well, before anything long."""
+        config = self.config
+        self.spec = check_environment(config.env) if self.load else check_start(config, self.console.say)[0]
+        check_placement(config)
+        if config.imagination.environments:
             from accerl_lerobot.world_model.imagined import check_imagination
 
-            check_imagination(self.config)
+            check_imagination(config)
 
-    def practise(self, checkpoint: Path | None, times: Times) -> dict[str, Any]:
+    def keep(self, recipe: RunConfig) -> None:
+        """Write the run's config. A resume that was refused has left the run as it was."""
+        if self.resume_from is None and self.load is None:
+            from accerl_lerobot.policies.loading import pinned
+
+            recipe = self.config = replace(recipe, policy=pinned(recipe.policy))
+        text = yaml.safe_dump(encode(replace(recipe, resume=False)), sort_keys=False)
+        layout.write_atomically(self.directory / layout.CONFIG, text)
+
+    def go_back_to(self, checkpoint: Path) -> None:
+        """Resume from a checkpoint in a new process."""
+        layout.go_back_to(checkpoint)
+        self.console.say(f"going on from {checkpoint}")
+        self.times.before_s = None
+
+    def practise(self, checkpoint: Path | None) -> dict[str, Any]:
         """Evaluate, train and evaluate by one engine after another, each from the last checkpoint."""
-        recovery = resuming.Recovery(self.config.launch.max_restarts)
-        with contextlib.ExitStack() as stack:  # flushes the log, whatever fails
-            stop = stack.enter_context(Stopping(resuming.resume_command(self.directory, self.config)))
-            times.clock = stack.enter_context(closing(open_clock(self.config.timeline_folder, "driver")))
-            log = MetricsLog(self.directory, self.config.wandb, encode(self.config))
-            stack.enter_context(closing(log))
+        stop, lost, most = Stopping(self.how), 0, self.config.launch.max_restarts
+        with (
+            handled(stop.note),
+            closing(open_clock(self.config.timeline_folder, "driver")) as self.times.clock,
+            closing(MetricsLog(self.directory, self.config.wandb, encode(self.config))) as log,
+        ):
             while True:
+                furthest = self.times.furthest
                 try:
-                    return self._practise_once(checkpoint, times, stop, log)
+                    return self._practise_once(checkpoint, stop, log)
                 except WorkerError as loss:
-                    times.clock.enter(RECOVERY)
+                    self.times.clock.enter(RECOVERY)
                     stop.check()
-                    checkpoints = self.directory / layout.CHECKPOINTS
-                    checkpoint = recovery.next(checkpoints, self.console, loss, times.furthest)
-                    stop.check()
+                    lost = 1 if self.times.furthest > furthest else lost + 1
+                    if lost > most or not layout.has_checkpoint(self.directory / layout.CHECKPOINTS):
+                        raise
+                    checkpoint = resuming.newest_checkpoint(self.directory, layout.LAST, self.console)
+                    self.console.say(f"{loss}\ngoing on from {checkpoint} ({lost} of {most} times)")
                     layout.go_back_to(checkpoint)
                     self.config = resuming.continued(self.config, self.directory, checkpoint)
 
-    def _practise_once(
-        self, checkpoint: Path | None, times: Times, stop: Stopping, log: MetricsLog
-    ) -> dict[str, Any]:
-        """The run, or what is left of it, by one set of workers."""
-        assert self.spec is not None
-        history = 1 if self.load is not None else check_policy(self.config, self.spec, own=True)
+    def _practise_once(self, checkpoint: Path | None, stop: Stopping, log: MetricsLog) -> dict[str, Any]:
+        """The run, or the rest of it, by one set of workers."""
+        history = 1 if self.load else check_policy(self.config, self.spec, own=True)
         state = None if checkpoint is None else checkpoint / layout.TRAINING_STATE
         with self.console.stage("starting workers"), stop.at_once():
             engine = make_engine(self.config, self.spec.tasks, history, state, self.load)
+        recorder = Recorder(self.config, log, self.console, self.times)
         with closing(engine):
-            return Loop(
-                self.config, self.directory, self.console, log, engine, self.spec.tasks, times, stop
-            ).run(state)
+            loop = Loop(self.config, self.directory, engine, self.spec.tasks, recorder, stop)
+            return loop.run(state)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -404,9 +416,8 @@ def evaluate(
         config = replace(config, evaluation=replace(config.evaluation, episodes=episodes))
     with redirect_stdout(sys.stderr):
         results = play_evaluation(config, Console())
-    names = sorted({result.plan.task for result in results})
-    tasks = {name: _rate([result for result in results if result.plan.task == name]) for name in names}
-    return EvaluationResult(success=_rate(results), tasks=tasks, episodes=results)
+    tasks = {task: rate_of(episodes) for task, episodes in by_task(results).items()}
+    return EvaluationResult(success=rate_of(results), tasks=tasks, episodes=results)
 
 
 def load_policy(
@@ -441,7 +452,3 @@ def _result(directory: Path, summary: dict[str, Any]) -> TrainResult:
         after=rate("after"),
         summary=summary,
     )
-
-
-def _rate(results: list[EpisodeResult]) -> Rate:
-    return Rate(successes=sum(r.success for r in results), n=len(results))
