@@ -71,8 +71,8 @@ def test_nothing_committed_is_lost_or_doubled_and_no_update_made_twice(engine, t
     second.train()
     after = drive(second)
     assert updates(after) == [i + 1.0 for i in range(saved.version, UPDATES)]
-    whole = second._trainer.call("hold", timeout=60)[0]
-    second._trainer.call("write", tmp_path / "end", timeout=60)
+    whole = second._trainer.call("hold")[0]
+    second._trainer.call("write", tmp_path / "end")
     ledger = snapshot.load(tmp_path / "end" / TRAINING_STATE / "trainer")["ledger"]
     assert whole == len(ledger) == UPDATES
     uses = Counter(key for keys in ledger for key in keys)

@@ -141,7 +141,7 @@ def drive_counting(engine: Any) -> tuple[list[Progress], Counter[int]]:
         history.append(progress)
         if progress.done:
             break
-        sizes.append(sum((w.call("sizes", timeout=60) for w in engine._inference), Counter()))
+        sizes.append(sum((w.call("sizes") for w in engine._inference), Counter()))
     return history, sizes[-2]  # another look after it has found the run in training
 
 

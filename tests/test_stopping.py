@@ -10,14 +10,15 @@ from pathlib import Path
 import pytest
 
 from accerl_lerobot.engines.config import RunConfig
-from accerl_lerobot.engines.stopping import StoppedError, Stopping, deferred
+from accerl_lerobot.engines.stopping import StoppedError, Stopping, handled
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import PolicyConfig, TuningConfig
 from accerl_lerobot.run.resuming import continued
 
 
 def test_a_signal_is_noted_first_and_interrupts_when_it_comes_again():
-    with pytest.raises(KeyboardInterrupt), Stopping() as stop:
+    stop = Stopping()
+    with pytest.raises(KeyboardInterrupt), handled(stop.note):
         os.kill(os.getpid(), signal.SIGTERM)
         assert stop.asked == signal.SIGTERM
         os.kill(os.getpid(), signal.SIGTERM)
@@ -26,7 +27,8 @@ def test_a_signal_is_noted_first_and_interrupts_when_it_comes_again():
 
 @pytest.mark.parametrize("before", [False, True])
 def test_where_nothing_can_be_saved_the_first_signal_interrupts(before: bool):
-    with Stopping("a command") as stop:
+    stop = Stopping("a command")
+    with handled(stop.note):
         if before:
             os.kill(os.getpid(), signal.SIGINT)
         with pytest.raises(StoppedError, match="stopped by SIGINT; to resume: a command"), stop.at_once():
@@ -35,18 +37,13 @@ def test_where_nothing_can_be_saved_the_first_signal_interrupts(before: bool):
         assert stop.asked == signal.SIGINT
 
 
-def test_a_library_that_starts_is_neither_interrupted_nor_heeds_signals_itself():
-    with Stopping() as stop:
-        with deferred():
+def test_handlers_of_a_library_that_starts_are_taken_back():
+    stop = Stopping()
+    with handled(stop.note):
+        with handled():
             signal.signal(signal.SIGTERM, lambda number, frame: pytest.fail("a handler of its own"))
-            os.kill(os.getpid(), signal.SIGTERM)
-            assert stop.asked is None
-            signal.alarm(600)  # as Ray's C++ code does for 3 s
-        assert signal.alarm(0) == 0
+        os.kill(os.getpid(), signal.SIGTERM)
         assert stop.asked == signal.SIGTERM
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job of a shell ignores it
-    with pytest.raises(KeyboardInterrupt), deferred():
-        os.kill(os.getpid(), signal.SIGINT)
 
 
 def test_low_rank_adapters_need_the_policy_that_they_adapt(tmp_path: Path):

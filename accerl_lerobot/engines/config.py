@@ -69,11 +69,10 @@ class LaunchConfig(Section, section="launch"):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.engine == "local":
-            for name, default in (("schedule", ASYNCHRONOUS), ("address", None), ("placement", {})):
-                if (value := getattr(self, name)) != default:
-                    hint = "launch.engine=local is one process; leave it out"
-                    raise InputError(f"launch.{name}", value, hint)
+        for name, default in (("schedule", ASYNCHRONOUS), ("address", None), ("placement", {})):
+            value = getattr(self, name)
+            if self.engine == "local" and value != default:
+                raise InputError(f"launch.{name}", value, "launch.engine=local is one process; leave it out")
         for role, nodes in self.placement.items():
             if role not in ROLES or not nodes.strip():
                 hint = f"use one of {', '.join(ROLES)}, and a resource of nodes, or all"

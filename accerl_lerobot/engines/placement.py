@@ -9,6 +9,7 @@ read the policy's files and write into the run's folder, so their nodes must see
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from accerl_lerobot.algorithms import ChunkCriticConfig
@@ -18,7 +19,6 @@ from accerl_lerobot.errors import InputError
 if TYPE_CHECKING:
     from accerl_lerobot.engines.config import RunConfig
 
-SECTION = "launch.placement"
 ALL = "all"
 PART = 0.001  # share of a resource that a worker takes, so that any number of them fit where it is
 
@@ -29,16 +29,18 @@ class Placement:
     def __init__(self, config: RunConfig, nodes: list[dict[str, float]], this_node: str = "") -> None:
         """`nodes` are the resources of each node, this one first; `this_node` is Ray's id of that."""
         self._nodes, self._this_node, self._selectors = nodes, this_node, config.launch.placement
+        learns = learns_states(config)
         self._workers = {
             "trainer": config.trainer.ranks,
-            "world_model": int(learns_states(config) or config.imagination.learns),
+            "world_model": int(learns or config.imagination.learns),
             "inference": config.inference.workers,
             "rollout": config.rollout.workers,
         }
+        for role in self._selectors:
+            self._nodes_of(role)
         # The world model of imagined environments predicts and learns on processors.
-        self._on_cpu = {"rollout"} if learns_states(config) else {"rollout", "world_model"}
-        self._check_resources()
-        self._shares = {} if config.policy.device == "cpu" else self._gpu_shares(config)
+        on_gpu = ("trainer", "inference", "world_model") if learns else ("trainer", "inference")
+        self._shares = {} if config.policy.device == "cpu" else self._gpu_shares(config, on_gpu)
 
     def options(self, role: str) -> dict[str, Any]:
         """Ray's options of an actor of this role; ``replay`` is on this node."""
@@ -47,53 +49,46 @@ class Placement:
         options: dict[str, Any] = {"num_cpus": 0, "num_gpus": self._shares.get(role, 0.0)}
         selector = self._selectors.get(role)
         if selector is None:
-            here = NodeAffinitySchedulingStrategy(self._this_node, soft=False)
-            return options | {"scheduling_strategy": here}
-        if selector == ALL:
+            options["scheduling_strategy"] = NodeAffinitySchedulingStrategy(self._this_node, soft=False)
+        elif selector == ALL:
             # Ray chooses the node of a worker that takes nothing by chance.
-            return options | {"num_cpus": PART, "scheduling_strategy": "SPREAD"}
-        return options | {"resources": {selector: PART}}
-
-    def is_here(self, role: str) -> bool:
-        """True if all workers of a role are on this node."""
-        return role not in self._selectors
+            options |= {"num_cpus": PART, "scheduling_strategy": "SPREAD"}
+        else:
+            options["resources"] = {selector: PART}
+        return options
 
     def rows(self) -> list[str]:
         """The plan in words, one line a role."""
         rows = []
         for role, count in (self._workers | {"replay": 1}).items():
+            selector, share = self._selectors.get(role, "this node"), self._shares.get(role, 0.0)
+            where = "all nodes" if selector == ALL else selector
+            if role in self._selectors and selector != ALL:
+                where = f"nodes with {selector}"
+            gpus = f" × {share:g} GPU" if share else ""
             if count:
-                selector = self._selectors.get(role)
-                where = "this node" if selector is None else f"nodes with {selector}"
-                share = self._shares.get(role, 0.0)
-                gpus = f" × {share:g} GPU" if share else ""
-                rows.append(f"{count} {role}{gpus} on {'all nodes' if selector == ALL else where}")
+                rows.append(f"{count} {role}{gpus} on {where}")
         return rows
 
-    def _on(self, selector: str | None) -> list[dict[str, float]]:
-        """Resources of the nodes that a selector means."""
+    def _nodes_of(self, role: str) -> list[dict[str, float]]:
+        """Resources of the nodes that a role's workers may be on."""
+        selector = self._selectors.get(role)
         if selector is None:
             return self._nodes[:1]
-        return [node for node in self._nodes if selector == ALL or selector in node]
+        nodes = [node for node in self._nodes if selector in (ALL, *node)]
+        if not nodes:
+            known = ", ".join(sorted(set().union(*self._nodes) - {"CPU", "GPU", "memory"}))
+            hint = f"no node of the cluster has this resource; there are {known}, or use all"
+            raise InputError(f"launch.placement.{role}", selector, hint)
+        return nodes
 
-    def _check_resources(self) -> None:
-        for role, selector in self._selectors.items():
-            if not self._on(selector):
-                names = {name for node in self._nodes for name in node} - {"CPU", "GPU", "memory"}
-                known = ", ".join(sorted(names - {"object_store_memory"}))
-                hint = f"no node of the cluster has this resource; there are {known}, or use all"
-                raise InputError(f"{SECTION}.{role}", selector, hint)
-
-    def _gpu_shares(self, config: RunConfig) -> dict[str, float]:
+    def _gpu_shares(self, config: RunConfig, on_gpu: Sequence[str]) -> dict[str, float]:
         """Share of a GPU for each process of a role; roles that are sent to the same nodes share what these
         have."""
         shares: dict[str, float] = {}
-        groups: dict[str | None, list[str]] = {}
-        for role, count in self._workers.items():
-            if count and role not in self._on_cpu:
-                groups.setdefault(self._selectors.get(role), []).append(role)
-        for selector, roles in groups.items():
-            gpus = sum(node.get("GPU", 0.0) for node in self._on(selector))
+        for selector in {self._selectors.get(role) for role in on_gpu}:
+            roles = [role for role in on_gpu if self._selectors.get(role) == selector]
+            gpus = sum(node.get("GPU", 0.0) for node in self._nodes_of(roles[0]))
             if not gpus and config.policy.device.startswith("cuda") and selector is not None:
                 hint = f"there is no GPU on the nodes with {selector}; use auto, cpu or other nodes"
                 raise InputError("policy.device", config.policy.device, hint)

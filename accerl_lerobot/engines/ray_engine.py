@@ -32,6 +32,7 @@ from accerl_lerobot.engines.ray_session import NO_HUB_TOKEN, start_ray
 from accerl_lerobot.engines.stopping import WorkerError
 from accerl_lerobot.engines.supervision import (
     RESTARTED,
+    START_S,
     RestartedWorker,
     RolloutSlot,
     Worker,
@@ -126,13 +127,13 @@ class RayEngine(Engine):
         self._schedule = schedule
         # The trainer first: replay's turns wait for it to hand over its weights.
         for worker in (self._trainer, self._replay):
-            worker.call("follow", schedule, timeout=self._limit)
+            worker.call("follow", schedule)
         for index, replica in enumerate(self._inference):
             clients = len(self._rollouts[index :: len(self._inference)])
             together = clients * self._config.rollout.environments
             replica.together = 0 if schedule == ASYNCHRONOUS else together
             if not replica.is_starting:
-                replica.call("lock_step", replica.together, timeout=self._limit)
+                replica.call("lock_step", replica.together)
 
     def poll(self) -> Progress:
         self._ask()
@@ -163,12 +164,12 @@ class RayEngine(Engine):
         state = directory / TRAINING_STATE
         # Records that the trainer has sent come first: `hold` returns the rest, up to its version.
         self._hear(self._trainer, self._limit)
-        version, records = self._trainer.call("hold", timeout=self._limit)  # it waits for an update at most
+        version, records = self._trainer.call("hold")  # it waits for an update at most
         # At once, so that little comes in that was decided by weights of later updates.
-        self._replay.call("save", state, version, timeout=self._limit)
+        self._replay.call("save", state, version)
         if self._world_learner is not None:
-            self._world_learner.call("save", directory, timeout=self._limit)
-        self._trainer.call("write", directory, timeout=self._limit)
+            self._world_learner.call("save", directory)
+        self._trainer.call("write", directory)
         save_rollouts(state, self._rollouts)
         self._last_change = time.monotonic()
         updates, self._updates = self._updates + records, []
@@ -187,7 +188,7 @@ class RayEngine(Engine):
 
     def pids(self) -> dict[str, int]:
         """Process ids by worker: ``inference``, ``replay``, ``trainer``, ``rollout 0`` …; for fault tests."""
-        return {w.name: int(w.call("ready", timeout=self._limit)) for w in self._everyone()}
+        return {w.name: int(w.call("ready")) for w in self._everyone()}
 
     def _everyone(self) -> Iterator[Worker]:
         """All workers, those that others depend on first."""
@@ -215,7 +216,7 @@ class RayEngine(Engine):
             return ray.remote(kind).options(**options).remote(*arguments)
 
         def add(name: str, *arguments: Any) -> Worker:
-            self._others.append(Worker(name, actor(*arguments)))
+            self._others.append(Worker(name, actor(*arguments), config.launch))
             return self._others[-1]
 
         stores = (config.replay, config.seed, state, config.folder, timeline, in_cluster)
@@ -246,7 +247,7 @@ class RayEngine(Engine):
         for name in replicas:
             deciding = (config.policy, config.inference, self._version, state, load, timeline, name)
             handle = actor("inference", InferenceWorker, 1000, *deciding, in_cluster, **RESTARTED)
-            self._inference.append(InferenceReplica(name, handle, config.launch.max_restarts))
+            self._inference.append(InferenceReplica(name, handle, config.launch))
         for index in range(config.rollout.workers):
             name = f"rollout {index}"
             collecting = (config.env, config.rollout, name, history, timeline, config.imagination)
@@ -258,7 +259,7 @@ class RayEngine(Engine):
         workers = list(self._everyone())
         ready = [worker.actor.ready.remote(*worker.ready_arguments()) for worker in workers]
         for worker, reference in zip(workers, ready, strict=True):
-            worker.pid = worker.result(reference, "ready", worker.start_timeout(self._limit))
+            worker.pid = worker.result(reference, "ready", START_S)
         self._replay.work = self._replay.actor.run.remote()
         for slot in self._rollouts:
             replica = self._inference[slot.index % len(self._inference)]
@@ -317,10 +318,10 @@ class RayEngine(Engine):
         self._done, self._version = True, version
         self.follow(ASYNCHRONOUS)
         self._hear(self._trainer, self._limit)
-        self._updates += self._trainer.call("metrics", timeout=self._limit)
-        self._replay.call("close", timeout=self._limit)
+        self._updates += self._trainer.call("metrics")
+        self._replay.call("close")
         self._hear(self._replay, self._limit)
-        self._replay.last_answer = self._replay.call("metrics", timeout=self._limit)
+        self._replay.last_answer = self._replay.call("metrics")
 
     def _listen(self) -> list[EpisodeResult]:
         """Take all answers that have come; returns the episodes in them."""
@@ -332,7 +333,7 @@ class RayEngine(Engine):
         imagining = self._config.imagination.environments > 0
         if not self._collected and not imagining and all(slot.spent for slot in self._rollouts):
             self._collected = True
-            self._replay.call("end", timeout=self._limit)
+            self._replay.call("end")
         return episodes
 
     def _hear(self, worker: Worker, timeout: float = 0.0) -> Any:
@@ -368,18 +369,17 @@ class RayEngine(Engine):
         for worker in (*self._others, *self._rollouts, *self._inference):
             if isinstance(worker, RestartedWorker) and worker.is_starting:
                 self._last_change = time.monotonic()  # a restart has a timeout of its own
-                if worker.advance_start(self._limit):
+                if worker.advance_start():
                     self._begin(worker)
-            elif why := worker.hung(self._limit):
+            elif why := worker.hung():
                 worker.lost(WorkerError(f"{worker.name} worker {why}"))
 
     def _check_moving(self, progress: Progress) -> None:
         """End a run in which every worker answers and nothing moves."""
         moves = sum(slot.last_answer.moves for slot in self._rollouts if slot.last_answer is not None)
         state = (progress.version, moves, progress.rollout["restarts"])
-        awaited = self._training and not self._done
-        if not awaited:
-            awaited = any(slot.outstanding for slot in self._rollouts)
+        planned = any(slot.outstanding for slot in self._rollouts)
+        awaited = planned or (self._training and not self._done)
         now = time.monotonic()
         if state != self._last_state or not awaited:
             self._last_state, self._last_change = state, now

@@ -22,7 +22,7 @@ import ray
 from ray.exceptions import ActorDiedError, GetTimeoutError, RayActorError, RayError, RayTaskError
 
 from accerl_lerobot.checkpoint import snapshot
-from accerl_lerobot.engines.config import RunConfig
+from accerl_lerobot.engines.config import LaunchConfig, RunConfig
 from accerl_lerobot.engines.stopping import WorkerError
 from accerl_lerobot.errors import InputError, collected_warnings, last_exception, show_warnings
 from accerl_lerobot.experience import REAL
@@ -32,7 +32,7 @@ from accerl_lerobot.transport.endpoint import Endpoint
 
 logger = logging.getLogger(__name__)
 
-START_S = 600.0  # timeout for the start of a worker; `LaunchConfig.stall_s` counts from its first answer
+START_S = 600.0  # timeout for the start of a worker, or ``launch.stall_s`` if that is more
 STEADY_S = 30.0  # a worker that has run for so long starts counting restarts anew
 LAST_WARNINGS_S = 1.0  # how long the last warnings of workers are waited for
 GONE_S = 10.0  # how long to wait for the end of processes; Ray kills one that has been stopped after 5 s
@@ -50,8 +50,9 @@ class Worker:
     for an actor with threads.
     """
 
-    def __init__(self, name: str, actor: Any) -> None:
+    def __init__(self, name: str, actor: Any, launch: LaunchConfig) -> None:
         self.name, self.actor = name, actor
+        self._launch = launch
         self.endpoint = Endpoint(name=name, actor=actor)
         self.pid = 0  # of its process, once that is ready
         self.work: Any = None  # reference of the long call
@@ -59,10 +60,6 @@ class Worker:
         self.warnings: list[Any] = []  # references of what its process has warned of
         self._question: Any = None
         self._asked = 0.0
-
-    def start_timeout(self, limit: float) -> float:
-        """Seconds that a new process may take before it answers, where an answer may take `limit` later."""
-        return max(START_S, limit)
 
     def ready_arguments(self) -> tuple[Any, ...]:
         """Arguments of ``ready`` for a new process."""
@@ -88,18 +85,20 @@ class Worker:
         self.last_answer = ray.get(question)
         return self.last_answer
 
-    def hung(self, limit: float) -> str:
+    def hung(self) -> str:
         """Reason to give the worker up; empty: none."""
         if self._question is None or ray.wait([self._question], timeout=0)[0]:
             return ""
         silent = time.monotonic() - self._asked
-        return f"has not answered for {silent:.0f} s" if silent > limit else ""
+        return f"has not answered for {silent:.0f} s" if silent > self._launch.stall_s else ""
 
-    def call(self, method: str, *arguments: Any, timeout: float) -> Any:
-        return self.result(getattr(self.actor, method).remote(*arguments), method, timeout)
+    def call(self, method: str, *arguments: Any) -> Any:
+        """The result of a method of the actor."""
+        return self.result(getattr(self.actor, method).remote(*arguments), method)
 
-    def result(self, reference: Any, method: str, timeout: float) -> Any:
-        """The result of a call that has been made."""
+    def result(self, reference: Any, method: str, timeout: float = 0.0) -> Any:
+        """The result of a call that has been made; waits for ``launch.stall_s``, or for longer."""
+        timeout = max(timeout, self._launch.stall_s)
         try:
             return ray.get(reference, timeout=timeout)
         except GetTimeoutError as error:
@@ -120,10 +119,9 @@ class RestartedWorker(Worker):
     A new process first answers ``ready``. Then `begin` starts its long call.
     """
 
-    def __init__(self, name: str, actor: Any, max_restarts: int) -> None:
-        super().__init__(name, actor)
+    def __init__(self, name: str, actor: Any, launch: LaunchConfig) -> None:
+        super().__init__(name, actor, launch)
         self.restarts = self.all_restarts = 0  # in a row, and since this engine began
-        self._max_restarts = max_restarts
         self._since = math.inf  # when its long call began
         self._starting: Any = None  # reference of ``ready``, while the process is restarted
 
@@ -141,12 +139,13 @@ class RestartedWorker(Worker):
             raise error
         if time.monotonic() - self._since > STEADY_S:
             self.restarts = 0
-        if self.restarts >= self._max_restarts:
+        most = self._launch.max_restarts
+        if self.restarts >= most:
             times = f" after {self.restarts} restarts" if self.restarts else ""
             raise WorkerError(f"{self.name} worker failed for good{times}:\n{error}") from error
         self.restarts += 1
         self.all_restarts += 1
-        number = f"({self.restarts} of {self._max_restarts} times)"
+        number = f"({self.restarts} of {most} times)"
         reason = last_exception(str(error))[:200]
         logger.warning("%s worker is restarted %s: %s", self.name, number, reason)
         if not has_died(error):
@@ -156,10 +155,10 @@ class RestartedWorker(Worker):
         self._asked = time.monotonic()
         self._ask_ready()
 
-    def advance_start(self, limit: float) -> bool:
+    def advance_start(self) -> bool:
         """True if a restarted process is ready now."""
         waited = time.monotonic() - self._asked
-        if waited > self.start_timeout(limit):
+        if waited > max(START_S, self._launch.stall_s):
             raise WorkerError(f"{self.name} worker did not start again within {waited:.0f} s")
         try:
             pid = ray.get(self._starting, timeout=0)
@@ -189,7 +188,7 @@ class RolloutSlot(RestartedWorker):
     """
 
     def __init__(self, index: int, actor: Any, config: RunConfig, tasks: tuple[str, ...]) -> None:
-        super().__init__(f"rollout {index}", actor, config.launch.max_restarts)
+        super().__init__(f"rollout {index}", actor, config.launch)
         self.index = index
         self.services: tuple[Endpoint, ...] = ()  # an inference replica, and replay
         self.incarnation = 0  # grows with every process; part of its seeds and of its segments' keys
@@ -200,7 +199,6 @@ class RolloutSlot(RestartedWorker):
         self.world: Any = None  # reference of a version of the world model, and its weights
         self._unsent: list[EpisodePlan] = []
         self._tasks, self._seed = tasks, config.seed
-        self._environments = config.rollout.environments
 
     @property
     def counters(self) -> Counter[str]:
@@ -250,15 +248,11 @@ class RolloutSlot(RestartedWorker):
         if self.ask("report", training, self._unsent, in_turn):
             self._unsent = []
 
-    def start_timeout(self, limit: float) -> float:
-        """See the base class; its environments are made one after the other."""
-        return max(START_S, limit * self._environments)
-
-    def hung(self, limit: float) -> str:
+    def hung(self) -> str:
         """Also an environment that does not return."""
-        why = super().hung(limit)
+        why = super().hung()
         report: Report | None = self.last_answer
-        if why or report is None or report.busy_s <= limit:
+        if why or report is None or report.busy_s <= self._launch.stall_s:
             return why
         cause = "its environment has not returned" if report.in_environment else "it has done nothing"
         return f"{cause} for {report.busy_s:.0f} s"

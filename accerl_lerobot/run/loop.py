@@ -26,7 +26,7 @@ import logging
 import math
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -150,7 +150,7 @@ class Recorder:
         # The first episodes to end are the short ones, which are successes.
         training = math.isinf(state.steps)
         if explored and training and len(state.recent) >= RECENT // 4:
-            state.curve.append((self.env_steps(progress), float(np.mean(state.recent))))
+            state.curve.append((self.env_steps(progress), _mean(state.recent)))
         # Imagined episodes and learning go on once all real episodes have been played.
         if explored or any(metrics["update"] % RECORD_EVERY == 0 for metrics in progress.updates):
             self._log_counters(progress, explored)
@@ -192,26 +192,19 @@ class Recorder:
 
     def status(self, progress: Progress) -> str:
         """The words beside the bar of training."""
-        state = self.state
-        success = f"{np.mean(state.recent):.0%} of {len(state.recent)}" if state.recent else "…"
-        lag = f"{state.lags[-1]:.0f}" if state.lags else "…"
+        recent, lags = self.state.recent, self.state.lags
+        success = f"{np.mean(recent):.0%} of {len(recent)}" if recent else "…"
+        lag = f"{lags[-1]:.0f}" if lags else "…"
         decisions = self.since(progress, "decisions")
-        words = f"exploring success {success} · lag {lag} · {decisions:.0f} decisions"
-        if dropped := self.since(progress, "dropped_episodes"):
-            words += f" · {dropped:.0f} episodes dropped"
-        if state.evaluations:
-            newest = state.evaluations[-1]
-            words += f" · evaluation {newest['success']:.0%} at update {newest['version_max']}"
-        return words
+        return f"exploring success {success} · lag {lag} · {decisions:.0f} decisions"
 
     def warn_if_hopeless(self) -> None:
         """Tell if no exploring episode has succeeded."""
         if not self.state.won:
-            note = f" ({self.state.note})" if self.state.note else ""
             logger.warning(
                 "none of %d exploring episodes succeeded%s; where success is the only reward there is "
                 "nothing to learn from: see env.success, and docs/troubleshooting.md",
-                self.state.explored, note,
+                self.state.explored, f" ({self.state.note})" if self.state.note else "",
             )  # fmt: skip
 
     def _count(self, explored: list[EpisodeResult]) -> None:
@@ -225,18 +218,22 @@ class Recorder:
 
     def _log_counters(self, progress: Progress, explored: list[EpisodeResult]) -> None:
         state = self.state
-        values = dict(progress.rollout)
-        values["success_exploring"] = float(np.mean(state.recent)) if state.recent else math.nan
+        values = progress.rollout | {"success_exploring": _mean(state.recent)}
         if state.imagined:
-            values["success_imagined"] = float(np.mean(state.imagined))
+            values["success_imagined"] = _mean(state.imagined)
         if explored:
-            values["episode_return"] = float(np.mean([episode.episode_return for episode in explored]))
-            values["episode_steps"] = float(np.mean([episode.steps for episode in explored]))
-            values["episode_decisions"] = float(np.mean([episode.decisions for episode in explored]))
+            values["episode_return"] = _mean([episode.episode_return for episode in explored])
+            values["episode_steps"] = _mean([episode.steps for episode in explored])
+            values["episode_decisions"] = _mean([episode.decisions for episode in explored])
         for part in ("replay", "inference", "world_model"):
             numbers = getattr(progress, part)
             values |= {f"{part}_{name}": value for name, value in numbers.items()}
         self.log.write("rollout", progress.version, values)
+
+
+def _mean(values: Sequence[float]) -> float:
+    """The mean; NaN of nothing."""
+    return float(np.mean(values)) if values else math.nan
 
 
 class Loop:
@@ -390,7 +387,7 @@ class Loop:
             "trained_decisions": int(last.replay.get("trained_decisions", 0)),
             "unique_decisions": int(last.replay.get("unique_decisions", 0)),
             "restarts": int(last.rollout.get("restarts", 0)),
-            "lag_mean": float(np.mean(state.lags)) if state.lags else 0.0,
+            "lag_mean": _mean(state.lags or [0.0]),
             "lag_max": state.lag_max,
             "ratio_max_dev": state.mismatch_max,
             "wall_s": times["wall_s"],

@@ -26,7 +26,7 @@ from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE
 from accerl_lerobot.metrics import MetricsLog, plain
-from accerl_lerobot.world_model.config import SimulatorStateConfig, StateModelConfig, default_state_model
+from accerl_lerobot.world_model.config import SimulatorStateConfig, default_state_model
 
 if TYPE_CHECKING:
     from accerl_lerobot.cli.configs import OfflineRun
@@ -35,7 +35,7 @@ logger = logging.getLogger(__name__)
 
 BYTES = 4 * 1024**3  # observations that are kept in memory at most
 LOG_EVERY = 25  # updates between two records of metrics, which are means over them
-COMPARED = 256  # decisions of successes, and of failures, whose imitation loss is measured before and after
+COMPARED = 64  # decisions of successes, and of failures, whose imitation loss is measured before and after
 
 
 def learn_offline(config: OfflineRun, directory: Path, console: Console) -> dict[str, Any]:
@@ -48,67 +48,66 @@ def learn_offline(config: OfflineRun, directory: Path, console: Console) -> dict
     torch.manual_seed(config.seed)
     torch.set_num_threads(config.trainer.num_threads)
     policy, meta = learning_config(config.policy, imitates=True), open_metadata(config.dataset)
-    wanted = _check(config, policy, meta)
-    adapter = _adapter(config, wanted)
+    shapes = _check(config, policy, meta)
     # One step for each update, instead of so many for each new decision.
     assert isinstance(config.algorithm, OffPolicyConfig)
     algorithm = replace(config.algorithm, policy_steps=1.0)
     if isinstance(algorithm, ChunkCriticConfig):
         algorithm = replace(algorithm, critic_steps=algorithm.critic_steps or 1.0)
-    update: Any = make_update(adapter, algorithm, config.trainer)
-    counts = _remember(config, update, meta, wanted, console)
+    update: Any = make_update(_adapter(config, shapes), algorithm, config.trainer)
+    counts = _remember(config, update, meta, shapes, console)
     before = _imitation(update)
-    with (
-        contextlib.closing(MetricsLog(directory, config.wandb, encode(config))) as log,
-        console.stage(f"offline ({algorithm.type})", total=config.trainer.updates) as stage,
-    ):
-        recent: list[dict[str, float]] = []
-        while update.version < config.trainer.updates:
-            recent.append(update.learn(1))
-            update.version += 1
-            if update.version % LOG_EVERY == 0 or update.version == config.trainer.updates:
-                names = dict.fromkeys(name for metrics in recent for name in metrics)
-                means = {k: float(np.mean([m[k] for m in recent if k in m])) for k in names}
-                log.write("train", update.version, means)
-                stage.update(update.version, f"imitation loss {means.get('imitation_loss', math.nan):.4f}")
-                recent = []
+    _learn(config, update, directory, console)
 
     def write(folder: Path) -> int:
+        adapter = update.adapter
         adapter.save(folder / layout.PRETRAINED, config.policy, adapter.copy_weights())
         shutil.copyfile(directory / layout.CONFIG, folder / layout.CONFIG)
         return int(update.version)
 
-    layout.save_checkpoint(directory / layout.CHECKPOINTS, write)
-    policy_folder = directory / layout.CHECKPOINTS / layout.LAST / layout.PRETRAINED
-    losses = {"before": before, "after": _imitation(update)}
-    summary: dict[str, Any] = plain(
-        counts
-        | {"algorithm": algorithm.type, "updates": update.version, "imitation_loss": losses}
-        | {"wall_s": time.monotonic() - started, "policy": str(policy_folder)}
-    )
+    checkpoints = directory / layout.CHECKPOINTS
+    layout.save_checkpoint(checkpoints, write)
+    summary: dict[str, Any] = counts | {
+        "algorithm": algorithm.type,
+        "updates": update.version,
+        "imitation_loss": {"before": before, "after": _imitation(update)},
+        "wall_s": time.monotonic() - started,
+        "policy": str(checkpoints / layout.LAST / layout.PRETRAINED),
+    }
+    summary = plain(summary)
     layout.write_atomically(directory / layout.SUMMARY, json.dumps(summary, indent=2) + "\n")
     return summary
 
 
-def _adapter(config: OfflineRun, wanted: dict[str, tuple[int, ...]]) -> Any:
+def _learn(config: OfflineRun, update: Any, directory: Path, console: Console) -> None:
+    """Make all updates, and log the means of their metrics."""
+    last = config.trainer.updates
+    recent: dict[str, list[float]] = {}
+    with (
+        contextlib.closing(MetricsLog(directory, config.wandb, encode(config))) as log,
+        console.stage(f"offline ({config.algorithm.type})", total=last) as stage,
+    ):
+        while update.version < last:
+            for name, value in update.learn(1).items():
+                recent.setdefault(name, []).append(value)
+            update.version += 1
+            if update.version % LOG_EVERY == 0 or update.version == last:
+                means = {name: float(np.mean(values)) for name, values in recent.items()}
+                log.write("train", update.version, means)
+                stage.update(update.version, f"imitation loss {means.get('imitation_loss', math.nan):.4f}")
+                recent = {}
+
+
+def _adapter(config: OfflineRun, shapes: dict[str, tuple[int, ...]]) -> Any:
     """The policy; with the teacher of `ChunkCriticConfig`, which labels and never acts here."""
     from accerl_lerobot.policies.loading import load_adapter
     from accerl_lerobot.policies.teacher import with_teacher
 
     if not isinstance(config.algorithm, ChunkCriticConfig):
         return load_adapter(config.policy)
-    model = _state_model(config, ENVIRONMENT_STATE in wanted)
-    numbers = math.prod(wanted[ENVIRONMENT_STATE]) if ENVIRONMENT_STATE in wanted else 0
+    model = config.world_model or default_state_model(ENVIRONMENT_STATE in shapes)
+    numbers = math.prod(shapes.get(ENVIRONMENT_STATE, (0,)))
     return with_teacher(load_adapter, model, numbers, config.algorithm.teacher_episodes, config.policy)
-
-
-def _state_model(config: OfflineRun, offered: bool) -> StateModelConfig:
-    """State that critic and teacher see; refuses the simulator's if the dataset has not `offered` it."""
-    model: StateModelConfig = config.world_model or default_state_model(offered)
-    if isinstance(model, SimulatorStateConfig) and not offered:
-        hint = f"the dataset has no {ENVIRONMENT_STATE}; use latent"
-        raise InputError("world_model.type", model.type, hint)
-    return model
 
 
 def _check(config: OfflineRun, policy: Any, meta: Any) -> dict[str, tuple[int, ...]]:
@@ -134,34 +133,36 @@ def _check(config: OfflineRun, policy: Any, meta: Any) -> dict[str, tuple[int, .
         raise InputError("dataset.repo_id", config.dataset.repo_id, hint)
     shapes, read = dataset_shapes(meta), policy_features(policy).shapes.keys() | {ACTION}
     if isinstance(config.algorithm, ChunkCriticConfig):
-        _state_model(config, ENVIRONMENT_STATE in shapes)
         read |= {ENVIRONMENT_STATE}
+    if isinstance(config.world_model, SimulatorStateConfig) and ENVIRONMENT_STATE not in shapes:
+        hint = f"the dataset has no {ENVIRONMENT_STATE}; use latent"
+        raise InputError("world_model.type", config.world_model.type, hint)
     return {name: shape for name, shape in shapes.items() if renames.get(name, name) in read}
 
 
 def _remember(
-    config: OfflineRun, update: Any, meta: Any, wanted: dict[str, tuple[int, ...]], console: Console
+    config: OfflineRun, update: Any, meta: Any, shapes: dict[str, tuple[int, ...]], console: Console
 ) -> dict[str, Any]:
     """Fills the memory; counts of what is in it."""
     from accerl_lerobot.algorithms.demonstrations import recorded
     from accerl_lerobot.policies.config import executed_rows
 
-    algorithm = config.algorithm
-    assert isinstance(algorithm, OffPolicyConfig)
+    algorithm: Any = config.algorithm
     chunk = executed_rows(update.adapter.policy.config)
-    size = sum(math.prod(shape) * (1 if len(shape) == 3 else 4) for shape in wanted.values())
+    size = sum(math.prod(shape) * (1 if len(shape) == 3 else 4) for shape in shapes.values())
     most = max(1, min(algorithm.memory, BYTES // size))
     longest = int(max(meta.episodes["length"]))
-    outcomes: dict[int, bool] = {}
-    totals: dict[int, float] = {}
+    outcomes: dict[int, bool] = {}  # episode → success
+    totals: dict[int, float] = {}  # episode → reward of its first segment
     with console.stage("reading the dataset", total=meta.total_frames) as stage:
         frames = 0
-        for segment in recorded(config.dataset, meta, wanted, chunk, most, most, longest):
+        for segment in recorded(config.dataset, meta, shapes, chunk, most, most, longest):
             update.remember(segment)
-            outcomes[segment.origin.seed] = segment.success
-            totals.setdefault(segment.origin.seed, float(segment.reward.sum()))
+            episode = segment.origin.seed
+            outcomes[episode] = segment.success
+            totals.setdefault(episode, float(segment.reward.sum()))
             frames += int(segment.steps.sum())
-            stage.update(min(frames, meta.total_frames))
+            stage.update(frames)
     if len(outcomes) < meta.total_episodes:
         left = f"{len(outcomes)} of {meta.total_episodes} episodes fit into {most} decisions"
         logger.warning("%s, the others are left out", left)
@@ -170,26 +171,22 @@ def _remember(
     if not len(update.imitable()) or not (counts["successes"] or graded):
         hint = "none of its episodes is a success, or better than another; there is nothing to imitate"
         raise InputError("dataset.repo_id", config.dataset.repo_id, hint)
-    console.say(f"{counts['episodes']} episodes, {counts['successes']} of them successes; "
-                f"{counts['decisions']} decisions")  # fmt: skip
+    console.say(", ".join(f"{number} {name}" for name, number in counts.items()))
     return counts
 
 
 @torch.no_grad()
 def _imitation(update: Any) -> dict[str, float | None]:
     """Mean imitation loss of some decisions of successes, and of failures; equal noise at every call."""
-    found: dict[str, float | None] = {}
+    losses: dict[str, float | None] = {}
     for name, outcome in (("successes", True), ("failures", False)):
         rows = np.flatnonzero(update.memory["success"] == outcome)
-        rows = rows[np.random.default_rng(0).permutation(len(rows))[:COMPARED]]
-        found[name] = None
+        rows = np.random.default_rng(0).permutation(rows)[:COMPARED]
+        losses[name] = None
         if len(rows):
             with torch.random.fork_rng(), update.adapter.autocast():
                 torch.manual_seed(0)
-                losses = []
-                for part in np.array_split(rows, math.ceil(len(rows) / update.config.micro_batch)):
-                    executed = update.tensor("chunk", part)
-                    loss, _ = update.adapter.imitate(*update.memory.observations(part), executed)
-                    losses.append(loss.float().mean() * len(part))
-            found[name] = float(torch.stack(losses).sum() / len(rows))
-    return found
+                observations = update.memory.observations(rows)
+                loss, _ = update.adapter.imitate(*observations, update.tensor("chunk", rows))
+            losses[name] = float(loss.float().mean())
+    return losses

@@ -7,7 +7,6 @@
 from __future__ import annotations
 
 import contextlib
-import copy
 import difflib
 import logging
 import math
@@ -21,6 +20,7 @@ import draccus
 import numpy as np
 
 from accerl_lerobot.algorithms import AWRConfig, ChunkCriticConfig, OffPolicyConfig, RatioConfig
+from accerl_lerobot.checkpoint.safety import brief
 from accerl_lerobot.config.machine import check_disk
 from accerl_lerobot.envs import (
     EnvConfig,
@@ -162,7 +162,7 @@ def check_start(config: RunConfig, say: Callable[[str], object] = str) -> tuple[
         needed = policy_features(policy)
         check_features(needed, env_features(spec), renames, "policy.path", config.policy.path)
     if isinstance(algorithm, OffPolicyConfig):
-        check_off_policy(config, policy, spec, say)
+        check_off_policy(config, policy, spec)
         if meta is None and config.dataset.repo_id is not None:
             meta = open_metadata(config.dataset)
         if meta is not None:
@@ -171,9 +171,7 @@ def check_start(config: RunConfig, say: Callable[[str], object] = str) -> tuple[
     return spec, history
 
 
-def check_off_policy(
-    config: RunConfig, policy: Any, spec: EnvironmentSpec, say: Callable[[str], object]
-) -> None:
+def check_off_policy(config: RunConfig, policy: Any, spec: EnvironmentSpec) -> None:
     """Refuse a policy, segments or states that an off-policy algorithm cannot learn from."""
     from accerl_lerobot.policies.config import executed_rows
 
@@ -184,23 +182,18 @@ def check_off_policy(
         why = f"algorithm.type={algorithm.type} looks at whole episodes; use at least {decisions}"
         raise InputError("rollout.segment_length", config.rollout.segment_length, why)
     if isinstance(algorithm, ChunkCriticConfig):
-        check_state_model(config, policy, decisions, say)
+        check_state_model(config, policy, decisions)
 
 
-def check_state_model(config: RunConfig, policy: Any, decisions: int, say: Callable[[str], object]) -> None:
+def check_state_model(config: RunConfig, policy: Any, decisions: int) -> None:
     """Refuse a world model that no policy of this kind has, or that such short episodes do not teach."""
     from accerl_lerobot.policies.teacher import state_spec
     from accerl_lerobot.world_model.states import new_state_model
 
-    model, state_size = config.state_model, config.env.state_size * policy.n_obs_steps
-    if config.world_model is None and not config.env.tells_state:
-        offers = hasattr(config.env, "environment_state")
-        hint = "; env.environment_state gives them the simulator's" if offers else ""
-        say(f"critic and teacher see a latent state that is learned{hint}")
-    if policy.input_features and policy.output_features:
-        learns = new_state_model(state_spec(policy, config.policy.rename_map, state_size), model).learns
-    else:  # a new policy reads what is offered
-        learns = not isinstance(model, SimulatorStateConfig)
+    model, learns = config.state_model, not isinstance(config.state_model, SimulatorStateConfig)
+    if policy.input_features and policy.output_features:  # a new policy reads the features that are offered
+        spec = state_spec(policy, config.policy.rename_map, config.env.state_size * policy.n_obs_steps)
+        learns = new_state_model(spec, model).learns
     if learns and decisions < 2:
         hint = "an episode is one decision, after which nothing follows; lower policy.n_action_steps"
         raise InputError("world_model.type", model.type, hint)
@@ -249,23 +242,19 @@ def check_training_data(
         return meta  # with names of its own, LeRobot compares dataset and policy
     if sft.init_path is None:
         needs = _new_policy_features(policy, source, about)
-        _check_new_policy(policy, needs, sft)
     else:
         needs = fine_tuned_features(policy, source, {})
     if sft.init_path is not None and data is not None:
         check_features(replace(needs, tasks=()), data, {}, "sft.init_path", sft.init_path, "dataset")
     if offered is not None:
-        reader = about if sft.init_path is None else ("sft.init_path", sft.init_path)
-        hint = "; or name fewer in sft.policy.input_features" if sft.init_path is None else ""
-        check_features(needs, offered, rename_map, *reader, hint=hint)
+        new = sft.init_path is None
+        field, value = about if new else ("sft.init_path", sft.init_path)
+        hint = "; or name fewer in sft.policy.input_features" if new else ""
+        check_features(needs, offered, rename_map, field, value, hint=hint)
     if offered is not None and data is not None and sft.init_path is not None:
         # Its cameras may have names of their own.
         vectors = {name: shape for name, shape in data.shapes.items() if name in (STATE, ACTION)}
         check_features(replace(data, shapes=vectors), offered, {}, *about)
-    for name, most in ((STATE, "max_state_dim"), (ACTION, "max_action_dim")):
-        limit, size = getattr(policy, most, None), needs.shapes.get(name, (0,))[0]
-        if limit is not None and limit < size:
-            raise InputError(f"sft.policy.{most}", limit, f"{name} has {size} numbers; use at least that")
     if meta is not None and spec is not None:
         with opened(dataset, meta, picked(dataset, sft.pick)) as read:
             check_actions(numbers(read, ACTION, dataset), spec, *about)
@@ -279,23 +268,6 @@ def _new_policy_features(policy: Any, source: Features, about: tuple[str, Any]) 
         raise InputError(*about, f"no {ACTION} for a policy: {why}")
     shapes = policy_features(policy).shapes or source.shapes
     return replace(source, shapes=shapes | {ACTION: source.shapes[ACTION]})
-
-
-def _check_new_policy(policy: Any, source: Features, sft: SFTConfig) -> None:
-    """Have LeRobot check the features that it will give a new policy."""
-    from lerobot.configs.types import FeatureType, PolicyFeature
-
-    kinds = {STATE: FeatureType.STATE, ENV_STATE: FeatureType.ENV, ACTION: FeatureType.ACTION}
-    features = {}
-    for name, shape in source.shapes.items():
-        features[name] = PolicyFeature(type=kinds.get(name, FeatureType.VISUAL), shape=shape)
-    policy = copy.deepcopy(policy)
-    policy.output_features = {ACTION: features.pop(ACTION)}
-    policy.input_features = policy.input_features or features
-    try:
-        policy.validate_features()
-    except ValueError as error:
-        raise InputError("sft.policy", sft.policy, f"LeRobot says: {error}") from error
 
 
 def check_wandb(config: WandBConfig) -> None:
@@ -356,18 +328,17 @@ def check_sft_policy(config: SFTConfig) -> Any:
     from accerl_lerobot.demos.sft import policy_fields
     from accerl_lerobot.policies.config import check_size
 
-    fields: dict[str, Any] = {k: v for k, v in config.policy.items() if k != "type"}
     kind = config.policy["type"]
+    fields = {name: value for name, value in config.policy.items() if name != "type"}
     names = policy_fields(kind, "sft.policy.type")
     if config.backbone is not None and "vlm_model_name" not in names:
         hint = f"{kind} has no vision-language backbone; leave the section out"
         raise InputError("sft.backbone", config.backbone, hint)
-    for key, value in fields.items():
-        if key not in names:
-            near = " or ".join(difflib.get_close_matches(key, names, n=3))
-            hint = f"LeRobot's {kind} has no such field{f'; did you mean {near}?' if near else ''}"
-            raise InputError(f"sft.policy.{key}", value, hint)
-        check_size(key, value, f"sft.policy.{key}")
+    for name, value in fields.items():
+        if name not in names:
+            near = " or ".join(difflib.get_close_matches(name, names)) or "one of its own"
+            raise InputError(f"sft.policy.{name}", value, f"LeRobot's {kind} has no such field; use {near}")
+        check_size(name, value, f"sft.policy.{name}")
     try:
         # Without a device LeRobot looks for one.
         return draccus.decode(PreTrainedConfig.get_choice_class(kind), {"device": "cpu"} | fields)

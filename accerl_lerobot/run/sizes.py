@@ -30,7 +30,8 @@ def check_memory(config: RunConfig) -> None:
         raise InputError(largest, getattr(getattr(config, section), name), hint)
     weights = policy_gib(config)
     if weights > total:
-        text = f"its weights take {weights:.1f} GiB in the processes of this run, this machine has {total:.1f}"
+        text = f"its weights take {weights:.1f} GiB in the processes of this run"
+        text += f", this machine has {total:.1f}"
         hint = "use a smaller policy, a GPU, launch.engine=local or policy.tuning.mode=lora"
         raise InputError("policy.path", config.policy.path, f"{text}; {hint}")
 
