@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
-from unittest.mock import MagicMock
 
 import pytest
 import torch
@@ -14,7 +13,6 @@ from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.console import Console
 from accerl_lerobot.engines.config import LaunchConfig, RunConfig
 from accerl_lerobot.engines.placement import Placement
-from accerl_lerobot.engines.ray_engine import InferenceReplica
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.policies.config import PolicyConfig
@@ -67,7 +65,7 @@ def test_by_default_all_is_here_and_shares_the_gpus(count: float, share: float):
     placement = Placement(run(), cluster((8, count), (64, 8)), "a" * 56)
     for role in ("trainer", "inference", "rollout", "replay"):
         options = placement.options(role)
-        assert options["scheduling_strategy"].node_id == "a" * 56 and placement.is_here(role)
+        assert options["scheduling_strategy"].node_id == "a" * 56
         assert options["num_gpus"] == (share if role in ("trainer", "inference") else 0.0)
 
 
@@ -83,7 +81,7 @@ def test_each_role_goes_where_it_is_sent_and_shares_what_is_there():
         "trainer": 0.6, "inference": 0.4, "world_model": 0.0, "rollout": 0.0, "replay": 0.0
     }  # fmt: skip
     placement = Placement(config, nodes, "a" * 56)
-    assert placement.options("rollout")["resources"].keys() == {"sim"} and not placement.is_here("rollout")
+    assert placement.options("rollout")["resources"].keys() == {"sim"}
     assert placement.rows() == [
         "2 trainer × 0.6 GPU on this node",
         "1 world_model on nodes with node:10.0.0.2",
@@ -132,16 +130,4 @@ def test_a_run_that_does_not_fit_does_not_begin(tmp_path: Path, monkeypatch: pyt
         InputError, match=r"trainer\.ranks=2: .* 2 ranks on 1 GPUs leave 1 without; use at most 1"
     ):
         Run(config, tmp_path, Console()).execute()
-    assert [path.name for path in tmp_path.iterdir()] == ["config.yaml"]
-
-
-def test_a_replica_that_was_restarted_when_training_began_follows_the_trainer():
-    for trainer_first in (True, False):
-        actor, trainer = MagicMock(), MagicMock()
-        replica = InferenceReplica("inference", actor, 3)
-        if trainer_first:
-            replica.trainer = trainer
-        assert replica.ready_arguments() == ((trainer,) if trainer_first else ())
-        replica.trainer = trainer
-        replica.begin()
-        assert actor.follow.remote.called is not trainer_first
+    assert not list(tmp_path.iterdir())

@@ -27,14 +27,8 @@ STATISTICS = {
     "QUANTILE10": ("q10", "q90"),
 }
 """LeRobot's modes of normalisation → the statistics that they read."""
-IMAGENET = (
-    "use ImageNet's: VISUAL: MEAN_STD in the policy's normalization_mapping, and no "
-    "--dataset.use_imagenet_stats=false in sft.extra_args"
-)
 TEXT_FIELDS = ("tokenizer_", "text_encoder_", "text_tokenizer_", "vlm_", "qwen_")
 """Beginnings of the fields of LeRobot's policy configs that only policies with an instruction have."""
-EPSILON = 1e-8
-"""Number that LeRobot adds to a width that it divides by."""
 OUTSIDE_SHARE, OUTSIDE_SLACK = 0.05, 0.01
 """Share of a dataset's actions to be warned of that lie outside the bounds by this part of their width."""
 RESIZERS = ("resize_imgs_with_padding", "image_resolution", "resize_shape")
@@ -203,44 +197,6 @@ def _check_tasks(needed: tuple[str, ...], offered: tuple[str, ...], field: str, 
         logger.warning("%s=%r: its instructions are %s, and the environment gives none", field, value, has)
     if len(known) < len(needed):
         logger.warning("%s=%r: instructions that differ in spelling only: %s", field, value, has)
-
-
-def check_statistics(
-    policy: Any, needed: Features, stats: dict[str, Any], field: str, value: object, recompute: str
-) -> None:
-    """Refuses statistics of a dataset, by the policy's names, that its normalisation cannot use.
-
-    `recompute` says how to compute those of numbers again.
-    """
-    for name, shape in needed.shapes.items():
-        kind = {STATE: "STATE", ENV_STATE: "ENV", ACTION: "ACTION"}.get(name, "VISUAL")
-        mode = policy.normalization_mapping.get(kind)
-        mode = str(getattr(mode, "value", mode))
-        wanted = STATISTICS.get(mode, ())
-        own = {key: np.asarray(numbers) for key, numbers in (stats.get(name) or {}).items()}
-        if not wanted:
-            continue
-        hint = IMAGENET if kind == "VISUAL" else recompute
-        about = f"{' and '.join(wanted)} of {name} in its statistics"
-        if not own.keys() >= set(wanted):
-            raise InputError(field, value, f"no {about}, which normalisation by {mode} reads; {hint}")
-        first, second = (own[statistic] for statistic in wanted)
-        for array in (first, second):
-            fits = kind == "VISUAL" or array.shape == shape
-            if array.dtype.kind not in "biuf" or not fits or not np.isfinite(array).all():
-                raise InputError(field, value, f"{about} are not {math.prod(shape)} finite numbers; {hint}")
-        width = second if wanted == STATISTICS["MEAN_STD"] else second - first
-        flat = width <= EPSILON
-        if not flat.any():
-            continue
-        changes = kind == "VISUAL" or bool((own.get("max", second) - own.get("min", second))[flat].any())
-        if changes:
-            raise InputError(field, value, f"by {about} it never changes, and is divided by 0; {hint}")
-        if kind != "ACTION":
-            text = (
-                "%s=%r: numbers %s of %s never change, and any other value is some 1e8 once it is normalised"
-            )
-            logger.warning(text, field, value, np.flatnonzero(flat).tolist(), name)
 
 
 def check_actions(actions: np.ndarray, spec: EnvironmentSpec, field: str, value: object) -> None:

@@ -263,11 +263,13 @@ def check_training_data(
 
 def _new_policy_features(policy: Any, source: Features, about: tuple[str, Any]) -> Features:
     """Features of the source that a new policy reads: those that it names, or all of them."""
+    named = policy_features(policy).shapes
+    for name, why in source.unusable.items():
+        if name == ACTION or not named or name in named:
+            raise InputError(*about, f"no {name} for a policy: {why}")
     if ACTION not in source.shapes:
-        why = source.unusable.get(ACTION, "there is nothing to imitate; name another dataset")
-        raise InputError(*about, f"no {ACTION} for a policy: {why}")
-    shapes = policy_features(policy).shapes or source.shapes
-    return replace(source, shapes=shapes | {ACTION: source.shapes[ACTION]})
+        raise InputError(*about, f"no {ACTION}, so that there is nothing to imitate; name another dataset")
+    return replace(source, shapes=(named or source.shapes) | {ACTION: source.shapes[ACTION]})
 
 
 def check_wandb(config: WandBConfig) -> None:
