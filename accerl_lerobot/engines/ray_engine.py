@@ -117,8 +117,7 @@ class RayEngine(Engine):
         self._trainer.work = self._trainer.actor.run.remote(self._replay.actor)
         for replica in self._inference:
             replica.trainer = self._trainer.actor
-            if not replica.is_starting:  # a replica that has died unnoticed is restarted, and follows then
-                replica.actor.follow.remote(replica.trainer)
+            replica.actor.follow.remote(replica.trainer)  # lost if it is restarted, and then asked again
 
     def follow(self, schedule: Schedule) -> None:
         """Change the schedule of collecting and learning, see `replay.pacing`."""
@@ -132,8 +131,7 @@ class RayEngine(Engine):
             clients = len(self._rollouts[index :: len(self._inference)])
             together = clients * self._config.rollout.environments
             replica.together = 0 if schedule == ASYNCHRONOUS else together
-            if not replica.is_starting:
-                replica.call("lock_step", replica.together)
+            replica.actor.lock_step.remote(replica.together)
 
     def poll(self) -> Progress:
         self._ask()
@@ -359,8 +357,7 @@ class RayEngine(Engine):
         newest = learner.actor.weights.remote()
         for slot in self._rollouts:
             slot.world = newest
-            if not slot.is_starting:
-                slot.actor.imagine_with.remote(newest)
+            slot.actor.imagine_with.remote(newest)
 
     def _supervise(self) -> None:
         """Give up workers that hang, and go on with those that are being restarted."""
@@ -384,7 +381,7 @@ class RayEngine(Engine):
         if state != self._last_state or not awaited:
             self._last_state, self._last_change = state, now
         elif now - self._last_change > 2 * self._limit:  # a single worker that hangs is found earlier
+            hint = "raise launch.stall_s if a single step takes that long"
             raise WorkerError(
-                f"nothing moved for {2 * self._limit:.0f} s: {progress.rollout}, {progress.replay}, "
-                f"{progress.inference}; raise launch.stall_s if a single step takes that long"
+                f"nothing moved for {2 * self._limit:.0f} s: {progress.rollout}, {progress.replay}; {hint}"
             )

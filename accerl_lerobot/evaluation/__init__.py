@@ -184,13 +184,10 @@ def success_curve(
             axes.plot(steps, share, color="0.7", lw=1.5, label="while exploring")
         evaluations = sorted(evaluations, key=lambda e: e["env_steps"])
         x = [e["env_steps"] for e in evaluations]
-        y = [e["success"] for e in evaluations]
-        # Rounding may leave the rate a hair outside its interval, and matplotlib refuses negative lengths.
-        low = [max(0.0, e["success"] - e["ci95"][0]) for e in evaluations]
-        high = [max(0.0, e["ci95"][1] - e["success"]) for e in evaluations]
-        axes.errorbar(
-            x, y, yerr=[low, high], marker="o", capsize=3, color="C0", label="evaluation, 95 % Wilson"
-        )
+        y = np.array([e["success"] for e in evaluations])
+        lengths = np.abs(np.array([e["ci95"] for e in evaluations]).T - y)  # below and above the rate
+        label = "evaluation, 95 % Wilson"
+        axes.errorbar(x, y, yerr=lengths, marker="o", capsize=3, color="C0", label=label)
         for e in (evaluations[0], evaluations[-1]):
             place = (e["env_steps"], e["success"])
             axes.annotate(f"n={e['n']}", place, textcoords="offset points", xytext=(6, -12), fontsize=8)
