@@ -58,14 +58,15 @@ class LaunchConfig(Section, section="launch"):
     lock step, then learned from. overlap: the next one is collected meanwhile. The last two are for measuring
     what the first gains; with several inference replicas, the environments of each are in step."""
     stall_s: Positive = 300.0
-    """Timeout in seconds for an answer of a worker, a step of an environment, and any progress of the run.
+    """Timeout in seconds for an answer of a worker and a step of an environment. Twice as long without any
+    progress ends all workers.
 
-    A rollout worker or an inference replica is restarted alone then; after any other loss, all workers are.
+    A rollout worker or an inference replica is restarted alone. After any other loss, all workers are.
     """
     max_restarts: Annotated[int, Range("[0, 1000000]")] = 3
     """How often in a row a rollout worker or an inference replica is restarted alone; 30 s at work reset the
     count. After that, and after any other loss, all workers are restarted from the last checkpoint, as often
-    in a row without a later update or checkpoint in between."""
+    in a row without a later update in between."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
