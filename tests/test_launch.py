@@ -145,23 +145,14 @@ def test_the_books_of_replay_balance(story: Story):
     assert books["trained_decisions"] <= story.config.replay.samples_per_insert * books["inserted_decisions"]
 
 
-def test_the_worker_that_was_killed_was_started_again_once(story: Story):
-    assert story.history[-1].rollout["restarts"] == 1.0
-    restarts = [p.rollout["restarts"] for p in story.history]
-    assert restarts == sorted(restarts) and restarts[0] == 0.0
-
-
-def test_the_inference_service_that_was_killed_came_back_alone(story: Story):
-    """With the newest weights: what it decides agrees with the trainer, and no version is older."""
-    assert story.history[-1].inference["restarts"] == 1.0
+def test_workers_that_were_killed_came_back_once(story: Story):
+    """Inference with the newest weights: its decisions agree with the trainer, and no version is older."""
+    assert story.history[-1].rollout["restarts"] == story.history[-1].inference["restarts"] == 1.0
     served = [p.inference["version"] for p in story.history if "version" in p.inference]
-    assert served == sorted(served) and served[-1] > UPDATES // 2
-
-
-def test_counters_never_fall_not_even_when_a_worker_is_lost(story: Story):
-    for name in ("env_steps", "decisions", "episodes"):
+    assert served == sorted(served) and UPDATES // 2 < served[-1] <= UPDATES
+    for name in ("env_steps", "decisions", "episodes", "restarts"):
         values = [p.rollout[name] for p in story.history]
-        assert values == sorted(values) and values[-1] > values[0], name
+        assert values == sorted(values) and values[-1] > values[0], f"{name} never falls"
 
 
 def test_every_planned_episode_has_exactly_one_result(story: Story):
@@ -174,23 +165,17 @@ def test_every_planned_episode_has_exactly_one_result(story: Story):
     assert len(set(explored)) == len(explored), "an exploring episode was reported twice"
 
 
-def test_evaluation_uses_the_weights_of_its_time(story: Story):
+def test_evaluation_uses_the_weights_of_its_time_and_equal_ones_give_equal_results(story: Story):
+    """Batches differ between the two, and the process that ran them may; the episodes must not."""
     assert {r.versions for r in story.before} == {(0, 0)}
     assert {r.versions for r in story.after} == {(UPDATES, UPDATES)}
     during = [e.versions for e in story.episodes if e.plan.group == "during"]
     assert all(0 < old <= new <= UPDATES for old, new in during)
-
-
-def test_equal_weights_and_seeds_give_equal_evaluations(story: Story):
-    """Batches differ between the two, and the process that ran them may; the episodes must not."""
     before, after = (
         {r.plan.index: (r.success, r.steps, r.decisions) for r in results}
         for results in (story.before, story.after)
     )
     assert before == after
-
-
-def test_only_what_was_to_be_filmed_is_filmed(story: Story):
     assert [bool(r.frames) for r in sorted(story.before, key=lambda r: r.plan.index)] == [True] + [False] * 5
 
 
@@ -221,8 +206,3 @@ def test_every_worker_has_left_its_timeline(story: Story):
     assert {"compute", "wait_in", "weights"} <= spent["inference"].keys()
     assert {"compute", "wait_in", "transport", "weights", "checkpoint"} <= spent["trainer"].keys()
     assert "checkpoint" in spent["replay"]
-
-
-def test_inference_reports_what_it_did(story: Story):
-    last = story.history[-1].inference
-    assert last["batches"] > 0 and 0 < last["version"] <= UPDATES and last["batch_size_mean"] >= 1

@@ -239,10 +239,8 @@ def test_what_is_no_run_is_refused(
 @pytest.mark.parametrize(
     ("name", "text", "why"),
     [
-        ("summary.json", "null", "a mapping is wanted"),
         ("summary.json", '{"updates": ', "not good JSON"),
         ("summary.json", '{"updates": -1}', "use a whole number"),
-        (".lock", None, "a link that leads out of the folder"),
         ("timeline", None, "a link that leads out of the folder"),
     ],
 )
@@ -311,8 +309,8 @@ def test_an_asynchronous_run_that_was_killed_and_stopped_goes_on(tiny_checkpoint
 
 def test_a_run_says_what_the_command_line_has_to_allow_again(tmp_path: Path):
     config = decode(RunConfig, {"algorithm": {"type": "ppo", "discover_packages_path": "mine.too"}})
-    said = [shlex.split(resume_command(tmp_path / "a run", one)) for one in (decode(RunConfig, {}), config)]
-    assert said[1] == [*said[0], "--algorithm.discover_packages_path=mine.too"] and len(said[0]) == 4
+    words = shlex.split(resume_command(tmp_path / "a run", config))
+    assert words[4:] == ["--algorithm.discover_packages_path=mine.too"]
 
 
 def test_demonstrations_that_are_complete_are_not_recorded_again(tmp_path: Path, monkeypatch):

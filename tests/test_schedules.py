@@ -215,19 +215,26 @@ def test_what_services_say_merge_metrics():
     assert merge_metrics([one]) == one and merge_metrics([]) == {}
 
 
-def test_services_without_callers_are_refused():
-    with pytest.raises(InputError, match=r"inference\.workers=2.*rollout\.workers, 1"):
-        RunConfig(inference=InferenceConfig(workers=2))
-    local = LaunchConfig(engine="local")
-    with pytest.raises(InputError, match=r"inference\.workers=2.*local"):
-        RunConfig(inference=InferenceConfig(workers=2), rollout=RolloutConfig(workers=2), launch=local)
-
-
-def test_schedules_that_cannot_be_are_refused():
+def test_schedules_and_replicas_that_cannot_be_are_refused():
+    local, synchronous = LaunchConfig(engine="local"), LaunchConfig(schedule=SYNCHRONOUS)
+    two = InferenceConfig(workers=2)
+    cases: list[tuple[str, dict[str, Any]]] = [
+        (r"inference\.workers=2.*rollout\.workers, 1", {"inference": two}),
+        (
+            r"inference\.workers=2.*local",
+            {"inference": two, "rollout": RolloutConfig(workers=2), "launch": local},
+        ),
+        (
+            r"launch\.schedule.*rollout\.episodes",
+            {"launch": synchronous, "rollout": RolloutConfig(episodes=8)},
+        ),
+        (
+            r"launch\.schedule.*imagination",
+            {"launch": synchronous, "imagination": ImaginationConfig(environments=4, path="somewhere")},
+        ),
+    ]
+    for message, sections in cases:
+        with pytest.raises(InputError, match=message):
+            RunConfig(**sections)
     with pytest.raises(InputError, match=r"launch\.schedule.*engine=local"):
         LaunchConfig(schedule=OVERLAP, engine="local")
-    launch = LaunchConfig(schedule=SYNCHRONOUS)
-    with pytest.raises(InputError, match=r"launch\.schedule.*rollout\.episodes"):
-        RunConfig(launch=launch, rollout=RolloutConfig(episodes=8))
-    with pytest.raises(InputError, match=r"launch\.schedule.*imagination"):
-        RunConfig(launch=launch, imagination=ImaginationConfig(environments=4, path="somewhere"))
