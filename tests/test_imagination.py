@@ -227,7 +227,7 @@ def test_what_does_not_fit_is_refused_before_the_run_begins(
     seen = told(path, "--env.environment_state=true")
     assert "env.environment_state=True: no policy reads it, and nothing imagined has it" in seen
     few = told(path, "--rollout.workers=4", "--rollout.episodes=2")
-    assert "rollout.episodes=2: each of 4 rollout workers needs a real episode" in few
+    assert "rollout.episodes=2: use at least 4: each rollout worker needs a real episode" in few
     looks = told(path, "--env.image_size=32", "--policy.n_action_steps=2")
     assert "executes 2 actions per decision; train one with world_model.chunk=2" in looks
     tiny_checkpoint = write_diffusion(tmp_path / "back", image=32, n_obs_steps=2)

@@ -169,21 +169,24 @@ class RunConfig(Section):
         if (held := self.trainer.hold_back) >= self.replay.max_lag:
             hint = f"use more than trainer.hold_back, {held}, or all is thrown away as too old"
             raise InputError("replay.max_lag", self.replay.max_lag, hint)
-        counts = {"inference.workers": self.inference.workers, "trainer.ranks": self.trainer.ranks}
-        for name, count in counts.items():
+        for name, count in (
+            ("inference.workers", self.inference.workers),
+            ("trainer.ranks", self.trainer.ranks),
+        ):
             if count > 1 and self.launch.engine == "local":
-                hint = "launch.engine=local is one process; use launch.engine=ray, or 1"
-                raise InputError(name, count, hint)
+                raise InputError(
+                    name, count, "launch.engine=local is one process; use launch.engine=ray, or 1"
+                )
         if self.inference.workers > self.rollout.workers:
             hint = f"use at most rollout.workers, {self.rollout.workers}, or some have nobody to answer"
             raise InputError("inference.workers", self.inference.workers, hint)
         batch, length = self.trainer.batch_decisions, self.rollout.segment_length
         if self.trainer.updates:
             self.replay.check(batch_decisions=batch, segment_decisions=length)
-        imagined = self.imagination.environments
-        if imagined and 0 < self.rollout.episodes < self.rollout.workers:
-            hint = f"each of {self.rollout.workers} rollout workers needs a real episode to imagine from"
-            raise InputError("rollout.episodes", self.rollout.episodes, f"{hint}; use that many, or more")
+        imagined, workers = self.imagination.environments, self.rollout.workers
+        if imagined and 0 < self.rollout.episodes < workers:
+            hint = f"use at least {workers}: each rollout worker needs a real episode to imagine from"
+            raise InputError("rollout.episodes", self.rollout.episodes, hint)
         if self.launch.schedule != ASYNCHRONOUS and (imagined or self.rollout.episodes):
             hint = "use asynchronous, or leave out imagination.environments and rollout.episodes"
             raise InputError("launch.schedule", self.launch.schedule, hint)
@@ -191,12 +194,10 @@ class RunConfig(Section):
     def _check_off_policy(self) -> None:
         """A memory of its own stands for replay's reuse, and holds whole real episodes."""
         if isinstance(self.world_model, SimulatorStateConfig) and not self.env.tells_state:
-            offered = getattr(self.env, "environment_state", None)
-            hint = "use latent"
-            if offered is not None:
-                hint = "add --env.environment_state=" + ("true" if offered is False else "'[KEY, …]'")
-            why = f"env.type={self.env.type} tells no state here; {hint}"
-            raise InputError("world_model.type", "simulator", why)
+            hint = "add env.environment_state, if the environment has it, or use latent"
+            raise InputError(
+                "world_model.type", "simulator", f"env.type={self.env.type} tells no state; {hint}"
+            )
         only = f"algorithm.type={self.algorithm.type}"
         for name, value, wanted, why in (
             ("replay.samples_per_insert", self.replay.samples_per_insert, 1.0, "draws from its own memory"),

@@ -328,5 +328,12 @@ def end_all(workers: Sequence[Worker]) -> None:
         ray.kill(worker.actor)
     deadline = time.monotonic() + GONE_S
     # A process of another node is waited for in vain if its number is taken here.
-    while any(psutil.pid_exists(worker.pid) for worker in workers) and time.monotonic() < deadline:
+    while any(_runs(worker.pid) for worker in workers) and time.monotonic() < deadline:
         time.sleep(0.02)
+
+
+def _runs(pid: int) -> bool:
+    try:
+        return bool(psutil.Process(pid).status() != psutil.STATUS_ZOMBIE)
+    except psutil.NoSuchProcess:
+        return False
