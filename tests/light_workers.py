@@ -19,7 +19,6 @@ from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE
 from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.inference.batcher import Batcher
-from accerl_lerobot.rollout.runner import EpisodePlans
 from accerl_lerobot.rollout.worker import Report, RolloutWorker
 from accerl_lerobot.trainer.peers import LearnerSettings
 from accerl_lerobot.transport.connection import Address, Server, ServiceStoppedError, serve_on_loop
@@ -84,21 +83,6 @@ class LightInference:
 def _decision(request: Request, version: int) -> Decision:
     chunk = np.random.default_rng(request.noise_seed).uniform(-1, 1, (4, 2)).astype(np.float32)
     return Decision(chunk=chunk, latent={"x": chunk}, log_prob=np.zeros(4, np.float32), version=version)
-
-
-class FalteringRollout(RolloutWorker):
-    """The first process in the first seat fails when it is to report for the third time."""
-
-    def ready(self, plans: EpisodePlans | None = None, *arguments: Any) -> int:
-        if plans is not None:
-            self._left = 2 if plans.worker == plans.incarnation == 0 else 1_000_000
-        return super().ready(plans, *arguments)
-
-    def report(self, *arguments: Any) -> Report:
-        self._left -= 1
-        if self._left < 0:
-            raise OSError("no space left for the timeline")
-        return super().report(*arguments)
 
 
 class WarningRollout(RolloutWorker):

@@ -30,7 +30,7 @@ from accerl_lerobot.rollout import worker as rollout_worker
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
 from benchmarks.simulated_environment import LatencyConfig
 from benchmarks.victims import alive
-from tests.light_workers import FULL, HANGS, NO_WEIGHTS, FalteringRollout, LightInference, WarningRollout
+from tests.light_workers import FULL, HANGS, NO_WEIGHTS, LightInference, WarningRollout
 from tests.runs import collect, drive, polls, until
 
 SLOW = LatencyConfig(max_steps=16, frame_ms=4.0)
@@ -155,19 +155,6 @@ def test_a_rollout_worker_that_is_lost_is_replaced_and_a_lost_replay_ends_the_ru
         drive(one)
     one.close()
     assert gone(pids["replay"])
-
-
-@pytest.mark.slow
-def test_a_rollout_worker_that_fails_to_report_is_replaced(engine, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(rollout_worker, "RolloutWorker", FalteringRollout)
-    one = engine(rollout=TWO, trainer=ENDLESS)
-    one.plan(evaluation_plans(("match",), 12, "before"))
-    assert sorted(r.plan.index for r in collect(one, "before", 12)) == list(range(12))
-    one.train()
-    for progress in polls(one):
-        if progress.rollout["restarts"] >= 1 and progress.version >= 3:
-            break
-    assert progress.rollout["restarts"] == 1
 
 
 def fail(one: RayEngine, pid: int) -> None:

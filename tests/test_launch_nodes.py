@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
@@ -21,4 +20,3 @@ def test_two_nodes():
     env = clean | {"PYTHONPATH": root}
     done = subprocess.run(command, env=env, cwd=root, capture_output=True, text=True, timeout=240)
     assert done.returncode == 0, done.stderr[-6000:]
-    assert json.loads(done.stdout.splitlines()[-1]).keys() == {"start", "refusals", "run", "node lost"}

@@ -310,9 +310,7 @@ def check_data(dataset: DatasetConfig, **policy: Any) -> None:
 
 def test_a_camera_that_the_policy_does_not_read_is_not_judged(tmp_path: Path):
     dataset = write_dataset(tmp_path / "data", more={FRONT: IMAGE, "observation.images.top.left": IMAGE})
-    with pytest.raises(
-        InputError, match="no observation.images.top.left in the env.*name fewer in"
-    ):
+    with pytest.raises(InputError, match="no observation.images.top.left in the env.*name fewer in"):
         check_data(dataset)
     features = {FRONT: {"type": "VISUAL", "shape": [3, 32, 32]}, STATE: {"type": "STATE", "shape": [4]}}
     check_data(dataset, input_features=features)

@@ -19,7 +19,6 @@ import pytest
 
 from accerl_lerobot.engines import ray_session
 from accerl_lerobot.engines.config import LaunchConfig
-from accerl_lerobot.engines.stopping import WorkerError
 from accerl_lerobot.errors import InputError
 
 TOKEN = "RAY_AUTH_TOKEN"
@@ -205,5 +204,5 @@ def test_a_ray_that_does_not_start_is_started_again_a_few_times(
         ray_session.start_ray()
         assert stand.init.call_count == failures + 1
         return
-    with pytest.raises(WorkerError, match="Ray did not start: Exception: The current node timed out"):
+    with pytest.raises(RuntimeError, match="Ray did not start: Exception: The current node timed out"):
         ray_session.start_ray()

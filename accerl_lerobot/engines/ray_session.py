@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING
 
 from accerl_lerobot import guardian
 from accerl_lerobot.config.parsing import imported
-from accerl_lerobot.engines.stopping import WorkerError, handled
+from accerl_lerobot.engines.stopping import handled
 from accerl_lerobot.errors import InputError, in_one_line
 
 if TYPE_CHECKING:
@@ -122,7 +122,7 @@ def _start_private() -> None:
         except Exception as error:  # Ray raises a plain one when its start-up fails
             ray.shutdown()
             if attempt == STARTS:
-                raise WorkerError(f"Ray did not start: {in_one_line(error)}") from error
+                raise RuntimeError(f"Ray did not start: {in_one_line(error)}") from error
 
 
 def _join(address: str) -> None:

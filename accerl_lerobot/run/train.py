@@ -225,6 +225,9 @@ class Run:
         except StoppedError:
             raise
         except BaseException as error:
+            if not (self.directory / layout.CONFIG).is_file():  # nothing has begun
+                discard_unused(self.directory)
+                raise
             reason = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
             if is_full(error):
                 reason = f"the disk of {self.directory} is full"
