@@ -284,8 +284,8 @@ def test_a_verb_that_is_asked_to_stop_ends_what_it_has_started(monkeypatch: pyte
 @pytest.mark.parametrize(
     ("error", "said"),
     [
-        (OSError(errno.ENOSPC, "full"), "the disk of {run} is full; free some space, then {how}"),
-        (WorkerError("replay:\n  OSError: No space left on device"), "the disk of {run} is full; free some"),
+        (OSError(errno.ENOSPC, "full"), "the disk of {run} is full; to resume: {how}"),
+        (WorkerError("replay:\n  OSError: No space left on device"), "the disk of {run} is full; to resume"),
         (WorkerError("a worker is lost"), "a worker is lost; to resume: {how}"),
     ],
 )

@@ -21,7 +21,6 @@ import numpy as np
 
 from accerl_lerobot.algorithms import AWRConfig, ChunkCriticConfig, OffPolicyConfig, RatioConfig
 from accerl_lerobot.checkpoint.safety import brief
-from accerl_lerobot.config.machine import check_disk
 from accerl_lerobot.envs import (
     EnvConfig,
     EnvironmentSpec,
@@ -30,7 +29,7 @@ from accerl_lerobot.envs import (
     environment_error,
     make_environment,
 )
-from accerl_lerobot.errors import InputError, causes
+from accerl_lerobot.errors import InputError, causes, check_absent, expanded
 from accerl_lerobot.experience import Observation
 from accerl_lerobot.policies.features import (
     ACTION,
@@ -135,6 +134,8 @@ def check_start(config: RunConfig, say: Callable[[str], object] = str) -> tuple[
     from accerl_lerobot.policies.config import check_likelihood, sampler_config
 
     algorithm = config.algorithm
+    if config.output_dir is not None and not config.resume:
+        check_absent(expanded(config.output_dir, "output_dir"))
     if config.policy.path is None and not config.sft.steps:
         hint = "give a LeRobot checkpoint, or sft.steps > 0 to make one; the recipe quickstart does"
         raise InputError("policy.path", None, hint)
@@ -167,7 +168,6 @@ def check_start(config: RunConfig, say: Callable[[str], object] = str) -> tuple[
             meta = open_metadata(config.dataset)
         if meta is not None:
             _check_remembered(config, spec, meta, history)
-    check_disk(config.output_dir)
     return spec, history
 
 

@@ -31,6 +31,7 @@ import yaml
 from accerl_lerobot import guardian
 from accerl_lerobot.algorithms import GIPOConfig
 from accerl_lerobot.checkpoint import layout
+from accerl_lerobot.config.machine import check_disk
 from accerl_lerobot.config.parsing import as_text
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.console import Console
@@ -79,6 +80,7 @@ def make_output_dir(config: Any) -> Path:
     else:
         path = expanded(config.output_dir, "output_dir")
     check_absent(path)
+    check_disk(config.output_dir)
     make_folder(path, "output_dir")
     return path
 
@@ -225,9 +227,6 @@ class Run:
         except StoppedError:
             raise
         except BaseException as error:
-            if not (self.directory / layout.CONFIG).is_file():  # nothing has begun
-                discard_unused(self.directory)
-                raise
             reason = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
             if is_full(error):
                 reason = f"the disk of {self.directory} is full"
@@ -239,11 +238,14 @@ class Run:
     def execute(self) -> dict[str, Any]:
         """Do all phases; returns the summary, which is also in ``summary.json``."""
         checkpoint = self.find_checkpoint()
+        if self.resume_from is None:  # first: the run can be resumed, whatever fails from here on
+            self.pin()
+            self.keep(self.config)
         recipe = self.config
         if checkpoint is not None:
             self.config = resuming.continued(recipe, self.directory, checkpoint)
         self.check()
-        self.keep(recipe)
+        self.keep(recipe)  # only now if it is resumed: a resume that is refused leaves the run as it was
         if checkpoint is None:
             self.config = warm_start(self.config, self.directory, self.console)
         else:
@@ -261,19 +263,26 @@ class Run:
     def check(self) -> None:
         """Refuse a run that could not go well, before anything long."""
         config = self.config
-        self.spec = check_environment(config.env) if self.load else check_start(config, self.console.say)[0]
+        if self.load is None:
+            checked = replace(config, output_dir=None)  # the folder is there by now
+            self.spec, _ = check_start(checked, self.console.say)
+        else:
+            self.spec = check_environment(config.env)
         check_placement(config)
         if config.imagination.environments:
             from accerl_lerobot.world_model.imagined import check_imagination
 
             check_imagination(config)
 
-    def keep(self, recipe: RunConfig) -> None:
-        """Write the run's config. A resume that was refused has left the run as it was."""
-        if self.resume_from is None and self.load is None:
+    def pin(self) -> None:
+        """Name the commit that a checkpoint on the Hub has now."""
+        if self.load is None:
             from accerl_lerobot.policies.loading import pinned
 
-            recipe = self.config = replace(recipe, policy=pinned(recipe.policy))
+            self.config = replace(self.config, policy=pinned(self.config.policy))
+
+    def keep(self, recipe: RunConfig) -> None:
+        """Write the run's config."""
         text = yaml.safe_dump(encode(replace(recipe, resume=False)), sort_keys=False)
         layout.write_atomically(self.directory / layout.CONFIG, text)
 

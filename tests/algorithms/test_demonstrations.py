@@ -28,7 +28,7 @@ from accerl_lerobot.experience import ENVIRONMENT_STATE, Segment, SegmentStart
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.loading import load_adapter
 from accerl_lerobot.policies.teacher import with_teacher
-from accerl_lerobot.run.preflight import _say_if_unlike, check_start
+from accerl_lerobot.run.preflight import _check_remembered, check_start
 from accerl_lerobot.world_model.config import SimulatorStateConfig
 from tests.algorithms.test_chunk_critic import SECTIONS
 from tests.replay.segments import make_segment
@@ -180,9 +180,9 @@ def test_they_are_looked_at_before_the_run_begins(
         assert "does not join the memory: the dataset's observation.images.front has shape" in caplog.text
         meta, spec = open_metadata(dataset), make_environment(ENV).spec
         caplog.clear()
-        _say_if_unlike(config, spec, meta, history=1)
+        _check_remembered(config, spec, meta, history=1)
         assert not caplog.text
-        _say_if_unlike(config, spec, meta, history=2)
+        _check_remembered(config, spec, meta, history=2)
     assert "the dataset's observation.state has shape (4,), the environment's (2, 4)" in caplog.text
     with pytest.raises(InputError, match=r"^dataset\.root="):
         check_start(replace(config, dataset=DatasetConfig(repo_id="a/b", root=str(tmp_path))))
