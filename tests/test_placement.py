@@ -129,5 +129,5 @@ def test_a_run_that_does_not_fit_does_not_begin(tmp_path: Path, monkeypatch: pyt
     with pytest.raises(
         InputError, match=r"trainer\.ranks=2: .* 2 ranks on 1 GPUs leave 1 without; use at most 1"
     ):
-        Run(config, tmp_path, Console()).execute()
+        Run(config, tmp_path, Console(), load=lambda policy: None).execute()
     assert [path.name for path in tmp_path.iterdir()] == ["config.yaml"]
