@@ -237,28 +237,39 @@ class Run:
 
     def execute(self) -> dict[str, Any]:
         """Do all phases; returns the summary, which is also in ``summary.json``."""
-        checkpoint = self.find_checkpoint()
-        if self.resume_from is None:  # first: the run can be resumed, whatever fails from here on
+        checkpoint = None
+        if self.resume_from is None:
             self.pin()
-            self.keep(self.config)
-        recipe = self.config
-        if checkpoint is not None:
-            self.config = resuming.continued(recipe, self.directory, checkpoint)
-        self.check()
-        self.keep(recipe)  # only now if it is resumed: a resume that is refused leaves the run as it was
+            self.keep(self.config)  # first: the run can be resumed, whatever fails from here on
+            self.check()
+        else:
+            recipe = self.config
+            checkpoint = resuming.checkpoint_of(self.directory, self.resume_from, self.console)
+            if checkpoint is not None:
+                self.config = resuming.continued(recipe, self.directory, checkpoint)
+            self.check()
+            self.keep(recipe)  # only now: a resume that is refused leaves the run as it was
         if checkpoint is None:
             self.config = warm_start(self.config, self.directory, self.console)
         else:
-            self.go_back_to(checkpoint)
+            layout.go_back_to(checkpoint)
+            self.console.say(f"going on from {checkpoint}")
+            self.times.before_s = None
         self.times.warm_s = time.monotonic() - self.times.started
         self.config = replace(self.config, output_dir=str(self.directory))
         return self.practise(checkpoint)
 
-    def find_checkpoint(self) -> Path | None:
-        """The checkpoint to resume from, if there is one."""
-        if self.resume_from is None:
-            return None
-        return resuming.checkpoint_of(self.directory, self.resume_from, self.console)
+    def pin(self) -> None:
+        """Name the commit that a checkpoint on the Hub has now."""
+        if self.load is None:
+            from accerl_lerobot.policies.loading import pinned
+
+            self.config = replace(self.config, policy=pinned(self.config.policy))
+
+    def keep(self, recipe: RunConfig) -> None:
+        """Write the run's config."""
+        text = yaml.safe_dump(encode(replace(recipe, resume=False)), sort_keys=False)
+        layout.write_atomically(self.directory / layout.CONFIG, text)
 
     def check(self) -> None:
         """Refuse a run that could not go well, before anything long."""
@@ -273,24 +284,6 @@ class Run:
             from accerl_lerobot.world_model.imagined import check_imagination
 
             check_imagination(config)
-
-    def pin(self) -> None:
-        """Name the commit that a checkpoint on the Hub has now."""
-        if self.load is None:
-            from accerl_lerobot.policies.loading import pinned
-
-            self.config = replace(self.config, policy=pinned(self.config.policy))
-
-    def keep(self, recipe: RunConfig) -> None:
-        """Write the run's config."""
-        text = yaml.safe_dump(encode(replace(recipe, resume=False)), sort_keys=False)
-        layout.write_atomically(self.directory / layout.CONFIG, text)
-
-    def go_back_to(self, checkpoint: Path) -> None:
-        """Resume from a checkpoint in a new process."""
-        layout.go_back_to(checkpoint)
-        self.console.say(f"going on from {checkpoint}")
-        self.times.before_s = None
 
     def practise(self, checkpoint: Path | None) -> dict[str, Any]:
         """Evaluate, train and evaluate by one engine after another, each from the last checkpoint."""
