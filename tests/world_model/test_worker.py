@@ -155,7 +155,7 @@ def test_a_run_on_a_state_that_another_process_learns(tiny_checkpoint: Path, tmp
         later = snapshot.load(tmp_path / "later" / TRAINING_STATE / "trainer")
         assert later["state_learner"]["count"] > saved
         os.kill(second.pids()["world model"], signal.SIGKILL)
-        with pytest.raises(WorkerError, match="world model worker failed"):
+        with pytest.raises(WorkerError, match="worker failed"):
             for _ in polls(second):
                 pass
     finally:
