@@ -90,8 +90,8 @@ def test_what_cannot_be_drawn_is_left_out_with_a_warning(
 ) -> None:
     nowhere = tmp_path / "missing"
     success_curve(nowhere / "curve.png", [evaluated(0, 1, 2)], [])
-    odd = [result(0, True, [np.zeros((2, 3), np.uint8)])]
-    before_after(tmp_path / "both.mp4", odd, odd, fps=4)
+    sizes = ([result(0, True, clip(1, (0, 0, 0), side))] for side in (32, 16))
+    before_after(tmp_path / "both.mp4", *sizes, fps=4)
     starts = ("success_curve.png", "film (")
     assert all(m.startswith(f"there is no {s}") for m, s in zip(caplog.messages, starts, strict=True))
     before_after(tmp_path / "film.mp4", [], [], fps=4)
