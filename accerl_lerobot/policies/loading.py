@@ -142,7 +142,7 @@ def sizes_of(adapter: Any) -> Sizes:
 def load_acting(
     config: PolicyConfig, *, dry_run: bool = False, fine_tuned: bool = False
 ) -> LeRobotAdapter | StockAdapter:
-    """A policy of any of LeRobot's types: by `load_adapter` if it has an exact likelihood, else to act only."""
+    """A policy of any of LeRobot's types, to act: by `load_adapter` if it has an exact likelihood."""
     checkpoint = open_checkpoint(config)
     if checkpoint.config.type in POLICIES:
         with contextlib.suppress(NoDensityError):

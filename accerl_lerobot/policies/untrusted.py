@@ -63,7 +63,7 @@ def fetched_checkpoint(path: str, revision: str | None, field: str) -> Path:
 
 
 def check_checkpoint(folder: Path, source: FileSource, *, fetched: bool = False) -> None:
-    """Checks links, processors, configs and the kind of weights of a LeRobot checkpoint, before they are read.
+    """Checks links, processors, configs and the kind of weights of a checkpoint, before they are read.
 
     One that was `fetched` from the Hub must not name folders of this machine.
     """
