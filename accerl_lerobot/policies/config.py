@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import importlib
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -11,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import draccus
 
-from accerl_lerobot.config.parsing import import_plugins, imported, not_imported
+from accerl_lerobot.config.parsing import import_plugins, imported
 from accerl_lerobot.config.ranges import Commit, Device, Range, Section, check, registered_name
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE
@@ -210,20 +209,11 @@ def check_registered(policy_type: Any, field: str, prefix: str = "") -> None:
     from lerobot.configs.policies import PreTrainedConfig
 
     known = sorted(PreTrainedConfig.get_known_choices())
-    if policy_type is None:
-        why = f'its config.json names no type; add "type": one of {", ".join(known)}'
-        raise InputError(field, None, prefix + why)
-    if policy_type in known:
-        package = PreTrainedConfig.get_choice_class(policy_type).__module__.partition(".")[0]
-        try:
-            importlib.import_module(package)
-        except (Exception, SystemExit) as error:  # it has registered the type, and then failed
-            raise InputError(field, policy_type, prefix + not_imported(package, error)) from error
-        return
-    install = "install the package that has it, or name it: policy.discover_packages_path"
-    broken = "; ".join(NOT_IMPORTED.values())
-    why = f"no such policy type here; {broken or install}; there are {', '.join(known)}"
-    raise InputError(field, policy_type, prefix + why)
+    if policy_type not in known:
+        install = "install the package that has it, or name it: policy.discover_packages_path"
+        broken = "; ".join(NOT_IMPORTED.values())
+        why = f"no such policy type here; {broken or install}; there are {', '.join(known)}"
+        raise InputError(field, policy_type, prefix + why)
 
 
 def discovery(policy_type: str | None) -> list[str]:

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from lerobot.configs.policies import PreTrainedConfig
 from safetensors.torch import save_file
 
 from accerl_lerobot import cli, load_policy
@@ -221,35 +220,6 @@ def test_exploring_is_the_chunk_and_noise_of_the_request(written: Any):
     np.testing.assert_array_equal(noisy[2].chunk, adapter.decide(asked, 0)[2].chunk)
 
 
-def test_a_policy_that_takes_no_batch_decides_one_by_one(
-    written: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-):
-    from lerobot.policies.vqbet.modeling_vqbet import VQBeTPolicy
-
-    stock = VQBeTPolicy.select_action
-
-    def one_at_a_time(self: Any, batch: dict[str, torch.Tensor]) -> torch.Tensor:
-        if len(batch["observation.state"]) > 1:
-            raise RuntimeError("one at a time, please")
-        return stock(self, batch)
-
-    monkeypatch.setattr(VQBeTPolicy, "select_action", one_at_a_time)
-    adapter = learning(written("vqbet"))
-    assert "vqbet policies decide for one environment at a time" in caplog.text
-    assert len(adapter.decide(adapter.example_requests(), 0)) == 2
-
-
-def test_a_policy_that_changes_while_it_acts_is_refused(written: Any, monkeypatch: pytest.MonkeyPatch):
-    from lerobot.policies.vqbet.modeling_vqbet import VQBeTPolicy
-
-    stock, count = VQBeTPolicy.select_action, iter(range(10_000))
-    monkeypatch.setattr(VQBeTPolicy, "select_action", lambda self, batch: stock(self, batch) + next(count))
-    with pytest.raises(
-        InputError, match="policy.type='vqbet': asked twice with the same noise, it gives two"
-    ):
-        learning(written("vqbet"))
-
-
 @pytest.mark.parametrize("algorithm", ["self_imitation", "chunk_critic"])
 def test_any_policy_learns_and_is_saved_for_stock_lerobot(
     algorithm: str, written: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -319,35 +289,3 @@ def test_a_type_that_is_missing_and_a_package_that_is_broken_are_two_lines(
     with pytest.raises(InputError, match=f"no such policy type here; {why}") as caught:
         load_acting(config)
     assert "\n" not in str(caught.value) and "lerobot_policy_theirs" not in sys.modules
-
-
-HALF = """
-from dataclasses import dataclass
-from lerobot.configs.policies import PreTrainedConfig
-from lerobot.policies.act.configuration_act import ACTConfig
-
-@PreTrainedConfig.register_subclass("half")
-@dataclass
-class HalfConfig(ACTConfig):
-    pass
-"""
-
-
-def test_a_package_that_registers_its_type_and_then_fails_is_told_by_its_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    (tmp_path / "policy").mkdir()
-    (tmp_path / "policy" / "config.json").write_text('{"type": "half"}')
-    save_file({"weight": torch.zeros(1)}, tmp_path / "policy" / "model.safetensors")
-    write_package(
-        tmp_path / "site", "lerobot_policy_half", "from . import config\nimport no_such_module_of_theirs"
-    )
-    (tmp_path / "site" / "lerobot_policy_half" / "config.py").write_text(HALF)
-    monkeypatch.syspath_prepend(str(tmp_path / "site"))
-    monkeypatch.setattr("accerl_lerobot.policies.config.NOT_IMPORTED", {})
-    why = "lerobot_policy_half is installed and cannot be imported .ModuleNotFoundError: No module named"
-    try:
-        with pytest.raises(InputError, match=f"policy.type='half': .*{why} 'no_such_module_of_theirs'"):
-            load_acting(PolicyConfig(path=str(tmp_path / "policy"), device="cpu"))
-    finally:
-        PreTrainedConfig.get_known_choices().pop("half", None)
