@@ -147,12 +147,6 @@ class Diffusion(Model):
         inputs = {key: batch[key] for key in (OBS_STATE, *config.image_features)}
         if config.n_obs_steps == 1:
             inputs = {key: value[:, None] for key, value in inputs.items()}
-        elif inputs[OBS_STATE].shape[1:-1] != (config.n_obs_steps,):
-            shape = tuple(inputs[OBS_STATE].shape)
-            raise ValueError(
-                f"observation.state is {shape}, but the policy reads {config.n_obs_steps} env steps at a "
-                "time: make environments with history=n_obs_steps"
-            )
         images = [inputs[key] for key in config.image_features]
         return inputs | {OBS_IMAGES: torch.stack(images, dim=-4)}
 

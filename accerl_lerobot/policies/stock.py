@@ -32,8 +32,6 @@ from accerl_lerobot.policies.processing import Processing
 from accerl_lerobot.seeds import episode_of
 
 EPISODES = 256  # episodes whose state is kept; the one that acted longest ago goes first
-SHARED = ("config", "_modules", "_parameters", "_buffers")
-"""Attributes of a policy that all episodes have in common."""
 NOISE = 6  # distinguishes the seeds of the noise on executed chunks
 
 
@@ -130,10 +128,9 @@ class StockAdapter(PretrainedAdapter):
         """The episode's policy object, which is new and reset if this is its first decision."""
         policy = self._episodes.get((episode, task))
         if policy is None:
-            policy = copy.copy(self.policy)
-            own = {name: value for name, value in vars(policy).items() if name not in SHARED}
-            shared = (*policy.modules(), *policy.parameters(), *policy.buffers())
-            vars(policy).update(copy.deepcopy(own, {id(part): part for part in shared}))
+            shared = (self.policy.config, *self.policy.modules(), *self.policy.parameters())
+            memo = {id(part): part for part in (*shared, *self.policy.buffers()) if part is not self.policy}
+            policy = copy.deepcopy(self.policy, memo)
             policy.reset()
             self._episodes[episode, task] = policy
         self._episodes.move_to_end((episode, task))

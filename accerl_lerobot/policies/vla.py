@@ -229,7 +229,8 @@ class Pi0Fast(TokenModel):
             hint = "LeRobot's sampler has to be greedy here: set it to 0 in config.json; exploration has a "
             hint += "policy.sampler.temperature"
             raise NoDensityError("policy.temperature", config.temperature, hint)
-        if config.n_action_steps != (rows := config.chunk_size):
+        rows = config.chunk_size
+        if config.n_action_steps != rows:
             # The coefficients of K rows, read as those of fewer, are another, faster and larger movement.
             hint = f"LeRobot decodes so many rows from the coefficients of {rows}; use {rows}"
             raise InputError("policy.n_action_steps", config.n_action_steps, hint)
@@ -239,9 +240,6 @@ class Pi0Fast(TokenModel):
         self.terminator = tokenizer.convert_tokens_to_ids(END)
         paligemma = policy.model.paligemma_with_expert.paligemma
         self.width = paligemma.model.language_model.config.hidden_size
-        if len(tokenizer) < paligemma.lm_head.out_features:
-            known = f"{len(tokenizer)} of the {paligemma.lm_head.out_features} tokens the policy writes"
-            raise InputError("policy.text_tokenizer_name", config.text_tokenizer_name, f"knows only {known}")
 
     def encode(self, batch: dict[str, Tensor]) -> Encoded:
         """The features are the prefix's: images, prompt, BOS."""

@@ -139,12 +139,6 @@ def test_a_run_asks_the_policy_how_far_it_looks_back(looking: Path, tmp_path: Pa
     assert summary["updates"] == 3 and summary["n_after"] == 4 and summary["ratio_max_dev"] < 1
 
 
-def test_a_world_without_a_history_is_refused_in_words(looking: Path):
-    request = requests(1, image=40)[0]
-    with pytest.raises(ValueError, match="but the policy reads 2 env steps at a time: make environments"):
-        adapter_at(looking).decide([request], 0)
-
-
 def test_a_rollout_process_asks_with_the_history():
     worker = RolloutWorker(WORLD, RolloutConfig(environments=1), history=OBSERVED)
     worker.ready(EpisodePlans(("match",), 0, None))

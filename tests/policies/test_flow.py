@@ -151,14 +151,3 @@ def test_the_executed_noise_has_the_configured_size(path: Path):
     stock = np.stack([d.chunk for d in adapter.decide(requests(200, explore=False), 0)])
     added = (noisy - stock) / 0.5
     assert abs(added.mean()) < 0.02 and added.std() == pytest.approx(0.2, rel=0.06)
-
-
-def test_published_weights_that_do_not_fit_change_nothing(path: Path):
-    adapter = adapter_at(path)
-    good = adapter.export_trainable()
-    moved = {k: v + 1 for k, v in good.items()}
-    first, *_, last = moved
-    for wrong in ({k: v for k, v in moved.items() if k != first}, moved | {last: np.zeros(7, np.float32)}):
-        with pytest.raises(ValueError, match="published weights differ by name or shape"):
-            adapter.load_trainable(wrong)
-    assert all(np.array_equal(a, good[k]) for k, a in adapter.export_trainable().items())

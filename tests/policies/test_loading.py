@@ -488,14 +488,6 @@ def test_tokenisers_named_by_their_path_move_along(damaged: Any, tmp_path: Path)
     refused(path, f"policy.path=.*its files were in {path}/.*, which is gone; put a copy into")
 
 
-def test_a_tokeniser_with_too_few_tokens(damaged: Any):
-    path = damaged("pi0_fast")
-    state = json.loads((path / BACKBONE / "tokenizer.json").read_text())
-    del state["model"]["vocab"]["<loc0399>"]
-    (path / BACKBONE / "tokenizer.json").write_text(json.dumps(state))
-    refused(path, "policy.text_tokenizer_name=.*knows only 399 of the 400 tokens")
-
-
 def test_what_lerobot_forgets_of_its_action_tokeniser_is_put_back(written: Any):
     path = written("pi0_fast")
     step = adapter_at(path).processing.preprocessor.steps[6]
