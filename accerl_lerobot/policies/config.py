@@ -231,15 +231,8 @@ def check_observations(policy_config: Any, field: str) -> None:
         raise InputError(field, policy_config.n_obs_steps, hint)
 
 
-def sampler_config(
-    config: PolicyConfig, policy_type: Any, field: str = "policy.type", prefix: str = ""
-) -> SamplerConfig:
-    """How a policy of this type explores in this run.
-
-    Refuses a type that is not there, naming `field`, in a hint that begins with `prefix`; and a sampler that
-    does not suit it.
-    """
-    check_registered(policy_type, field, prefix)
+def sampler_config(config: PolicyConfig, policy_type: str) -> SamplerConfig:
+    """How a policy of this type explores in this run; refuses a sampler that does not suit it."""
     families = (*POLICIES[policy_type][1], ANY) if policy_type in POLICIES else (ANY,)
     if config.sampler is None:
         return SamplerConfig.get_choice_class(families[0])()

@@ -96,9 +96,14 @@ class Family(nn.Module, ABC):
     def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Log-prob (B, L), differentiable, of what `act` stored, and entropy (B,)."""
 
-    @abstractmethod
     def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
         """Largest difference, normalised units, between our sampler without exploration and LeRobot's."""
+        count = len(encoded.features)
+        requests = [Request(observation={}, noise_seed=seed, explore=False) for seed in range(count)]
+        ours, latent, _ = self.act(encoded, requests)
+        noise = {"noise": latent["path"][:, 0].clone()} if "path" in latent else {}
+        stock = self.model.stock(batch, **noise)
+        return float((ours - stock[:, : ours.shape[1]]).abs().max())
 
     def imitation_loss(self, encoded: Encoded, chunk: Tensor) -> Tensor:
         """LeRobot's training loss (B,) on chunks (B, K, A) of as many actions as are executed, normalised.

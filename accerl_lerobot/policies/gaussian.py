@@ -84,10 +84,6 @@ class GaussianFamily(Family):
         log_prob = normal_log_prob(latent["u"], mean, std).sum(-1)
         return log_prob, normal_entropy(std).sum((1, 2))
 
-    def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
-        mean, _ = self._gaussian(encoded)
-        return float((mean - self.model.stock(batch)[:, : self.model.executed]).abs().max())
-
     def imitation_loss(self, encoded: Encoded, chunk: Tensor) -> Tensor:
         """Mean absolute error, ACT's reconstruction loss."""
         return (self._gaussian(encoded)[0] - chunk).abs().mean((1, 2))

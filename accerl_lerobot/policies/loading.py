@@ -162,8 +162,7 @@ def load_adapter(
         InputError: see `open_checkpoint` and `LeRobotAdapter.self_check`; or a file did not load.
     """
     checkpoint = open_checkpoint(config)
-    prefix = f"{config.path} is of this type: "
-    sampler = sampler_config(config, checkpoint.config.type, prefix=prefix)
+    sampler = sampler_config(config, checkpoint.config.type)
     if isinstance(sampler, ChunkNoiseConfig):
         return _stock_adapter(checkpoint, config, sampler, dry_run, fine_tuned)
     model_class = imported(POLICIES[checkpoint.config.type][0])

@@ -15,9 +15,9 @@ from __future__ import annotations
 
 import copy
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import Any, NoReturn
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -167,7 +167,7 @@ class StockAdapter(PretrainedAdapter):
             torch.manual_seed(requests[0].noise_seed % 2**63)
             policy.reset()
             *earlier, newest = [self.processing.prepare(frame, tasks) for frame in self._frames(arrays)]
-            with self._only_looking():
+            with patch.object(policy, "predict_action_chunk", self._no_prediction):
                 for batch in earlier:
                     policy.select_action(batch)
             # It computes a chunk at the first call, and takes one action after the other out of it.
@@ -182,20 +182,10 @@ class StockAdapter(PretrainedAdapter):
             return [arrays]
         return [{name: values[:, step] for name, values in arrays.items()} for step in range(steps)]
 
-    @contextmanager
-    def _only_looking(self) -> Iterator[None]:
-        """Inside, `select_action` notes the observation and gives zeros in the place of a prediction."""
-        policy, dims = self.policy, self.policy.config.action_feature.shape[0]
-
-        def nothing(batch: dict[str, Tensor], *args: Any, **fields: Any) -> Tensor:
-            count = next(len(value) for value in batch.values() if isinstance(value, Tensor))
-            return torch.zeros(count, 1, dims, device=self.device)
-
-        policy.predict_action_chunk = nothing
-        try:
-            yield
-        finally:
-            del policy.predict_action_chunk
+    def _no_prediction(self, batch: dict[str, Tensor], *args: Any, **fields: Any) -> Tensor:
+        """Zeros in the place of a predicted chunk, so that `select_action` only notes the observation."""
+        count = next(len(value) for value in batch.values() if isinstance(value, Tensor))
+        return torch.zeros(count, 1, self.policy.config.action_feature.shape[0], device=self.device)
 
     def _training_batch(
         self, observations: dict[str, np.ndarray], tasks: Sequence[str], chunk: Tensor
@@ -204,8 +194,8 @@ class StockAdapter(PretrainedAdapter):
         config, count = self.policy.config, len(tasks)
         executed = self.processing.unnormalise(chunk)
         batch: dict[str, Any] = {"task": list(tasks), ACTION: executed[:, 0]}
-        if (deltas := config.action_delta_indices) is not None:
-            rows = torch.tensor(list(deltas), device=executed.device)
+        if config.action_delta_indices is not None:
+            rows = torch.tensor(list(config.action_delta_indices), device=executed.device)
             batch[ACTION] = executed[:, rows.clamp(0, chunk.shape[1] - 1)]
             outside = (rows < 0) | (rows >= chunk.shape[1])
             batch[f"{ACTION}_is_pad"] = outside.expand(count, -1)

@@ -460,7 +460,7 @@ def policy_to_be(config: RunConfig) -> Any:
             what = "" if error.field == "policy.path" else f"{error.field.partition('.')[2]}={error.value}: "
             raise InputError("sft.init_path", start.path, what + error.hint) from error
     policy_config = check_sft_policy(config.sft)
-    sampler_config(config.policy, config.sft.policy["type"], "sft.policy.type")
+    sampler_config(config.policy, config.sft.policy["type"])
     override(policy_config, config.policy)
     check_observations(policy_config, "sft.policy.n_obs_steps")
     return policy_config
