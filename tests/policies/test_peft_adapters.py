@@ -148,11 +148,3 @@ def test_it_is_fine_tuned_as_an_adapter(adapted: Path, tmp_path: Path):
             SFTConfig(init_path=str(folder)), DatasetConfig(repo_id="a/b"), tmp_path, 0, "cpu"
         )
         assert {flag for flag in command if "peft" in flag.partition("=")[0]} == flags
-
-
-def test_merged_weights_that_are_still_marked_as_an_adapter_load(tmp_path: Path):
-    folder = write_smolvla(tmp_path / "merged")
-    edit_config(folder, use_peft=True)
-    config = PolicyConfig(path=str(folder), device="cpu")
-    save_pretrained(load_adapter(config), tmp_path / "saved", config)
-    stock_policy(tmp_path / "saved")

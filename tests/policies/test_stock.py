@@ -152,15 +152,7 @@ def learning(path: Path, **fields: Any) -> StockAdapter:
     return adapter
 
 
-def test_act_acts_as_by_its_own_likelihood(tmp_path: Path):
-    path = write_act(tmp_path / "act", image=32)
-    asked = requests(3, explore=False)
-    ours = load_adapter(PolicyConfig(path=str(path), device="cpu")).decide(asked, 1)
-    for one, other in zip(ours, learning(path).decide(asked, 1), strict=True):
-        np.testing.assert_allclose(one.chunk, other.chunk, atol=1e-5)
-
-
-@pytest.mark.parametrize("write", [write_smolvla, write_diffusion])
+@pytest.mark.parametrize("write", [write_act, write_smolvla, write_diffusion])
 def test_types_that_are_known_act_as_in_lerobot_s_loop(write: Callable[..., Path], tmp_path: Path):
     adapter = learning(write(tmp_path / "policy", image=32))
     (asked,) = requests(1, explore=False)
