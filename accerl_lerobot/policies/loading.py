@@ -21,6 +21,7 @@ from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies.factory import get_policy_class
 from torch import Tensor
 
+from accerl_lerobot.checkpoint.layout import BACKBONE
 from accerl_lerobot.checkpoint.safety import FileSource, read_json, read_tensors, tensor_shapes
 from accerl_lerobot.config.machine import computes_bf16
 from accerl_lerobot.config.parsing import discover, imported
@@ -53,6 +54,11 @@ from accerl_lerobot.policies.stock import StockAdapter
 from accerl_lerobot.policies.untrusted import ADAPTER, ADAPTER_CONFIG, fetched_checkpoint, refusing
 
 ACTS_MOST = 10**9  # parameters of a policy that acts in a dry run; π0's four billion would take minutes
+
+PROCESSORS_HINT = (
+    f"a tokeniser that cannot be had from the Hub goes into {BACKBONE}/ beside config.json; a checkpoint from "
+    "before LeRobot's processors is converted by python -m lerobot.processor.migrate_policy_normalization"
+)
 
 
 class Sizes(NamedTuple):
@@ -257,7 +263,7 @@ def _load_parts(
         guards.enter_context(untrusted.guarded("policy", config.trust_remote_code))
         if model_class is not None:
             guards.enter_context(model_class.loading())
-        with refusing(source, "its LeRobot processors did not load"):
+        with refusing(source, f"its LeRobot processors did not load; {PROCESSORS_HINT}"):
             processing = load_processors(policy_config, folder, config.rename_map)
         with refusing(source, "its network cannot be built as its config.json says"), untrusted.Unfilled():
             policy = _build_network(policy_config)

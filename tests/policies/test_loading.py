@@ -244,7 +244,8 @@ def test_a_shared_embedding_is_read_as_lerobot_reads_it(damaged: Any):
 def test_missing_processors(damaged: Any):
     path = damaged("act")
     (path / PROCESSOR).unlink()
-    refused(path, "policy.path=.*its LeRobot processors did not load")
+    refused(path, "policy.path=.*its LeRobot processors did not load; .*migrate_policy_normalization")
+    assert locate("lerobot.processor.migrate_policy_normalization") is not None
 
 
 def test_torchvision_s_weights_are_not_asked_for(
