@@ -56,7 +56,7 @@ from accerl_lerobot.policies.untrusted import ADAPTER, ADAPTER_CONFIG, fetched_c
 ACTS_MOST = 10**9  # parameters of a policy that acts in a dry run; π0's four billion would take minutes
 
 PROCESSORS_HINT = (
-    f"a tokeniser that cannot be had from the Hub goes into {BACKBONE}/ beside config.json; a checkpoint from "
+    f"a tokeniser that is not to be had from the Hub goes into {BACKBONE}/ beside config.json; one from "
     "before LeRobot's processors is converted by python -m lerobot.processor.migrate_policy_normalization"
 )
 
