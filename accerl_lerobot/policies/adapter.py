@@ -45,7 +45,8 @@ class ValueHead(nn.Module):
         self.query = nn.Parameter(torch.zeros(width))
         self.norm = nn.LayerNorm(width)
         self.hidden = nn.Linear(width, HIDDEN)
-        bound, generator = width**-0.5, torch.Generator().manual_seed(torch.initial_seed() % 2**63)
+        bound = width**-0.5
+        generator = torch.Generator().manual_seed(torch.initial_seed() % 2**63)
         for parameter in self.hidden.parameters():  # as nn.Linear begins
             nn.init.uniform_(parameter, -bound, bound, generator=generator)
         self.out = nn.Linear(HIDDEN, 1)

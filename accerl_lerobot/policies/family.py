@@ -62,7 +62,8 @@ class Model(ABC):
 
     def __init__(self, policy: Any) -> None:
         """Refuses options that several of LeRobot's policies have."""
-        if (rtc := getattr(policy.config, "rtc_config", None)) is not None and rtc.enabled:
+        real_time = getattr(policy.config, "rtc_config", None)
+        if real_time is not None and real_time.enabled:
             hint = "real-time chunking changes the sampler's density; set it to false in config.json"
             raise InputError("policy.rtc_config.enabled", True, hint)
         self.policy = policy
