@@ -128,6 +128,8 @@ def read_json(path: Path, origin: FileSource) -> dict[str, Any]:
     try:
         text = path.read_bytes().decode()
         content = yaml.safe_load(text) if is_yaml else json.loads(text)
+    except FileNotFoundError as error:
+        raise origin.refuse(path.name, "is missing; give the whole folder") from error
     except (OSError, RecursionError, ValueError, yaml.YAMLError) as error:
         language = "YAML" if is_yaml else "JSON"
         raise origin.refuse(path.name, f"not good {language} ({brief(error)})") from error
