@@ -123,8 +123,8 @@ def test_what_cannot_learn_is_evaluated_and_refused_in_one_line(written: Any, tm
         f"--output_dir={tmp_path / 'new'}",
     ]
     for kind, algorithm, why in (
-        ("tdmpc", "gipo", "algorithm.type=gipo needs exact likelihoods, which smolvla, act, .* have here"),
-        ("tdmpc", "self_imitation", "LeRobot trains it on what follows a chunk"),
+        ("tdmpc", "gipo", "LeRobot trains it on what follows a chunk"),
+        ("vqbet", "gipo", "algorithm.type=gipo needs exact likelihoods, which smolvla, act, .* have here"),
         ("act", "gipo", ".*averaging over earlier chunks"),
         ("act", "awr", ".*averaging over earlier chunks"),
         ("vqbet", "awr", "awr's critic reads the policy's features, which are not known; use chunk_critic"),
