@@ -15,7 +15,6 @@ of one. Every byte is checked before a run resumes from it.
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 import os
@@ -33,7 +32,7 @@ CHECKPOINTS, DEMOS = "checkpoints", "demos"
 CONFIG, SUMMARY = "config.yaml", "summary.json"
 MANIFEST, LAST = "manifest.json", "last"
 KEEP = 2  # newest checkpoints that can be resumed from; the others keep their policies only
-WRITING, REPLACED = ".writing-", ".replaced-"
+WRITING = ".writing-"  # how names of folders begin that are not complete, or replaced
 RUN_STATE, WEIGHTS = "run", "weights"
 """Names of states in `TRAINING_STATE`: the progress of the run, and the exact trained weights."""
 STEP = "training_step.json"
@@ -49,6 +48,7 @@ STEP_FOLDERS = {
 }
 """LeRobot processor step → its option that names files, and our folder for them."""
 PREPROCESSOR = "policy_preprocessor.json"
+NAMING_BACKBONE = ("config.json", PREPROCESSOR)  # files of a policy that name its backbone or tokenisers
 BACKBONE_FILES = (
     "config.json", "*_config.json", "tokenizer.json", "vocab.json", "vocab.txt", "merges.txt", "*.model",
     "special_tokens_map.json", "added_tokens.json", "chat_template.*", "processing_*.py",
@@ -60,8 +60,6 @@ NAMING = ("config.json", "*_config.json", "*processor.json", "accerl.json", "inf
 NOT_READ = "train_config.json"  # LeRobot's record of a training
 RECORDED = ("pretrained_path", "_name_or_path", "name_or_path", "special_tokens_map_file")
 """Keys that say where something once was. Nothing reads it there."""
-LOOKED_UP = ("_name", "_path", "vocab_file", "merges_file", "tokenizer_file")
-"""Endings of keys whose values LeRobot and transformers look for below the current folder first."""
 
 
 def save_checkpoint(checkpoints: Path, write: Callable[[Path], int]) -> Path:
@@ -87,7 +85,7 @@ def save_checkpoint(checkpoints: Path, write: Callable[[Path], int]) -> Path:
         for path in [*sorted(temporary.rglob("*"), reverse=True), temporary]:
             _sync(path)
         if final.exists():
-            final.rename(checkpoints / f"{REPLACED}{final.name}")
+            final.rename(checkpoints / f"{WRITING}{final.name}")
         temporary.rename(final)
         fault_point("driver.renamed", final)
     finally:
@@ -98,15 +96,9 @@ def save_checkpoint(checkpoints: Path, write: Callable[[Path], int]) -> Path:
 
 
 def _tidy(checkpoints: Path) -> None:
-    """Removes what a killed process has left half written, and restores what it had put aside."""
+    """Removes what a killed process has left half written."""
     for partial in checkpoints.glob(f"{WRITING}*"):
         shutil.rmtree(partial)
-    for aside in checkpoints.glob(f"{REPLACED}*"):
-        original = checkpoints / aside.name.removeprefix(REPLACED)
-        if original.exists():
-            shutil.rmtree(aside)
-        else:
-            aside.rename(original)
 
 
 def _point_at(checkpoint: Path) -> None:
@@ -153,19 +145,25 @@ def write_manifest(directory: Path) -> None:
     (directory / MANIFEST).write_text(json.dumps({"format": FORMAT, "files": files}, indent=2) + "\n")
 
 
-def read_manifest(directory: Path) -> dict[str, Any]:
-    """The content of a manifest, not checked any further."""
-    return read_json(directory / MANIFEST, FileSource("config_path", str(directory)))
+def resumable(directory: Path) -> bool:
+    """True if a checkpoint has its training state."""
+    return (directory / TRAINING_STATE / f"{RUN_STATE}.json").is_file()
 
 
 def defect(directory: Path) -> str | None:
-    """The first difference between a checkpoint and its manifest; None if every byte is as it was written."""
+    """The first difference between a checkpoint and its manifest; None if every byte is as it was written.
+
+    The training state does not count where it was removed.
+    """
+    source = FileSource("config_path", str(directory))
     try:
-        manifest = read_manifest(directory)
+        manifest = read_json(directory / MANIFEST, source)
         if manifest["format"] != FORMAT:
             return f"its format is {manifest['format']}, and this accerl reads {FORMAT}"
         for name, written in manifest["files"].items():
-            path = safe_join(directory, name, FileSource("config_path", str(directory)))
+            path = safe_join(directory, name, source)
+            if name.startswith(f"{TRAINING_STATE}/") and not resumable(directory):
+                continue
             if not path.is_file():
                 return f"{name} is missing"
             if path.stat().st_size != written["size"] or digest(path) != written["sha256"]:
@@ -194,7 +192,7 @@ def newest_whole(checkpoints: Path, wanted: str = LAST) -> tuple[Path, list[str]
     skipped: list[str] = []
     for path in reversed(numbers):
         why = defect(path)
-        if why is None and f"{TRAINING_STATE}/{RUN_STATE}.json" not in read_manifest(path)["files"]:
+        if why is None and not resumable(path):
             why = f"only the newest {KEEP} keep their training state"
         if why is None:
             return path, skipped
@@ -210,32 +208,15 @@ def saved_version(state: Path) -> int:
 def prune(checkpoints: Path, *, needed: str | None = None) -> None:
     """Removes the training state of all but the newest `KEEP` checkpoints; their policies stay.
 
-    The weights of the one named `needed` are kept too, although it cannot be resumed from any more: an
-    inference replica that is lost starts again where all workers did.
+    The files of the one named `needed` stay too, although it cannot be resumed from any more: an inference
+    replica that is lost starts again where all workers did.
     """
-    resumable = [path for path in _numbered(checkpoints) if (path / TRAINING_STATE).is_dir()]
-    for path in resumable[:-KEEP]:
-        # The manifest first: a checkpoint whose files are half removed would count as broken.
-        with contextlib.suppress(InputError, KeyError, AttributeError):
-            _forget_training_state(path)
-        if path.name != needed:
-            shutil.rmtree(path / TRAINING_STATE)
-            continue
-        for file in (path / TRAINING_STATE).iterdir():
-            if file.is_dir():
-                shutil.rmtree(file)
-            elif file.stem != WEIGHTS:
-                file.unlink()
-
-
-def _forget_training_state(checkpoint: Path) -> None:
-    """Removes the training state from a checkpoint's manifest."""
-    manifest = read_manifest(checkpoint)
-    names = [name for name in manifest["files"] if name.startswith(f"{TRAINING_STATE}/")]
-    for name in names:
-        del manifest["files"][name]
-    if names:
-        write_atomically(checkpoint / MANIFEST, json.dumps(manifest, indent=2) + "\n")
+    states = [path / TRAINING_STATE for path in _numbered(checkpoints)]
+    for state in [state for state in states if state.is_dir()][:-KEEP]:
+        # Without this file the others do not count, even where their removal is interrupted.
+        (state / f"{RUN_STATE}.json").unlink(missing_ok=True)
+        if state.parent.name != needed:
+            shutil.rmtree(state)
 
 
 def _numbered(checkpoints: Path) -> list[Path]:
@@ -264,28 +245,31 @@ def relocate(directory: Path, home: Path) -> None:
     """
     if not (directory / BACKBONE).is_dir():
         return
-    config, processor, places = _local_names(directory)
-    for fields, key, folder in places:
-        fields[key] = str((home / folder).absolute())
-    (directory / "config.json").write_text(json.dumps(config, indent=4) + "\n")
-    (directory / PREPROCESSOR).write_text(json.dumps(processor, indent=4) + "\n")
+    for file in NAMING_BACKBONE:
+        content = json.loads((directory / file).read_text())
+        for fields, key, folder in _local_names(content):
+            fields[key] = str((home / folder).absolute())
+        (directory / file).write_text(json.dumps(content, indent=4) + "\n")
 
 
 def displaced(directory: Path) -> bool:
     """True if a checkpoint has a backbone folder of its own and its files name one that does not exist."""
     if not (directory / BACKBONE).is_dir():
         return False
-    return any(not Path(fields[key]).is_dir() for fields, key, _ in _local_names(directory)[2])
+    named: list[str] = []
+    for file in NAMING_BACKBONE:
+        content = json.loads((directory / file).read_text())
+        named += [fields[key] for fields, key, _ in _local_names(content)]
+    return not all(Path(name).is_dir() for name in named)
 
 
 Place = tuple[dict[str, Any], str, str]  # mapping, its key that may name a folder, and our folder for that
 
 
-def _local_names(directory: Path) -> tuple[dict[str, Any], dict[str, Any], list[Place]]:
-    """Config, preprocessor, and their places that name a folder here, or by its bare name one beside them."""
-    config, processor = (json.loads((directory / name).read_text()) for name in ("config.json", PREPROCESSOR))
-    named = [(place, place[0].get(place[1]) or "") for place in places_of_names(config, processor)]
-    return config, processor, [at for at, name in named if Path(name).is_absolute() or name == at[2]]
+def _local_names(content: dict[str, Any]) -> list[Place]:
+    """Places in a policy's file that name a folder here, or by its bare name one beside the file."""
+    places = [place for place in places_of_names(content, content) if place[0].get(place[1])]
+    return [at for at in places if at[0][at[1]] == at[2] or Path(at[0][at[1]]).is_absolute()]
 
 
 def check_names(folder: Path, origin: FileSource) -> None:
@@ -296,13 +280,12 @@ def check_names(folder: Path, origin: FileSource) -> None:
     for path in sorted(folder.rglob("*")):
         if path.name == NOT_READ or not path.is_file() or not any(map(path.match, NAMING)):
             continue
-        content, is_json = read_json(path, origin), path.suffix == ".json"
-        places = places_of_names(content, content) if is_json and path.parent == folder else []
-        beside = [(fields, key) for fields, key, own in places if (folder / own).is_dir()]
-        for fields, key, text in texts_in(content):
-            if key in RECORDED or any(fields is one and key == other for one, other in beside):
-                continue
-            if leads_out(text) or (is_json and key.endswith(LOOKED_UP) and os.path.exists(text)):
+        content = read_json(path, origin)
+        for fields, key, own in places_of_names(content, content):
+            if path.parent == folder and (folder / own).is_dir():
+                fields.pop(key, None)
+        for key, text in texts_in(content):
+            if key not in RECORDED and leads_out(text):
                 name = path.relative_to(folder).as_posix()
                 why = f"{text[:80]!r} is a place on this machine, which files from elsewhere may not name"
                 raise origin.refuse(f"{name}: {key}", f"{why}; a copy of a backbone goes into {BACKBONE}/")
@@ -312,6 +295,7 @@ def places_of_names(config: dict[str, Any], processor: dict[str, Any]) -> list[P
     """Places where a policy's files may name a folder."""
     places = [(config, key, folder) for key, folder in CONFIG_FOLDERS.items()]
     for step in processor.get("steps", []):
-        if (option := STEP_FOLDERS.get(step.get("registry_name"))) is not None:
+        option = STEP_FOLDERS.get(step.get("registry_name"))
+        if option is not None:
             places.append((step["config"], *option))
     return places

@@ -1,19 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Validation of files from untrusted sources: names, sizes, JSON and safetensors.
+"""Checks of files from untrusted sources: names, links, JSON and safetensors.
 
-Checkpoints, world models and datasets may be anybody's. Everything here reads little, runs nothing, writes
-nothing, and refuses with an `InputError` that names the file. Free of torch and LeRobot.
+Checkpoints, world models and datasets may be anybody's. Nothing here runs or writes anything; a file that is
+refused is named by an `InputError`. Free of torch and LeRobot.
 """
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
 import os
 import re
-import stat
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -23,10 +22,7 @@ from safetensors import SafetensorError, safe_open
 
 from accerl_lerobot.errors import InputError
 
-PICKLES = (".bin", ".pt", ".pth", ".pkl", ".pickle", ".ckpt")
-"""Endings of files that PyTorch unpickles, which may run whatever their author wished."""
 REVISION = re.compile(r"[0-9a-f]{40}")
-HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]{0,95}(/[A-Za-z0-9][\w.-]{0,95})?", re.ASCII)
 _INSIDE = re.compile(r"(?![~/]|[A-Za-z]:)[^\\\x00-\x1f\x7f\ud800-\udfff]+")
 _ABSOLUTE = re.compile(r"(~[^/\s]*)?/[\w.]|[A-Za-z]:[\\/]|file:|~$")
 
@@ -63,14 +59,12 @@ def safe_join(root: Path, name: object, origin: FileSource) -> Path:
 
 
 def _check_link(path: Path, root: Path, name: str, origin: FileSource) -> None:
-    homes = [root.resolve()]
-    cache = homes[0].parent.parent
-    if homes[0].parent.name == "snapshots" and cache.name.startswith(("models--", "datasets--")):
-        homes.append(cache / "blobs")
-    try:
-        real = path.resolve()
-    except (OSError, RuntimeError) as error:
-        raise origin.refuse(name, "its links go in a circle; put the file itself there") from error
+    """Refuses a link that leads out of `root`; the Hub's cache keeps the content of files beside it."""
+    home = Path(os.path.realpath(root))
+    homes = [home]
+    if home.parent.name == "snapshots":
+        homes.append(home.parents[1] / "blobs")
+    real = Path(os.path.realpath(path))
     if not any(real.is_relative_to(home) for home in homes):
         raise origin.refuse(name, "a link that leads out of the folder; put the file itself there")
 
@@ -97,36 +91,28 @@ def leads_out(text: str) -> bool:
     return _ABSOLUTE.match(text) is not None or ".." in re.split(r"[\\/]", text)
 
 
-def texts_in(
-    content: Any, holder: dict[str, Any] | None = None, key: str = ""
-) -> Iterator[tuple[dict[str, Any], str, str]]:
-    """(mapping, key, text) of every text below a key of JSON or YAML, those in lists included.
-
-    `holder` and `key` are those under which `content` stands.
-    """
+def texts_in(content: Any, key: str = "") -> Iterator[tuple[str, str]]:
+    """Key and text of every text below a key of JSON or YAML, texts in lists included."""
     if isinstance(content, dict):
         for name, value in content.items():
-            yield from texts_in(value, content, str(name))
+            yield from texts_in(value, str(name))
     elif isinstance(content, list):
         for value in content:
-            yield from texts_in(value, holder, key)
-    elif isinstance(content, str) and holder is not None:
-        yield holder, key, content
+            yield from texts_in(value, key)
+    elif isinstance(content, str):
+        yield key, content
 
 
 def check_folder(folder: Path, origin: FileSource) -> None:
-    """Refuses what is no folder, or has a link that leads out, a pipe or a device."""
+    """Refuses a path that is no folder, and a folder with a link that leads out."""
     if not folder.is_dir():
         hint = "a file; name the folder of a run" if folder.exists() else "no such folder"
         raise InputError(origin.field, origin.value, hint)
     for at, folders, files in os.walk(folder):
-        for path in (Path(at, name) for name in (*folders, *files)):
-            name = path.relative_to(folder).as_posix()
-            _check_link(path, folder, name, origin)
-            with contextlib.suppress(FileNotFoundError):  # the run may still be going on
-                if not path.is_dir() and not stat.S_ISREG(path.stat().st_mode):
-                    raise origin.refuse(name, "neither a file nor a folder; remove it")
-        if Path(at) == folder and "wandb" in folders:
+        for name in (*folders, *files):
+            path = Path(at, name)
+            _check_link(path, folder, path.relative_to(folder).as_posix(), origin)
+        if "wandb" in folders:
             folders.remove("wandb")  # its client links a log that lies elsewhere, and nothing here reads it
 
 
@@ -136,36 +122,25 @@ def check_name(name: object, what: str, origin: FileSource) -> None:
         raise origin.refuse(what, f"the name {_shown(str(name))!r} cannot be part of a path")
 
 
-def file_size(path: Path, origin: FileSource) -> int:
-    """Bytes of a regular file; a pipe or a device is refused, since reading it may never end."""
-    try:
-        found = path.stat()
-    except (OSError, ValueError) as error:
-        raise origin.refuse(path.name, "is missing; give the whole folder") from error
-    if not stat.S_ISREG(found.st_mode):
-        raise origin.refuse(path.name, "not a regular file; give the whole folder")
-    return found.st_size
-
-
 def read_json(path: Path, origin: FileSource) -> dict[str, Any]:
     """The mapping in a JSON file, or a YAML one by its suffix."""
-    parse, language = (yaml.safe_load, "YAML") if path.suffix == ".yaml" else (json.loads, "JSON")
-    file_size(path, origin)
+    is_yaml = path.suffix == ".yaml"
     try:
-        content = parse(path.read_bytes().decode())
-    except OSError as error:
-        raise origin.refuse(path.name, f"cannot be read ({error.strerror})") from error
-    except (RecursionError, ValueError, yaml.YAMLError) as error:
+        text = path.read_bytes().decode()
+        content = yaml.safe_load(text) if is_yaml else json.loads(text)
+    except FileNotFoundError as error:
+        raise origin.refuse(path.name, "is missing; give the whole folder") from error
+    except (OSError, RecursionError, ValueError, yaml.YAMLError) as error:
+        language = "YAML" if is_yaml else "JSON"
         raise origin.refuse(path.name, f"not good {language} ({brief(error)})") from error
     if not isinstance(content, dict):
         raise origin.refuse(path.name, f"a mapping is wanted, not {type(content).__name__}")
     return content
 
 
-@contextlib.contextmanager
+@contextmanager
 def opened(path: Path, origin: FileSource, framework: str = "np") -> Iterator[Any]:
     """A safetensors file, whose header safetensors itself compares with the file."""
-    file_size(path, origin)
     try:
         with safe_open(path, framework) as file:
             yield file
@@ -200,21 +175,10 @@ def _finite(tensor: Any) -> bool:
     return math.isfinite(least) and math.isfinite(most)
 
 
-def check_not_pickled(folder: Path, weights: str, origin: FileSource) -> None:
-    """Refuses a folder without `weights`, and says so where there are only pickled ones."""
-    if (folder / weights).is_file():
-        return
-    pickled = sorted(path.name for path in folder.iterdir() if path.suffix in PICKLES)
-    if pickled:
-        hint = f"is missing, and {pickled[0]} is a pickle, which may run code when it is loaded; convert it"
-        raise origin.refuse(weights, f"{hint} to safetensors where you trust it: save_pretrained does")
-    raise origin.refuse(weights, "is missing; give a folder with the weights as safetensors")
-
-
-def brief(error: BaseException) -> str:
-    """An error's words on one line, not more than a line's worth."""
+def brief(error: BaseException, length: int = 160) -> str:
+    """An error's words on one line, cut off after so many characters."""
     text = " ".join(str(error).split()) or type(error).__name__
-    return text if len(text) <= 160 else text[:159] + "…"
+    return _shown(text, length)
 
 
 def unsafe_name(name: object) -> str:
@@ -225,5 +189,5 @@ def unsafe_name(name: object) -> str:
     return "it leads out of the folder" if ".." in parts or not parts else ""
 
 
-def _shown(text: str) -> str:
-    return text if len(text) <= 80 else f"{text[:79]}…"
+def _shown(text: str, length: int = 80) -> str:
+    return text if len(text) <= length else f"{text[: length - 1]}…"

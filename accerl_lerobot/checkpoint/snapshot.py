@@ -18,6 +18,7 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
+from accerl_lerobot.checkpoint.safety import brief
 from accerl_lerobot.errors import InputError
 
 MARK = "$"  # key of a JSON object that stands for something JSON does not know
@@ -51,39 +52,34 @@ def load(path: Path) -> Any:
         text, arrays = file.read_text(), load_file(path.with_suffix(".safetensors"))
         return from_json(json.loads(text), arrays)
     except (OSError, ValueError, KeyError, TypeError, RecursionError, SafetensorError) as error:
-        said = " ".join(str(error).split())[:160]
-        hint = f"not a state that accerl has saved ({said}); resume from another checkpoint"
+        hint = f"not a state that accerl has saved ({brief(error)}); resume from another checkpoint"
         raise InputError("checkpoint", str(file), hint) from error
 
 
 def to_json(value: Any, place: str, arrays: dict[str, np.ndarray]) -> Any:
     """A tree as JSON can hold it; its arrays go into `arrays`, by number. Raises as `save` does."""
     cls: Any = type(value)
-    if value is None or cls in (bool, int, float, str):
+    if value is None or isinstance(value, bool | int | float | str):
         return value
     if cls is np.ndarray:
         return _stored(value, "array", place, arrays)
-    if cls is list:
-        return [to_json(part, f"{place}.{i}", arrays) for i, part in enumerate(value)]
-    if cls is tuple:
+    if cls in (list, tuple):
         items = [to_json(part, f"{place}.{i}", arrays) for i, part in enumerate(value)]
-        return {MARK: "tuple", "items": items}
+        return items if cls is list else {MARK: "tuple", "items": items}
     if cls is dict:
         parts = {key: to_json(part, f"{place}.{key}", arrays) for key, part in value.items()}
         if MARK not in parts and all(isinstance(key, str) for key in parts):
             return parts
         keys = [to_json(key, f"{place}.key", arrays) for key in parts]
-        return {MARK: "map", "items": [list(item) for item in zip(keys, parts.values(), strict=True)]}
+        return {MARK: "map", "items": list(zip(keys, parts.values(), strict=True))}
     if cls in _KINDS.values():
         fields = {f: to_json(getattr(value, f), f"{place}.{f}", arrays) for f in cls.__annotations__}
         return {MARK: cls.__name__, "fields": fields}
     if isinstance(value, np.generic):
         return value.item()
-    if isinstance(value, bool | int | float | str):
-        return value
     if cls.__module__ == "torch":
         return _stored(value.detach().cpu().numpy(), "tensor", place, arrays)
-    if isinstance(value, np.random.Generator):
+    if cls is np.random.Generator:
         return {MARK: "generator", "state": value.bit_generator.state}
     raise TypeError(f"{place}: a {cls.__name__} cannot be saved")
 

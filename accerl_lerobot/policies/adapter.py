@@ -11,7 +11,6 @@ from __future__ import annotations
 import contextlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,13 +24,12 @@ from accerl_lerobot.experience import TASK, Decision, Request, Segment, stack_ob
 from accerl_lerobot.policies import saving
 from accerl_lerobot.policies.config import PLUGINS, PolicyConfig, SamplerConfig
 from accerl_lerobot.policies.family import Encoded, Family, Model, pooled
+from accerl_lerobot.policies.processing import IMAGES, Processing
 from accerl_lerobot.policies.teacher import TEACHER_PREFIX, Teacher
 from accerl_lerobot.policies.untrusted import FAMILY, VALUE_HEAD
 
 HIDDEN = 128
 OBS_STATE = "observation.state"
-IMAGES = "observation.image"  # begins ``observation.images.<camera>``; LeRobot's name for a lone camera
-CONSTANT = 1e-6  # environment units in one normalised unit, below which an action counts as constant
 SELF_CHECK_TOLERANCE = 1e-5  # between our sampler and LeRobot's, in normalised actions; fp32 noise is 1e-6
 
 
@@ -47,7 +45,8 @@ class ValueHead(nn.Module):
         self.query = nn.Parameter(torch.zeros(width))
         self.norm = nn.LayerNorm(width)
         self.hidden = nn.Linear(width, HIDDEN)
-        bound, generator = width**-0.5, torch.Generator().manual_seed(torch.initial_seed() % 2**63)
+        bound = width**-0.5
+        generator = torch.Generator().manual_seed(torch.initial_seed() % 2**63)
         for parameter in self.hidden.parameters():  # as nn.Linear begins
             nn.init.uniform_(parameter, -bound, bound, generator=generator)
         self.out = nn.Linear(HIDDEN, 1)
@@ -111,14 +110,11 @@ class PolicyAdapter(nn.Module, ABC):
         """Writes `weights`, from `copy_weights`, as ``pretrained_model`` into `directory`."""
 
     def load_trainable(self, tensors: dict[str, np.ndarray]) -> None:
-        """Copies published weights in place: all of them, or none where names or shapes do not fit."""
-        parameters = self.trainable()
-        mine, theirs = ({(k, tuple(v.shape)) for k, v in of.items()} for of in (parameters, tensors))
-        if mine != theirs:
-            raise ValueError(f"published weights differ by name or shape: {sorted(mine ^ theirs)[:4]}")
+        """Copies published weights in place."""
         with torch.no_grad():
-            for name, parameter in parameters.items():
-                array, on_cpu = tensors[name], parameter.device.type == "cpu"
+            for name, parameter in self.trainable().items():
+                array = tensors[name]
+                on_cpu = parameter.device.type == "cpu"
                 # Received arrays are read-only, which torch cannot express: NumPy copies, where it can.
                 if on_cpu and parameter.dtype == torch.float32 and not in_parts(parameter):
                     np.copyto(parameter.detach().numpy(), array)
@@ -135,92 +131,97 @@ class PolicyAdapter(nn.Module, ABC):
         return {name: view.copy() for name, view in self.view_trainable().items()}
 
 
-def trainable_of(parts: dict[str, nn.Module], teacher: Teacher | None) -> dict[str, nn.Parameter]:
-    """Trainable parameters of the parts, and all of the teacher's, by the names they are published under."""
-    named = {
-        f"{part}.{name}": parameter
-        for part, module in parts.items()
-        for name, parameter in module.named_parameters()
-        if parameter.requires_grad
-    }
-    learned = {} if teacher is None else dict(teacher.named_parameters())
-    return named | {TEACHER_PREFIX + name: parameter for name, parameter in learned.items()}
-
-
-def example_requests(config: Any, rename_map: dict[str, str], *, explore: bool = True) -> list[Request]:
-    """Two requests with random observations for a policy, and instructions of unequal length.
-
-    `config` is LeRobot's; `rename_map` is environment name → the policy's. A policy that looks back gets as
-    many env steps as it wants, unless it keeps them itself, without exploration.
-    """
-    rng, env_names = np.random.default_rng(0), {policy: env for env, policy in rename_map.items()}
-    batch = (2,) if config.n_obs_steps == 1 or not explore else (2, config.n_obs_steps)
-    arrays: dict[str, np.ndarray] = {}
-    for key, feature in config.input_features.items():
-        name, shape = env_names.get(key, key), tuple(feature.shape)
-        if key.startswith(IMAGES) and ".empty_camera_" not in key:
-            arrays[name] = rng.integers(0, 256, (*batch, *shape[1:], shape[0]), dtype=np.uint8)
-        elif key == OBS_STATE:
-            arrays[name] = rng.standard_normal((*batch, *shape), dtype=np.float32)
-    return [
-        Request(
-            observation={k: v[i] for k, v in arrays.items()} | {TASK: task}, noise_seed=i, explore=explore
-        )
-        for i, task in enumerate(("Go", "Put the red cube on the plate"))
-    ]
-
-
-def autocast_on(device: torch.device, precision: str) -> contextlib.AbstractContextManager[Any]:
-    """Surrounds whatever runs a network in this precision."""
-    if precision == "fp32":
-        return contextlib.nullcontext()
-    return torch.autocast(device.type, torch.bfloat16)
-
-
-@dataclass
-class Processing:
-    """LeRobot's pre- and post-processor, which tokenise and normalise, fed with raw observations."""
-
-    preprocessor: Any
-    postprocessor: Any
-    device: torch.device
-    rename_map: dict[str, str]
-
-    def prepare(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> dict[str, Tensor]:
-        """Normalised and tokenised observations."""
-        return self.preprocessor({"task": list(tasks), **self.tensors(observations)})
-
-    def tensors(self, observations: dict[str, np.ndarray]) -> dict[str, Tensor]:
-        """By the policy's names; images go from uint8 (..., H, W, 3) to float (..., 3, H, W) in [0, 1]."""
-        batch: dict[str, Tensor] = {}
-        for key, array in observations.items():
-            tensor = torch.from_numpy(np.ascontiguousarray(array)).to(self.device)
-            if key.startswith(IMAGES):
-                tensor = tensor.movedim(-1, -3).contiguous().float() / 255.0
-            batch[self.rename_map.get(key, key)] = tensor
-        return batch
-
-    def unnormalise(self, chunk: Tensor) -> Tensor:
-        """(B, K, A) from normalised to environment units."""
-        return self.postprocessor(chunk)
-
-    def normalise(self, chunk: Tensor) -> Tensor:
-        """(B, K, A) from environment to normalised units; every normalisation that LeRobot has is affine.
-
-        An action that is constant in the policy's dataset has no scale; it is 0.
-        """
-        ends = torch.stack([torch.zeros_like(chunk[0]), torch.ones_like(chunk[0])])
-        zero, one = self.unnormalise(ends.to(self.device)).to(chunk)
-        scale = one - zero
-        varies = scale.abs() > CONSTANT
-        return torch.where(varies, (chunk - zero) / torch.where(varies, scale, 1), 0)
-
-
-class LeRobotAdapter(PolicyAdapter):
-    """A LeRobot policy with its processors, a model that runs it, a likelihood and a critic.
+class PretrainedAdapter(PolicyAdapter):
+    """A LeRobot policy with its processors.
 
     With `precision` bf16 the network runs under autocast; densities are computed in fp32 either way.
     """
+
+    parts: dict[str, nn.Module]
+    """Modules with trainable parameters, by the names that these are published under."""
+    own_files: dict[str, nn.Module]
+    """Modules that LeRobot does not save, by the names of their files."""
+    feature_width: int | None = None
+    """Width of the features that `imitate` returns; None: they are not known."""
+    explores = True
+
+    def __init__(self, policy: Any, processing: Processing, precision: str) -> None:
+        super().__init__()
+        self.policy, self.processing, self.precision = policy.eval(), processing, precision
+        self.device = next(policy.parameters()).device
+        self.parts = {"policy": policy}
+        self.own_files = {}
+        self.teacher: Teacher | None = None
+        """Acts in its place in part of the exploring episodes; given by `teacher.with_teacher`."""
+        self.demonstrations: Callable[[Segment], Iterator[Segment]] | None = None
+        """Remembered by off-policy learning from the start; set by `run.adapter.make_adapter`."""
+
+    @property
+    @abstractmethod
+    def sampler(self) -> SamplerConfig:
+        """How it explores."""
+
+    @abstractmethod
+    def imitate(
+        self, observations: dict[str, np.ndarray], tasks: Sequence[str], chunk: Tensor
+    ) -> tuple[Tensor, Encoded | None]:
+        """LeRobot's training loss, (B,) or its mean, of chunks (B, K, A) in normalised units, and what it was
+        read from, if that is known."""
+
+    def autocast(self) -> contextlib.AbstractContextManager[Any]:
+        """Surrounds whatever runs the network."""
+        if self.precision == "fp32":
+            return contextlib.nullcontext()
+        return torch.autocast(self.device.type, torch.bfloat16)
+
+    def execute(self, chunk: Tensor, requests: Sequence[Request]) -> np.ndarray:
+        """Chunks (B, K, A) in the environment's units, the teacher's where it acts."""
+        if self.teacher is not None:
+            chunk = self.teacher.replace(chunk, requests)
+        return self.processing.unnormalise(chunk).cpu().numpy()
+
+    def trainable(self) -> dict[str, nn.Parameter]:
+        named: dict[str, nn.Parameter] = {}
+        for part, module in self.parts.items():
+            for name, parameter in module.named_parameters():
+                if parameter.requires_grad:
+                    named[f"{part}.{name}"] = parameter
+        if self.teacher is not None:
+            for name, parameter in self.teacher.named_parameters():
+                named[TEACHER_PREFIX + name] = parameter
+        return named
+
+    def copy_weights(self) -> saving.Weights:
+        return saving.copy_weights(self.policy, self.own_files)
+
+    def save(self, directory: Path, config: PolicyConfig, weights: Any) -> None:
+        saving.save_pretrained(self, directory, config, weights)
+
+    def example_requests(self) -> list[Request]:
+        """Two requests with random observations for this policy, and instructions of unequal length.
+
+        A policy that looks back gets as many env steps as it wants, unless it does not explore: then it keeps
+        them itself.
+        """
+        rng, config = np.random.default_rng(0), self.policy.config
+        env_names = {policy: env for env, policy in self.processing.rename_map.items()}
+        batch = (2,) if config.n_obs_steps == 1 or not self.explores else (2, config.n_obs_steps)
+        arrays: dict[str, np.ndarray] = {}
+        for key, feature in config.input_features.items():
+            name, shape = env_names.get(key, key), tuple(feature.shape)
+            if key.startswith(IMAGES) and ".empty_camera_" not in key:
+                arrays[name] = rng.integers(0, 256, (*batch, *shape[1:], shape[0]), dtype=np.uint8)
+            elif key == OBS_STATE:
+                arrays[name] = rng.standard_normal((*batch, *shape), dtype=np.float32)
+        requests: list[Request] = []
+        for i, task in enumerate(("Go", "Put the red cube on the plate")):
+            observation = {name: array[i] for name, array in arrays.items()} | {TASK: task}
+            requests.append(Request(observation=observation, noise_seed=i, explore=self.explores))
+        return requests
+
+
+class LeRobotAdapter(PretrainedAdapter):
+    """A LeRobot policy with a model that runs it, a likelihood and a critic."""
 
     def __init__(
         self,
@@ -231,16 +232,16 @@ class LeRobotAdapter(PolicyAdapter):
         value_head: ValueHead,
         precision: str = "fp32",
     ) -> None:
-        super().__init__()
-        self.policy, self.processing, self.model = policy, processing, model
-        self.device = next(policy.parameters()).device
+        super().__init__(policy, processing, precision)
+        self.model = model
         self.family, self.value_head = family.to(self.device), value_head.to(self.device)
-        self.precision = precision
-        self.policy.eval()
-        self.teacher: Teacher | None = None
-        """Acts in its place in part of the exploring episodes; given by `teacher.with_teacher`."""
-        self.demonstrations: Callable[[Segment], Iterator[Segment]] | None = None
-        """Remembered by off-policy learning from the start; set by `engine.adapter.make_adapter`."""
+        self.parts |= {"family": self.family, "value_head": self.value_head}
+        self.own_files |= {VALUE_HEAD: self.value_head, FAMILY: self.family}
+        self.feature_width = model.width
+
+    @property
+    def sampler(self) -> SamplerConfig:
+        return self.family.sampler
 
     def encode(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Encoded:
         """Reads raw observations, each (B, ...), and B instructions, for the family; differentiable."""
@@ -249,18 +250,8 @@ class LeRobotAdapter(PolicyAdapter):
     def imitate(
         self, observations: dict[str, np.ndarray], tasks: Sequence[str], chunk: Tensor
     ) -> tuple[Tensor, Encoded]:
-        """LeRobot's training loss (B,) of chunks (B, K, A) in normalised units, and what it was read from."""
         encoded = self.encode(observations, tasks)
         return self.family.imitation_loss(encoded, chunk), encoded
-
-    @property
-    def feature_width(self) -> int | None:
-        """Width of the features that `imitate` returns."""
-        return self.model.width
-
-    def autocast(self) -> contextlib.AbstractContextManager[Any]:
-        """Surrounds whatever runs the network."""
-        return autocast_on(self.device, self.precision)
 
     def factors(self, latent: dict[str, Tensor]) -> Tensor | None:
         return self.family.factors(latent)
@@ -271,10 +262,7 @@ class LeRobotAdapter(PolicyAdapter):
         with self.autocast():
             encoded = self.encode(arrays, tasks)
             action = self.family.act(encoded, requests)
-        executed = action.chunk.float()
-        if self.teacher is not None:
-            executed = self.teacher.replace(executed, requests)
-        chunk = self.processing.unnormalise(executed).cpu().numpy()
+        chunk = self.execute(action.chunk.float(), requests)
         log_prob = action.log_prob.float().cpu().numpy()
         latents = {k: v.cpu().numpy() for k, v in action.latent.items()}
         return [
@@ -301,30 +289,11 @@ class LeRobotAdapter(PolicyAdapter):
             encoded = self.encode(observations, tasks)
         return self.value_head(encoded.features, encoded.mask)
 
-    def trainable(self) -> dict[str, nn.Parameter]:
-        parts = {"policy": self.policy, "family": self.family, "value_head": self.value_head}
-        return trainable_of(parts, self.teacher)
-
-    def example_requests(self) -> list[Request]:
-        """Two requests with random observations for this policy, and instructions of unequal length."""
-        return example_requests(self.policy.config, self.processing.rename_map)
-
     def example(self) -> tuple[dict[str, np.ndarray], Sequence[str], dict[str, Tensor]]:
         requests = self.example_requests()
         latents = [decision.latent for decision in self.decide(requests, 0)]
         stacked = {k: torch.from_numpy(np.stack([latent[k] for latent in latents])) for k in latents[0]}
         return *stack_observations(requests), stacked
-
-    def copy_weights(self) -> saving.Weights:
-        return saving.copy_weights(self, {VALUE_HEAD: self.value_head, FAMILY: self.family})
-
-    @property
-    def sampler(self) -> SamplerConfig:
-        """How it explores."""
-        return self.family.sampler
-
-    def save(self, directory: Path, config: PolicyConfig, weights: Any) -> None:
-        saving.save_pretrained(self, directory, config, weights)
 
     @torch.no_grad()
     def self_check(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> float:
@@ -340,10 +309,11 @@ class LeRobotAdapter(PolicyAdapter):
         self.policy.reset()
         if difference <= SELF_CHECK_TOLERANCE:
             return difference
-        if (package := PLUGINS.get(self.policy.config.type)) is not None:
-            why = f"its adapter in {package} acts unlike the policy without exploration"
+        kind = self.policy.config.type
+        if kind in PLUGINS:
+            why = f"its adapter in {PLUGINS[kind]} acts unlike the policy without exploration"
             hint = f"{why}, by {difference:.2e}; correct the adapter's encode or stock"
-            raise InputError("policy.type", self.policy.config.type, hint)
+            raise InputError("policy.type", kind, hint)
         fits = f"the adapter of {self.policy.name} does not fit LeRobot {lerobot.__version__}"
         hint = f"{fits}: it differs from its sampler by {difference:.2e}; install the pinned version"
         raise InputError("lerobot", lerobot.__version__, hint)

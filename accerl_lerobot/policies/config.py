@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import importlib
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -11,8 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import draccus
 
-from accerl_lerobot.checkpoint.safety import FileSource
-from accerl_lerobot.config.parsing import import_plugins, imported, not_imported
+from accerl_lerobot.config.parsing import import_plugins, imported
 from accerl_lerobot.config.ranges import Commit, Device, Range, Section, check, registered_name
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE
@@ -211,20 +209,11 @@ def check_registered(policy_type: Any, field: str, prefix: str = "") -> None:
     from lerobot.configs.policies import PreTrainedConfig
 
     known = sorted(PreTrainedConfig.get_known_choices())
-    if policy_type is None:
-        why = f'its config.json names no type; add "type": one of {", ".join(known)}'
-        raise InputError(field, None, prefix + why)
-    if policy_type in known:
-        package = PreTrainedConfig.get_choice_class(policy_type).__module__.partition(".")[0]
-        try:
-            importlib.import_module(package)
-        except (Exception, SystemExit) as error:  # it has registered the type, and then failed
-            raise InputError(field, policy_type, prefix + not_imported(package, error)) from error
-        return
-    install = "install the package that has it, or name it: policy.discover_packages_path"
-    broken = "; ".join(NOT_IMPORTED.values())
-    why = f"no such policy type here; {broken or install}; there are {', '.join(known)}"
-    raise InputError(field, policy_type, prefix + why)
+    if policy_type not in known:
+        install = "install the package that has it, or name it: policy.discover_packages_path"
+        broken = "; ".join(NOT_IMPORTED.values())
+        why = f"no such policy type here; {broken or install}; there are {', '.join(known)}"
+        raise InputError(field, policy_type, prefix + why)
 
 
 def discovery(policy_type: str | None) -> list[str]:
@@ -242,15 +231,8 @@ def check_observations(policy_config: Any, field: str) -> None:
         raise InputError(field, policy_config.n_obs_steps, hint)
 
 
-def sampler_config(
-    config: PolicyConfig, policy_type: Any, field: str = "policy.type", prefix: str = ""
-) -> SamplerConfig:
-    """How a policy of this type explores in this run.
-
-    Refuses a type that is not there, naming `field`, in a hint that begins with `prefix`; and a sampler that
-    does not suit it.
-    """
-    check_registered(policy_type, field, prefix)
+def sampler_config(config: PolicyConfig, policy_type: str) -> SamplerConfig:
+    """How a policy of this type explores in this run; refuses a sampler that does not suit it."""
     families = (*POLICIES[policy_type][1], ANY) if policy_type in POLICIES else (ANY,)
     if config.sampler is None:
         return SamplerConfig.get_choice_class(families[0])()
@@ -278,8 +260,8 @@ def env_steps_seen(policy_config: Any, *, learns: bool = False) -> int:
 
 def executed_rows(policy_config: Any) -> int:
     """Actions that a policy executes for each of its decisions, in LeRobot's loop and here."""
-    named = (getattr(policy_config, name, None) for name in ("n_action_steps", "action_chunk_size"))
-    return next((int(rows) for rows in named if rows), 1)
+    rows = getattr(policy_config, "n_action_steps", None) or getattr(policy_config, "action_chunk_size", None)
+    return int(rows or 1)
 
 
 def check_size(name: str, value: Any, field: str) -> None:
@@ -287,19 +269,6 @@ def check_size(name: str, value: Any, field: str) -> None:
     if isinstance(value, int):
         span = Range("[1, 10000]" if name in SIZES else "[-1, 1000000]")
         check(Annotated[int, span], int(value), field)
-
-
-def check_sizes(policy_config: Any, origin: FileSource) -> None:
-    """`check_size` of a checkpoint's config, which must not execute more rows than it predicts."""
-    for name in SIZES:
-        value = getattr(policy_config, name, None)
-        try:
-            check_size(name, value, name)
-        except InputError as error:
-            raise origin.refuse(f"config.json: {name}={value}", error.hint) from error
-    steps, rows = getattr(policy_config, "n_action_steps", None), predicted_rows(policy_config)
-    if steps is not None and rows is not None and steps > rows:
-        raise origin.refuse(f"config.json: n_action_steps={steps}", f"use 1 to {rows}, the chunk it predicts")
 
 
 def predicted_rows(policy_config: Any) -> int | None:
@@ -312,28 +281,31 @@ def predicted_rows(policy_config: Any) -> int | None:
 
 def override(policy_config: Any, config: PolicyConfig) -> None:
     """Puts a run's choices of denoising steps, executed rows and precision into LeRobot's policy config."""
-    if hasattr(policy_config, "pretrained_backbone_weights"):
+    fixed: dict[str, Any] = {
         # The checkpoint has them; LeRobot would download torchvision's first, even when told to stay offline.
-        policy_config.pretrained_backbone_weights = None
-    if config.temporal_ensemble_coeff is None and hasattr(policy_config, "temporal_ensemble_coeff"):
-        policy_config.temporal_ensemble_coeff = None
+        "pretrained_backbone_weights": None,
+        "use_peft": False,  # an adapter is merged into the weights
+        "compile_model": False,  # a compiled sampler rounds unlike the re-scoring pass
+    }
+    if config.temporal_ensemble_coeff is None:
+        fixed["temporal_ensemble_coeff"] = None
+    if policy_config.type in POLICIES:
+        fixed["dtype"] = "float32"  # see `PolicyConfig.precision`
+    for name, value in fixed.items():
+        if hasattr(policy_config, name):
+            setattr(policy_config, name, value)
     if config.num_steps is not None:
-        names = (name for name in ("num_steps", "num_inference_steps") if hasattr(policy_config, name))
-        if (name := next(names, None)) is None:
+        names = [name for name in ("num_steps", "num_inference_steps") if hasattr(policy_config, name)]
+        if not names:
             hint = f"a {policy_config.type} policy does not denoise; leave the field out"
             raise InputError("policy.num_steps", config.num_steps, hint)
-        setattr(policy_config, name, config.num_steps)
-    policy_config.use_peft = False  # an adapter is merged into the weights
-    if hasattr(policy_config, "dtype") and policy_config.type in POLICIES:
-        policy_config.dtype = "float32"  # see `PolicyConfig.precision`
-    if hasattr(policy_config, "compile_model"):
-        policy_config.compile_model = False  # a compiled sampler rounds unlike the re-scoring pass
+        setattr(policy_config, names[0], config.num_steps)
     if config.n_action_steps is not None:
-        if not hasattr(policy_config, "n_action_steps"):
-            hint = f"a {policy_config.type} policy has no such field; leave it out"
+        rows = predicted_rows(policy_config)
+        if rows is None or not hasattr(policy_config, "n_action_steps"):
+            hint = f"a {policy_config.type} policy has no such choice; leave the field out"
             raise InputError("policy.n_action_steps", config.n_action_steps, hint)
-        chunk = predicted_rows(policy_config) or 1
-        if config.n_action_steps > chunk:
-            hint = f"use 1 to {chunk}, the chunk the policy predicts"
+        if config.n_action_steps > rows:
+            hint = f"use 1 to {rows}, the chunk the policy predicts"
             raise InputError("policy.n_action_steps", config.n_action_steps, hint)
         policy_config.n_action_steps = config.n_action_steps

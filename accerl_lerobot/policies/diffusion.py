@@ -91,7 +91,8 @@ class Diffusion(Model):
     def __init__(self, policy: Any) -> None:
         super().__init__(policy)
         config = policy.config
-        steps, most = policy.diffusion.num_inference_steps, config.num_train_timesteps
+        steps = policy.diffusion.num_inference_steps
+        most = config.num_train_timesteps
         if steps > most:
             raise InputError("policy.num_steps", steps, f"use at most {most}, as many as it was trained with")
         self.size = (config.horizon, config.action_feature.shape[0])
@@ -147,12 +148,6 @@ class Diffusion(Model):
         inputs = {key: batch[key] for key in (OBS_STATE, *config.image_features)}
         if config.n_obs_steps == 1:
             inputs = {key: value[:, None] for key, value in inputs.items()}
-        elif inputs[OBS_STATE].shape[1:-1] != (config.n_obs_steps,):
-            shape = tuple(inputs[OBS_STATE].shape)
-            raise ValueError(
-                f"observation.state is {shape}, but the policy reads {config.n_obs_steps} env steps at a "
-                "time: make environments with history=n_obs_steps"
-            )
         images = [inputs[key] for key in config.image_features]
         return inputs | {OBS_IMAGES: torch.stack(images, dim=-4)}
 
@@ -185,7 +180,8 @@ class DiffusionFamily(Family):
 
     def sample(self, network: Network, x: Tensor, eps: Tensor, explore: Tensor) -> Action:
         """Denoises `x` (B, H, A) with step noise `eps` (B, N, H, A); as LeRobot where not `explore` (B,)."""
-        path, log_prob = [x], x.new_zeros(x.shape[:2])
+        path = [x]
+        log_prob = x.new_zeros(x.shape[:2])
         for k, timestep in enumerate(self.schedule.timesteps):
             output = network(x, timestep)
             mean, std = self.schedule.step(k, x, output)

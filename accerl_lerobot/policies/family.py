@@ -62,7 +62,8 @@ class Model(ABC):
 
     def __init__(self, policy: Any) -> None:
         """Refuses options that several of LeRobot's policies have."""
-        if (rtc := getattr(policy.config, "rtc_config", None)) is not None and rtc.enabled:
+        real_time = getattr(policy.config, "rtc_config", None)
+        if real_time is not None and real_time.enabled:
             hint = "real-time chunking changes the sampler's density; set it to false in config.json"
             raise InputError("policy.rtc_config.enabled", True, hint)
         self.policy = policy
@@ -96,9 +97,14 @@ class Family(nn.Module, ABC):
     def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Log-prob (B, L), differentiable, of what `act` stored, and entropy (B,)."""
 
-    @abstractmethod
     def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
         """Largest difference, normalised units, between our sampler without exploration and LeRobot's."""
+        count = len(encoded.features)
+        requests = [Request(observation={}, noise_seed=seed, explore=False) for seed in range(count)]
+        ours, latent, _ = self.act(encoded, requests)
+        noise = {"noise": latent["path"][:, 0].clone()} if "path" in latent else {}
+        stock = self.model.stock(batch, **noise)
+        return float((ours - stock[:, : ours.shape[1]]).abs().max())
 
     def imitation_loss(self, encoded: Encoded, chunk: Tensor) -> Tensor:
         """LeRobot's training loss (B,) on chunks (B, K, A) of as many actions as are executed, normalised.

@@ -80,28 +80,33 @@ def fine_tuned_features(policy: Any, dataset: Features, renames: dict[str, str])
     `renames` LeRobot wants one's cameras to be among the other's.
     """
     needed = policy_features(policy)
-    there = {renames.get(name, name): shape for name, shape in dataset.shapes.items()}
-    mine, theirs = ({k for k, s in shapes.items() if len(s) == 3} for shapes in (needed.shapes, there))
-    if not pads(policy) or not mine & theirs or not (renames or mine <= theirs or theirs <= mine):
+    offered = {renames.get(name, name): shape for name, shape in dataset.shapes.items()}
+    read = {name for name, shape in needed.shapes.items() if len(shape) == 3}
+    recorded = {name for name, shape in offered.items() if len(shape) == 3}
+    matching = bool(renames) or read <= recorded or recorded <= read
+    if not (pads(policy) and read & recorded and matching):
         return needed
-    return replace(needed, shapes={name: there[name] for name in needed.shapes if name in there})
+    return replace(needed, shapes={name: offered[name] for name in needed.shapes if name in offered})
 
 
 def dataset_features(meta: Any) -> Features:
     """Features of a LeRobotDataset, which a policy trained on it needs."""
-    shapes, unusable = dataset_shapes(meta), {}
+    shapes = dataset_shapes(meta)
+    unusable: dict[str, str] = {}
     if meta.camera_keys:
         shapes.pop(ENV_STATE, None)  # see `demos.guarded_train`
     for name in (STATE, ACTION):
+        if name in meta.features:
+            kind = meta.features[name]["dtype"]
+            if not kind.startswith(NUMERIC):
+                unusable[name] = f"it is {kind}, and policies read numbers; record it as float32"
+                del shapes[name]
+            continue
         parts = ", ".join(key for key in meta.features if key.startswith(f"{name}."))
-        kind = meta.features[name]["dtype"] if name in meta.features else None
-        if kind is None and parts:
+        if parts:
             unusable[name] = (
                 f"it is in parts ({parts}); join them into one {name} with LeRobot's add_features"
             )
-        elif kind is not None and not kind.startswith(NUMERIC):
-            unusable[name] = f"it is {kind}, and policies read numbers; record it as float32"
-            del shapes[name]
     tasks = tuple(map(str, meta.tasks.index))
     return Features(shapes=shapes, fps=meta.fps, tasks=tasks, unusable=unusable)
 
@@ -146,72 +151,67 @@ def check_features(
         shapes[new] = shape
     for name, shape in needed.shapes.items():
         image = len(shape) == 3
-        if name not in shapes and name in offered.unusable:
+        if name in offered.unusable:
             raise InputError(field, value, f"no {name} in the {offerer}: {offered.unusable[name]}")
         if name not in shapes:
             same = [k for k, other in shapes.items() if len(other) == len(shape) and k != ACTION]
-            offers = ", ".join(same) or "none"
-            choose = "; choose env.camera (env.images of gym), or map names with policy.rename_map" + hint
-            hint = choose * image
-            raise InputError(field, value, f"no {name} in the {offerer}, which offers {offers}{hint}")
-        skip = 1 if image and needed.any_size else len(shape)
-        if shapes[name][:skip] != shape[:skip]:
-            hint = "give both one image size" if image else "choose parties that were made for each other"
+            why = f"no {name} in the {offerer}, which offers {', '.join(same) or 'none'}"
+            if image:
+                why += "; choose env.camera (env.images of gym), or map names with policy.rename_map" + hint
+            raise InputError(field, value, why)
+        compared = 1 if image and needed.any_size else len(shape)
+        if shapes[name][:compared] != shape[:compared]:
+            advice = "give both one image size" if image else "choose parties that were made for each other"
             sizes = f"its {name} is {shape}, but {shapes[name]} in the {offerer}"
-            raise InputError(field, value, f"{sizes}; {hint}")
+            raise InputError(field, value, f"{sizes}; {advice}")
     rates = (offered.fps, *offered.labelled_fps) if offered.fps else ()
     if needed.fps and rates and not any(math.isclose(needed.fps, rate) for rate in rates):
         why = f"recorded at {needed.fps:g} Hz, but the environment runs at {offered.fps:g} Hz"
-        hint = "its actions would be executed at another rate; use a dataset of this rate"
-        raise InputError(field, value, f"{why}: {hint}, or with env.type=gym set env.fps")
+        advice = "its actions would be executed at another rate; use a dataset of this rate"
+        raise InputError(field, value, f"{why}: {advice}, or with env.type=gym set env.fps")
     if needed.reads_text and offerer == "environment" and not offered.tasks:
-        logger.warning(
-            "%s=%r: the policy reads an instruction, and the environment gives none; name it in env.task",
-            field,
-            value,
-        )
+        why = "the policy reads an instruction, and the environment gives none; name it in env.task"
+        logger.warning("%s=%r: %s", field, value, why)
     _check_tasks(needed.tasks, offered.tasks, field, value)
 
 
 def _check_tasks(needed: tuple[str, ...], offered: tuple[str, ...], field: str, value: object) -> None:
     """Compares a dataset's instructions with an environment's."""
-    known = {_plain(text): text for text in needed}
-    has = ", ".join(map(repr, needed[:4])) + (" …" if len(needed) > 4 else "")
-    missing = [text for text in offered if _plain(text) not in known]
-    if needed and missing and not any(needed):
-        why = f"its episodes have no instruction, and the environment's is {missing[0]!r}"
-        tool = f"lerobot-edit-dataset --operation.type=modify_tasks --operation.new_task={missing[0]!r}"
+    if not needed or not offered:
+        return
+    if not any(needed):
+        why = f"its episodes have no instruction, and the environment's is {offered[0]!r}"
+        tool = f"lerobot-edit-dataset --operation.type=modify_tasks --operation.new_task={offered[0]!r}"
         raise InputError(field, value, f"{why}; set it with {tool}, --repo_id and --root")
-    if known and missing:
-        message = f"no episode of {', '.join(map(repr, missing[:4]))}, the environment's task: it has {has}"
-        if len(missing) == len(offered):
-            raise InputError(field, value, f"{message}; choose env.task accordingly")
+    spelled = {_plain(text): text for text in needed}
+    missing = [text for text in offered if _plain(text) not in spelled]
+    has = ", ".join(map(repr, needed[:4])) + (" …" if len(needed) > 4 else "")
+    message = f"no episode of {', '.join(map(repr, missing[:4]))}, the environment's task: it has {has}"
+    if len(missing) == len(offered):
+        raise InputError(field, value, f"{message}; choose env.task accordingly")
+    if missing:
         logger.warning("%s=%r: %s", field, value, message)
     for text in offered:
-        if known and text not in needed and text not in missing:
-            logger.warning(
-                "%s=%r: the environment's instruction is %r, and the dataset's %r; policies tell them apart",
-                field, value, text, known[_plain(text)],
-            )  # fmt: skip
-    if any(needed) and not offered:
-        logger.warning("%s=%r: its instructions are %s, and the environment gives none", field, value, has)
-    if len(known) < len(needed):
-        logger.warning("%s=%r: instructions that differ in spelling only: %s", field, value, has)
+        if text not in needed and text not in missing:
+            why = f"the environment's instruction is {text!r}, and the dataset's {spelled[_plain(text)]!r}"
+            logger.warning("%s=%r: %s; policies tell them apart", field, value, why)
 
 
 def check_actions(actions: np.ndarray, spec: EnvironmentSpec, field: str, value: object) -> None:
-    """Warns where many of a dataset's actions (N, A) lie outside what the environment executes."""
+    """Warns where many of a dataset's actions (N, A) lie outside the range that the environment executes."""
     slack = OUTSIDE_SLACK * (spec.action_high - spec.action_low)
     outside = (actions < spec.action_low - slack) | (actions > spec.action_high + slack)
     share = outside.mean(0)
     worst = int(share.argmax())
     if share[worst] < OUTSIDE_SHARE:
         return
+    column = actions[:, worst]
+    recorded = f"from {column.min():.4g} to {column.max():.4g} in the dataset"
+    bounds = f"{spec.action_low[worst]:.4g} to {spec.action_high[worst]:.4g} in the environment"
     logger.warning(
         "%s=%r: %.0f%% of its actions lie outside the environment's bounds, which cut them off: number %d is "
-        "from %.4g to %.4g in the dataset, and %.4g to %.4g in the environment; are both in the same unit?",
-        field, value, 100 * share[worst], worst, actions[:, worst].min(), actions[:, worst].max(),
-        spec.action_low[worst], spec.action_high[worst],
+        "%s, and %s; are both in the same unit?",
+        field, value, 100 * share[worst], worst, recorded, bounds,
     )  # fmt: skip
 
 

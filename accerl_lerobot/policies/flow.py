@@ -104,13 +104,6 @@ class FlowFamily(Family):
         log_prob = self.log_prob(encoded.context, latent)
         return log_prob, log_prob.new_full((len(log_prob),), self.entropy)
 
-    def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
-        size = (len(encoded.features), self.shape.chunk_size, self.shape.padded_dim)
-        x0 = torch.randn(size, generator=torch.Generator().manual_seed(0)).to(encoded.features.device)
-        stock = self.model.stock(batch, noise=x0.clone())
-        ours = self.shape.integrate(encoded.context, x0)[..., : self.shape.action_dim]
-        return float((ours - stock).abs().max())
-
     def imitation_loss(self, encoded: Encoded, chunk: Tensor) -> Tensor:
         """Flow matching at a time from LeRobot's Beta(1.5, 1), executed entries only."""
         target = chunk.new_zeros(len(chunk), self.shape.chunk_size, self.shape.padded_dim)

@@ -52,7 +52,8 @@ class StdHead(nn.Module):
 
     def __init__(self, width: int, action_dim: int, sampler: GaussianSamplerConfig) -> None:
         super().__init__()
-        self.norm, self.out = nn.LayerNorm(width), nn.Linear(width, action_dim)
+        self.norm = nn.LayerNorm(width)
+        self.out = nn.Linear(width, action_dim)
         self.low, self.high = (math.log(bound) for bound in sampler.bounds)
         start = (math.log(sampler.std) - self.low) / (self.high - self.low)
         nn.init.zeros_(self.out.weight)
@@ -84,10 +85,6 @@ class GaussianFamily(Family):
         log_prob = normal_log_prob(latent["u"], mean, std).sum(-1)
         return log_prob, normal_entropy(std).sum((1, 2))
 
-    def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
-        mean, _ = self._gaussian(encoded)
-        return float((mean - self.model.stock(batch)[:, : self.model.executed]).abs().max())
-
     def imitation_loss(self, encoded: Encoded, chunk: Tensor) -> Tensor:
         """Mean absolute error, ACT's reconstruction loss."""
         return (self._gaussian(encoded)[0] - chunk).abs().mean((1, 2))
@@ -106,15 +103,17 @@ class ACT(GaussianModel):
     def __init__(self, policy: Any) -> None:
         super().__init__(policy)
         config = policy.config
-        if (coefficient := config.temporal_ensemble_coeff) is not None:
-            hint = "averaging over earlier chunks makes actions depend on more than the observation"
-            raise NoDensityError("policy.temporal_ensemble_coeff", coefficient, f"{hint}; use null")
-        self.executed, self.action_dim = config.n_action_steps, config.action_feature.shape[0]
+        if config.temporal_ensemble_coeff is not None:
+            hint = "averaging over earlier chunks makes actions depend on more than the observation; use null"
+            raise NoDensityError("policy.temporal_ensemble_coeff", config.temporal_ensemble_coeff, hint)
+        self.executed = config.n_action_steps
+        self.action_dim = config.action_feature.shape[0]
         self.width = self.row_width = config.dim_model
 
     def encode(self, batch: dict[str, Tensor]) -> Encoded:
         """The features are the encoder's output: latent, state, image positions."""
-        model, inputs = self.policy.model, dict[str, Any](batch)
+        model = self.policy.model
+        inputs: dict[str, Any] = dict(batch)
         if self.policy.config.image_features:
             inputs[OBS_IMAGES] = [batch[key] for key in self.policy.config.image_features]
         seen: dict[str, Tensor] = {}

@@ -1,58 +1,64 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A LeRobot checkpoint in, a stochastic policy out.
+"""Load a LeRobot checkpoint as a stochastic policy.
 
-Config and processors load through LeRobot's `from_pretrained`. LeRobot's loaders of weights take what fits
-and leave the rest at random, some of them after printing what went wrong; here file and policy must hold the
-same tensors of the same shapes.
+    open_checkpoint ─► load_processors ─► build_network ─► load_weights ─► adapter ─► check ─► tune
+
+LeRobot's loaders of weights take what fits and leave the rest at random, some of them after printing what
+went wrong; here file and policy must hold the same tensors of the same shapes.
 """
 
 from __future__ import annotations
 
 import contextlib
 import io
-import json
-import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import draccus
 import torch
 from lerobot.configs.policies import PreTrainedConfig
-from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+from lerobot.policies.factory import get_policy_class
+from torch import Tensor
 
-from accerl_lerobot.checkpoint.layout import BACKBONE, CONFIG_FOLDERS, STEP_FOLDERS
-from accerl_lerobot.checkpoint.safety import FileSource, brief, read_json, read_tensors, tensor_shapes
+from accerl_lerobot.checkpoint.layout import BACKBONE
+from accerl_lerobot.checkpoint.safety import FileSource, read_json, read_tensors, tensor_shapes
 from accerl_lerobot.config.machine import computes_bf16
 from accerl_lerobot.config.parsing import discover, imported
 from accerl_lerobot.errors import InputError, expanded
 from accerl_lerobot.experience import stack_observations
 from accerl_lerobot.policies import untrusted
-from accerl_lerobot.policies.adapter import LeRobotAdapter, Processing, ValueHead
+from accerl_lerobot.policies.adapter import LeRobotAdapter, ValueHead
 from accerl_lerobot.policies.config import (
     POLICIES,
     ChunkNoiseConfig,
     PolicyConfig,
     Precision,
-    SamplerConfig,
     check_observations,
     check_registered,
-    check_sizes,
     override,
     register_policies,
     sampler_config,
-)  # fmt: skip
+)
 from accerl_lerobot.policies.family import Model, NoDensityError
-from accerl_lerobot.policies.normalisation import check_statistics, correct_inputs, stored_steps
-from accerl_lerobot.policies.peft_adapters import merged, weights_folder
+from accerl_lerobot.policies.processing import (
+    Processing,
+    check_statistics,
+    correct_inputs,
+    keep_tokenizer_names,
+    load_processors,
+    use_own_files,
+)
 from accerl_lerobot.policies.saving import tune
 from accerl_lerobot.policies.stock import StockAdapter
-
-logger = logging.getLogger(__name__)
+from accerl_lerobot.policies.untrusted import ADAPTER, ADAPTER_CONFIG, fetched_checkpoint, refusing
 
 ACTS_MOST = 10**9  # parameters of a policy that acts in a dry run; π0's four billion would take minutes
+
+PROCESSORS_HINT = (
+    f"a tokeniser that is not to be had from the Hub goes into {BACKBONE}/ beside config.json; one from "
+    "before LeRobot's processors is converted by python -m lerobot.processor.migrate_policy_normalization"
+)
 
 
 class Sizes(NamedTuple):
@@ -62,47 +68,40 @@ class Sizes(NamedTuple):
     trained: int
 
 
-_dry_runs: dict[tuple[Any, ...], Sizes] = {}  # of checkpoints and configs that need no other dry run
+class Checkpoint(NamedTuple):
+    """A LeRobot checkpoint whose files have been checked."""
+
+    folder: Path
+    source: FileSource
+    config: Any  # LeRobot's config of the policy, with the run's choices in it
+
+
+_known_sizes: dict[tuple[str, bool, bool], Sizes] = {}  # of the dry runs of this process
 
 
 def resolve_device(name: str, field: str = "policy.device") -> torch.device:
     """The device of this name; ``auto`` is CUDA when there is one. The error names `field`."""
-    here = torch.cuda.is_available()
-    device = torch.device(("cuda" if here else "cpu") if name == "auto" else name)
-    if device.type == "cuda" and not here:
+    available = torch.cuda.is_available()
+    automatic = "cuda" if available else "cpu"
+    device = torch.device(automatic if name == "auto" else name)
+    if device.type == "cuda" and not available:
         raise InputError(field, name, "no CUDA device here; use cpu or auto")
-    if device.type == "cuda" and (device.index or 0) >= (count := torch.cuda.device_count()):
+    count = torch.cuda.device_count()
+    if device.type == "cuda" and (device.index or 0) >= count:
         raise InputError(field, name, f"there are {count} such devices here, numbered from 0")
     return device
 
 
-def precision_on(device: torch.device, wanted: Precision) -> Precision:
-    """fp32 or bf16: what is `wanted`, or, for ``auto``, bf16 where the device itself computes in it."""
-    if wanted != "auto":
-        return wanted
+def precision_on(device: torch.device, precision: Precision) -> Precision:
+    """fp32 or bf16; for ``auto``, bf16 where the device itself computes in it."""
+    if precision != "auto":
+        return precision
     return "bf16" if computes_bf16(device) else "fp32"
 
 
 def load_lerobot_config(config: PolicyConfig) -> Any:
-    """The checkpoint's LeRobot policy config, without its weights.
-
-    Raises:
-        InputError: no checkpoint there, or one of a policy type that is not installed.
-    """
-    folder, origin = _checkpoint_folder(config), FileSource("policy.path", config.path)
-    _registered_type(config, folder)
-    what = (
-        "its config.json is not one of this LeRobot's policies; remove the fields of another version from it"
-    )
-    with _refusing(config, what):
-        lerobot_config = PreTrainedConfig.from_pretrained(folder)
-        correct_inputs(lerobot_config, folder, origin)
-    check_sizes(lerobot_config, origin)
-    lerobot_config.device = str(resolve_device(config.device))
-    override(lerobot_config, config)
-    check_observations(lerobot_config, "policy.n_obs_steps")
-    _use_backbone(lerobot_config, folder, config.path)
-    return lerobot_config
+    """The checkpoint's LeRobot policy config, without its weights; see `open_checkpoint`."""
+    return open_checkpoint(config).config
 
 
 def dry_run_config(config: PolicyConfig, *, fine_tuned: bool = False) -> Any:
@@ -111,95 +110,98 @@ def dry_run_config(config: PolicyConfig, *, fine_tuned: bool = False) -> Any:
     return load_lerobot_config(config)
 
 
-def learning_config(config: PolicyConfig, *, fine_tuned: bool = False, imitates: bool = False) -> Any:
-    """`dry_run_config` of a policy that learns, by LeRobot's training loss if it `imitates`."""
-    policy_sizes(config, fine_tuned=fine_tuned, imitates=imitates, learns=True)
-    lerobot_config = load_lerobot_config(config)
-    sampler_config(config, lerobot_config.type, prefix=f"{config.path} is of this type: ")
-    return lerobot_config
+def learning_config(config: PolicyConfig, *, fine_tuned: bool = False) -> Any:
+    """`dry_run_config` of a policy that learns."""
+    policy_sizes(config, fine_tuned=fine_tuned, learns=True)
+    return load_lerobot_config(config)
 
 
-def policy_sizes(
-    config: PolicyConfig, *, fine_tuned: bool = False, imitates: bool = False, learns: bool = False
-) -> Sizes:
-    """`Sizes` of a checkpoint's policy, which has been loaded on the CPU and has acted once.
+def policy_sizes(config: PolicyConfig, *, fine_tuned: bool = False, learns: bool = False) -> Sizes:
+    """`Sizes` of a checkpoint's policy, which has been built on the CPU and has acted once, in a dry run.
 
-    One that `imitates`, of a type without a likelihood, computes LeRobot's training loss too. If it is to be
-    `fine_tuned`, statistics that it lacks are no reason to refuse it. If it `learns`, an option that has no
-    exact likelihood is one. A checkpoint whose files have not changed since is not loaded again.
+    If it is to be `fine_tuned`, statistics that it lacks are no reason to refuse it. If it `learns`, an
+    option that keeps it from learning is one. A policy is built once in a process.
 
     Raises:
-        InputError: see `load_lerobot_config` and `load_adapter`.
+        InputError: see `open_checkpoint` and `load_adapter`.
     """
-    files = [path for path in sorted(_checkpoint_folder(config).rglob("*")) if path.is_file()]
-    state = repr([(str(path), path.stat().st_mtime_ns) for path in files])
-    key = (repr(config), state, fine_tuned, imitates)
-    for learning in (learns, True):  # a policy that can learn can act
-        if (*key, learning) in _dry_runs:
-            return _dry_runs[*key, learning]
-    sizes = dry_run(
-        replace(config, precision="fp32"), sizes_of, fine_tuned=fine_tuned, imitates=imitates, learns=learns
-    )
-    return _dry_runs.setdefault((*key, learns), sizes)
-
-
-def dry_run[T](
-    config: PolicyConfig,
-    task: Callable[[Any], T],
-    *,
-    fine_tuned: bool = False,
-    imitates: bool = False,
-    learns: bool = False,
-) -> T:
-    """Result of `task` with the policy of `policy_sizes`, whose weights are not read.
-
-    What LeRobot prints is dropped: the standard output of a command is its result.
-    """
+    text = repr(config)
+    for key in ((text, fine_tuned, learns), (text, fine_tuned, True)):  # a policy that can learn can act
+        if key in _known_sizes:
+            return _known_sizes[key]
+    load = load_adapter if learns else load_acting
     precision = precision_on(resolve_device(config.device), config.precision)
-    config = replace(config, device="cpu", precision=precision)
-    load = partial(load_adapter, explores=False) if imitates else partial(load_acting, learns=learns)
+    on_cpu = replace(config, device="cpu", precision=precision)
+    # What LeRobot prints is dropped: the standard output of a command is its result.
     with contextlib.redirect_stdout(io.StringIO()), torch.random.fork_rng(devices=[]):
-        return task(load(config, dry_run=True, fine_tuned=fine_tuned))
+        sizes = sizes_of(load(on_cpu, dry_run=True, fine_tuned=fine_tuned))
+    _known_sizes[text, fine_tuned, learns] = sizes
+    return sizes
 
 
 def sizes_of(adapter: Any) -> Sizes:
-    of = (adapter.policy.parameters(), adapter.trainable().values())
-    return Sizes(*(sum(parameter.numel() for parameter in parameters) for parameters in of))
+    policy = sum(parameter.numel() for parameter in adapter.policy.parameters())
+    trained = sum(parameter.numel() for parameter in adapter.trainable().values())
+    return Sizes(policy, trained)
 
 
 def load_acting(
-    config: PolicyConfig, *, dry_run: bool = False, fine_tuned: bool = False, learns: bool = False
+    config: PolicyConfig, *, dry_run: bool = False, fine_tuned: bool = False
 ) -> LeRobotAdapter | StockAdapter:
-    """A policy of any of LeRobot's types: by `load_adapter` if it has an exact likelihood, else to act only.
+    """A policy of any of LeRobot's types, to act: by `load_adapter` if it has an exact likelihood."""
+    checkpoint = open_checkpoint(config)
+    if checkpoint.config.type in POLICIES:
+        with contextlib.suppress(NoDensityError):
+            return load_adapter(config, dry_run=dry_run, fine_tuned=fine_tuned)
+    return _stock_adapter(checkpoint, config, None, dry_run, fine_tuned)
 
-    If it `learns`, one of a type with a likelihood must have it.
+
+def load_adapter(
+    config: PolicyConfig, *, dry_run: bool = False, fine_tuned: bool = False
+) -> LeRobotAdapter | StockAdapter:
+    """Loads policy, processors and critic; proves that the sampler is LeRobot's.
+
+    In a `dry_run` the weights are not read, and a decision is made in place of that proof. `policy_sizes`
+    explains `fine_tuned`.
+
+    Raises:
+        InputError: see `open_checkpoint` and `LeRobotAdapter.self_check`; or a file did not load.
     """
-    lerobot_config = load_lerobot_config(config)
-    if lerobot_config.type in POLICIES:
-        with contextlib.suppress(*(() if learns else (NoDensityError,))):
-            return load_adapter(config, dry_run=dry_run, fine_tuned=fine_tuned, explores=False)
-    return _stock_adapter(config, lerobot_config, None, dry_run, fine_tuned)
-
-
-def load_network(config: PolicyConfig) -> tuple[Any, Processing]:
-    """LeRobot's policy of any type, and its processors, for another use than to act."""
-    policy, processing, _ = _load_parts(config, load_lerobot_config(config), None, False, False)
-    return policy, processing
+    checkpoint = open_checkpoint(config)
+    sampler = sampler_config(config, checkpoint.config.type)
+    if isinstance(sampler, ChunkNoiseConfig):
+        return _stock_adapter(checkpoint, config, sampler, dry_run, fine_tuned)
+    model_class = imported(POLICIES[checkpoint.config.type][0])
+    policy, processing = _load_parts(checkpoint, config, model_class, dry_run, fine_tuned)
+    with refusing(checkpoint.source, "it cannot act here"):
+        model = model_class(policy)
+        family = imported(sampler.family)(model, sampler)
+        critic = ValueHead(model.width)
+        precision = precision_on(processing.device, config.precision)
+        adapter = LeRobotAdapter(policy, processing, model, family, critic, precision)
+        _load_ours(adapter, checkpoint)
+        requests = adapter.example_requests()
+        if not dry_run:
+            adapter.self_check(*stack_observations(requests))
+        elif sizes_of(adapter).policy <= ACTS_MOST:
+            adapter.decide(requests[:1], 0)
+        tune(policy, config.tuning, model.backbone, model.idle)
+    return adapter
 
 
 def _stock_adapter(
+    checkpoint: Checkpoint,
     config: PolicyConfig,
-    lerobot_config: Any,
     sampler: ChunkNoiseConfig | None,
     dry_run: bool,
     fine_tuned: bool,
 ) -> StockAdapter:
     """A policy of any type, which has acted once; with a `sampler` one that explores and learns."""
-    known = POLICIES.get(lerobot_config.type)
-    model_class: type[Model] | None = None if known is None else imported(known[0])
-    policy, processing, precision = _load_parts(config, lerobot_config, model_class, dry_run, fine_tuned)
-    adapter = StockAdapter(policy, processing, precision, sampler)
-    with _refusing(config, "it cannot act here"):
+    known = POLICIES.get(checkpoint.config.type)
+    model_class = None if known is None else imported(known[0])
+    policy, processing = _load_parts(checkpoint, config, model_class, dry_run, fine_tuned)
+    adapter = StockAdapter(policy, processing, precision_on(processing.device, config.precision), sampler)
+    with refusing(checkpoint.source, "it cannot act here"):
         if sampler is None:
             adapter.decide(adapter.example_requests(), 0)
         else:
@@ -208,248 +210,178 @@ def _stock_adapter(
     return adapter
 
 
-def load_adapter(
-    config: PolicyConfig, *, dry_run: bool = False, fine_tuned: bool = False, explores: bool = True
-) -> LeRobotAdapter | StockAdapter:
-    """Loads policy, processors and critic; proves that the sampler is LeRobot's.
-
-    In a `dry_run` the weights are not read, and a decision is made in place of that proof. `policy_sizes`
-    explains `fine_tuned`.
-
-    Raises:
-        InputError: see `load_lerobot_config` and `LeRobotAdapter.self_check`; or a file did not load.
-    """
-    lerobot_config = load_lerobot_config(config)
-    sampler = sampler_config(config, lerobot_config.type, prefix=f"{config.path} is of this type: ")
-    if isinstance(sampler, ChunkNoiseConfig):
-        return _stock_adapter(config, lerobot_config, sampler, dry_run, fine_tuned)
-    model_class: type[Model] = imported(POLICIES[lerobot_config.type][0])
-    policy, processing, precision = _load_parts(config, lerobot_config, model_class, dry_run, fine_tuned)
-    folder, origin = _checkpoint_folder(config), FileSource("policy.path", config.path)
-    with _refusing(config, "it cannot act here"):
-        model = model_class(policy)
-        family = imported(sampler.family)(model, sampler)
-        critic = ValueHead(model.width)
-        adapter = LeRobotAdapter(policy, processing, model, family, critic, precision)
-        if (folder / untrusted.OURS).is_file():
-            _load_ours(adapter, folder, origin, explores)
-        requests = adapter.example_requests()
-        if not dry_run:
-            adapter.self_check(*stack_observations(requests))
-        elif sum(parameter.numel() for parameter in policy.parameters()) <= ACTS_MOST:
-            adapter.decide(requests[:1], 0)
-        tune(policy, config.tuning, model.backbone, model.idle)
-    return adapter
-
-
-def _load_parts(
-    config: PolicyConfig,
-    lerobot_config: Any,
-    model_class: type[Model] | None,
-    dry_run: bool,
-    fine_tuned: bool,
-) -> tuple[Any, Processing, Precision]:
-    """LeRobot's policy with the checkpoint's weights, its processors, and the precision it computes in."""
-    folder, origin = _checkpoint_folder(config), FileSource("policy.path", config.path)
-    loading = contextlib.nullcontext if model_class is None else model_class.loading
-    with (
-        _refusing(config, "its network cannot be built as its config.json says"),
-        untrusted.guarded("policy", config.trust_remote_code),
-        loading(),
-        untrusted.Unfilled(),
-    ):
-        policy = _built(lerobot_config)
-        if model_class is not None:
-            # LeRobot builds SmolVLA's backbone and expert in the backbone's bfloat16, in which small steps of
-            # a gradient are lost.
-            policy = policy.float()
-    base = weights_folder(folder, origin)
-    unread = () if model_class is None else model_class.unread
-    load_weights(policy, unread, base / untrusted.WEIGHTS, config.path, read=not dry_run)
-    if base != folder:
-        with _refusing(config, "its adapter did not load"), untrusted.guarded("policy"):
-            policy = merged(policy, folder, origin)
-    device = torch.device(lerobot_config.device)
-    policy.to(device).eval()
-    precision = precision_on(device, config.precision)
-    if precision == "fp32" and device.type == "cuda":
-        # torch convolves with 10 bits of mantissa there. For batches of different sizes cuDNN chooses other
-        # algorithms; what they round differently is divided by the std of the noise in every log-prob.
-        torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = False
-    overrides = {"device_processor": {"device": str(device)}}
-    check_statistics(lerobot_config, folder, origin, replaced=fine_tuned)
-    hint = f"a tokeniser that cannot be had from the Hub goes into {BACKBONE}/ beside {untrusted.CONFIG}"
-    with _refusing(config, f"its LeRobot processors did not load; {hint}"):
-        overrides |= _tokenizer_overrides(lerobot_config, folder)
-        with untrusted.guarded("policy", config.trust_remote_code), loading():
-            pre, post = make_pre_post_processors(
-                lerobot_config, pretrained_path=str(folder), preprocessor_overrides=overrides
-            )
-        _keep_names(lerobot_config, pre, folder)
-    return policy, Processing(pre, post, device, config.rename_map), precision
-
-
-def _built(lerobot_config: Any) -> Any:
-    """LeRobot's policy, without the backbone's weights, which its own file has, too."""
-    if asked := getattr(lerobot_config, "load_vlm_weights", False):
-        lerobot_config.load_vlm_weights = False
-    policy = get_policy_class(lerobot_config.type)(lerobot_config)
-    if asked:
-        policy.config.load_vlm_weights = True
-    return policy
-
-
-@contextlib.contextmanager
-def _refusing(config: PolicyConfig, what: str) -> Iterator[None]:
-    """LeRobot takes files at their word, and may fail over any of it: one line for all that is raised."""
-    try:
-        yield
-    except InputError:
-        raise
-    except Exception as error:
-        if (ours := untrusted.input_error(error)) is not None:
-            raise ours from error
-        raise InputError("policy.path", config.path, f"{what} ({untrusted.reason(error)})") from error
-
-
-def _checkpoint_folder(config: PolicyConfig) -> Path:
-    if config.path is None:
-        hint = "give a LeRobot checkpoint directory or Hub id, or an sft section"
-        raise InputError("policy.path", None, hint)
-    return untrusted.fetched_checkpoint(config.path, config.revision, "policy.path")
+def load_network(config: PolicyConfig) -> tuple[Any, Processing]:
+    """LeRobot's policy of any type, and its processors, for another use than to act."""
+    return _load_parts(open_checkpoint(config), config, None, False, False)
 
 
 def pinned(config: PolicyConfig) -> PolicyConfig:
     """With the commit that a Hub checkpoint has now, which all processes and a resumed run then load."""
-    local = config.path is None or expanded(config.path, "policy.path").exists()
-    return config if local else replace(config, revision=_checkpoint_folder(config).name)
+    if config.path is None or expanded(config.path, "policy.path").exists():
+        return config
+    folder = fetched_checkpoint(config.path, config.revision, "policy.path")
+    return replace(config, revision=folder.name)
 
 
-def _registered_type(config: PolicyConfig, folder: Path) -> Any:
-    """The checkpoint's policy type; packages that may have it are imported."""
+def open_checkpoint(config: PolicyConfig) -> Checkpoint:
+    """Fetches and checks a checkpoint's files, and reads its config.
+
+    Raises:
+        InputError: no checkpoint there, or one of a policy type that is not installed.
+    """
+    if config.path is None:
+        hint = "give a LeRobot checkpoint directory or Hub id, or an sft section"
+        raise InputError("policy.path", None, hint)
+    folder = fetched_checkpoint(config.path, config.revision, "policy.path")
+    source = FileSource("policy.path", config.path)
     discover(config.discover_packages_path, "policy")
-    kind = read_json(folder / untrusted.CONFIG, FileSource("policy.path", config.path)).get("type")
+    kind = read_json(folder / untrusted.CONFIG, source).get("type")
     register_policies(str(kind))
     check_registered(kind, "policy.type", f"{config.path} is of this type: ")
-    return kind
+    what = "its config.json is not one of this LeRobot's policies; remove the fields of another version"
+    with refusing(source, what):
+        policy_config = PreTrainedConfig.from_pretrained(folder)
+        correct_inputs(policy_config, folder, source)
+    policy_config.device = str(resolve_device(config.device))
+    override(policy_config, config)
+    check_observations(policy_config, "policy.n_obs_steps")
+    use_own_files(policy_config, folder, source)
+    return Checkpoint(folder, source, policy_config)
 
 
-def _load_ours(adapter: LeRobotAdapter, folder: Path, origin: FileSource, explores: bool) -> None:
-    """Loads critic and family, and says where a run explores with other options than they were made with."""
-    there = json.loads((folder / untrusted.OURS).read_text()).get("sampler", {})
-    here = draccus.encode(adapter.family.sampler, SamplerConfig)
-    differing = [k for k in here if k in there and there[k] != here[k]]
-    if explores and differing:
-        logger.warning(
-            "this run explores unlike the one that made the checkpoint: %s",
-            ", ".join(f"policy.sampler.{k}={here[k]}, there {there[k]}" for k in differing),
-        )
-    file = folder / untrusted.FAMILY
-    state = dict(read_tensors(file, origin)) if file.is_file() else {}
-    mine = adapter.family.state_dict()
-    if {k: v.shape for k, v in state.items()} == {k: v.shape for k, v in mine.items()}:
-        adapter.family.load_state_dict(state)
-    elif state and mine:
-        logger.warning("the checkpoint's weights of the sampler are not loaded: they are of another shape")
-    if (folder / untrusted.VALUE_HEAD).is_file():
-        state = dict(read_tensors(folder / untrusted.VALUE_HEAD, origin))
-        try:
-            adapter.value_head.load_state_dict(state)
-        except RuntimeError as error:
-            hint = f"it is no critic of this policy; remove it to start anew ({brief(error)})"
-            raise origin.refuse(untrusted.VALUE_HEAD, hint) from error
+def _load_parts(
+    checkpoint: Checkpoint,
+    config: PolicyConfig,
+    model_class: type[Model] | None,
+    dry_run: bool,
+    fine_tuned: bool,
+) -> tuple[Any, Processing]:
+    """LeRobot's policy with the checkpoint's weights, and its processors."""
+    folder, source, policy_config = checkpoint
+    check_statistics(policy_config, folder, source, replaced=fine_tuned)
+    with contextlib.ExitStack() as guards:
+        guards.enter_context(untrusted.guarded("policy", config.trust_remote_code))
+        if model_class is not None:
+            guards.enter_context(model_class.loading())
+        with refusing(source, f"its LeRobot processors did not load; {PROCESSORS_HINT}"):
+            processing = load_processors(policy_config, folder, config.rename_map)
+        with refusing(source, "its network cannot be built as its config.json says"), untrusted.Unfilled():
+            policy = _build_network(policy_config)
+    if model_class is not None:
+        # LeRobot builds SmolVLA's backbone and expert in the backbone's bfloat16, in which small steps of a
+        # gradient are lost.
+        policy = policy.float()
+    base = weights_folder(folder, source)
+    unread = () if model_class is None else model_class.unread
+    load_weights(policy, unread, base / untrusted.WEIGHTS, source, read=not dry_run)
+    if base != folder:
+        with refusing(source, "its adapter did not load"), untrusted.guarded("policy"):
+            policy = _merged(policy, folder, source)
+    keep_tokenizer_names(policy_config, folder)
+    policy.to(processing.device).eval()
+    if processing.device.type == "cuda" and precision_on(processing.device, config.precision) == "fp32":
+        # torch convolves with 10 bits of mantissa there. For batches of different sizes cuDNN chooses other
+        # algorithms; what they round differently is divided by the std of the noise in every log-prob.
+        torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = False
+    return policy, processing
 
 
-def _use_backbone(lerobot_config: Any, folder: Path, path: str | None) -> None:
-    """Points a LeRobot policy config at the checkpoint's own files, where it has them."""
-    for field, own in CONFIG_FOLDERS.items():
-        if not hasattr(lerobot_config, field):
-            continue
-        if (folder / own).is_dir():
-            setattr(lerobot_config, field, str((folder / own).resolve()))
-        named = Path(getattr(lerobot_config, field))
-        if named.is_absolute() and not named.is_dir():
-            what = "backbone was" if field == "vlm_model_name" else "tokeniser was"
-            hint = f"its {what} in {named}, which is gone; put a copy into {own}/ beside config.json"
-            raise InputError("policy.path", path, hint)
+def _build_network(policy_config: Any) -> Any:
+    """LeRobot's policy, without the backbone's weights, which its own file has, too."""
+    loads_backbone = getattr(policy_config, "load_vlm_weights", False)
+    if loads_backbone:
+        policy_config.load_vlm_weights = False
+    policy = get_policy_class(policy_config.type)(policy_config)
+    if loads_backbone:
+        policy.config.load_vlm_weights = True
+    return policy
 
 
-def _tokenizer_overrides(lerobot_config: Any, folder: Path) -> dict[str, dict[str, Any]]:
-    """Processor step → options, such that tokenisers are the checkpoint's own, where it has them."""
-    overrides: dict[str, dict[str, Any]] = {}
-    for entry in stored_steps(folder):
-        step = entry.get("registry_name", "")
-        if step in STEP_FOLDERS and (folder / STEP_FOLDERS[step][1]).is_dir():
-            option, own = STEP_FOLDERS[step]
-            overrides[step] = {option: str((folder / own).resolve())}
-        if step == "action_tokenizer_processor":  # LeRobot does not save these two of its options
-            overrides.setdefault(step, {})["paligemma_tokenizer_name"] = lerobot_config.text_tokenizer_name
-            overrides[step]["fast_skip_tokens"] = lerobot_config.fast_skip_tokens
-    return overrides
-
-
-def _keep_names(lerobot_config: Any, preprocessor: Any, folder: Path) -> None:
-    """Undoes the two functions above in what will be saved, once tokenisers are loaded."""
-    stored = json.loads((folder / untrusted.CONFIG).read_text())
-    for field in CONFIG_FOLDERS.keys() - {"vlm_model_name"}:
-        if hasattr(lerobot_config, field) and field in stored:
-            setattr(lerobot_config, field, stored[field])
-    for step, entry in zip(preprocessor.steps, stored_steps(folder), strict=True):
-        if (option := STEP_FOLDERS.get(entry.get("registry_name", ""))) is not None:
-            setattr(step, option[0], entry["config"].get(option[0]))
-
-
-class _Name(str):
-    """The name of a tensor in its place, for LeRobot's functions that rename the keys of a dict."""
-
-    def clone(self) -> _Name:
-        return self
-
-
-@torch.no_grad()
 def load_weights(
-    policy: Any, unread: Sequence[str], file: Path, path: str | None, *, read: bool = True
+    policy: Any, unread: Sequence[str], file: Path, source: FileSource, *, read: bool = True
 ) -> None:
     """Fills a policy from a file with the same tensors, or only compares names and shapes if not `read`.
 
     Those named in `unread` may be missing.
     """
-    origin = FileSource("policy.path", path)
-    shapes = {name: shape for name, (_, shape) in tensor_shapes(file, origin).items()}
-    mine, stored = policy.state_dict(), _names(shapes, policy)
+    if read:
+        stored = dict(read_tensors(file, source))
+    else:
+        shapes = tensor_shapes(file, source)
+        stored = {name: torch.empty(shape, device="meta") for name, (_, shape) in shapes.items()}
+    stored = _renamed(stored, policy)
+    expected = policy.state_dict()
     # Nor is a tensor missing that a policy holds under several names: savers keep one of them.
-    held = {mine[k].data_ptr() for k in stored.keys() & mine.keys()}
-    absent = mine.keys() - stored.keys() - set(unread)
-    missing = sorted(k for k in absent if mine[k].data_ptr() not in held)
-    unexpected = sorted(stored.keys() - mine.keys())
-    if missing or unexpected:
-        counts = f"{len(missing)} tensors missing {missing[:3]}, {len(unexpected)} unexpected "
-        hint = f"{counts}{unexpected[:3]}; config.json and {file.name} disagree"
-        raise InputError("policy.path", path, f"the weights did not load: {hint}")
-    for name, theirs in stored.items():
-        if mine[name].shape != shapes[theirs]:
-            sizes = f"{shapes[theirs]} in the file, {tuple(mine[name].shape)} in the policy"
-            hint = f"the weights did not load: size mismatch for {name}, {sizes}"
-            raise InputError("policy.path", path, hint)
-    for theirs, tensor in read_tensors(file, origin) if read else ():
-        for name in (name for name, place in stored.items() if place == theirs):
-            mine[name].copy_(tensor)
+    held = {expected[name].data_ptr() for name in stored.keys() & expected.keys()}
+    absent = expected.keys() - stored.keys() - set(unread)
+    problems = {
+        "missing": [name for name in absent if expected[name].data_ptr() not in held],
+        "unexpected": list(stored.keys() - expected.keys()),
+        "of another shape": [n for n, t in stored.items() if n in expected and t.shape != expected[n].shape],
+    }
+    if any(problems.values()):
+        counts = ", ".join(f"{len(names)} {what} {sorted(names)[:3]}" for what, names in problems.items())
+        hint = f"the weights did not load: tensors {counts}; config.json and {file.name} disagree"
+        raise InputError(source.field, source.value, hint)
+    if read:
+        policy.load_state_dict(stored, strict=False)
 
 
-def _names(shapes: dict[str, Any], policy: Any) -> dict[str, str]:
-    """Name of a policy's tensor → name in the file, as LeRobot's loader of this policy has it.
+def _renamed(stored: dict[str, Tensor], policy: Any) -> dict[str, Tensor]:
+    """Tensors of a file by the names that LeRobot's loader of this policy gives them.
 
     π0's reads files of openpi as well: without the leading ``model.``, with other names for some layers, and
     with the input embedding left out where it equals the output layer.
     """
-    stored: dict[str, str] = {name: _Name(name) for name in shapes}
     rename = getattr(policy, "_fix_pytorch_state_dict_keys", None)
     if rename is None:
         return stored
     renamed = _prefixed(rename(stored, policy.config))
     # What a file has under its own name goes before what is taken for it.
-    return renamed | {k: v for k, v in _prefixed(stored).items() if k in renamed}
+    return renamed | {name: t for name, t in _prefixed(stored).items() if name in renamed}
 
 
-def _prefixed(names: dict[str, str]) -> dict[str, str]:
-    return {k if k.startswith("model.") else f"model.{k}": v for k, v in names.items()}
+def _prefixed(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {k if k.startswith("model.") else f"model.{k}": tensor for k, tensor in tensors.items()}
+
+
+def weights_folder(folder: Path, source: FileSource) -> Path:
+    """The folder with all of a policy's weights: `folder` itself, or, of an adapter, the policy it is for."""
+    if not untrusted.is_adapter(folder):
+        return folder
+    stored = read_json(folder / ADAPTER_CONFIG, source)
+    base = stored.get("base_model_name_or_path")
+    try:
+        return fetched_checkpoint(str(base), stored.get("revision"), source.field)
+    except InputError as error:
+        why = f"{base!r}, the policy that the adapter is for: {error.hint}"
+        raise source.refuse(f"{ADAPTER_CONFIG}: base_model_name_or_path", why) from error
+
+
+def _merged(policy: Any, folder: Path, source: FileSource) -> Any:
+    """The policy with the adapter of LeRobot's PEFT training in `folder` added to its weights.
+
+    Parameters that were trainable in it are again.
+    """
+    from peft import PeftModel, get_peft_model_state_dict
+
+    trainable = {name for name, parameter in policy.named_parameters() if parameter.requires_grad}
+    stored = dict(read_tensors(folder / ADAPTER, source))
+    wrapped = PeftModel.from_pretrained(policy, str(folder), torch_device="cpu")
+    differing = sorted(get_peft_model_state_dict(wrapped).keys() ^ stored.keys())
+    if differing:
+        why = f"{len(differing)} tensors are missing or unexpected, such as {differing[0]}"
+        raise source.refuse(ADAPTER, f"{why}; {ADAPTER_CONFIG} and this file disagree")
+    policy = wrapped.merge_and_unload()
+    for name, parameter in policy.named_parameters():
+        parameter.requires_grad_(name in trainable)
+    return policy
+
+
+def _load_ours(adapter: LeRobotAdapter, checkpoint: Checkpoint) -> None:
+    """Loads critic and family, where the checkpoint has them."""
+    folder, source, _ = checkpoint
+    for file, module in ((untrusted.FAMILY, adapter.family), (untrusted.VALUE_HEAD, adapter.value_head)):
+        if (folder / file).is_file():
+            with refusing(source, f"{file}: not of this policy; remove it to start anew"):
+                module.load_state_dict(dict(read_tensors(folder / file, source)))

@@ -70,20 +70,15 @@ def _inject(policy: Any, config: TuningConfig) -> None:
     inject_adapter_in_model(lora, policy)
 
 
-def merged_state_dict(policy: nn.Module) -> dict[str, Tensor] | None:
-    """The weights with low-rank adapters added in, under their plain names; None where there are none."""
-    if not any(".lora_" in name for name, _ in policy.named_parameters()):
-        return None
-    from peft.tuners.lora import Linear
-
+def merged_state_dict(policy: nn.Module) -> dict[str, Tensor]:
+    """The weights, with low-rank adapters added in, under their plain names."""
+    state = {name: tensor for name, tensor in policy.state_dict().items() if ".lora_" not in name}
     # Under every name: a module that a policy holds twice is in its state twice.
-    modules = policy.named_modules(remove_duplicate=False)
-    layers = {name: m for name, m in modules if isinstance(m, Linear)}
-    state = {k: v for k, v in policy.state_dict().items() if ".lora_" not in k}
-    for name, layer in layers.items():
-        weight = state[f"{name}.base_layer.weight"]
-        state[f"{name}.base_layer.weight"] = weight + layer.get_delta_weight("default").to(weight)
-    return {k.replace(".base_layer.", "."): v.detach() for k, v in state.items()}
+    for name, layer in policy.named_modules(remove_duplicate=False):
+        if hasattr(layer, "get_delta_weight"):  # a low-rank adapter of peft's
+            weight = state[f"{name}.base_layer.weight"]
+            state[f"{name}.base_layer.weight"] = weight + layer.get_delta_weight("default").to(weight)
+    return {name.replace(".base_layer.", "."): tensor.detach() for name, tensor in state.items()}
 
 
 class Weights(NamedTuple):
@@ -93,11 +88,10 @@ class Weights(NamedTuple):
     ours: dict[str, dict[str, Tensor]]  # by the name of their file
 
 
-def copy_weights(adapter: Any, ours: dict[str, nn.Module]) -> Weights:
-    """A copy to be saved while the adapter is trained on; `ours` are its other modules, by file."""
-    policy = merged_state_dict(adapter.policy) or adapter.policy.state_dict()
+def copy_weights(policy: nn.Module, ours: dict[str, nn.Module]) -> Weights:
+    """A copy to be saved while the policy is trained on; `ours` are other modules, by file."""
     states = {file: _copied(module.state_dict()) for file, module in ours.items()}
-    return Weights(_copied(policy), {file: state for file, state in states.items() if state})
+    return Weights(_copied(merged_state_dict(policy)), states)
 
 
 def save_pretrained(
@@ -112,7 +106,8 @@ def save_pretrained(
     adapter.processing.postprocessor.save_pretrained(directory)
     relocate(directory, directory)
     for file, tensors in weights.ours.items():
-        save_file(tensors, directory / file)
+        if tensors:
+            save_file(tensors, directory / file)
     ours = {"sampler": draccus.encode(adapter.sampler, SamplerConfig), "rename_map": config.rename_map}
     (directory / OURS).write_text(json.dumps(ours, indent=2) + "\n")
 
@@ -122,7 +117,8 @@ def _save_backbone(lerobot_config: Any, preprocessor: Any, directory: Path) -> N
     if not hasattr(lerobot_config, "vlm_model_name"):
         for step in preprocessor.steps:
             for name, folder in (("input_tokenizer", BACKBONE), ("action_tokenizer", FAST)):
-                if (tokenizer := getattr(step, name, None)) is not None:
+                tokenizer = getattr(step, name, None)
+                if tokenizer is not None:
                     tokenizer.save_pretrained(directory / folder)
         return
     source = Path(lerobot_config.vlm_model_name)

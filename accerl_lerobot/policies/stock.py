@@ -14,47 +14,29 @@ A dims.
 from __future__ import annotations
 
 import copy
-import logging
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any, NoReturn
+from unittest.mock import patch
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from accerl_lerobot.checkpoint.safety import brief
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import Decision, Request, Segment, stack_observations
-from accerl_lerobot.policies import saving
-from accerl_lerobot.policies.adapter import (
-    Evaluation,
-    PolicyAdapter,
-    Processing,
-    autocast_on,
-    example_requests,
-    trainable_of,
-)  # fmt: skip
-from accerl_lerobot.policies.config import ChunkNoiseConfig, PolicyConfig, SamplerConfig, executed_rows
+from accerl_lerobot.experience import Decision, Request, stack_observations
+from accerl_lerobot.policies.adapter import Evaluation, PretrainedAdapter
+from accerl_lerobot.policies.config import ChunkNoiseConfig, SamplerConfig, executed_rows
 from accerl_lerobot.policies.features import ACTION
-from accerl_lerobot.policies.teacher import Teacher
+from accerl_lerobot.policies.processing import Processing
 from accerl_lerobot.seeds import episode_of
 
-logger = logging.getLogger(__name__)
-
 EPISODES = 256  # episodes whose state is kept; the one that acted longest ago goes first
-SHARED = ("config", "_modules", "_parameters", "_buffers")
-"""Attributes of a policy that all episodes have in common."""
 NOISE = 6  # distinguishes the seeds of the noise on executed chunks
 
 
-class StockAdapter(PolicyAdapter):
+class StockAdapter(PretrainedAdapter):
     """A LeRobot policy without a likelihood. Without a `sampler` it acts and does not learn."""
-
-    feature_width = None
-    """Width of the features that `imitate` returns: they are not known."""
 
     def __init__(
         self,
@@ -63,31 +45,20 @@ class StockAdapter(PolicyAdapter):
         precision: str = "fp32",
         sampler: ChunkNoiseConfig | None = None,
     ) -> None:
-        super().__init__()
-        self.policy, self.processing, self.precision = policy.eval(), processing, precision
+        super().__init__(policy, processing, precision)
         self._sampler = sampler
-        self.device = next(policy.parameters()).device
-        self.teacher: Teacher | None = None
-        """Acts in its place in part of the exploring episodes; given by `teacher.with_teacher`."""
-        self.demonstrations: Callable[[Segment], Iterator[Segment]] | None = None
-        """Remembered by off-policy learning from the start; set by `adapter.make_adapter`."""
+        self.explores = sampler is not None
         self._episodes: OrderedDict[tuple[int, str], Any] = OrderedDict()
-        self._takes_batches = True
 
     @property
     def sampler(self) -> SamplerConfig:
-        """How it explores."""
         if self._sampler is None:
             self._refuse()
         return self._sampler
 
-    def autocast(self) -> Any:
-        """Surrounds whatever runs the network."""
-        return autocast_on(self.device, self.precision)
-
     @torch.no_grad()
     def decide(self, requests: Sequence[Request], version: int) -> list[Decision]:
-        if self._sampler is not None:
+        if self.explores:
             return self._decide_chunks(requests, version)
         if any(request.explore for request in requests):
             self._refuse()
@@ -96,7 +67,6 @@ class StockAdapter(PolicyAdapter):
     def imitate(
         self, observations: dict[str, np.ndarray], tasks: Sequence[str], chunk: Tensor
     ) -> tuple[Tensor, None]:
-        """LeRobot's training loss, a scalar, of chunks (B, K, A) in normalised units."""
         batch = self._training_batch(observations, tasks, chunk)
         self.policy.train()
         for module in self.policy.modules():
@@ -108,59 +78,24 @@ class StockAdapter(PolicyAdapter):
             self.policy.eval()
 
     def self_check(self) -> None:
-        """Proves that the policy can be asked twice for a chunk, and that its training loss can be computed.
+        """Acts once for two environments, and computes the training loss once.
 
         Raises:
-            InputError: it answers the same question differently, or trains on more than its chunks.
+            InputError: LeRobot trains the policy on more than its chunks.
         """
+        config = self.policy.config
+        later = [delta for delta in config.observation_delta_indices or () if delta > 0]
+        if later or config.reward_delta_indices is not None:
+            hint = "LeRobot trains it on what follows a chunk, rewards or observations, and not on chunks"
+            raise InputError("policy.type", config.type, f"{hint} alone; it can be evaluated (accerl eval)")
         requests = self.example_requests()
-        config, request = self.policy.config, [requests[0]]
-        first, second = (self.decide(request, 0)[0].chunk for _ in range(2))
-        if not np.array_equal(first, second):
-            hint = "asked twice with the same noise, it gives two chunks: it changes while it acts"
-            raise InputError("policy.type", config.type, f"{hint}; it can be evaluated (accerl eval)")
-        try:
-            with torch.no_grad():
-                self._chunk(requests)
-        except Exception as error:  # somebody's policy, which may fail in any way
-            self._takes_batches = False
-            reason = f"{type(error).__name__}: {brief(error)}"
-            logger.warning(
-                "%s policies decide for one environment at a time, which takes as many calls as there are "
-                "environments: a batch of two fails (%s)", config.type, reason,
-            )  # fmt: skip
-        deltas = [*(config.observation_delta_indices or ()), *(config.reward_delta_indices or ())]
-        if config.reward_delta_indices is not None or any(delta > 0 for delta in deltas):
-            hint = (
-                "LeRobot trains it on what follows a chunk, rewards or observations, and not on chunks alone"
-            )
-            raise InputError("policy.type", config.type, f"{hint}; it can be evaluated (accerl eval)")
-        arrays, tasks = stack_observations(requests)
-        chunk = torch.zeros(len(requests), *first.shape, device=self.device)
-        kept = {name: buffer.clone() for name, buffer in self.policy.named_buffers()}
+        acted = self.decide(requests, 0)[0]
+        chunk = torch.zeros(len(requests), *acted.chunk.shape, device=self.device)
+        buffers = {name: buffer.clone() for name, buffer in self.policy.named_buffers()}
         with torch.no_grad(), torch.random.fork_rng(), self.autocast():
-            loss, _ = self.imitate(arrays, tasks, chunk)
+            self.imitate(*stack_observations(requests), chunk)
             for name, buffer in self.policy.named_buffers():  # such as a codebook that the loss moves
-                buffer.copy_(kept[name])
-        if loss.numel() != 1:
-            hint = (
-                f"its training loss has shape {tuple(loss.shape)}, where LeRobot's policies return a number"
-            )
-            raise InputError("policy.type", config.type, f"{hint}; it can be evaluated (accerl eval)")
-
-    def example_requests(self) -> list[Request]:
-        """Two requests with random observations for this policy, which explore if it learns."""
-        learns = self._sampler is not None
-        return example_requests(self.policy.config, self.processing.rename_map, explore=learns)
-
-    def trainable(self) -> dict[str, nn.Parameter]:
-        return trainable_of({"policy": self.policy}, self.teacher)
-
-    def copy_weights(self) -> Any:
-        return saving.copy_weights(self, {})
-
-    def save(self, directory: Path, config: PolicyConfig, weights: Any) -> None:
-        saving.save_pretrained(self, directory, config, weights)
+                buffer.copy_(buffers[name])
 
     def evaluate(
         self, observations: dict[str, np.ndarray], tasks: Sequence[str], latent: dict[str, Tensor]
@@ -191,11 +126,11 @@ class StockAdapter(PolicyAdapter):
 
     def _policy_of(self, episode: int, task: str) -> Any:
         """The episode's policy object, which is new and reset if this is its first decision."""
-        if (policy := self._episodes.get((episode, task))) is None:
-            policy = copy.copy(self.policy)
-            own = {name: value for name, value in vars(policy).items() if name not in SHARED}
-            shared = (*policy.modules(), *policy.parameters(), *policy.buffers())
-            vars(policy).update(copy.deepcopy(own, {id(part): part for part in shared}))
+        policy = self._episodes.get((episode, task))
+        if policy is None:
+            shared = (self.policy.config, *self.policy.modules(), *self.policy.parameters())
+            memo = {id(part): part for part in (*shared, *self.policy.buffers()) if part is not self.policy}
+            policy = copy.deepcopy(self.policy, memo)
             policy.reset()
             self._episodes[episode, task] = policy
         self._episodes.move_to_end((episode, task))
@@ -207,21 +142,22 @@ class StockAdapter(PolicyAdapter):
         """Exploring environments are decided for together, the others one by one, each with its own noise."""
         assert self._sampler is not None
         exploring = [i for i, request in enumerate(requests) if request.explore]
-        together = exploring if self._takes_batches else []
-        groups = [[i] for i in range(len(requests)) if i not in together]
+        groups = [[i] for i, request in enumerate(requests) if not request.explore]
+        if exploring:
+            groups.append(exploring)
         chunks: dict[int, Tensor] = {}
-        for rows in [together, *groups] if together else groups:
+        for rows in groups:
             chunk = self._chunk([requests[i] for i in rows])
             chunks |= dict(zip(rows, chunk, strict=True))
         executed = torch.stack([chunks[i] for i in range(len(requests))])
         for i in exploring:
             noise = np.random.default_rng((requests[i].noise_seed, NOISE)).standard_normal(executed[i].shape)
             executed[i] += self._sampler.noise_level * torch.from_numpy(noise).to(executed)
-        if self.teacher is not None:
-            executed = self.teacher.replace(executed, requests)
-        actions = self.processing.unnormalise(executed).cpu().numpy()
         nothing = np.zeros(1, np.float32)
-        return [Decision(chunk=chunk, latent={}, log_prob=nothing, version=version) for chunk in actions]
+        return [
+            Decision(chunk=chunk, latent={}, log_prob=nothing, version=version)
+            for chunk in self.execute(executed, requests)
+        ]
 
     def _chunk(self, requests: Sequence[Request]) -> Tensor:
         """(B, K, A) by LeRobot's sampler, in normalised units; its noise follows from the first request."""
@@ -231,7 +167,7 @@ class StockAdapter(PolicyAdapter):
             torch.manual_seed(requests[0].noise_seed % 2**63)
             policy.reset()
             *earlier, newest = [self.processing.prepare(frame, tasks) for frame in self._frames(arrays)]
-            with self._only_looking():
+            with patch.object(policy, "predict_action_chunk", self._no_prediction):
                 for batch in earlier:
                     policy.select_action(batch)
             # It computes a chunk at the first call, and takes one action after the other out of it.
@@ -246,20 +182,10 @@ class StockAdapter(PolicyAdapter):
             return [arrays]
         return [{name: values[:, step] for name, values in arrays.items()} for step in range(steps)]
 
-    @contextmanager
-    def _only_looking(self) -> Iterator[None]:
-        """Inside, `select_action` notes the observation and gives zeros in the place of a prediction."""
-        policy, dims = self.policy, self.policy.config.action_feature.shape[0]
-
-        def nothing(batch: dict[str, Tensor], *args: Any, **fields: Any) -> Tensor:
-            count = next(len(value) for value in batch.values() if isinstance(value, Tensor))
-            return torch.zeros(count, 1, dims, device=self.device)
-
-        policy.predict_action_chunk = nothing
-        try:
-            yield
-        finally:
-            del policy.predict_action_chunk
+    def _no_prediction(self, batch: dict[str, Tensor], *args: Any, **fields: Any) -> Tensor:
+        """Zeros in the place of a predicted chunk, so that `select_action` only notes the observation."""
+        count = next(len(value) for value in batch.values() if isinstance(value, Tensor))
+        return torch.zeros(count, 1, self.policy.config.action_feature.shape[0], device=self.device)
 
     def _training_batch(
         self, observations: dict[str, np.ndarray], tasks: Sequence[str], chunk: Tensor
@@ -268,8 +194,8 @@ class StockAdapter(PolicyAdapter):
         config, count = self.policy.config, len(tasks)
         executed = self.processing.unnormalise(chunk)
         batch: dict[str, Any] = {"task": list(tasks), ACTION: executed[:, 0]}
-        if (deltas := config.action_delta_indices) is not None:
-            rows = torch.tensor(list(deltas), device=executed.device)
+        if config.action_delta_indices is not None:
+            rows = torch.tensor(list(config.action_delta_indices), device=executed.device)
             batch[ACTION] = executed[:, rows.clamp(0, chunk.shape[1] - 1)]
             outside = (rows < 0) | (rows >= chunk.shape[1])
             batch[f"{ACTION}_is_pad"] = outside.expand(count, -1)

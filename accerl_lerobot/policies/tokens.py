@@ -103,9 +103,10 @@ class TokenFamily(Family):
 
     def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
         """Samples; where a request does not explore, the most likely token."""
-        device, length = encoded.features.device, self.model.length
+        device = encoded.features.device
         explore = self.exploring(requests, device)
-        draws = np.stack([np.random.default_rng(r.noise_seed).random(length) for r in requests])
+        generators = [np.random.default_rng(request.noise_seed) for request in requests]
+        draws = np.stack([generator.random(self.model.length) for generator in generators])
         uniform = torch.from_numpy(draws).to(device)
         tokens, log_prob = self._decide(encoded, explore, uniform)
         counted = explore[:, None] & existing(tokens, self.model.terminator)
@@ -117,7 +118,8 @@ class TokenFamily(Family):
         factors = existing(tokens, self.model.terminator)
         # Positions at which every row has ended are not computed: a logit for each of V tokens is a lot.
         used = int(factors.any(0).sum())
-        logits, temperature = encoded.context.logits(tokens[:, :used]), self.sampler.temperature
+        temperature = self.sampler.temperature
+        logits = encoded.context.logits(tokens[:, :used])
         log_prob = token_log_prob(logits, tokens[:, :used], temperature)
         entropy = token_entropy(logits, temperature)
         missing = (0, tokens.shape[1] - used)
@@ -140,7 +142,8 @@ class TokenFamily(Family):
         tokens, acted = self._decide(encoded, greedy, torch.zeros(size, device=device))
         difference = float((self.model.chunk(tokens) - self.model.stock(batch)).abs().max())
         factors = existing(tokens, self.model.terminator)
-        if (stock := self.model.stock_tokens(batch)) is not None:
+        stock = self.model.stock_tokens(batch)
+        if stock is not None:
             difference += float((tokens != stock)[factors].sum())
         used = int(factors.any(0).sum())
         tokens, acted, factors = tokens[:, :used], acted[:, :used], factors[:, :used]

@@ -11,7 +11,6 @@ the functions through which all of that goes, whoever is the caller.
 from __future__ import annotations
 
 import contextlib
-import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -23,24 +22,8 @@ import torch
 from torch import nn
 from torch.overrides import TorchFunctionMode
 
-from accerl_lerobot.checkpoint.layout import (
-    BACKBONE,
-    CONFIG_FOLDERS,
-    PREPROCESSOR,
-    STEP_FOLDERS,
-    check_names,
-)  # fmt: skip
-from accerl_lerobot.checkpoint.safety import (
-    HUB_ID,
-    FileSource,
-    brief,
-    check_not_pickled,
-    file_size,
-    read_json,
-    safe_join,
-    tensor_shapes,
-    texts_in,
-)  # fmt: skip
+from accerl_lerobot.checkpoint.layout import BACKBONE, PREPROCESSOR, check_names
+from accerl_lerobot.checkpoint.safety import FileSource, brief, check_folder, read_json, safe_join, texts_in
 from accerl_lerobot.errors import InputError, causes, expanded
 
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
@@ -49,9 +32,6 @@ OURS, VALUE_HEAD, FAMILY = "accerl.json", "value_head.safetensors", "family.safe
 FILES = ("*.json", WEIGHTS, ADAPTER, "*processor_step_*.safetensors", VALUE_HEAD, FAMILY, f"{BACKBONE}/*")
 """Files that are fetched of a checkpoint on the Hub."""
 PROCESSORS = (PREPROCESSOR, "policy_postprocessor.json")
-BEFORE_PROCESSORS = re.compile(r"(un)?normalize_\w+\.buffer_")
-"""Names of statistics among the weights of a policy that LeRobot saved before it had processors."""
-MIGRATION = "lerobot.processor.migrate_policy_normalization"
 LARGE = 2**16  # numbers of a tensor that is not filled, see `Unfilled`
 FILLS = frozenset((
     "normal_", "uniform_", "zero_", "fill_", "erfinv_", "trunc_normal_", "constant_", "ones_", "zeros_",
@@ -76,87 +56,60 @@ def fetched_checkpoint(path: str, revision: str | None, field: str) -> Path:
             raise InputError(field, path, hint) from error
     if not (folder / CONFIG).is_file():
         raise InputError(field, path, "no config.json there; give the folder named pretrained_model")
-    try:
-        check_checkpoint(folder, FileSource(field, path), fetched=not local)
-    except InputError:
-        raise
-    except Exception as error:  # its files may hold anything
-        raise InputError(field, path, f"not a checkpoint that LeRobot has saved ({brief(error)})") from error
+    source = FileSource(field, path)
+    with refusing(source, "not a checkpoint that LeRobot has saved"):
+        check_checkpoint(folder, source, fetched=not local)
     return folder
 
 
-def check_checkpoint(folder: Path, origin: FileSource, *, fetched: bool = False) -> None:
-    """Checks all files of a LeRobot checkpoint that are read, before they are.
+def check_checkpoint(folder: Path, source: FileSource, *, fetched: bool = False) -> None:
+    """Checks links, processors, configs and the kind of weights of a checkpoint, before they are read.
 
     One that was `fetched` from the Hub must not name folders of this machine.
     """
-    for name in (CONFIG, ADAPTER_CONFIG, *PROCESSORS, WEIGHTS, ADAPTER, VALUE_HEAD, FAMILY, OURS, BACKBONE):
-        safe_join(folder, name, origin)
-    weights = ADAPTER if is_adapter(folder) else WEIGHTS
-    config = read_json(folder / CONFIG, origin)
-    for key, own in CONFIG_FOLDERS.items():
-        check_name(config.get(key), folder / own, f"{CONFIG}: {key}", origin)
+    check_folder(folder, source)
     for name in PROCESSORS:
         if (folder / name).exists():
-            check_processor(folder, name, origin)
-    check_not_pickled(folder, weights, origin)
-    stored = tensor_shapes(folder / weights, origin)
-    if not (folder / PREPROCESSOR).exists() and any(map(BEFORE_PROCESSORS.match, stored)):
-        convert = f"python -m {MIGRATION} --pretrained-path={origin.value} --output-dir=NEW"
-        why = "holds the statistics, as LeRobot saved them before it had processors"
-        raise origin.refuse(weights, f"{why}; convert it, and use what {convert} writes")
-    _check_beside(folder, origin)
+            check_processor(folder, name, source)
+    for path in sorted(folder.rglob(CONFIG)):
+        for key, text in texts_in(read_json(path, source)):
+            if "attn_implementation" in key and "/" in text:
+                name = path.relative_to(folder).as_posix()
+                raise source.refuse(name, f"{key} names code on the Hub; use sdpa or eager")
+    weights = ADAPTER if is_adapter(folder) else WEIGHTS
+    if not (folder / weights).is_file():
+        raise source.refuse(weights, "is missing; give a folder with the weights as safetensors")
     if fetched:
-        check_names(folder, origin)
+        check_names(folder, source)
 
 
 def is_adapter(folder: Path) -> bool:
     """True for an adapter of LeRobot's PEFT training, which is loaded on top of another checkpoint."""
-    if not (folder / ADAPTER_CONFIG).is_file():
-        return False
-    config = read_json(folder / CONFIG, FileSource("path", str(folder)))
-    return bool(config.get("use_peft")) or not (folder / WEIGHTS).is_file()
+    return (folder / ADAPTER_CONFIG).is_file() and not (folder / WEIGHTS).is_file()
 
 
-def check_processor(folder: Path, name: str, origin: FileSource) -> None:
+def check_processor(folder: Path, name: str, source: FileSource) -> None:
     """Checks a processor file: only LeRobot's registered steps, with state files in this folder."""
-    for step in read_json(folder / name, origin).get("steps", []):
-        kind, options = step.get("registry_name"), dict(step.get("config", {}))
-        if not isinstance(kind, str) or "class" in step:
+    for step in read_json(folder / name, source).get("steps", []):
+        if not isinstance(step.get("registry_name"), str) or "class" in step:
             hint = "only steps with a registry_name are loaded: LeRobot would import and call this class"
-            raise origin.refuse(f"{name}: {str(step.get('class'))[:60]}", hint)
+            raise source.refuse(f"{name}: {str(step.get('class'))[:60]}", hint)
         if "state_file" in step:
-            safe_join(folder, step["state_file"], origin)
-        if kind in STEP_FOLDERS:
-            option, own = STEP_FOLDERS[kind]
-            check_name(options.get(option), folder / own, f"{name}: {option}", origin)
+            safe_join(folder, step["state_file"], source)
 
 
-def check_name(name: Any, own: Path, what: str, origin: FileSource) -> None:
-    """Checks that a backbone or tokeniser has the form of a Hub id, or is a folder.
-
-    `own` is the checkpoint's own folder of it; `what` says file and key, for the error.
-    """
-    if name is None or (isinstance(name, str) and HUB_ID.fullmatch(name)):
-        return
-    if not isinstance(name, str) or not Path(name).is_absolute():
-        raise origin.refuse(what, f"{str(name)[:80]!r} is neither a Hub id nor an absolute path")
-    if ".." in Path(name).parts and not own.is_dir():
-        raise origin.refuse(what, f"{name[:80]!r} leads elsewhere; name the folder without ..")
-
-
-def _check_beside(folder: Path, origin: FileSource) -> None:
-    """The backbone's own folder: links, what is no file, attention that is compiled code on the Hub."""
-    for path in sorted((folder / BACKBONE).rglob("*")):
-        name = path.relative_to(folder).as_posix()
-        safe_join(folder, name, origin)
-        if path.is_dir():
-            continue
-        file_size(path, origin)
-        content = read_json(path, origin) if path.name == CONFIG else {}
-        for _, key, text in texts_in(content):
-            if "attn_implementation" in key and "/" in text:
-                raise origin.refuse(name, f"{key} names code on the Hub; use sdpa or eager")
+@contextlib.contextmanager
+def refusing(source: FileSource, what: str) -> Iterator[None]:
+    """Makes one line of whatever is raised: LeRobot takes files at their word, and may fail over any."""
+    try:
+        yield
+    except Exception as error:
+        ours = input_error(error)
+        if ours is error:
+            raise
+        if ours is not None:
+            raise ours from error
+        raise InputError(source.field, source.value, f"{what} ({reason(error)})") from error
 
 
 @contextlib.contextmanager
@@ -226,4 +179,4 @@ def input_error(error: BaseException) -> InputError | None:
 def reason(error: BaseException) -> str:
     """An error's words; of one that draccus wraps, those of the error itself."""
     wrapped = isinstance(error, draccus.utils.DraccusException)
-    return brief(list(causes(error))[-1] if wrapped else error)
+    return brief(list(causes(error))[-1] if wrapped else error, 400)

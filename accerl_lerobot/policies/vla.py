@@ -210,7 +210,8 @@ def data_only() -> Iterator[None]:
     from lerobot.processor import tokenizer_processor
     from transformers import AutoTokenizer
 
-    load, never = AutoTokenizer.from_pretrained, {"trust_remote_code": False}
+    load = AutoTokenizer.from_pretrained
+    never = {"trust_remote_code": False}
     text = SimpleNamespace(from_pretrained=lambda name, **options: load(name, **options | never))
     ours: dict[str, Any] = {"AutoProcessor": FastTokenizer, "AutoTokenizer": text}
     with patch.multiple(modeling_pi0_fast, **ours), patch.multiple(tokenizer_processor, **ours):
@@ -224,32 +225,33 @@ class Pi0Fast(TokenModel):
 
     def __init__(self, policy: Any) -> None:
         super().__init__(policy)
-        config, tokenizer = policy.config, policy._paligemma_tokenizer
+        config = policy.config
         if config.temperature != 0:
             hint = "LeRobot's sampler has to be greedy here: set it to 0 in config.json; exploration has a "
             hint += "policy.sampler.temperature"
             raise NoDensityError("policy.temperature", config.temperature, hint)
-        if config.n_action_steps != (rows := config.chunk_size):
+        rows = config.chunk_size
+        if config.n_action_steps != rows:
             # The coefficients of K rows, read as those of fewer, are another, faster and larger movement.
             hint = f"LeRobot decodes so many rows from the coefficients of {rows}; use {rows}"
             raise InputError("policy.n_action_steps", config.n_action_steps, hint)
         config.validate_action_token_prefix = False
         logging.root.addFilter(_decodable)
         self.length = config.max_decoding_steps
-        self.terminator = tokenizer.convert_tokens_to_ids(END)
+        self.terminator = policy._paligemma_tokenizer.convert_tokens_to_ids(END)
         paligemma = policy.model.paligemma_with_expert.paligemma
         self.width = paligemma.model.language_model.config.hidden_size
-        if len(tokenizer) < paligemma.lm_head.out_features:
-            known = f"{len(tokenizer)} of the {paligemma.lm_head.out_features} tokens the policy writes"
-            raise InputError("policy.text_tokenizer_name", config.text_tokenizer_name, f"knows only {known}")
 
     def encode(self, batch: dict[str, Tensor]) -> Encoded:
         """The features are the prefix's: images, prompt, BOS."""
-        model, network = self.policy.model, self.policy.model.paligemma_with_expert
+        model = self.policy.model
+        network = model.paligemma_with_expert
         images, image_masks = self.policy._preprocess_images(batch)
-        prompt, known = batch[OBS_LANGUAGE_TOKENS], batch[OBS_LANGUAGE_ATTENTION_MASK]
+        prompt = batch[OBS_LANGUAGE_TOKENS]
+        known = batch[OBS_LANGUAGE_ATTENTION_MASK]
         bos = torch.full_like(prompt[:, :1], self.policy._paligemma_tokenizer.bos_token_id)
-        prompt, known = torch.cat([prompt, bos], 1), torch.cat([known, torch.ones_like(known[:, :1])], 1)
+        prompt = torch.cat([prompt, bos], 1)
+        known = torch.cat([known, torch.ones_like(known[:, :1])], 1)
         embedded, pad, att, _, _ = model.embed_prefix_fast(images, image_masks, prompt, known)
         mask = prepare_attention_masks_4d(att, dtype=embedded.dtype)
         features, cache = _run(network, embedded, mask, torch.cumsum(pad, dim=1) - 1)

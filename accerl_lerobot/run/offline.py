@@ -47,7 +47,7 @@ def learn_offline(config: OfflineRun, directory: Path, console: Console) -> dict
     started = time.monotonic()
     torch.manual_seed(config.seed)
     torch.set_num_threads(config.trainer.num_threads)
-    policy, meta = learning_config(config.policy, imitates=True), open_metadata(config.dataset)
+    policy, meta = learning_config(config.policy), open_metadata(config.dataset)
     shapes = _check(config, policy, meta)
     # One step for each update, instead of so many for each new decision.
     assert isinstance(config.algorithm, OffPolicyConfig)

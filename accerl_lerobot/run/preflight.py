@@ -304,20 +304,19 @@ def policy_to_be(config: RunConfig) -> Any:
     from accerl_lerobot.policies.config import check_observations, override, sampler_config
     from accerl_lerobot.policies.loading import learning_config
 
-    imitates = isinstance(config.algorithm, OffPolicyConfig)
     if config.policy.path is not None:
-        return learning_config(config.policy, imitates=imitates)
+        return learning_config(config.policy)
     if config.sft.init_path is not None:  # fine-tuning changes its weights alone
         start = replace(config.policy, path=config.sft.init_path, revision=None)
         try:
-            return learning_config(start, fine_tuned=True, imitates=imitates)
+            return learning_config(start, fine_tuned=True)
         except InputError as error:
             if error.field not in ("policy.path", "policy.type", "policy.n_obs_steps"):
                 raise
             what = "" if error.field == "policy.path" else f"{error.field.partition('.')[2]}={error.value}: "
             raise InputError("sft.init_path", start.path, what + error.hint) from error
     policy_config = check_sft_policy(config.sft)
-    sampler_config(config.policy, config.sft.policy["type"], "sft.policy.type")
+    sampler_config(config.policy, config.sft.policy["type"])
     override(policy_config, config.policy)
     check_observations(policy_config, "sft.policy.n_obs_steps")
     return policy_config
@@ -359,18 +358,13 @@ def sft_policy(config: SFTConfig) -> Any:
     from lerobot.configs.policies import PreTrainedConfig
 
     from accerl_lerobot.checkpoint.safety import FileSource, read_json
-    from accerl_lerobot.policies.config import check_sizes, register_policies
-    from accerl_lerobot.policies.peft_adapters import weights_folder
-    from accerl_lerobot.policies.untrusted import CONFIG, fetched_checkpoint, reason
+    from accerl_lerobot.policies.config import register_policies
+    from accerl_lerobot.policies.loading import weights_folder
+    from accerl_lerobot.policies.untrusted import CONFIG, fetched_checkpoint, refusing
 
     folder = fetched_checkpoint(config.init_path, None, "sft.init_path")
     origin = FileSource("sft.init_path", config.init_path)
     weights_folder(folder, origin)  # what an adapter is for
     register_policies(str(read_json(folder / CONFIG, origin).get("type")))
-    try:
-        policy = PreTrainedConfig.from_pretrained(folder)
-    except Exception as error:  # LeRobot takes the file at its word, and may fail over any of it
-        hint = f"its config.json is not one of this LeRobot's policies ({reason(error)})"
-        raise InputError("sft.init_path", config.init_path, hint) from error
-    check_sizes(policy, origin)
-    return policy
+    with refusing(origin, "its config.json is not one of this LeRobot's policies"):
+        return PreTrainedConfig.from_pretrained(folder)

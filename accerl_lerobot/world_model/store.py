@@ -20,14 +20,7 @@ from lerobot.configs.rewards import RewardModelConfig
 from safetensors.torch import save_file
 
 from accerl_lerobot.checkpoint.layout import write_atomically
-from accerl_lerobot.checkpoint.safety import (
-    FileSource,
-    brief,
-    check_not_pickled,
-    read_json,
-    read_tensors,
-    safe_join,
-)
+from accerl_lerobot.checkpoint.safety import FileSource, brief, read_json, read_tensors, safe_join
 from accerl_lerobot.config.parsing import DISCOVER, discover
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import task_codes
@@ -124,7 +117,6 @@ def load_world_model(
 
 def _filled[M: torch.nn.Module](what: str, make: Callable[[], M], directory: Path, origin: FileSource) -> M:
     """A new model with the weights in `directory`."""
-    check_not_pickled(directory, WEIGHTS, origin)
     weights = safe_join(directory, WEIGHTS, origin)
     try:
         with Unfilled():

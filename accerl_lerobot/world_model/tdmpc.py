@@ -21,10 +21,10 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.policies.adapter import IMAGES, Processing
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.features import STATE
 from accerl_lerobot.policies.loading import load_network
+from accerl_lerobot.policies.processing import IMAGES, Processing
 from accerl_lerobot.world_model.config import TDMPCStateConfig
 from accerl_lerobot.world_model.latent import shifted
 from accerl_lerobot.world_model.states import Observations, StateModel, StateSpec, Transitions

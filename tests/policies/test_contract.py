@@ -17,8 +17,9 @@ import torch
 from torch import Tensor
 
 from accerl_lerobot.experience import Observation, Request, stack_observations
-from accerl_lerobot.policies.adapter import LeRobotAdapter, Processing
+from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.config import POLICIES, PolicyConfig, SamplerConfig
+from accerl_lerobot.policies.processing import Processing
 from accerl_lerobot.policies.saving import save_pretrained
 from accerl_lerobot.testing import check_batches, check_gradient, check_saved, log_ratio, perturb, stored
 from tests.policies.cases import CASES, VARIANTS, Case

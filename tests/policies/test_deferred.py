@@ -7,8 +7,6 @@ import sys
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
-import pytest
-
 from accerl_lerobot.policies.deferred import OURS, _distributions
 
 CODE = """
@@ -32,12 +30,6 @@ assert "lerobot.policies.groot.processor_groot" in sys.modules
 def test_one_policy_is_imported_without_the_others(tiny_checkpoint: Path):
     command = [sys.executable, "-c", CODE, str(tiny_checkpoint)]
     subprocess.run(command, check=True, timeout=300, env=os.environ | {OURS: "1"})
-
-
-def test_whoever_calls_us_has_all_of_lerobot(tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.delenv(OURS, raising=False)
-    code = CODE.replace('["smolvla"]', '["smolvla", "act", "groot"]')
-    subprocess.run([sys.executable, "-c", code, str(tiny_checkpoint)], check=True, timeout=300)
 
 
 def test_distributions_are_those_that_python_finds():

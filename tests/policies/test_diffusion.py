@@ -17,14 +17,11 @@ from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.experience import TASK, Request, stack_observations
 from accerl_lerobot.policies.config import DiffusionSamplerConfig, PolicyConfig
 from accerl_lerobot.policies.family import Family
-from accerl_lerobot.rollout.runner import EpisodePlans, RolloutConfig
-from accerl_lerobot.rollout.worker import RolloutWorker
 from accerl_lerobot.run import train as run
 from tests.policies.checkpoints import write_diffusion
 from tests.policies.tiny import adapter_at, requests
 from tests.rounding import assert_close
 from tests.runs import tiny_run
-from tests.transport.played import played
 
 
 def ask(count: int, **options: bool) -> list[Request]:
@@ -137,25 +134,3 @@ def test_a_run_asks_the_policy_how_far_it_looks_back(looking: Path, tmp_path: Pa
     config = config_for(looking, tmp_path / "run")
     summary = run.Run(config, run.make_output_dir(config), Console()).execute()
     assert summary["updates"] == 3 and summary["n_after"] == 4 and summary["ratio_max_dev"] < 1
-
-
-def test_a_world_without_a_history_is_refused_in_words(looking: Path):
-    request = requests(1, image=40)[0]
-    with pytest.raises(ValueError, match="but the policy reads 2 env steps at a time: make environments"):
-        adapter_at(looking).decide([request], 0)
-
-
-def test_a_rollout_process_asks_with_the_history():
-    worker = RolloutWorker(WORLD, RolloutConfig(environments=1), history=OBSERVED)
-    worker.ready(EpisodePlans(("match",), 0, None))
-    asked: list[Request] = []
-
-    def decide(due: list[Request]) -> list[Request]:
-        asked.extend(due)
-        raise InterruptedError
-
-    worker.report(True, [])
-    with pytest.raises(InterruptedError):
-        worker.run(played(decide), played(lambda segments: True))
-    assert asked[0].observation[STATE].shape == (OBSERVED, 4)
-    assert asked[0].observation["observation.images.front"].shape == (OBSERVED, 40, 40, 3)

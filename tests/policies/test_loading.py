@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import pickle
 import shutil
 from collections.abc import Callable
@@ -18,17 +17,13 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from accerl_lerobot import load_policy
 from accerl_lerobot.checkpoint.layout import BACKBONE, FAST, PRETRAINED, displaced, relocate, save_checkpoint
-from accerl_lerobot.demos.sft import SFTConfig
 from accerl_lerobot.engines.config import RunConfig, parse
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE, stack_observations
 from accerl_lerobot.policies.config import FlowSamplerConfig, PolicyConfig, SamplerConfig
 from accerl_lerobot.policies.loading import load_adapter, load_lerobot_config, precision_on, resolve_device
 from accerl_lerobot.policies.saving import save_pretrained
-from accerl_lerobot.policies.untrusted import MIGRATION
-from accerl_lerobot.run.preflight import sft_policy
 from accerl_lerobot.testing import perturb
 from tests.hub_cache import cached_repo
 from tests.policies.cases import CASES
@@ -85,13 +80,6 @@ def test_a_path_to_nothing(path: str | None, sentence: str):
     with pytest.raises(InputError) as caught:
         load_lerobot_config(PolicyConfig(path=path))
     assert str(caught.value).startswith(sentence) and "\n" not in str(caught.value)
-
-
-def test_a_policy_of_an_unknown_type(damaged: Any):
-    path = damaged("act")
-    edit_config(path, type="my_policy")
-    why = f"{path} is of this type: no such policy type here; install the package that has it"
-    refused(path, f"policy.type='my_policy': {why}")
 
 
 @pytest.mark.parametrize(
@@ -191,33 +179,31 @@ PALI = "model.paligemma_with_expert.paligemma."
 EMBEDDING, HEAD = f"{PALI}model.language_model.embed_tokens.weight", f"{PALI}lm_head.weight"
 
 
-def with_nan(tensors: Tensors, key: str) -> None:
-    tensors[key].view(-1)[0] = float("nan")
+MISSING = r"1 missing \['{key}'\], 0 unexpected \[\]"
 
 
-@pytest.mark.parametrize(("name", "key"), [("smolvla", OUT), ("pi0", OUT), ("pi0_fast", HEAD)])
 @pytest.mark.parametrize(
-    ("damage", "detail"),
+    ("name", "key", "damage", "detail"),
     [
-        (lambda t, key: t.pop(key), r"1 tensors missing \['{key}'\], 0 unexpected \[\]"),
-        (lambda t, key: t.update(x=torch.zeros(2)), r"0 tensors missing \[\], 1 unexpected \['(model.)?x'\]"),
-        (lambda t, key: t.update({key: torch.zeros(3, 3)}), r"size mismatch for {key}, \(3, 3\) in the file"),
-        (with_nan, "model.safetensors: {key} holds NaN or infinity"),
+        ("smolvla", OUT, lambda t: t.pop(OUT), MISSING),
+        ("pi0", OUT, lambda t: t.pop(OUT), MISSING),  # LeRobot prints it, and returns a random π0
+        ("pi0_fast", HEAD, lambda t: t.pop(HEAD), MISSING),
+        ("pi0", OUT, lambda t: t.update(x=torch.zeros(2)), r"1 unexpected \['model.x'\]"),
+        ("smolvla", OUT, lambda t: t.update({OUT: torch.zeros(3, 3)}), r"1 of another shape \['{key}'\]"),
+        ("smolvla", OUT, lambda t: t[OUT].view(-1)[0].fill_(torch.nan), "{key} holds NaN or infinity"),
     ],
-    ids=["missing", "unexpected", "shape", "nan"],
-)  # fmt: skip
+)
 def test_weights_that_did_not_load_are_named(
     damaged: Any, name: str, key: str, damage: Callable[..., object], detail: str
 ):
     path = damaged(name)
-    edit_weights(path, lambda tensors: damage(tensors, key))
-    refused(path, f"policy.path=.*: {detail.replace('{key}', key)}")
+    edit_weights(path, damage)
+    refused(path, f"policy.path=.*: .*{detail.replace('{key}', key)}")
 
 
-@pytest.mark.parametrize("name", ["smolvla", "pi0"])  # LeRobot prints it, and returns a random π0
 @pytest.mark.parametrize(("content", "why"), [(None, "is missing"), (b"not tensors", "not safetensors")])
-def test_a_weights_file_that_is_none(damaged: Any, name: str, content: bytes | None, why: str):
-    path = damaged(name)
+def test_a_weights_file_that_is_none(damaged: Any, content: bytes | None, why: str):
+    path = damaged("pi0")
     (path / "model.safetensors").unlink()
     if content is not None:
         (path / "model.safetensors").write_bytes(content)
@@ -244,7 +230,7 @@ def test_openpi_s_names_are_read_as_lerobot_reads_them(damaged: Any, name: str):
     edit_weights(path, as_openpi)
     assert decided(path) == expected
     edit_weights(path, lambda t: t.pop("action_in_proj.bias"))
-    refused(path, r"policy.path=.*1 tensors missing \['model.action_in_proj.bias'\]")
+    refused(path, r"policy.path=.*1 missing \['model.action_in_proj.bias'\]")
 
 
 def test_a_shared_embedding_is_read_as_lerobot_reads_it(damaged: Any):
@@ -255,57 +241,11 @@ def test_a_shared_embedding_is_read_as_lerobot_reads_it(damaged: Any):
     assert decided(path) == expected
 
 
-@pytest.mark.parametrize(
-    ("name", "changes", "sentence"),
-    [
-        ("act", {"n_action_steps": 0}, "n_action_steps=0: use a whole number in"),
-        ("act", {"n_action_steps": -3}, "n_action_steps=-3: use a whole number in"),
-        ("act", {"chunk_size": 10**9}, "chunk_size=1000000000: use a whole number in"),
-        ("act", {"n_obs_steps": 0}, "n_obs_steps=0|Multiple observation steps not handled"),
-        ("act", {"n_action_steps": 6}, "The chunk size is the upper bound"),
-        ("smolvla", {"num_steps": 0}, "num_steps=0: use a whole number in"),
-        ("smolvla", {"max_action_dim": 0}, "max_action_dim=0: use a whole number in"),
-        ("pi05", {"num_inference_steps": 0}, "num_inference_steps=0: use a whole number in"),
-        ("diffusion", {"n_obs_steps": 0}, "n_obs_steps=0: use a whole number in"),
-        ("diffusion", {"n_action_steps": 8}, "n_action_steps=8: use 1 to 7, the chunk it predicts"),
-    ],
-)
-def test_numbers_that_divide_or_shape_are_refused(damaged: Any, name: str, changes: dict, sentence: str):
-    path = damaged(name)
-    edit_config(path, **changes)
-    for field in ("policy.path", "sft.init_path"):
-        with pytest.raises(InputError, match=f"^{field}='.*': .*({sentence})"):
-            if field == "policy.path":
-                load_lerobot_config(PolicyConfig(path=str(path), device="cpu"))
-            else:
-                sft_policy(SFTConfig(init_path=str(path)))
-
-
-def test_a_checkpoint_from_before_the_processors_is_to_be_converted(damaged: Any):
-    path = damaged("act")
-    edit_weights(path, lambda t: t.update({"normalize_inputs.buffer_observation_state.mean": torch.zeros(4)}))
-    refused(path, ".*1 unexpected")  # with processors it is another mistake
-    (path / PROCESSOR).unlink()
-    convert = f"python -m {MIGRATION} --pretrained-path={path} --output-dir=NEW"
-    refused(path, f"policy.path=.*holds the statistics, as LeRobot saved them before .*{convert}")
-    assert locate(MIGRATION) is not None
-
-
-def test_statistics_are_numbers(damaged: Any):
-    path = damaged("smolvla")
-    (file,) = path.glob("policy_preprocessor*.safetensors")
-    tensors = load_file(file)
-    tensors["observation.state.mean"].view(-1)[-1] = float("nan")
-    save_file(tensors, file)
-    refused(
-        path, f"policy.path='{path}': {file.name}: observation.state.mean holds NaN or infinity; train it"
-    )
-
-
 def test_missing_processors(damaged: Any):
     path = damaged("act")
     (path / PROCESSOR).unlink()
-    refused(path, "policy.path=.*its LeRobot processors did not load")
+    refused(path, "policy.path=.*its LeRobot processors did not load; .*migrate_policy_normalization")
+    assert locate("lerobot.processor.migrate_policy_normalization") is not None
 
 
 def test_torchvision_s_weights_are_not_asked_for(
@@ -329,8 +269,6 @@ def test_torchvision_s_weights_are_not_asked_for(
     [
         ("act", "act.modeling_act.ACTPolicy.predict_action_chunk"),
         ("smolvla", "smolvla.modeling_smolvla.SmolVLAPolicy.predict_action_chunk"),
-        ("pi0", "pi0.modeling_pi0.PI0Policy.predict_action_chunk"),
-        ("pi05", "pi05.modeling_pi05.PI05Policy.predict_action_chunk"),
         ("diffusion", "diffusion.modeling_diffusion.DiffusionPolicy.predict_action_chunk"),
         ("pi0_fast", "pi0_fast.modeling_pi0_fast.PI0FastPolicy.predict_action_chunk"),
         ("pi0_fast", "pi0_fast.modeling_pi0_fast.PI0FastPytorch.sample_actions_fast_kv_cache"),
@@ -455,20 +393,11 @@ def test_the_critic_is_saved_and_loaded(written: Any, tmp_path: Path, caplog: py
     assert caplog.text == ""
 
 
-def test_another_sampler_is_pointed_out(written: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture):
+def test_how_it_explored_is_noted(written: Any, tmp_path: Path):
     sampler = FlowSamplerConfig(noise_level=0.4)
     path = saved(written("smolvla"), tmp_path / "saved", sampler=sampler)
     stored = json.loads((path / "accerl.json").read_text())["sampler"]
-    assert stored == draccus.encode(sampler, SamplerConfig)
-    assert stored["type"] == "flow" and stored["noise_level"] == 0.4
-    with caplog.at_level(logging.WARNING):
-        adapter_at(path, sampler)
-        assert caplog.text == ""
-        adapter_at(path, FlowSamplerConfig(noise_level=0.2))
-        assert "policy.sampler.noise_level=0.2, there 0.4" in caplog.text
-        caplog.clear()
-        load_policy(path, device="cpu")  # it does not explore
-    assert caplog.text == ""
+    assert stored == draccus.encode(sampler, SamplerConfig) and stored["type"] == "flow"
 
 
 REMOTE_CODE = """
@@ -515,20 +444,13 @@ def named(path: Path) -> set[str]:
     }
 
 
-@pytest.mark.parametrize(
-    ("name", "sentence"),
-    [
-        ("pi0", f"its LeRobot processors did not load; .*into {BACKBONE}/ beside config"),
-        ("pi05", f"its LeRobot processors did not load; .*into {BACKBONE}/ beside config"),
-        ("pi0_fast", "its network cannot be built .*Failed to load required tokenizers"),
-    ],
-)
+@pytest.mark.parametrize("name", ["pi0", "pi05", "pi0_fast"])
 def test_lerobot_s_checkpoint_needs_the_hub_and_ours_does_not(
-    name: str, sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     original = write_pi(tmp_path / "original", name, num_steps=8, whole=False)
     assert not (original / BACKBONE).exists()
-    refused(original, f"policy.path=.*{sentence}")
+    refused(original, "policy.path=.*its LeRobot processors did not load")
     with hub(tmp_path / "original-hub"):
         marker = remote(tmp_path / "original-hub", monkeypatch)
         adapter = adapter_at(original)
@@ -564,15 +486,7 @@ def test_tokenisers_named_by_their_path_move_along(damaged: Any, tmp_path: Path)
     relocate(path, path)
     assert not displaced(path)
     shutil.rmtree(path / BACKBONE)
-    refused(path, f"policy.path=.*its tokeniser was in {path}/.*, which is gone; put a copy into")
-
-
-def test_a_tokeniser_with_too_few_tokens(damaged: Any):
-    path = damaged("pi0_fast")
-    state = json.loads((path / BACKBONE / "tokenizer.json").read_text())
-    del state["model"]["vocab"]["<loc0399>"]
-    (path / BACKBONE / "tokenizer.json").write_text(json.dumps(state))
-    refused(path, "policy.text_tokenizer_name=.*knows only 399 of the 400 tokens")
+    refused(path, f"policy.path=.*its files were in {path}/.*, which is gone; put a copy into")
 
 
 def test_what_lerobot_forgets_of_its_action_tokeniser_is_put_back(written: Any):

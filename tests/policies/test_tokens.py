@@ -36,7 +36,7 @@ class Recurrent(TokenModel):
         self.decoder = torch.randn(LENGTH, VOCABULARY, 2, generator=draw)
         self.out += perturbation * torch.randn(VOCABULARY, WIDTH, generator=draw)
         self.embedding += perturbation * torch.randn(VOCABULARY, WIDTH, generator=draw)
-        self.late, self.calls = late, 0
+        self.late = late
 
     def encode(self, batch: dict[str, Tensor]) -> Encoded:
         start = batch["observation"]
@@ -44,7 +44,6 @@ class Recurrent(TokenModel):
 
         def logits(tokens: Tensor) -> Tensor:
             h, rows = start, []
-            self.scored = tokens.shape[1]
             for position in range(tokens.shape[1]):
                 rows.append(h @ self.out.T)
                 fed = tokens[:, max(0, position - self.late)]  # `late`: as if trained in another layout
@@ -54,7 +53,6 @@ class Recurrent(TokenModel):
         def generate(choose: tk.Choose) -> None:
             h = start
             for position in range(LENGTH):
-                self.calls += 1
                 chosen = choose(h @ self.out.T, position)
                 assert chosen.dtype == torch.int64
                 if (chosen == END).all():
@@ -230,28 +228,6 @@ def test_nothing_after_the_terminator_counts():
     assert all(map(torch.equal, again, score))
 
 
-def test_positions_at_which_all_have_ended_are_not_computed():
-    model = Recurrent()
-    tokens_family, read = family(model), encoded(model, observations(2))
-    score, entropy = tokens_family.score(read, {"tokens": torch.tensor([[END, END, END], [1, END, END]])})
-    assert model.scored == 2 and score.shape == (2, LENGTH) and not score[:, 2].any()
-    other, another = tokens_family.score(read, {"tokens": torch.tensor([[END, END, END], [1, 0, 2]])})
-    assert model.scored == LENGTH
-    assert torch.equal(score[0], other[0]) and entropy[0] == another[0]
-    assert torch.equal(score[1, :1], other[1, :1])
-
-
-def test_generation_ends_when_all_have_ended():
-    model = Recurrent()
-    model.out[END] = 0.0
-    model.out[END, 0] = 100.0
-    starts = observations(3)
-    starts[:, 0] = 1.0
-    action = family(model).act(encoded(model, starts), requests(3))
-    assert model.calls == 1 and action.latent["tokens"].tolist() == [[END] * LENGTH] * 3
-    assert (action.log_prob[:, 0] > -1e-5).all() and not action.log_prob[:, 1:].any()
-
-
 @pytest.mark.parametrize("kind", MODELS)
 def test_weighted_samples_of_mu_are_samples_of_pi(kind: Any):
     old, new, start, count = kind(), kind(0.3), observations(1, seed=1), 20_000
@@ -325,9 +301,3 @@ def test_other_tokens_behind_the_same_chunk_are_caught():
     assert family(model).difference(batch, model.encode(batch)) == 0.0
     said[2, 0] = (said[2, 0] + 1) % VOCABULARY
     assert family(model).difference(batch, model.encode(batch)) >= 1.0
-
-
-def test_nan_logits_are_visible_in_the_log_prob_and_break_nothing():
-    model = Parallel()
-    action = family(model).act(encoded(model, torch.full((2, WIDTH), torch.nan)), requests(2))
-    assert torch.isnan(action.log_prob).all() and (action.latent["tokens"] < VOCABULARY).all()

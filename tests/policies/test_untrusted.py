@@ -8,6 +8,7 @@ import pickle
 import shutil
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from accerl_lerobot.checkpoint.safety import FileSource
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies import loading
 from accerl_lerobot.policies.config import PolicyConfig
-from accerl_lerobot.policies.loading import dry_run, dry_run_config, load_adapter
+from accerl_lerobot.policies.loading import dry_run_config, load_adapter
 from accerl_lerobot.policies.saving import save_pretrained
 from accerl_lerobot.policies.untrusted import Unfilled, check_checkpoint, guarded
 from tests.hub_cache import cached_repo
@@ -80,57 +81,38 @@ def test_a_state_file_lies_in_the_folder(copied: Path, tmp_path: Path):
     refused(copied, "a link that leads out of the folder")
 
 
-@pytest.mark.parametrize(
-    "name", ["config.json", PRE, "model.safetensors", "value_head.safetensors", "accerl.json"]
-)
+@pytest.mark.parametrize("name", ["config.json", "model.safetensors"])
 def test_links_out_of_the_folder(copied: Path, tmp_path: Path, name: str):
     (copied / name).rename(tmp_path / "outside")
     (copied / name).symlink_to(tmp_path / "outside")
     refused(copied, f"{name}: a link that leads out")
 
 
-def test_backbones_are_not_fetched_from_just_anywhere(copied: Path):
-    refusals = {
-        "neither a Hub id nor an absolute path": (
-            "../../secret",
-            "./secret",
-            "a/b/c",
-            "https://example.com/x",
-            7,
-        ),
-        "leads elsewhere": ("/a/../secret",),
-        "may not name": ("/somewhere/secret",),
-    }
-    for why, names in refusals.items():
-        for name in names:
-            edit_config(copied, vlm_model_name=name)
-            where = f"^policy.path='theirs': config.json: vlm_model_name: .*{why}"
-            with pytest.raises(InputError, match=where):
-                check_checkpoint(copied, ORIGIN, fetched=True)
-    for name, fetched in (("google/paligemma-3b-pt-224", True), ("gpt2", True), ("/somewhere/mine", False)):
+def test_a_checkpoint_from_the_hub_names_no_folder_of_this_machine(copied: Path):
+    for name, refusal in (("../../secret", True), ("/somewhere/secret", True), ("google/paligemma", False)):
         edit_config(copied, vlm_model_name=name)
-        check_checkpoint(copied, ORIGIN, fetched=fetched)
+        check_checkpoint(copied, ORIGIN)
+        context: Any = nullcontext()
+        if refusal:
+            context = pytest.raises(InputError, match="^policy.path='theirs': config.json: vlm_model_name: ")
+        with context:
+            check_checkpoint(copied, ORIGIN, fetched=True)
 
 
-@pytest.mark.parametrize("files", [["pytorch_model.bin"], ["model.pt", "config.yaml"], ["policy.ckpt"]])
-def test_pickled_weights_only(copied: Path, files: list[str]):
-    (copied / "model.safetensors").unlink()
-    for name in files:
-        (copied / name).write_bytes(b"\x80\x04.")
-    refused(copied, f"model.safetensors: is missing, and {files[0]} is a pickle.*convert it to safetensors")
+def test_pickled_weights_are_not_read(copied: Path):
+    (copied / "model.safetensors").rename(copied / "pytorch_model.bin")
+    refused(copied, "model.safetensors: is missing; give a folder with the weights as safetensors")
 
 
-@pytest.mark.parametrize("key", ["attn_implementation", "_attn_implementation"])
-def test_attention_is_not_fetched_as_compiled_code(copied: Path, key: str):
+def test_attention_is_not_fetched_as_compiled_code(copied: Path):
+    key = "_attn_implementation"
     (copied / BACKBONE).mkdir()
     content = {"model_type": "smolvlm", "text_config": {key: "them/kernels"}}
     (copied / BACKBONE / "config.json").write_text(json.dumps(content))
     refused(copied, f"{key} names code on the Hub")
 
 
-@pytest.mark.parametrize(
-    "content", [{"steps": [7]}, {"steps": 7}, {"steps": [{"registry_name": "x", "config": 7}]}]
-)
+@pytest.mark.parametrize("content", [{"steps": [7]}, {"steps": 7}])
 def test_files_that_lerobot_has_not_saved_are_one_line(copied: Path, content: dict[str, Any]):
     (copied / PRE).write_text(json.dumps(content))
     refused(copied, "not a checkpoint that LeRobot has saved")
@@ -140,18 +122,23 @@ def test_a_checkpoint_is_tried_once_without_a_random_number_or_a_word(
     good: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     config = PolicyConfig(path=str(good), device="cpu")
+    load = loading.load_acting
+
+    def talkative(*given: Any, **options: Any) -> Any:
+        sys.stdout.write("a word of LeRobot's")
+        return load(*given, **options)
+
+    monkeypatch.setattr(loading, "load_acting", talkative)
     before = torch.get_rng_state()
     assert dry_run_config(config).type == "act"
-    assert torch.equal(torch.get_rng_state(), before)
-    dry_run(config, lambda adapter: sys.stdout.write("a word of LeRobot's"))
-    assert capsys.readouterr().out == ""
-    monkeypatch.setattr(loading, "dry_run", None)
+    assert torch.equal(torch.get_rng_state(), before) and capsys.readouterr().out == ""
+    monkeypatch.setattr(loading, "load_acting", None)
     assert dry_run_config(config).type == "act"
 
 
 def test_a_critic_of_another_size(copied: Path):
     shutil.copy(copied / "model.safetensors", copied / "value_head.safetensors")
-    refused(copied, "value_head.safetensors: it is no critic of this policy")
+    refused(copied, "value_head.safetensors: not of this policy; remove it to start anew")
 
 
 COMMIT, NEWER = "0" * 39 + "1", "0" * 39 + "2"

@@ -1,0 +1,183 @@
+# SPDX-License-Identifier: Apache-2.0
+"""LeRobot's processors of a checkpoint: names, tokenisers and the numbers that they normalise by.
+
+LeRobot passes a tensor on as it is where a normaliser has no statistics under its name. Here such a
+checkpoint is refused.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.policies.factory import make_pre_post_processors
+from torch import Tensor
+
+from accerl_lerobot.checkpoint.layout import CONFIG_FOLDERS, PREPROCESSOR, STEP_FOLDERS
+from accerl_lerobot.checkpoint.safety import FileSource, read_tensors, tensor_shapes
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.policies.features import ACTION, STATE, STATISTICS, pads, policy_features
+from accerl_lerobot.policies.untrusted import CONFIG, PROCESSORS
+
+logger = logging.getLogger(__name__)
+
+IMAGES = "observation.image"  # begins ``observation.images.<camera>``; LeRobot's name for a lone camera
+CONSTANT = 1e-6  # environment units in one normalised unit, below which an action counts as constant
+NORMALISERS = ("normalizer_processor", "unnormalizer_processor")
+
+
+@dataclass
+class Processing:
+    """LeRobot's pre- and post-processor, which tokenise and normalise, fed with raw observations."""
+
+    preprocessor: Any
+    postprocessor: Any
+    device: torch.device
+    rename_map: dict[str, str]
+
+    def prepare(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> dict[str, Tensor]:
+        """Normalised and tokenised observations."""
+        return self.preprocessor({"task": list(tasks), **self.tensors(observations)})
+
+    def tensors(self, observations: dict[str, np.ndarray]) -> dict[str, Tensor]:
+        """By the policy's names; images go from uint8 (..., H, W, 3) to float (..., 3, H, W) in [0, 1]."""
+        batch: dict[str, Tensor] = {}
+        for key, array in observations.items():
+            tensor = torch.from_numpy(np.ascontiguousarray(array)).to(self.device)
+            if key.startswith(IMAGES):
+                tensor = tensor.movedim(-1, -3).contiguous().float() / 255.0
+            batch[self.rename_map.get(key, key)] = tensor
+        return batch
+
+    def unnormalise(self, chunk: Tensor) -> Tensor:
+        """(B, K, A) from normalised to environment units."""
+        return self.postprocessor(chunk)
+
+    def normalise(self, chunk: Tensor) -> Tensor:
+        """(B, K, A) from environment to normalised units; every normalisation that LeRobot has is affine.
+
+        An action that is constant in the policy's dataset has no scale; it is 0.
+        """
+        ends = torch.stack([torch.zeros_like(chunk[0]), torch.ones_like(chunk[0])])
+        zero, one = self.unnormalise(ends.to(self.device)).to(chunk)
+        scale = one - zero
+        varies = scale.abs() > CONSTANT
+        return torch.where(varies, (chunk - zero) / torch.where(varies, scale, 1), 0)
+
+
+def load_processors(policy_config: Any, folder: Path, rename_map: dict[str, str]) -> Processing:
+    """The processors of a checkpoint that has been checked; `policy_config` is LeRobot's, with its device."""
+    device = policy_config.device
+    overrides: dict[str, dict[str, Any]] = {"device_processor": {"device": device}}
+    steps = stored_steps(folder, PREPROCESSOR)
+    for step in steps:
+        kind = step["registry_name"]
+        option, own = STEP_FOLDERS.get(kind, ("", ""))
+        if own and (folder / own).is_dir():
+            overrides[kind] = {option: str((folder / own).resolve())}
+        if kind == "action_tokenizer_processor":  # LeRobot does not save these two of its options
+            overrides.setdefault(kind, {}).update(
+                paligemma_tokenizer_name=policy_config.text_tokenizer_name,
+                fast_skip_tokens=policy_config.fast_skip_tokens,
+            )
+    pre, post = make_pre_post_processors(
+        policy_config, pretrained_path=str(folder), preprocessor_overrides=overrides
+    )
+    for loaded, step in zip(pre.steps, steps, strict=True):
+        option, _ = STEP_FOLDERS.get(step["registry_name"], ("", ""))
+        if option:  # what is saved has the names that the checkpoint has
+            setattr(loaded, option, step["config"].get(option))
+    return Processing(pre, post, torch.device(device), rename_map)
+
+
+def use_own_files(policy_config: Any, folder: Path, source: FileSource) -> None:
+    """Points LeRobot's policy config at the backbone and tokenisers in a checkpoint's folder."""
+    for field, own in CONFIG_FOLDERS.items():
+        if not hasattr(policy_config, field):
+            continue
+        if (folder / own).is_dir():
+            setattr(policy_config, field, str((folder / own).resolve()))
+        named = Path(getattr(policy_config, field))
+        if named.is_absolute() and not named.is_dir():
+            hint = f"its files were in {named}, which is gone; put a copy into {own}/ beside {CONFIG}"
+            raise InputError(source.field, source.value, hint)
+
+
+def keep_tokenizer_names(policy_config: Any, folder: Path) -> None:
+    """Undoes `use_own_files` for tokenisers, in what will be saved, once they are loaded."""
+    stored = json.loads((folder / CONFIG).read_text())
+    for field in CONFIG_FOLDERS.keys() - {"vlm_model_name"}:
+        if field in stored and hasattr(policy_config, field):
+            setattr(policy_config, field, stored[field])
+
+
+def stored_steps(folder: Path, processor: str) -> list[dict[str, Any]]:
+    """Steps of a processor that has been checked; none if the file is missing."""
+    file = folder / processor
+    return json.loads(file.read_text())["steps"] if file.is_file() else []
+
+
+def correct_inputs(policy_config: Any, folder: Path, source: FileSource) -> None:
+    """Gives a policy that pads the inputs that it was trained on, by the statistics that it normalises by.
+
+    LeRobot's fine-tuning leaves those of the policy that it started from in ``config.json``, whatever states
+    and cameras the dataset had.
+    """
+    if not pads(policy_config):
+        return
+    seen: dict[str, tuple[int, ...]] = {}
+    renames: dict[str, str] = {}
+    for step in stored_steps(folder, PREPROCESSOR):
+        renames |= step.get("config", {}).get("rename_map", {})
+        if step["registry_name"] in NORMALISERS and "state_file" in step:
+            for key, (_, shape) in tensor_shapes(folder / step["state_file"], source).items():
+                name = key.removesuffix(".mean")
+                seen[renames.get(name, name)] = shape
+    inputs = policy_config.input_features
+    cameras = {name for name, shape in policy_features(policy_config).shapes.items() if len(shape) == 3}
+    if cameras & seen.keys():
+        for name in cameras - seen.keys():
+            del inputs[name]
+    if STATE in inputs and STATE in seen:
+        inputs[STATE] = replace(inputs[STATE], shape=seen[STATE])
+
+
+def check_statistics(policy_config: Any, folder: Path, source: FileSource, *, replaced: bool = False) -> None:
+    """Refuses a checkpoint whose processors lack numbers that they normalise by, or hold NaN.
+
+    None are needed if they are `replaced` by those of a training to come.
+    """
+    features = {**(policy_config.input_features or {}), **(policy_config.output_features or {})}
+    for processor in PROCESSORS:
+        for step in stored_steps(folder, processor):
+            file = step.get("state_file")
+            state = {} if file is None else dict(read_tensors(folder / file, source))
+            if step["registry_name"] not in NORMALISERS or replaced:
+                continue
+            options = step.get("config", {})
+            for name in _normalised(step["registry_name"], options, features):
+                kind = features[name].type.value
+                needed = STATISTICS.get(options.get("norm_map", {}).get(kind), ())
+                if all(f"{name}.{statistic}" in state for statistic in needed):
+                    continue
+                has = sorted({key.rpartition(".")[0] for key in state})
+                why = f"no {' and '.join(needed)} of {name}, by which the policy normalises"
+                why += f"; it has {', '.join(has[:6]) or 'none'}"
+                if kind != "VISUAL":
+                    hint = "fine-tuning it on a dataset (sft.init_path) computes new ones"
+                    raise source.refuse(file or processor, f"{why}; {hint}")
+                logger.warning("%s; pictures go in as they are", source.refuse(file or processor, why))
+
+
+def _normalised(step: str, options: dict[str, Any], features: dict[str, Any]) -> list[str]:
+    """Names of the features that a step changes when the policy acts."""
+    if step == "unnormalizer_processor":
+        return [ACTION] if ACTION in features else []
+    chosen = options.get("normalize_observation_keys") or options.get("features", {})
+    return [key for key in features if key in chosen and key != ACTION and ".empty_camera_" not in key]
