@@ -257,9 +257,7 @@ def test_it_goes_on_with_what_it_has_learned_from_and_never_with_what_was_held_o
         learn = replace(config.imagination.learn, dataset=dataset)
         config = replace(config, imagination=replace(config.imagination, learn=learn))
         if expected is None:
-            with pytest.raises(
-                InputError, match=r"^imagination\.learn\.dataset\.repo_id='a/b': the world model"
-            ):
+            with pytest.raises(InputError, match=r"^imagination\.learn\.dataset\.repo_id='a/b': the world"):
                 make_learner(config)
         else:
             assert [episode.key for episode in make_learner(config)._offline] == expected
@@ -319,9 +317,9 @@ def test_one_command_records_play_trains_a_world_model_on_it_and_practises(
     )  # fmt: skip
     launch = replace(config.launch, engine="local")
     config = replace(config, imagination=play, launch=launch, env=replace(ENV, image_size=32))
-    with mock.patch("accerl_lerobot.world_model.pretrain.pretrain", side_effect=KeyboardInterrupt):
-        with pytest.raises(KeyboardInterrupt):
-            Run(config, tmp_path, Console()).execute()
+    stopped = mock.patch("accerl_lerobot.world_model.pretrain.pretrain", side_effect=KeyboardInterrupt)
+    with stopped, pytest.raises(KeyboardInterrupt):
+        Run(config, tmp_path, Console()).execute()
     recorded = load_episodes(DatasetConfig(repo_id="a/b", root=str(tmp_path / "play")), SPEC)
     assert len(recorded) == 16 and {episode.success for episode in recorded} == {True, False}
     assert not (tmp_path / "pretraining").exists()

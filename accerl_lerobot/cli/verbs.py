@@ -208,7 +208,10 @@ def _checked(
     """Does the work in a new folder; the exit status tells if the world model passed its check."""
     if config.dataset.repo_id is None:
         raise InputError("dataset.repo_id", None, NO_DATASET)
-    found, _, _ = _in_new_folder(config, work)
+    from accerl_lerobot.world_model.pretrain import show
+
+    found, directory, console = _in_new_folder(config, work)
+    show(found, directory, console)
     return tell(found, 0 if found["passed"] else 1)
 
 

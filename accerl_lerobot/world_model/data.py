@@ -108,8 +108,8 @@ def _window(episode: Episode, first: int, spec: WorldModelSpec, chunks: int) -> 
     """Arrays of one window; ``frames`` and ``robot`` are those of the context and those after each chunk."""
     size, before = spec.chunk, spec.context - 1
     start = int(episode.times[first])
-    begins = start + size * np.arange(-before, chunks)  # env step with which each chunk begins
-    boundaries = np.append(begins, start + size * chunks)
+    begins = start + size * np.arange(chunks)  # env step with which each chunk begins
+    boundaries = start + size * np.arange(-before, chunks + 1)
     latest = np.searchsorted(episode.times, boundaries, side="right") - 1
     shown = np.maximum(latest, 0)  # the first frame stands for those before the episode
     last = len(episode) - 1
@@ -117,7 +117,6 @@ def _window(episode: Episode, first: int, spec: WorldModelSpec, chunks: int) -> 
     earlier = np.zeros((size * before, episode.actions.shape[1]), np.float32)
     known = episode.actions[max(0, start - size * before) : start]
     earlier[len(earlier) - len(known) :] = known
-    begins = begins[before:]
     return {
         "frames": episode.frames[shown],
         "robot": episode.state[shown],

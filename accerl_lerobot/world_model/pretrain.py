@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from accerl_lerobot.checkpoint.layout import write_atomically
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos import record
@@ -111,7 +112,7 @@ def pretrain(
     failed = [name for name, outcome in found["checks"].items() if not outcome["holds"]]
     save_world(directory / "world_model", world, [episode.key for episode in learnt], failed)
     found = found | {"learnt": len(learnt), "seconds": seconds}
-    tell(found, directory, console)
+    write_atomically(directory / VALIDATION, json.dumps(plain(found), indent=2) + "\n")
     return found
 
 
@@ -130,13 +131,12 @@ def evaluate(run: WorldModelEvalRun, directory: Path, console: Console) -> dict[
     with console.stage("check"):
         found = check(world, kept, run.seed)
         preview(directory / "preview.mp4", world, kept)
-    tell(found, directory, console)
+    write_atomically(directory / VALIDATION, json.dumps(plain(found), indent=2) + "\n")
     return found
 
 
-def tell(found: dict[str, Any], directory: Path, console: Console) -> None:
-    """Writes and shows the outcome of a check."""
-    (directory / VALIDATION).write_text(json.dumps(plain(found), indent=2) + "\n")
+def show(found: dict[str, Any], directory: Path, console: Console) -> None:
+    """Shows people the outcome of a check."""
     console.rich.print(checks_table(found))
     console.say(f"{'passed' if found['passed'] else 'FAILED'}; see {directory / 'preview.mp4'}")
 
@@ -147,7 +147,7 @@ def prepared(config: RunConfig, directory: Path, console: Console, load: Load | 
     A part that is complete is not done again.
     """
     imagination = config.imagination
-    play, pretraining = directory / PLAY, directory / PRETRAINING
+    play, pretraining = directory.absolute() / PLAY, directory.absolute() / PRETRAINING
     dataset = DatasetConfig(repo_id="accerl/play", root=str(play))
     if not play.exists():
         record_play(config, play, console, load)
@@ -157,7 +157,8 @@ def prepared(config: RunConfig, directory: Path, console: Console, load: Load | 
         with record.appearing(pretraining) as folder:
             folder.mkdir()
             device = config.policy.device
-            pretrain(model, config.env, dataset, folder, console, seed=config.seed, device=device)
+            found = pretrain(model, config.env, dataset, folder, console, seed=config.seed, device=device)
+        show(found, pretraining, console)
     learn = replace(imagination.learn, dataset=dataset)
     path = str(pretraining / "world_model")
     return replace(config, imagination=replace(imagination, path=path, learn=learn))

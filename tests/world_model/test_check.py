@@ -61,9 +61,6 @@ def test_models_of_known_quality(kind: str):
     found = check(world(kind), ending_on_the_right(dots(60, steps=30, seed=2)))
     values = {name: outcome["value"] for name, outcome in found["checks"].items()}
     assert found["passed"] is (kind == "exact")
-    assert all(
-        outcome["holds"] == (outcome["value"] > outcome["above"]) for outcome in found["checks"].values()
-    )
     if kind == "exact":
         assert values["skill"] > 0.99 and values["sensitivity"] > 10 and values["auroc"] > 0.9
     else:
