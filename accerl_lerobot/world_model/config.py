@@ -123,7 +123,7 @@ class PixelModelConfig(LearnableModelConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class WorldModelConfig(Section, section="world_model"):
-    """A pixel world model and its training. The default has 1.8 million weights and trains on two cores."""
+    """A pixel world model and its training. The default has 2 million weights and trains on two cores."""
 
     model: LearnableModelConfig = field(default_factory=PixelModelConfig)
     discover_packages_path: str | None = field(default=None, metadata={"registers": True})

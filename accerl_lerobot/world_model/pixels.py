@@ -11,10 +11,11 @@ Shapes: see `contract.py`; C = 3·V channels.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 
 import torch
+from diffusers import UNet2DModel
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -33,9 +34,8 @@ COARSE = 8  # side of the coarse view of the frame from which the robot's state 
 CONTEXT_NOISE = 0.02
 """Largest std of the noise on the context's frames in training, in units of [−1, 1]: imagined frames are
 never as clean as recorded ones."""
-CONDITION, PLANES = 128, 8
-"""Width of the conditioning vector that the adaptive norms read; channels of the action planes."""
-GRID, HIDDEN = 4, 128  # side of the success model's last feature map, and width of the layer behind it
+HIDDEN, PLANES = 128, 8  # width of hidden layers; channels of the planes that tell the actions
+GRID = 4  # side of the success model's last feature map
 NOISE, SHIFT = 0.03, 3
 """Noise on frames in the success model's training, its largest std where 1 is white, and their largest shift
 in pixels."""
@@ -50,9 +50,9 @@ class PixelWorldModel(LearnableWorldModel):
         numbers = spec.chunk * (action * spec.context + 1) + action + robot * (spec.context + 1) + TASK_BITS
         self.network = FrameNetwork(channels, (spec.context + 1) * channels, numbers, config.channels)
         self.motion = nn.Sequential(
-            nn.Linear(numbers + channels * COARSE * COARSE, 128), nn.SiLU(),
-            nn.Linear(128, 128), nn.SiLU(),
-            _zero(nn.Linear(128, robot)),
+            nn.Linear(numbers + channels * COARSE * COARSE, HIDDEN), nn.SiLU(),
+            nn.Linear(HIDDEN, HIDDEN), nn.SiLU(),
+            _zero(nn.Linear(HIDDEN, robot)),
         )  # fmt: skip
         for name, size in {"robot": robot, "action": action, "motion": robot, "commanded": action}.items():
             self.register_buffer(f"{name}_mean", torch.zeros(size))
@@ -216,7 +216,7 @@ def _to_floats(frames: Tensor) -> Tensor:
 
 
 class FrameNetwork(nn.Module):
-    """(frames, numbers) → image: a small U-Net.
+    """(frames, numbers) → image: a U-Net of diffusers.
 
     Space-to-depth keeps it cheap on a CPU: pixels move into channels before the first convolution, so no
     layer works at full resolution. The numbers enter twice, through adaptive norms and as planes beside the
@@ -227,87 +227,31 @@ class FrameNetwork(nn.Module):
 
     def __init__(self, image: int, frames: int, numbers: int, channels: Sequence[int]) -> None:
         super().__init__()
-        pixels, first, coarsest = SPACE_TO_DEPTH**2, channels[0], channels[-1]
-        self.condition = nn.Sequential(
-            nn.Linear(numbers, CONDITION), nn.SiLU(),
-            nn.Linear(CONDITION, CONDITION), nn.SiLU(),
-            nn.Linear(CONDITION, CONDITION), nn.SiLU(),
-        )  # fmt: skip
+        pixels = SPACE_TO_DEPTH**2
+        hidden, condition = nn.Linear(numbers, HIDDEN), nn.Linear(HIDDEN, 4 * channels[0])
+        self.condition = nn.Sequential(hidden, nn.SiLU(), condition)
         self.planes = nn.Linear(numbers, PLANES)
-        self.enter = nn.Conv2d(frames * pixels + PLANES, first, 3, padding=1)
-        self.down, self.up = nn.ModuleList([nn.ModuleList([Block(first, first)])]), nn.ModuleList()
-        for finer, width in pairwise(channels):
-            shrink = nn.Conv2d(finer, width, 3, stride=2, padding=1)
-            self.down.append(nn.ModuleList([shrink, Block(width, width)]))
-        middle = [Block(coarsest, coarsest), Attention(coarsest), Block(coarsest, coarsest)]
-        self.middle = nn.ModuleList(middle)
-        for finer, width in reversed(list(pairwise(channels))):
-            block, grow = Block(2 * width, width), nn.Conv2d(width, finer, 3, padding=1)
-            self.up.append(nn.ModuleList([block, nn.Upsample(scale_factor=2.0), grow]))
-        self.up.append(nn.ModuleList([Block(2 * first, first)]))
-        last = _zero(nn.Conv2d(first, image * pixels, 3, padding=1))
-        self.leave = nn.Sequential(_norm(first), nn.SiLU(), last)
+        self.unet = UNet2DModel(
+            in_channels=frames * pixels + PLANES,
+            out_channels=image * pixels,
+            block_out_channels=tuple(channels),
+            down_block_types=("DownBlock2D",) * len(channels),
+            up_block_types=("UpBlock2D",) * len(channels),
+            layers_per_block=1,
+            norm_num_groups=math.gcd(8, *channels),
+            attention_head_dim=math.gcd(32, channels[-1]),
+            resnet_time_scale_shift="scale_shift",
+            class_embed_type="identity",
+        )
+        _zero(self.unet.conv_out)
 
     def forward(self, frames: Tensor, numbers: Tensor) -> Tensor:
         """(B, frames, H, W) and (B, numbers) to (B, image, H, W); zero before training."""
-        condition = self.condition(numbers)
-        h = functional.pixel_unshuffle(frames, SPACE_TO_DEPTH)
-        planes = self.planes(numbers)[:, :, None, None].expand(-1, -1, *h.shape[2:])
-        h = self.enter(torch.cat([h, planes], 1))
-        kept = []
-        for level in self.down:
-            h = _through(level, h, condition)
-            kept.append(h)
-        h = _through(self.middle, h, condition)
-        for level in self.up:
-            h = _through(level, torch.cat([h, kept.pop()], 1), condition)
-        return functional.pixel_shuffle(self.leave(h), SPACE_TO_DEPTH)
-
-
-def _through(steps: Iterable[nn.Module], h: Tensor, condition: Tensor) -> Tensor:
-    for step in steps:
-        h = step(h, condition) if isinstance(step, Block) else step(h)
-    return h
-
-
-class Block(nn.Module):
-    """Two convolutions with adaptive group norms and a skip connection; starts as the skip alone."""
-
-    def __init__(self, before: int, after: int) -> None:
-        super().__init__()
-        self.skip = nn.Conv2d(before, after, 1) if before != after else nn.Identity()
-        self.norms = nn.ModuleList([_norm(before, affine=False), _norm(after, affine=False)])
-        self.convs = nn.ModuleList([nn.Conv2d(width, after, 3, padding=1) for width in (before, after)])
-        self.adapt = nn.ModuleList([nn.Linear(CONDITION, 2 * width) for width in (before, after)])
-        _zero(self.convs[1])
-
-    def forward(self, x: Tensor, condition: Tensor) -> Tensor:
-        """(B, before, H, W) to (B, after, H, W)."""
-        h = x
-        for norm, conv, adapt in zip(self.norms, self.convs, self.adapt, strict=True):
-            scale, shift = adapt(condition)[:, :, None, None].chunk(2, 1)
-            h = conv(functional.silu(norm(h) * (1 + scale) + shift))
-        return self.skip(x) + h
-
-
-class Attention(nn.Module):
-    """Self-attention over positions, in heads of some 32 channels; starts as the identity."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.norm = _norm(width)
-        self.attend = nn.MultiheadAttention(width, math.gcd(width, max(1, width // 32)), batch_first=True)
-        _zero(self.attend.out_proj)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """(B, width, H, W) to the same."""
-        h = self.norm(x).flatten(2).transpose(1, 2)
-        mixed, _ = self.attend(h, h, h, need_weights=False)
-        return x + mixed.transpose(1, 2).reshape(x.shape)
-
-
-def _norm(channels: int, *, affine: bool = True) -> nn.GroupNorm:
-    return nn.GroupNorm(math.gcd(channels, 8), channels, affine=affine)
+        pixels = functional.pixel_unshuffle(frames, SPACE_TO_DEPTH)
+        planes = self.planes(numbers)[:, :, None, None].expand(-1, -1, *pixels.shape[2:])
+        seen = torch.cat([pixels, planes], 1)
+        made = self.unet(seen, timestep=0, class_labels=self.condition(numbers)).sample
+        return functional.pixel_shuffle(made, SPACE_TO_DEPTH)
 
 
 def _zero[M: nn.Module](layer: M) -> M:

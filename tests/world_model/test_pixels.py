@@ -18,7 +18,7 @@ from accerl_lerobot.world_model.config import PixelModelConfig
 from accerl_lerobot.world_model.contract import Context, Prediction, Windows, WorldModelSpec
 from accerl_lerobot.world_model.data import Episode, WindowStart, cut_windows
 from accerl_lerobot.world_model.imagined import World
-from accerl_lerobot.world_model.pixels import Attention, FrameNetwork, PixelWorldModel, SuccessModel
+from accerl_lerobot.world_model.pixels import FrameNetwork, PixelWorldModel, SuccessModel
 from accerl_lerobot.world_model.training import Trainer, uniform
 from tests.rounding import assert_close
 
@@ -185,8 +185,8 @@ def test_every_chunk_is_predicted_for_the_task_and_the_loss_reaches_every_weight
         assert not torch.equal(first.frames, second.frames) and not torch.equal(first.robot, second.robot)
     made.fit_statistics(of)
     made.loss(of, torch.Generator().manual_seed(0))[0].backward()
-    silent = [k for k, p in made.named_parameters() if p.grad is None or not p.grad.abs().max() > 0]
-    assert silent == []
+    silent = [k for k, p in made.named_parameters() if p.grad is None or not p.grad.abs().max() > 1e-12]
+    assert [name for name in silent if not name.endswith("to_k.bias")] == [], "softmax ignores that one"
 
 
 @pytest.fixture(scope="module")
@@ -222,7 +222,7 @@ def test_the_weights_that_serve_follow_those_that_learn(learnt: Trainer):
 def test_a_training_that_diverges_is_an_error_and_changes_nothing(learnt: Trainer):
     trainer, episodes = copy.deepcopy(learnt), dots(4)
     with torch.no_grad():
-        trainer.world.model.network.enter.bias.fill_(torch.nan)  # type: ignore[union-attr]
+        trainer.world.model.network.planes.bias.fill_(torch.nan)  # type: ignore[union-attr]
     before = copy.deepcopy(trainer.world.state_dict())
     with pytest.raises(FloatingPointError, match="not finite at step 251; lower world_model.lr"):
         trainer.step(episodes, uniform(episodes))
@@ -275,7 +275,7 @@ def test_a_frame_is_a_success_of_one_task_and_a_failure_of_another():
     assert auroc(made.probabilities(frames, other[:1].expand(300, -1)).numpy(), lit.numpy()) < 0.05
 
 
-@pytest.mark.parametrize("channels", [(8, 8, 12), (7,), (10, 14)], ids=["deep", "flat", "odd widths"])
+@pytest.mark.parametrize("channels", [(8, 8, 12), (16,), (10, 14)], ids=["deep", "flat", "odd widths"])
 def test_networks_of_other_sizes(channels: tuple[int, ...]):
     torch.manual_seed(0)
     network, side = FrameNetwork(3, 6, 8, channels), 8 * 2 ** (len(channels) - 1)
@@ -285,5 +285,3 @@ def test_networks_of_other_sizes(channels: tuple[int, ...]):
     assert image.shape == (2, 3, side, side) and torch.isfinite(image).all()
     for name, value in given.items():
         assert (network(**given | {name: value.flip(0)}) - image).abs().max() > 1e-3, name
-    layer, x = Attention(channels[0]), torch.randn(2, channels[0], 3, 2)
-    assert torch.equal(layer(x), x), "it starts as the identity"
