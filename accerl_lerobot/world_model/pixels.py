@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import torch
-from diffusers import UNet2DModel
+from diffusers.models.unets.unet_2d import UNet2DModel
 from torch import Tensor, nn
 from torch.nn import functional
 
