@@ -27,14 +27,7 @@ import torch
 from safetensors.torch import save_file
 from torch import nn
 
-from accerl_lerobot.checkpoint.safety import (
-    FileSource,
-    brief,
-    check_not_pickled,
-    read_json,
-    read_tensors,
-    safe_join,
-)
+from accerl_lerobot.checkpoint.safety import FileSource, brief, read_json, read_tensors, safe_join
 from accerl_lerobot.config.parsing import DISCOVER, discover
 from accerl_lerobot.demos.record import make_expert
 from accerl_lerobot.envs import make_environment
@@ -145,7 +138,6 @@ def load_world(directory: Path, package: str | None = None, *, section: str = ""
         package_field = origin.field.removesuffix("path") + DISCOVER
         hint = f"use one of {', '.join(types)}, or name its package: {package_field}"
         raise origin.refuse(f"{CONFIG}: model.type", f"{str(kind)[:60]!r}; {hint}")
-    check_not_pickled(directory, WEIGHTS, origin)
     weights = safe_join(directory, WEIGHTS, origin)
     try:
         with Unfilled():
