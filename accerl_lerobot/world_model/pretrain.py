@@ -14,6 +14,7 @@ model is named: it records episodes of the policy and of a disturbed expert, and
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import time
 from collections.abc import Iterator
@@ -85,7 +86,9 @@ def pretrain(
         episodes = load_episodes(dataset, spec)
     learnt, held_out = split_episodes(episodes, np.random.default_rng((seed, 0)))
     if any({episode.success for episode in part} != {True, False} for part in (learnt, held_out)):
-        hint = "at least two successes and two failures (demos.failure_share) are needed, to hold out one"
+        hint = (
+            "it needs at least two successes and two failures, to hold out one of each; record more episodes"
+        )
         raise InputError("dataset.repo_id", dataset.repo_id, hint)
     spec = replace(spec, tasks=tuple(sorted({episode.task for episode in episodes})))
     started = time.monotonic()
@@ -176,11 +179,10 @@ def record_play(config: RunConfig, root: Path, console: Console, load: Load | No
         with closing(make_environment(config.env)) as environment:
             spec = environment.spec
         dataset = stack.enter_context(record.new_dataset(folder, "accerl/play", spec, config.env))
-        for episode in policy_play(config, policy_episodes, load):
-            record.save_episode(dataset, episode, tally)
-            stage.update(tally["episodes"], f"{tally['successes']} successes")
-        disturbed = record.simulated(config.env, expert, range(expert_episodes))
-        for episode, _ in stack.enter_context(disturbed) if expert_episodes else ():
+        # The expert's processes are at work meanwhile.
+        disturbed = stack.enter_context(record.simulated(config.env, expert, range(expert_episodes)))
+        by_expert = (episode for episode, _ in disturbed)
+        for episode in itertools.chain(policy_play(config, policy_episodes, load), by_expert):
             record.save_episode(dataset, episode, tally)
             stage.update(tally["episodes"], f"{tally['successes']} successes")
     console.say("{episodes} episodes of play, {successes} successes".format(**tally))

@@ -92,7 +92,7 @@ def test_from_a_dataset_to_a_check_and_another_check(
 def test_what_cannot_be_held_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     demos = record_demos(ENV, DemosConfig(episodes=3, failure_share=0.5), str(tmp_path / "demos"))
     assert cli.main(arguments(demos, tmp_path / "out")) == 2
-    assert "at least two successes and two failures" in capsys.readouterr().err
+    assert "it needs at least two successes and two failures" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
