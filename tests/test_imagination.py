@@ -291,7 +291,7 @@ def test_a_world_model_of_another_package_imagines_and_goes_on_learning(
     sys.modules.pop(package)
     config = imagining(tiny_checkpoint, path, episodes=24)
     config = replace(config, imagination=replace(config.imagination, discover_packages_path=package))
-    config = replace(config, launch=replace(config.launch, engine=engine), output_dir=str(tmp_path / "run"))
+    config = replace(config, launch=replace(config.launch, engine=engine), output_dir=str(tmp_path))
     running = make_engine(config, ("match",), history=1)
     try:
         running.train()

@@ -114,17 +114,18 @@ def _window(episode: Episode, first: int, spec: WorldModelSpec, chunks: int) -> 
     shown = np.maximum(latest, 0)  # the first frame stands for those before the episode
     last = len(episode) - 1
     executed = start + np.arange(size * chunks)
-    earlier = np.zeros((size * before, episode.actions.shape[1]), np.float32)
+    action_dim = episode.actions.shape[1]
+    earlier = np.zeros((size * before, action_dim), np.float32)
     known = episode.actions[max(0, start - size * before) : start]
     earlier[len(earlier) - len(known) :] = known
     return {
         "frames": episode.frames[shown],
         "robot": episode.state[shown],
-        "before": earlier.reshape(before, size, -1),
+        "before": earlier.reshape(before, size, action_dim),
         "first_frame": episode.frames[0],
         "first_robot": episode.state[0],
         "commanded_sum": episode.actions[:start].sum(0, dtype=np.float32),
-        "actions": episode.actions[np.minimum(executed, last)].reshape(chunks, size, -1),
+        "actions": episode.actions[np.minimum(executed, last)].reshape(chunks, size, action_dim),
         "steps": np.clip(episode.times[shown[before + 1 :]] - begins, 0, size),
         "success": (begins <= episode.success_at) & (episode.success_at < begins + size),
     }
