@@ -142,7 +142,7 @@ def test_every_frame_and_action_is_the_dataset_s_once(
     ("changes", "why"),
     [
         ({"observation.images.front": None}, "no 'observation.images.front': the dataset has no camera"),
-        ({"action": (7,)}, r"action has shape \(7,\), the environment's \(2,\): it is another robot's"),
+        ({"action": (7,)}, r"action has shape \(7,\), the environment's has \(2,\): it is another"),
         ({"observation.state": None}, "observation.state has shape None, the environment's"),
         ({"next.success": None}, "no next.success: record it, as accerl demos does"),
         ({"fps": 10}, "10 frames a second, and the environment makes 80 steps"),
