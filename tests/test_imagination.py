@@ -3,11 +3,14 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import signal
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -16,28 +19,29 @@ import torch
 from accerl_lerobot import cli
 from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.checkpoint import snapshot
-from accerl_lerobot.checkpoint.layout import TRAINING_STATE
+from accerl_lerobot.checkpoint.layout import TRAINING_STATE, WORLD_MODEL
 from accerl_lerobot.console import Console
-from accerl_lerobot.engines.config import RunConfig
+from accerl_lerobot.demos.record import DemosConfig, record_demos
+from accerl_lerobot.engines.config import DatasetConfig, RunConfig
 from accerl_lerobot.engines.contract import Progress
 from accerl_lerobot.engines.local import LocalEngine
 from accerl_lerobot.envs import SimulatedConfig, make_environment
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, REAL, Segment
 from accerl_lerobot.rollout.runner import EpisodePlans, RolloutConfig
 from accerl_lerobot.rollout.worker import RolloutWorker
-from accerl_lerobot.run.train import Run
+from accerl_lerobot.run.train import Run, make_engine
 from accerl_lerobot.timeline.read import read_timeline
 from accerl_lerobot.world_model.config import (
     ImaginationConfig,
+    LearnableModelConfig,
     OnlineLearnConfig,
     PixelModelConfig,
-    WorldModelConfig,
 )
-from accerl_lerobot.world_model.learners import new_success_model
-from accerl_lerobot.world_model.online import ONLINE
-from accerl_lerobot.world_model.pixels import PixelWorldModel
-from accerl_lerobot.world_model.pretrain import world_spec
-from accerl_lerobot.world_model.store import save_world_model
+from accerl_lerobot.world_model.contract import WorldModelSpec, new_model
+from accerl_lerobot.world_model.data import load_episodes
+from accerl_lerobot.world_model.imagined import World, check_imagination, load_world, read_content, save_world
+from accerl_lerobot.world_model.online import ONLINE, make_learner
 from tests.policies.checkpoints import write_diffusion
 from tests.runs import drive, polls, tiny_run
 
@@ -45,15 +49,22 @@ from tests.runs import drive, polls, tiny_run
 ENV = SimulatedConfig(max_steps=16, hold=8, tolerance=0.45)
 
 
+SPEC = WorldModelSpec(
+    cameras=("observation.images.front",), image_size=(32, 32), state_dim=4, action_dim=2, chunk=4, context=2,
+    fps=80,
+)  # fmt: skip
+
+
+def new_world(folder: Path, config: LearnableModelConfig, **content: Any) -> Path:
+    """A world that has learnt nothing."""
+    torch.manual_seed(0)
+    save_world(folder, World(new_model(replace(SPEC, context=config.context), config)), **content)
+    return folder
+
+
 @pytest.fixture(scope="module")
 def world_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A new one, which has learnt nothing."""
-    torch.manual_seed(0)
-    config = PixelModelConfig(channels=(8, 8))
-    spec = world_spec(WorldModelConfig(chunk=4, image_size=32, model=config), ENV)
-    folder = tmp_path_factory.mktemp("environment") / "world_model"
-    save_world_model(folder, PixelWorldModel(spec, config), new_success_model(4))
-    return folder
+    return new_world(tmp_path_factory.mktemp("world") / "world_model", PixelModelConfig(channels=(8, 8)))
 
 
 def imagining(
@@ -193,7 +204,7 @@ def test_it_runs_asynchronously(tiny_checkpoint: Path, world_model: Path, tmp_pa
     spent = read_timeline(tmp_path).shares()
     assert {"compute", "wait_in"} <= spent["world-model learning"].keys()
     saved = snapshot.load(tmp_path / "saved" / TRAINING_STATE / ONLINE)
-    assert saved["learner"]["count"] >= last.world_model["learn_steps"]
+    assert saved["trainer"]["count"] >= last.world_model["learn_steps"]
 
 
 def test_a_process_that_takes_anothers_place_imagines_from_its_episodes(world_model: Path):
@@ -220,7 +231,6 @@ def test_what_does_not_fit_is_refused_before_the_run_begins(
         return capsys.readouterr().err
 
     path = f"--imagination.path={world_model}"
-    assert "imagination.path=None: give the folder world_model" in told()
     assert "imagination.path='nowhere': config.json: is missing" in told("--imagination.path=nowhere")
     paid = told(path, "--env.reward=dense")
     assert "env.reward='dense': use success with imagination.environments" in paid
@@ -233,6 +243,95 @@ def test_what_does_not_fit_is_refused_before_the_run_begins(
     tiny_checkpoint = write_diffusion(tmp_path / "back", image=32, n_obs_steps=2)
     assert "policy.n_obs_steps=2: the policy looks back so many env steps" in told(path)
     assert not (tmp_path / "out" / "checkpoints").exists()
+
+
+def test_it_goes_on_with_what_it_has_learned_from_and_never_with_what_was_held_out(
+    tiny_checkpoint: Path, tmp_path: Path
+):
+    demos = record_demos(ENV, DemosConfig(episodes=6, failure_share=0.5), str(tmp_path / "demos"))
+    dataset = DatasetConfig(repo_id="a/b", root=str(demos))
+    keys = [episode.key for episode in load_episodes(dataset, SPEC)]
+    for learnt, expected in ((keys[1:4], keys[1:4]), (["elsewhere"], None)):
+        path = new_world(tmp_path / str(len(learnt)), PixelModelConfig(channels=(8, 8)), learnt=learnt)
+        config = imagining(tiny_checkpoint, path)
+        learn = replace(config.imagination.learn, dataset=dataset)
+        config = replace(config, imagination=replace(config.imagination, learn=learn))
+        if expected is None:
+            with pytest.raises(InputError, match=r"^imagination\.learn\.dataset\.repo_id='a/b': the world"):
+                make_learner(config)
+        else:
+            assert [episode.key for episode in make_learner(config)._offline] == expected
+    nowhere = replace(learn, dataset=replace(dataset, root="nowhere"))
+    config = replace(config, imagination=replace(config.imagination, learn=nowhere))
+    with pytest.raises(InputError, match=r"^imagination\.learn\.dataset\.root='nowhere': no meta/info.json"):
+        check_imagination(config)
+
+
+@pytest.mark.parametrize(
+    ("failed", "told"), [(None, "was never checked"), (["auroc"], "failed checks (auroc)"), ([], None)]
+)
+def test_of_a_world_model_that_has_not_passed_a_run_warns(
+    failed: list[str] | None, told: str | None, tiny_checkpoint: Path, tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+):  # fmt: skip
+    path = new_world(tmp_path / "w", PixelModelConfig(channels=(8, 8)), failed_checks=failed)
+    check_imagination(imagining(tiny_checkpoint, path))
+    warnings = [text for text in caplog.messages if "the world model of" in text]
+    assert bool(warnings) == (told is not None) and all(str(told) in text for text in warnings)
+
+
+@pytest.mark.parametrize("engine", ["local", pytest.param("ray", marks=pytest.mark.slow)])
+def test_a_world_model_of_another_package_imagines_and_goes_on_learning(
+    engine: str, tiny_checkpoint: Path, tmp_path: Path
+):
+    package = "tests.world_model.linear_world"
+    linear = importlib.import_module(package).LinearModelConfig
+    path = new_world(tmp_path / "w", linear(gain=3.0))
+    LearnableModelConfig.get_known_choices().pop("linear")
+    sys.modules.pop(package)
+    config = imagining(tiny_checkpoint, path, episodes=24)
+    config = replace(config, imagination=replace(config.imagination, discover_packages_path=package))
+    config = replace(config, launch=replace(config.launch, engine=engine), output_dir=str(tmp_path))
+    running = make_engine(config, ("match",), history=1)
+    try:
+        running.train()
+        last = drive(running)[-1]
+        running.save(tmp_path / "saved")
+    finally:
+        running.close()
+    assert last.world_model["learn_steps"] > 0 < last.replay["trained_imagined"]
+    before, after = load_world(path, package), load_world(tmp_path / "saved" / WORLD_MODEL)
+    moved = after.get_parameter("model.motion.weight") - before.get_parameter("model.motion.weight")
+    assert float(moved.abs().max()) > 0
+
+
+@pytest.mark.slow
+def test_one_command_records_play_trains_a_world_model_on_it_and_practises(
+    tiny_checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """Stopped after a part, it goes on with the next one."""
+    config = imagining(tiny_checkpoint, None, environments=4)
+    play = ImaginationConfig(
+        environments=4, policy_episodes=8, expert_episodes=8, steps=30,
+        learn=OnlineLearnConfig(steps_per_episode=1),
+    )  # fmt: skip
+    launch = replace(config.launch, engine="local")
+    config = replace(config, imagination=play, launch=launch, env=replace(ENV, image_size=32))
+    stopped = mock.patch("accerl_lerobot.world_model.pretrain.pretrain", side_effect=KeyboardInterrupt)
+    with stopped, pytest.raises(KeyboardInterrupt):
+        Run(config, tmp_path, Console()).execute()
+    recorded = load_episodes(DatasetConfig(repo_id="a/b", root=str(tmp_path / "play")), SPEC)
+    assert len(recorded) == 16 and {episode.success for episode in recorded} == {True, False}
+    assert not (tmp_path / "pretraining").exists()
+    capsys.readouterr()
+    summary = Run(config, tmp_path, Console(), "last").execute()
+    assert "episodes of play" not in capsys.readouterr().err, "they are there"
+    assert summary["updates"] == 12 and summary["imagined_episodes"] > 0
+    assert summary["episodes_explored"] == 6
+    learnt = read_content(tmp_path / "pretraining" / "world_model")["learnt"]
+    assert {episode.key for episode in recorded} > set(learnt)
+    saved = read_content(tmp_path / "checkpoints" / "last" / WORLD_MODEL)["learnt"]
+    assert len(saved) == len(learnt) + 6, "and the real episodes of the run"
 
 
 def test_the_summary_says_how_much_was_imagined(tiny_checkpoint: Path, world_model: Path, tmp_path: Path):

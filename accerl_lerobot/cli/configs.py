@@ -18,7 +18,7 @@ from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.metrics import WandBConfig
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
-from accerl_lerobot.world_model.config import StateModelConfig, ValidationConfig, WorldModelConfig
+from accerl_lerobot.world_model.config import StateModelConfig, WorldModelConfig
 
 NO_DATASET = "name a LeRobotDataset, on the Hub or with dataset.root"
 
@@ -110,7 +110,7 @@ class EvalRun(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class WorldModelRun(NewFolderRun):
-    """``accerl world-model``: a world model, and a success model, from one or two LeRobotDatasets."""
+    """``accerl world-model``: a world model, and a success model, from a LeRobotDataset."""
 
     job_name: str = "world_model"
     device: Device = "auto"
@@ -118,16 +118,14 @@ class WorldModelRun(NewFolderRun):
     env: EnvConfig = field(default_factory=MetaWorldConfig)
     """Environment to model: its cameras, sizes, rate and tasks."""
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
-    """Demonstrations, some of which fail."""
-    online: DatasetConfig = field(default_factory=DatasetConfig)
-    """Episodes of a policy, as ``accerl export`` writes them, to train on as well; none without a name. No
+    """Successes and failures; episodes of a policy, as ``accerl export`` writes, should be among them: no
     demonstration shows how a policy fails."""
     world_model: WorldModelConfig = field(default_factory=WorldModelConfig)
 
 
 @dataclass(frozen=True, kw_only=True)
 class WorldModelEvalRun(NewFolderRun):
-    """``accerl world-model-eval``: a saved world model on one or two LeRobotDatasets."""
+    """``accerl world-model-eval``: a saved world model on a LeRobotDataset."""
 
     job_name: str = "world_model_eval"
     device: Device = "auto"
@@ -138,9 +136,6 @@ class WorldModelEvalRun(NewFolderRun):
     """Package to import that registers the type of the world model, where that is not one of ours."""
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     """Episodes it was not trained on; of its own dataset, those that were held out."""
-    online: DatasetConfig = field(default_factory=DatasetConfig)
-    """Likewise, episodes of a policy as ``accerl export`` writes them; none without a name."""
-    validation: ValidationConfig = field(default_factory=ValidationConfig)
 
     def __post_init__(self) -> None:
         super().__post_init__()

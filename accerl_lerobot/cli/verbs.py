@@ -183,33 +183,35 @@ def evaluate(arguments: list[str]) -> int:
 
 
 def world_model(arguments: list[str]) -> int:
-    """``accerl world-model``; 1 if it fails validation."""
+    """``accerl world-model``; 1 if it fails a check."""
     config: WorldModelRun = parse(WorldModelRun, arguments, recipe_class=RunConfig)
     from accerl_lerobot.world_model.pretrain import pretrain
 
-    return _validated(config, lambda directory, console: pretrain(config, directory, console))
+    def work(*place: Any) -> dict[str, Any]:
+        sections = config.world_model, config.env, config.dataset
+        return pretrain(*sections, *place, seed=config.seed, device=config.device)
+
+    return _checked(config, work)
 
 
 def world_model_eval(arguments: list[str]) -> int:
-    """``accerl world-model-eval``; 1 if it fails validation."""
+    """``accerl world-model-eval``; 1 if it fails a check."""
     config: WorldModelEvalRun = parse(WorldModelEvalRun, arguments, recipe_class=RunConfig)
-    from accerl_lerobot.world_model.validation import evaluate
+    from accerl_lerobot.world_model.pretrain import evaluate
 
-    return _validated(config, lambda directory, console: evaluate(config, directory, console))
+    return _checked(config, lambda *place: evaluate(config, *place))
 
 
-def _validated(
+def _checked(
     config: WorldModelRun | WorldModelEvalRun, work: Callable[[Path, Console], dict[str, Any]]
 ) -> int:
-    """Does the work in a new folder and shows the validation that it ends with."""
+    """Does the work in a new folder; the exit status tells if the world model passed its check."""
     if config.dataset.repo_id is None:
         raise InputError("dataset.repo_id", None, NO_DATASET)
-    from accerl_lerobot.world_model.validation import checks_table
+    from accerl_lerobot.world_model.pretrain import show
 
     found, directory, console = _in_new_folder(config, work)
-    (directory / "validation.json").write_text(json.dumps(plain(found), indent=2) + "\n")
-    console.rich.print(checks_table(found))
-    console.say(f"{'passed' if found['passed'] else 'FAILED'}; see {directory / 'preview.mp4'}")
+    show(found, directory, console)
     return tell(found, 0 if found["passed"] else 1)
 
 

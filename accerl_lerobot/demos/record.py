@@ -35,11 +35,11 @@ from accerl_lerobot.config.parsing import imported
 from accerl_lerobot.config.ranges import Range, Section, Share
 from accerl_lerobot.console import Console
 from accerl_lerobot.envs import make_environment
-from accerl_lerobot.envs.base import EnvConfig, Environment, EnvironmentSpec
+from accerl_lerobot.envs.base import ChunkResult, EnvConfig, Environment, EnvironmentSpec
 from accerl_lerobot.envs.metaworld import MetaWorld, expert_name
 from accerl_lerobot.envs.simulated import SimulatedEnvironment
 from accerl_lerobot.errors import InputError, check_absent, expanded
-from accerl_lerobot.experience import ENVIRONMENT_STATE, REWARD, SUCCESS
+from accerl_lerobot.experience import ENVIRONMENT_STATE, REWARD, SUCCESS, Observation
 from accerl_lerobot.seeds import demo_seed
 
 REPO_ID = "accerl/demos"  # name of a recorded dataset, which is where its folder is
@@ -88,27 +88,34 @@ def make_expert(config: EnvConfig, environment: Environment, task: str) -> Exper
     return expert
 
 
+PlayedStep = tuple[Observation, np.ndarray, ChunkResult]
+"""The observation before an env step, the action, and the outcome."""
+
+
 def played(environment: Environment, task: str, seed: int, actions: Iterable[np.ndarray]) -> Episode:
     """Plays actions, float32 (A,), until they or the episode end; each is asked for when it is its turn."""
-    observation, done, success_at = environment.reset(seed, task), False, -1
-    seen, executed, rewards = [], [], []
+    observation = environment.reset(seed, task)
+    steps: list[PlayedStep] = []
     for action in actions:
         result = environment.step_chunk(action[None])
-        seen.append(observation)
-        executed.append(action)
-        rewards.append(result.rewards[0])
-        if result.success and success_at < 0:
-            success_at = len(executed) - 1
-        observation, done = result.observation, result.done
-        if done:
+        steps.append((observation, action, result))
+        observation = result.observation
+        if result.done:
             break
+    return episode_of(steps, seed)
+
+
+def episode_of(steps: Sequence[PlayedStep], seed: int) -> Episode:
+    """The episode that consists of these env steps."""
+    seen, actions, results = zip(*steps, strict=True)
+    successes = [result.success for result in results]
     return Episode(
         observations={key: np.stack([row[key] for row in seen]) for key in seen[0] if key != "task"},
-        actions=np.stack(executed),
-        rewards=np.asarray(rewards, np.float32),
+        actions=np.stack(actions),
+        rewards=np.concatenate([result.rewards for result in results]).astype(np.float32),
         task=str(seen[0]["task"]),
-        done=done,
-        success_at=success_at,
+        done=results[-1].done,
+        success_at=successes.index(True) if any(successes) else -1,
         seed=seed,
     )
 
@@ -337,7 +344,7 @@ def record_demos(
         make_expert(env_config, environment, task)  # refuses a task without an expert before any work
     environment.close()
     tally = {"episodes": 0, "frames": 0, "successes": 0, "discarded": 0}
-    record = partial(_record_one, env_config, config, seed)
+    record = partial(record_one, env_config, config, seed)
     with appearing(folder) as unfinished:
         with (
             simulated(env_config, record, range(config.episodes)) as episodes,
@@ -399,7 +406,7 @@ def features(spec: EnvironmentSpec, environment_state: int) -> dict[str, dict[st
     return table
 
 
-def _record_one(env_config: EnvConfig, config: DemosConfig, seed: int, slot: int) -> tuple[Episode, int]:
+def record_one(env_config: EnvConfig, config: DemosConfig, seed: int, slot: int) -> tuple[Episode, int]:
     """The episode at place `slot` of the dataset, and how many tries were thrown away for it."""
     environment = this_environment()
     tasks, share = environment.spec.tasks, config.failure_share

@@ -23,11 +23,18 @@ from accerl_lerobot.engines.config import RunConfig
 from accerl_lerobot.engines.contract import Engine, Progress, Saved
 from accerl_lerobot.envs import make_environment
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import REAL, Observation, Request, Segment
+from accerl_lerobot.experience import REAL, Request, Segment
 from accerl_lerobot.policies.config import Load, loader
 from accerl_lerobot.replay.buffer import Replay
 from accerl_lerobot.replay.journal import EPISODES, Journal
-from accerl_lerobot.rollout.runner import MOST_STARTS, EpisodePlan, EpisodePlans, EpisodeResult, RolloutRunner
+from accerl_lerobot.rollout.runner import (
+    MOST_STARTS,
+    EpisodePlan,
+    EpisodePlans,
+    EpisodeResult,
+    RolloutRunner,
+    Starts,
+)
 from accerl_lerobot.seeds import global_generators, restore_global_generators
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, WEIGHT_SYNC, open_clock
 from accerl_lerobot.transport.weights import PublishDelay
@@ -73,7 +80,7 @@ class LocalEngine(Engine):
         environments = [
             make_environment(config.env, history, config.rollout.reward_model) for _ in range(count)
         ]
-        starts: deque[tuple[str, Observation]] = deque(maxlen=MOST_STARTS)
+        starts: Starts = deque(maxlen=MOST_STARTS)
         self._world: Any = None
         self._world_learner: Any = None
         if config.imagination.environments:

@@ -159,7 +159,7 @@ CONTENTS = {
         *(f"{FOLDER}/{name}" for name in KEPT[POLICY]),
     ),
     WORLD_MODEL: (
-        CONFIG, WEIGHTS, f"success_model/{CONFIG}", f"success_model/{WEIGHTS}",
+        CONFIG, WEIGHTS,
         *(f"{FOLDER}/{name}" for name in KEPT[WORLD_MODEL]),
     ),
     DATASET: ("meta/*", "meta/*/*/*.parquet", "data/*/*.parquet", "videos/*/*/*.mp4"),

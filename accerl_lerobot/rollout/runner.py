@@ -40,6 +40,7 @@ STARTS_PER_INCARNATION = 1000
 LEAST_SHARE = 0.1  # how often a task that never fails is explored, compared with one that always does
 RECENT = 20  # episodes of a task that tell how often it fails now
 MOST_STARTS = 256  # newest real episodes at whose first observation imagined ones start
+Starts = deque[tuple[str, Observation]]  # tasks and first observations of real episodes, the newest last
 MOST_DROPPED = 20  # episodes in a row that may be dropped before the environment counts as broken
 
 
@@ -167,6 +168,11 @@ class EpisodePlan:
     which changes nothing else."""
 
 
+def start_of(starts: Starts, seed: int) -> tuple[str, Observation]:
+    """Task and first observation of the imagined episode with this seed."""
+    return starts[seed % len(starts)]
+
+
 def budgets(config: RolloutConfig) -> list[int | None]:
     """How many exploring episodes each worker plays; None: no end."""
     if not config.episodes:
@@ -221,13 +227,13 @@ class EpisodePlans:
         self._owed[task] -= 1
         return EpisodePlan(task=task, seed=train_seed(self._seed, self.worker, number), explore=True)
 
-    def next_imagined(self, exploring: bool, starts: Sequence[tuple[str, Observation]]) -> EpisodePlan | None:
-        """The same for an imagined environment; `starts` are the tasks and first observations to begin at."""
+    def next_imagined(self, exploring: bool, starts: Starts) -> EpisodePlan | None:
+        """The same for an imagined environment, which begins at one of `starts`."""
         if not exploring or not starts:
             return None
         number, self.imagined = self.imagined, self.imagined + 1
         seed = train_seed(self._seed, self.worker, number)
-        task, _ = starts[seed % len(starts)]
+        task, _ = start_of(starts, seed)
         return EpisodePlan(task=task, seed=seed, explore=True, source=IMAGINED)
 
     def ended(self, result: EpisodeResult) -> None:
@@ -281,7 +287,6 @@ class Counters:
     dropped_episodes: int = 0  # episodes that ended so
     imagined_decisions: int = 0  # those and the next are in no other counter
     imagined_episodes: int = 0
-    imagined_uncertain: int = 0  # imagined episodes that ended because the world model was too uncertain
 
 
 @dataclass(eq=False)
@@ -300,7 +305,7 @@ class RolloutRunner:
     name: str
     on_segment: Callable[[Segment], object]
     on_episode: Callable[[EpisodeResult], object]
-    starts: deque[tuple[str, Observation]] = field(default_factory=lambda: deque(maxlen=MOST_STARTS))
+    starts: Starts = field(default_factory=lambda: deque(maxlen=MOST_STARTS))
 
     def __post_init__(self) -> None:
         self.counters = Counters()
@@ -346,7 +351,6 @@ class RolloutRunner:
             self.counters.decisions += 1
         else:
             self.counters.imagined_decisions += 1
-            self.counters.imagined_uncertain += bool(result.info.get("uncertain"))
         bad = nonfinite({"the reward": result.rewards, **result.observation})
         if bad or result.info.get("nonfinite"):
             self.counters.dropped_nonfinite += len(episode.builder.taken) + 1

@@ -27,7 +27,7 @@ import numpy as np
 
 from accerl_lerobot import errors
 from accerl_lerobot.envs import EnvConfig, make_environment
-from accerl_lerobot.experience import REAL, Decision, Observation, Request, Segment
+from accerl_lerobot.experience import REAL, Decision, Request, Segment
 from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.rollout.runner import (
     MOST_STARTS,
@@ -36,6 +36,7 @@ from accerl_lerobot.rollout.runner import (
     EpisodeResult,
     RolloutConfig,
     RolloutRunner,
+    Starts,
 )
 from accerl_lerobot.timeline import COMPUTE, TRANSPORT, WAIT_IN, WAIT_OUT, WEIGHT_SYNC, open_clock
 from accerl_lerobot.transport.endpoint import Endpoint, ReconnectingClient
@@ -91,8 +92,8 @@ class RolloutWorker:
         self._environments = [
             make_environment(env, history, config.reward_model) for _ in range(config.environments)
         ]
-        self._starts: deque[tuple[str, Observation]] = deque(maxlen=MOST_STARTS)
-        self._world: Any = None  # an `ImaginedWorld`
+        self._starts: Starts = deque(maxlen=MOST_STARTS)
+        self._world: Any = None  # an `imagined.World`
         self._new_world: deque[tuple[int, Any]] = deque(maxlen=1)
         if imagination is not None and imagination.environments:
             self._imagine(imagination)

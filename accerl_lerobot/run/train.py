@@ -255,6 +255,10 @@ class Run:
             layout.go_back_to(checkpoint)
             self.console.say(f"going on from {checkpoint}")
             self.times.before_s = None
+        if self.config.imagination.environments and self.config.imagination.path is None:
+            from accerl_lerobot.world_model.pretrain import prepared
+
+            self.config = prepared(self.config, self.directory, self.console, self.load)
         self.times.warm_s = time.monotonic() - self.times.started
         self.config = replace(self.config, output_dir=str(self.directory))
         return self.practise(checkpoint)

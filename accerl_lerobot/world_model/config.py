@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Options of world models: network, training, validation, and imagination in a run. Free of torch."""
+"""Options of world models: network, training, and imagination in a run. Free of torch."""
 
 from __future__ import annotations
 
@@ -12,9 +12,8 @@ import draccus
 from accerl_lerobot.config.ranges import DatasetConfig, LearningRate, Range, Section, registered_name
 from accerl_lerobot.errors import InputError
 
-PIXELS = "pixels"  # the type of our own class of learned world models
-SPACE_TO_DEPTH = 4  # side of the pixel blocks that become channels in its network
-IMAGINATION = "imagination"  # name of the config section
+WORLD_LEARNING = "world-model learning"  # name of the worker that trains the pixel world model
+SPACE_TO_DEPTH = 4  # side of the pixel blocks that become channels in the network of `PixelModelConfig`
 WORLD_LEARNING = "world-model learning"  # name of the worker that trains the world model
 
 
@@ -77,7 +76,7 @@ def default_state_model(tells_state: bool) -> StateModelConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class LearnableModelConfig(Section, draccus.ChoiceRegistry, section="world_model.model"):
-    """Base config of a class of learned world models, which is a `contract.LearnableWorldModel`.
+    """Base config of a type of pixel world model, which is a `contract.LearnableWorldModel`.
 
     Example:
         >>> @LearnableModelConfig.register_subclass("mine")
@@ -101,7 +100,7 @@ class LearnableModelConfig(Section, draccus.ChoiceRegistry, section="world_model
         return 1
 
 
-@LearnableModelConfig.register_subclass(PIXELS)
+@LearnableModelConfig.register_subclass("pixels")
 @dataclass(frozen=True, kw_only=True)
 class PixelModelConfig(LearnableModelConfig):
     """Our own world model of images and robot state."""
@@ -123,77 +122,25 @@ class PixelModelConfig(LearnableModelConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
-class LearnConfig(Section, section="world_model.learn"):
-    """Training of a world model."""
-
-    steps: Annotated[int, Range("[1, 1000000000]")] = 1500
-    """Gradient steps of the pre-training."""
-    batch: Annotated[int, Range("[2, 65536]")] = 16
-    """Windows per gradient step."""
-    lr: LearningRate = 1e-3
-    """Peak learning rate; rises over 50 steps and falls to a tenth by a cosine."""
-    chunks: Annotated[int, Range("[1, 10000]")] = 2
-    """Chunks per window. From its second chunk on, the model is trained on its own prediction as input."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class SuccessLearnConfig(Section, section="world_model.success"):
-    """Training of the success model."""
-
-    steps: Annotated[int, Range("[1, 1000000000]")] = 400
-    """Gradient steps."""
-    batch: Annotated[int, Range("[4, 65536]")] = 32
-    """Pairs of frames per gradient step."""
-    lr: LearningRate = 1e-3
-
-
-@dataclass(frozen=True, kw_only=True)
-class ValidationConfig(Section, section="world_model.validation"):
-    """Held-out validation: its data, and the checks that a world model has to pass."""
-
-    depth: Annotated[int, Range("[1, 100000]")] = 6
-    """Chunks predicted from each window, the horizon that frames are compared at."""
-    stride: Annotated[int, Range("[1, 1000000]")] = 10
-    """Env steps between two windows of an episode."""
-    max_windows: Annotated[int, Range("[1, 1000000]")] = 400
-    """Windows at most, drawn at random."""
-    skill: float = 0.3
-    """The skill on changed pixels after one chunk must exceed this."""
-    sensitivity: float = 1.2
-    """The lower end of the sensitivity's interval after one chunk must exceed this."""
-    auroc: float = 0.9
-    """The lower end of the interval of the AUROC of rollouts' outcomes must exceed this."""
-    false_positives: Annotated[float, Range("[0, 1)")] = 0.1
-    """Largest share of failures above the success threshold when it is chosen. Of the thresholds that keep
-    to it, the one that best separates successes from failures is taken."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class WorldModelConfig(Section, section="world_model"):
-    """A world model and its success model. The default has 1.8 million weights and trains on two cores."""
+    """A pixel world model and its training. The default has 2 million weights and trains on two cores."""
 
     model: LearnableModelConfig = field(default_factory=PixelModelConfig)
     discover_packages_path: str | None = field(default=None, metadata={"registers": True})
     """Package to import that registers the type of `model`, where that is not one of ours."""
-    learn: LearnConfig = field(default_factory=LearnConfig)
-    success: SuccessLearnConfig = field(default_factory=SuccessLearnConfig)
-    validation: ValidationConfig = field(default_factory=ValidationConfig)
-    longest: Annotated[int, Range("[1, 10000]")] = 15
-    """Chunks of an imagined rollout at most: so far back lies the anchor, and so long are the imagined
-    replays of real episodes that half of the pairs of frames come from."""
-    held_out: Annotated[float, Range("(0, 1)")] = 0.2
-    """Share of the episodes held out for validation."""
+    steps: Annotated[int, Range("[1, 1000000000]")] = 4000
+    """Gradient steps of the pre-training."""
+    lr: LearningRate = 1e-3
+    """Peak learning rate; rises over 50 steps and falls to a tenth by a cosine."""
     image_size: Annotated[int, Range("[2, 1024]")] = 64
     """Height and width in pixels of the predicted frames."""
     chunk: Annotated[int, Range("[1, 10000]")] = 10
     """Env steps per prediction: the actions a policy executes per decision."""
-    shuffle_actions: bool = False
-    """Train with the actions of other windows: a placebo, which must fail validation."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         multiple = math.lcm(2, self.model.multiple)  # the success model halves it first
-        if self.image_size < multiple or self.image_size % multiple:
+        if self.image_size % multiple:
             hint = f"use a multiple of {multiple}, or change world_model.model"
             raise InputError("world_model.image_size", self.image_size, hint)
 
@@ -203,10 +150,9 @@ class OnlineLearnConfig(Section, section="imagination.learn"):
     """Training of the world model on the policy's episodes during a run."""
 
     steps_per_episode: Annotated[float, Range("[0, 1000000]")] = 5.0
-    """Gradient steps of world model and success model each, per real episode; 0: both stay as they are."""
+    """Gradient steps of the world model per real episode; 0: it stays as it is."""
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
-    """Dataset of the pre-training, or both merged: half of each batch is from the episodes that the model was
-    trained on."""
+    """Dataset that the model of `imagination.path` was trained on: half of each batch comes from it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -216,17 +162,18 @@ class ImaginationConfig(Section, section="imagination"):
     environments: Annotated[int, Range("[0, 1000]")] = 0
     """Imagined environments per rollout process, beside ``rollout.environments`` real ones; 0: none."""
     path: str | None = None
-    """The folder ``world_model`` that ``accerl world-model`` has written."""
+    """The folder ``world_model`` that ``accerl world-model`` has written. None: before training, the run
+    records episodes and trains a world model on them."""
     discover_packages_path: str | None = None
     """Package to import that registers the type of the world model in `path`, where that is not one of ours;
     every machine of the cluster needs it."""
+    policy_episodes: Annotated[int, Range("[0, 9999]")] = 100
+    """Exploring episodes of the policy that are recorded for the pre-training."""
+    expert_episodes: Annotated[int, Range("[0, 9999]")] = 100
+    """Episodes of the scripted expert, disturbed, that are recorded for the pre-training."""
+    steps: Annotated[int, Range("[1, 1000000000]")] = 4000
+    """Gradient steps of the pre-training."""
     learn: OnlineLearnConfig = field(default_factory=OnlineLearnConfig)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.environments and self.path is None:
-            hint = "give the folder world_model that accerl world-model has written"
-            raise InputError("imagination.path", None, hint)
 
     @property
     def learns(self) -> bool:

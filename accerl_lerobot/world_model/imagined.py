@@ -1,58 +1,68 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Imagined environments: a learned world model that the rollout runner steps as it steps a simulator.
+"""Imagined worlds: their files, and the environments that the rollout runner steps as it steps a simulator.
 
 An imagined episode begins at the first observation of a real one. Each chunk is one prediction of the world
-model. The episode ends with the success model's first success, at the time limit, or as a failure where the
-world model is too uncertain, which is the pessimism of MOReL (arXiv 2005.05951).
+model. The episode ends with the success model's first success, or at the time limit.
+
+world_model/
+  config.json          spec, config of the model, keys of the episodes it was trained on, checks it failed
+  model.safetensors    weights and statistics of both models
 
 Shapes: V cameras, H×W pixels, S robot state dims, K env steps of a chunk, A action dims.
 """
 
 from __future__ import annotations
 
+import json
 import logging
-import math
-from collections.abc import Sequence
+from collections.abc import Collection
 from contextlib import closing
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import draccus
 import numpy as np
 import torch
+from safetensors.torch import save_file
 from torch import nn
 
+from accerl_lerobot.checkpoint.safety import FileSource, brief, read_json, read_tensors, safe_join
+from accerl_lerobot.config.parsing import DISCOVER, discover
+from accerl_lerobot.demos.record import make_expert
 from accerl_lerobot.envs import make_environment
 from accerl_lerobot.envs.base import ChunkResult, Environment, EnvironmentSpec, checked_actions
 from accerl_lerobot.errors import InputError, expanded
 from accerl_lerobot.experience import IMAGINED, TASK, Observation, task_codes
-from accerl_lerobot.world_model.config import IMAGINATION, ImaginationConfig
+from accerl_lerobot.policies.untrusted import Unfilled, input_error
+from accerl_lerobot.rollout.runner import Starts, start_of
+from accerl_lerobot.world_model.config import ImaginationConfig, LearnableModelConfig
 from accerl_lerobot.world_model.contract import (
     Context,
     LearnableWorldModel,
     Prediction,
     State,
     WorldModelSpec,
+    new_model,
 )
-from accerl_lerobot.world_model.data import model_arrays, open_datasets, resize
-from accerl_lerobot.world_model.store import check_predicts, load_failed, load_world_model
-from accerl_lerobot.world_model.success_model import SuccessPairsRewardModel
+from accerl_lerobot.world_model.data import check_dataset, model_arrays, resize
+from accerl_lerobot.world_model.pixels import SuccessModel
 
 if TYPE_CHECKING:
     from accerl_lerobot.engines.config import RunConfig
 
 logger = logging.getLogger(__name__)
 
+CONFIG, WEIGHTS = "config.json", "model.safetensors"
 LEARN = "imagination.learn.dataset"
-MAX_UNCERTAINTY = 2.0
-"""Uncertainty above which an episode ends before a prediction; 1 is training data's 95th percentile."""
 
 
-class ImaginedWorld(nn.Module):
+class World(nn.Module):
     """World model and success model, which all imagined environments of a process share."""
 
-    def __init__(self, model: LearnableWorldModel, success: SuccessPairsRewardModel) -> None:
+    def __init__(self, model: LearnableWorldModel) -> None:
         super().__init__()
-        self.model, self.success = model, success
+        self.model, self.success = model, SuccessModel()
         self.version = 0  # gradient steps that they have made in the run
 
     def begin(self, frames: np.ndarray, robot: np.ndarray, task: str) -> State:
@@ -64,19 +74,22 @@ class ImaginedWorld(nn.Module):
             frames=images[:, None].repeat(1, spec.context, 1, 1, 1, 1),
             robot=numbers[:, None].repeat(1, spec.context, 1),
             actions=torch.zeros(1, spec.context - 1, spec.chunk, spec.action_dim),
+            first_frame=images,
+            first_robot=numbers,
             commanded_sum=torch.zeros(1, spec.action_dim),
-            initial_state=numbers,
         )
         return self.model.begin(context, [task])
 
     @torch.no_grad()
     def step(self, state: State, actions: np.ndarray, seed: int) -> Prediction:
-        """Predict one chunk of actions, float32 (K, A)."""
+        """Predicts one chunk of actions, float32 (K, A)."""
         return self.model.step(state, torch.from_numpy(actions[None]), [seed])
 
-    def succeeds(self, before: np.ndarray, after: np.ndarray, task: str) -> float:
-        """P(success) after a chunk, of the frames before and after it, uint8 (V, H, W, 3)."""
-        return float(self.success.probabilities(before[None], after[None], task_codes([task]))[0])
+    def succeeds(self, frames: np.ndarray, task: str) -> bool:
+        """True if the frames, uint8 (V, H, W, 3), show the task achieved."""
+        codes = torch.from_numpy(task_codes([task]))
+        probability = self.success.probabilities(torch.from_numpy(frames[None]), codes)
+        return bool(probability[0] > self.success.threshold)
 
     def load(self, version: int, weights: dict[str, Any]) -> None:
         """Take over the weights of another world, between two chunks; episodes under way go on."""
@@ -84,32 +97,89 @@ class ImaginedWorld(nn.Module):
         self.version = version
 
 
+def save_world(
+    directory: Path, world: World, learnt: Collection[str] = (), failed_checks: Collection[str] | None = None
+) -> None:
+    """Writes a new folder. `learnt` are keys of episodes; `failed_checks` None: it has not been checked."""
+    directory.mkdir(parents=True)
+    content = {
+        "spec": asdict(world.model.spec),
+        "model": draccus.encode(world.model.config, LearnableModelConfig),
+        "learnt": sorted(learnt),
+        "failed_checks": None if failed_checks is None else list(failed_checks),
+    }
+    (directory / CONFIG).write_text(json.dumps(content, indent=2) + "\n")
+    # Copies, as safetensors refuses tensors that share memory.
+    weights = {k: v.clone(memory_format=torch.contiguous_format) for k, v in world.state_dict().items()}
+    save_file(weights, directory / WEIGHTS)
+
+
+def read_content(directory: Path, section: str = "") -> dict[str, Any]:
+    """The config file that `save_world` wrote; errors name the config `section`."""
+    origin = _origin(directory, section)
+    content = read_json(safe_join(directory, CONFIG, origin), origin)
+    for name in ("learnt", "failed_checks"):
+        if not isinstance(content.get(name) or [], list):
+            raise origin.refuse(f"{CONFIG}: {name}", "not one of accerl world-model")
+    return content
+
+
+def load_world(directory: Path, package: str | None = None, *, section: str = "") -> World:
+    """Reads what `save_world` wrote, on the CPU and in eval mode.
+
+    `package` registers the model's type, where that is not one of ours; errors name the config `section`.
+    """
+    origin = _origin(directory, section)
+    discover(package, section)
+    content = read_content(directory, section)
+    named, types = content.get("model"), sorted(LearnableModelConfig.get_known_choices())
+    kind = named.get("type") if isinstance(named, dict) else None
+    if kind not in types:
+        package_field = origin.field.removesuffix("path") + DISCOVER
+        hint = f"use one of {', '.join(types)}, or name its package: {package_field}"
+        raise origin.refuse(f"{CONFIG}: model.type", f"{str(kind)[:60]!r}; {hint}")
+    weights = safe_join(directory, WEIGHTS, origin)
+    try:
+        with Unfilled():
+            spec = draccus.decode(WorldModelSpec, content.get("spec"))
+            world = World(new_model(spec, draccus.decode(LearnableModelConfig, named)))
+        world.load_state_dict(dict(read_tensors(weights, origin)))
+    except Exception as error:  # the files may hold anything
+        ours = input_error(error)  # draccus wraps what a config refuses
+        if ours is None:
+            hint = f"not a world model of accerl world-model ({brief(error)})"
+            raise InputError(origin.field, origin.value, hint) from error
+        raise (ours if ours.field == origin.field else origin.refuse(CONFIG, brief(ours))) from error
+    return world.requires_grad_(False).eval()
+
+
+def _origin(directory: Path, section: str) -> FileSource:
+    return FileSource(f"{section}.path" if section else "path", str(directory))
+
+
 class ImaginedEnvironment(Environment):
     """An environment of a world model's predictions, with the real environment's spec.
 
     Args:
-        starts: tasks and first observations of real episodes; `reset` takes one of them by its seed.
+        starts: tasks and first observations of real episodes.
     """
 
     source = IMAGINED
 
-    def __init__(
-        self, world: ImaginedWorld, spec: EnvironmentSpec, starts: Sequence[tuple[str, Observation]]
-    ) -> None:
+    def __init__(self, world: World, spec: EnvironmentSpec, starts: Starts) -> None:
         self.spec, self._world, self._starts = spec, world, starts
         self._task = ""
         self._seed = self._steps = 0
         self._done = True
         self._frames = np.zeros((0, 0, 0, 3), np.uint8)
-        self._robot = np.zeros(0, np.float32)
         self._state: State = {}
 
     def reset(self, seed: int, task: str) -> Observation:
-        _, first = self._starts[seed % len(self._starts)]
+        _, first = start_of(self._starts, seed)
         arrays = {name: np.asarray(value)[None] for name, value in first.items() if name != TASK}
         frames, robot = model_arrays(arrays, self._world.model.spec)
         self._task, self._seed, self._steps, self._done = str(first[TASK]), seed, 0, False
-        self._frames, self._robot = frames[0], robot[0]
+        self._frames = frames[0]
         self._state = self._world.begin(frames[0], robot[0], self._task)
         return self._observation(robot[0])
 
@@ -119,32 +189,26 @@ class ImaginedEnvironment(Environment):
         actions = checked_actions(actions, self.spec)
         seed = int(np.random.default_rng((self._seed, self._steps)).integers(2**31))
         prediction = self._world.step(self._state, actions, seed)
-        frames, robot = prediction.frames[0].cpu().numpy(), prediction.robot[0].cpu().numpy()
-        probability = self._world.succeeds(self._frames, frames, self._task)
-        uncertain = float(prediction.uncertainty[0]) > MAX_UNCERTAINTY  # NaN: the model has none
-        if not (np.isfinite(robot).all() and math.isfinite(probability)):
-            uncertain, frames, robot = True, self._frames, self._robot  # the model has diverged
-        success = not uncertain and probability > self._world.success.config.threshold
-        self._state, self._frames, self._robot = prediction.state, frames, robot
+        self._state, self._frames = prediction.state, prediction.frames[0].cpu().numpy()
+        success = self._world.succeeds(self._frames, self._task)
         self._steps += len(actions)
         late = self._steps >= self.spec.max_steps
-        self._done = success or uncertain or late
+        self._done = success or late
         rewards = np.zeros(len(actions), np.float32)
         rewards[-1] = float(success)
         return ChunkResult(
-            observation=self._observation(robot),
+            observation=self._observation(prediction.robot[0].cpu().numpy()),
             rewards=rewards,
             terminated=success,
-            truncated=self._done and not success,
+            truncated=late and not success,
             success=success,
-            info={"uncertain": float(uncertain)},
         )
 
     def render(self, height: int, width: int) -> np.ndarray:
         return resize(self._frames[:1], (height, width))[0]
 
     def state(self) -> Any:
-        names = ("_task", "_seed", "_steps", "_done", "_frames", "_robot", "_state")
+        names = ("_task", "_seed", "_steps", "_done", "_frames", "_state")
         return {name: getattr(self, name) for name in names}
 
     def restore(self, state: Any) -> None:
@@ -162,24 +226,28 @@ class ImaginedEnvironment(Environment):
         return observation
 
 
-def load_world(config: ImaginationConfig) -> ImaginedWorld:
-    """The world that ``imagination.path`` has, on the CPU."""
-    path = expanded(str(config.path), f"{IMAGINATION}.path")
-    return ImaginedWorld(*load_world_model(path, config.discover_packages_path, section=IMAGINATION))
+def world_path(config: ImaginationConfig) -> Path:
+    """The folder that ``imagination.path`` names."""
+    return expanded(str(config.path), "imagination.path")
+
+
+def world_of(config: ImaginationConfig) -> World:
+    """The world that ``imagination.path`` has."""
+    return load_world(world_path(config), config.discover_packages_path, section="imagination")
 
 
 def imagined_environments(
-    config: ImaginationConfig, count: int, spec: EnvironmentSpec, starts: Sequence[tuple[str, Observation]]
-) -> tuple[ImaginedWorld, list[Environment]]:
+    config: ImaginationConfig, count: int, spec: EnvironmentSpec, starts: Starts
+) -> tuple[World, list[Environment]]:
     """The world of a run, and so many environments in it; `spec` is the real environment's."""
-    world = load_world(config)
+    world = world_of(config)
     return world, [ImaginedEnvironment(world, spec, starts) for _ in range(count)]
 
 
 def check_imagination(config: RunConfig) -> None:
-    """Refuses, before a run begins, a world model that does not fit environment and policy.
+    """Refuses, before a run begins, what imagined episodes cannot have, and a world model that does not fit.
 
-    It warns of one that is used as it is and has failed its validation.
+    It warns of a world model that has failed a check.
     """
     from accerl_lerobot.run.preflight import policy_to_be
 
@@ -197,31 +265,25 @@ def check_imagination(config: RunConfig) -> None:
         raise InputError("policy.n_obs_steps", policy.n_obs_steps, f"{hint} policy with 1, or no imagination")
     with closing(make_environment(config.env)) as environment:
         spec = environment.spec
-    path = expanded(str(imagination.path), f"{IMAGINATION}.path")
-    world = load_world(imagination)
-    check_predicts(path, world.model, world.success, section=IMAGINATION)
-    check_fit(world.model.spec, spec, getattr(policy, "n_action_steps", 1))
-    if imagination.learns:
-        open_datasets({LEARN: imagination.learn.dataset}, world.model.spec)
-    _warn_of_failed(path)
+        if imagination.path is None:
+            if imagination.expert_episodes:
+                make_expert(config.env, environment, spec.tasks[0])
+            return
+    world = world_of(imagination)
+    _check_fit(world.model.spec, spec, getattr(policy, "n_action_steps", 1))
+    if imagination.learns and imagination.learn.dataset.repo_id is not None:
+        check_dataset(imagination.learn.dataset, world.model.spec, LEARN)
+    failed = read_content(world_path(imagination), "imagination").get("failed_checks")
+    if failed != []:
+        why = "was never checked" if failed is None else f"failed checks ({', '.join(map(str, failed))})"
+        text = "the world model of imagination.path=%s %s; train it longer or on more episodes"
+        logger.warning(text, imagination.path, why)
 
 
-def _warn_of_failed(path: Path) -> None:
-    failed = load_failed(path, IMAGINATION)
-    if failed == []:
-        return
-    why = "was never validated" if failed is None else f"failed its validation ({', '.join(failed)[:200]})"
-    logger.warning(
-        "the world model of imagination.path=%s %s and is used all the same; train it longer or on more "
-        "episodes",
-        path, why,
-    )  # fmt: skip
-
-
-def check_fit(spec: WorldModelSpec, environment: EnvironmentSpec, executed: int) -> None:
+def _check_fit(spec: WorldModelSpec, environment: EnvironmentSpec, executed: int) -> None:
     """Refuses a world model that does not fit environment and policy, which executes so many actions per
     decision."""
-    field, again = f"{IMAGINATION}.path", "train one of this environment"
+    field, again = "imagination.path", "train one of this environment"
     if missing := [camera for camera in environment.images if camera not in spec.cameras]:
         hint = f"the environment shows this camera, the world model {spec.cameras!r}; {again}"
         raise InputError(field, missing[0], hint)
@@ -230,15 +292,9 @@ def check_fit(spec: WorldModelSpec, environment: EnvironmentSpec, executed: int)
         if modelled != real:
             hint = f"is the world model's {name}, and the environment's is {real}; {again}"
             raise InputError(field, modelled, hint)
-    if spec.tasks and (others := [task for task in environment.tasks if not _is_of(task, spec.tasks)]):
-        hint = f"the world model is of {spec.tasks!r}; name these, or train one of it"
-        raise InputError("env.task", others[0], hint)
+    unknown = [text for text in environment.instructions if spec.tasks and text not in spec.tasks]
+    if unknown:
+        raise InputError(field, unknown[0], f"the world model was trained on {spec.tasks!r}; {again}")
     if spec.chunk != executed:
         hint = f"env steps per prediction, and the policy executes {executed} actions per decision"
         raise InputError(field, spec.chunk, f"{hint}; train one with world_model.chunk={executed}")
-
-
-def _is_of(task: str, known: Sequence[str]) -> bool:
-    """True if the task is known. A task of a suite that is played alone may have the suite's name only."""
-    suite, _, number = task.partition("/")
-    return task in known or suite in known or (not number and any(k.startswith(f"{suite}/") for k in known))

@@ -1,21 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Training of a world model on the policy's episodes during a run.
+"""Training of a pixel world model on the policy's episodes during a run.
 
-The loss is that of the pre-training with its defaults. Batches are of real windows only: some from the
-pre-training data, the others from the policy's episodes, the newest and the failed ones more often, as
-demonstrations do not show how the policy fails.
+Half of each batch is from the pre-training data, half from the policy's episodes: demonstrations do not show
+how the policy fails.
 """
 
 from __future__ import annotations
 
-import contextlib
 import copy
-import math
 import os
 import threading
 from collections import OrderedDict, deque
-from collections.abc import Mapping, Sequence
-from itertools import accumulate
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,37 +21,25 @@ from accerl_lerobot import errors
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE, WORLD_MODEL
 from accerl_lerobot.checkpoint.tensors import copied
-from accerl_lerobot.errors import expanded
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import REAL, Segment
 from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, open_clock
-from accerl_lerobot.world_model.config import (
-    IMAGINATION,
-    WORLD_LEARNING,
-    LearnConfig,
-    OnlineLearnConfig,
-    SuccessLearnConfig,
-    WorldModelConfig,
-)
+from accerl_lerobot.world_model.config import WORLD_LEARNING, OnlineLearnConfig
 from accerl_lerobot.world_model.contract import WorldModelSpec
-from accerl_lerobot.world_model.data import Episode, WindowStart, load_datasets, model_arrays
-from accerl_lerobot.world_model.imagined import LEARN, ImaginedWorld, load_world
-from accerl_lerobot.world_model.learners import Examples, Learner, SuccessLearner
-from accerl_lerobot.world_model.store import LEARNT, load_roles, save_world_model
+from accerl_lerobot.world_model.data import Episode, load_episodes, model_arrays
+from accerl_lerobot.world_model.imagined import LEARN, World, read_content, save_world, world_of, world_path
+from accerl_lerobot.world_model.training import Trainer, uniform
 
 if TYPE_CHECKING:
     from accerl_lerobot.engines.config import RunConfig
 
-BATCH, LEARNING_RATE = 16, 3e-4  # windows per gradient step, and the learning rate after the first steps
-OFFLINE, RECENT, FAILURES = 0.5, 0.7, 0.6
-"""Share of windows from the pre-training data; of the others, from the newest quarter of episodes; and of
-those, from failures."""
+ONLINE = "online_world_model"  # name of its part of a checkpoint
+LEARNING_RATE = 3e-4
 MEMORY = 400  # real episodes kept for training
 MOST_PENDING = 16  # episodes whose steps may be due, where episodes come faster than it can train
 MOST_UNFINISHED = 1024
 """Incomplete episodes; of more the oldest are dropped, such as those of a worker that died."""
-ONLINE = "online_world_model"  # name of its part of a checkpoint
-ENDLESS = 10**9  # steps of a learning rate that never falls
 
 
 def episode_from_segments(segments: Sequence[Segment], spec: WorldModelSpec) -> Episode:
@@ -70,177 +54,119 @@ def episode_from_segments(segments: Sequence[Segment], spec: WorldModelSpec) -> 
     return Episode(
         frames=frames,
         times=np.concatenate([[0], np.cumsum(steps)]).astype(np.int64),
-        state=robot.astype(np.float32),
+        state=robot,
         actions=actions,
         success_at=len(actions) - 1 if segments[-1].success else -1,
         task=segments[-1].task,
-        own=True,
     )
 
 
 class OnlineLearner:
-    """Trains a copy of both models as real segments come in: `add`, and `step` while steps are pending.
+    """Trains a copy of a world as real segments come in: `add`, and `step` while steps are pending.
 
     Args:
-        known: episodes of the pre-training, in whose windows it goes on to be trained.
-        roles: what the saved world model knows of episodes, by their keys, see `store`.
-        longest: chunks of an imagined episode at most.
+        offline: episodes of the pre-training, in which it goes on to be trained.
+        learnt: keys of all episodes of the pre-training.
     """
 
     def __init__(
         self,
-        world: ImaginedWorld,
+        world: World,
         config: OnlineLearnConfig,
-        known: Sequence[Episode] = (),
-        roles: Mapping[str, str] | None = None,
-        longest: int = 15,
+        offline: Sequence[Episode] = (),
+        learnt: Collection[str] = (),
         seed: int = 0,
     ) -> None:
         self.config = config
-        self.roles = dict(roles or {}) | {episode.key: LEARNT for episode in known}
+        self.learnt = set(learnt)
         self.pending_steps = 0.0  # gradient steps that are due
-        training = WorldModelConfig(
-            learn=LearnConfig(steps=ENDLESS, batch=BATCH, lr=LEARNING_RATE),
-            success=SuccessLearnConfig(lr=LEARNING_RATE),
-            longest=longest,
-        )
-        self._learner = Learner(copy.deepcopy(world.model).requires_grad_(True), training, seed)
-        self._success = SuccessLearner(copy.deepcopy(world.success).requires_grad_(True), training, seed)
-        self._offline = [episode for episode in known if len(episode.frames) > 1]
-        self._learnt: deque[Episode] = deque(maxlen=MEMORY)
-        self._rng = np.random.default_rng((seed, 4))
+        self._trainer = Trainer(copy.deepcopy(world), LEARNING_RATE, seed)
+        self._offline = list(offline)
+        self._own: deque[Episode] = deque(maxlen=MEMORY)
         self._unfinished: OrderedDict[tuple[str, int], dict[int, Segment]] = OrderedDict()
-        self._seen: set[str] = set()  # keys of segments, which a trainer may draw more than once
-        self._examples: Examples | None = None
+        self._ended: set[tuple[str, int]] = set()  # episodes whose segments a trainer may draw again
 
     @property
     def version(self) -> int:
         """Gradient steps made."""
-        return self._learner.count
+        return self._trainer.count
 
     @property
-    def world(self) -> ImaginedWorld:
+    def world(self) -> World:
         """The models to use now, which share their weights with this learner."""
-        world = ImaginedWorld(self._learner.serving, self._success.model)
+        world = self._trainer.serving
         world.version = self.version
         return world
 
     def add(self, segment: Segment) -> None:
         """Takes a real segment, once."""
-        if segment.source != REAL or segment.key in self._seen:
-            return
-        self._seen.add(segment.key)
-        parts = self._completed(segment)
-        if parts is None or (parts[-1].success and not parts[-1].terminated):
-            return  # incomplete, or the step of its success is unknown
-        episode = episode_from_segments(parts, self._learner.model.spec)
-        self._learnt.append(episode)
-        self.roles[episode.key] = LEARNT
-        self._take_examples()
-        most = MOST_PENDING * self.config.steps_per_episode
-        self.pending_steps = min(self.pending_steps + self.config.steps_per_episode, most)
-
-    def step(self) -> dict[str, float]:
-        """Makes one gradient step of either model."""
-        self.pending_steps -= 1
-        metrics = self._learner.step(self._learner.cut(self._episodes, self._draw()))
-        if self._examples is not None:
-            success = self._success.step(self._examples, self._learner.serving)
-            metrics |= {f"success_{k}": v for k, v in success.items()}
-        return metrics
-
-    def state(self) -> dict[str, Any]:
-        """Copies all that `restore` needs."""
-        return {
-            "pending_steps": self.pending_steps,
-            "roles": dict(self.roles),
-            "learner": self._learner.state(),
-            "success": self._success.state(),
-            "learnt": list(self._learnt),
-            "rng": copy.deepcopy(self._rng),
-            "unfinished": {name: dict(parts) for name, parts in self._unfinished.items()},
-            "seen": sorted(self._seen),
-        }
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Continues from a `state`."""
-        self.pending_steps, self._rng = state["pending_steps"], state["rng"]
-        self.roles = state["roles"]
-        self._learner.restore(state["learner"])
-        self._success.restore(state["success"])
-        self._learnt.extend(state["learnt"])
-        self._unfinished.update(state["unfinished"])
-        self._seen.update(state["seen"])
-        self._take_examples()
-
-    def metrics(self) -> dict[str, float]:
-        return {"learn_steps": float(self.version), "learn_episodes": float(len(self._learnt))}
-
-    @property
-    def _episodes(self) -> list[Episode]:
-        return [*self._offline, *self._learnt]
-
-    def _take_examples(self) -> None:
-        """Take the success model's examples from all episodes; none while there is one kind of outcome."""
-        self._examples = None
-        with contextlib.suppress(ValueError):
-            self._examples = Examples(self._episodes, self._learner.model.spec.chunk)
-
-    def _completed(self, segment: Segment) -> list[Segment] | None:
-        """The whole episode, in order, if it is complete with this segment."""
         name = segment.origin[:2]
+        if segment.source != REAL or name in self._ended:
+            return
         parts = self._unfinished.setdefault(name, {})
         parts[segment.origin.decision] = segment
         if len(self._unfinished) > MOST_UNFINISHED:
             self._unfinished.popitem(last=False)
         ordered = [parts[decision] for decision in sorted(parts)]
-        starts = accumulate(map(len, ordered[:-1]), initial=0)
-        if sorted(parts) != [*starts] or not ordered[-1].terminated:
-            return None
+        last = ordered[-1]
+        if not last.terminated or sum(map(len, ordered)) != last.origin.decision + len(last):
+            return
         self._unfinished.pop(name, None)
-        return ordered
+        self._ended.add(name)
+        episode = episode_from_segments(ordered, self._trainer.world.model.spec)
+        self._own.append(episode)
+        self.learnt.add(episode.key)
+        most = MOST_PENDING * self.config.steps_per_episode
+        self.pending_steps = min(self.pending_steps + self.config.steps_per_episode, most)
 
-    def _draw(self) -> list[WindowStart]:
-        """Draws a batch from the pre-training episodes, which have the first indices, and the policy's."""
-        known = len(self._offline)
-        offline = round(OFFLINE * BATCH) if known else 0
-        chosen = self._rng.integers(known, size=offline).tolist() if offline else []
-        weights = episode_weights([e.success for e in self._learnt])
-        chosen += (known + self._rng.choice(len(weights), size=BATCH - offline, p=weights)).tolist()
-        episodes = self._episodes
-        return [WindowStart(e, int(self._rng.integers(len(episodes[e].frames) - 1))) for e in chosen]
+    def step(self) -> dict[str, float]:
+        """Makes one gradient step of both models."""
+        self.pending_steps -= 1
+        parts = [part for part in (self._offline, list(self._own)) if part]
+        weights = np.concatenate([uniform(part) for part in parts]) / len(parts)
+        return self._trainer.step([episode for part in parts for episode in part], weights)
 
+    def state(self) -> dict[str, Any]:
+        """Copies all that `restore` needs."""
+        return {
+            "pending_steps": self.pending_steps,
+            "learnt": sorted(self.learnt),
+            "trainer": self._trainer.state(),
+            "own": list(self._own),
+            "unfinished": {name: dict(parts) for name, parts in self._unfinished.items()},
+            "ended": sorted(self._ended),
+        }
 
-def episode_weights(successes: Sequence[bool]) -> np.ndarray:
-    """Probability of drawing each of the policy's episodes, oldest first."""
-    count = len(successes)
-    newest = np.arange(count) >= count - max(1, count // 4)
-    weights = np.where(newest, RECENT / newest.sum(), (1 - RECENT) / max(1, (~newest).sum()))
-    failed = ~np.asarray(successes, bool)
-    if failed.any() and not failed.all():
-        for which, share in ((failed, FAILURES), (~failed, 1 - FAILURES)):
-            weights[which] *= share / weights[which].sum()
-    return np.asarray(weights / weights.sum())
+    def restore(self, state: dict[str, Any]) -> None:
+        """Continues from a `state`."""
+        self.pending_steps, self.learnt = state["pending_steps"], set(state["learnt"])
+        self._trainer.restore(state["trainer"])
+        self._own.extend(state["own"])
+        self._unfinished.update(state["unfinished"])
+        self._ended.update(state["ended"])
+
+    def metrics(self) -> dict[str, float]:
+        return {"learn_steps": float(self.version), "learn_episodes": float(len(self._own))}
 
 
 def make_learner(config: RunConfig) -> OnlineLearner:
-    """The learner of a run's world model, which starts at the saved one.
-
-    Of ``imagination.learn.dataset`` it is trained on the episodes that were not held out before.
-    """
-    world, imagination = load_world(config.imagination), config.imagination
-    roles = load_roles(expanded(str(imagination.path), f"{IMAGINATION}.path"))
-    held_out = {key for key, role in roles.items() if role != LEARNT}
-    known = load_datasets({LEARN: imagination.learn.dataset}, world.model.spec).get(LEARN, [])
-    known = [episode for episode in known if episode.key not in held_out]
-    longest = math.ceil(config.env.max_steps / world.model.spec.chunk)
-    return OnlineLearner(world, imagination.learn, known, roles, longest, config.seed)
+    """The learner of a run's world model, which starts at the saved one and goes on with its episodes."""
+    imagination, dataset = config.imagination, config.imagination.learn.dataset
+    world = world_of(imagination)
+    learnt = set(read_content(world_path(imagination), "imagination").get("learnt") or ())
+    offline: list[Episode] = []
+    if dataset.repo_id is not None:
+        episodes = load_episodes(dataset, world.model.spec, LEARN)
+        offline = [episode for episode in episodes if episode.key in learnt]
+        if not offline:
+            hint = "the world model of imagination.path was trained on no episode of it; name another"
+            raise InputError(f"{LEARN}.repo_id", dataset.repo_id, hint)
+    return OnlineLearner(world, imagination.learn, offline, learnt, config.seed)
 
 
 def save_online(directory: Path, learner: OnlineLearner) -> None:
     """Writes the learned models into a checkpoint, as ``accerl world-model`` writes them."""
-    world = learner.world
-    save_world_model(directory / WORLD_MODEL, world.model, world.success, learner.roles)
+    save_world(directory / WORLD_MODEL, learner.world, learner.learnt)
 
 
 class OnlineLearningWorker:

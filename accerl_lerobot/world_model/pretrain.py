@@ -1,17 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pre-training of a world model on LeRobotDatasets, and its held-out validation; ``accerl world-model``.
+"""Training of a pixel world model before a run.
+
+``accerl world-model`` trains on a LeRobotDataset. `prepared` is what ``accerl train`` does where no world
+model is named: it records episodes of the policy and of a disturbed expert, and trains on them.
 
 <output_dir>/
-  world_model/     see `store.py`
-  metrics.jsonl    training losses
-and the results of the validation, see `validation.py`.
+  world_model/       see `imagined.py`
+  metrics.jsonl      training losses
+  validation.json    the check
+  preview.mp4        held-out episodes, recorded above imagined
 """
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
@@ -21,113 +27,211 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from accerl_lerobot.checkpoint.layout import write_atomically
 from accerl_lerobot.config.ranges import DatasetConfig
-from accerl_lerobot.console import Console, Stage
+from accerl_lerobot.console import Console
+from accerl_lerobot.demos import record
 from accerl_lerobot.envs import EnvConfig, make_environment
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.envs.base import ChunkResult, Environment, WrappedEnvironment
+from accerl_lerobot.errors import InputError, expanded
+from accerl_lerobot.experience import Observation
+from accerl_lerobot.metrics import plain
+from accerl_lerobot.policies.config import Load, loader
 from accerl_lerobot.policies.loading import resolve_device
-from accerl_lerobot.world_model import data, learners, store, validation
+from accerl_lerobot.rollout.runner import EpisodePlans, RolloutRunner
+from accerl_lerobot.run.preflight import policy_to_be
+from accerl_lerobot.world_model.check import check, checks_table, preview
 from accerl_lerobot.world_model.config import WorldModelConfig
 from accerl_lerobot.world_model.contract import WorldModelSpec, new_model
-from accerl_lerobot.world_model.data import Episode
+from accerl_lerobot.world_model.data import load_episodes, split_episodes
+from accerl_lerobot.world_model.imagined import World, load_world, read_content, save_world
+from accerl_lerobot.world_model.training import Trainer, uniform
 
 if TYPE_CHECKING:
-    from accerl_lerobot.cli.configs import WorldModelRun
+    from accerl_lerobot.cli.configs import WorldModelEvalRun
+    from accerl_lerobot.engines.config import RunConfig
 
 LOG_EVERY = 20  # steps between two lines of training losses
-METRICS = "metrics.jsonl"
+VALIDATION = "validation.json"
+PLAY, PRETRAINING = "play", "pretraining"  # folders of a run: recorded episodes, and their world model
+DISTURBED = record.DemosConfig(failure_share=0.1, action_noise=0.2, push=2.0)
+"""The expert's part of `PLAY`: some of its episodes miss narrowly, as a policy does, and some drift."""
+PLAY_WORKER = 999  # of the seeds of the policy's part of `PLAY`, apart from those of rollout workers
 
 
-def world_spec(config: WorldModelConfig, env: EnvConfig) -> WorldModelSpec:
-    """Spec of a model of this environment."""
-    with closing(make_environment(env)) as environment:
-        spec = environment.spec
-    return WorldModelSpec(
-        cameras=tuple(spec.images), image_size=(config.image_size, config.image_size),
-        state_dim=spec.state_dim, action_dim=spec.action_dim, chunk=config.chunk,
-        context=config.model.context, fps=spec.fps,
-    )  # fmt: skip
-
-
-def pretrain(run: WorldModelRun, directory: Path, console: Console) -> dict[str, Any]:
-    """Trains, validates and saves a world model; `directory` exists and is empty.
+def pretrain(
+    config: WorldModelConfig,
+    env: EnvConfig,
+    dataset: DatasetConfig,
+    directory: Path,
+    console: Console,
+    *,
+    seed: int,
+    device: str,
+) -> dict[str, Any]:
+    """Trains, checks and saves a world model; `directory` exists.
 
     Returns:
-        See `validate_datasets`, with ``seconds`` of the training and how many ``episodes`` and ``env_steps``
-        were ``learnt`` and ``held_out``.
+        What `check` returns, with ``seconds`` of the training and the number of ``learnt`` episodes.
     """
-    device = resolve_device(run.device, "device")
-    config, rng = run.world_model, np.random.default_rng((run.seed, 0))
-    spec = world_spec(config, run.env)
-    learnt: list[Episode] = []
-    held_out: dict[str, list[Episode]] = {}
-    with console.stage("episodes"):
-        loaded = data.load_datasets({data.DATASET: run.dataset, data.ONLINE: run.online}, spec)
-        for section, episodes in loaded.items():
-            learn, held_out[section] = data.split_episodes(episodes, config.held_out, rng)
-            with data.name_section(section):
-                _check_split(getattr(run, section), learn, held_out[section], config)
-            learnt += learn
-    held = [episode for part in held_out.values() for episode in part]
-    spec = replace(spec, tasks=_tasks(run.env, learnt + held))
-
-    def on_step(stage: Stage, kind: str, step: int, metrics: dict[str, float]) -> None:
-        stage.update(step, " ".join(f"{k} {v:.3f}" for k, v in [*metrics.items()][:2]))
-        if step % LOG_EVERY == 0:
-            with (directory / METRICS).open("a") as log:
-                log.write(json.dumps({"kind": kind, "step": step} | metrics) + "\n")
-
-    started = time.monotonic()
-    examples = learners.Examples(learnt, config.chunk)
-    torch.manual_seed(run.seed)
-    # Both networks are initialised on the CPU, so alike on every device.
-    model = new_model(spec, config.model).to(device)
-    with console.stage("world model", total=config.learn.steps) as stage:
-        say = partial(on_step, stage, "world_model")
-        serving = learners.train_from_scratch(model, learnt, config, run.seed, say).serving
-    validation.fit_uncertainty_scale(serving, learnt, config.validation, run.seed)
-    success = learners.new_success_model(config.chunk).to(device)
-    learner = learners.SuccessLearner(success, config, run.seed)
-    with console.stage("success model", total=config.success.steps) as stage:
-        for step in range(1, config.success.steps + 1):
-            on_step(stage, "success_model", step, learner.step(examples, serving))
-    success.eval()
-    seconds = time.monotonic() - started
-
-    roles = {e.key: store.HELD_OUT for e in held} | {e.key: store.LEARNT for e in learnt}
-    store.save_world_model(directory / "world_model", serving, success, roles)
-    with console.stage("validation"):
-        found = validation.validate_datasets(serving, held_out, config.validation, success, run.seed)
-        validation.preview_videos(directory, serving, held_out, config.validation, run.seed)
-    failed = (name for name, check in found["checks"].items() if not check["holds"])
-    store.note_failed(directory / "world_model", failed)
-    # The threshold is chosen on the policy's failures, where there are any, as demonstrations fail otherwise.
-    success.config.threshold = list(found["datasets"].values())[-1]["threshold"]
-    success.save_pretrained(directory / "world_model" / store.SUCCESS)
-    counts = {"learnt": data.count_episodes(learnt), "held_out": data.count_episodes(held)}
-    return found | counts | {"seconds": seconds}
-
-
-def _tasks(env: EnvConfig, episodes: Sequence[Episode]) -> tuple[str, ...]:
-    """Names of the environment's tasks that the episodes have, matched by their instructions."""
+    torch_device = resolve_device(device, "device")
     with closing(make_environment(env)) as environment:
-        instructions = {name: str(environment.reset(0, name)["task"]) for name in environment.spec.tasks}
-    recorded = {episode.task for episode in episodes}
-    if unknown := sorted(recorded - set(instructions.values())):
-        hint = f"an episode's task is {unknown[0][:80]!r}, which none of these is; name its task"
-        raise InputError("env.task", ", ".join(instructions), hint)
-    return tuple(name for name, task in instructions.items() if task in recorded)
-
-
-def _check_split(
-    dataset: DatasetConfig, learnt: Sequence[Episode], held_out: Sequence[Episode], config: WorldModelConfig
-) -> None:
-    """Refuses a split that could not be validated, before the training."""
+        sizes = environment.spec
+    spec = WorldModelSpec(
+        cameras=tuple(sizes.images), image_size=(config.image_size, config.image_size),
+        state_dim=sizes.state_dim, action_dim=sizes.action_dim, chunk=config.chunk,
+        context=config.model.context, fps=sizes.fps,
+    )  # fmt: skip
+    with console.stage("episodes"):
+        episodes = load_episodes(dataset, spec)
+    learnt, held_out = split_episodes(episodes, np.random.default_rng((seed, 0)))
     if any({episode.success for episode in part} != {True, False} for part in (learnt, held_out)):
-        hint = "at least two successes and two failures (demos.failure_share) are needed, to hold out one"
+        hint = (
+            "it needs at least two successes and two failures, to hold out one of each; record more episodes"
+        )
         raise InputError("dataset.repo_id", dataset.repo_id, hint)
-    needed = config.chunk * config.validation.depth + 1
-    longest = max(len(episode.frames) for episode in held_out)
-    if longest < needed:
-        hint = f"held-out episodes have at most {longest} frames, and rollouts of this depth need {needed}"
-        raise InputError("world_model.validation.depth", config.validation.depth, hint)
+    spec = replace(spec, tasks=tuple(sorted({episode.task for episode in episodes})))
+    started = time.monotonic()
+    torch.manual_seed(seed)
+    # The networks are initialised on the CPU, so alike on every device.
+    world = World(new_model(spec, config.model)).to(torch_device)
+    trainer, weights = Trainer(world, config.lr, seed, config.steps), uniform(learnt)
+    trainer.fit_statistics(learnt)
+    with (
+        console.stage("world model", total=config.steps) as stage,
+        (directory / "metrics.jsonl").open("w") as log,
+    ):
+        for step in range(1, config.steps + 1):
+            metrics = trainer.step(learnt, weights)
+            stage.update(step, " ".join(f"{name} {value:.3f}" for name, value in metrics.items()))
+            if step % LOG_EVERY == 0:
+                log.write(json.dumps({"step": step} | metrics) + "\n")
+    seconds = time.monotonic() - started
+    world = trainer.serving
+    with console.stage("check"):
+        found = check(world, held_out, seed)
+        preview(directory / "preview.mp4", world, held_out)
+    world.success.threshold.fill_(found["threshold"])
+    failed = [name for name, outcome in found["checks"].items() if not outcome["holds"]]
+    save_world(directory / "world_model", world, [episode.key for episode in learnt], failed)
+    found = found | {"learnt": len(learnt), "seconds": seconds}
+    write_atomically(directory / VALIDATION, json.dumps(plain(found), indent=2) + "\n")
+    return found
+
+
+def evaluate(run: WorldModelEvalRun, directory: Path, console: Console) -> dict[str, Any]:
+    """Checks a saved world model on episodes that it was not trained on."""
+    device = resolve_device(run.device, "device")
+    path = expanded(str(run.path), "path")
+    world = load_world(path, run.discover_packages_path).to(device)
+    learnt = read_content(path).get("learnt") or ()
+    with console.stage("episodes"):
+        episodes = load_episodes(run.dataset, world.model.spec)
+    kept = [episode for episode in episodes if episode.key not in learnt]
+    if not kept:
+        hint = "the world model was trained on every episode of it; give another dataset"
+        raise InputError("dataset.repo_id", run.dataset.repo_id, hint)
+    with console.stage("check"):
+        found = check(world, kept, run.seed)
+        preview(directory / "preview.mp4", world, kept)
+    write_atomically(directory / VALIDATION, json.dumps(plain(found), indent=2) + "\n")
+    return found
+
+
+def show(found: dict[str, Any], directory: Path, console: Console) -> None:
+    """Shows people the outcome of a check."""
+    console.rich.print(checks_table(found))
+    console.say(f"{'passed' if found['passed'] else 'FAILED'}; see {directory / 'preview.mp4'}")
+
+
+def prepared(config: RunConfig, directory: Path, console: Console, load: Load | None = None) -> RunConfig:
+    """A run whose policy is there, with a world model of its own: play is recorded, and trained on.
+
+    A part that is complete is not done again.
+    """
+    imagination = config.imagination
+    play, pretraining = directory.absolute() / PLAY, directory.absolute() / PRETRAINING
+    dataset = DatasetConfig(repo_id="accerl/play", root=str(play))
+    if not play.exists():
+        record_play(config, play, console, load)
+    if not pretraining.exists():
+        chunk = getattr(policy_to_be(config), "n_action_steps", 1)
+        model = WorldModelConfig(steps=imagination.steps, chunk=chunk)
+        with record.appearing(pretraining) as folder:
+            folder.mkdir()
+            device = config.policy.device
+            found = pretrain(model, config.env, dataset, folder, console, seed=config.seed, device=device)
+        show(found, pretraining, console)
+    learn = replace(imagination.learn, dataset=dataset)
+    path = str(pretraining / "world_model")
+    return replace(config, imagination=replace(imagination, path=path, learn=learn))
+
+
+def record_play(config: RunConfig, root: Path, console: Console, load: Load | None) -> None:
+    """Records exploring episodes of a run's policy, and episodes of the disturbed expert, as one dataset."""
+    policy_episodes, expert_episodes = config.imagination.policy_episodes, config.imagination.expert_episodes
+    tally = {"episodes": 0, "frames": 0, "successes": 0}
+    # Of other starts than the demonstrations.
+    expert = partial(record.record_one, config.env, DISTURBED, config.seed + 1)
+    with contextlib.ExitStack() as stack:
+        stage = stack.enter_context(console.stage("play", total=policy_episodes + expert_episodes))
+        folder = stack.enter_context(record.appearing(root))
+        with closing(make_environment(config.env)) as environment:
+            spec = environment.spec
+        dataset = stack.enter_context(record.new_dataset(folder, "accerl/play", spec, config.env))
+        # The expert's processes are at work meanwhile.
+        disturbed = stack.enter_context(record.simulated(config.env, expert, range(expert_episodes)))
+        by_expert = (episode for episode, _ in disturbed)
+        for episode in itertools.chain(policy_play(config, policy_episodes, load), by_expert):
+            record.save_episode(dataset, episode, tally)
+            stage.update(tally["episodes"], f"{tally['successes']} successes")
+    console.say("{episodes} episodes of play, {successes} successes".format(**tally))
+
+
+def policy_play(config: RunConfig, count: int, load: Load | None) -> Iterator[record.Episode]:
+    """Exploring episodes of a run's policy, with an observation at every env step."""
+    adapter = loader(load)(config.policy)
+    ended: list[record.Episode] = []
+    environments = [
+        RecordingEnvironment(make_environment(config.env, 1, config.rollout.reward_model), ended)
+        for _ in range(min(count, config.rollout.environments))
+    ]
+    if not environments:
+        return
+    plans = EpisodePlans(environments[0].spec.tasks, config.seed, count, PLAY_WORKER)
+    runner = RolloutRunner(
+        environments, lambda source: plans.next(True), config.rollout, PLAY,
+        on_segment=lambda segment: None, on_episode=plans.ended,
+    )  # fmt: skip
+    with closing(runner):
+        requests = {slot: runner.start(slot) for slot in range(len(runner))}
+        while due := {slot: request for slot, request in requests.items() if request is not None}:
+            decisions = adapter.decide(list(due.values()), 0)
+            for slot, decision in zip(due, decisions, strict=True):
+                requests[slot] = runner.advance(slot, decision)
+            yield from ended
+            ended.clear()
+
+
+class RecordingEnvironment(WrappedEnvironment):
+    """An environment that adds its whole episodes to `ended`."""
+
+    def __init__(self, environment: Environment, ended: list[record.Episode]) -> None:
+        super().__init__(environment)
+        self._ended = ended
+
+    def reset(self, seed: int, task: str) -> Observation:
+        self._seed, self._observation = seed, super().reset(seed, task)
+        self._steps: list[record.PlayedStep] = []
+        return self._observation
+
+    def step_chunk(self, actions: np.ndarray) -> ChunkResult:
+        results: list[ChunkResult] = []
+        for action in np.clip(actions, self.spec.action_low, self.spec.action_high).astype(np.float32):
+            results.append(self._environment.step_chunk(action[None]))
+            self._steps.append((self._observation, action, results[-1]))
+            self._observation = results[-1].observation
+            if results[-1].done:
+                self._ended.append(record.episode_of(self._steps, self._seed))
+                break
+        return replace(results[-1], rewards=np.concatenate([result.rewards for result in results]))

@@ -16,7 +16,7 @@ from accerl_lerobot.demos.episodes import EpisodeLabels, read_labels, step_of_re
 from accerl_lerobot.demos.sft import picked
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.contract import WorldModelSpec
-from accerl_lerobot.world_model.data import load_datasets
+from accerl_lerobot.world_model.data import load_episodes
 from tests.tiny_datasets import ACTION, FPS, FRONT, IMAGE, STATE, STEPS, labels, rewrite, write_dataset
 
 SUCCESS, REWARD = "next.success", "next.reward"
@@ -66,7 +66,7 @@ def outcomes(dataset: DatasetConfig) -> dict[str, list[bool]]:
     spec = WorldModelSpec(
         cameras=(FRONT,), image_size=(32, 32), state_dim=4, action_dim=2, chunk=2, context=1, fps=FPS
     )
-    episodes = load_datasets({"dataset": dataset}, spec)["dataset"]
+    episodes = load_episodes(dataset, spec)
     chosen = picked(dataset, "successes") or []
     return {
         "memory": [segment.success for segment in segments],

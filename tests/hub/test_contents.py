@@ -59,9 +59,9 @@ def test_folders_one_above_say_which_below(tmp_path: Path):
     (tmp_path / "learnt" / "world_model").mkdir(parents=True)
     with pytest.raises(InputError, match="name the folder world_model in it"):
         recognise(tmp_path / "learnt")
-    write_json(tmp_path / "success_model" / "config.json", {"type": "success_pairs"})
+    write_json(tmp_path / "other" / "config.json", {"type": "other"})
     with pytest.raises(InputError, match="no known artifact"):
-        recognise(tmp_path / "success_model")
+        recognise(tmp_path / "other")
     with pytest.raises(InputError, match="a policy has config.json, model.safetensors"):
         recognise(tmp_path)
     with pytest.raises(InputError, match="no such folder"):

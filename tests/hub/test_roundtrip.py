@@ -11,13 +11,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
 from accerl_lerobot import cli
 from accerl_lerobot.checkpoint.layout import save_checkpoint
-from accerl_lerobot.experience import TASK_BITS
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.loading import load_adapter, pinned
 from accerl_lerobot.policies.saving import save_pretrained
@@ -122,25 +120,14 @@ def test_a_dataset_is_one_that_lerobot_finds(hub: HubServer, tmp_path: Path):
 
 
 def test_a_world_model_brings_its_success_model(hub: HubServer, tmp_path: Path):
-    from accerl_lerobot.world_model.learners import new_success_model
-    from accerl_lerobot.world_model.store import load_roles, load_world_model, save_world_model
-    from accerl_lerobot.world_model.success_model import SuccessPairsRewardModel
+    from accerl_lerobot.world_model.imagined import World, load_world, read_content, save_world
 
-    environment, success, roles = model(), new_success_model(5), {"a": "learnt", "b": "held out"}
-    environment.fit_statistics(windows(dots(2)))
-    save_world_model(tmp_path / "world_model", environment, success, roles)
+    world = World(model())
+    world.model.fit_statistics(windows(dots(2)))
+    save_world(tmp_path / "world_model", world, ["a"], ["auroc"])
     accerl("push", f"--path={tmp_path / 'world_model'}", "--repo_id=alice/environment")
     accerl("pull", "--repo_id=alice/environment", f"--output_dir={tmp_path / 'pulled'}")
-    came, judge = load_world_model(tmp_path / "pulled")
-    assert load_roles(tmp_path / "pulled") == roles
-    assert (came.spec, came.config) == (environment.spec, environment.config)
-    assert not any(p.requires_grad for p in came.parameters())
-    for first, second in ((environment, came), (success, judge)):
-        loaded = second.state_dict() | dict(second.named_buffers())
-        saved = first.state_dict() | dict(first.named_buffers())
-        assert all(torch.equal(value, loaded[key]) for key, value in saved.items())
-    alone = SuccessPairsRewardModel.from_pretrained(str(tmp_path / "pulled" / "success_model"), strict=True)
-    frames = torch.from_numpy(np.random.default_rng(0).random((2, 1, 3, 16, 16), dtype=np.float32))
-    task = torch.ones(2, TASK_BITS)
-    with torch.no_grad():
-        assert torch.equal(alone.logits(frames, frames, task)[0], judge.logits(frames, frames, task)[0])
+    came, content = load_world(tmp_path / "pulled"), read_content(tmp_path / "pulled")
+    assert content["learnt"] == ["a"] and content["failed_checks"] == ["auroc"]
+    assert (came.model.spec, came.model.config) == (world.model.spec, world.model.config)
+    assert all(torch.equal(value, came.state_dict()[name]) for name, value in world.state_dict().items())

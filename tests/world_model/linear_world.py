@@ -53,9 +53,8 @@ class LinearWorldModel(LearnableWorldModel):
 
     def fit_statistics(self, windows: Windows) -> None:
         """The usual size of a motion."""
-        now = windows.context - 1
-        moved = windows.state[:, now + 1] - windows.state[:, now]
-        self.scale.copy_(torch.from_numpy(moved.std(0)).clamp(min=1e-3))
+        moved = windows.robot[:, 0] - windows.context.robot[:, -1]
+        self.scale.copy_(moved.std(0).clamp(min=1e-3))
 
     def begin(self, context: Context, tasks: Sequence[str]) -> State:
         """See the base class."""
@@ -66,18 +65,12 @@ class LinearWorldModel(LearnableWorldModel):
     def step(self, state: State, actions: Tensor, seeds: Sequence[int]) -> Prediction:
         """See the base class."""
         robot = state["robot"] + self._moved(actions)
-        return Prediction(
-            state=state | {"robot": robot},
-            frames=state["frames"],
-            robot=robot,
-            uncertainty=robot.new_full((len(robot),), torch.nan),
-        )
+        return Prediction(state=state | {"robot": robot}, frames=state["frames"], robot=robot)
 
     def loss(self, windows: Windows, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
         """Mean squared error of the first motion."""
-        now = windows.context - 1
-        states = torch.from_numpy(windows.state).to(self.scale.device)
-        error = states[:, now] + self._moved(torch.from_numpy(windows.actions[:, 0])) - states[:, now + 1]
+        before, after = windows.context.robot[:, -1].to(self.scale), windows.robot[:, 0].to(self.scale)
+        error = before + self._moved(windows.actions[:, 0]) - after
         loss = (error / self.scale).square().mean()
         return loss, {"motion": loss.item()}
 

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-import math
+from collections import deque
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,10 +14,10 @@ import torch
 from accerl_lerobot.envs import make_environment
 from accerl_lerobot.experience import IMAGINED, REAL, TASK
 from accerl_lerobot.rollout.runner import EpisodePlans, RolloutConfig, RolloutRunner
+from accerl_lerobot.world_model.config import PixelModelConfig
 from accerl_lerobot.world_model.contract import Prediction
-from accerl_lerobot.world_model.imagined import ImaginedEnvironment, ImaginedWorld
-from accerl_lerobot.world_model.learners import new_success_model
-from accerl_lerobot.world_model.pixels import PixelModelConfig, PixelWorldModel
+from accerl_lerobot.world_model.imagined import ImaginedEnvironment, World
+from accerl_lerobot.world_model.pixels import PixelWorldModel
 from tests.world_model.real_segments import SPEC, WORLD, K, decided
 
 CAMERA = "observation.images.front"
@@ -26,32 +26,24 @@ CAMERA = "observation.images.front"
 class CountingWorld:
     """Each chunk brightens the image by one, and adds the chunk's sum to the robot's first number."""
 
-    def __init__(self, success_at: int = 99, uncertain_at: int = 99, broken_at: int = 99) -> None:
+    def __init__(self, success_at: int = 99) -> None:
         self.model: Any = SimpleNamespace(spec=SPEC)
-        self.success: Any = SimpleNamespace(config=SimpleNamespace(threshold=0.5))
-        self._success_at, self._uncertain_at, self._broken_at = success_at, uncertain_at, broken_at
+        self._success_at = success_at
         self.seeds: list[int] = []
 
     def begin(self, frames: np.ndarray, robot: np.ndarray, task: str) -> dict[str, torch.Tensor]:
-        return {"count": torch.tensor([0]), "frames": torch.tensor(frames), "robot": torch.tensor(robot)}
+        return {"frames": torch.tensor(frames), "robot": torch.tensor(robot)}
 
     def step(self, state: dict[str, torch.Tensor], actions: np.ndarray, seed: int) -> Prediction:
         self.seeds.append(seed)
-        count = int(state["count"]) + 1
         frames = state["frames"] + 1
         robot = state["robot"].clone()
         robot[0] += float(actions.sum())
-        doubt = 3.0 if count == self._uncertain_at else math.nan
-        following = {"count": torch.tensor([count]), "frames": frames, "robot": robot}
-        return Prediction(
-            state=following, frames=frames[None], robot=robot[None], uncertainty=torch.tensor([doubt])
-        )
+        following = {"frames": frames, "robot": robot}
+        return Prediction(state=following, frames=frames[None], robot=robot[None])
 
-    def succeeds(self, before: np.ndarray, after: np.ndarray, task: str) -> float:
-        count = int(after.reshape(-1)[0]) - 7
-        if count == self._broken_at:
-            return math.nan
-        return 0.9 if count == self._success_at else 0.1
+    def succeeds(self, frames: np.ndarray, task: str) -> bool:
+        return int(frames.reshape(-1)[0]) - 7 == self._success_at
 
 
 def start(value: int) -> tuple[str, dict[str, Any]]:
@@ -61,7 +53,7 @@ def start(value: int) -> tuple[str, dict[str, Any]]:
 
 
 def environment(world: Any, *starts: tuple[str, dict[str, Any]]) -> ImaginedEnvironment:
-    return ImaginedEnvironment(world, make_environment(WORLD).spec, list(starts) or [start(7)])
+    return ImaginedEnvironment(world, make_environment(WORLD).spec, deque(starts or [start(7)]))
 
 
 CHUNK = np.full((K, 2), 0.5, np.float32)
@@ -80,7 +72,7 @@ def test_a_chunk_is_one_prediction():
     made.reset(0, "match")
     result = made.step_chunk(CHUNK)
     assert result.observation[CAMERA].max() == 8 and result.observation["observation.state"][0] == 4.0
-    assert result.rewards.tolist() == [0.0] * K and not result.done and result.info == {"uncertain": 0.0}
+    assert result.rewards.tolist() == [0.0] * K and not result.done
     made.step_chunk(CHUNK)
     first = list(world.seeds)
     made.reset(0, "match")
@@ -104,22 +96,6 @@ def test_the_time_limit_ends_it_as_a_failure():
     results = [made.step_chunk(CHUNK) for _ in range(16 // K)]
     assert [result.done for result in results] == [False, False, False, True]
     assert results[-1].truncated and not results[-1].success
-
-
-def test_where_the_world_model_is_too_uncertain_it_ends_as_a_failure():
-    made = environment(CountingWorld(success_at=1, uncertain_at=1))
-    made.reset(0, "match")
-    result = made.step_chunk(CHUNK)
-    assert result.truncated and not result.success and result.info["uncertain"] == 1.0
-
-
-def test_where_the_models_diverge_it_ends_as_a_failure_at_the_last_observation():
-    made = environment(CountingWorld(broken_at=2))
-    made.reset(0, "match")
-    made.step_chunk(CHUNK)
-    result = made.step_chunk(CHUNK)
-    assert result.truncated and not result.success and result.info["uncertain"] == 1.0
-    assert result.observation[CAMERA].max() == 8 and result.observation["observation.state"][0] == 4.0
 
 
 def test_an_episode_under_way_goes_on_from_its_state():
@@ -162,20 +138,15 @@ def test_the_runner_counts_imagined_episodes_apart_and_none_begins_before_a_real
 
 
 def test_a_batch_of_one_is_what_the_models_say():
-    """The environment's own calls, against the models' batched ones."""
+    """The environment's own calls, against the model's."""
     torch.manual_seed(0)
-    model, success = (
-        PixelWorldModel(SPEC, PixelModelConfig(channels=(8, 8))).eval(),
-        new_success_model(K).eval(),
-    )
-    world = ImaginedWorld(model, success)
-    made = ImaginedEnvironment(world, make_environment(WORLD).spec, [start(100)])
+    world = World(PixelWorldModel(SPEC, PixelModelConfig(channels=(8, 8)))).eval()
+    made = environment(world, start(100))
     made.reset(0, "match")
     result = made.step_chunk(CHUNK)
-    frames = np.full((1, 1, 16, 16, 3), 100, np.uint8)
-    state = world.begin(frames[0], np.zeros(4, np.float32), "do it")
-    seed = int(np.random.default_rng((0, 0)).integers(2**31))
+    frames = np.full((1, 16, 16, 3), 100, np.uint8)
+    state = world.begin(frames, np.zeros(4, np.float32), "do it")
     with torch.no_grad():
-        prediction = model.step(state, torch.from_numpy(CHUNK[None]), [seed])
+        prediction = world.model.step(state, torch.from_numpy(CHUNK[None]), [0])
     assert np.array_equal(result.observation[CAMERA], prediction.frames[0, 0].numpy())
     np.testing.assert_allclose(result.observation["observation.state"], prediction.robot[0].numpy())

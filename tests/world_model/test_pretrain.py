@@ -1,166 +1,128 @@
 # SPDX-License-Identifier: Apache-2.0
-"""accerl world-model from a dataset to its validation, saved and loaded again; accerl world-model-eval."""
+"""accerl world-model from a dataset to its check, saved and loaded again; of our model and of another's."""
 
 from __future__ import annotations
 
+import importlib
 import json
-import shutil
-from collections import Counter
-from dataclasses import replace
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
+from torch import nn
 
 from accerl_lerobot import cli
-from accerl_lerobot.cli.configs import WorldModelEvalRun, WorldModelRun
+from accerl_lerobot.cli.configs import WorldModelRun
 from accerl_lerobot.demos.record import DemosConfig, record_demos
-from accerl_lerobot.engines.config import DatasetConfig
+from accerl_lerobot.engines.config import parse
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.world_model import learners, pixels, pretrain, validation
-from accerl_lerobot.world_model.config import PixelModelConfig, WorldModelConfig
-from accerl_lerobot.world_model.contract import new_model
-from accerl_lerobot.world_model.data import DATASET, ONLINE, load_datasets
-from accerl_lerobot.world_model.learners import new_success_model
-from accerl_lerobot.world_model.store import (
-    HELD_OUT,
-    LEARNT,
-    check_predicts,
-    load_failed,
-    load_roles,
-    load_world_model,
-    save_world_model,
-)
+from accerl_lerobot.world_model.config import LearnableModelConfig
+from accerl_lerobot.world_model.contract import LearnableWorldModel, new_model
+from accerl_lerobot.world_model.imagined import World, load_world, read_content, save_world
+from accerl_lerobot.world_model.training import Trainer, uniform
 from tests.runs import replacing
-from tests.world_model.test_pixels import dots, model
+from tests.world_model.test_pixels import SPEC, dots, model
 
 ENV = SimulatedConfig(max_steps=60, hold=25, image_size=16)
-CONFIG = WorldModelConfig(image_size=16, chunk=5, model=PixelModelConfig(channels=(8, 8)))
+PACKAGE = "tests.world_model.linear_world"
+NAMED = [f"--world_model.discover_packages_path={PACKAGE}", "--world_model.model.type=linear"]
 
 
-def recorded(root: Path, episodes: int, seed: int) -> Path:
-    of = DemosConfig(episodes=episodes, failure_share=0.5)
-    return record_demos(ENV, of, str(root), seed)
+def forget() -> None:
+    LearnableModelConfig.get_known_choices().pop("linear", None)
+    sys.modules.pop(PACKAGE, None)
+
+
+@pytest.fixture(autouse=True)
+def forgotten() -> Iterator[None]:
+    """Whoever does not import the package of the linear model fails."""
+    forget()
+    yield
+    forget()
 
 
 @pytest.fixture(scope="module")
 def demos(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return recorded(tmp_path_factory.mktemp("demos") / "dataset", 8, 0)
+    root = tmp_path_factory.mktemp("demos") / "dataset"
+    return record_demos(ENV, DemosConfig(episodes=12, failure_share=0.5), str(root))
 
 
-@pytest.fixture(scope="module")
-def rollouts(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return recorded(tmp_path_factory.mktemp("rollouts") / "dataset", 6, 1)
-
-
-def arguments(demos: Path, output_dir: Path) -> list[str]:
-    return [
+def arguments(demos: Path, output_dir: Path, *more: str) -> list[str]:
+    told = [
         "world-model", "--env.type=simulated", "--env.image_size=16", "--dataset.repo_id=a/b",
         f"--dataset.root={demos}", f"--output_dir={output_dir}", "--device=cpu",
-        "--world_model.image_size=16", "--world_model.chunk=5", "--world_model.learn.steps=25",
-        "--world_model.success.steps=10", "--world_model.validation.depth=2",
-        "--world_model.model.channels=16,24",
+        "--world_model.image_size=16", "--world_model.chunk=5", "--world_model.steps=25",
     ]  # fmt: skip
+    return replacing(told, *more)
 
 
-def test_from_a_dataset_to_a_validation(demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_from_a_dataset_to_a_check_and_another_check(
+    demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     out = tmp_path / "out"
-    code = cli.main(arguments(demos, out))
+    code = cli.main(arguments(demos, out, "--world_model.model.channels=16,24"))
     stdout, stderr = capsys.readouterr()
     found = json.loads(stdout)
-    assert code == (0 if found["passed"] else 1) and found == json.loads(
-        (out / "validation.json").read_text()
-    )
-    assert {p.name for p in out.iterdir()} == {
+    assert code == 1 and not found["passed"], "it has hardly learnt"
+    assert found == json.loads((out / "validation.json").read_text())
+    assert {path.name for path in out.iterdir()} == {
         "config.yaml", "world_model", "validation.json", "preview.mp4", "metrics.jsonl",
     }  # fmt: skip
-    assert found["learnt"]["episodes"] + found["held_out"]["episodes"] == 8
-    [(name, one)] = found["datasets"].items()
-    assert name == "dataset" and found["checks"] == one["checks"]
-    assert [row["depth"] for row in one["depths"]] == [1, 2] and found["seconds"] > 0
-    assert one["threshold"] >= 0.5
-    kinds = [json.loads(line)["kind"] for line in (out / "metrics.jsonl").read_text().splitlines()]
-    assert kinds == ["world_model"]
-    assert all(check in stderr for check in found["checks"]) and "preview.mp4" in stderr
-    environment, success = load_world_model(out / "world_model")
-    assert success.config.chunk == environment.spec.chunk == 5
-    assert success.config.threshold == pytest.approx(one["threshold"])
-    failed = [name for name, check in found["checks"].items() if not check["holds"]]
-    assert load_failed(out / "world_model") == failed != []
-    assert (
-        environment.spec.cameras == ("observation.images.front",)
-        and float(environment.uncertainty_scale) != 1
-    )
-    assert (out / "preview.mp4").stat().st_size > 1000
+    assert found["learnt"] + found["episodes"] == 12
+    assert set(found["checks"]) == {"skill", "sensitivity", "auroc"}
+    losses = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in losses] == [20] and {"image", "state", "success"} <= losses[0].keys()
+    assert all(name in stderr for name in found["checks"]) and "FAILED; see" in stderr
+    world, content = load_world(out / "world_model"), read_content(out / "world_model")
+    assert float(world.success.threshold) == pytest.approx(found["threshold"])
+    failed = [name for name, outcome in found["checks"].items() if not outcome["holds"]]
+    assert content["failed_checks"] == failed and len(content["learnt"]) == found["learnt"]
+    assert world.model.spec.tasks == ("Match the target",)
+    told = ["world-model-eval", f"--path={out / 'world_model'}", "--dataset.repo_id=a/b"]
+    cli.main([*told, f"--dataset.root={demos}", f"--output_dir={tmp_path / 'again'}", "--device=cpu"])
+    again = json.loads(capsys.readouterr().out)
+    assert again["checks"] == found["checks"], "of its own dataset, the episodes that were held out"
 
 
-@pytest.mark.parametrize(
-    ("option", "message"),
-    [
-        (
-            "--world_model.validation.depth=20",
-            "world_model.validation.depth=20: held-out episodes have at most",
-        ),
-        ("--env.task=mirror", "env.task='mirror': an episode's task is"),
-    ],
-)
-def test_what_is_refused_before_anything_is_learnt(
-    option: str, message: str, demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_what_cannot_be_held_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    demos = record_demos(ENV, DemosConfig(episodes=3, failure_share=0.5), str(tmp_path / "demos"))
+    assert cli.main(arguments(demos, tmp_path / "out")) == 2
+    assert "it needs at least two successes and two failures" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_model_of_another_package_is_learned_and_checked_by_naming_it(
+    demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    assert cli.main(replacing(arguments(demos, tmp_path / "out"), option)) == 2
-    assert message in capsys.readouterr().err and not (tmp_path / "out").exists()
-
-
-def test_one_success_is_not_enough_to_learn_from_and_be_classified_on():
-    config = WorldModelConfig()
-    failures = dots(4, steps=80)
-    success = [replace(failures[0], success_at=79)]
-    with pytest.raises(InputError, match="at least two successes and two failures"):
-        pretrain._check_split(DatasetConfig(), success + failures[:2], failures[2:], config)
-    pretrain._check_split(DatasetConfig(), success + failures[:2], success + failures[2:], config)
-
-
-@pytest.mark.slow
-def test_a_policys_episodes_are_learned_from_beside_demonstrations(
-    demos: Path,
-    rollouts: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-):
-    seen: dict[str, set[str]] = {}
-
-    def spy(module: Any, name: str) -> None:
-        real = getattr(module, name)
-
-        def called(*args: Any) -> Any:
-            seen.setdefault(name, set()).update(episode.key for episode in args[1])
-            return real(*args)
-
-        monkeypatch.setattr(module, name, called)
-
-    spy(learners, "train_from_scratch")
-    spy(validation, "validate")
-    theirs = ["--online.repo_id=a/rollouts", f"--online.root={rollouts}"]
     out = tmp_path / "out"
-    code = cli.main([*arguments(demos, out), *theirs])
-    stdout, stderr = capsys.readouterr()
-    found = json.loads(stdout)
-    roles = load_roles(out / "world_model")
-    assert seen["train_from_scratch"] == {key for key, role in roles.items() if role == "learnt"}
-    assert seen["validate"] == roles.keys() - seen["train_from_scratch"]
-    counts = Counter(roles.values())
-    assert counts["learnt"] == found["learnt"]["episodes"] and counts.total() == 8 + 6
-    assert counts["held out"] == found["held_out"]["episodes"]
-    online = found["datasets"]["online"]
-    assert found["passed"] is all(check["holds"] for check in found["checks"].values()) is (code == 0)
-    assert (out / "preview_online.mp4").stat().st_size > 1000
-    environment, success = load_world_model(out / "world_model")
-    assert success.config.threshold == online["threshold"]
-    assert environment.spec.tasks == ("match",) and "online" in stderr
+    cli.main(arguments(demos, out, *NAMED, "--world_model.steps=300", "--world_model.lr=0.03"))
+    found = json.loads(capsys.readouterr().out)
+    losses = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+    assert 0 < losses[-1]["motion"] < 0.5, "in usual motions; of one that knows nothing it is 1 or more"
+    assert not found["checks"]["skill"]["holds"], "its pictures never change"
+    told = ["world-model-eval", f"--path={out / 'world_model'}", "--dataset.repo_id=a/b", "--device=cpu"]
+    told += [f"--dataset.root={demos}", f"--output_dir={tmp_path / 'again'}"]
+    forget()
+    assert cli.main(told) == 2
+    assert "or name its package: discover_packages_path" in capsys.readouterr().err
+    cli.main([*told, f"--discover_packages_path={PACKAGE}"])
+    assert json.loads(capsys.readouterr().out)["checks"] == found["checks"]
+
+
+def test_its_fields_are_fields_of_the_command_line():
+    run = parse(WorldModelRun, [*NAMED, "--world_model.model.gain=2", "--world_model.image_size=18"])
+    assert run.world_model.model == importlib.import_module(PACKAGE).LinearModelConfig(gain=2.0)
+    with pytest.raises(InputError, match=r"^world_model.model.gain=0\.?0?: use a positive number"):
+        parse(WorldModelRun, [*NAMED, "--world_model.model.gain=0"])
+    with pytest.raises(
+        InputError, match="^world_model.model.channels=3: no such field; world_model.model has"
+    ):
+        parse(WorldModelRun, [*NAMED, "--world_model.model.channels=3"])
 
 
 @pytest.mark.parametrize(
@@ -168,107 +130,83 @@ def test_a_policys_episodes_are_learned_from_beside_demonstrations(
     [
         ("nowhere", "config.json: is missing"),
         ("config", "config.json: model.type: 'None'; use one of"),
-        ("success", "config.json: is missing"),
         ("weights", "model.safetensors: not safetensors"),
         ("size", "not a world model of accerl world-model"),
         ("chunk", r"config.json: spec.chunk=0: use a whole number in \[1, "),
-        ("nan", "model.safetensors: uncertainty_scale holds NaN or infinity; train it again"),
+        ("learnt", "config.json: learnt: not one of accerl world-model"),
+        ("nan", "model.safetensors: 'model.change' holds NaN or infinity; train it again"),
     ],
 )
 def test_what_cannot_be_loaded(tmp_path: Path, harm: str, why: str):
     folder = tmp_path / "w"
-    save_world_model(folder, model(), new_success_model(2))
+    save_world(folder, World(model()))
+    content = json.loads((folder / "config.json").read_text())
     if harm == "nowhere":
         folder = tmp_path / "nowhere"
-    if harm == "config":
-        (folder / "config.json").write_text("{}")
-    if harm == "success":
-        shutil.rmtree(folder / "success_model")
-    if harm == "weights":
+    elif harm == "config":
+        content = {}
+    elif harm == "weights":
         (folder / "model.safetensors").write_bytes(b"\x00" * 64)
-    if harm == "nan":
+    elif harm == "learnt":
+        content["learnt"] = 7
+    elif harm == "nan":
         tensors = load_file(folder / "model.safetensors")
-        save_file(
-            tensors | {"uncertainty_scale": tensors["uncertainty_scale"] * float("nan")},
-            folder / "model.safetensors",
-        )
-    if harm in ("size", "chunk"):
-        content = json.loads((folder / "config.json").read_text())
+        tensors["model.change"] *= float("nan")
+        save_file(tensors, folder / "model.safetensors")
+    else:
         content["spec"] |= {"action_dim": 7} if harm == "size" else {"chunk": 0}
+    if folder.exists():
         (folder / "config.json").write_text(json.dumps(content))
     with pytest.raises(InputError, match=f"^path=.*{why}"):
-        load_world_model(folder)
-
-
-def test_one_that_predicts_nothing_is_refused_before_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    folder = tmp_path / "w"
-    save_world_model(folder, model(), new_success_model(2).eval())
-    loaded = load_world_model(folder)
-    check_predicts(folder, *loaded)
-    monkeypatch.setattr(pixels.PixelWorldModel, "step", lambda *_: 1 / 0)
-    with pytest.raises(InputError, match=r"^path=.*config.json: it predicts nothing \(division by zero\)"):
-        check_predicts(folder, *loaded)
+        load_world(folder)
 
 
 def test_a_device_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    assert WorldModelRun().device == WorldModelEvalRun(path="x").device == "auto"
-    for name, why in (("tpu", "use auto, cpu, cuda"), ("cuda", "no CUDA device here; use cpu or auto")):
-        if name == "cuda" and torch.cuda.is_available():
-            continue
-        # The dataset is not there either, and is not looked for.
-        nowhere = ["--dataset.repo_id=a/b", "--dataset.root=nowhere"]
-        told = [*nowhere, f"--output_dir={tmp_path / 'out'}", f"--device={name}"]
-        assert cli.main(["world-model", "--env.type=simulated", *told]) == 2
-        assert f"accerl: device='{name}': {why}" in capsys.readouterr().err
-        assert cli.main(["world-model-eval", "--path=nowhere", *told]) == 2
-        assert f"accerl: device='{name}': {why}" in capsys.readouterr().err
+    # The dataset is not there either, and is not looked for.
+    told = ["--dataset.repo_id=a/b", "--dataset.root=nowhere", f"--output_dir={tmp_path}/out", "--device=tpu"]
+    for verb in (["world-model", "--env.type=simulated"], ["world-model-eval", "--path=nowhere"]):
+        assert cli.main([*verb, *told]) == 2
+        assert "accerl: device='tpu': use auto, cpu, cuda" in capsys.readouterr().err
         assert not (tmp_path / "out").exists()
 
 
-@pytest.fixture(scope="module")
-def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
-    """Demonstrations, a world model that has learnt from some of them (nothing yet), and other episodes."""
-    root = tmp_path_factory.mktemp("evaluated")
-    demos, others = recorded(root / "demos", 8, 0), recorded(root / "others", 8, 1)
-    torch.manual_seed(0)
-    spec = pretrain.world_spec(CONFIG, ENV)
-    episodes = load_datasets({DATASET: DatasetConfig(repo_id="a/b", root=str(demos))}, spec)[DATASET]
-    roles = {episode.key: LEARNT if i < 4 else HELD_OUT for i, episode in enumerate(episodes)}
-    save_world_model(root / "model", new_model(spec, CONFIG.model), new_success_model(5), roles)
-    return demos, root / "model", others
+class Moody(LearnableWorldModel):
+    """Behaves otherwise in training, counts in a buffer, has a layer twice, and a view."""
+
+    def __init__(self, spec: Any, config: Any) -> None:
+        super().__init__(spec, config)
+        self.norm, self.first = nn.BatchNorm1d(spec.action_dim), nn.Linear(spec.action_dim, spec.action_dim)
+        self.again = self.first
+        self.part = nn.Parameter(torch.randn(64)[:4])
+
+    def fit_statistics(self, windows: Any) -> None:
+        """It has none."""
+
+    def begin(self, context: Any, tasks: Any) -> Any:
+        """See the base class."""
+
+    def step(self, state: Any, actions: Any, seeds: Any) -> Any:
+        """See the base class."""
+
+    def loss(self, windows: Any, generator: torch.Generator) -> Any:
+        """How far what it makes of the first actions is from nothing."""
+        made = self.norm(self.again(windows.actions[:, 0, 0]))
+        return (made + 1).square().mean() + self.part.square().mean(), {}
 
 
-def told(folders: tuple[Path, Path, Path], out: Path, *more: str) -> list[str]:
-    demos, model, _ = folders
-    return [
-        "world-model-eval", f"--path={model}", "--dataset.repo_id=a/b", f"--dataset.root={demos}",
-        f"--output_dir={out}", "--validation.depth=2", *more,
-    ]  # fmt: skip
-
-
-def test_the_same_measures_on_every_dataset(
-    folders: tuple[Path, Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
-    out = tmp_path / "out"
-    more = ["--online.repo_id=a/c", f"--online.root={folders[2]}"]
-    code = cli.main(told(folders, out, *more))
-    stdout, stderr = capsys.readouterr()
-    found = json.loads(stdout)
-    assert code == 1 and found == json.loads((out / "validation.json").read_text())
-    assert {name: one["episodes"] for name, one in found["datasets"].items()} == {DATASET: 4, ONLINE: 8}
-    own, other = (one["checks"] for one in found["datasets"].values())
-    assert set(own) == set(other) and found["checks"] == own | {f"online.{k}": v for k, v in other.items()}
-    assert {p.name for p in out.iterdir()} == {
-        "config.yaml", "validation.json", "preview.mp4", "preview_online.mp4",
-    }  # fmt: skip
-    assert "sensitivity" in stderr and "FAILS" in stderr
-    assert "dataset: trained on 4 episodes of it, evaluated on the other 4" in stderr
-
-
-def test_one_that_does_not_know_the_dataset_is_tried_on_all_of_it(
-    folders: tuple[Path, Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
-    arguments = [a.replace(str(folders[0]), str(folders[2])) for a in told(folders, tmp_path / "out")]
-    cli.main(arguments)
-    found = json.loads(capsys.readouterr().out)
-    assert {name: one["episodes"] for name, one in found["datasets"].items()} == {DATASET: 8}
+def test_it_is_saved_as_it_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Not in training; with what it has counted; and with layers that it has twice, and views."""
+    linear = importlib.import_module(PACKAGE).LinearModelConfig
+    monkeypatch.setattr(linear, "make", f"{__name__}:Moody")
+    trainer, episodes = Trainer(World(new_model(SPEC, linear())), 1e-3, seed=0), dots(4)
+    for _ in range(3):
+        trainer.step(episodes, uniform(episodes))
+    served = trainer.serving
+    assert trainer.world.training and not served.training
+    assert int(served.model.norm.num_batches_tracked) == 3  # type: ignore[union-attr,arg-type]
+    save_world(tmp_path / "w", served)
+    again = load_world(tmp_path / "w")
+    assert not any(module.training for module in again.modules())
+    assert not any(parameter.requires_grad for parameter in again.parameters())
+    for name, value in served.state_dict().items():
+        assert torch.equal(value, again.state_dict()[name]), name

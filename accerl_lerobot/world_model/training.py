@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Gradient steps of a pixel world model and its success model, before a run and during it.
+
+The world model trains on real frames only; its own predictions are input, never a target. The success model
+trains on frames after chunks of replayed episodes, recorded ones and those that the world model predicts
+from the executed actions, with the outcomes that the episodes really had. The weights that are used and saved
+are a moving average of those that are trained.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from accerl_lerobot.checkpoint.snapshot import kind
+from accerl_lerobot.checkpoint.tensors import copied, optimizer_state, restore_optimizer
+from accerl_lerobot.experience import task_codes
+from accerl_lerobot.world_model.contract import Windows, replay
+from accerl_lerobot.world_model.data import Episode, WindowStart, cut_windows
+from accerl_lerobot.world_model.imagined import World
+
+BATCH, CHUNKS = 16, 2  # windows per gradient step, and chunks of each of them
+SUCCESS_BATCH = 32  # frames per gradient step of the success model, half of them successes
+WEIGHT_DECAY, GRAD_CLIP = 1e-2, 1.0
+WARMUP = 50  # steps in which the learning rate rises
+AVERAGE = 0.99  # decay of the moving average of the weights
+STATISTICS_WINDOWS = 2048  # windows from which normalisation statistics are taken
+REPLAYED, REFRESH_EVERY = 48, 50
+"""Episodes that are replayed at a time for the success model; gradient steps until others are."""
+
+
+@kind
+class Labelled(NamedTuple):
+    """N frames, with their tasks' codes and outcomes."""
+
+    frames: Tensor  # uint8 (N, V, H, W, 3)
+    tasks: Tensor  # float32 (N, 16), see `experience.task_codes`
+    success: Tensor  # bool (N,)
+
+
+class Trainer:
+    """Trains a world; `serving` is the one to use.
+
+    Args:
+        steps: gradient steps over which the learning rate falls; None: it stays.
+    """
+
+    def __init__(self, world: World, lr: float, seed: int, steps: int | None = None) -> None:
+        self.world = world.train().requires_grad_(True)
+        self.serving = copy.deepcopy(world).requires_grad_(False).eval()
+        self.count = 0
+        self.rng = np.random.default_rng((seed, 1))
+        self._lr, self._steps = lr, steps
+        self._generator = torch.Generator().manual_seed(seed)
+        self._optimizer = torch.optim.AdamW(world.parameters(), lr=lr, weight_decay=WEIGHT_DECAY)
+        self._labelled: Labelled | None = None
+
+    def fit_statistics(self, episodes: Sequence[Episode]) -> None:
+        """Fits the statistics of a new model."""
+        weights = uniform(episodes)
+        self.world.model.fit_statistics(self._draw(episodes, weights, STATISTICS_WINDOWS))
+        self.serving.load_state_dict(self.world.state_dict())
+
+    def step(self, episodes: Sequence[Episode], weights: np.ndarray) -> dict[str, float]:
+        """Makes a gradient step on episodes drawn by `weights`; returns the losses and ``grad_norm``.
+
+        The success model is left out while there are only successes, or only failures.
+        """
+        loss, metrics = self.world.model.loss(self._draw(episodes, weights, BATCH), self._generator)
+        if self._labelled is None or self.count % REFRESH_EVERY == 0:
+            self._labelled = self._replayed(episodes, weights)
+        if self._labelled is not None:
+            success_loss = self.world.success.loss(*self._halves(self._labelled), self._generator)
+            metrics["success"] = success_loss.item()
+            loss = loss + success_loss
+        self._optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        parts = (self.world.model, self.world.success)
+        norms = [torch.nn.utils.clip_grad_norm_(part.parameters(), GRAD_CLIP).item() for part in parts]
+        if not math.isfinite(sum(norms)):
+            raise FloatingPointError(
+                f"the world model's loss or gradient is not finite at step {self.count + 1}; "
+                "lower world_model.lr; in a run, use imagination.learn.steps_per_episode=0"
+            )
+        for group in self._optimizer.param_groups:
+            group["lr"] = self._rate()
+        self._optimizer.step()
+        self.count += 1
+        self._average()
+        return metrics | {"loss": loss.item(), "grad_norm": norms[0]}
+
+    def state(self) -> dict[str, Any]:
+        """Copies all that `restore` needs; see `snapshot`."""
+        return {
+            "world": copied(self.world),
+            "serving": copied(self.serving),
+            "count": self.count,
+            "rng": copy.deepcopy(self.rng),
+            "generator": self._generator.get_state(),
+            "optimizer": optimizer_state(self._optimizer),
+            "labelled": self._labelled,
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Continues from a `state`."""
+        self.world.load_state_dict(state["world"])
+        self.serving.load_state_dict(state["serving"])
+        self.count, self.rng, self._labelled = state["count"], state["rng"], state["labelled"]
+        self._generator.set_state(state["generator"])
+        restore_optimizer(self._optimizer, state["optimizer"])
+
+    def _draw(self, episodes: Sequence[Episode], weights: np.ndarray, count: int) -> Windows:
+        """Windows that begin at frames of equal chance in episodes drawn by `weights`."""
+        chosen = self.rng.choice(len(episodes), size=count, p=weights)
+        at = [WindowStart(int(e), int(self.rng.integers(episodes[e].starts))) for e in chosen]
+        return cut_windows(episodes, at, self.world.model.spec, CHUNKS)
+
+    def _replayed(self, episodes: Sequence[Episode], weights: np.ndarray) -> Labelled | None:
+        """Frames of as many successes as failures, half of them replayed from their first frame on."""
+        succeeded = np.array([episode.success for episode in episodes])
+        at = []
+        for alike in (weights * succeeded, weights * ~succeeded):
+            if not alike.any():
+                return None
+            for e in self.rng.choice(len(episodes), size=REPLAYED // 2, p=alike / alike.sum()):
+                later = int(self.rng.integers(episodes[e].starts_before_success))
+                at.append(WindowStart(int(e), 0 if self.rng.random() < 0.5 else later))
+        windows = whole_windows(episodes, at, self.world)
+        known = windows.known
+        codes = torch.from_numpy(task_codes(windows.tasks))
+        tasks = codes[:, None].expand(-1, known.shape[1], -1)[known]
+        recorded, imagined = windows.frames[known], replay(self.serving.model, windows)[known]
+        success = windows.success[known]
+        return Labelled(torch.cat([recorded, imagined]), tasks.repeat(2, 1), success.repeat(2))
+
+    def _halves(self, labelled: Labelled) -> Labelled:
+        """A batch of as many successes as failures."""
+        rows = [
+            self.rng.choice(alike.nonzero()[:, 0].numpy(), SUCCESS_BATCH // 2)
+            for alike in (labelled.success, ~labelled.success)
+        ]
+        chosen = torch.from_numpy(np.concatenate(rows))
+        return Labelled(*(part[chosen] for part in labelled))
+
+    def _rate(self) -> float:
+        rising = min(1.0, (self.count + 1) / WARMUP)
+        if self._steps is None:
+            return self._lr * rising
+        done = min(1.0, self.count / self._steps)
+        return self._lr * rising * (0.1 + 0.9 * 0.5 * (1 + math.cos(math.pi * done)))
+
+    @torch.no_grad()
+    def _average(self) -> None:
+        # The average is over fewer steps at the beginning.
+        decay = min(AVERAGE, self.count / (9 + self.count))
+        for mean, now in zip(self.serving.parameters(), self.world.parameters(), strict=True):
+            mean.lerp_(now, 1 - decay)
+        for served, now in zip(self.serving.model.buffers(), self.world.model.buffers(), strict=True):
+            served.copy_(now)
+
+
+def uniform(episodes: Sequence[Episode]) -> np.ndarray:
+    """Weights by which all frames have the same chance."""
+    starts = np.array([episode.starts for episode in episodes], float)
+    return starts / starts.sum()
+
+
+def whole_windows(episodes: Sequence[Episode], at: Sequence[WindowStart], world: World) -> Windows:
+    """Windows that go on to the end of the longest of the episodes."""
+    spec = world.model.spec
+    longest = max(len(episodes[start.episode]) for start in at)
+    return cut_windows(episodes, at, spec, math.ceil(longest / spec.chunk))
