@@ -14,30 +14,58 @@ import io
 import re
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Literal, NamedTuple
 from unittest.mock import patch
 
 import numpy as np
 
 from accerl_lerobot.checkpoint.safety import brief
+from accerl_lerobot.envs.base import SuiteEnvironment, unit_spec
 from accerl_lerobot.envs.graphics import import_mujoco, new_renderer
-from accerl_lerobot.envs.libero_tasks import REMEDY, bddl_file, load_libero, recorded_states
+from accerl_lerobot.envs.libero import (
+    LEROBOT_NAMES,
+    MAX_OBJECTS,
+    REMEDY,
+    LiberoConfig,
+    bddl_file,
+    instruction,
+    load_libero,
+    recorded_states,
+)  # fmt: skip
 from accerl_lerobot.envs.metaworld import diverged, draw_fast
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.seeds import EVAL_SEEDS
 
 FPS = 20
 SETTLING = 10  # env steps without motion before the first observation, as in LeRobot's own environment
-MAX_OBJECTS = 4  # most objects that a task names as those it is about
 MAX_FACES = 2000
 ARENA = "64M"  # memory of a simulation's contacts and constraints; some 6 MB are used
-NUMBERS = 25 + MAX_OBJECTS * 4 + 6 * 10  # of robot, objects, and what lies between them
 TIMESTEP = 0.002
 NEAR = 0.03  # scale in m of the squashed vectors that a critic sees
 STILL = np.array([0, 0, 0, 0, 0, 0, -1], np.float32)
 _alone = threading.RLock()
 """Held where LIBERO uses what a process has one of: LeRobot plays tasks in threads."""
 _coarse: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
+
+
+class LiberoEnvironment(SuiteEnvironment):
+    """One LIBERO instance.
+
+    Observations and actions are those of LeRobot's own environment: a policy that was trained on LeRobot's
+    LIBERO datasets acts here as it is.
+    """
+
+    config: LiberoConfig
+
+    def __init__(self, config: LiberoConfig) -> None:
+        images = [f"observation.images.{LEROBOT_NAMES.get(camera, camera)}" for camera in config.cameras]
+        spec = unit_spec(config, images, instruction, state=8, action=7, fps=FPS)
+        # Datasets of LIBERO's demonstrations on the Hub say 10 Hz, whose actions were executed at 20 Hz.
+        super().__init__(config, replace(spec, labelled_fps=(10,)))
+
+    def _build(self, task: str) -> Simulator:
+        return Simulator(task, self.config.rendering, self.config.assets)
 
 
 class Arm(NamedTuple):
@@ -221,8 +249,9 @@ class Simulator:
     def render(self, camera: str, height: int, width: int) -> np.ndarray:
         """Frame of a camera, uint8 (height, width, 3), turned as LeRobot's datasets have it."""
         self._look()
-        if (renderer := self._renderers.get((height, width))) is None:
-            renderer = self._renderers[height, width] = new_renderer(self.model, height, width)
+        if (height, width) not in self._renderers:
+            self._renderers[height, width] = new_renderer(self.model, height, width)
+        renderer = self._renderers[height, width]
         renderer.update_scene(self._seen, camera, self._visible)
         return np.ascontiguousarray(renderer.render()[:, ::-1])
 

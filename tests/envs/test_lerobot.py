@@ -9,10 +9,10 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
+from accerl_lerobot.envs.lerobot_env import LeRobotEnvironment
 
 from accerl_lerobot.envs import GymConfig, LeRobotEnvConfig, MetaWorldConfig, make_environment
 from accerl_lerobot.envs.base import lerobot_eval_arguments
-from accerl_lerobot.envs.lerobot_env import LeRobotEnvironment
 from accerl_lerobot.errors import InputError
 from tests.hub_cache import cached_repo
 

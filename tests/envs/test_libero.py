@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from accerl_lerobot.envs.libero_tasks import bddl_file, instruction, recorded_states, task_name
 
 from accerl_lerobot.demos.record import disturbed, make_expert, played
 from accerl_lerobot.envs import LiberoConfig, libero_tasks, make_environment
@@ -29,7 +30,6 @@ from accerl_lerobot.envs.libero_simulator import (
     moved_texture,
     operational_space_torques,
 )
-from accerl_lerobot.envs.libero_tasks import bddl_file, instruction, recorded_states, task_name
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.seeds import EVAL_SEEDS, demo_seed, eval_seed, train_seed
 from tests.envs.libero_assets import ASSETS, needs_assets

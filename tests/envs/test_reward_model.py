@@ -21,7 +21,7 @@ from transformers import ResNetConfig, ResNetModel
 
 from accerl_lerobot.engines.config import LaunchConfig
 from accerl_lerobot.envs import JudgedEnvironment, RewardModelConfig, SimulatedConfig, make_environment
-from accerl_lerobot.envs.reward_model import load_judge
+from accerl_lerobot.envs.making import load_judge
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.run.preflight import check_environment, check_start
