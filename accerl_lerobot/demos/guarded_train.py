@@ -16,7 +16,7 @@ import json
 import math
 import sys
 import traceback
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch.utils.data import Dataset
@@ -31,21 +31,7 @@ from accerl_lerobot.policies.untrusted import guarded
 
 PACKAGE = f"--policy.{DISCOVER}="
 MAX_BYTES = 4 * 1024**3
-"""Datasets whose images would take more memory than this are read the stock way."""
-
-
-class _Pixels(NamedTuple):
-    """A float image in [0, 1] as the bytes that it was made from, a quarter of its memory."""
-
-    values: torch.Tensor
-
-
-def _small(value: Any) -> Any:
-    """An image as `_Pixels`, if that gives it back exactly; anything else as it is."""
-    if not isinstance(value, torch.Tensor) or value.dtype != torch.float32 or value.ndim < 3:
-        return value
-    values = (value * 255).round().to(torch.uint8)
-    return _Pixels(values) if torch.equal(values / 255, value) else value
+"""Datasets whose images, as float32, would take more memory than this are read the stock way."""
 
 
 @functools.cache
@@ -81,11 +67,9 @@ class CachedDataset(Dataset[Any]):
         return len(self._dataset)
 
     def __getitem__(self, index: int) -> dict[str, Any]:
-        item = self._items.get(index)
-        if item is None:
-            item = {name: _small(value) for name, value in self._dataset[index].items()}
-            self._items[index] = item
-        return {name: v.values / 255 if isinstance(v, _Pixels) else v for name, v in item.items()}
+        if index not in self._items:
+            self._items[index] = self._dataset[index]
+        return dict(self._items[index])
 
     def __getattr__(self, name: str) -> Any:
         if name == "_dataset":  # not there yet while a loader process unpickles this object
@@ -104,8 +88,8 @@ def _adapted(stock: Any) -> Any:
             train.meta.features.pop(ENVIRONMENT_STATE, None)
         # LeRobot 0.6.1 renames the dataset's features and not their statistics.
         train.meta.stats = rename_stats(train.meta.stats, cfg.rename_map)
-        images = [math.prod(train.meta.features[camera]["shape"]) for camera in train.meta.camera_keys]
-        fits = len(train) * sum(images) * cfg.policy.n_obs_steps <= MAX_BYTES
+        pixels = [math.prod(train.meta.features[camera]["shape"]) for camera in train.meta.camera_keys]
+        fits = 4 * sum(pixels) * cfg.policy.n_obs_steps * len(train) <= MAX_BYTES
         if fits and not cfg.dataset.image_transforms.enable and not cfg.dataset.streaming:
             train = CachedDataset(train)
         return train, evaluation

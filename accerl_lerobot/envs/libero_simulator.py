@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import hashlib
 import io
 import re
 import threading
@@ -46,7 +45,6 @@ NEAR = 0.03  # scale in m of the squashed vectors that a critic sees
 STILL = np.array([0, 0, 0, 0, 0, 0, -1], np.float32)
 _alone = threading.RLock()
 """Held where LIBERO uses what a process has one of: LeRobot plays tasks in threads."""
-_coarse: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
 
 
 class LiberoEnvironment(SuiteEnvironment):
@@ -430,7 +428,7 @@ def _make_cheap(model: Any) -> None:
             continue
         faces, first = model.mesh_face[at : at + count], int(model.mesh_vertadr[mesh])
         vertices = model.mesh_vert[first : first + int(model.mesh_vertnum[mesh])]
-        kept, merged = _coarser_once(vertices, faces)
+        kept, merged = _coarser_once(vertices.tobytes(), faces.tobytes())
         corners = model.mesh_facetexcoord[at : at + count][kept] + model.mesh_texcoordadr[mesh]
         if model.mesh_texcoordnum[mesh] == 3 * count:  # each corner has its own place in the texture
             places = model.mesh_texcoord[corners]
@@ -441,12 +439,11 @@ def _make_cheap(model: Any) -> None:
         model.mesh_facenum[mesh] = len(kept)
 
 
-def _coarser_once(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+@functools.cache
+def _coarser_once(vertices: bytes, faces: bytes) -> tuple[np.ndarray, np.ndarray]:
     """`coarser` of a mesh, computed once in a process: the robot and most objects are in many scenes."""
-    key = hashlib.sha256(vertices.tobytes() + faces.tobytes()).digest()
-    if key not in _coarse:
-        _coarse[key] = coarser(vertices, faces, MAX_FACES)
-    return _coarse[key]
+    points = np.frombuffer(vertices, np.float32).reshape(-1, 3)
+    return coarser(points, np.frombuffer(faces, np.int32).reshape(-1, 3), MAX_FACES)
 
 
 def coarser(vertices: np.ndarray, faces: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:

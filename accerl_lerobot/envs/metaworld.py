@@ -160,7 +160,6 @@ class Simulator:
         if config.rendering == "fast":
             draw_fast(env.model)
         config.shift.apply(env, config.cameras)
-        env.touching_object = functools.partial(touching_object, env)
         self._delay = config.shift.action_delay
         self._renderers: dict[tuple[int, int], Any] = {}
 
@@ -201,20 +200,6 @@ class Simulator:
         for renderer in self._renderers.values():
             renderer.close()
         self.env.close()
-
-
-def touching_object(sim: Any, geom: int) -> bool:
-    """MetaWorld's function of this name, which loops over all contacts, with arrays.
-
-    The rewards of 14 tasks ask for it at every env step, where loops took a quarter of the simulation.
-    """
-    contact, force = sim.data.contact, sim.data.efc_force
-    for name in ("leftpad_geom", "rightpad_geom"):
-        pad = sim.data.geom(name).id
-        pressing = (contact.geom == geom).any(1) & (contact.geom == pad).any(1)
-        if force[contact.efc_address[pressing]].sum() <= 0:
-            return False
-    return True
 
 
 def draw_fast(model: Any) -> None:
