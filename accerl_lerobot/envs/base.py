@@ -356,10 +356,10 @@ class SuiteEnvironment(EpisodeEnvironment):
 
     def _observe(self) -> Observation:
         simulator, spec = self.simulator, self.spec
-        observation: Observation = {
-            key: simulator.render(camera, *size[:2])
-            for camera, (key, size) in zip(self.config.cameras, spec.images.items(), strict=True)
-        }
+        size = self.config.image_size
+        observation: Observation = {}
+        for camera, key in zip(self.config.cameras, spec.images, strict=True):
+            observation[key] = simulator.render(camera, size, size)
         observation["observation.state"] = simulator.state()
         if self.config.environment_state:
             numbers = np.append(simulator.everything(), self.late)
@@ -370,22 +370,20 @@ class SuiteEnvironment(EpisodeEnvironment):
 
 def lerobot_eval_arguments(env: Mapping[str, Any]) -> list[str]:
     """``--env.…`` and seed of stock ``lerobot-eval`` for an environment; none if LeRobot cannot have it."""
-    kind = env.get("type")
-    if kind == "lerobot":
-        if env.get("success", IS_SUCCESS) != IS_SUCCESS:  # the only key that LeRobot reads
-            return []
-        fields: dict[str, Any] = {"type": env.get("name"), **(env.get("kwargs") or {})}
+    kind, fields = env.get("type"), dict[str, Any]()
+    if kind == "lerobot" and env.get("success", IS_SUCCESS) == IS_SUCCESS:  # the only key that LeRobot reads
+        fields = {"type": env.get("name"), **(env.get("kwargs") or {})}
         if env.get("max_steps"):
             fields["episode_length"] = env["max_steps"]
-    elif kind in EnvConfig.get_known_choices():
+    elif kind != "lerobot" and kind in EnvConfig.get_known_choices():
         # Only what differs from the defaults, as the run wrote them.
-        usual = encoded_defaults(EnvConfig.get_choice_class(str(kind)))
+        usual = encoded_defaults(EnvConfig.get_choice_class(kind))
         given = {name: value for name, value in env.items() if value != usual.get(name)}
-        plugin = {"discover_packages_path": "accerl_lerobot.envs.lerobot_plugin", "type": "accerl"}
-        fields = plugin | {"environment": json.dumps(given)}
-        if package := given.get("discover_packages_path"):
-            fields["environment.discover_packages_path"] = package
-    else:
+        plugin = "accerl_lerobot.envs.lerobot_plugin"
+        fields = {"discover_packages_path": plugin, "type": "accerl", "environment": json.dumps(given)}
+        if "discover_packages_path" in given:
+            fields["environment.discover_packages_path"] = given["discover_packages_path"]
+    if not fields:
         return []
     seed = f"--seed={EVAL_SEEDS.start}"  # the starts of our evaluation of a run with seed 0
     return [*(f"--env.{name}={shlex.quote(str(value))}" for name, value in fields.items()), seed]

@@ -70,8 +70,7 @@ class Arm(NamedTuple):
     """State that the controller reads, as views of MuJoCo's arrays."""
 
     jacobian: np.ndarray  # (2, 3, V): of the hand's position and rotation
-    packed_mass: np.ndarray
-    mass_entries: np.ndarray  # int (7, 7): where `packed_mass` has the arm's
+    mass: np.ndarray  # (V, V)
     bias: np.ndarray
     qpos: np.ndarray
     qvel: np.ndarray
@@ -97,7 +96,7 @@ class Simulator:
 
     def __init__(self, task: str, rendering: Literal["stock", "fast"], assets: str) -> None:
         self._mujoco = import_mujoco()
-        self.env = _build(task, assets)
+        self.env, self._bodies = _build(task, assets)
         self.model, self.data = self.env.sim.model._model, self.env.sim.data._data
         self._recorded = recorded_states(task).reshape(-1, 1 + self.model.nq + self.model.nv)
         if rendering == "fast":
@@ -113,17 +112,16 @@ class Simulator:
         self._grip_centre, self._grip_half = 0.5 * (high + low), 0.5 * (high - low)
         self._site = robot.eef_site_id
         self._hand = self.model.body(robot.robot_model.eef_name).id
-        self._mass_entries = _mass_entries(self.model, self._dofs)
+        self._mass = np.zeros((self.model.nv, self.model.nv))
         self._jacobian = np.zeros((2, 3, self.model.nv))
         self._renderers: dict[tuple[int, int], Any] = {}
-        self._fixtures = _fixtures(self.env)
         self._visible = self._mujoco.MjvOption()
         self._visible.geomgroup[:2] = 0, 1  # visual meshes, not what collides
         data = self.data
         self._position, self._rotation = data.site_xpos[self._site], data.site_xmat[self._site].reshape(3, 3)
         self._ctrl, self._torques = data.ctrl, _compiled_torques()
         self._arm = Arm(
-            self._jacobian, data.qM, self._mass_entries, data.qfrc_bias, data.qpos, data.qvel, self._dofs,
+            self._jacobian, self._mass, data.qfrc_bias, data.qpos, data.qvel, self._dofs,
             self._position, self._rotation,
         )  # fmt: skip
         # What is looked at: the data of the last reading of the sensors, without its velocities.
@@ -132,8 +130,8 @@ class Simulator:
 
     def reset(self, seed: int) -> None:
         """To the start that `seed` stands for, at rest."""
-        for body, pos, quat in self._fixtures:
-            self.model.body_pos[body], self.model.body_quat[body] = pos, quat
+        # An episode moves fixtures a little, and objects that begin on one are placed where it stood before.
+        self.model.body_pos[:], self.model.body_quat[:] = self._bodies
         _placed(self.env.reset, seed)
         env = self.env
         if seed in EVAL_SEEDS:
@@ -188,6 +186,7 @@ class Simulator:
         if decided:
             self._goal = self._new_goal(action)
         self._mujoco.mj_jacSite(self.model, self.data, *self._jacobian, self._site)
+        self._mujoco.mj_fullM(self.model, self._mass, self.data.qM)
         torques = self._torques(self._arm, Aim(*self._goal, self._rest, self._gains))
         self._ctrl[self._motors] = np.clip(torques, *self._limits)
         self._grip = np.clip(self._grip + self._closing, -1.0, 1.0)
@@ -293,7 +292,7 @@ def operational_space_torques(arm: Arm, aim: Aim) -> np.ndarray:
     mass, joined, velocity = np.empty((n, n)), np.empty((6, n)), np.zeros(6)
     for i in range(n):
         for j in range(n):
-            mass[i, j] = arm.packed_mass[arm.mass_entries[i, j]]
+            mass[i, j] = arm.mass[dofs[i], dofs[j]]
         for k in range(3):
             joined[k, i] = arm.jacobian[0, k, dofs[i]]
             joined[3 + k, i] = arm.jacobian[1, k, dofs[i]]
@@ -365,15 +364,19 @@ def liberos_own(task: str) -> Any:
     return ControlEnv(file, use_camera_obs=False, has_offscreen_renderer=False, ignore_done=True)
 
 
-def _build(task: str, assets: str) -> Any:
-    """robosuite's environment of a task, which draws nothing."""
+def _build(task: str, assets: str) -> tuple[Any, list[np.ndarray]]:
+    """robosuite's environment of a task, which draws nothing, and its bodies' positions and quaternions."""
     with _alone:
         load_libero(assets)
     from robosuite.utils.binding_utils import MjSim
 
+    bodies: list[np.ndarray] = []
+
     def smaller(xml: str) -> Any:
         """Space for 5,000 contacts is 1.3 GB of addresses for each simulation: no process could be forked."""
-        return compiled(re.sub(r"<size [^>]*>", f'<size memory="{ARENA}"/>', xml))
+        simulation = compiled(re.sub(r"<size [^>]*>", f'<size memory="{ARENA}"/>', xml))
+        bodies[:] = simulation.model.body_pos.copy(), simulation.model.body_quat.copy()
+        return simulation
 
     with _alone:
         compiled = MjSim.from_xml_string
@@ -384,36 +387,7 @@ def _build(task: str, assets: str) -> Any:
             why = f"the scene of {task} does not load ({brief(error)}); if the folder is incomplete, {REMEDY}"
             raise InputError("env.assets", assets, why) from error
     env.hard_reset = False  # the scene is always the same: no need to compile it anew for each episode
-    return env
-
-
-def _fixtures(env: Any) -> list[tuple[int, np.ndarray, np.ndarray]]:
-    """Body, position and quaternion of each fixture in the scene's file.
-
-    An episode moves them a little, and objects that begin on one are placed where it stood before.
-    """
-    found = []
-    for fixture in env.fixtures_dict.values():
-        element = env.model.root.find(f".//body[@name='{fixture.root_body}']")
-        pos, quat = (
-            np.array(element.get(key, default).split(), np.float64)
-            for key, default in (("pos", "0 0 0"), ("quat", "1 0 0 0"))
-        )
-        found.append((env.sim.model.body_name2id(fixture.root_body), pos, quat))
-    return found
-
-
-def _mass_entries(model: Any, dofs: np.ndarray) -> np.ndarray:
-    """Where MuJoCo's packed mass matrix holds those of some joints that follow one another, int (n, n)."""
-    entries = np.zeros((len(dofs), len(dofs)), int)
-    for row in range(len(dofs)):
-        dof, address = int(dofs[row]), int(model.dof_Madr[dofs[row]])
-        while dof >= 0:
-            if dof in dofs:
-                column = int(np.flatnonzero(dofs == dof)[0])
-                entries[row, column] = entries[column, row] = address
-            dof, address = int(model.dof_parentid[dof]), address + 1
-    return entries
+    return env, bodies
 
 
 def _make_cheap(model: Any) -> None:
