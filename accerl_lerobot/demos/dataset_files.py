@@ -18,8 +18,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from unittest.mock import patch
 
+import numpy as np
+
 from accerl_lerobot.checkpoint.safety import FileSource, check_folder, check_name, read_json, unsafe_name
-from accerl_lerobot.errors import InputError, causes, expanded, in_one_line
+from accerl_lerobot.errors import InputError, expanded, in_one_line
 
 if TYPE_CHECKING:
     from accerl_lerobot.config.ranges import DatasetConfig
@@ -69,7 +71,22 @@ def opened(dataset: DatasetConfig, meta: Any, episodes: Sequence[int] | None = N
             data = LeRobotDataset(
                 meta.repo_id, root=meta.root, revision=meta.revision, episodes=chosen, video_backend="pyav"
             )
+            _check_rows(data, origin_of(dataset))
         yield data
+
+
+def _check_rows(data: Any, origin: FileSource) -> None:
+    """Refuse rows that LeRobot would take for those of another episode or, in videos, of another time."""
+    meta, names = data.meta, ["index", "episode_index", "frame_index", "timestamp"]
+    rows = data.hf_dataset.with_format("numpy", columns=names)[:]
+    by_borders = np.searchsorted(meta.episodes["dataset_to_index"], rows["index"], side="right")
+    regular = np.isclose(rows["timestamp"], rows["frame_index"] / meta.fps, rtol=1e-6, atol=1e-4)
+    for right, hint in (
+        (rows["episode_index"] == by_borders, "by meta/episodes it is of another episode; get it again"),
+        (regular | (not meta.video_keys), f"its timestamp is not frame_index / {meta.fps}; set it to that"),
+    ):
+        if not right.all():
+            raise origin.refuse(DATA, f"row {rows['index'][right.argmin()]}: {hint}")
 
 
 @contextlib.contextmanager
@@ -85,8 +102,8 @@ def _one_line_errors(dataset: DatasetConfig) -> Iterator[None]:
     except (CompatibilityError, NotImplementedError) as error:
         raise another_version(dataset) from error
     except Exception as error:
-        first = list(causes(error))[-1]  # `datasets` hides it behind an error of its own
-        hint = f"LeRobot cannot read it ({in_one_line(first)}); name a complete LeRobotDataset"
+        shown = error.__cause__ or error  # `datasets` raises an error of its own from the one that tells why
+        hint = f"LeRobot cannot read it ({in_one_line(shown)}); name a complete LeRobotDataset that exists"
         raise InputError(origin.field, origin.value, hint) from error
 
 

@@ -241,8 +241,10 @@ def expand_tasks(text: str, groups: Mapping[str, Sequence[str]]) -> tuple[str, .
     found: dict[str, None] = {}
     for name in (part.strip() for part in text.split(",")):
         if name not in known:
-            near = difflib.get_close_matches(name, known, cutoff=0.4) or list(known)[-1:]
-            hint = f"use names such as {' or '.join(near)}, separated by commas, or of {', '.join(groups)}"
+            close = difflib.get_close_matches(name, known, cutoff=0.4)
+            near = f"did you mean {' or '.join(close)}? " if close else ""
+            example = next(iter(groups.values()))[0]
+            hint = f"{near}use names such as {example}, separated by commas, or of {', '.join(groups)}"
             raise InputError("env.task", text, f"{name!r} is no task; {hint}")
         found |= dict.fromkeys(known[name])
     return tuple(found)

@@ -37,6 +37,11 @@ from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Observation
 FPS = 20  # control rate of environments that name none
 MAX_STEPS = 500  # episode limit of environments that have none
 RENDER = "render"  # in `GymConfig.images`: the picture that the environment renders
+RETURNS = {
+    "reset": ("observation", "info"),
+    "step": ("observation", "reward", "terminated", "truncated", "info"),
+}
+"""Values that Gymnasium's methods return."""
 _STATE, _IMAGE = "observation.state", "observation.image"
 _PINNED = re.compile(r"[\w.-]+/[\w.-]+@[0-9a-f]{40}(:\w[\w./-]*\.py)?", re.ASCII)
 
@@ -96,11 +101,20 @@ class GymnasiumEnvironment(EpisodeEnvironment):
         return action
 
     def _begin(self, seed: int, task: str) -> None:
-        self._raw, _ = self.environments[task].reset(seed=seed)
+        self._raw, _ = self._returned("reset", self.environments[task].reset(seed=seed))
+
+    def _returned(self, method: str, values: Any) -> tuple[Any, ...]:
+        """The values that a method of the environment has returned; those of the older gym are refused."""
+        names = RETURNS[method]
+        if isinstance(values, tuple) and len(values) == len(names):
+            return values
+        field = self.config.named_by
+        hint = f"let its {method} return ({', '.join(names)}), as in Gymnasium"
+        raise InputError(f"env.{field}", getattr(self.config, field), hint)
 
     def _step(self, action: np.ndarray) -> Step:
         step = self.environments[self._task].step(self._processed(action))
-        self._raw, reward, ended, cut, info = step
+        self._raw, reward, ended, cut, info = self._returned("step", step)
         success = bool(ended)
         if self.config.success:
             told = flattened(info)

@@ -13,6 +13,7 @@ import functools
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from importlib.metadata import metadata
 from typing import Annotated, Any
 
 import numpy as np
@@ -78,8 +79,11 @@ def environment_error(config: EnvConfig, error: Exception) -> InputError:
         return drawing
     field, value = f"env.{config.named_by}", getattr(config, config.named_by)
     if isinstance(error, ModuleNotFoundError):
+        missing = str(error.name or getattr(error.__cause__, "name", None)).partition(".")[0]
+        hint = f"the package {missing} is not installed"
         package = "accerl-lerobot" if config.named_by == "type" else "lerobot"
-        hint = f"{error}; pip install '{package}[{value}]', if it has this extra, or the package itself"
+        if value in (metadata(package).get_all("Provides-Extra") or ()):
+            hint += f"; pip install '{package}[{value}]'"
         return InputError(field, value, hint)
     kwargs = getattr(config, "kwargs", None)
     if kwargs:

@@ -6,8 +6,6 @@ from __future__ import annotations
 import io
 import json
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +19,7 @@ from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos.dataset_files import check_metadata, checked, open_metadata, opened, task_texts
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.hub.card import recognise
-from tests.tiny_datasets import FRONT, IMAGE, STEPS, rewrite, write_dataset, write_old
+from tests.tiny_datasets import STEPS, rewrite, write_dataset
 
 ROOT = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
 CAMERA = "observation.images.corner2"
@@ -243,20 +241,6 @@ def test_missing_data_are_not_fetched_from_the_hub(tmp_path: Path, monkeypatch: 
     (tmp_path / "data" / DATA).unlink()
     with pytest.raises(InputError, match="data: files of some episodes are missing; give the whole folder"):
         opened(dataset, meta).__enter__()
-
-
-def test_an_old_dataset_is_told_the_command_that_converts_it(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-):
-    new = Path(str(write_dataset(tmp_path / "new", more={FRONT: IMAGE}).root))
-    old = write_old(new, tmp_path / "old")
-    dataset = DatasetConfig(repo_id="a/b", root=str(old))
-    with pytest.raises(InputError, match="its format is not v3.0") as caught:
-        open_metadata(dataset)
-    assert not caplog.records, "LeRobot warns of its fields"
-    command = caught.value.hint.rpartition("convert with: python ")[2].split()
-    subprocess.run([sys.executable, *command], check=True, capture_output=True)
-    assert open_metadata(dataset).total_frames == 2 * STEPS
 
 
 def test_tasks_are_found_by_their_indices(tmp_path: Path):

@@ -210,8 +210,8 @@ def test_the_environment_has_its_own_limit():
             r"MUJOCO_GL='.*': the environment cannot draw \(gladLoad",
         ),
         (
-            {"fails": ModuleNotFoundError("No module named 'arms'")},
-            r"env\.id='Odd-v0': No module named 'arms'",
+            {"fails": ModuleNotFoundError("x", name="arms.left")},
+            r"env\.id='Odd-v0': the package arms is not installed",
         ),
         ({"fast": True}, r"env\.kwargs={'fast': True}: the environment fails \(TypeError: .*'fast'"),
     ],
