@@ -431,7 +431,7 @@ class HistoryEnvironment(WrappedEnvironment):
         if self._left:  # after the end, the environment itself complains
             actions = actions[: self._left]
         unseen = max(1, len(actions) - self._length + 1)
-        parts = [actions[:unseen], *np.split(actions[unseen:], len(actions) - unseen)]
+        parts = [actions[:unseen], *actions[unseen:, None]]
         results: list[ChunkResult] = []
         for part in parts:
             results.append(self._environment.step_chunk(part))

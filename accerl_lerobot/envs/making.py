@@ -85,11 +85,9 @@ def environment_error(config: EnvConfig, error: Exception) -> InputError:
         if value in (metadata(package).get_all("Provides-Extra") or ()):
             hint += f"; pip install '{package}[{value}]'"
         return InputError(field, value, hint)
-    kwargs = getattr(config, "kwargs", None)
-    if kwargs:
-        field, value = "env.kwargs", kwargs
     why = f"the environment fails ({type(error).__name__}: {brief(error)}); ACCERL_LOG=DEBUG shows where"
-    return InputError(field, value, why)
+    kwargs = getattr(config, "kwargs", None)
+    return InputError("env.kwargs", kwargs, f"{value}: {why}") if kwargs else InputError(field, value, why)
 
 
 @functools.lru_cache(maxsize=1)

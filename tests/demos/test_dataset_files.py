@@ -103,7 +103,7 @@ def test_templates(copied: Path, key: str, template: str):
 )
 def test_what_info_may_say(copied: Path, changes: dict[str, Any], why: str):
     edit(copied, **changes)
-    refused(copied, f"meta.*{why}")
+    refused(copied, why)
 
 
 def test_columns_that_would_open_other_files(copied: Path, tmp_path: Path):
@@ -120,7 +120,7 @@ def test_columns_that_would_open_other_files(copied: Path, tmp_path: Path):
         return table.replace_schema_metadata({"huggingface": json.dumps(described)})
 
     rewrite(copied / EPISODES, change)
-    refused(copied, "columns of kind Image, which name other files")
+    refused(copied, "columns of kind Image; numbers and texts are wanted")
 
 
 def data_with(root: Path, images: list[dict[str, Any]]) -> None:
@@ -207,7 +207,7 @@ def test_links_out_of_the_folder(copied: Path, tmp_path: Path, part: str):
 def test_an_error_of_lerobot_s_is_one_line(tmp_path: Path):
     dataset = write_dataset(tmp_path / "data")
     meta = open_metadata(dataset)
-    rewrite(tmp_path / "data" / DATA, lambda table: table.drop_columns(["action"]))
+    (tmp_path / "data" / DATA).write_bytes(b"PAR1 of something else")
     with pytest.raises(InputError, match=r"^dataset.root='.*': LeRobot cannot read it \(") as caught:
         opened(dataset, meta).__enter__()
     assert "\n" not in str(caught.value)
