@@ -26,8 +26,8 @@ from accerl_lerobot.config.ranges import Positive, Range, Repeats, Section
 from accerl_lerobot.demos.record import simulators
 from accerl_lerobot.envs import EnvConfig, LiberoConfig, MetaWorldConfig, make_environment
 from accerl_lerobot.envs.graphics import import_mujoco
+from accerl_lerobot.envs.libero import load_libero
 from accerl_lerobot.envs.libero_simulator import Simulator, liberos_own
-from accerl_lerobot.envs.libero_tasks import load_libero
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.seeds import train_seed
 from benchmarks.tables import as_table, host, ranged, spread

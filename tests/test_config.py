@@ -251,7 +251,6 @@ class TestPreflight:
         ("policy", "message"),
         [
             ({"type": "smol"}, "sft.policy.type='smol': no such policy type here; install the package"),
-            ({"type": "gaussian_actor"}, "sft.policy.type='gaussian_actor': only LeRobot's SAC trains it"),
             ({"type": "smolvla", "chunks": 3}, "sft.policy.chunks=3: LeRobot's smolvla has no such field"),
             ({"type": "smolvla", "num_steps": "x"}, "sft.policy.num_steps='x': LeRobot says: "),
             ({"type": "smolvla", "chunk_size": 0}, "sft.policy.chunk_size=0: use a whole number in [1, "),

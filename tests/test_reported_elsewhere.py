@@ -78,8 +78,8 @@ def test_success_reward_and_end_may_be_arrays_of_one(registered: Any):
 @pytest.mark.parametrize(
     ("method", "given", "message"),
     [
-        ("reset", lambda full: full[0], r"its reset returns a dict; let it return \(observation, info\)"),
-        ("step", lambda full: (*full[:3], full[4]), "its step returns 4 values; let it return"),
+        ("reset", lambda full: full[0], r"let its reset return \(observation, info\)"),
+        ("step", lambda full: (*full[:3], full[4]), r"let its step return \(observation, reward"),
     ],
 )
 def test_an_environment_of_the_older_interface_is_told_what_to_return(
@@ -153,7 +153,7 @@ def test_episodes_whose_borders_contradict_the_rows_are_refused(tmp_path: Path):
         return table
 
     rewrite(tmp_path / "data/meta/episodes/chunk-000/file-000.parquet", move_border)
-    message = "data: row 6 is of episode 1, and by meta/episodes of episode 0; get"
+    message = "data: row 6: by meta/episodes it is of another episode"
     with pytest.raises(InputError, match=message), opened(dataset, open_metadata(dataset)):
         pass
 
@@ -191,7 +191,7 @@ def test_videos_in_several_files_and_timestamps_off_the_rate(tmp_path: Path):
         return table.set_column(column, "timestamp", pa.array(stamps))
 
     rewrite(tmp_path / "data/data/chunk-000/file-000.parquet", delay)
-    message = "frame 2 of episode 0 has the timestamp 0.0375, and at 80 Hz it is 0.0250; set timestamps to"
+    message = "data: row 2: its timestamp is not frame_index / 80"
     with pytest.raises(InputError, match=message), opened(dataset, open_metadata(dataset)):
         pass
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -75,41 +74,3 @@ def rewrite(path: Path, change: Callable[[pa.Table], pa.Table]) -> None:
     with pq.ParquetFile(path) as file:
         table = file.read()
     pq.write_table(change(table), path)
-
-
-def edit_json(path: Path, change: Callable[[dict[str, Any]], Any]) -> None:
-    """Changes a JSON file in place."""
-    content = json.loads(path.read_text())
-    change(content)
-    path.write_text(json.dumps(content))
-
-
-def write_old(new: Path, root: Path) -> Path:
-    """A dataset in the layout of LeRobot's format v2.1, from one of format v3.0 without videos."""
-    info = json.loads((new / "meta/info.json").read_text())
-    stats = json.loads((new / "meta/stats.json").read_text())
-    info |= {
-        "codebase_version": "v2.1",
-        "total_chunks": 1,
-        "total_videos": 0,
-        "data_path": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
-        "video_path": "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4",
-    }
-    data = LeRobotDataset("a/b", root=new, video_backend="pyav")
-    with pq.ParquetFile(new / "data/chunk-000/file-000.parquet") as file:
-        table = file.read()
-    (root / "meta").mkdir(parents=True)
-    (root / "data/chunk-000").mkdir(parents=True)
-    (root / "meta/info.json").write_text(json.dumps(info))
-    tasks = [{"task_index": i, "task": text} for i, text in enumerate(data.meta.tasks.index)]
-    episodes, statistics = [], []
-    for index, episode in enumerate(data.meta.episodes):
-        first, last = episode["dataset_from_index"], episode["dataset_to_index"]
-        part = table.slice(first, last - first)
-        pq.write_table(part, root / f"data/chunk-000/episode_{index:06d}.parquet")
-        episodes.append({"episode_index": index, "tasks": episode["tasks"], "length": last - first})
-        statistics.append({"episode_index": index, "stats": stats})
-    for name, rows in (("tasks", tasks), ("episodes", episodes), ("episodes_stats", statistics)):
-        lines = "".join(f"{json.dumps(row)}\n" for row in rows)
-        (root / f"meta/{name}.jsonl").write_text(lines)
-    return root

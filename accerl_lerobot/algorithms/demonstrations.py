@@ -12,7 +12,7 @@ import numpy as np
 
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos.dataset_files import open_metadata, opened
-from accerl_lerobot.demos.episodes import check_images, numbers, observations, read_labels
+from accerl_lerobot.demos.episodes import numbers, observations, read_labels
 from accerl_lerobot.experience import Segment, SegmentStart
 from accerl_lerobot.policies.features import dataset_shapes
 
@@ -71,9 +71,7 @@ def recorded(
     share = min(1.0, most * chunk / meta.total_frames)
     episodes = range(math.ceil(share * meta.total_episodes))
     with opened(dataset, meta, episodes) as data:
-        shapes = dataset_shapes(meta)
-        images = {name: shapes[name] for name, shape in wanted.items() if len(shape) > 2}
-        check_images(data, images, dataset)
+        images = [name for name, shape in wanted.items() if len(shape) > 2]
         vectors = {
             name: numbers(data, name, dataset).astype(np.float32).reshape(-1, *shape)
             for name, shape in wanted.items()

@@ -7,13 +7,13 @@ says when an episode counts as a success.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from accerl_lerobot.demos.dataset_files import origin_of
+from accerl_lerobot.demos.dataset_files import origin_of, task_texts
 from accerl_lerobot.experience import REWARD, SUCCESS
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ LABEL = f"label the episodes with {SUCCESS}, as the page about recorded episodes
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeLabels:
-    """Rows of an episode in the order of time, and what is known of them; T env steps."""
+    """Rows of an episode in the order of time, and its labels; T env steps."""
 
     index: int  # its number in the dataset
     rows: np.ndarray  # int64 (T,), places in the loaded dataset
@@ -43,34 +43,33 @@ def read_labels(data: Any, dataset: DatasetConfig, one_task: bool = True) -> lis
 
     With `one_task`, an episode whose instruction changes is refused.
     """
-    meta, origin = data.meta, origin_of(dataset)
-    episode, step, task = (column(data, f"{name}_index", dataset) for name in ("episode", "frame", "task"))
-    rewards = column(data, REWARD, dataset) if REWARD in meta.features else None
-    flags = column(data, SUCCESS, dataset) if SUCCESS in meta.features else None
-    if flags is not None and not np.isin(flags, (0, 1)).all():
-        raise origin.refuse(SUCCESS, f"a value other than 0 and 1; {LABEL}")
-    texts = [str(text) for text in meta.tasks.index]
-    order = np.lexsort((step, episode))
+    origin, texts = origin_of(dataset), task_texts(data.meta)
+    read = ("episode_index", "frame_index", "task_index", REWARD, SUCCESS)
+    columns = {name: numbers(data, name, dataset) for name in read if name in data.meta.features}
+    episode = columns["episode_index"]
+    order = np.lexsort((columns["frame_index"], episode))
     ends = np.flatnonzero(np.diff(episode[order])) + 1
     found = []
     for rows in np.split(order, ends):
+        own = {name: values[rows] for name, values in columns.items()}
         index = int(episode[rows[0]])
-        numbers_of_tasks = dict.fromkeys(task[rows].tolist())
-        names = tuple(texts[int(number)] for number in numbers_of_tasks)
-        if one_task and len(names) > 1:
-            hint = f"its instruction changes from {names[0]!r} to {names[1]!r}, and one is read here"
+        tasks = tuple(texts[number] for number in dict.fromkeys(own["task_index"].tolist()))
+        if one_task and len(tasks) > 1:
+            hint = f"its instruction changes from {tasks[0]!r} to {tasks[1]!r}, and one is read here"
             raise origin.refuse(f"episode {index}", f"{hint}; split the episode, or use accerl sft")
-        given = None if rewards is None else rewards[rows].astype(np.float32)
-        success_at = None
-        if flags is not None:
-            success_at = step_of_success(flags[rows])
-        elif given is not None:
-            success_at = step_of_reward(given)
+        success_at, rewards = None, own.get(REWARD)
+        if SUCCESS in own:
+            success_at = step_of_success(own[SUCCESS])
+        elif rewards is not None:
+            success_at = step_of_reward(rewards)
             if success_at is None:
                 hint = f"{REWARD} is above 0 at steps that do not end it, so that it tells no success"
                 raise origin.refuse(f"episode {index}", f"{hint}; {LABEL}")
-        labels = EpisodeLabels(index=index, rows=rows, tasks=names, rewards=given, success_at=success_at)
-        found.append(labels)
+        if rewards is not None:
+            rewards = rewards.astype(np.float32)
+        found.append(
+            EpisodeLabels(index=index, rows=rows, tasks=tasks, rewards=rewards, success_at=success_at)
+        )
     return found
 
 
@@ -90,22 +89,11 @@ def step_of_reward(rewards: np.ndarray) -> int | None:
     None if rewards are dense: a reward above 0 tells success if it comes once, or stays until the end.
     """
     positive = np.flatnonzero(rewards > 0)
-    if not len(positive):
+    if len(positive) == 0:
         return -1
-    first, last = int(positive[0]), int(positive[-1])
-    held = last == len(rewards) - 1 and len(positive) == last - first + 1
-    same = bool((rewards[positive] == rewards[first]).all())
-    if len(positive) == 1 or (held and same and first > 0):
-        return first
-    return None
-
-
-def column(data: Any, name: str, dataset: DatasetConfig) -> np.ndarray:
-    """A column of one finite number per row, (N,)."""
-    values = numbers(data, name, dataset)
-    if values.size != len(values):
-        raise origin_of(dataset).refuse(name, f"shape {values.shape[1:]} at each step; one number is wanted")
-    return values.reshape(-1)
+    first = int(positive[0])
+    stays = first > 0 and bool((rewards[first:] == rewards[first]).all())
+    return first if len(positive) == 1 or stays else None
 
 
 def numbers(data: Any, name: str, dataset: DatasetConfig) -> np.ndarray:
@@ -121,25 +109,14 @@ def numbers(data: Any, name: str, dataset: DatasetConfig) -> np.ndarray:
     return values
 
 
-def check_images(data: Any, shapes: Mapping[str, tuple[int, ...]], dataset: DatasetConfig) -> None:
-    """Refuses a dataset whose first images have not the shapes (channels, height, width) that it names."""
-    first = data[0] if shapes else {}
-    for name, shape in shapes.items():
-        if (found := tuple(first[name].shape)) != shape:
-            hint = f"its images have shape {found}, and meta/info.json says {shape}; record it again"
-            raise origin_of(dataset).refuse(name, hint)
-
-
 def observations(
     data: Any, rows: np.ndarray, vectors: dict[str, np.ndarray], cameras: Collection[str]
 ) -> dict[str, np.ndarray]:
     """Contents of some rows: of `vectors`, columns of the dataset, and images uint8 (T, h, w, 3)."""
     found = {name: values[rows] for name, values in vectors.items()}
     frames = [data[int(row)] for row in rows] if cameras else []
-    return found | {camera: np.stack([_pixels(frame[camera]) for frame in frames]) for camera in cameras}
-
-
-def _pixels(image: Any) -> np.ndarray:
-    """uint8 (h, w, 3) from LeRobot's float (3, h, w) in [0, 1]."""
-    pixels: np.ndarray = (image * 255).round().clamp(0, 255).byte().permute(1, 2, 0).numpy()
-    return pixels
+    for camera in cameras:
+        # LeRobot gives float (3, h, w) in [0, 1].
+        images = [(frame[camera] * 255).round().byte().permute(1, 2, 0).numpy() for frame in frames]
+        found[camera] = np.stack(images)
+    return found

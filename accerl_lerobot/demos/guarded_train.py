@@ -16,36 +16,22 @@ import json
 import math
 import sys
 import traceback
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch.utils.data import Dataset
 
 from accerl_lerobot import errors
-from accerl_lerobot.checkpoint.safety import FileSource
 from accerl_lerobot.config.parsing import DISCOVER, discover
-from accerl_lerobot.demos.dataset_files import checked
+from accerl_lerobot.config.ranges import DatasetConfig
+from accerl_lerobot.demos.dataset_files import checked, origin_of
 from accerl_lerobot.demos.sft import ANSWER, TRUST
 from accerl_lerobot.experience import ENVIRONMENT_STATE
 from accerl_lerobot.policies.untrusted import guarded
 
 PACKAGE = f"--policy.{DISCOVER}="
 MAX_BYTES = 4 * 1024**3
-"""Datasets whose images would take more memory than this are read the stock way."""
-
-
-class _Pixels(NamedTuple):
-    """A float image in [0, 1] as the bytes that it was made of, a quarter of its memory."""
-
-    values: torch.Tensor
-
-
-def _small(value: Any) -> Any:
-    """An image as `_Pixels`, if that gives it back exactly; anything else as it is."""
-    if not isinstance(value, torch.Tensor) or value.dtype != torch.float32 or value.ndim < 3:
-        return value
-    values = (value * 255).round().clamp(0, 255).to(torch.uint8)
-    return _Pixels(values) if torch.equal(values / 255, value) else value
+"""Datasets whose images, as float32, would take more memory than this are read the stock way."""
 
 
 @functools.cache
@@ -81,11 +67,9 @@ class CachedDataset(Dataset[Any]):
         return len(self._dataset)
 
     def __getitem__(self, index: int) -> dict[str, Any]:
-        item = self._items.get(index)
-        if item is None:
-            item = {name: _small(value) for name, value in self._dataset[index].items()}
-            self._items[index] = item
-        return {name: v.values / 255 if isinstance(v, _Pixels) else v for name, v in item.items()}
+        if index not in self._items:
+            self._items[index] = self._dataset[index]
+        return dict(self._items[index])
 
     def __getattr__(self, name: str) -> Any:
         if name == "_dataset":  # not there yet while a loader process unpickles this object
@@ -104,45 +88,38 @@ def _adapted(stock: Any) -> Any:
             train.meta.features.pop(ENVIRONMENT_STATE, None)
         # LeRobot 0.6.1 renames the dataset's features and not their statistics.
         train.meta.stats = rename_stats(train.meta.stats, cfg.rename_map)
-        fixed = not cfg.dataset.image_transforms.enable and not cfg.dataset.streaming
-        item_bytes = 0
-        for camera in train.meta.camera_keys:
-            pixel_bytes = 4 if camera in train.meta.depth_keys else 1  # depth stays float, see `_small`
-            item_bytes += pixel_bytes * math.prod(train.meta.features[camera]["shape"])
-        if fixed and len(train) * item_bytes * cfg.policy.n_obs_steps <= MAX_BYTES:
+        pixels = [math.prod(train.meta.features[camera]["shape"]) for camera in train.meta.camera_keys]
+        fits = 4 * sum(pixels) * cfg.policy.n_obs_steps * len(train) <= MAX_BYTES
+        if fits and not cfg.dataset.image_transforms.enable and not cfg.dataset.streaming:
             train = CachedDataset(train)
         return train, evaluation
 
     return make
 
 
+def _argument(flag: str) -> str | None:
+    """The value of an argument of the command line."""
+    return next((text.removeprefix(flag) for text in sys.argv if text.startswith(flag)), None)
+
+
 def main() -> None:
-    """Runs ``lerobot-train`` on the command line's arguments."""
+    """Run ``lerobot-train`` on the command line's arguments."""
     from lerobot.datasets.dataset_reader import DatasetReader
     from lerobot.scripts import lerobot_train
 
     from accerl_lerobot.policies.vla import data_only
 
-    given: dict[str, str] = {}
-    for argument in sys.argv[1:]:
-        name, equals, value = argument.partition("=")
-        given.setdefault(name + equals, value)
-    code, root = given.get(TRUST), given.get("--dataset.root=")
-    origin = FileSource("dataset.root", root)
-    if root is None:
-        origin = FileSource("dataset.repo_id", given.get("--dataset.repo_id="))
+    commit, root = _argument(TRUST), _argument("--dataset.root=")
+    dataset = DatasetConfig(repo_id=_argument("--dataset.repo_id="), root=root)
     lerobot_train.make_train_eval_datasets = _adapted(lerobot_train.make_train_eval_datasets)
     DatasetReader._query_hf_dataset = query_rows
-    discover(given.get(PACKAGE), "policy")
-    sys.argv[1:] = [a for a in sys.argv[1:] if not a.startswith((TRUST, PACKAGE))]
+    discover(_argument(PACKAGE), "policy")
+    sys.argv[1:] = [argument for argument in sys.argv[1:] if not argument.startswith((TRUST, PACKAGE))]
     answer: dict[str, Any] = {}
     errors.collect_warnings()
+    tokenisers = data_only() if commit is None else contextlib.nullcontext()
     try:
-        with contextlib.ExitStack() as guards:
-            guards.enter_context(guarded("sft", code))
-            guards.enter_context(checked(origin, whole=root is not None))
-            if code is None:
-                guards.enter_context(data_only())
+        with guarded("sft", commit), checked(origin_of(dataset), whole=root is not None), tokenisers:
             lerobot_train.main()
     except Exception as error:
         answer = errors.error_as_json(error)

@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from accerl_lerobot.demos.libero_grasp import DOWN, Grasp, Scene
 from accerl_lerobot.envs.base import Environment
-from accerl_lerobot.envs.libero import LiberoEnvironment
-from accerl_lerobot.envs.libero_simulator import Simulator
+from accerl_lerobot.envs.libero_simulator import LiberoEnvironment, Simulator
 from accerl_lerobot.errors import InputError
 
 Script = Generator[np.ndarray, None, bool]
@@ -33,8 +32,12 @@ OFFSETS = {
     "bowl": (0, 0, 0.03),
 }
 """Target of an object's lowest point, relative to the position of the object or region it is placed on."""
-HANDLE = np.array([-0.002, -0.1015, 0.1105])
-"""Centre of the handle of the cabinet's middle drawer, in the cabinet's frame."""
+HANDLES = {
+    "top": (-0.002, -0.1015, 0.184),
+    "middle": (-0.002, -0.1015, 0.1105),
+    "bottom": (-0.002, -0.1015, 0.041),
+}
+"""Centre of the handle of each of a cabinet's drawers, in the drawer's frame."""
 KNOB = 0.038  # height of the grasp above the origin of the stove's knob
 PRESS = 0.008  # height of the fingers above a plate's origin while they push it
 
@@ -135,106 +138,125 @@ class Hand:
         return bool(np.linalg.norm(offset - self.held) < 0.05)
 
 
-def pick_and_place(hand: Hand, name: str, place: Callable[[], np.ndarray]) -> Script:
-    """Carries an object to a place and releases it; repeats until the episode ends."""
+def pick_and_place(hand: Hand, name: str, region: str) -> Script:
+    """Carries an object to a region or another object and releases it there."""
     scene, simulator = hand.scene, hand.simulator
+    heights = scene.corners(name)[..., 2] - simulator.pose(name)[0][2]
+    x, y, up = next((offset for part, offset in OFFSETS.items() if part in region), (0, 0, 0.01))
+    up = up - heights.min()
+    if "basket" in region:  # the palm stays above the basket's rim
+        up = max(up, 0.045 - heights.max())
+
+    def place() -> np.ndarray:
+        return simulator.pose(region)[0] + [x, y, up]
 
     def goal() -> np.ndarray:
         position = simulator.hand[0]
         return place() + position - simulator.pose(name)[0]
 
-    while True:
-        yield from hand.pick(name, place)
-        position = simulator.hand[0]
-        below = position[2] - scene.corners(name)[..., 2].min()
-        clear = scene.height(name, position, goal()) + below + hand.rng.uniform(0.02, 0.04)
-        if not (yield from hand.over(goal, clear, lambda: hand.holds(name))):
-            continue
-        if not (yield from hand.move(goal, given=lambda: hand.holds(name))):
-            continue
-        yield from hand.set_grip(-1.0, simulator.hand[0])
-        yield from hand.rise(0.1, 15)
+    def held() -> bool:
+        return hand.holds(name)
+
+    yield from hand.pick(name, place)
+    position = simulator.hand[0]
+    below = position[2] - scene.corners(name)[..., 2].min()
+    clear = scene.height(name, position, goal()) + below + hand.rng.uniform(0.02, 0.04)
+    if not (yield from hand.over(goal, clear, held)):
+        return False
+    if not (yield from hand.move(goal, given=held)):
+        return False
+    yield from hand.set_grip(-1.0, simulator.hand[0])
+    return (yield from hand.rise(0.1, 15))
 
 
-def slide_plate(hand: Hand, name: str, place: Callable[[], np.ndarray]) -> Script:
-    """Slides a plate to a place with closed fingers that push its rim from inside."""
+def slide(hand: Hand, name: str, region: str) -> Script:
+    """Slides a plate to a region with closed fingers that push its rim from inside."""
     simulator = hand.simulator
 
     def ahead(distance: float, height: float) -> np.ndarray:
         position = simulator.pose(name)[0]
-        way = (place() - position)[:2]
+        way = (simulator.pose(region)[0] - position)[:2]
         return position + [*(distance * way / max(np.linalg.norm(way), 1e-6)), height]
 
     def follows() -> bool:
         return bool(np.linalg.norm(simulator.hand[0] - simulator.pose(name)[0]) < 0.075)
 
     hand.grip = 1.0
-    while True:
-        yield from hand.move(lambda: ahead(0.02, 0.08), within=0.02)
-        yield from hand.move(lambda: ahead(0.02, PRESS), steps=25)
-        yield from hand.move(lambda: ahead(0.065, PRESS), steps=80, given=follows)
-        yield from hand.rise(0.08, 12)
+    yield from hand.move(lambda: ahead(0.02, 0.08), within=0.02)
+    yield from hand.move(lambda: ahead(0.02, PRESS), steps=25)
+    yield from hand.move(lambda: ahead(0.065, PRESS), steps=80, given=follows)
+    return (yield from hand.rise(0.08, 12))
 
 
 def open_drawer(hand: Hand, region: str) -> Script:
-    """Opens the middle drawer: grasps the handle from the front and pulls."""
-    simulator, cabinet = hand.simulator, region.rsplit("_", 2)[0]
-    position, quaternion = simulator.pose(cabinet)
-    turn = Rotation.from_quat(quaternion, scalar_first=True)
+    """Opens the drawer with this region: grasps the handle from the front, pulls, and lets it go."""
+    simulator = hand.simulator
+    cabinet, level, _ = region.rsplit("_", 2)
+    drawer = simulator.data.body(f"{cabinet}_cabinet_{level}")
+    turn = Rotation.from_quat(simulator.pose(cabinet)[1], scalar_first=True)
     front = turn.apply([0, -1.0, 0])
-    drawer = simulator.data.body(region.replace("middle_region", "cabinet_middle"))
-    closed = drawer.xpos.copy()
     hand.turn = lambda at: Rotation.from_rotvec(1.4 * np.cross([0, 0, 1], front)).as_matrix() @ DOWN
 
     def handle(ahead: float = 0.0) -> np.ndarray:
-        return position + turn.apply(HANDLE) + drawer.xpos - closed + ahead * front
+        return drawer.xpos + turn.apply(HANDLES[level]) + ahead * front
 
     def holds() -> bool:
         return bool(np.linalg.norm(handle() - simulator.hand[0]) < 0.03)
 
-    while True:
-        yield from hand.move(lambda: handle(0.1), within=0.02)
-        yield from hand.move(handle, steps=30)
-        yield from hand.set_grip(1.0, handle())
-        yield from hand.move(functools.partial(lambda to: to, handle(0.2)), steps=40, given=holds)
-        yield from hand.set_grip(-1.0, simulator.hand[0], 5)
+    yield from hand.move(lambda: handle(0.1), within=0.02)
+    yield from hand.move(handle, steps=30)
+    yield from hand.set_grip(1.0, handle())
+    pulled = handle(0.2)
+    yield from hand.move(lambda: pulled, steps=40, given=holds)
+    yield from hand.set_grip(-1.0, simulator.hand[0], 5)
+    return (yield from hand.move(lambda: handle(0.1), within=0.02))
 
 
 def turn_knob(hand: Hand, name: str) -> Script:
     """Turns on a stove: grasps its knob from above and turns the hand."""
     simulator = hand.simulator
     knob = simulator.data.body(f"{name}_button").xpos + [0, 0, KNOB]
-    while True:
-        for height, steps in ((0.08, 60), (0.0, 25)):
-            yaw = simulator.opening(name)
-            hand.turn = functools.partial(hand.scene.turn, Grasp(np.zeros(3), yaw, 0.0))
-            yield from hand.move(functools.partial(lambda up: knob + [0, 0, up], height), steps=steps)
-        yield from hand.set_grip(1.0, knob)
-        hand.turn = functools.partial(hand.scene.turn, Grasp(np.zeros(3), yaw + 1.2, 0.0))
-        yield from hand.set_grip(1.0, knob, 15)
-        yield from hand.set_grip(-1.0, knob)
-        yield from hand.rise(0.08, 12)
+
+    def turn_by(angle: float) -> None:
+        grasp = Grasp(np.zeros(3), simulator.opening(name) + angle, 0.0)
+        hand.turn = functools.partial(hand.scene.turn, grasp)
+
+    turn_by(0.0)
+    yield from hand.move(lambda: knob + [0, 0, 0.08])
+    turn_by(0.0)
+    yield from hand.move(lambda: knob, steps=25)
+    yield from hand.set_grip(1.0, knob)
+    turn_by(1.2)
+    yield from hand.set_grip(1.0, knob, 15)
+    yield from hand.set_grip(-1.0, knob)
+    return (yield from hand.rise(0.08, 12))
 
 
-def script(simulator: Simulator) -> Script:
-    """The script of an episode; equal starts give equal scripts."""
+SKILLS: dict[str, Callable[..., Script]] = {
+    "in": pick_and_place,
+    "on": pick_and_place,
+    "open": open_drawer,
+    "turnon": turn_knob,
+    "main_table_stove_front_region": slide,
+}
+"""Skill that makes a predicate of LIBERO's true, by the name of its last object or else by its own name."""
+PLANS: dict[str, list[list[str]]] = {}
+"""Predicates of LIBERO's that a task needs, in the order of work, where its goal alone does not tell them."""
+
+
+def script(simulator: Simulator, task: str) -> Script:
+    """The script of an episode, which works at the first predicate that is not true yet.
+
+    Equal starts give equal scripts.
+    """
     rng = np.random.default_rng(simulator.data.qpos.view(np.uint32))
-    scene = Scene(simulator)
-    hand = Hand(scene, rng)
-    ((verb, *names),) = simulator.env.parsed_problem["goal_state"]
-    if verb == "open":
-        return open_drawer(hand, names[0])
-    if verb == "turnon":
-        return turn_knob(hand, names[0])
-    name, where = names
-    heights = scene.corners(name)[..., 2] - simulator.pose(name)[0][2]
-    offset = next((offset for part, offset in OFFSETS.items() if part in where), (0, 0, 0.01))
-    up = offset[2] - heights.min()
-    if "basket" in where:  # the palm stays above the basket's rim
-        up = max(up, 0.045 - heights.max())
-    if "stove_front" in where:
-        return slide_plate(hand, name, lambda: simulator.pose(where)[0])
-    return pick_and_place(hand, name, lambda: simulator.pose(where)[0] + [*offset[:2], up])
+    hand = Hand(Scene(simulator), rng)
+    plan = PLANS.get(task, simulator.env.parsed_problem["goal_state"])
+    while True:
+        missing = [step for step in plan if not simulator.env._eval_predicate(step)]
+        verb, *names = (missing or plan)[0]
+        skill = SKILLS.get(names[-1]) or SKILLS[verb]
+        yield from skill(hand, *names)
 
 
 def libero_expert(environment: Environment, task: str) -> Callable[[], np.ndarray]:
@@ -251,7 +273,7 @@ def libero_expert(environment: Environment, task: str) -> Callable[[], np.ndarra
 
     def act() -> np.ndarray:
         if not actions:
-            actions.append(script(environment.simulator))
+            actions.append(script(environment.simulator, task))
         return next(actions[0])
 
     return act

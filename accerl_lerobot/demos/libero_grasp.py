@@ -63,15 +63,16 @@ class Scene:
 
     def collisions(self, name: str, points: np.ndarray, margin: float = 0.004) -> np.ndarray:
         """Number of points (..., P, 3) that are inside an object other than `name`, int (...)."""
-        geoms, data = self._geoms(name, others=True), self.simulator.data
-        corners, every = self.corners(name, others=True), tuple(range(points.ndim - 1))
-        low, high = points.min(every) - 2 * margin, points.max(every) + 2 * margin
-        geoms = geoms[((corners.min(1) < high) & (corners.max(1) > low)).all(-1)]  # the others are too far
-        middle, half = np.split(self.simulator.model.geom_aabb[geoms], 2, axis=-1)
-        turn = data.geom_xmat[geoms].reshape(-1, 3, 3)
-        middle = middle + np.einsum("gi,gij->gj", data.geom_xpos[geoms], turn)
-        local = np.tensordot(points, turn, (-1, 1))  # (..., P, G, 3)
-        return (np.abs(local - middle) < half + margin).all(-1).any(-1).sum(-1)
+        model, data = self.simulator.model, self.simulator.data
+        centre = points.reshape(-1, 3).mean(0)
+        spread = np.linalg.norm(points - centre, axis=-1).max() + margin
+        inside = np.zeros(points.shape[:-1], bool)
+        for geom in self._geoms(name, others=True):
+            position, (middle, half) = data.geom_xpos[geom], model.geom_aabb[geom].reshape(2, 3)
+            if np.linalg.norm(position - centre) < spread + np.linalg.norm(middle) + np.linalg.norm(half):
+                local = (points - position) @ data.geom_xmat[geom].reshape(3, 3) - middle
+                inside |= (np.abs(local) < half + margin).all(-1)
+        return inside.sum(-1)
 
     def height(self, name: str, start: np.ndarray, goal: np.ndarray, margin: float = 0.08) -> float:
         """Highest point of the objects that are, seen from above, within `margin` of a line."""
@@ -94,30 +95,31 @@ class Scene:
         chooses among grasps of similar cost.
         """
         corners, position = self.corners(name), self.simulator.pose(name)[0]
-        low, high = corners[..., 2].min(), corners[..., 2].max()
-        height = max(high - DEPTH, (high + low) / 2)
-        flat = corners.reshape(-1, 3)[:, :2]
+        bottom, top = corners[..., 2].min(1), corners[..., 2].max(1)
+        height = max(top.max() - DEPTH, (top.max() + bottom.min()) / 2)
         yaws = np.radians(np.arange(-90, 90, 7.5))
-        axes = np.stack([-np.sin(yaws), np.cos(yaws)], -1)
-        if np.ptp(flat @ axes.T, axis=0).min() < WIDEST:  # across it, in the middle or toward an end
-            level = np.abs(corners[..., 2] - height).min(1) < 0.005
-            level |= (corners[..., 2].min(1) < height) & (corners[..., 2].max(1) > height)
-            flat = corners[level].reshape(-1, 3)[:, :2]
-            width, length = np.ptp(flat @ axes.T, axis=0), np.ptp(flat @ (axes[:, ::-1] * [1, -1]).T, axis=0)
+        across = np.stack([-np.sin(yaws), np.cos(yaws)], -1)  # axes of the fingers
+        along = np.stack([np.cos(yaws), np.sin(yaws)], -1)
+        flat = corners[..., :2].reshape(-1, 2)
+        if np.ptp(flat @ across.T, axis=0).min() < WIDEST:  # across it, in the middle or toward an end
+            level = (bottom < height) & (top > height) | (np.abs(corners[..., 2] - height).min(1) < 0.005)
+            flat = corners[level, :, :2].reshape(-1, 2)
+            width = np.ptp(flat @ across.T, axis=0)
+            length = np.ptp(flat @ along.T, axis=0)
+            to_end = along * np.maximum(length / 2 - 0.022, 0)[:, None]
+            offsets = np.concatenate([0 * along, to_end, -to_end])
             cost = np.where(width < WIDEST, 40 * (width - width.min()), np.inf)
-            along = axes[:, ::-1] * [1, -1] * np.maximum(length / 2 - 0.022, 0)[:, None]
-            middle = (flat.min(0) + flat.max(0)) / 2
-            points = np.concatenate([middle + 0 * along, middle + along, middle - along])
             cost = np.concatenate([cost, cost + 0.5, cost + 0.5])
         else:
-            middle = (flat.min(0) + flat.max(0)) / 2
-            radius = np.ptp(flat @ axes.T, axis=0)[:, None] / 2 - 0.012
-            points = np.concatenate([middle + radius * axes, middle - radius * axes])
-            cost = np.repeat([1.0, 0.0], len(axes))  # the side of −y, if it is free
+            to_rim = across * (np.ptp(flat @ across.T, axis=0) / 2 - 0.012)[:, None]
+            offsets = np.concatenate([to_rim, -to_rim])
+            cost = np.repeat([1.0, 0.0], len(across))  # the side of −y, if it is free
+        points = (flat.min(0) + flat.max(0)) / 2 + offsets
         yaws = np.tile(yaws, len(points) // len(yaws))
-        hands = np.concatenate([points, np.full((len(points), 1), height)], -1)
-        ways = points - self.base, points - position[:2] + goal[:2] - self.base
-        far = np.maximum(np.linalg.norm(ways, axis=-1).max(0) - EASY_REACH, 0)
+        hands = np.column_stack([points, np.full(len(points), height)])
+        moved = hands + goal - position
+        reach = np.maximum(*(np.linalg.norm(at[:, :2] - self.base, axis=-1) for at in (hands, moved)))
+        far = np.maximum(reach - EASY_REACH, 0)
         leans = np.minimum(3 * far, 0.35)
         grasps = [Grasp(*each) for each in zip(hands - position, yaws, leans, strict=True)]
         turns = np.stack([self.turn(grasp, position) for grasp in grasps])

@@ -19,10 +19,9 @@ import shutil
 import signal
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -49,8 +48,7 @@ SIDECAR = Path("meta") / "accerl_demos.json"
 _MAX_EPISODES = 10_000
 _MAX_TRIES = 50
 MOST_PROCESSES = 8  # a container may see more cores than it has
-_VERSIONS = {name: name for name in ("lerobot", "metaworld", "robosuite", "mujoco", "numpy")}
-_VERSIONS |= {"libero": "hf-libero"}  # module → distribution
+_DISTRIBUTIONS = ("lerobot", "metaworld", "hf-libero", "robosuite", "mujoco", "numpy")
 
 Expert = Callable[[], np.ndarray]  # gives the next action for the state its environment is in
 
@@ -66,14 +64,13 @@ class Episode:
     observations: dict[str, np.ndarray]  # before each step, under LeRobot's names
     actions: np.ndarray  # float32 (T, A), as executed: noise included, clipped to the environment's bounds
     rewards: np.ndarray
+    successes: np.ndarray  # bool; True from the step on that achieved the task
     task: str
     done: bool
-    success_at: int  # index of the first step after which the task was achieved; -1 for never
-    seed: int
 
     @property
     def success(self) -> bool:
-        return self.success_at >= 0
+        return bool(self.successes[-1])
 
     def __len__(self) -> int:
         return len(self.rewards)
@@ -102,21 +99,19 @@ def played(environment: Environment, task: str, seed: int, actions: Iterable[np.
         observation = result.observation
         if result.done:
             break
-    return episode_of(steps, seed)
+    return episode_of(steps)
 
 
-def episode_of(steps: Sequence[PlayedStep], seed: int) -> Episode:
+def episode_of(steps: Sequence[PlayedStep]) -> Episode:
     """The episode that consists of these env steps."""
     seen, actions, results = zip(*steps, strict=True)
-    successes = [result.success for result in results]
     return Episode(
-        observations={key: np.stack([row[key] for row in seen]) for key in seen[0] if key != "task"},
+        observations={key: np.stack([each[key] for each in seen]) for key in seen[0] if key != "task"},
         actions=np.stack(actions),
-        rewards=np.concatenate([result.rewards for result in results]).astype(np.float32),
+        rewards=np.concatenate([result.rewards for result in results]),
+        successes=np.array([result.success for result in results]),
         task=str(seen[0]["task"]),
         done=results[-1].done,
-        success_at=successes.index(True) if any(successes) else -1,
-        seed=seed,
     )
 
 
@@ -192,7 +187,9 @@ def simulators(
     """So many processes, each made ready by `start`; an error inside ends them at once."""
     context = multiprocessing.get_context("spawn")
     before = set(multiprocessing.active_children())
-    with _Pool(processes, context, initializer=_ready, initargs=(start, *arguments)) as pool:
+    with concurrent.futures.ProcessPoolExecutor(
+        processes, context, initializer=_ready, initargs=(start, *arguments)
+    ) as pool:
         try:
             yield pool
         except BaseException:
@@ -203,29 +200,9 @@ def simulators(
 
 def _ready(start: Callable[..., None], *arguments: Any) -> None:
     """Makes a process ready; Ctrl-C on the terminal is for its parent, which ends it."""
-    global _broken
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     errors.collect_warnings()
-    try:
-        start(*arguments)
-    except Exception as error:  # the pool would lose it
-        _broken = error
-
-
-_broken: Exception | None = None  # why this process could not be made ready
-
-
-class _Pool(concurrent.futures.ProcessPoolExecutor):
-    """Processes whose work raises what kept them from being made ready."""
-
-    def submit(self, work: Any, /, *arguments: Any) -> Any:  # type: ignore[override]
-        return super().submit(_checked, work, *arguments)
-
-
-def _checked(work: Callable[..., Any], *arguments: Any) -> Any:
-    if _broken is not None:
-        raise _broken
-    return work(*arguments)
+    start(*arguments)
 
 
 def _with_warnings[Item, Result](
@@ -238,25 +215,29 @@ def _with_warnings[Item, Result](
 def simulated[Item, Result](
     env_config: EnvConfig, work: Callable[[Item], Result], items: Sequence[Item]
 ) -> Iterator[Iterator[Result]]:
-    """Results of `work`, in the order of `items`, from processes that have each a `this_world`.
+    """Results of `work`, in the order of `items`, from processes that have each a `this_environment`.
 
-    The first are already under way when the context is entered; few finished ones wait in memory.
+    Few finished ones wait in memory.
     """
     # Each process comes to hold a simulator of every task.
     each = len(getattr(env_config, "tasks", ("one",))) * SIMULATOR_GIB.get(env_config.type, 0.1)
-    cores, fitting = len(os.sched_getaffinity(0)), (memory_gib("MemAvailable") or math.inf) / each
-    processes, left = max(1, int(min(cores, MOST_PROCESSES, len(items), fitting))), iter(items)
+    fitting = (memory_gib("MemAvailable") or math.inf) / each
+    cores = len(os.sched_getaffinity(0))
+    processes = max(1, int(min(cores, MOST_PROCESSES, len(items), fitting)))
     with simulators(processes, _open_environment, env_config) as pool:
-        first = itertools.islice(left, 2 * processes)
-        waiting = collections.deque(pool.submit(_with_warnings, work, item) for item in first)
+
+        def finished(work: Any) -> Result:
+            result, warned = work.result()
+            errors.show_warnings(warned)
+            return result
 
         def results() -> Iterator[Result]:
-            while waiting:
-                result, warned = waiting.popleft().result()
-                errors.show_warnings(warned)
-                more = itertools.islice(left, 1)
-                waiting.extend(pool.submit(_with_warnings, work, item) for item in more)
-                yield result
+            waiting: collections.deque[Any] = collections.deque()
+            for item in items:
+                waiting.append(pool.submit(_with_warnings, work, item))
+                if len(waiting) > 2 * processes:
+                    yield finished(waiting.popleft())
+            yield from map(finished, waiting)
 
         yield results()
 
@@ -288,7 +269,7 @@ def new_dataset(
     from datasets.utils.logging import disable_progress_bar
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    disable_progress_bar()  # one per episode would bury ours
+    disable_progress_bar()  # a bar per episode would bury ours
     dataset = LeRobotDataset.create(
         repo_id,
         fps=spec.fps,
@@ -306,7 +287,7 @@ def new_dataset(
 
 @dataclass(frozen=True, kw_only=True)
 class DemosConfig(Section, section="demos"):
-    """How many demonstrations, and how disturbed."""
+    """Number of demonstrations, and their disturbance. They show the environment without ``env.shift``."""
 
     episodes: Annotated[int, Range("[1, 10000]")] = 25
     """Episodes in the dataset; spread evenly over the tasks."""
@@ -320,8 +301,6 @@ class DemosConfig(Section, section="demos"):
     failure_share: Share = 0.0
     """Share of episodes that drift at random from early on and fail; for success and world models. Without a
     push, other episodes that fail are tried again with another seed."""
-    shifted: bool = False
-    """Apply ``env.shift`` to the demonstrations too; otherwise they show the environment without it."""
 
 
 def record_demos(
@@ -335,8 +314,7 @@ def record_demos(
         The dataset's folder; open it with ``LeRobotDataset(REPO_ID, root=...)``.
     """
     folder, console = check_free(root), console or Console()
-    if not config.shifted:
-        env_config = env_config.nominal()
+    env_config = env_config.nominal()
     environment = make_environment(env_config)
     spec = environment.spec
     check_instruction(spec, env_config)
@@ -345,21 +323,25 @@ def record_demos(
     environment.close()
     tally = {"episodes": 0, "frames": 0, "successes": 0, "discarded": 0}
     record = partial(record_one, env_config, config, seed)
-    with appearing(folder) as unfinished:
-        with (
-            simulated(env_config, record, range(config.episodes)) as episodes,
-            console.stage("demonstrations", total=config.episodes) as stage,
-            new_dataset(unfinished, REPO_ID, spec, env_config) as dataset,
-        ):
+    with (
+        appearing(folder) as unfinished,
+        simulated(env_config, record, range(config.episodes)) as episodes,
+        console.stage("demonstrations", total=config.episodes) as stage,
+    ):
+        with new_dataset(unfinished, REPO_ID, spec, env_config) as dataset:
             for episode, discarded in episodes:
                 save_episode(dataset, episode, tally)
                 tally["discarded"] += discarded
                 stage.update(tally["episodes"])
+        versions = {}
+        for name in _DISTRIBUTIONS:
+            with suppress(importlib.metadata.PackageNotFoundError):
+                versions[name] = importlib.metadata.version(name)
         sidecar = {
             "env": draccus.encode(env_config, EnvConfig),
             "demos": asdict(config) | {"seed": seed},
             **tally,
-            "versions": {k: importlib.metadata.version(v) for k, v in _VERSIONS.items() if find_spec(k)},
+            "versions": versions,
         }
         (unfinished / SIDECAR).write_text(json.dumps(sidecar, indent=2) + "\n")
     console.say("{episodes} episodes, {frames} frames, {successes} successes".format(**tally))
@@ -370,15 +352,13 @@ def save_episode(
     dataset: Any, episode: Episode, tally: dict[str, int], more: Mapping[str, np.ndarray] | None = None
 ) -> None:
     """Adds an episode, with `more` features (T, 1), to a dataset and to a count."""
+    last = len(episode) - 1
+    columns = {**episode.observations, **(more or {}), "action": episode.actions}
+    columns |= {REWARD: episode.rewards[:, None], SUCCESS: episode.successes[:, None]}
     for t in range(len(episode)):
-        frame = {
-            **{key: rows[t] for key, rows in (episode.observations | dict(more or {})).items()},
-            "action": episode.actions[t],
-            REWARD: episode.rewards[t : t + 1],
-            "next.done": np.array([episode.done and t == len(episode) - 1]),
-            SUCCESS: np.array([episode.success and t >= episode.success_at]),
-            "task": episode.task,
-        }
+        frame = {name: rows[t] for name, rows in columns.items()}
+        frame["task"] = episode.task
+        frame["next.done"] = np.array([episode.done and t == last])
         dataset.add_frame(frame)
     dataset.save_episode()
     tally["episodes"] += 1
@@ -395,14 +375,13 @@ def features(spec: EnvironmentSpec, environment_state: int) -> dict[str, dict[st
         key: {"dtype": "image", "shape": shape, "names": ["height", "width", "channels"]}
         for key, shape in spec.images.items()
     }
-    vectors = {"observation.state": ("state", spec.state_dim), "action": ("action", spec.action_dim)}
+    vectors = {"observation.state": spec.state_dim, "action": spec.action_dim, REWARD: 1}
     if environment_state:
-        vectors[ENVIRONMENT_STATE] = ("environment_state", environment_state)
-    for key, (name, size) in vectors.items():
-        table[key] = {"dtype": "float32", "shape": (size,), "names": [f"{name}_{i}" for i in range(size)]}
-    table[REWARD] = {"dtype": "float32", "shape": (1,), "names": None}
-    table["next.done"] = {"dtype": "bool", "shape": (1,), "names": None}
-    table[SUCCESS] = {"dtype": "bool", "shape": (1,), "names": None}
+        vectors[ENVIRONMENT_STATE] = environment_state
+    for key, size in vectors.items():
+        table[key] = {"dtype": "float32", "shape": (size,), "names": None}
+    for key in ("next.done", SUCCESS):
+        table[key] = {"dtype": "bool", "shape": (1,), "names": None}
     return table
 
 
@@ -413,19 +392,16 @@ def record_one(env_config: EnvConfig, config: DemosConfig, seed: int, slot: int)
     task, rank = tasks[slot % len(tasks)], slot // len(tasks)
     fail = math.floor((rank + 1) * share) > math.floor(rank * share)
     for attempt in range(_MAX_TRIES):
-        own, expert = (
-            demo_seed(seed, slot + attempt * _MAX_EPISODES),
-            make_expert(env_config, environment, task),
-        )
+        own_seed = demo_seed(seed, slot + attempt * _MAX_EPISODES)
+        expert = make_expert(env_config, environment, task)
         actions = disturbed(
-            expert, environment.spec, own, noise=config.action_noise, push=config.push, fail=fail
+            expert, environment.spec, own_seed, noise=config.action_noise, push=config.push, fail=fail
         )
-        episode = played(environment, task, own, actions)
+        episode = played(environment, task, own_seed, actions)
         if episode.success != fail or (config.push and not fail):
             return episode, attempt
-    raise InputError(
-        "demos.failure_share" if fail else "demos.action_noise",
-        share if fail else config.action_noise,
-        f"{_MAX_TRIES} tries of {task} in a row did not {'fail' if fail else 'succeed'}; "
-        "lower it, or allow more env steps (env.max_steps)",
-    )
+    hint = f"{_MAX_TRIES} tries of {task} in a row did not {'fail' if fail else 'succeed'}; lower it"
+    hint += ", or allow more env steps (env.max_steps)"
+    if fail:
+        raise InputError("demos.failure_share", share, hint)
+    raise InputError("demos.action_noise", config.action_noise, hint)

@@ -34,12 +34,14 @@ from accerl_lerobot.policies.config import check_registered, discovery, register
 logger = logging.getLogger(__name__)
 
 TRUST = "--trust_remote_code="
-PROGRESS = re.compile(r"(?:\| (\d+)/\d+ \[.*)?\bstep:(\d+\.?\d*)([KM]?) .*\bloss:(nan|inf|\d+\.?\d*)\b")
+PROGRESS = re.compile(
+    r"(\| (?P<bar>\d+)/\d+ \[.*)?"
+    r"\bstep:(?P<step>\d+\.?\d*)(?P<suffix>[KM]?) .*\bloss:(?P<loss>nan|inf|\d+\.?\d*)\b"
+)
+"""LeRobot's lines such as ``Training: 4%| | 1200/30000 [01:02<…]INFO … step:1K … loss:0.512 …``."""
 ANSWER = "accerl hands over: "
 """Begins the last line of a trainer; warnings and the last exception follow, as JSON."""
 LOG_EVERY, WARMUP_STEPS = 25, 20
-NO_SFT = {"gaussian_actor": "only LeRobot's SAC trains it, lerobot-train does not; use act"}
-"""LeRobot policy types that ``lerobot-train`` cannot fine-tune → why, and what to do."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,54 +89,52 @@ def sft_command(
     """The ``lerobot-train`` command line of this warm start; `episodes`: see `picked`."""
     from accerl_lerobot.policies.untrusted import is_adapter  # imports torch
 
-    policy: dict[str, Any]
-    adapts = False
-    if config.init_path is not None:
-        stored = read_json(
-            Path(config.init_path) / "config.json", FileSource("sft.init_path", config.init_path)
-        )
-        policy, kind = {"path": config.init_path}, str(stored.get("type"))
-        adapts = is_adapter(Path(config.init_path))
-        if adapts or stored.get("use_peft"):
-            policy["use_peft"] = adapts
-    else:
-        policy, kind = dict(config.policy), str(config.policy["type"])
+    start, adapts = config.init_path, False
+    if start is None:
+        kind, policy = str(config.policy["type"]), dict(config.policy)
         if config.backbone is not None:
             policy["vlm_model_name"] = str((output_dir.parent / "backbone").resolve())
             policy["load_vlm_weights"] = False
-    known = policy_fields(kind, "sft.init_path" if config.init_path is not None else "sft.policy.type")
-    policy |= {"device": device, "push_to_hub": False}
+        known = policy_fields(kind, "sft.policy.type")
+    else:
+        stored = read_json(Path(start) / "config.json", FileSource("sft.init_path", start))
+        kind, policy = str(stored.get("type")), {"path": start}
+        adapts = is_adapter(Path(start))
+        if adapts or stored.get("use_peft"):
+            policy["use_peft"] = adapts
+        known = policy_fields(kind, "sft.init_path")
+        if "pretrained_backbone_weights" in known:
+            policy["pretrained_backbone_weights"] = None  # the checkpoint's replace them; spares a download
     preset = {
         "optimizer_lr": config.lr,
         "scheduler_warmup_steps": WARMUP_STEPS,
         "scheduler_decay_steps": config.steps,
     }
+    policy |= {"device": device, "push_to_hub": False}
     policy |= {name: value for name, value in preset.items() if name in known}
-    if config.init_path is not None and "pretrained_backbone_weights" in known:
-        policy["pretrained_backbone_weights"] = None  # the checkpoint's replace them; spares their download
-    command = [sys.executable, "-m", "accerl_lerobot.demos.guarded_train"]
-    command += [f"{TRUST}{config.trust_remote_code}"] if config.trust_remote_code else []
-    command += [f"--policy.{key}={as_text(value)}" for key, value in policy.items()]
-    # LeRobot writes an adapter's config.json only where it is told of one; the method is the adapter's own.
-    command += ["--peft.method_type=LORA"] if adapts else []
-    command += discovery(kind)
-    root = None if dataset.root is None else expanded(dataset.root, "dataset.root")
-    named = {"repo_id": dataset.repo_id, "root": root, "revision": dataset.revision}
-    command += [f"--dataset.{key}={value}" for key, value in named.items() if value]
-    command += [f"--dataset.episodes={json.dumps(episodes)}"] if episodes is not None else []
-    command += [
-        f"--output_dir={output_dir}",
-        f"--steps={config.steps}",
-        f"--batch_size={config.batch_size}",
-        "--num_workers=0",  # best where the dataset fits into memory, see `guarded_train`
-        f"--seed={seed}",
-        f"--save_freq={config.steps}",
-        f"--log_freq={LOG_EVERY}",
-        "--env_eval_freq=0",
-        "--wandb.enable=false",
-        "--dataset.video_backend=pyav",
-    ]
-    return command + list(config.extra_args)
+    root = None if dataset.root is None else str(expanded(dataset.root, "dataset.root"))
+    data = {"repo_id": dataset.repo_id, "root": root, "revision": dataset.revision, "episodes": episodes}
+    flags = {f"policy.{name}": value for name, value in policy.items()}
+    flags |= {f"dataset.{name}": value for name, value in data.items() if value is not None}
+    flags |= {
+        "output_dir": str(output_dir),
+        "steps": config.steps,
+        "batch_size": config.batch_size,
+        "num_workers": 0,  # best where the dataset fits into memory, see `guarded_train`
+        "seed": seed,
+        "save_freq": config.steps,
+        "log_freq": LOG_EVERY,
+        "env_eval_freq": 0,
+        "wandb.enable": False,
+        "dataset.video_backend": "pyav",
+    }
+    if adapts:  # LeRobot writes an adapter's config.json only if a method is named; it is the adapter's own
+        flags["peft.method_type"] = "LORA"
+    if config.trust_remote_code is not None:
+        flags["trust_remote_code"] = config.trust_remote_code
+    command = [sys.executable, "-m", "accerl_lerobot.demos.guarded_train", *discovery(kind)]
+    command += [f"--{name}={as_text(value)}" for name, value in flags.items()]
+    return command + config.extra_args
 
 
 def run_sft(
@@ -156,18 +156,16 @@ def run_sft(
         RuntimeError: the trainer failed; carries its last exception and the place of its log.
     """
     check_absent(output_dir)
-    if config.init_path is not None:
-        from accerl_lerobot.policies.untrusted import fetched_checkpoint  # imports torch
-
-        config = replace(config, init_path=str(fetched_checkpoint(config.init_path, None, "sft.init_path")))
     output_dir.parent.mkdir(parents=True, exist_ok=True)
-    if config.init_path is None and config.backbone is not None:
+    if config.init_path is not None:
+        config = replace(config, init_path=str(_start(config.init_path, output_dir.parent / "init")))
+    elif config.backbone is not None:
         write_backbone(output_dir.parent / "backbone", texts, Sizes(**vars(config.backbone)))
-    config = _with_backbone_in_place(config, output_dir.parent / "init")
     command = sft_command(config, dataset, output_dir, seed, device, picked(dataset, config.pick))
     logger.info("%s", shlex.join(command))
-    # Whoever holds Ray's token can run code in its workers; a trainer has no business there.
-    environment = {k: v for k, v in os.environ.items() if not k.startswith("RAY_AUTH")} | {
+    # With Ray's token a process can run code in Ray's workers; a trainer has no business there.
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("RAY_AUTH")}
+    environment |= {
         "OMP_NUM_THREADS": str(config.num_threads),
         "OMP_WAIT_POLICY": "PASSIVE",
         "TOKENIZERS_PARALLELISM": "false",
@@ -188,8 +186,9 @@ def run_sft(
             assert process.stdout is not None
             for line in process.stdout:
                 file.write(line)
-                if on_step is not None and (parsed := _parse_progress(line)):
-                    on_step(*parsed)
+                progress = PROGRESS.search(line)
+                if progress is not None and on_step is not None:
+                    on_step(_step(progress), float(progress["loss"]))
         except BaseException:
             process.terminate()  # nobody reads on: it must not train alone
             raise
@@ -197,19 +196,33 @@ def run_sft(
     return output_dir / CHECKPOINTS / LAST / PRETRAINED
 
 
+def _start(path: str, copy: Path) -> Path:
+    """The checkpoint to start from: a copy if its backbone is no longer at the place that its files name."""
+    from accerl_lerobot.policies.untrusted import fetched_checkpoint  # imports torch
+
+    start = fetched_checkpoint(path, None, "sft.init_path")
+    if not displaced(start):
+        return start
+    shutil.copytree(start, copy)
+    relocate(copy, copy)
+    return copy
+
+
 def _check_end(code: int, log: Path) -> None:
-    """Shows a trainer's warnings, and raises its last exception if it failed."""
-    text, found, rest = log.read_text().rpartition(f"\n{ANSWER}")
-    if not found:  # it was ended before it could hand anything over
-        text, rest = rest, "{}"
-    line, _, after = rest.partition("\n")
-    answer, text = json.loads(line), f"{text}\n{after}"
+    """Show a trainer's warnings, and raise its last exception if it failed."""
+    text, found, rest = log.read_text().rpartition(ANSWER)
+    answer: dict[str, Any] = {}
+    if found:
+        line, _, after = rest.partition("\n")
+        answer, rest = json.loads(line), text + after
     errors.show_warnings(answer.get("warnings", ()))
     if code == 0:
         return
     errors.raise_refusal(answer)
-    ended = f"was ended by {signal.Signals(-code).name}" if code < 0 else last_exception(text)
-    raise RuntimeError(f"lerobot-train failed, see {log}: {answer.get('error', ended)}")
+    reason = answer.get("error") or last_exception(rest)
+    if code < 0:
+        reason = f"was ended by {signal.Signals(-code).name}"
+    raise RuntimeError(f"lerobot-train failed, see {log}: {reason}")
 
 
 def picked(dataset: DatasetConfig, pick: str) -> list[int] | None:
@@ -235,35 +248,16 @@ def picked(dataset: DatasetConfig, pick: str) -> list[int] | None:
     return wanted
 
 
-def _with_backbone_in_place(config: SFTConfig, copy: Path) -> SFTConfig:
-    """Starts from a copy where the checkpoint's own backbone is no longer where its files say it is."""
-    start = Path(config.init_path or "").expanduser()
-    if config.init_path is None or not displaced(start):
-        return config
-    shutil.copytree(start, copy)
-    relocate(copy, copy)
-    return replace(config, init_path=str(copy))
-
-
 def policy_fields(kind: str, field: str) -> set[str]:
-    """Names of the fields of LeRobot's config of a policy type; one it cannot fine-tune is refused."""
+    """Names of the fields of LeRobot's config of a policy type; an unknown type is refused."""
     from lerobot.configs.policies import PreTrainedConfig
 
     register_policies(kind)
     check_registered(kind, field)
-    choices = PreTrainedConfig.get_known_choices()
-    if kind in NO_SFT:
-        raise InputError(field, kind, NO_SFT[kind])
-    return {f.name for f in fields(choices[kind])}
+    return {own.name for own in fields(PreTrainedConfig.get_choice_class(kind))}
 
 
-def _parse_progress(line: str) -> tuple[int, float] | None:
-    """LeRobot logs lines such as ``Training: 4%| | 1200/30000 [01:02<…]INFO … step:1K … loss:0.512 …``.
-
-    From 1000 on steps are the bar's, which may be a moment old; without one (under Slurm) thousands.
-    """
-    if (found := PROGRESS.search(line)) is None:
-        return None
-    exact, step, suffix, loss = found.groups()
-    scale = {"": 1, "K": 1_000, "M": 1_000_000}[suffix]
-    return int(exact) if exact and suffix else int(float(step) * scale), float(loss)
+def _step(progress: re.Match[str]) -> int:
+    """The step of a line of progress: the bar's, or without a bar (under Slurm) the rounded number."""
+    scale = {"": 1, "K": 1_000, "M": 1_000_000}[progress["suffix"]]
+    return int(progress["bar"] or float(progress["step"]) * scale)

@@ -7,12 +7,15 @@ Importing this package loads no simulator; an environment imports its own when i
 from __future__ import annotations
 
 from accerl_lerobot.envs.base import ChunkResult, EnvConfig, Environment, EnvironmentSpec, HistoryEnvironment
-from accerl_lerobot.envs.gym_env import GymConfig
-from accerl_lerobot.envs.lerobot_env import LeRobotEnvConfig
+from accerl_lerobot.envs.gym_env import GymConfig, LeRobotEnvConfig
 from accerl_lerobot.envs.libero import LiberoConfig
-from accerl_lerobot.envs.making import environment_error, make_environment
+from accerl_lerobot.envs.making import (
+    JudgedEnvironment,
+    RewardModelConfig,
+    environment_error,
+    make_environment,
+)
 from accerl_lerobot.envs.metaworld import MetaWorldConfig
-from accerl_lerobot.envs.reward_model import JudgedEnvironment, RewardModelConfig
 from accerl_lerobot.envs.simulated import SimulatedConfig
 
 __all__ = [

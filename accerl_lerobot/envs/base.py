@@ -71,8 +71,8 @@ class Environment(ABC):
 
     Example:
         >>> environment = make_environment(MetaWorldConfig(task="drawer-open-v3"))
-        >>> observation = world.reset(seed=3, task="drawer-open-v3")
-        >>> result = world.step_chunk(np.zeros((10, 4), np.float32))
+        >>> observation = environment.reset(seed=3, task="drawer-open-v3")
+        >>> result = environment.step_chunk(np.zeros((10, 4), np.float32))
     """
 
     spec: EnvironmentSpec
@@ -147,9 +147,7 @@ class EpisodeEnvironment(Environment):
             raise InputError("task", task, f"this environment has: {', '.join(self.spec.tasks)}")
         if not 0 <= seed < 2**32:
             raise InputError("seed", seed, "use 0 to 2**32 - 1")
-        self._done = (
-            True  # until the new episode stands: an error below leaves an environment that must be reset
-        )
+        self._done = True  # an error below leaves an environment that must be reset
         self._begin(seed, task)
         self._task, self._steps, self._success, self._done = task, 0, False, False
         return self._observe()
@@ -239,15 +237,16 @@ def names(text: str) -> tuple[str, ...]:
 
 def expand_tasks(text: str, groups: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
     """Expands names of tasks and groups, separated by commas; keeps the order, drops repetitions."""
-    tasks = dict.fromkeys(task for group in groups.values() for task in group)
+    known = dict(groups) | {task: (task,) for group in groups.values() for task in group}
     found: dict[str, None] = {}
     for name in (part.strip() for part in text.split(",")):
-        if name not in groups and name not in tasks:
-            close = difflib.get_close_matches(name, [*tasks, *groups], cutoff=0.4)
+        if name not in known:
+            close = difflib.get_close_matches(name, known, cutoff=0.4)
             near = f"did you mean {' or '.join(close)}? " if close else ""
-            hint = f"use names such as {next(iter(tasks))}, separated by commas, or of {', '.join(groups)}"
-            raise InputError("env.task", text, f"{name!r} is no task; {near}{hint}")
-        found |= dict.fromkeys(groups.get(name, (name,)))
+            example = next(iter(groups.values()))[0]
+            hint = f"{near}use names such as {example}, separated by commas, or of {', '.join(groups)}"
+            raise InputError("env.task", text, f"{name!r} is no task; {hint}")
+        found |= dict.fromkeys(known[name])
     return tuple(found)
 
 
@@ -270,10 +269,9 @@ class SuiteConfig(EnvConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         expand_tasks(self.task, type(self).groups())
-        if not self.cameras or len(set(self.cameras)) < len(self.cameras):
-            raise InputError("env.camera", self.camera, "name each camera once, separated by commas")
-        if unknown := [name for name in self.cameras if name not in self.CAMERAS]:
-            hint = f"{unknown[0]!r} is none of: {', '.join(self.CAMERAS)}"
+        cameras = set(self.cameras)
+        if not cameras or len(cameras) < len(self.cameras) or not cameras <= set(self.CAMERAS):
+            hint = f"name each camera once, separated by commas, of: {', '.join(self.CAMERAS)}"
             raise InputError("env.camera", self.camera, hint)
 
     @property
@@ -308,9 +306,8 @@ def unit_spec(
     )
 
 
-_spare: dict[tuple[str, str], list[Any]] = defaultdict(
-    list
-)  # simulators no environment has, by config and task
+_spare: dict[str, dict[str, list[Any]]] = defaultdict(lambda: defaultdict(list))
+"""Simulators that no environment has, by config and task."""
 
 
 class SuiteEnvironment(EpisodeEnvironment):
@@ -318,10 +315,10 @@ class SuiteEnvironment(EpisodeEnvironment):
     in turn."""
 
     simulator: Any = None  # of the current task; for experts, not for policies
-    _key = "", ""  # config and task of the simulator
 
     def __init__(self, config: SuiteConfig, spec: EnvironmentSpec) -> None:
         self.config, self.spec = config, spec
+        self._spare = _spare[repr(config)]
 
     @abstractmethod
     def _build(self, task: str) -> Any:
@@ -329,18 +326,18 @@ class SuiteEnvironment(EpisodeEnvironment):
         `state`, `everything` (numbers of ``observation.environment_state``), `render` and `close`."""
 
     def _begin(self, seed: int, task: str) -> None:
-        if self.simulator is None or self._key[1] != task:
+        if self.simulator is None or self._task != task:
             self._put_back()
-            self._key = repr(self.config), task
             try:
-                self.simulator = _spare[self._key].pop()
+                self.simulator = self._spare[task].pop()
             except IndexError:  # LeRobot plays tasks in threads, so looking first would not do
                 self.simulator = self._build(task)
+            self._task = task
         self.simulator.reset(seed)
 
     def _put_back(self) -> None:
         if self.simulator is not None:
-            _spare[self._key].append(self.simulator)
+            self._spare[self._task].append(self.simulator)
         self.simulator = None
 
     def _step(self, action: np.ndarray) -> Step:
@@ -354,17 +351,17 @@ class SuiteEnvironment(EpisodeEnvironment):
 
     def close(self) -> None:
         self._put_back()
-        for key in [key for key in list(_spare) if key[0] == repr(self.config)]:
-            for simulator in _spare.pop(key, ()):
-                simulator.close()
-        self._task, self._done = "", True
+        for simulators in self._spare.values():
+            while simulators:
+                simulators.pop().close()
+        self._done = True
 
     def _observe(self) -> Observation:
         simulator, spec = self.simulator, self.spec
-        observation: Observation = {
-            key: simulator.render(camera, *size[:2])
-            for camera, (key, size) in zip(self.config.cameras, spec.images.items(), strict=True)
-        }
+        size = self.config.image_size
+        observation: Observation = {}
+        for camera, key in zip(self.config.cameras, spec.images, strict=True):
+            observation[key] = simulator.render(camera, size, size)
         observation["observation.state"] = simulator.state()
         if self.config.environment_state:
             numbers = np.append(simulator.everything(), self.late)
@@ -375,22 +372,20 @@ class SuiteEnvironment(EpisodeEnvironment):
 
 def lerobot_eval_arguments(env: Mapping[str, Any]) -> list[str]:
     """``--env.…`` and seed of stock ``lerobot-eval`` for an environment; none if LeRobot cannot have it."""
-    kind = env.get("type")
-    if kind == "lerobot":
-        if env.get("success", IS_SUCCESS) != IS_SUCCESS:  # the only key that LeRobot reads
-            return []
-        fields: dict[str, Any] = {"type": env.get("name"), **(env.get("kwargs") or {})}
+    kind, fields = env.get("type"), dict[str, Any]()
+    if kind == "lerobot" and env.get("success", IS_SUCCESS) == IS_SUCCESS:  # the only key that LeRobot reads
+        fields = {"type": env.get("name"), **(env.get("kwargs") or {})}
         if env.get("max_steps"):
             fields["episode_length"] = env["max_steps"]
-    elif kind in EnvConfig.get_known_choices():
+    elif kind != "lerobot" and kind in EnvConfig.get_known_choices():
         # Only what differs from the defaults, as the run wrote them.
-        usual = encoded_defaults(EnvConfig.get_choice_class(str(kind)))
+        usual = encoded_defaults(EnvConfig.get_choice_class(kind))
         given = {name: value for name, value in env.items() if value != usual.get(name)}
-        plugin = {"discover_packages_path": "accerl_lerobot.envs.lerobot_plugin", "type": "accerl"}
-        fields = plugin | {"environment": json.dumps(given)}
-        if package := given.get("discover_packages_path"):
-            fields["world.discover_packages_path"] = package
-    else:
+        plugin = "accerl_lerobot.envs.lerobot_plugin"
+        fields = {"discover_packages_path": plugin, "type": "accerl", "environment": json.dumps(given)}
+        if "discover_packages_path" in given:
+            fields["environment.discover_packages_path"] = given["discover_packages_path"]
+    if not fields:
         return []
     seed = f"--seed={EVAL_SEEDS.start}"  # the starts of our evaluation of a run with seed 0
     return [*(f"--env.{name}={shlex.quote(str(value))}" for name, value in fields.items()), seed]
@@ -433,11 +428,10 @@ class HistoryEnvironment(WrappedEnvironment):
 
     def step_chunk(self, actions: np.ndarray) -> ChunkResult:
         actions = checked_actions(actions, self.spec)
-        steps = min(len(actions), self._left) or len(
-            actions
-        )  # after the end, the environment itself complains
-        unseen = max(0, steps - self._length + 1)
-        parts = ([actions[:unseen]] if unseen else []) + [actions[i : i + 1] for i in range(unseen, steps)]
+        if self._left:  # after the end, the environment itself complains
+            actions = actions[: self._left]
+        unseen = max(1, len(actions) - self._length + 1)
+        parts = [actions[:unseen], *actions[unseen:, None]]
         results: list[ChunkResult] = []
         for part in parts:
             results.append(self._environment.step_chunk(part))
@@ -446,7 +440,7 @@ class HistoryEnvironment(WrappedEnvironment):
                 break
         if results[0].steps > 1:  # some were passed unseen; `length` follow, unless it was cut
             self._seen.extend([self._seen[-1]] * (self._length - len(results)))
-        rewards = np.concatenate([r.rewards for r in results])
+        rewards = np.concatenate([result.rewards for result in results])
         self._left -= len(rewards)
         return replace(results[-1], observation=self._observation(), rewards=rewards)
 

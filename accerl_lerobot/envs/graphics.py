@@ -20,7 +20,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from accerl_lerobot.checkpoint.safety import brief
 from accerl_lerobot.errors import InputError, causes
 
 _LIBRARIES = {
@@ -28,11 +27,10 @@ _LIBRARIES = {
     "osmesa": ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so"),
 }
 _GPU_NODES = ("/dev/nvidia0", "/dev/dri/renderD128")
-REMEDY = (
-    "install an offscreen OpenGL: apt-get install -y libosmesa6 (MUJOCO_GL=osmesa) "
+HINT = (
+    "without a display an offscreen OpenGL is needed: apt-get install -y libosmesa6 (MUJOCO_GL=osmesa) "
     "or apt-get install -y libegl1 libgl1-mesa-dri libgles2 (MUJOCO_GL=egl)"
 )
-_NO_DISPLAY = "there is no display: use egl or osmesa, or unset it"
 _ABOUT_DRAWING = re.compile("OpenGL|gladLoad|glGetError|EGL|(?i:osmesa|glfw|framebuffer)|X11|DISPLAY")
 _open: weakref.WeakSet[Any] = weakref.WeakSet()
 
@@ -55,52 +53,41 @@ def choose_backend() -> str | None:
 
 def start_graphics() -> None:
     """Set ``MUJOCO_GL`` to a backend that works here, unless it is set."""
-    # One software-rendering thread per environment: several environments then share the cores without
-    # fighting.
+    # One thread of software rendering per environment: several environments share the cores then.
     os.environ.setdefault("LP_NUM_THREADS", "1")
     if os.environ.get("MUJOCO_GL") or find_spec("mujoco") is None:
         return
-    if (chosen := choose_backend()) is None:
+    chosen = choose_backend()
+    if chosen is None:
         return
     os.environ["MUJOCO_GL"] = chosen
     if "mujoco" in sys.modules:
-        # Somebody imported MuJoCo before us, without a backend; only this module reads the variable.
+        # MuJoCo was imported before, without a backend; only this module of it reads the variable.
         importlib.reload(sys.modules["mujoco"].gl_context)
 
 
 def import_mujoco() -> ModuleType:
     """Import MuJoCo with a backend that works here; respects ``MUJOCO_GL`` if it is set."""
     start_graphics()
-    given = os.environ.get("MUJOCO_GL", "").lower()
-    if given not in _LIBRARIES and _headless():
-        raise InputError("MUJOCO_GL", given, _NO_DISPLAY if given else REMEDY)
-    try:
-        return importlib.import_module("mujoco")
-    except (ImportError, AttributeError, RuntimeError) as error:
-        if isinstance(error, ModuleNotFoundError) and error.name == "mujoco":
-            raise
-        raise InputError("MUJOCO_GL", given, REMEDY) from error
+    given = os.environ.get("MUJOCO_GL", "")
+    if given.lower() not in _LIBRARIES and _headless():
+        raise InputError("MUJOCO_GL", given, HINT)
+    return importlib.import_module("mujoco")
 
 
 def drawing_error(error: BaseException) -> InputError | None:
     """The one line for an error that says that nothing can be drawn here; None for other errors."""
-    about = next((link for link in causes(error) if _ABOUT_DRAWING.search(str(link))), None)
+    about = next((str(link) for link in causes(error) if _ABOUT_DRAWING.search(str(link))), None)
     if about is None:
         return None
     given = os.environ.get("MUJOCO_GL", "")
-    wrong = given and given.lower() not in _LIBRARIES and _headless()
-    hint = _NO_DISPLAY if wrong else REMEDY
-    return InputError("MUJOCO_GL", given, f"the environment cannot draw ({brief(about)}); {hint}")
+    return InputError("MUJOCO_GL", given, f"the environment cannot draw ({about[:160]}); {HINT}")
 
 
 def new_renderer(model: Any, height: int, width: int) -> Any:
     """A `mujoco.Renderer` whose framebuffer is exactly (height, width)."""
-    mujoco = import_mujoco()
     model.vis.global_.offheight, model.vis.global_.offwidth = height, width
-    try:
-        renderer = mujoco.Renderer(model, height, width)
-    except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
-        raise InputError("MUJOCO_GL", os.environ.get("MUJOCO_GL", ""), REMEDY) from error
+    renderer = import_mujoco().Renderer(model, height, width)
     close_at_exit(renderer)
     return renderer
 

@@ -1,15 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Any registered Gymnasium environment with continuous actions, with LeRobot's features.
+"""Environments of Gymnasium's interface: any registered one with continuous actions, and all of LeRobot's.
 
-Also `GymnasiumEnvironment`, the base of all environments that step environments of Gymnasium's interface.
-Importing this file loads no Gymnasium; making the environment does.
+LeRobot's environments disagree on autoreset, truncation and success, so the single environment is taken out
+of LeRobot's vector one, and episode limits are counted here. Observations and actions pass through LeRobot's
+own per-environment processors: a policy sees exactly the observations of ``lerobot-eval``.
+Importing this file loads neither Gymnasium nor LeRobot; making the environment does.
 """
 
 from __future__ import annotations
 
 import contextlib
 import functools
-import inspect
+import io
+import re
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -17,6 +20,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
+from accerl_lerobot.config.parsing import PLUGINS, import_plugins
 from accerl_lerobot.config.ranges import Range
 from accerl_lerobot.envs.base import (
     IS_SUCCESS,
@@ -37,17 +41,15 @@ RETURNS = {
     "reset": ("observation", "info"),
     "step": ("observation", "reward", "terminated", "truncated", "info"),
 }
-"""Values that Gymnasium's methods return; those of the older gym returned fewer."""
+"""Values that Gymnasium's methods return."""
+_STATE, _IMAGE = "observation.state", "observation.image"
+_PINNED = re.compile(r"[\w.-]+/[\w.-]+@[0-9a-f]{40}(:\w[\w./-]*\.py)?", re.ASCII)
 
 
 @dataclass(frozen=True, kw_only=True)
 class GymnasiumConfig(EnvConfig):
     """Base of the configs of environments of Gymnasium's interface."""
 
-    LIMIT: ClassVar[str]
-    """The environment's own argument that limits an episode."""
-
-    kwargs: dict[str, Any]
     max_steps: Annotated[int, Range("[0, 1000000]")] = 0
     """Episode limit in env steps; reaching it truncates. 0: the environment's own, or 500 if it has none."""
     success: str = IS_SUCCESS
@@ -55,13 +57,6 @@ class GymnasiumConfig(EnvConfig):
     empty: its ``terminated``."""
     reward: Literal["success", "env"] = "success"
     """``success`` (1.0 at the first success, else 0.0) or ``env`` (the environment's own)."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.LIMIT in self.kwargs:
-            limit = self.kwargs[self.LIMIT]
-            hint = f"the limit of an episode is another field; use --env.max_steps={limit} in its place"
-            raise InputError(f"env.kwargs.{self.LIMIT}", limit, hint)
 
 
 class GymnasiumEnvironment(EpisodeEnvironment):
@@ -73,11 +68,10 @@ class GymnasiumEnvironment(EpisodeEnvironment):
 
     def __init__(self, environments: dict[str, Any]) -> None:
         """Take in the environments, by task, and start an episode in the first of them."""
-        self.max_steps = self.config.max_steps or episode_limit(next(iter(environments.values())))
-        self.environments = {task: unlimited(env) for task, env in environments.items()}
-        self.pictures: dict[str, np.ndarray] = {}  # images of the last observation, by camera
-        self._info_keys: set[str] = set()  # seen so far: some environments have a key only when it is true
         self._task = next(iter(environments))
+        self.max_steps = self.config.max_steps or episode_limit(environments[self._task])
+        self.environments = {task: unlimited(env) for task, env in environments.items()}
+        self._info_keys: set[str] = set()  # seen so far: some environments have a key only when it is true
         self._begin(0, self._task)
         self.spec = self._look(self._observe())
         close_at_exit(self)
@@ -86,22 +80,46 @@ class GymnasiumEnvironment(EpisodeEnvironment):
     def _look(self, observation: Observation) -> EnvironmentSpec:
         """Learn sizes and features from a first observation."""
 
+    def _spec(self, observation: Observation, fps: int, instructions: list[str]) -> EnvironmentSpec:
+        """The spec of an environment with such observations."""
+        space = self.environments[self._task].action_space
+        images: dict[str, Any] = {k: np.shape(v) for k, v in observation.items() if k.startswith(_IMAGE)}
+        return EnvironmentSpec(
+            images=images,
+            state_dim=len(observation[_STATE]),
+            action_dim=space.shape[0],
+            action_low=np.asarray(space.low, np.float32),
+            action_high=np.asarray(space.high, np.float32),
+            fps=fps,
+            max_steps=self.max_steps,
+            tasks=tuple(self.environments),
+            instructions=tuple(text for text in instructions if text),
+        )
+
     def _processed(self, action: np.ndarray) -> np.ndarray:
         """The action as the environment takes it."""
         return action
 
     def _begin(self, seed: int, task: str) -> None:
-        self._raw, _ = self._returned(task, "reset", seed=seed)
+        self._raw, _ = self._returned("reset", self.environments[task].reset(seed=seed))
+
+    def _returned(self, method: str, values: Any) -> tuple[Any, ...]:
+        """The values that a method of the environment has returned; those of the older gym are refused."""
+        names = RETURNS[method]
+        if isinstance(values, tuple) and len(values) == len(names):
+            return values
+        field = self.config.named_by
+        hint = f"let its {method} return ({', '.join(names)}), as in Gymnasium"
+        raise InputError(f"env.{field}", getattr(self.config, field), hint)
 
     def _step(self, action: np.ndarray) -> Step:
-        key, chosen = self.config.success, self._processed(action)
-        self._raw, reward, ended, cut, info = self._returned(self._task, "step", chosen)
+        step = self.environments[self._task].step(self._processed(action))
+        self._raw, reward, ended, cut, info = self._returned("step", step)
         success = bool(ended)
-        if key:
+        if self.config.success:
             told = flattened(info)
             self._info_keys |= told.keys()
-            # A vector environment within keeps the last step's beside the next episode's first.
-            success = any(bool(np.any(told[name])) for name in (key, f"final_info.{key}") if name in told)
+            success = any(bool(np.any(told[name])) for name in self._success_keys & told.keys())
         return Step(
             success=success,
             ended=bool(ended) or (success and self.ends_at_success),
@@ -109,33 +127,32 @@ class GymnasiumEnvironment(EpisodeEnvironment):
             cut=bool(cut),
         )
 
-    def _returned(self, task: str, method: str, *arguments: Any, **named: Any) -> tuple[Any, ...]:
-        """The values that a method of the environment returns, if they are Gymnasium's."""
-        values = getattr(self.environments[task], method)(*arguments, **named)
-        if isinstance(values, tuple) and len(values) == len(RETURNS[method]):
-            return values
-        found = f"{len(values)} values" if isinstance(values, tuple) else f"a {type(values).__name__}"
-        hint = f"its {method} returns {found}; let it return ({', '.join(RETURNS[method])}), as in Gymnasium"
-        raise InputError(f"env.{self.config.named_by}", getattr(self.config, self.config.named_by), hint)
+    @property
+    def _success_keys(self) -> set[str]:
+        """Keys that tell success; a vector environment keeps the last step's beside the next ones."""
+        return {self.config.success, f"final_info.{self.config.success}"}
 
     def step_chunk(self, actions: np.ndarray) -> ChunkResult:
         result, key = super().step_chunk(actions), self.config.success
-        if not result.done or not key or {key, f"final_info.{key}"} & self._info_keys:
+        if not result.done or not key or self._success_keys & self._info_keys:
             return result
-        shown = ", ".join(sorted(self._info_keys))
+        has = ", ".join(sorted(self._info_keys)) or "no keys"
         note = (
-            f"env.success={key!r}: the environment's info has no such key, which counts as a failure; "
-            + (f"it has {shown}" if shown else "it is empty")
-            + "; name the key that tells success, or use --env.success= to take terminated for success"
+            f"env.success={key!r}: the environment's info has no such key, which counts as a failure; it has "
+        )
+        note += (
+            f"{has}; name the key that tells success, or use --env.success= to take terminated for success"
         )
         return replace(result, note=note)
 
     def render(self, height: int, width: int) -> np.ndarray:
         env = self.environments[self._task]
-        frame = env.render() if str(env.render_mode).startswith("rgb_array") else None
-        if frame is None:  # a film shows what the policy sees
-            frame = next(iter(self.pictures.values()), np.zeros((height, width, 3), np.uint8))
-        return resized(one_picture(frame), height, width)
+        if env.render_mode == "rgb_array":
+            return resized(env.render(), height, width)
+        images = [value for key, value in self._observe().items() if key.startswith(_IMAGE)]
+        if not images:
+            return np.zeros((height, width, 3), np.uint8)
+        return resized(np.asarray(images[0]), height, width)  # a film shows the images of the policy
 
     def close(self) -> None:
         for env in self.environments.values():
@@ -153,7 +170,6 @@ class GymConfig(GymnasiumConfig):
 
     environment = "accerl_lerobot.envs.gym_env:GymEnvironment"
     named_by = "id"
-    LIMIT = "max_episode_steps"
 
     id: str = ""
     """Name in Gymnasium's registry. The package that registers it is `discover_packages_path`."""
@@ -185,9 +201,7 @@ class GymConfig(GymnasiumConfig):
         """See the base class; only the environment knows, so it is made to ask."""
         if not self.environment_state:
             return 0
-        from accerl_lerobot.envs.making import make_environment
-
-        with contextlib.closing(make_environment(self)) as environment:
+        with contextlib.closing(GymEnvironment(self)) as environment:
             return len(environment.reset(0, self.id)[ENVIRONMENT_STATE])
 
 
@@ -200,43 +214,40 @@ class GymEnvironment(GymnasiumEnvironment):
     def __init__(self, config: GymConfig) -> None:
         import gymnasium
 
-        self.config, env = config, _made(config)
+        self.config = config
+        # Without its checker, which judges what is never read.
+        options: dict[str, Any] = {"disable_env_checker": True}
+        if RENDER in config.images.values():
+            options["render_mode"] = "rgb_array"
+        try:
+            env: Any = gymnasium.make(config.id, **options | config.kwargs)
+        except gymnasium.error.Error as error:
+            hint = f"{error} Is env.discover_packages_path the package that registers it?"
+            raise InputError("env.id", config.id, hint) from error
         space = env.action_space
         if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1 or not space.is_bounded():
             raise InputError("env.id", config.id, f"actions must be a bounded vector, they are {space}")
         super().__init__({config.id: env})
 
     def _look(self, observation: Observation) -> EnvironmentSpec:
-        config, env = self.config, self.environments[self.config.id]
-        space = env.action_space
-        return EnvironmentSpec(
-            images={f"observation.images.{name}": picture.shape for name, picture in self.pictures.items()},
-            state_dim=len(observation["observation.state"]),
-            action_dim=space.shape[0],
-            action_low=np.asarray(space.low, np.float32),
-            action_high=np.asarray(space.high, np.float32),
-            fps=config.fps or int(env.metadata.get("render_fps") or FPS),
-            max_steps=self.max_steps,
-            tasks=(config.id,),
-            instructions=(config.task,) if config.task else (),
-        )
+        config, metadata = self.config, self.environments[self.config.id].metadata
+        return self._spec(observation, config.fps or int(metadata.get("render_fps") or FPS), [config.task])
 
     def _observe(self) -> Observation:
-        raw, config, size = flattened(self._raw), self.config, self.config.image_size
+        raw, config = flattened(self._raw), self.config
         state = self._vector("state", raw, config.state or ("",))
-        observation: Observation = {TASK: config.task, "observation.state": state}
-        self.pictures = {}
+        observation: Observation = {TASK: config.task, _STATE: state}
         for camera, key in config.images.items():
-            env = self.environments[config.id]
-            picture = one_picture(env.render()) if key == RENDER else _part(raw, key, "images")
+            rendered = self.environments[config.id].render() if key == RENDER else _part(raw, key, "images")
+            picture = np.array(rendered)
             if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8:
                 hint = f"{key} is {picture.dtype} {picture.shape}; an image is uint8 (H, W, 3)"
                 raise InputError("env.images", config.images, hint)
-            self.pictures[camera] = resized(picture, size, size) if size else picture.copy()
-        observation |= {f"observation.images.{name}": picture for name, picture in self.pictures.items()}
+            size = config.image_size
+            observation[f"{_IMAGE}s.{camera}"] = resized(picture, size, size) if size else picture
         if config.environment_state:
-            keys, own = config.environment_state, config.environment_state == ("state",)
-            numbers = state if own else self._vector("environment_state", raw, keys)
+            keys = config.environment_state
+            numbers = state if keys == ("state",) else self._vector("environment_state", raw, keys)
             observation[ENVIRONMENT_STATE] = np.append(numbers, np.float32(self.late))
         return observation
 
@@ -247,33 +258,136 @@ class GymEnvironment(GymnasiumEnvironment):
         return np.concatenate([part.astype(np.float32).ravel() for part in parts])
 
 
-def _made(config: GymConfig) -> Any:
-    """The environment that ``gymnasium.make`` gives; without its checker, which judges what is never read."""
-    import gymnasium
+@EnvConfig.register_subclass("lerobot")
+@dataclass(frozen=True, kw_only=True)
+class LeRobotEnvConfig(GymnasiumConfig):
+    """Which of LeRobot's environments, those of installed packages ``lerobot_env_*`` included."""
 
-    renders = {"render_mode": "rgb_array"} if RENDER in config.images.values() else {}
-    try:
-        return gymnasium.make(config.id, **({"disable_env_checker": True} | renders | config.kwargs))
-    except gymnasium.error.VersionNotFound as error:
-        raise InputError("env.id", config.id, str(error)) from error
-    except gymnasium.error.UnregisteredEnv as error:
-        hint = f"{error} Is env.discover_packages_path the package that registers it?"
-        raise InputError("env.id", config.id, hint) from error
-    except TypeError as error:
-        if not any(f"unexpected keyword argument '{name}'" in str(error) for name in config.kwargs):
-            raise
-        hint = f"it takes {_arguments(config.id)} ({error})"
-        raise InputError("env.kwargs", config.kwargs, hint) from error
+    environment = "accerl_lerobot.envs.gym_env:LeRobotEnvironment"
+    named_by = "name"
+
+    name: str = "pusht"
+    """LeRobot's own name of the environment: what ``lerobot-eval --env.type`` takes."""
+    kwargs: dict[str, Any] = field(default_factory=dict)
+    """Fields of LeRobot's config of that environment, such as ``task`` or ``obs_type``."""
+    trust_remote_code: bool = False
+    """True if an environment on the Hub is run with your rights. It needs ``hub_path`` in `kwargs`, with the
+    commit whose code you have read: ``owner/name@COMMIT`` or ``owner/name@COMMIT:file.py``."""
+    task: str = ""
+    """Instruction text, for environments that have none of their own."""
+    camera: str = "image"
+    """Name of a lone camera: ``observation.images.<camera>``; if empty, LeRobot's ``observation.image``,
+    which policies trained on LeRobot's PushT dataset expect."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.name.startswith("libero"):
+            hint = "LeRobot takes its starts in turn and not from the seed; use env.type=libero for LIBERO"
+            raise InputError("env.name", self.name, hint)
 
 
-def _arguments(name: str) -> str:
-    """Names of the arguments that an environment takes."""
-    from gymnasium.envs.registration import load_env_creator, spec
+class LeRobotEnvironment(GymnasiumEnvironment):
+    """One of LeRobot's environments; a suite of several tasks has one simulator for each."""
 
-    entry = spec(name).entry_point
-    creator = load_env_creator(entry) if isinstance(entry, str) else entry
-    assert creator is not None
-    return ", ".join(inspect.signature(creator).parameters)
+    config: LeRobotEnvConfig
+    ends_at_success = False
+
+    def __init__(self, config: LeRobotEnvConfig) -> None:
+        from lerobot.envs.configs import EnvConfig as LeRobotConfig
+        from lerobot.envs.factory import make_env
+
+        self.config = config
+        if config.name not in LeRobotConfig.get_known_choices():
+            broken = import_plugins(*PLUGINS)
+            known = LeRobotConfig.get_known_choices()
+            if config.name not in known:
+                hint = "; ".join([*broken.values(), f"LeRobot has: {', '.join(known)}"])
+                raise InputError("env.name", config.name, hint)
+        kind = LeRobotConfig.get_choice_class(config.name)
+        names = kind.__dataclass_fields__
+        limit = {"episode_length": config.max_steps} if config.max_steps and "episode_length" in names else {}
+        try:
+            self._settings = kind(**config.kwargs | limit)
+        except (TypeError, ValueError) as error:
+            hint = f"{error}; LeRobot's {config.name} has the fields {', '.join(names)}"
+            raise InputError("env.kwargs", config.kwargs, hint) from error
+        _check_hub(config, getattr(self._settings, "hub_path", None))
+        self._before, self._after = self._settings.get_env_processors()
+        with contextlib.redirect_stdout(io.StringIO()):  # LeRobot prints, and results go there
+            trust = config.trust_remote_code
+            self._vectors = make_env(self._settings, n_envs=1, trust_remote_code=trust)
+        super().__init__(_single_envs(self._vectors))
+
+    def _processed(self, action: np.ndarray) -> np.ndarray:
+        import torch
+
+        processed: np.ndarray = self._after({"action": torch.from_numpy(action[None])})["action"].numpy()
+        return processed[0]
+
+    def close(self) -> None:
+        for suite in self._vectors.values():
+            for vector in suite.values():
+                vector.close()
+        self._vectors, self.environments, self._done = {}, {}, True
+
+    def _look(self, observation: Observation) -> EnvironmentSpec:
+        if _STATE not in observation or not any(key.startswith(_IMAGE) for key in observation):
+            hint = f"a policy needs images and a state, {self.config.name} shows {', '.join(observation)}"
+            raise InputError("env.kwargs", self.config.kwargs, f"{hint}; use obs_type=pixels_agent_pos")
+        instructions = [self._instruction(task) for task in self.environments]
+        return self._spec(observation, int(self._settings.fps), instructions)
+
+    def _observe(self) -> Observation:
+        from lerobot.envs.utils import preprocess_observation
+
+        text = self._instruction(self._task)
+        batch = self._before({**preprocess_observation(_batched(self._raw)), TASK: [text]})
+        observation: Observation = {TASK: text}
+        for key, value in batch.items():
+            if key == _STATE:
+                observation[key] = value[0].numpy().astype(np.float32)
+            elif key.startswith(_IMAGE):
+                renamed = key == _IMAGE and self.config.camera
+                name = f"{_IMAGE}s.{self.config.camera}" if renamed else key
+                # LeRobot has divided by 255; rounding brings every one of the 256 values back.
+                observation[name] = (value[0].permute(1, 2, 0) * 255).round().byte().numpy().copy()
+        return observation
+
+    def _instruction(self, task: str) -> str:
+        env = self.environments[task].unwrapped
+        texts = [getattr(env, name, None) for name in ("task_description", "task")]
+        return next((text for text in texts if text and isinstance(text, str)), self.config.task)
+
+
+def _check_hub(config: LeRobotEnvConfig, hub_path: str | None) -> None:
+    """Refuse code from the Hub that nobody asked for, or whose version is not named."""
+    if hub_path is None:
+        return
+    if not config.trust_remote_code:
+        hint = f"{config.name} is code of {hub_path} on the Hub, which would run with your rights; read it,"
+        hint += " then set this, and its commit in hub_path"
+        raise InputError("env.trust_remote_code", False, hint)
+    if not _PINNED.fullmatch(hub_path) or ".." in hub_path:
+        hint = "name a commit, owner/name@COMMIT or owner/name@COMMIT:file.py with 40 hexadecimal digits"
+        raise InputError("env.kwargs.hub_path", hub_path, f"{hint}: branches can be moved to other code")
+
+
+def _single_envs(vectors: dict[str, dict[int, Any]]) -> dict[str, Any]:
+    """Name each single environment ``suite/number``, or a lone one ``suite``."""
+    found = {}
+    for suite, tasks in vectors.items():
+        for number, vector in tasks.items():
+            alone = len(vectors) == len(tasks) == 1
+            found[suite if alone else f"{suite}/{number}"] = vector.envs[0]
+    return found
+
+
+def _batched(raw: Any) -> Any:
+    """Add the leading dimension a vector environment would have added; text has none there, either."""
+    if isinstance(raw, dict):
+        return {key: _batched(value) for key, value in raw.items()}
+    array = np.asarray(raw)
+    return array[None] if array.dtype.kind in "fiub" else (raw,)
 
 
 def episode_limit(env: Any) -> int:
@@ -303,19 +417,14 @@ def resized(frame: np.ndarray, height: int, width: int) -> np.ndarray:
     return np.asarray(Image.fromarray(frame).resize((width, height), Image.Resampling.BILINEAR))
 
 
-def one_picture(rendered: Any) -> np.ndarray:
-    """A rendered frame as one image: several views stand beside each other."""
-    views = list(rendered.values()) if isinstance(rendered, Mapping) else rendered
-    several = isinstance(views, (list, tuple)) or np.ndim(views) == 4
-    return np.concatenate([np.asarray(view) for view in views], axis=1) if several else np.asarray(views)
-
-
 def flattened(raw: Any, prefix: str = "") -> dict[str, Any]:
-    """Values of a nested mapping by their dotted keys; one that is no mapping has the key ""."""
+    """Values of a nested mapping by their dotted keys; a value that is no mapping has the key ""."""
     if not isinstance(raw, Mapping):
         return {prefix: raw}
-    nested = (flattened(part, f"{prefix}.{key}" if prefix else str(key)) for key, part in raw.items())
-    return {key: value for part in nested for key, value in part.items()}
+    flat: dict[str, Any] = {}
+    for key, part in raw.items():
+        flat |= flattened(part, f"{prefix}.{key}" if prefix else str(key))
+    return flat
 
 
 def _part(raw: dict[str, Any], key: str, name: str) -> np.ndarray:

@@ -1,28 +1,130 @@
 # SPDX-License-Identifier: Apache-2.0
-"""LIBERO (Liu et al., 2023), stepped a chunk at a time and rendered once per decision.
+"""LIBERO (Liu et al., 2023): its config, and the files of its package.
 
-Observations and actions are those of LeRobot's own environment: a policy that was trained on LeRobot's LIBERO
-datasets acts here as it is. Importing this file loads neither MuJoCo nor LIBERO.
+The files (names and texts of tasks, recorded starts, meshes) are read without importing LIBERO, which asks
+the terminal for folders and imports torch. Importing this module loads neither MuJoCo nor LIBERO.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import ast
+import contextlib
+import functools
+import io
+import logging
+import pickletools
+import zipfile
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Annotated, Literal
+from unittest.mock import patch
 
+import numpy as np
+
+from accerl_lerobot.checkpoint.safety import brief
 from accerl_lerobot.config.ranges import Range
-from accerl_lerobot.envs.base import EnvConfig, SuiteConfig, SuiteEnvironment, unit_spec
-from accerl_lerobot.envs.libero_simulator import FPS, NUMBERS, Simulator
-from accerl_lerobot.envs.libero_tasks import instruction, suites
+from accerl_lerobot.envs.base import EnvConfig, SuiteConfig
+from accerl_lerobot.errors import InputError, expanded
 
+ASSETS = "lerobot/libero-assets"
+REMEDY = f"hf download {ASSETS} --repo-type=dataset --local-dir=FOLDER, and name the folder"
+"""How to get LIBERO's meshes and textures where a run cannot."""
 LEROBOT_NAMES = {"agentview": "image", "robot0_eye_in_hand": "image2"}
 """LeRobot's names of the two cameras that policies see."""
 LIMITS = {"libero_spatial": 280, "libero_object": 280, "libero_goal": 300, "libero_10": 520, "libero_90": 400}
-"""LeRobot's episode limits in env steps."""
-LABELLED_FPS = (10,)
-"""Datasets of LIBERO's demonstrations on the Hub say so, whose actions were executed at 20 Hz."""
-STATE_DIM = 8
-ACTION_DIM = 7
+"""Suites → LeRobot's episode limits in env steps."""
+MAX_OBJECTS = 4  # most objects that a task names as the objects of interest
+STATE_NUMBERS = 25 + MAX_OBJECTS * 4 + 6 * 10  # of robot, objects, and vectors between them
+
+
+def package() -> Path:
+    """Folder of the installed ``libero.libero``, found without importing it: that would ask the terminal."""
+    spec = find_spec("libero")
+    if spec is None or not spec.submodule_search_locations:
+        hint = "the package libero is not installed; pip install 'accerl-lerobot[libero]'"
+        raise InputError("env.type", "libero", hint)
+    return Path(spec.submodule_search_locations[0]) / "libero"
+
+
+@functools.cache
+def _names() -> dict[str, list[str]]:
+    """Names of each suite's tasks: LIBERO's own table, read without importing LIBERO and torch with it."""
+    text = (package() / "benchmark" / "libero_suite_task_map.py").read_text()
+    value = next(node.value for node in ast.parse(text).body if isinstance(node, ast.Assign))
+    return ast.literal_eval(value)
+
+
+@functools.cache
+def suites() -> dict[str, tuple[str, ...]]:
+    """Tasks of each suite, ``suite/number``."""
+    return {suite: tuple(f"{suite}/{i}" for i in range(len(_names()[suite]))) for suite in LIMITS}
+
+
+def task_file(task: str, folder: str, suffix: str) -> Path:
+    """A file of a task: its description (objects, regions, goal) or its recorded starts."""
+    suite, number = task.split("/")
+    return package() / folder / suite / f"{_names()[suite][int(number)]}{suffix}"
+
+
+def bddl_file(task: str) -> Path:
+    """LIBERO's description of a task: objects, regions, goal."""
+    return task_file(task, "bddl_files", ".bddl")
+
+
+def instruction(task: str) -> str:
+    """Text of a task, as LeRobot's environment and datasets have it."""
+    name = bddl_file(task).stem
+    _, scene, rest = name.partition("SCENE")
+    words = rest.partition("_")[2] if scene else name  # the scene has a number
+    return words.replace("_", " ")
+
+
+def recorded_states(task: str) -> np.ndarray:
+    """The 50 standard start states of a task, one after another: time, positions and velocities, float64.
+
+    LIBERO ships each as the pickle of one array. Its numbers are the longest text of the stream, which is
+    read and not executed.
+    """
+    with zipfile.ZipFile(task_file(task, "init_files", ".pruned_init")) as archive:
+        opcodes = pickletools.genops(archive.read("archive/data.pkl"))
+        texts = [argument for _, argument, _ in opcodes if isinstance(argument, str | bytes)]
+    numbers = max(texts, key=len)
+    return np.frombuffer(numbers.encode("latin-1") if isinstance(numbers, str) else numbers, "<f8")
+
+
+def assets_folder(given: str) -> Path:
+    """Folder of meshes and textures: `given` if it is named, the installed package's, or a copy of the Hub's.
+
+    Raises:
+        InputError: it is none, or there is none and the Hub could not be asked.
+    """
+    if given:
+        folder = expanded(given, "env.assets").absolute()
+        if not (folder / "scenes").is_dir():
+            raise InputError("env.assets", given, "no folder of LIBERO's assets: it holds no scenes/")
+        return folder
+    folder = package() / "assets"
+    if folder.is_dir():
+        return folder
+    from huggingface_hub import snapshot_download
+
+    try:
+        return Path(snapshot_download(ASSETS, repo_type="dataset"))
+    except Exception as error:
+        why = f"LIBERO's meshes are not installed, and the Hub did not give them ({brief(error)})"
+        raise InputError("env.assets", given, f"{why}; {REMEDY}") from error
+
+
+def load_libero(assets: str) -> None:
+    """Import LIBERO with the meshes of `assets_folder`; it asks nothing and prints nothing."""
+    logging.getLogger("robosuite_logs").setLevel(logging.ERROR)  # asks for a file of macros that nobody needs
+    no = patch("builtins.input", return_value="n")  # the first import asks for another folder of datasets
+    with no, contextlib.redirect_stdout(io.StringIO()):
+        import libero.libero as imported
+        import libero.libero.envs
+
+        imported._assets_path_cache = str(assets_folder(assets))
 
 
 @EnvConfig.register_subclass("libero")
@@ -35,9 +137,9 @@ class LiberoConfig(SuiteConfig):
     """
 
     expert = "accerl_lerobot.demos.libero_expert:libero_expert"
-    environment = "accerl_lerobot.envs.libero:LiberoEnvironment"
+    environment = "accerl_lerobot.envs.libero_simulator:LiberoEnvironment"
     groups = staticmethod(suites)
-    STATE_NUMBERS = NUMBERS
+    STATE_NUMBERS = STATE_NUMBERS
     CAMERAS = (*LEROBOT_NAMES, "frontview", "birdview", "sideview", "galleryview", "robot0_robotview")
 
     task: str = "libero_object"
@@ -67,17 +169,3 @@ class LiberoConfig(SuiteConfig):
         if not self.max_steps:
             longest = max(LIMITS[task.split("/")[0]] for task in self.tasks)
             object.__setattr__(self, "max_steps", longest)
-
-
-class LiberoEnvironment(SuiteEnvironment):
-    """One LIBERO instance."""
-
-    config: LiberoConfig
-
-    def __init__(self, config: LiberoConfig) -> None:
-        images = [f"observation.images.{LEROBOT_NAMES.get(camera, camera)}" for camera in config.cameras]
-        spec = unit_spec(config, images, instruction, STATE_DIM, ACTION_DIM, FPS)
-        super().__init__(config, replace(spec, labelled_fps=LABELLED_FPS))
-
-    def _build(self, task: str) -> Simulator:
-        return Simulator(task, self.config.rendering, self.config.assets)

@@ -9,43 +9,68 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import hashlib
 import io
 import re
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Literal, NamedTuple
 from unittest.mock import patch
 
 import numpy as np
 
 from accerl_lerobot.checkpoint.safety import brief
+from accerl_lerobot.envs.base import SuiteEnvironment, unit_spec
 from accerl_lerobot.envs.graphics import import_mujoco, new_renderer
-from accerl_lerobot.envs.libero_tasks import REMEDY, bddl_file, load_libero, recorded_states
+from accerl_lerobot.envs.libero import (
+    LEROBOT_NAMES,
+    MAX_OBJECTS,
+    REMEDY,
+    LiberoConfig,
+    bddl_file,
+    instruction,
+    load_libero,
+    recorded_states,
+)  # fmt: skip
 from accerl_lerobot.envs.metaworld import diverged, draw_fast
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.seeds import EVAL_SEEDS
 
 FPS = 20
 SETTLING = 10  # env steps without motion before the first observation, as in LeRobot's own environment
-MAX_OBJECTS = 4  # most objects that a task names as those it is about
 MAX_FACES = 2000
 ARENA = "64M"  # memory of a simulation's contacts and constraints; some 6 MB are used
-NUMBERS = 25 + MAX_OBJECTS * 4 + 6 * 10  # of robot, objects, and what lies between them
 TIMESTEP = 0.002
 NEAR = 0.03  # scale in m of the squashed vectors that a critic sees
 STILL = np.array([0, 0, 0, 0, 0, 0, -1], np.float32)
 _alone = threading.RLock()
 """Held where LIBERO uses what a process has one of: LeRobot plays tasks in threads."""
-_coarse: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
+
+
+class LiberoEnvironment(SuiteEnvironment):
+    """One LIBERO instance.
+
+    Observations and actions are those of LeRobot's own environment: a policy that was trained on LeRobot's
+    LIBERO datasets acts here as it is.
+    """
+
+    config: LiberoConfig
+
+    def __init__(self, config: LiberoConfig) -> None:
+        images = [f"observation.images.{LEROBOT_NAMES.get(camera, camera)}" for camera in config.cameras]
+        spec = unit_spec(config, images, instruction, state=8, action=7, fps=FPS)
+        # Datasets of LIBERO's demonstrations on the Hub say 10 Hz, whose actions were executed at 20 Hz.
+        super().__init__(config, replace(spec, labelled_fps=(10,)))
+
+    def _build(self, task: str) -> Simulator:
+        return Simulator(task, self.config.rendering, self.config.assets)
 
 
 class Arm(NamedTuple):
     """State that the controller reads, as views of MuJoCo's arrays."""
 
     jacobian: np.ndarray  # (2, 3, V): of the hand's position and rotation
-    packed_mass: np.ndarray
-    mass_entries: np.ndarray  # int (7, 7): where `packed_mass` has the arm's
+    mass: np.ndarray  # (V, V)
     bias: np.ndarray
     qpos: np.ndarray
     qvel: np.ndarray
@@ -71,7 +96,7 @@ class Simulator:
 
     def __init__(self, task: str, rendering: Literal["stock", "fast"], assets: str) -> None:
         self._mujoco = import_mujoco()
-        self.env = _build(task, assets)
+        self.env, self._bodies = _build(task, assets)
         self.model, self.data = self.env.sim.model._model, self.env.sim.data._data
         self._recorded = recorded_states(task).reshape(-1, 1 + self.model.nq + self.model.nv)
         if rendering == "fast":
@@ -87,17 +112,16 @@ class Simulator:
         self._grip_centre, self._grip_half = 0.5 * (high + low), 0.5 * (high - low)
         self._site = robot.eef_site_id
         self._hand = self.model.body(robot.robot_model.eef_name).id
-        self._mass_entries = _mass_entries(self.model, self._dofs)
+        self._mass = np.zeros((self.model.nv, self.model.nv))
         self._jacobian = np.zeros((2, 3, self.model.nv))
         self._renderers: dict[tuple[int, int], Any] = {}
-        self._fixtures = _fixtures(self.env)
         self._visible = self._mujoco.MjvOption()
         self._visible.geomgroup[:2] = 0, 1  # visual meshes, not what collides
         data = self.data
         self._position, self._rotation = data.site_xpos[self._site], data.site_xmat[self._site].reshape(3, 3)
         self._ctrl, self._torques = data.ctrl, _compiled_torques()
         self._arm = Arm(
-            self._jacobian, data.qM, self._mass_entries, data.qfrc_bias, data.qpos, data.qvel, self._dofs,
+            self._jacobian, self._mass, data.qfrc_bias, data.qpos, data.qvel, self._dofs,
             self._position, self._rotation,
         )  # fmt: skip
         # What is looked at: the data of the last reading of the sensors, without its velocities.
@@ -106,8 +130,8 @@ class Simulator:
 
     def reset(self, seed: int) -> None:
         """To the start that `seed` stands for, at rest."""
-        for body, pos, quat in self._fixtures:
-            self.model.body_pos[body], self.model.body_quat[body] = pos, quat
+        # An episode moves fixtures a little, and objects that begin on one are placed where it stood before.
+        self.model.body_pos[:], self.model.body_quat[:] = self._bodies
         _placed(self.env.reset, seed)
         env = self.env
         if seed in EVAL_SEEDS:
@@ -162,6 +186,7 @@ class Simulator:
         if decided:
             self._goal = self._new_goal(action)
         self._mujoco.mj_jacSite(self.model, self.data, *self._jacobian, self._site)
+        self._mujoco.mj_fullM(self.model, self._mass, self.data.qM)
         torques = self._torques(self._arm, Aim(*self._goal, self._rest, self._gains))
         self._ctrl[self._motors] = np.clip(torques, *self._limits)
         self._grip = np.clip(self._grip + self._closing, -1.0, 1.0)
@@ -221,8 +246,9 @@ class Simulator:
     def render(self, camera: str, height: int, width: int) -> np.ndarray:
         """Frame of a camera, uint8 (height, width, 3), turned as LeRobot's datasets have it."""
         self._look()
-        if (renderer := self._renderers.get((height, width))) is None:
-            renderer = self._renderers[height, width] = new_renderer(self.model, height, width)
+        if (height, width) not in self._renderers:
+            self._renderers[height, width] = new_renderer(self.model, height, width)
+        renderer = self._renderers[height, width]
         renderer.update_scene(self._seen, camera, self._visible)
         return np.ascontiguousarray(renderer.render()[:, ::-1])
 
@@ -266,7 +292,7 @@ def operational_space_torques(arm: Arm, aim: Aim) -> np.ndarray:
     mass, joined, velocity = np.empty((n, n)), np.empty((6, n)), np.zeros(6)
     for i in range(n):
         for j in range(n):
-            mass[i, j] = arm.packed_mass[arm.mass_entries[i, j]]
+            mass[i, j] = arm.mass[dofs[i], dofs[j]]
         for k in range(3):
             joined[k, i] = arm.jacobian[0, k, dofs[i]]
             joined[3 + k, i] = arm.jacobian[1, k, dofs[i]]
@@ -338,15 +364,19 @@ def liberos_own(task: str) -> Any:
     return ControlEnv(file, use_camera_obs=False, has_offscreen_renderer=False, ignore_done=True)
 
 
-def _build(task: str, assets: str) -> Any:
-    """robosuite's environment of a task, which draws nothing."""
+def _build(task: str, assets: str) -> tuple[Any, list[np.ndarray]]:
+    """robosuite's environment of a task, which draws nothing, and its bodies' positions and quaternions."""
     with _alone:
         load_libero(assets)
     from robosuite.utils.binding_utils import MjSim
 
+    bodies: list[np.ndarray] = []
+
     def smaller(xml: str) -> Any:
         """Space for 5,000 contacts is 1.3 GB of addresses for each simulation: no process could be forked."""
-        return compiled(re.sub(r"<size [^>]*>", f'<size memory="{ARENA}"/>', xml))
+        simulation = compiled(re.sub(r"<size [^>]*>", f'<size memory="{ARENA}"/>', xml))
+        bodies[:] = simulation.model.body_pos.copy(), simulation.model.body_quat.copy()
+        return simulation
 
     with _alone:
         compiled = MjSim.from_xml_string
@@ -357,36 +387,7 @@ def _build(task: str, assets: str) -> Any:
             why = f"the scene of {task} does not load ({brief(error)}); if the folder is incomplete, {REMEDY}"
             raise InputError("env.assets", assets, why) from error
     env.hard_reset = False  # the scene is always the same: no need to compile it anew for each episode
-    return env
-
-
-def _fixtures(env: Any) -> list[tuple[int, np.ndarray, np.ndarray]]:
-    """Body, position and quaternion of each fixture in the scene's file.
-
-    An episode moves them a little, and objects that begin on one are placed where it stood before.
-    """
-    found = []
-    for fixture in env.fixtures_dict.values():
-        element = env.model.root.find(f".//body[@name='{fixture.root_body}']")
-        pos, quat = (
-            np.array(element.get(key, default).split(), np.float64)
-            for key, default in (("pos", "0 0 0"), ("quat", "1 0 0 0"))
-        )
-        found.append((env.sim.model.body_name2id(fixture.root_body), pos, quat))
-    return found
-
-
-def _mass_entries(model: Any, dofs: np.ndarray) -> np.ndarray:
-    """Where MuJoCo's packed mass matrix holds those of some joints that follow one another, int (n, n)."""
-    entries = np.zeros((len(dofs), len(dofs)), int)
-    for row in range(len(dofs)):
-        dof, address = int(dofs[row]), int(model.dof_Madr[dofs[row]])
-        while dof >= 0:
-            if dof in dofs:
-                column = int(np.flatnonzero(dofs == dof)[0])
-                entries[row, column] = entries[column, row] = address
-            dof, address = int(model.dof_parentid[dof]), address + 1
-    return entries
+    return env, bodies
 
 
 def _make_cheap(model: Any) -> None:
@@ -401,7 +402,7 @@ def _make_cheap(model: Any) -> None:
             continue
         faces, first = model.mesh_face[at : at + count], int(model.mesh_vertadr[mesh])
         vertices = model.mesh_vert[first : first + int(model.mesh_vertnum[mesh])]
-        kept, merged = _coarser_once(vertices, faces)
+        kept, merged = _coarser_once(vertices.tobytes(), faces.tobytes())
         corners = model.mesh_facetexcoord[at : at + count][kept] + model.mesh_texcoordadr[mesh]
         if model.mesh_texcoordnum[mesh] == 3 * count:  # each corner has its own place in the texture
             places = model.mesh_texcoord[corners]
@@ -412,12 +413,11 @@ def _make_cheap(model: Any) -> None:
         model.mesh_facenum[mesh] = len(kept)
 
 
-def _coarser_once(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+@functools.cache
+def _coarser_once(vertices: bytes, faces: bytes) -> tuple[np.ndarray, np.ndarray]:
     """`coarser` of a mesh, computed once in a process: the robot and most objects are in many scenes."""
-    key = hashlib.sha256(vertices.tobytes() + faces.tobytes()).digest()
-    if key not in _coarse:
-        _coarse[key] = coarser(vertices, faces, MAX_FACES)
-    return _coarse[key]
+    points = np.frombuffer(vertices, np.float32).reshape(-1, 3)
+    return coarser(points, np.frombuffer(faces, np.int32).reshape(-1, 3), MAX_FACES)
 
 
 def coarser(vertices: np.ndarray, faces: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:

@@ -1,17 +1,54 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Environments are made from their configs, and their errors become one line."""
+"""Environments made from their configs, with one-line errors, and success as a reward model sees it.
+
+A reward model serves environments that cannot tell success, such as a real robot behind Gymnasium's
+interface. It judges the observation after each executed chunk, at the rollout worker's CPU; an episode ends
+with the first success.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from importlib.metadata import PackageNotFoundError, metadata
+import contextlib
+import functools
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from importlib.metadata import metadata
+from typing import Annotated, Any
 
-from accerl_lerobot.checkpoint.safety import brief
-from accerl_lerobot.config.parsing import discover, imported
-from accerl_lerobot.envs.base import EnvConfig, Environment, HistoryEnvironment
+import numpy as np
+
+from accerl_lerobot.checkpoint.safety import FileSource, brief
+from accerl_lerobot.config.parsing import PLUGINS, discover, import_plugins, imported
+from accerl_lerobot.config.ranges import Commit, Range, Section
+from accerl_lerobot.envs.base import (
+    ChunkResult,
+    EnvConfig,
+    Environment,
+    HistoryEnvironment,
+    WrappedEnvironment,
+)
 from accerl_lerobot.envs.graphics import drawing_error, start_graphics
-from accerl_lerobot.envs.reward_model import JudgedEnvironment, RewardModelConfig, load_judge
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.experience import TASK, Observation
+
+REWARD_MODEL = "rollout.reward_model"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RewardModelConfig(Section, section=REWARD_MODEL):
+    """The model that tells success, where the environment does not."""
+
+    path: str | None = None
+    """A reward model that judges single observations, as ``lerobot-train`` makes a
+    ``reward_classifier``: a folder or a Hub id. None: the environment tells."""
+    revision: str | None = None
+    """Hub revision."""
+    threshold: Annotated[float, Range("(0, 1)")] = 0.5
+    """Probability of success, or reward, above which an observation counts as a success."""
+    trust_remote_code: Commit | None = None
+    """Commit of the Hub repository that the model's encoder is from:
+    its Python code, which you have read, runs with your rights, and no other does."""
 
 
 def make_environment(
@@ -37,23 +74,94 @@ def environment_error(config: EnvConfig, error: Exception) -> InputError:
     """The one line for an error of somebody's environment, which may be any."""
     if isinstance(error, InputError):
         return error
-    if (drawing := drawing_error(error)) is not None:
+    drawing = drawing_error(error)
+    if drawing is not None:
         return drawing
-    field, name = f"env.{config.named_by}", str(getattr(config, config.named_by))
+    field, value = f"env.{config.named_by}", getattr(config, config.named_by)
     if isinstance(error, ModuleNotFoundError):
         missing = str(error.name or getattr(error.__cause__, "name", None)).partition(".")[0]
+        hint = f"the package {missing} is not installed"
         package = "accerl-lerobot" if config.named_by == "type" else "lerobot"
-        extra = f"; pip install '{package}[{name}]'" if name in _extras(package) else ""
-        return InputError(field, name, f"the package {missing} is not installed{extra}")
+        if value in (metadata(package).get_all("Provides-Extra") or ()):
+            hint += f"; pip install '{package}[{value}]'"
+        return InputError(field, value, hint)
     why = f"the environment fails ({type(error).__name__}: {brief(error)}); ACCERL_LOG=DEBUG shows where"
-    if kwargs := getattr(config, "kwargs", None):
-        return InputError("env.kwargs", kwargs, f"{name}: {why}")
-    return InputError(field, name, why)
+    kwargs = getattr(config, "kwargs", None)
+    return InputError("env.kwargs", kwargs, f"{value}: {why}") if kwargs else InputError(field, value, why)
 
 
-def _extras(package: str) -> Sequence[str]:
-    """Names of the extras that a package can be installed with."""
+@functools.lru_cache(maxsize=1)
+def load_judge(config: RewardModelConfig) -> Callable[[Observation], bool]:
+    """Load a reward model, one for all environments of a process; the result tells if it sees a success."""
+    import torch
+    from lerobot.configs.rewards import RewardModelConfig as LeRobotConfig
+    from lerobot.processor import PolicyProcessorPipeline
+    from lerobot.rewards.factory import get_reward_model_class
+
+    from accerl_lerobot.policies import untrusted
+
+    origin = FileSource(f"{REWARD_MODEL}.path", config.path)
+    folder = untrusted.fetched_checkpoint(str(config.path), config.revision, origin.field)
+    import_plugins(*PLUGINS)
     try:
-        return metadata(package).get_all("Provides-Extra") or ()
-    except PackageNotFoundError:
-        return ()
+        (name,) = [path.name for path in folder.glob("*_preprocessor.json")]
+        untrusted.check_processor(folder, name, origin)
+        trusted = config.trust_remote_code
+        with untrusted.guarded(REWARD_MODEL, trusted), contextlib.redirect_stdout(sys.stderr):
+            settings = LeRobotConfig.from_pretrained(folder)
+            settings.device = "cpu"
+            model = get_reward_model_class(settings.type).from_pretrained(folder, config=settings)
+            on_cpu = {"device_processor": {"device": "cpu"}}
+            prepare = PolicyProcessorPipeline.from_pretrained(folder, name, overrides=on_cpu)
+    except InputError:
+        raise
+    except Exception as error:  # LeRobot takes the files at their word, and may fail over any of them
+        hint = f"it cannot be loaded as one of LeRobot's reward models ({brief(error)})"
+        raise InputError(origin.field, config.path, hint) from error
+    if settings.observation_delta_indices is not None:
+        hint = f"{settings.type} looks at several observations at once; use one that judges each alone"
+        raise InputError(origin.field, config.path, hint)
+
+    @torch.no_grad()
+    def succeeded(observation: Observation) -> bool:
+        batch: dict[str, Any] = {TASK: [observation[TASK]]}
+        for name, feature in settings.input_features.items():
+            value = torch.from_numpy(np.asarray(observation.get(name, np.zeros(0))))[None].float()
+            if value.dim() == 4:
+                value = value.permute(0, 3, 1, 2) / 255
+            shape = tuple(value.shape[1:])
+            if shape != tuple(feature.shape):
+                hint = f"its {name} is {feature.shape}, the environment's {shape}"
+                raise InputError(origin.field, config.path, hint)
+            batch[name] = value
+        batch = prepare(batch)
+        if hasattr(model, "predict_reward"):
+            return bool(model.predict_reward(batch, threshold=config.threshold)[0])
+        return bool(model.compute_reward(batch)[0] > config.threshold)
+
+    return succeeded
+
+
+class JudgedEnvironment(WrappedEnvironment):
+    """An environment whose successes, and rewards, are those that a reward model sees.
+
+    An episode also ends where the environment itself ends it, successfully or not.
+    """
+
+    def __init__(self, environment: Environment, succeeded: Callable[[Observation], bool]) -> None:
+        super().__init__(environment)
+        self.succeeded = succeeded
+
+    def step_chunk(self, actions: np.ndarray) -> ChunkResult:
+        result = self._environment.step_chunk(actions)
+        success = not result.info.get("nonfinite") and self.succeeded(result.observation)
+        rewards = np.zeros_like(result.rewards)
+        rewards[-1] = success
+        return replace(
+            result,
+            rewards=rewards,
+            success=success,
+            terminated=result.terminated or success,
+            truncated=result.truncated and not success,
+            note="",
+        )

@@ -12,8 +12,8 @@ import functools
 import json
 from collections import deque
 from dataclasses import dataclass, field, replace
+from importlib.resources import files
 from importlib.util import find_spec
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
@@ -29,11 +29,7 @@ if TYPE_CHECKING:
 @functools.cache
 def _tables() -> dict[str, Any]:
     """LeRobot's MetaWorld tables: a JSON file in its package, as importing it costs seconds and memory."""
-    spec = find_spec("lerobot")
-    if spec is None or not spec.submodule_search_locations:
-        raise ModuleNotFoundError("LeRobot is not installed: pip install lerobot[metaworld]", name="lerobot")
-    path = Path(spec.submodule_search_locations[0]) / "envs" / "metaworld_config.json"
-    return json.loads(path.read_text())
+    return json.loads((files("lerobot") / "envs" / "metaworld_config.json").read_text())
 
 
 @functools.cache
@@ -136,9 +132,8 @@ class MetaWorld(SuiteEnvironment):
     config: MetaWorldConfig
 
     def __init__(self, config: MetaWorldConfig) -> None:
-        for package in ("metaworld", "mujoco"):
-            if find_spec(package) is None:
-                raise ModuleNotFoundError(f"No module named {package!r}", name=package)
+        if find_spec("metaworld") is None:
+            raise ModuleNotFoundError("No module named 'metaworld'", name="metaworld")
         images = [f"observation.images.{camera}" for camera in config.cameras]
         super().__init__(config, unit_spec(config, images, description, STATE_DIM, ACTION_DIM, FPS))
 
@@ -165,7 +160,6 @@ class Simulator:
         if config.rendering == "fast":
             draw_fast(env.model)
         config.shift.apply(env, config.cameras)
-        env.touching_object = functools.partial(touching_object, env)
         self._delay = config.shift.action_delay
         self._renderers: dict[tuple[int, int], Any] = {}
 
@@ -194,8 +188,9 @@ class Simulator:
 
     def render(self, camera: str, height: int, width: int) -> np.ndarray:
         """Frame of a camera, uint8 (height, width, 3)."""
-        if (renderer := self._renderers.get((height, width))) is None:
-            renderer = self._renderers[height, width] = new_renderer(self.env.model, height, width)
+        if (height, width) not in self._renderers:
+            self._renderers[height, width] = new_renderer(self.env.model, height, width)
+        renderer = self._renderers[height, width]
         renderer.update_scene(self.env.data, camera=camera)
         image: np.ndarray = renderer.render()
         # corner2 hangs upside down in MetaWorld's scene; LeRobot turns it, and so do its datasets.
@@ -205,18 +200,6 @@ class Simulator:
         for renderer in self._renderers.values():
             renderer.close()
         self.env.close()
-
-
-def touching_object(sim: Any, geom: int) -> bool:
-    """MetaWorld's function of this name, which loops over all contacts, with arrays.
-
-    The rewards of 14 tasks ask for it at every env step, where loops took a quarter of the simulation.
-    """
-    contact, force = sim.data.contact, sim.data.efc_force
-    pads = (sim.data.geom(name).id for name in ("leftpad_geom", "rightpad_geom"))
-    of_object = (contact.geom == geom).any(1)
-    pressing = (of_object & (contact.geom == pad).any(1) for pad in pads)
-    return all(force[contact.efc_address[which]].sum() > 0 for which in pressing)
 
 
 def draw_fast(model: Any) -> None:

@@ -55,7 +55,7 @@ class SimulatedConfig(EnvConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.tasks or any(name not in INSTRUCTIONS for name in self.tasks):
+        if not self.tasks or not INSTRUCTIONS.keys() >= set(self.tasks):
             raise InputError("env.task", self.task, f"use names from: {', '.join(INSTRUCTIONS)}")
         if self.hold > self.max_steps:
             raise InputError("env.hold", self.hold, f"use 1 to env.max_steps ({self.max_steps})")
@@ -95,10 +95,10 @@ class SimulatedEnvironment(EpisodeEnvironment):
 
     def render(self, height: int, width: int) -> np.ndarray:
         image = np.full((height, width, 3), 40, np.uint8)
+        radius = max(1, min(height, width) // 16)
+        last = np.array([height, width]) - 1
         for channel, point in ((1, self._target), (0, self._mean())):
-            # Where −1 … 1 lie among so many pixels.
-            row, column = np.rint((point + 1.0) / 2 * (np.array([height, width]) - 1)).astype(int)
-            radius = max(1, min(height, width) // 16)
+            row, column = np.rint((point + 1.0) / 2 * last).astype(int)  # −1 … 1 are the image's edges
             rows = slice(max(0, row - radius), row + radius + 1)
             image[rows, max(0, column - radius) : column + radius + 1, channel] = 255
         return image

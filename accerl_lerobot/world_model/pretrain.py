@@ -179,7 +179,6 @@ def record_play(config: RunConfig, root: Path, console: Console, load: Load | No
         with closing(make_environment(config.env)) as environment:
             spec = environment.spec
         dataset = stack.enter_context(record.new_dataset(folder, "accerl/play", spec, config.env))
-        # The expert's processes are at work meanwhile.
         disturbed = stack.enter_context(record.simulated(config.env, expert, range(expert_episodes)))
         by_expert = (episode for episode, _ in disturbed)
         for episode in itertools.chain(policy_play(config, policy_episodes, load), by_expert):
@@ -221,7 +220,7 @@ class RecordingEnvironment(WrappedEnvironment):
         self._ended = ended
 
     def reset(self, seed: int, task: str) -> Observation:
-        self._seed, self._observation = seed, super().reset(seed, task)
+        self._observation = super().reset(seed, task)
         self._steps: list[record.PlayedStep] = []
         return self._observation
 
@@ -232,6 +231,6 @@ class RecordingEnvironment(WrappedEnvironment):
             self._steps.append((self._observation, action, results[-1]))
             self._observation = results[-1].observation
             if results[-1].done:
-                self._ended.append(record.episode_of(self._steps, self._seed))
+                self._ended.append(record.episode_of(self._steps))
                 break
         return replace(results[-1], rewards=np.concatenate([result.rewards for result in results]))

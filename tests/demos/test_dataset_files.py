@@ -1,14 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hostile files of a dataset, and what LeRobot and `datasets` would have made of them."""
+"""Hostile files of a dataset, and the results of LeRobot and `datasets` without the checks."""
 
 from __future__ import annotations
 
 import io
 import json
 import shutil
-import subprocess
-import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +19,12 @@ from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos.dataset_files import check_metadata, checked, open_metadata, opened, task_texts
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.hub.card import recognise
-from accerl_lerobot.policies.features import dataset_features
-from tests.tiny_datasets import FRONT, IMAGE, STEPS, edit_json, rewrite, write_dataset, write_old
+from tests.tiny_datasets import STEPS, rewrite, write_dataset
 
 ROOT = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
 CAMERA = "observation.images.corner2"
 PNG = b"\x89PNG\r\n\x1a\n"
+IMAGE_REFUSED = "an image whose row does not hold it as PNG, JPEG or TIFF"
 ORIGIN = FileSource("dataset.root", "theirs")
 EPISODES, DATA = "meta/episodes/chunk-000/file-000.parquet", "data/chunk-000/file-000.parquet"
 
@@ -68,9 +65,7 @@ def test_datasets_that_are_not_there(tmp_path: Path):
         open_metadata(DatasetConfig())
     with pytest.raises(InputError) as caught:
         open_metadata(DatasetConfig(repo_id="nobody/nothing"))
-    assert str(caught.value).startswith(
-        "dataset.repo_id='nobody/nothing': not found locally nor on the Hub ("
-    )
+    assert str(caught.value).startswith("dataset.repo_id='nobody/nothing': LeRobot cannot read it (")
     assert "\n" not in str(caught.value)
 
 
@@ -101,7 +96,6 @@ def test_templates(copied: Path, key: str, template: str):
 @pytest.mark.parametrize(
     ("changes", "why"),
     [
-        ({"total_episodes": 9}, "4 episodes, and meta/info.json says 9"),
         ({"chunks_size": 0}, "chunks_size must be positive"),
         ({"features": {"../../x": {"dtype": "float32", "shape": [4]}}}, "cannot be part of a path"),
         ({"total_episodes": 0, "total_tasks": 0, "total_frames": 365}, "it has no episodes, or no tasks"),
@@ -109,7 +103,7 @@ def test_templates(copied: Path, key: str, template: str):
 )
 def test_what_info_may_say(copied: Path, changes: dict[str, Any], why: str):
     edit(copied, **changes)
-    refused(copied, f"meta.*{why}")
+    refused(copied, why)
 
 
 def test_columns_that_would_open_other_files(copied: Path, tmp_path: Path):
@@ -126,7 +120,7 @@ def test_columns_that_would_open_other_files(copied: Path, tmp_path: Path):
         return table.replace_schema_metadata({"huggingface": json.dumps(described)})
 
     rewrite(copied / EPISODES, change)
-    refused(copied, "columns of kind Image, which name other files")
+    refused(copied, "columns of kind Image; numbers and texts are wanted")
 
 
 def data_with(root: Path, images: list[dict[str, Any]]) -> None:
@@ -147,21 +141,19 @@ def first_frame(root: Path) -> Any:
 
 
 @pytest.mark.parametrize(
-    ("image", "why"),
+    ("content", "path"),
     [
-        ({"bytes": None, "path": "/etc/hostname"}, "an image without its bytes"),
-        ({"bytes": None, "path": "http://127.0.0.1:9/x.png"}, "an image without its bytes"),
-        ({"bytes": b"%!PS-Adobe-3.0 EPSF-3.0\n", "path": None}, "no PNG, JPEG or TIFF, or broken"),
-        ({"bytes": b"\xc5\xd0\xd3\xc6\x1e\0\0\0", "path": None}, "no PNG, JPEG or TIFF, or broken"),
-        ({"bytes": PNG, "path": "/etc/hostname"}, "no PNG, JPEG or TIFF, or broken"),
-        ({"bytes": PNG, "path": "zip://a::b"}, "no PNG, JPEG or TIFF, or broken"),
+        (None, "/etc/hostname"),
+        (None, "http://127.0.0.1:9/x.png"),
+        (b"%!PS-Adobe-3.0 EPSF-3.0\n", None),
+        (b"\xc5\xd0\xd3\xc6\x1e\0\0\0", None),
+        (PNG, "/etc/hostname"),
     ],
 )
-def test_images_lie_in_their_rows(copied: Path, image: Any, why: str):
-    data_with(copied, [image])
-    with pytest.raises(InputError, match=f"^dataset.root='theirs': data: .*{why}") as caught:
+def test_images_lie_in_their_rows(copied: Path, content: bytes | None, path: str | None):
+    data_with(copied, [{"bytes": content, "path": path}])
+    with pytest.raises(InputError, match=f"^dataset.root='theirs': data: {IMAGE_REFUSED}"):
         first_frame(copied)
-    assert " at 0x" not in str(caught.value)
 
 
 def test_lerobot_would_open_the_file_that_a_row_names(copied: Path, tmp_path: Path):
@@ -173,7 +165,7 @@ def test_lerobot_would_open_the_file_that_a_row_names(copied: Path, tmp_path: Pa
     data_with(copied, [{"bytes": None, "path": str(secret)}])
     read = LeRobotDataset("a/b", root=copied, video_backend="pyav")[0][CAMERA]
     assert abs(float(read.mean()) - 200 / 255) < 0.01
-    with pytest.raises(InputError, match="an image without its bytes"):
+    with pytest.raises(InputError, match=IMAGE_REFUSED):
         first_frame(copied)
 
 
@@ -195,7 +187,7 @@ def test_a_picture_does_not_start_a_program(copied: Path, tmp_path: Path, monkey
         dataset[0]
     assert mark.exists(), "as LeRobot alone does"
     mark.unlink()
-    with pytest.raises(InputError, match="no PNG, JPEG or TIFF, or broken"):
+    with pytest.raises(InputError, match=IMAGE_REFUSED):
         first_frame(copied)
     assert not mark.exists()
 
@@ -212,37 +204,13 @@ def test_links_out_of_the_folder(copied: Path, tmp_path: Path, part: str):
     refused(copied, "a link that leads out of the folder")
 
 
-def column(name: str, values: Callable[[list[Any]], Any]) -> Callable[[pa.Table], pa.Table]:
-    """Replaces a column by one made of all its values but the first."""
-
-    def change(table: pa.Table) -> pa.Table:
-        at = table.schema.get_field_index(name)
-        return table.set_column(at, name, values(table.column(name).to_pylist()[1:]))
-
-    return change
-
-
-@pytest.mark.parametrize(
-    ("change", "why"),
-    [
-        (lambda t: t.slice(0, 300), "300 rows, and meta/info.json says 365 frames"),
-        (column("task_index", lambda v: pa.array([99, *v])), "task_index=99, and there are 1"),
-        (
-            column("episode_index", lambda v: pa.array([4, *v])),
-            "row 0 is of episode 4, and by meta/episodes of",
-        ),
-        (column("action", lambda v: pa.array([[0.0], *v], pa.list_(pa.float32()))), "LeRobot cannot load it"),
-        (column("frame_index", lambda v: pa.array([None, *v])), "frame_index has a number"),
-        (lambda t: t.take([1, 0, *range(2, 365)]), "its rows are not in the order of their index"),
-    ],
-)
-def test_rows_are_what_their_features_say(copied: Path, change: Callable[[pa.Table], pa.Table], why: str):
-    """Before LeRobot loads them, which would not notice, or end in an error of pyarrow or torch."""
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-    rewrite(copied / DATA, change)
-    with checked(ORIGIN, whole=True), pytest.raises(InputError, match=f"^dataset.root='theirs': data.*{why}"):
-        LeRobotDataset("a/b", root=copied, video_backend="pyav")
+def test_an_error_of_lerobot_s_is_one_line(tmp_path: Path):
+    dataset = write_dataset(tmp_path / "data")
+    meta = open_metadata(dataset)
+    (tmp_path / "data" / DATA).write_bytes(b"PAR1 of something else")
+    with pytest.raises(InputError, match=r"^dataset.root='.*': LeRobot cannot read it \(") as caught:
+        opened(dataset, meta).__enter__()
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("part", ["meta/tasks.parquet", EPISODES])
@@ -264,58 +232,25 @@ def test_one_from_the_hub_is_checked_as_well(tmp_path: Path, monkeypatch: pytest
         open_metadata(DatasetConfig(repo_id="them/data"))
 
 
-def test_a_missing_data_file_is_named_and_the_hub_is_not_asked(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_missing_data_are_not_fetched_from_the_hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     from lerobot.datasets import lerobot_dataset
 
     monkeypatch.setattr(lerobot_dataset, "get_safe_version", None)  # it would ask the Hub for the label
     dataset = write_dataset(tmp_path / "data")
     meta = open_metadata(dataset)
     (tmp_path / "data" / DATA).unlink()
-    with pytest.raises(InputError, match=f"data: {DATA} is missing; give the whole folder"):
+    with pytest.raises(InputError, match="data: files of some episodes are missing; give the whole folder"):
         opened(dataset, meta).__enter__()
 
 
-def test_an_old_dataset_is_told_the_command_that_converts_it(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-):
-    new = Path(str(write_dataset(tmp_path / "new", more={FRONT: IMAGE}).root))
-    old = write_old(new, tmp_path / "old")
-    dataset = DatasetConfig(repo_id="a/b", root=str(old))
-    with pytest.raises(InputError, match="its format is not v3.0") as caught:
-        open_metadata(dataset)
-    assert not caplog.records, "LeRobot warns of its fields"
-    command = caught.value.hint.rpartition("convert with: python ")[2].split()
-    subprocess.run([sys.executable, *command], check=True, capture_output=True)
-    assert open_metadata(dataset).total_frames == 2 * STEPS
-
-
-def test_tasks_and_episodes_are_found_by_their_indices(tmp_path: Path):
-    """LeRobot takes both from the rows of their tables, whose order no file promises."""
+def test_tasks_are_found_by_their_indices(tmp_path: Path):
+    """LeRobot takes them from the rows of their table, whose order no file promises."""
     dataset = write_dataset(tmp_path / "data", tasks=("open", "close"))
-    for part in ("meta/tasks.parquet", EPISODES):
-        rewrite(tmp_path / "data" / part, lambda table: table.take([1, 0]))
+    rewrite(tmp_path / "data/meta/tasks.parquet", lambda table: table.take([1, 0]))
     meta = open_metadata(dataset)
-    assert task_texts(meta) == ["open", "close"] and meta.episodes[1]["episode_index"] == 1
+    assert task_texts(meta) == ["open", "close"]
     with opened(dataset, meta) as data:
         assert (data[0]["task"], data[STEPS]["task"]) == ("open", "close")
-    rewrite(tmp_path / "data/meta/tasks.parquet", lambda table: table.slice(0, 1))
-    with pytest.raises(InputError, match="its task_index are not 0 to 0"):
-        open_metadata(dataset)
-
-
-@pytest.mark.parametrize(
-    ("shape", "names"),
-    [((32, 32, 3), None), ((32, 32, 3), ["a", "b", "c"]), ((3, 32, 32), ["channels", "height", "width"])],
-)
-def test_a_camera_is_known_by_its_shape_where_its_axes_have_no_names(tmp_path: Path, shape: Any, names: Any):
-    dataset = write_dataset(tmp_path / "data", more={FRONT: IMAGE})
-    edit_json(
-        tmp_path / "data/meta/info.json",
-        lambda info: info["features"][FRONT].update(names=names, shape=list(shape)),
-    )
-    assert dataset_features(open_metadata(dataset)).shapes[FRONT] == (3, 32, 32)
 
 
 def test_depth_is_decoded(tmp_path: Path):

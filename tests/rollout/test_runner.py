@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from accerl_lerobot.envs import Environment, SimulatedConfig, make_environment
-from accerl_lerobot.envs.reward_model import JudgedEnvironment
+from accerl_lerobot.envs.making import JudgedEnvironment
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import summarise
 from accerl_lerobot.experience import TASK, Decision, Observation, Request, Segment, SegmentStart

@@ -89,9 +89,7 @@ class AccerlEnvConfig(EnvConfig):
     features_map: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        with contextlib.closing(
-            make_environment(self.environment_config)
-        ) as environment:  # refuses bad values now
+        with contextlib.closing(make_environment(self.environment_config)) as environment:
             spec = environment.spec
         self.fps, self.tasks = spec.fps, spec.tasks
         self.features = {
