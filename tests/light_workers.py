@@ -22,8 +22,13 @@ from accerl_lerobot.inference.batcher import Batcher
 from accerl_lerobot.rollout.runner import EpisodePlans
 from accerl_lerobot.rollout.worker import Report, RolloutWorker
 from accerl_lerobot.trainer.peers import LearnerSettings
-from accerl_lerobot.transport.connection import Address, Server, ServiceStoppedError, serve_on_loop
-from accerl_lerobot.transport.endpoint import node_address
+from accerl_lerobot.transport.connection import (
+    Address,
+    Server,
+    ServiceStoppedError,
+    node_address,
+    serve_on_loop,
+)
 from accerl_lerobot.transport.weights import WeightPublisher
 
 NO_WEIGHTS = "a path without weights"

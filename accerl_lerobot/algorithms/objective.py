@@ -130,7 +130,7 @@ class LossOutput:
     """Loss and metrics of one batch."""
 
     loss: Tensor  # (), call ``backward`` on it
-    means: dict[str, Tensor]  # means over decisions, scalars without gradient; ``decisions`` is a count
+    means: dict[str, Tensor]  # means over decisions, scalars without gradient
     samples: Tensor
     """float64 (N, 3F + 2) without gradient, for metrics that are no means over decisions, such as quantiles:
     of each ratio log ρ, ω and 1 if it exists, else 0; V; R."""
@@ -166,8 +166,13 @@ def assemble(
         loss = loss + config.kl_coef * kl
     if config.entropy_coef:  # an entropy that is not used may be non-finite
         loss = loss - config.entropy_coef * mean_entropy
-    means = {"policy_loss": policy_loss, "value_loss": value_loss, "kl": kl, "entropy": mean_entropy}
-    means |= {"loss": loss, "decisions": loss.new_tensor(float(len(inputs.value)))}
+    means = {
+        "loss": loss,
+        "policy_loss": policy_loss,
+        "value_loss": value_loss,
+        "kl": kl,
+        "entropy": mean_entropy,
+    }
     exists = torch.ones_like(log_ratio) if inputs.factors is None else present(inputs.factors, config.level)
     columns = (log_ratio, weight, exists, inputs.value[:, None], inputs.returns[:, None])
     samples = torch.cat([column.detach().double() for column in columns], 1)

@@ -43,7 +43,7 @@ from accerl_lerobot.engines.supervision import (
 from accerl_lerobot.inference.batcher import merge_metrics
 from accerl_lerobot.metrics import numbered
 from accerl_lerobot.policies.config import Load
-from accerl_lerobot.replay.pacing import ASYNCHRONOUS, Schedule
+from accerl_lerobot.replay.buffer import ASYNCHRONOUS, Schedule
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.transport.connection import ServiceStoppedError
 from accerl_lerobot.world_model.config import WORLD_LEARNING
@@ -126,7 +126,7 @@ class RayEngine(Engine):
                 replica.actor.follow.remote(self._trainer.actor)
 
     def follow(self, schedule: Schedule) -> None:
-        """Change the schedule of collecting and learning, see `replay.pacing`."""
+        """Change the schedule of collecting and learning, see `replay.buffer`."""
         if schedule == self._schedule:
             return
         self._schedule = schedule

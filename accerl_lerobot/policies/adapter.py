@@ -9,6 +9,7 @@ LeRobot.
 from __future__ import annotations
 
 import contextlib
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -94,9 +95,20 @@ class PolicyAdapter(nn.Module, ABC):
     def values(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Tensor:
         """V only, (B,), without gradient."""
 
-    @abstractmethod
-    def example(self) -> tuple[dict[str, np.ndarray], Sequence[str], dict[str, Tensor]]:
-        """A few decisions as `evaluate` takes them."""
+    block_names = ""  # regular expression
+
+    def blocks(self) -> list[nn.Module]:
+        """The network's repeated modules whose weights are used inside their own call and nowhere else.
+
+        Neither their arguments hold anything in which a call leaves tensors, such as a key-value cache. None
+        is within another.
+        """
+        found: dict[str, nn.Module] = {}
+        for name, module in self.named_modules():
+            inside = any(name.startswith(f"{outer}.") for outer in found)
+            if not inside and re.fullmatch(self.block_names, name):
+                found[name] = module
+        return list(found.values()) if self.block_names else []
 
     @abstractmethod
     def trainable(self) -> dict[str, nn.Parameter]:
@@ -236,6 +248,7 @@ class LeRobotAdapter(PolicyAdapter):
         self.device = next(policy.parameters()).device
         self.family, self.value_head = family.to(self.device), value_head.to(self.device)
         self.precision = precision
+        self.block_names = model.blocks and rf"policy\.({model.blocks})"
         self.policy.eval()
         self.teacher: Teacher | None = None
         """Acts in its place in part of the exploring episodes; given by `teacher.with_teacher`."""
@@ -308,12 +321,6 @@ class LeRobotAdapter(PolicyAdapter):
     def example_requests(self) -> list[Request]:
         """Two requests with random observations for this policy, and instructions of unequal length."""
         return example_requests(self.policy.config, self.processing.rename_map)
-
-    def example(self) -> tuple[dict[str, np.ndarray], Sequence[str], dict[str, Tensor]]:
-        requests = self.example_requests()
-        latents = [decision.latent for decision in self.decide(requests, 0)]
-        stacked = {k: torch.from_numpy(np.stack([latent[k] for latent in latents])) for k in latents[0]}
-        return *stack_observations(requests), stacked
 
     def copy_weights(self) -> saving.Weights:
         return saving.copy_weights(self, {VALUE_HEAD: self.value_head, FAMILY: self.family})

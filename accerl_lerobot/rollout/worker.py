@@ -38,7 +38,7 @@ from accerl_lerobot.rollout.runner import (
     RolloutRunner,
 )
 from accerl_lerobot.timeline import COMPUTE, TRANSPORT, WAIT_IN, WAIT_OUT, WEIGHT_SYNC, open_clock
-from accerl_lerobot.transport.endpoint import Endpoint, ReconnectingClient
+from accerl_lerobot.transport.connection import Endpoint, ReconnectingClient
 
 if TYPE_CHECKING:
     from accerl_lerobot.world_model.config import ImaginationConfig
@@ -143,8 +143,8 @@ class RolloutWorker:
 
     def run(self, inference: Endpoint, replay: Endpoint) -> None:
         """Steps environments until the process ends."""
-        deciding, storing = ReconnectingClient("inference"), replay.connect()
-        deciding.move(inference)
+        deciding = ReconnectingClient(inference)
+        storing = replay.connect()
         idle = list(range(len(self._runner)))
         due: dict[int, Request] = {}
         under_way: dict[int, list[int]] = {}

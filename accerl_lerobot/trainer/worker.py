@@ -24,7 +24,7 @@ from accerl_lerobot.algorithms.batch import save_batch_if_not_finite
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import PRETRAINED, TRAINING_STATE, WEIGHTS
 from accerl_lerobot.fault_points import fault_point
-from accerl_lerobot.replay.pacing import ASYNCHRONOUS, Schedule
+from accerl_lerobot.replay.buffer import ASYNCHRONOUS, Schedule
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
 from accerl_lerobot.trainer.peers import LearnerSettings, Peers
 from accerl_lerobot.transport.weights import PublishDelay, WeightPublisher
@@ -131,7 +131,7 @@ class TrainerWorker:
     def _publish(self, held: PublishDelay, last: bool) -> None:
         """Hands the weights of now over, or those that are old enough."""
         adapter = self._update.adapter
-        with self._peers.lending("lend_weights"):
+        with self._peers.gathering("gather_weights"):
             weights = adapter.export_trainable() if self._config.hold_back else adapter.view_trainable()
         for version, tensors in held.push(self._update.version, weights, last=last):
             fault_point("trainer.publish")
@@ -152,7 +152,7 @@ class TrainerWorker:
         Returns its version, and the records up to it that `metrics` has not given.
         """
         with self._lock:
-            with self._peers.lending("lend_state"):
+            with self._peers.gathering("gather_state"):
                 adapter = self._update.adapter
                 self._kept = adapter.copy_weights(), adapter.export_trainable(), self._update.state()
             return self._update.version, self.metrics()

@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from accerl_lerobot.algorithms.sharding import Watch, arrange
 
 from accerl_lerobot.algorithms import GIPOConfig
 from accerl_lerobot.algorithms.batch import split_rows
 from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.algorithms.ranks import Ranks
 from accerl_lerobot.algorithms.ratio_update import RatioUpdate
-from accerl_lerobot.algorithms.sharding import Watch, arrange
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.errors import InputError
 from tests.algorithms import sharded

@@ -15,9 +15,8 @@ import pytest
 
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import CHECKPOINTS, TRAINING_STATE, save_checkpoint
-from accerl_lerobot.replay.buffer import Replay
+from accerl_lerobot.replay.buffer import Replay, ReplayConfig
 from accerl_lerobot.replay.journal import EPISODES, Journal
-from accerl_lerobot.replay.pacing import ReplayConfig
 from benchmarks.audit import audit_segments, audit_updates
 from benchmarks.fault_injection import POINTS
 from benchmarks.faults import BenchFaultsConfig, bench_faults

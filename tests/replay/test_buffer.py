@@ -10,8 +10,7 @@ import pytest
 
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.experience import IMAGINED, REAL
-from accerl_lerobot.replay.buffer import DRAWS, Replay
-from accerl_lerobot.replay.pacing import ReplayConfig
+from accerl_lerobot.replay.buffer import DRAWS, Replay, ReplayConfig
 from tests.replay.segments import assert_books_balance, make_segment
 
 

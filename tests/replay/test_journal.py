@@ -13,9 +13,8 @@ import pytest
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, Segment, SegmentStart
-from accerl_lerobot.replay.buffer import Replay
+from accerl_lerobot.replay.buffer import Replay, ReplayConfig
 from accerl_lerobot.replay.journal import Journal, read_journal, whole_episodes
-from accerl_lerobot.replay.pacing import ReplayConfig
 from tests.replay.segments import make_segment
 
 

@@ -11,8 +11,7 @@ import pytest
 
 from accerl_lerobot.engines.config import lag_limits
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.replay.buffer import Replay
-from accerl_lerobot.replay.pacing import ReplayConfig, draws_for, lag_bound
+from accerl_lerobot.replay.buffer import Replay, ReplayConfig, draws_for, lag_bound
 from accerl_lerobot.rollout.runner import RolloutConfig
 from tests.replay.segments import assert_books_balance, make_segment
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from accerl_lerobot.replay.pacing import ReplayConfig
+from accerl_lerobot.replay.buffer import ReplayConfig
 from accerl_lerobot.replay.worker import ReplayWorker
 from accerl_lerobot.transport.connection import ServiceStoppedError
 from tests.replay.segments import make_segment

@@ -18,7 +18,7 @@ from accerl_lerobot.experience import Decision, Request, Segment
 from accerl_lerobot.rollout import worker as module
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodePlans, EpisodeResult, RolloutConfig
 from accerl_lerobot.rollout.worker import MAX_PENDING, RolloutWorker
-from accerl_lerobot.transport import endpoint
+from accerl_lerobot.transport import connection
 from accerl_lerobot.transport.connection import ServiceStoppedError
 from tests.rollout.environments import evaluate
 from tests.runs import HANGS_S
@@ -191,7 +191,7 @@ def test_a_worker_outlives_its_inference_and_plays_what_it_would_have_played(
     stage, monkeypatch: pytest.MonkeyPatch
 ):
     """Decisions are of their requests alone; the service is lost with requests under way, and comes back."""
-    monkeypatch.setattr(endpoint, "RETRY_S", 0.05)
+    monkeypatch.setattr(connection, "RETRY_S", 0.05)
     played_out = []
     for lost in (False, True):
         one = stage(lambda segments: True)

@@ -9,8 +9,7 @@ from typing import Any
 import pytest
 
 from accerl_lerobot.transport import endpoint
-from accerl_lerobot.transport.connection import ServiceStoppedError
-from accerl_lerobot.transport.endpoint import Endpoint, ReconnectingClient
+from accerl_lerobot.transport.connection import Endpoint, ReconnectingClient, ServiceStoppedError
 from tests.transport.played import played
 
 
