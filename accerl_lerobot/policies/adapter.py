@@ -106,7 +106,8 @@ class PolicyAdapter(nn.Module, ABC):
         found: dict[str, nn.Module] = {}
         for name, module in self.named_modules():
             inside = any(name.startswith(f"{outer}.") for outer in found)
-            if not inside and re.fullmatch(self.block_names, name):
+            has_weights = next(module.parameters(), None) is not None
+            if has_weights and not inside and re.fullmatch(self.block_names, name):
                 found[name] = module
         return list(found.values()) if self.block_names else []
 

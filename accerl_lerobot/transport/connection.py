@@ -424,8 +424,7 @@ class Server:
         with contextlib.suppress(OSError):
             self._listener.shutdown(socket.SHUT_RDWR)  # ends the thread that accepts
         self._listener.close()
-        while not self._accepted.empty():
-            self._accepted.get().close()
+        self._close_accepted()
         for key in list(self._selector.get_map().values()):
             if key.fileobj is not self._woken:
                 self._drop(key.fileobj)
@@ -442,6 +441,13 @@ class Server:
                 end = _proved(end, self.address.key, ACCEPT_S, deliver_challenge, answer_challenge)
                 self._accepted.put(end)
                 self.wake()
+        self._close_accepted()
+
+    def _close_accepted(self) -> None:
+        """Close connections that `poll` has not taken over."""
+        with contextlib.suppress(queue.Empty):
+            while True:
+                self._accepted.get_nowait().close()
 
     def _exchange(self, stream: Any, events: int) -> list[PendingRequest]:
         """Send a client what is left of replies, and read its messages."""

@@ -98,7 +98,7 @@ def test_a_torn_last_line_is_left_out_and_a_broken_one_is_named(tmp_path: Path):
     assert [d.key for d in read_journal(path)] == ["a"]
     line = json.loads(whole.splitlines()[0])
     for change in (
-        {"actions": "####"}, {"action_dim": 0}, {"steps": [1]}, {"versions": []}, {"seed": None},
+        {"actions": "####"}, {"action_dim": 0}, {"steps": [1]},  {"seed": None},
         {"rewards": 3}, {"seed": math.inf}, {"decision": math.nan},
     ):  # fmt: skip
         path.write_bytes(json.dumps(line | change).encode() + b"\n" + whole)
