@@ -83,7 +83,7 @@ class LightInference:
         return [_decision(request, self._version) for request in requests]
 
     async def metrics(self) -> dict[str, float]:
-        return Batcher(1, 0.0).metrics() | {"busy_share": 0.0, "version": float(self._version)}
+        return Batcher(1, 0.0).counts | {"busy_share": 0.0, "version": float(self._version)}
 
 
 def _decision(request: Request, version: int) -> Decision:

@@ -18,7 +18,6 @@ from accerl_lerobot.engines.contract import Progress
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.inference import worker as inference_worker
-from accerl_lerobot.inference.batcher import merge_metrics
 from accerl_lerobot.inference.worker import InferenceConfig, InferenceWorker
 from accerl_lerobot.replay.buffer import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
@@ -175,16 +174,6 @@ def test_several_services_share_the_worlds_out(counted: None):
         assert {r.versions for r in results} == {(6, 6)}  # both have the last weights
     finally:
         engine.close()
-
-
-def test_what_services_say_merge_metrics():
-    one = {"batches": 2.0, "batch_size_mean": 3.0, "wait_mean_s": 0.1, "version": 7.0, "busy_share": 0.2}
-    other = {"batches": 4.0, "batch_size_mean": 1.0, "wait_mean_s": 0.3, "version": 6.0, "busy_share": 0.6}
-    found = merge_metrics([one, other])
-    assert found["batches"] == 6.0 and found["batch_size_mean"] == pytest.approx(10 / 6)
-    assert found["wait_mean_s"] == pytest.approx((0.1 * 6 + 0.3 * 4) / 10)
-    assert (found["version"], found["busy_share"]) == (6.0, pytest.approx(0.4))
-    assert merge_metrics([one]) == one and merge_metrics([]) == {}
 
 
 def test_services_without_callers_are_refused():

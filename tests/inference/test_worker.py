@@ -156,7 +156,7 @@ def test_a_lonely_request_is_served_when_it_has_waited(play):
         await ask(worker, 5)
         assert adapter.batches == [[5]]
         metrics = await worker.metrics()
-        assert metrics["wait_mean_s"] >= 0.05 and metrics["batches"] == 1
+        assert metrics["waited_s"] >= 0.05 and metrics["batches"] == 1
 
     play(scene, max_batch=4, max_wait_s=0.05)
 
