@@ -98,9 +98,11 @@ def advantage_column(inputs: LossInputs) -> Tensor:
 
 def sample_metrics(samples: Tensor, clip: tuple[float, float]) -> dict[str, Tensor]:
     """Scalars, see ``docs/metrics.md``, of the `LossOutput.samples` of a batch's parts, in any order."""
-    f, (low, high) = (samples.shape[1] - 2) // 3, clip
+    f = (samples.shape[1] - 2) // 3
     log_ratio, weight, exists, value, returns = samples.split([f, f, f, 1, 1], dim=1)
-    keep, rho = exists.bool(), ratio(log_ratio)
+    keep = exists.bool()
+    rho = ratio(log_ratio)
+    low, high = clip
     weighted = weight * rho
     squares = masked_mean(weighted.square(), keep).clamp(min=TINY)
     logs = log_ratio.masked_fill(~keep, math.nan).flatten()
@@ -246,8 +248,10 @@ class PPOConfig(RatioConfig):
 
     def loss(self, inputs: LossInputs) -> LossOutput:
         logs = at_level(inputs.log_prob_new - inputs.log_prob_old, inputs, self.level)
-        rho, advantage = ratio(logs), advantage_column(inputs)
-        low, high = 1.0 - self.clip_low, 1.0 + self.clip_high
+        rho = ratio(logs)
+        advantage = advantage_column(inputs)
+        low = 1.0 - self.clip_low
+        high = 1.0 + self.clip_high
         surrogate = (rho * advantage).minimum(rho.clamp(low, high) * advantage)
         dropped = ((advantage > 0.0) & (rho > high)) | ((advantage < 0.0) & (rho < low))
         return assemble(

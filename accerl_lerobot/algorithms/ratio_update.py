@@ -63,7 +63,8 @@ class BaseUpdate(ABC):
         """A copy of all that `restore` needs, the policy's weights apart; see `snapshot`."""
         return {
             "version": self.version,
-            "skipped": (self.skipped, self._skipped_in_a_row),
+            "skipped": self.skipped,
+            "skipped_in_a_row": self._skipped_in_a_row,
             "schedule_updates": self._schedule_updates,
             "optimizer": optimizer_state(self.optimizer),
         }
@@ -71,7 +72,8 @@ class BaseUpdate(ABC):
     def restore(self, state: dict[str, Any]) -> None:
         """Resume from `state`; the adapter has its weights already."""
         self.version = state["version"]
-        self.skipped, self._skipped_in_a_row = state["skipped"]
+        self.skipped = state["skipped"]
+        self._skipped_in_a_row = state["skipped_in_a_row"]
         self._schedule_updates = state["schedule_updates"]
         restore_optimizer(self.optimizer, state["optimizer"])
 
