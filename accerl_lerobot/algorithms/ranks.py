@@ -19,6 +19,7 @@ import socket
 from collections.abc import Callable, Sequence
 from datetime import timedelta
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import psutil
@@ -44,17 +45,28 @@ def size() -> int:
     return dist.get_world_size() if dist.is_initialized() else 1
 
 
-def split_rows(rows: np.ndarray, at_once: int, this_rank: int, ranks: int) -> list[tuple[np.ndarray, bool]]:
-    """A rank's share of rows, consecutive ones, in parts of at most `at_once`; True beside its own.
+class Part(NamedTuple):
+    """Rows on which a rank runs the network at once."""
+
+    rows: np.ndarray
+    own: bool  # False if the rows are another rank's, and the result is not counted
+
+    def counted(self, result: Tensor) -> Tensor:
+        """The result of these rows, (rows, ...), without rows that are not counted."""
+        return result if self.own else result[:0]
+
+
+def split_rows(rows: np.ndarray, at_once: int, this_rank: int, ranks: int) -> list[Part]:
+    """A rank's share of rows, consecutive ones, in parts of at most `at_once`.
 
     Every rank gets as many parts, because all ranks have to run a network of which each keeps a part: a rank
-    without rows left repeats the first of all, and the result is not counted.
+    without rows left repeats the first of all.
     """
     shares = np.array_split(rows, ranks)
     share = shares[this_rank]
-    parts = [(share[start : start + at_once], True) for start in range(0, len(share), at_once)]
+    parts = [Part(share[start : start + at_once], True) for start in range(0, len(share), at_once)]
     turns = math.ceil(len(shares[0]) / at_once)
-    return parts + [(rows[:1], False)] * (turns - len(parts))
+    return parts + [Part(rows[:1], False)] * (turns - len(parts))
 
 
 def gather(local: Tensor, total: int) -> Tensor:
@@ -71,10 +83,8 @@ def gather(local: Tensor, total: int) -> Tensor:
 
 def over_rows(score: Callable[[np.ndarray], Tensor], rows: np.ndarray, at_once: int) -> Tensor:
     """Results of `score` for rows, (rows, ...) on the CPU; each rank scores its own, `at_once` at a time."""
-    results = []
-    for part, own in split_rows(rows, at_once, rank(), size()):
-        result = score(part).cpu()
-        results.append(result if own else result[:0])
+    parts = split_rows(rows, at_once, rank(), size())
+    results = [part.counted(score(part.rows).cpu()) for part in parts]
     return gather(torch.cat(results), len(rows))
 
 

@@ -27,6 +27,7 @@ from accerl_lerobot.algorithms.batch import Batch, collate, pick
 from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.algorithms.objective import lag_metrics, present, sample_metrics
 from accerl_lerobot.algorithms.probe import CRITIC_PREFIX, Probe
+from accerl_lerobot.algorithms.ranks import Part
 from accerl_lerobot.checkpoint.tensors import in_parts, optimizer_state, restore_optimizer
 from accerl_lerobot.config.parsing import imported
 from accerl_lerobot.errors import MAX_NONFINITE, NonFiniteError
@@ -116,7 +117,16 @@ class RatioUpdate(BaseUpdate):
         batch = collate(segments)
         mismatch = self._probe.read(batch)
         self.optimizer.zero_grad(set_to_none=True)
-        metrics = self._backward(batch)
+        parts = ranks.split_rows(np.arange(len(batch)), self.config.micro_batch, ranks.rank(), ranks.size())
+        following = self._values(batch.last_observations, batch.segment_tasks)
+        evaluation: Evaluation | None = None
+        if len(parts) == 1:  # the forward pass of a single micro-batch has the values
+            evaluation = self.adapter.evaluate(*batch.part(parts[0].rows))
+            values = ranks.gather(parts[0].counted(evaluation.value.detach().cpu().float()), len(batch))
+        else:
+            values = self._values(batch.observations, batch.tasks)
+        advantages, returns = self._targets(batch, values, following)
+        metrics = self._backward(batch, parts, evaluation, advantages, returns)
         fault_point("trainer.backward")
         metrics |= self._step(metrics["loss"])
         metrics |= mismatch | lag_metrics(torch.from_numpy(batch.version), self.version)
@@ -131,48 +141,6 @@ class RatioUpdate(BaseUpdate):
         super().restore(state)
         self._moments = state["moments"]
         self._probe.restore(state["probe"])
-
-    def _backward(self, batch: Batch) -> dict[str, float]:
-        """Accumulates the gradient of the loss over micro-batches; returns metrics of the whole batch."""
-        rows = np.arange(len(batch))
-        parts = ranks.split_rows(rows, self.config.micro_batch, ranks.rank(), ranks.size())
-        following = self._values(batch.last_observations, batch.segment_tasks)
-        only: Evaluation | None = None
-        if len(parts) == 1:  # the forward pass of a single micro-batch has the values
-            part, own = parts[0]
-            only = self.adapter.evaluate(*batch.part(part))
-            local = only.value.detach().cpu().float()
-            values = ranks.gather(local if own else local[:0], len(batch))
-        else:
-            values = self._values(batch.observations, batch.tasks)
-        advantages, returns = self._targets(batch, values, following)
-        factors = self.adapter.factors(batch.latent)
-        means: dict[str, float] = {}
-        samples: list[Tensor] = []
-        for part, own in parts:
-            evaluation = self.adapter.evaluate(*batch.part(part)) if only is None else only
-            inputs = self._inputs(batch, part, evaluation, advantages, returns, factors)
-            output = self.algorithm.loss(inputs)
-            share = len(part) / len(batch) if own else 0.0
-            loss = output.loss * share * ranks.size()  # a gradient is the mean over ranks
-            if fault_point("trainer.loss"):
-                loss = loss * math.nan
-            loss.backward()
-            for name, mean in output.means.items():
-                means[name] = means.get(name, 0.0) + share * float(mean)
-            samples.append(output.samples.cpu() if own else output.samples[:0].cpu())
-        if not self.config.zero:  # FSDP averages by itself
-            ranks.average_gradients(self._policy + self._value)
-        local_means = torch.tensor([list(means.values())], dtype=torch.float64)
-        totals = ranks.gather(local_means, ranks.size()).sum(0).tolist()
-        metrics = dict(zip(means, totals, strict=True))
-        all_samples = ranks.gather(torch.cat(samples), len(batch))
-        for name, value in sample_metrics(all_samples, output.clip).items():
-            metrics[name] = float(value)
-        metrics["decisions"] = float(len(batch))
-        metrics["return_mean"] = float(returns.mean())
-        metrics["reward_mean"] = float(batch.reward.mean())
-        return metrics
 
     def _values(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Tensor:
         """V of each row, (rows,), without gradient, at most `micro_batch` rows at a time."""
@@ -200,30 +168,59 @@ class RatioUpdate(BaseUpdate):
             self._moments = total
         return normalise(advantages, total, mask)[mask], returns[mask]
 
-    def _inputs(
+    def _backward(
         self,
         batch: Batch,
-        rows: np.ndarray,
-        evaluation: Evaluation,
+        parts: Sequence[Part],
+        only: Evaluation | None,
         advantages: Tensor,
         returns: Tensor,
-        factors: Tensor | None,
-    ) -> LossInputs:
-        """Some rows of the batch, as the objective takes them."""
-        device = evaluation.log_prob.device
+    ) -> dict[str, float]:
+        """Accumulates the gradient of the loss over micro-batches; returns metrics of the whole batch.
+
+        `only` is the evaluation of a single micro-batch.
+        """
+        factors = self.adapter.factors(batch.latent)
         ratios = None
         if factors is not None:
             ratios = float(present(factors, self.algorithm.level).sum()) / len(factors)
-        return LossInputs(
-            log_prob_new=evaluation.log_prob,
-            log_prob_old=batch.log_prob[rows].to(device),
-            advantage=advantages[rows].to(device),
-            value=evaluation.value,
-            returns=returns[rows].to(device),
-            entropy=evaluation.entropy,
-            factors=None if factors is None else factors[rows].to(device),
-            ratios_per_decision=ratios,
-        )
+        means: dict[str, float] = {}
+        samples: list[Tensor] = []
+        for part in parts:
+            rows = part.rows
+            evaluation = self.adapter.evaluate(*batch.part(rows)) if only is None else only
+            device = evaluation.log_prob.device
+            inputs = LossInputs(
+                log_prob_new=evaluation.log_prob,
+                log_prob_old=batch.log_prob[rows].to(device),
+                advantage=advantages[rows].to(device),
+                value=evaluation.value,
+                returns=returns[rows].to(device),
+                entropy=evaluation.entropy,
+                factors=None if factors is None else factors[rows].to(device),
+                ratios_per_decision=ratios,
+            )
+            output = self.algorithm.loss(inputs)
+            share = len(rows) / len(batch) if part.own else 0.0
+            loss = output.loss * share * ranks.size()  # a gradient is the mean over ranks
+            if fault_point("trainer.loss"):
+                loss = loss * math.nan
+            loss.backward()
+            for name, mean in output.means.items():
+                means[name] = means.get(name, 0.0) + share * float(mean)
+            samples.append(part.counted(output.samples.cpu()))
+        if not self.config.zero:  # FSDP averages by itself
+            ranks.average_gradients(self._policy + self._value)
+        local_means = torch.tensor([list(means.values())], dtype=torch.float64)
+        totals = ranks.gather(local_means, ranks.size()).sum(0).tolist()
+        metrics = dict(zip(means, totals, strict=True))
+        all_samples = ranks.gather(torch.cat(samples), len(batch))
+        for name, value in sample_metrics(all_samples, output.clip).items():
+            metrics[name] = float(value)
+        metrics["decisions"] = float(len(batch))
+        metrics["return_mean"] = float(returns.mean())
+        metrics["reward_mean"] = float(batch.reward.mean())
+        return metrics
 
     def _step(self, loss: float) -> dict[str, float]:
         """A step of the optimiser along the gradient, whose loss it was, if both are finite."""
