@@ -441,17 +441,10 @@ def _execute(environment: Environment, episode: ActiveEpisode, actions: np.ndarr
         result = environment.step_chunk(actions[i : i + every])
         rewards.append(result.rewards)
         with for_viewing("film"):
-            episode.frames.append(_frame(environment, side))
+            episode.frames.append(np.asarray(environment.render(side, side)))
         if result.done:
             break
     return replace(result, rewards=np.concatenate(rewards))
-
-
-def _frame(environment: Environment, side: int) -> np.ndarray:
-    frame = np.asarray(environment.render(side, side))
-    if frame.shape != (side, side, 3) or frame.dtype != np.uint8:
-        raise ValueError(f"a frame is {frame.dtype} {frame.shape}, not uint8 ({side}, {side}, 3)")
-    return frame
 
 
 def nonfinite(observation: Observation) -> str:
