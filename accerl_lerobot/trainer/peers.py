@@ -137,7 +137,8 @@ class Peers:
         """They do `method` while the first rank does its part inside; an error of theirs is raised here."""
         calls = [getattr(actor, method).remote(*arguments) for actor in self._actors]
         yield
-        ray.get(calls, timeout=self._timeout_s)
+        if calls:
+            ray.get(calls, timeout=self._timeout_s)
 
     def gathering(self, method: str) -> AbstractContextManager[None]:
         """As `joining`, for work of all ranks only where each keeps a part of the weights."""
