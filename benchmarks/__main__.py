@@ -15,7 +15,6 @@ from accerl_lerobot.config.parsing import parse
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError
 from benchmarks.async_vs_sync import BenchAsyncVsSyncConfig
-from benchmarks.batching import BenchBatchingConfig
 from benchmarks.efficiency import BenchEfficiencyConfig
 from benchmarks.environment import BenchEnvironmentConfig
 from benchmarks.faults import BenchFaultsConfig
@@ -25,7 +24,6 @@ from benchmarks.lag import BenchLagConfig
 from benchmarks.latency import BenchLatencyConfig
 from benchmarks.policy import BenchPolicyConfig
 from benchmarks.scaling import BenchScalingConfig
-from benchmarks.soak import BenchSoakConfig
 from benchmarks.third_party import BenchThirdPartyConfig
 from benchmarks.throughput import BenchThroughputConfig
 from benchmarks.transport import BenchTransportConfig
@@ -38,11 +36,9 @@ CONFIGS: dict[str, type[Any]] = {
     "lag": BenchLagConfig,
     "efficiency": BenchEfficiencyConfig,
     "faults": BenchFaultsConfig,
-    "soak": BenchSoakConfig,
     "async_vs_sync": BenchAsyncVsSyncConfig,
     "latency": BenchLatencyConfig,
     "scaling": BenchScalingConfig,
-    "batching": BenchBatchingConfig,
     "transport": BenchTransportConfig,
     "gpu": BenchGpuConfig,
     "third_party": BenchThirdPartyConfig,

@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map_only
 
-from accerl_lerobot.algorithms.sharding import Watch, forget
+from accerl_lerobot.algorithms.ranks import recompute
 from accerl_lerobot.experience import stack_observations
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.family import Action
@@ -113,7 +113,7 @@ def policy_memory(
             peaks.append(counter.peak)
         learn = partial(_prepare_gradient, adapter, action, imitates)
         if checkpointing:
-            forget(Watch(adapter, partial(learn, one)))
+            recompute(adapter)
         for rows in (batch, one):
             with Counter() as counter:
                 waiting = learn(rows)

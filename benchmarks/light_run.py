@@ -19,7 +19,7 @@ from accerl_lerobot.engines.config import LaunchConfig, RunConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.policies.config import Load, PolicyConfig
-from accerl_lerobot.replay.pacing import ReplayConfig
+from accerl_lerobot.replay.buffer import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from benchmarks.simulated_environment import LatencyConfig
 

@@ -20,7 +20,7 @@ from rich.table import Table
 from accerl_lerobot.config.ranges import NonNegative, Positive, Range, Repeats
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.replay.pacing import ASYNCHRONOUS
+from accerl_lerobot.replay.buffer import ASYNCHRONOUS
 from benchmarks.machinery import MOST_BUSY, MachineryConfig
 from benchmarks.records import as_markdown, output_folder, write
 from benchmarks.simulated_environment import read_trace

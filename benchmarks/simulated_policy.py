@@ -87,11 +87,6 @@ class SimulatedAdapter(PolicyAdapter):
     def values(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Tensor:
         return self._value(len(tasks))
 
-    def example(self) -> tuple[dict[str, np.ndarray], Sequence[str], dict[str, Tensor]]:
-        c = self.config
-        state = np.zeros((2, c.action_dim), np.float32)
-        return {OBS_STATE: state}, ["task"] * 2, {"u": torch.zeros(2, c.chunk, c.action_dim)}
-
     def trainable(self) -> dict[str, nn.Parameter]:
         return dict(self.named_parameters())
 

@@ -2,7 +2,8 @@
 """Many runs of one recipe, to be compared: every seed is warm-started once, and each cell begins there.
 
 Runs are in the single-process engine, each on one thread, where lag is what settings make it and not what
-else the machine is doing. What is finished is kept: the same command goes on where it was stopped.
+else the machine is doing. Finished runs are kept: the same command continues a study that was stopped. Other
+settings need another folder.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -28,13 +29,11 @@ from accerl_lerobot.demos.record import REPO_ID
 from accerl_lerobot.engines.config import RunConfig, encode, parse
 from accerl_lerobot.errors import InputError, expanded
 from accerl_lerobot.evaluation import Rate, drawing
-from accerl_lerobot.run.resuming import locked
 from benchmarks.records import mean_interval
 from benchmarks.tables import as_table
 
 INTERVALS = "intervals are 95 %, over seeds where there are several"
 """For people, see `together`."""
-IN_USE = "a study, or a run of one that was killed, still writes there; wait for it or end it"
 LOG_LINES = 12
 """Log lines of a failed run that its error shows."""
 
@@ -201,18 +200,24 @@ class Study:
         from accerl_lerobot.run.preflight import check_start
 
         for seed, start in self.starts.items():
-            check_start(replace(start, resume=self.start(seed).exists()))  # what is there is gone on with
-        with locked(self.root, "output_dir", IN_USE) as lock:
-            runner = _Runner(self.config.jobs, lock, console)
-            runner.run("warm starts", {self.start(seed): start for seed, start in self.starts.items()})
-            for cell in self.cells:
-                _check_newer(self.folder(cell), self.start(cell.seed))
-            folders = [self.folder(cell) for cell in self.cells]
-            runner.run("cells", dict(zip(folders, self.runs, strict=True)))
+            check_start(replace(start, resume=self.start(seed).exists()))  # a run that is there is resumed
+        self._do("warm starts", {self.start(seed): start for seed, start in self.starts.items()}, console)
+        folders = [self.folder(cell) for cell in self.cells]
+        self._do("cells", dict(zip(folders, self.runs, strict=True)), console)
         return Results(
             {seed: _summary(self.start(seed)) for seed in self.config.seeds},
             [(cell, _summary(folder)) for cell, folder in zip(self.cells, folders, strict=True)],
         )
+
+    def _do(self, name: str, runs: dict[Path, RunConfig], console: Console) -> None:
+        """Does the runs that have no summary yet, some at a time."""
+        missing = [(folder, run) for folder, run in runs.items() if not (folder / SUMMARY).is_file()]
+        with console.stage(name, total=len(runs)) as stage, ThreadPoolExecutor(self.config.jobs) as pool:
+            done = len(runs) - len(missing)
+            stage.update(done)
+            for _ in pool.map(lambda run: _train(*run), missing):
+                done += 1
+                stage.update(done)
 
     def _of(self, cell: Cell) -> RunConfig:
         chosen = list(cell.chosen)
@@ -247,88 +252,30 @@ class Study:
         return config
 
 
-class _Runner:
-    """Runs ``accerl train`` in processes of their own."""
-
-    def __init__(self, jobs: int, lock: int, console: Console) -> None:
-        self._jobs, self._lock, self._console = jobs, lock, console
-        self._processes: set[subprocess.Popen[bytes]] = set()
-        self._stopped = False
-
-    def run(self, name: str, runs: dict[Path, RunConfig]) -> None:
-        """Does those that have no summary yet."""
-        missing = {folder: config for folder, config in runs.items() if not (folder / SUMMARY).is_file()}
-        for folder, config in runs.items():
-            if folder not in missing:
-                _check_same(folder, config)
-        done = len(runs) - len(missing)
-        with self._console.stage(name, total=len(runs)) as stage, ThreadPoolExecutor(self._jobs) as pool:
-            stage.update(done)
-            under_way = [pool.submit(self._one, folder, config) for folder, config in missing.items()]
-            try:
-                for future in as_completed(under_way):
-                    future.result()
-                    done += 1
-                    stage.update(done)
-            except BaseException as error:
-                for future in under_way:
-                    future.cancel()
-                if not isinstance(error, Exception):  # asked to stop: nothing must train on alone
-                    self._stopped = True
-                    for process in list(self._processes):
-                        process.terminate()
-                raise
-
-    def _one(self, folder: Path, config: RunConfig) -> None:
-        recipe, log = folder.with_suffix(".yaml"), folder.with_suffix(".log")
-        command = [sys.executable, "-m", "accerl_lerobot.cli", "train"]
-        if (folder / CHECKPOINTS).is_dir() and _is_same(folder, config):  # it was stopped on its way
-            command += ["--resume=true", f"--config_path={folder / CONFIG}"]
-        else:
-            shutil.rmtree(folder, ignore_errors=True)
-            recipe.write_text(yaml.safe_dump(encode(config), sort_keys=False))
-            command.append(f"--config_path={recipe}")
+def _train(folder: Path, config: RunConfig) -> None:
+    """Runs ``accerl train``; resumes a run that was stopped."""
+    command = [sys.executable, "-m", "accerl_lerobot.cli", "train"]
+    if (folder / CHECKPOINTS).is_dir():
+        command += ["--resume=true", f"--config_path={folder / CONFIG}"]
+    else:
+        shutil.rmtree(folder, ignore_errors=True)
+        recipe = folder.with_suffix(".yaml")
+        recipe.parent.mkdir(parents=True, exist_ok=True)
+        recipe.write_text(yaml.safe_dump(encode(config), sort_keys=False))
+        command.append(f"--config_path={recipe}")
+    log = folder.with_suffix(".log")
+    with log.open("ab") as out:
         threads = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE"}
-        with log.open("ab") as out:
-            process = subprocess.Popen(
-                command,
-                stdout=out,
-                stderr=out,
-                env=os.environ | threads,
-                pass_fds=(self._lock,),
-                start_new_session=True,  # Ctrl-C is for the study, which asks them to stop
-            )
-        self._processes.add(process)
-        if self._stopped:
-            process.terminate()
-        code = process.wait()
-        self._processes.discard(process)
-        if code:
-            raise RuntimeError(f"the run {folder.name} failed, see {log}:\n{last_words(log)}")
+        code = subprocess.run(
+            command, stdout=out, stderr=out, env=os.environ | threads, check=False
+        ).returncode
+    if code:
+        raise RuntimeError(f"the run {folder.name} failed, see {log}:\n{last_words(log)}")
 
 
 def last_words(log: Path) -> str:
     """The end of what a run has said."""
     return "\n".join(log.read_text(errors="replace").splitlines()[-LOG_LINES:])
-
-
-def _check_same(folder: Path, config: RunConfig) -> None:
-    """Refuses to count a finished run of other settings."""
-    if not _is_same(folder, config):
-        hint = f"{folder.name} in it was run with other settings; choose another folder or remove it"
-        raise InputError("output_dir", str(folder.parent), hint)
-
-
-def _is_same(folder: Path, config: RunConfig) -> bool:
-    return bool(parse(RunConfig, [f"--config_path={folder / CONFIG}"]) == config)
-
-
-def _check_newer(folder: Path, start: Path) -> None:
-    """Refuses to count a run from a warm start that has been replaced."""
-    summary = folder / SUMMARY
-    if summary.is_file() and summary.stat().st_mtime < (start / SUMMARY).stat().st_mtime:
-        hint = f"{folder.name} in it is older than {start.name}, where it would have begun; remove it"
-        raise InputError("output_dir", str(folder.parent), hint)
 
 
 def _summary(folder: Path) -> dict[str, Any]:

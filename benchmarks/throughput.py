@@ -22,7 +22,7 @@ from accerl_lerobot.engines.config import RunConfig, parse
 from accerl_lerobot.engines.contract import Progress
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import Load
-from accerl_lerobot.replay.pacing import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, Schedule
+from accerl_lerobot.replay.buffer import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, Schedule
 from benchmarks.tables import as_table, host, ranged, spread
 
 SETTLE = 2  # updates after a change that are not counted, beside those that need nothing new

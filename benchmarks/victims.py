@@ -17,6 +17,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from accerl_lerobot.checkpoint.layout import CONFIG
 from accerl_lerobot.metrics import METRICS
 from benchmarks.fault_injection import environment
@@ -37,6 +39,7 @@ TRAIN = ("accerl_lerobot.cli", "train")
 LIGHT = ("benchmarks.light_run",)
 """Modules that run, and their first arguments."""
 LOOK_S = 0.05
+GONE = (psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD)
 
 
 class Victim:
@@ -71,9 +74,10 @@ class Victim:
         if target in (DRIVER, EVERYTHING):
             return [self.process.pid] if self.process.poll() is None else []
         name = f"ray::{CLASSES[target]}"
-        found = {pid for pid in descendants(self.process.pid) if title(pid).startswith(name)}
+        found = [pid for pid in descendants(self.process.pid) if title(pid).startswith(name)]
         # What a worker forks has its name, too, until it becomes something else.
-        return sorted(pid for pid in found if (now := _stat(pid)) is not None and now[1] not in found)
+        forked = {child for pid in found for child in descendants(pid)}
+        return [pid for pid in found if pid not in forked]
 
     def records(self) -> list[dict[str, Any]]:
         """Records that it has logged; a last line that is being written is left out."""
@@ -142,18 +146,15 @@ def hit(pid: int, number: int) -> bool:
 
 def alive(pid: int) -> bool:
     """True if there is such a process, which is no zombie."""
-    now = _stat(pid)
-    return now is not None and now[0] not in "ZX"
+    return _status(pid) not in GONE
 
 
 def await_hit(pid: int, number: int, timeout: float = 10.0) -> bool:
     """True if a signal that was sent has done what it should: the process has stopped, or is gone."""
+    expected = (psutil.STATUS_STOPPED,) if number == signal.SIGSTOP else GONE
     deadline = time.monotonic() + timeout
     while time.monotonic() < deadline:
-        now = _stat(pid)
-        if number == signal.SIGSTOP and now is not None and now[0] == "T":
-            return True
-        if number != signal.SIGSTOP and (now is None or now[0] in "ZX"):
+        if _status(pid) in expected:
             return True
         time.sleep(0.005)
     return False
@@ -161,36 +162,23 @@ def await_hit(pid: int, number: int, timeout: float = 10.0) -> bool:
 
 def descendants(pid: int) -> list[int]:
     """All processes below one that are no zombies."""
-    parents = {}
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdigit() and (now := _stat(int(entry.name))) is not None and now[0] not in "ZX":
-            parents[int(entry.name)] = now[1]
-    found, grown = {pid}, True
-    while grown:
-        below = {child for child, parent in parents.items() if parent in found} - found
-        found |= below
-        grown = bool(below)
-    return sorted(found - {pid})
+    try:
+        below = psutil.Process(pid).children(recursive=True)
+    except psutil.NoSuchProcess:
+        return []
+    return sorted(process.pid for process in below if alive(process.pid))
 
 
 def title(pid: int) -> str:
     """How a process is called; empty if there is none."""
-    return " ".join(_command(pid))
-
-
-def _command(pid: int) -> list[str]:
-    """Command line of a process; empty if there is none."""
     try:
-        return Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace").split("\0")
-    except OSError:
-        return []
+        return " ".join(psutil.Process(pid).cmdline())
+    except psutil.Error:
+        return ""
 
 
-def _stat(pid: int) -> tuple[str, int] | None:
-    """State and parent of a process; None if there is none."""
+def _status(pid: int) -> str:
     try:
-        text = Path(f"/proc/{pid}/stat").read_text()
-    except OSError:
-        return None
-    state, parent = text.rsplit(")", 1)[1].split()[:2]  # the name in front may hold anything
-    return state, int(parent)
+        return psutil.Process(pid).status()
+    except psutil.NoSuchProcess:
+        return psutil.STATUS_DEAD

@@ -21,8 +21,13 @@ from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.inference.batcher import Batcher
 from accerl_lerobot.rollout.worker import Report, RolloutWorker
 from accerl_lerobot.trainer.peers import LearnerSettings
-from accerl_lerobot.transport.connection import Address, Server, ServiceStoppedError, serve_on_loop
-from accerl_lerobot.transport.endpoint import node_address
+from accerl_lerobot.transport.connection import (
+    Address,
+    Server,
+    ServiceStoppedError,
+    node_address,
+    serve_on_loop,
+)
 from accerl_lerobot.transport.weights import WeightPublisher
 
 NO_WEIGHTS = "a path without weights"
@@ -77,7 +82,7 @@ class LightInference:
         return [_decision(request, self._version) for request in requests]
 
     async def metrics(self) -> dict[str, float]:
-        return Batcher(1, 0.0).metrics() | {"busy_share": 0.0, "version": float(self._version)}
+        return Batcher(1, 0.0).counts | {"busy_share": 0.0, "version": float(self._version)}
 
 
 def _decision(request: Request, version: int) -> Decision:

@@ -33,7 +33,7 @@ from accerl_lerobot.experience import Observation
 from accerl_lerobot.policies.config import PLUGINS, POLICIES, PolicyConfig
 from accerl_lerobot.policies.flow import FlowFamily
 from accerl_lerobot.policies.loading import dry_run_config, load_adapter
-from accerl_lerobot.replay.pacing import ReplayConfig
+from accerl_lerobot.replay.buffer import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.run.train import make_engine
 from accerl_lerobot.testing import check_policy

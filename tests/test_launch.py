@@ -20,7 +20,7 @@ from accerl_lerobot.checkpoint.layout import PRETRAINED
 from accerl_lerobot.engines.config import RunConfig
 from accerl_lerobot.engines.contract import Progress
 from accerl_lerobot.evaluation import evaluation_plans
-from accerl_lerobot.replay.pacing import ReplayConfig, lag_bound
+from accerl_lerobot.replay.buffer import ReplayConfig, lag_bound
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
 from accerl_lerobot.timeline.read import read_timeline
 from benchmarks.simulated_environment import LatencyConfig

@@ -18,7 +18,7 @@ from tensorboard.backend.event_processing.event_file_loader import EventFileLoad
 
 from accerl_lerobot.console import Console
 from accerl_lerobot.engines.config import RunConfig, parse
-from accerl_lerobot.inference.batcher import Batcher
+from accerl_lerobot.inference.batcher import Batcher, merge_metrics
 from accerl_lerobot.metrics import MetricsLog, WandBConfig
 from accerl_lerobot.run.loop import Loop
 from accerl_lerobot.run.train import make_engine
@@ -152,7 +152,8 @@ def test_every_logged_number_is_explained(tiny_checkpoint: Path, monkeypatch: py
     with_ray = {"wait_s", "update_s", "publish_s"}
     assert explained("train") == (told - {"update"}) | with_ray
     rollout = progress.rollout.keys() | {f"replay_{k}" for k in progress.replay}
-    rollout |= {f"inference_{k}" for k in (*Batcher(1, 0.0).metrics(), "busy_share", "version")}
+    served = Batcher(1, 0.0).counts | {"busy_share": 0.0, "version": 0.0}
+    rollout |= {f"inference_{k}" for k in merge_metrics([served])}
     rollout |= {"restarts", "inference_restarts", "success_exploring"}
     assert explained("rollout") == rollout | {f"episode_{name}" for name in ("return", "steps", "decisions")}
 

@@ -34,12 +34,11 @@ from accerl_lerobot.engines.config import LaunchConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.hub.card import PullConfig
 from accerl_lerobot.policies.config import TuningConfig
-from accerl_lerobot.replay.pacing import ReplayConfig
+from accerl_lerobot.replay.buffer import ReplayConfig
 from accerl_lerobot.timeline.read import TimelineConfig
 from accerl_lerobot.world_model.config import PixelModelConfig, WorldModelConfig
 from benchmarks.__main__ import CONFIGS as BENCHMARKS
 from benchmarks.async_vs_sync import BenchAsyncVsSyncConfig
-from benchmarks.batching import BenchBatchingConfig
 from benchmarks.efficiency import BenchEfficiencyConfig
 from benchmarks.lag import BenchLagConfig
 from benchmarks.machinery import MachineryConfig
@@ -106,7 +105,6 @@ RULES = [
     (BackboneConfig, {"image": 48}, "sft.backbone.image=48: use a multiple of 32"),
     (BackboneConfig, {"hidden": 12}, "sft.backbone.hidden=12: use a multiple of 8"),
     (BenchAsyncVsSyncConfig, {"cvs": ()}, "cvs="),
-    (BenchBatchingConfig, {"waits_ms": ()}, "waits_ms="),
     (BenchEfficiencyConfig, {"arms": ("none", "rollouts")}, "arms=('none', 'rollouts'): use a list"),
     (BenchEfficiencyConfig, {"budgets": (4, 4)}, "budgets="),
     (BenchLagConfig, {"algorithms": ()}, "algorithms="),

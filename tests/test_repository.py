@@ -30,9 +30,9 @@ HEADER = "# SPDX-License-Identifier: Apache-2.0\n"
 LONGEST_FILE = 600
 MOST_EXPRESSIONS, MOST_FILES = 75_250, 144
 ENGINE = {"placement.py", "ray_engine.py", "ray_session.py", "supervision.py"}
-SHELLS = ENGINE | {"doctor.py", "worker.py", "online.py", "peers.py", "endpoint.py"}
+SHELLS = ENGINE | {"doctor.py", "worker.py", "online.py", "peers.py", "connection.py"}
 """Files that may import Ray; all others are testable without it."""
-DISTRIBUTED = {"rendezvous.py", "ranks.py", "sharding.py", "tensors.py"}
+DISTRIBUTED = {"ranks.py", "tensors.py"}
 """Files that may know of other processes of a `torch.distributed` group."""
 
 LIGHT = [

@@ -21,7 +21,7 @@ from accerl_lerobot.engines.contract import Progress
 from accerl_lerobot.engines.ray_engine import RayEngine
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import evaluation_plans
-from accerl_lerobot.replay.pacing import ReplayConfig
+from accerl_lerobot.replay.buffer import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from benchmarks.simulated_environment import LatencyConfig
 from tests.runs import drive, polls, until

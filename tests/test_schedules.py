@@ -18,9 +18,8 @@ from accerl_lerobot.engines.contract import Progress
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.inference import worker as inference_worker
-from accerl_lerobot.inference.batcher import merge_metrics
 from accerl_lerobot.inference.worker import InferenceConfig, InferenceWorker
-from accerl_lerobot.replay.pacing import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, ReplayConfig, Turns
+from accerl_lerobot.replay.buffer import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.world_model.config import ImaginationConfig
 from benchmarks.simulated_environment import LatencyConfig
@@ -28,34 +27,6 @@ from benchmarks.simulated_policy import SimulatedPolicyConfig, load_simulated
 from tests.replay.segments import make_segment
 from tests.replay.test_worker import BATCH, play, start, waits
 from tests.runs import collect, polls
-
-
-@pytest.mark.parametrize(
-    ("schedule", "allowed"),
-    [(ASYNCHRONOUS, [True, True, True, True]), (OVERLAP, [True, True, True, False]),
-     (SYNCHRONOUS, [True, False, False, False])],
-)  # fmt: skip
-def test_who_may_collect(schedule: Any, allowed: list[bool]):
-    found = []
-    for learning in (False, True):
-        for ready in (False, True):
-            turns = Turns(schedule)
-            if learning:
-                turns.under_way += 1
-            found.append(turns.may_collect(ready))
-            # Nobody is kept while nothing happens that would end it.
-            assert found[-1] or (ready and turns.may_draw()) or learning
-    assert found == allowed
-
-
-def test_a_batch_is_drawn_when_the_one_before_has_been_learned_from():
-    for schedule, at_once in ((ASYNCHRONOUS, True), (OVERLAP, False), (SYNCHRONOUS, False)):
-        turns = Turns(schedule)
-        assert turns.may_draw()
-        turns.under_way += 1
-        assert turns.may_draw() is at_once
-        turns.under_way -= 1
-        assert turns.may_draw()
 
 
 def test_in_turn_who_brings_the_last_segment_waits_until_it_is_learned_from():
@@ -203,16 +174,6 @@ def test_several_services_share_the_worlds_out(counted: None):
         assert {r.versions for r in results} == {(6, 6)}  # both have the last weights
     finally:
         engine.close()
-
-
-def test_what_services_say_merge_metrics():
-    one = {"batches": 2.0, "batch_size_mean": 3.0, "wait_mean_s": 0.1, "version": 7.0, "busy_share": 0.2}
-    other = {"batches": 4.0, "batch_size_mean": 1.0, "wait_mean_s": 0.3, "version": 6.0, "busy_share": 0.6}
-    found = merge_metrics([one, other])
-    assert found["batches"] == 6.0 and found["batch_size_mean"] == pytest.approx(10 / 6)
-    assert found["wait_mean_s"] == pytest.approx((0.1 * 6 + 0.3 * 4) / 10)
-    assert (found["version"], found["busy_share"]) == (6.0, pytest.approx(0.4))
-    assert merge_metrics([one]) == one and merge_metrics([]) == {}
 
 
 def test_schedules_and_replicas_that_cannot_be_are_refused():

@@ -6,12 +6,11 @@ Shapes: S segments, N decisions in all, L log-prob factors of one.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,12 +19,6 @@ from torch import Tensor
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.errors import NonFiniteError
 from accerl_lerobot.experience import Segment
-
-
-class Versioned(Protocol):
-    """Updates, of which so many have been made."""
-
-    version: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,27 +66,14 @@ def pick(
     return {k: v[rows] for k, v in observations.items()}, [tasks[i] for i in rows]
 
 
-def split_rows(rows: np.ndarray, size: int, rank: int, ranks: int) -> list[tuple[np.ndarray, bool]]:
-    """A rank's share of rows, consecutive ones, in parts of at most `size`; True beside its own.
-
-    Every rank gets as many parts, because all ranks have to run a network of which each keeps a part: who has
-    no rows left repeats the first of all, and what comes of it is not counted.
-    """
-    shares = np.array_split(rows, ranks)
-    mine = shares[rank]
-    own = [(mine[start : start + size], True) for start in range(0, len(mine), size)]
-    most = math.ceil(len(shares[0]) / size)
-    return own + [(rows[:1], False)] * (most - len(own))
-
-
 @contextmanager
 def save_batch_if_not_finite(
-    directory: Path | None, update: Versioned, segments: Sequence[Segment]
+    directory: Path | None, update: Any, segments: Sequence[Segment]
 ) -> Iterator[None]:
     """Saves the segments of an update, made inside, that raises `NonFiniteError`, for `snapshot.load`.
 
-    ``nonfinite-000123.json`` and ``.safetensors`` in the run's `directory` hold what would have made update
-    123; the error names them.
+    ``nonfinite-000123.json`` and ``.safetensors`` in the run's `directory` hold the batch of update 123; the
+    error names them.
     """
     try:
         yield

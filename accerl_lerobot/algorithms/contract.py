@@ -25,7 +25,7 @@ class AlgorithmConfig(Section, draccus.ChoiceRegistry, section="algorithm"):
 
     update: ClassVar[str]
     """``module:class`` of the trainer's updates, made from adapter, algorithm and `TrainerConfig`: a
-    `ratio_update.RatioUpdate`, which is given the ranks too, or `off_policy.OffPolicyUpdate`."""
+    `ratio_update.RatioUpdate` or an `off_policy.OffPolicyUpdate`."""
 
     discover_packages_path: str | None = field(default=None, metadata={"registers": True})
     """Package to import that registers ``algorithm.type``, where that is not one of ours."""

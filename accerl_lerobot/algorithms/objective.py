@@ -98,9 +98,11 @@ def advantage_column(inputs: LossInputs) -> Tensor:
 
 def sample_metrics(samples: Tensor, clip: tuple[float, float]) -> dict[str, Tensor]:
     """Scalars, see ``docs/metrics.md``, of the `LossOutput.samples` of a batch's parts, in any order."""
-    f, (low, high) = (samples.shape[1] - 2) // 3, clip
+    f = (samples.shape[1] - 2) // 3
     log_ratio, weight, exists, value, returns = samples.split([f, f, f, 1, 1], dim=1)
-    keep, rho = exists.bool(), ratio(log_ratio)
+    keep = exists.bool()
+    rho = ratio(log_ratio)
+    low, high = clip
     weighted = weight * rho
     squares = masked_mean(weighted.square(), keep).clamp(min=TINY)
     logs = log_ratio.masked_fill(~keep, math.nan).flatten()
@@ -130,7 +132,7 @@ class LossOutput:
     """Loss and metrics of one batch."""
 
     loss: Tensor  # (), call ``backward`` on it
-    means: dict[str, Tensor]  # means over decisions, scalars without gradient; ``decisions`` is a count
+    means: dict[str, Tensor]  # means over decisions, scalars without gradient
     samples: Tensor
     """float64 (N, 3F + 2) without gradient, for metrics that are no means over decisions, such as quantiles:
     of each ratio log ρ, ω and 1 if it exists, else 0; V; R."""
@@ -166,8 +168,13 @@ def assemble(
         loss = loss + config.kl_coef * kl
     if config.entropy_coef:  # an entropy that is not used may be non-finite
         loss = loss - config.entropy_coef * mean_entropy
-    means = {"policy_loss": policy_loss, "value_loss": value_loss, "kl": kl, "entropy": mean_entropy}
-    means |= {"loss": loss, "decisions": loss.new_tensor(float(len(inputs.value)))}
+    means = {
+        "loss": loss,
+        "policy_loss": policy_loss,
+        "value_loss": value_loss,
+        "kl": kl,
+        "entropy": mean_entropy,
+    }
     exists = torch.ones_like(log_ratio) if inputs.factors is None else present(inputs.factors, config.level)
     columns = (log_ratio, weight, exists, inputs.value[:, None], inputs.returns[:, None])
     samples = torch.cat([column.detach().double() for column in columns], 1)
@@ -241,8 +248,10 @@ class PPOConfig(RatioConfig):
 
     def loss(self, inputs: LossInputs) -> LossOutput:
         logs = at_level(inputs.log_prob_new - inputs.log_prob_old, inputs, self.level)
-        rho, advantage = ratio(logs), advantage_column(inputs)
-        low, high = 1.0 - self.clip_low, 1.0 + self.clip_high
+        rho = ratio(logs)
+        advantage = advantage_column(inputs)
+        low = 1.0 - self.clip_low
+        high = 1.0 + self.clip_high
         surrogate = (rho * advantage).minimum(rho.clamp(low, high) * advantage)
         dropped = ((advantage > 0.0) & (rho > high)) | ((advantage < 0.0) & (rho < low))
         return assemble(

@@ -16,10 +16,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from accerl_lerobot.algorithms import ranks
 from accerl_lerobot.algorithms.batch import Batch
 from accerl_lerobot.algorithms.config import TrainerConfig
-from accerl_lerobot.algorithms.ranks import ALONE, Ranks
-from accerl_lerobot.algorithms.sharding import swapped_in
 from accerl_lerobot.checkpoint.tensors import copy_of, part_of
 from accerl_lerobot.policies.adapter import PolicyAdapter
 
@@ -30,12 +29,12 @@ CLIP = 0.2  # PPO's usual range: a mismatch outside it would be clipped as if th
 class Probe:
     """One copy of the policy's trainable weights after the other, without the critic's."""
 
-    def __init__(self, adapter: PolicyAdapter, config: TrainerConfig, ranks: Ranks = ALONE) -> None:
-        self.adapter, self._config, self._ranks = adapter, config, ranks
+    def __init__(self, adapter: PolicyAdapter, config: TrainerConfig) -> None:
+        self.adapter, self._config = adapter, config
         self._live = [p for name, p in adapter.trainable().items() if not name.startswith(CRITIC_PREFIX)]
         self._copy: list[Tensor] = []
         self._version: int | None = None  # version of the copy; None: there is none
-        self._next = 0
+        self._next = 0  # version from which on a copy is taken
         self.renew(0)
 
     def state(self) -> dict[str, Any]:
@@ -48,38 +47,55 @@ class Probe:
         self._copy = [part_of(t, live) for t, live in zip(state["weights"], self._live, strict=False)]
 
     def renew(self, version: int) -> None:
-        config = self._config
-        due = config.probe_every and self._version is None and version >= self._next
-        if due and version < config.updates:
+        """Copy the weights of this version, if a copy is due."""
+        every = self._config.probe_every
+        if not every or version >= self._config.updates:
+            return
+        if self._version is None and version >= self._next:
             self._copy = [parameter.detach().clone() for parameter in self._live]
-            self._version, self._next = version, version + config.probe_every
+            self._version, self._next = version, version + every
 
     def read(self, batch: Batch) -> dict[str, float]:
         """The mismatch, if the batch holds decisions of the probed version; else nothing."""
         if self._version is None:
             return {}
         rows = np.flatnonzero(batch.version == self._version)
+        skipped = np.median(batch.version) > self._version
+        metrics: dict[str, float] = {}
         if len(rows):
-            apart = self._ranks.each(partial(self.apart, batch), rows, self._config.micro_batch)
-            metrics = {
-                "logprob/mismatch_mean": float(apart.abs().mean()),
-                "logprob/mismatch_max": float(apart.abs().max()),
-                "logprob/mismatch_clip": float((apart.expm1().abs() > CLIP).double().mean()),
-            }
-        elif np.median(batch.version) > self._version:
-            metrics, self._next = {}, 0
+            self._exchange()
+            try:
+                apart = ranks.over_rows(partial(self._apart, batch), rows, self._config.micro_batch)
+            finally:
+                self._exchange()
+            metrics["logprob/mismatch_mean"] = float(apart.abs().mean())
+            metrics["logprob/mismatch_max"] = float(apart.abs().max())
+            metrics["logprob/mismatch_clip"] = float((apart.expm1().abs() > CLIP).double().mean())
+        elif skipped:
+            self._next = 0
         else:
             return {}
         self._copy, self._version = [], None
         return metrics
 
     @torch.no_grad()
-    def apart(self, batch: Batch, rows: np.ndarray) -> Tensor:
+    def _apart(self, batch: Batch, rows: np.ndarray) -> Tensor:
         """Σ log π − Σ log μ of each row, float64, with π of the copy."""
-        part = batch.part(rows)
-        with swapped_in(self.adapter, self._live, self._copy):
-            difference = self.adapter.evaluate(*part).log_prob.cpu() - batch.log_prob[rows]
-        factors = self.adapter.factors(part[2])
+        observations, tasks, latent = batch.part(rows)
+        log_prob = self.adapter.evaluate(observations, tasks, latent).log_prob.cpu()
+        difference = log_prob - batch.log_prob[rows]
+        factors = self.adapter.factors(latent)
         if factors is not None:
             difference = difference.masked_fill(~factors.cpu(), 0.0)
         return difference.double().sum(dim=-1)
+
+    @torch.no_grad()
+    def _exchange(self) -> None:
+        """Swap the values of the live weights and of the copy."""
+        for parameter, tensor in zip(self._live, self._copy, strict=True):
+            held = parameter.detach().clone()
+            parameter.copy_(tensor)
+            tensor.copy_(held)
+        for module in self.adapter.modules():
+            if hasattr(module, "reshard"):  # FSDP may have gathered the values of before
+                module.reshard()

@@ -7,8 +7,6 @@ by what they can do: the class itself costs an import that nobody needs who trai
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -20,25 +18,13 @@ def in_parts(tensor: Tensor) -> bool:
     return hasattr(tensor, "full_tensor")
 
 
-_lends: list[None] = []
-
-
-@contextmanager
-def lending() -> Iterator[None]:
-    """Inside, `whole` contributes this process's parts for another one that asks, and gives nothing back."""
-    _lends.append(None)
-    try:
-        yield
-    finally:
-        _lends.pop()
-
-
 def whole(tensor: Tensor) -> Tensor:
-    """All of it, on the CPU if it was in parts; every process of the group asks for it at the same time."""
+    """All of it, on the CPU if it was in parts: then every process of the group asks for it at the same time,
+    and the first one gets it, the others nothing."""
     if not in_parts(tensor):
         return tensor
     full: Tensor = tensor.full_tensor()
-    return torch.empty(0) if _lends else full.cpu()
+    return full.cpu() if torch.distributed.get_rank() == 0 else torch.empty(0)
 
 
 def copy_of(tensor: Tensor) -> Tensor:

@@ -23,7 +23,7 @@ from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.metrics import WandBConfig
 from accerl_lerobot.policies.config import PolicyConfig
-from accerl_lerobot.replay.pacing import ASYNCHRONOUS, ReplayConfig, Schedule, lag_bound
+from accerl_lerobot.replay.buffer import ASYNCHRONOUS, ReplayConfig, Schedule, lag_bound
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.timeline import TIMELINE
 from accerl_lerobot.world_model.config import (

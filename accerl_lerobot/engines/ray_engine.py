@@ -46,7 +46,7 @@ from accerl_lerobot.engines.supervision import (
 from accerl_lerobot.inference.batcher import merge_metrics
 from accerl_lerobot.metrics import numbered
 from accerl_lerobot.policies.config import Load
-from accerl_lerobot.replay.pacing import ASYNCHRONOUS, Schedule
+from accerl_lerobot.replay.buffer import ASYNCHRONOUS, Schedule
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.world_model.config import WORLD_LEARNING
 
@@ -120,7 +120,7 @@ class RayEngine(Engine):
             replica.actor.follow.remote(replica.trainer)  # lost if it is restarted, and then asked again
 
     def follow(self, schedule: Schedule) -> None:
-        """Change the schedule of collecting and learning, see `replay.pacing`."""
+        """Change the schedule of collecting and learning, see `replay.buffer`."""
         if schedule == self._schedule:
             return
         self._schedule = schedule

@@ -24,23 +24,16 @@ class Batcher[R: Sized]:
 
     def __init__(self, max_batch: int, max_wait_s: float) -> None:
         self.max_batch, self.max_wait_s = max_batch, max_wait_s
+        self.counts = {"batches": 0.0, "requests": 0.0, "observations": 0.0, "waited_s": 0.0}
+        """Served so far, and how long the requests had waited in sum."""
         self._waiting: deque[tuple[R, float]] = deque()
-        self._observations = 0
-        self._together = self._left = 0
-        self._batches = self._batched = self._served = 0  # batches; observations and requests in them
-        self._wait_sum_s = 0.0
+        self._observations = 0  # of the requests that wait
+        self._environments = 0  # in lock step: observations that wait for each other; 0: none do
+        self._of_round = 0  # in lock step: observations of a round that are not served yet
 
-    def metrics(self) -> dict[str, float]:
-        """Means for the log; 0 before the first batch."""
-        return {
-            "batches": float(self._batches),
-            "batch_size_mean": self._batched / max(self._batches, 1),
-            "wait_mean_s": self._wait_sum_s / max(self._served, 1),
-        }
-
-    def lock_step(self, observations: int) -> None:
+    def lock_step(self, environments: int) -> None:
         """From now on so many observations wait for each other; 0: none do."""
-        self._together, self._left = observations, 0
+        self._environments, self._of_round = environments, 0
 
     def __len__(self) -> int:
         return len(self._waiting)
@@ -59,42 +52,44 @@ class Batcher[R: Sized]:
         or in lock step with others that are not here yet."""
         if not self._waiting:
             return None
-        if self._together and not self._left:
-            return self._waiting[0][1] if self._observations >= self._together else None
-        full = self._left or self._observations >= self.max_batch
-        return self._waiting[0][1] + (0.0 if full else self.max_wait_s)
+        oldest = self._waiting[0][1]
+        if self._environments and not self._of_round:
+            return oldest if self._observations >= self._environments else None
+        full = self._of_round or self._observations >= self.max_batch
+        return oldest if full else oldest + self.max_wait_s
 
     def take(self, now: float) -> list[R]:
         """Remove the next batch, due or not: the oldest requests, as many as fit, at least one."""
+        if self._environments and not self._of_round:
+            self._of_round = self._observations
+        most = min(self.max_batch, self._of_round or self.max_batch)
         batch: list[R] = []
         size = 0
-        if self._together and not self._left:
-            self._left = self._observations
-        most = min(self.max_batch, self._left or self.max_batch)
         while self._waiting and (not batch or size + len(self._waiting[0][0]) <= most):
             request, since = self._waiting.popleft()
             batch.append(request)
             size += len(request)
-            self._wait_sum_s += now - since
+            self.counts["waited_s"] += now - since
         self._observations -= size
-        self._left = max(0, self._left - size)
-        self._batches += bool(batch)
-        self._batched += size
-        self._served += len(batch)
+        self._of_round = max(0, self._of_round - size)
+        self.counts["batches"] += bool(batch)
+        self.counts["requests"] += len(batch)
+        self.counts["observations"] += size
         return batch
 
 
-def merge_metrics(metrics: Sequence[dict[str, float]]) -> dict[str, float]:
-    """Metrics as of one replica: sums of batches, means, the oldest version; {} for none."""
-    if len(metrics) < 2:
-        return dict(*metrics)
-    batches = sum(m["batches"] for m in metrics)
-    observations = [m["batches"] * m["batch_size_mean"] for m in metrics]
-    waited = sum(m["wait_mean_s"] * n for m, n in zip(metrics, observations, strict=True))
+def merge_metrics(replicas: Sequence[dict[str, float]]) -> dict[str, float]:
+    """Metrics for the log from those of each replica: `Batcher.counts`, its version and busy share.
+
+    Means are over all batches and requests, 0 before the first; the version is the oldest. {} for no replica.
+    """
+    if not replicas:
+        return {}
+    totals = {name: sum(replica[name] for replica in replicas) for name in replicas[0]}
     return {
-        "batches": batches,
-        "batch_size_mean": sum(observations) / max(batches, 1.0),
-        "wait_mean_s": waited / max(sum(observations), 1.0),
-        "version": min(m["version"] for m in metrics),
-        "busy_share": sum(m["busy_share"] for m in metrics) / len(metrics),
+        "batches": totals["batches"],
+        "batch_size_mean": totals["observations"] / max(totals["batches"], 1.0),
+        "wait_mean_s": totals["waited_s"] / max(totals["requests"], 1.0),
+        "version": min(replica["version"] for replica in replicas),
+        "busy_share": totals["busy_share"] / len(replicas),
     }

@@ -29,12 +29,12 @@ from accerl_lerobot import errors
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import WEIGHTS
 from accerl_lerobot.config.ranges import Range, Section, Threads
+from accerl_lerobot.experience import Request
 from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.inference.batcher import Batcher
 from accerl_lerobot.policies.config import Load, PolicyConfig, loader
 from accerl_lerobot.timeline import COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
-from accerl_lerobot.transport.connection import Address, PendingRequest, Server
-from accerl_lerobot.transport.endpoint import node_address
+from accerl_lerobot.transport.connection import Address, PendingRequest, Server, node_address
 from accerl_lerobot.transport.weights import Tensors
 
 LOOK_S = 1.0  # longest wait of the serving thread before it checks whether it should end
@@ -76,7 +76,7 @@ class InferenceWorker:
         torch.set_num_threads(config.num_threads)
         self._adapter = loader(load)(policy)
         self._batcher: Batcher[PendingRequest] = Batcher(config.max_batch, config.max_wait_s)
-        self._server = Server(self._take, node_address(in_cluster))
+        self._server = Server(self._add, node_address(in_cluster))
         self._version = version
         if state is not None:
             self._adapter.load_trainable(snapshot.load(state / WEIGHTS))
@@ -86,8 +86,8 @@ class InferenceWorker:
         self._lock_step: deque[int] = deque(maxlen=1)
         self._over = False
         self._iteration: float | None = None  # start of the serving thread's last one, while it lives
-        self._busy_s = self._busy_told_s = 0.0
-        self._since = time.monotonic()
+        self._busy_s = 0.0  # time in forward passes
+        self._reported = time.monotonic(), 0.0  # when `metrics` was called last, and the busy time then
         self._clock.enter(WAIT_IN)
 
     async def ready(self, trainer: Any = None) -> int:
@@ -135,14 +135,15 @@ class InferenceWorker:
             self._server.wake()
 
     async def metrics(self) -> dict[str, float]:
-        """Numbers for the log; does not answer while the serving thread hangs."""
+        """Numbers for `merge_metrics`; does not answer while the serving thread hangs."""
         while self._iteration is not None and time.monotonic() - self._iteration > 2 * LOOK_S:
             await asyncio.sleep(0.1)
         self._clock.beat()
-        now, busy_s = time.monotonic(), self._busy_s
-        share = (busy_s - self._busy_told_s) / max(1e-9, now - self._since)
-        self._since, self._busy_told_s = now, busy_s
-        return self._batcher.metrics() | {"version": float(self._version), "busy_share": share}
+        since, busy_before = self._reported
+        now, busy = time.monotonic(), self._busy_s
+        self._reported = now, busy
+        share = (busy - busy_before) / max(1e-9, now - since)
+        return self._batcher.counts | {"version": float(self._version), "busy_share": share}
 
     def _serve(self) -> None:
         batch: list[PendingRequest] = []
@@ -151,7 +152,8 @@ class InferenceWorker:
                 self._iteration = time.monotonic()
                 self._clock.enter(WAIT_IN)
                 deadline = self._batcher.next_deadline()
-                self._server.poll(LOOK_S if deadline is None else max(0.0, deadline - time.monotonic()))
+                wait = LOOK_S if deadline is None else max(0.0, deadline - time.monotonic())
+                self._server.poll(wait)
                 if self._lock_step:
                     self._batcher.lock_step(self._lock_step.popleft())
                 self._swap()
@@ -164,13 +166,13 @@ class InferenceWorker:
             self._server.poll(0.0)
             while len(self._batcher):
                 batch += self._batcher.take(time.monotonic())
-            for asked in batch:
-                asked.fail(error)
+            for request in batch:
+                request.fail(error)
             self._server.close()
             raise
 
-    def _take(self, asked: PendingRequest) -> None:
-        self._batcher.add(asked, asked.sent)
+    def _add(self, request: PendingRequest) -> None:
+        self._batcher.add(request, request.sent)
 
     def _swap(self) -> None:
         """Use the weights that have come."""
@@ -184,17 +186,21 @@ class InferenceWorker:
         self._loop.call_soon_threadsafe(self._applied.set)
 
     def _serve_batch(self, batch: list[PendingRequest]) -> None:
-        batch = [asked for asked in batch if not asked.gone()]
-        requests = [request for asked in batch for request in asked.message]
+        """Decide for all observations of the batch, and answer each message with its decisions."""
+        batch = [pending for pending in batch if not pending.gone()]
+        requests: list[Request] = []
+        for pending in batch:
+            requests += pending.message
         started = time.monotonic()
         self._clock.enter(COMPUTE)
         broken = fault_point("inference.batch")
         decisions = self._adapter.decide(requests, self._version) if requests else []
-        for decision in decisions if broken else ():
-            decision.log_prob.fill(np.nan)
+        if broken:
+            for decision in decisions:
+                decision.log_prob.fill(np.nan)
         self._busy_s += time.monotonic() - started
         self._clock.enter(TRANSPORT)
         start = 0
-        for asked in batch:
-            asked.answer(decisions[start : start + len(asked)])
-            start += len(asked)
+        for pending in batch:
+            pending.answer(decisions[start : start + len(pending)])
+            start += len(pending)

@@ -9,6 +9,7 @@ LeRobot.
 from __future__ import annotations
 
 import contextlib
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -93,9 +94,21 @@ class PolicyAdapter(nn.Module, ABC):
     def values(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Tensor:
         """V only, (B,), without gradient."""
 
-    @abstractmethod
-    def example(self) -> tuple[dict[str, np.ndarray], Sequence[str], dict[str, Tensor]]:
-        """A few decisions as `evaluate` takes them."""
+    block_names = ""  # regular expression
+
+    def blocks(self) -> list[nn.Module]:
+        """The network's repeated modules whose weights are used inside their own call and nowhere else.
+
+        Neither their arguments hold anything in which a call leaves tensors, such as a key-value cache. None
+        is within another.
+        """
+        found: dict[str, nn.Module] = {}
+        for name, module in self.named_modules():
+            inside = any(name.startswith(f"{outer}.") for outer in found)
+            has_weights = next(module.parameters(), None) is not None
+            if has_weights and not inside and re.fullmatch(self.block_names, name):
+                found[name] = module
+        return list(found.values()) if self.block_names else []
 
     @abstractmethod
     def trainable(self) -> dict[str, nn.Parameter]:
@@ -238,6 +251,7 @@ class LeRobotAdapter(PretrainedAdapter):
         self.parts |= {"family": self.family, "value_head": self.value_head}
         self.own_files |= {VALUE_HEAD: self.value_head, FAMILY: self.family}
         self.feature_width = model.width
+        self.block_names = model.blocks and rf"policy\.({model.blocks})"
 
     @property
     def sampler(self) -> SamplerConfig:

@@ -84,6 +84,7 @@ class Diffusion(Model):
     `predict_action_chunk` wants a time dimension that its preprocessor does not add; `stock` adds it.
     """
 
+    blocks = r"diffusion\.unet\.((down|up)_modules\.\d+|mid_modules|final_conv)\.\d+"
     size: tuple[int, int]  # (H, A)
     rows: slice  # the executed ones among the H
     schedule: Schedule

@@ -56,6 +56,9 @@ class Model(ABC):
     """
 
     backbone: ClassVar[str | None] = None  # prefix of what tuning mode ``expert`` freezes; None: no expert
+    blocks: ClassVar[str] = ""
+    """Regular expression of the names of the policy's blocks, see `PolicyAdapter.blocks`; empty: none. Where
+    LeRobot runs the inside of a layer without calling the layer, the layer's parts are blocks."""
     unread: ClassVar[tuple[str, ...]] = ()  # tensors nothing is computed with; savers drop tied ones
     idle: tuple[str, ...] = ()  # prefixes of parameters that no action depends on; never trained or published
     width: int  # width of the features

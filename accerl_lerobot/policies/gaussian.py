@@ -98,6 +98,7 @@ class GaussianFamily(Family):
 class ACT(GaussianModel):
     """LeRobot's `ACTPolicy`: its own forward pass is run, and watched at two places."""
 
+    blocks = r"model\.((encoder|decoder)\.layers\.\d+|backbone\.layer\d\.\d+)"
     idle = ("model.vae_encoder", "model.encoder_latent_input_proj.weight")
 
     def __init__(self, policy: Any) -> None:

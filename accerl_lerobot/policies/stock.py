@@ -105,9 +105,6 @@ class StockAdapter(PretrainedAdapter):
     def values(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Tensor:
         self._refuse()
 
-    def example(self) -> tuple[dict[str, np.ndarray], Sequence[str], dict[str, Tensor]]:
-        self._refuse()
-
     def _refuse(self) -> NoReturn:
         kind = self.policy.config.type
         raise InputError(

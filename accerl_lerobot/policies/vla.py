@@ -71,10 +71,16 @@ def _velocity(model: Any, pad: Tensor, cache: Any, **shown: Tensor) -> Velocity:
     return velocity
 
 
+VISION_LAYER = r".*\.vision_model\.encoder\.layers\.\d+"
+PART_OF_LAYER = r".*\.layers\.\d+\.(self_attn\.[qkvo]_proj|mlp)"  # of the language model and the expert
+NORM_OF_EXPERT = r".*\.gemma_expert\.model\.layers\.\d+\.(input|post_attention)_layernorm"
+
+
 class SmolVLA(FlowModel):
     """Drives LeRobot's `SmolVLAPolicy`."""
 
     backbone = "model.vlm_with_expert.vlm."
+    blocks = rf"{VISION_LAYER}|{PART_OF_LAYER}"
     unread = ("model.vlm_with_expert.vlm.lm_head.weight",)
 
     def __init__(self, policy: Any) -> None:
@@ -107,6 +113,7 @@ class Pi05(FlowModel):
     """Drives LeRobot's `PI05Policy`: PaliGemma reads, a smaller Gemma, the action expert, denoises."""
 
     backbone = VLM
+    blocks = rf"{VISION_LAYER}|{PART_OF_LAYER}|{NORM_OF_EXPERT}"
     unread = (f"{VLM}lm_head.weight", "model.paligemma_with_expert.gemma_expert.lm_head.weight")
 
     def __init__(self, policy: Any) -> None:
@@ -221,6 +228,7 @@ def data_only() -> Iterator[None]:
 class Pi0Fast(TokenModel):
     """Drives LeRobot's `PI0FastPolicy`."""
 
+    blocks = rf"{VISION_LAYER}|{PART_OF_LAYER}"
     loading = staticmethod(data_only)
 
     def __init__(self, policy: Any) -> None:

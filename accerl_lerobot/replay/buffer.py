@@ -1,30 +1,134 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bounded store of segments, first in first out, that knows what became of each of them.
+"""A bounded store of segments, and the pace at which it is filled and drawn from.
 
     inserted = stored + evicted + retired        in segments and in decisions
 
-*evicted* made room for newer ones, *retired* were older than `max_lag` allows. A non-finite segment is
-counted but never inserted. The store survives its process: `state` is all of it, as it was before the batches
-that a trainer has drawn and not learnt from.
+*Evicted* segments made room for newer ones, *retired* ones were older than `max_lag` allows. A non-finite
+segment is counted and not inserted.
+
+The pace is counted in decisions. On entering the store each segment gets a number of draws (`draws_for`). A
+segment with draws left is *available*. With batch ≤ max_unlearned_decisions, one of `may_sample` and
+`may_insert` holds at any time. Rollouts wait on insert instead of having their segments thrown away later:
+the oldest segments are thrown away first, and those are of the longest episodes, which failed.
+
+    asynchronous   nobody waits for anybody, within the pace
+    overlap        the next batch is collected while one is learned from, and then both wait for each other
+    synchronous    a batch is collected, then learned from, then the weights are handed over
+
+The last two schedules are baselines: the same workers, held back. All environments are decided for together
+in them, as by a vectorised environment, so a step takes as long as its slowest environment.
 """
 
 from __future__ import annotations
 
+import math
 from collections import Counter, deque
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
 from accerl_lerobot.checkpoint.snapshot import kind
+from accerl_lerobot.config.ranges import Range, Section, Steps
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import REAL, Segment
 from accerl_lerobot.replay.journal import Journal
-from accerl_lerobot.replay.pacing import ReplayConfig, draws_for
 
 DRAWS = 1024
-"""Last draws that are remembered, to be taken back in `Replay.state`: a trainer draws one batch ahead, and
-goes on while it is saved."""
-BATCH_SHARE = 0.5  # share of a batch that is one, when no more will come
+"""Last draws that are remembered, for `Replay.state`: a trainer draws one batch ahead, and goes on while it
+is saved."""
+BATCH_SHARE = 0.5  # share of a batch that is trained on once collection has ended
+
+Schedule = Literal["asynchronous", "overlap", "synchronous"]
+ASYNCHRONOUS: Schedule = "asynchronous"
+OVERLAP: Schedule = "overlap"
+SYNCHRONOUS: Schedule = "synchronous"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayConfig(Section, section="replay"):
+    """Size and pace of one replay."""
+
+    capacity: Annotated[int, Range("[1, 100000000]")] = 4096
+    """Decisions held at most; the oldest segments leave first. At least `max_unlearned_decisions` plus one
+    segment."""
+    min_decisions: Annotated[int, Range("[1, 100000000]")] = 256
+    """Decisions that must be held before the trainer starts (warm start), from 1 to `capacity`."""
+    samples_per_insert: Annotated[float, Range("[1, 1000000]")] = 1.0
+    """How often a decision is trained on, on average: collect less rather than throw away."""
+    max_lag: Steps = 50
+    """A segment whose oldest decision is more updates behind the trainer than this is retired, at least 0.
+
+    A safety net: choose the pace so that `lag_bound` stays below it, and nothing is thrown away. What an
+    off-policy algorithm keeps in a memory of its own may be older.
+    """
+    max_unlearned_decisions: Annotated[int, Range("[1, 100000000]")] = 512
+    """Decisions to learn from, each counted as often as it will be, that the rollouts may be ahead of the
+    trainer; from one batch to `capacity`. Where environments end their segments together, room for all of
+    them keeps both sides busy. It costs lag."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("min_decisions", "max_unlearned_decisions"):
+            if getattr(self, name) > self.capacity:
+                hint = f"use 1 to capacity, {self.capacity}"
+                raise InputError(f"replay.{name}", getattr(self, name), hint)
+
+    @property
+    def most_available(self) -> int:
+        """Available decisions from which on rollouts wait."""
+        return max(self.max_unlearned_decisions, self.min_decisions)
+
+    def check(self, *, batch_decisions: int, segment_decisions: int) -> None:
+        """Refuses a pace that could stall or waste."""
+        if self.max_unlearned_decisions < batch_decisions:
+            hint = f"use at least one batch, {batch_decisions}, or both sides wait for each other"
+            raise InputError("replay.max_unlearned_decisions", self.max_unlearned_decisions, hint)
+        # Each of a segment's draws is for another update.
+        oldest = math.ceil(self.samples_per_insert) - 1
+        if self.max_lag < oldest:
+            hint = (
+                f"with replay.samples_per_insert={self.samples_per_insert:g} what is drawn last is {oldest} "
+                f"updates old at least; use {oldest} or more, rather several times as many"
+            )
+            raise InputError("replay.max_lag", self.max_lag, hint)
+        least = self.most_available + segment_decisions - 1
+        if self.capacity < least:
+            hint = f"use at least {least}: min_decisions or max_unlearned_decisions, and a segment"
+            raise InputError("replay.capacity", self.capacity, hint)
+
+
+def lag_bound(
+    config: ReplayConfig, *, batch_decisions: int, in_flight: int, pickup: int = 0, prefetch: int = 0
+) -> int:
+    """The largest lag of a decision that is drawn from replay, in updates, for people to read.
+
+        lag ≤ min(max_lag, pickup + drawn + prefetch)
+        drawn = ⌊⌈samples_per_insert⌉ · (max(max_unlearned_decisions, min_decisions) + 2·in_flight +
+        capacity) / batch⌋ − 1
+
+    Between a segment's first decision and its being drawn, each update has drawn a batch out of what was
+    available at first, at most max(max_unlearned_decisions, min_decisions) + in_flight, and of what was
+    inserted since: in_flight until the segment itself was in, and capacity after that, or it would have been
+    evicted. The weights that decided were `pickup` updates old at most, and `prefetch` batches are drawn
+    early.
+
+    `in_flight` decisions are inserted by all workers while a segment is made and inserted, one segment of
+    each environment if these are about equally fast. One that hangs breaks this; `max_lag` then retires it.
+    """
+    decisions = config.most_available + 2 * in_flight + config.capacity
+    drawn = math.ceil(config.samples_per_insert) * decisions // batch_decisions - 1
+    return min(config.max_lag, pickup + drawn + prefetch)
+
+
+def draws_for(samples_per_insert: float, n: int, remainder: float) -> tuple[int, float]:
+    """How often a new segment of n decisions may be drawn, such that the average is `samples_per_insert`.
+
+    `remainder` is the draws, in decisions, that rounding has withheld so far; the new one is returned too.
+    """
+    remainder += samples_per_insert * n
+    draws = min(math.floor(remainder / n), math.ceil(samples_per_insert))
+    return draws, remainder - draws * n
 
 
 @kind
@@ -34,7 +138,7 @@ class ReplayCounters:
 
     inserted_segments: int = 0
     inserted_decisions: int = 0
-    inserted_imagined: int = 0  # those of the decisions that are imagined
+    inserted_imagined: int = 0  # the imagined ones of these decisions
     evicted_segments: int = 0
     evicted_decisions: int = 0
     evicted_unused: int = 0
@@ -46,18 +150,24 @@ class ReplayCounters:
     trained_imagined: int = 0
     unique_decisions: int = 0  # drawn at least once
 
+    def trained(self, entry: Entry, times: int) -> None:
+        self.trained_decisions += times * entry.size
+        if entry.imagined:
+            self.trained_imagined += times * entry.size
+
 
 @dataclass(eq=False)
-class _Entry:
-    """A segment, which may be drawn `draws` times in all; once it has `left`, only the books of it."""
+class Entry:
+    """A stored segment, which may be drawn `draws` times in all; once it has `left`, its numbers only."""
 
     segment: Any
     draws: int
     uses: int = 0
-    left: str = ""
+    left: str = ""  # ``evicted`` or ``retired``
 
     def __post_init__(self) -> None:
-        self.size, self.oldest = len(self.segment), int(self.segment.version.min())
+        self.size = len(self.segment)
+        self.oldest = int(self.segment.version.min())
         self.imagined = self.segment.source != REAL
 
     @property
@@ -72,15 +182,15 @@ class Replay:
     """
 
     def __init__(self, config: ReplayConfig, journal: Journal | None = None) -> None:
-        self.config, self.counters = config, ReplayCounters()
+        self.config = config
+        self.counters = ReplayCounters()
         self.ended = False  # True if no segment will come any more
-        self._journal = journal
         self.stored_decisions = 0
         self.available_decisions = 0  # decisions of the segments with draws left
-        self._entries: deque[_Entry] = deque()  # oldest first
+        self._journal = journal
+        self._entries: deque[Entry] = deque()  # oldest first
         self._remainder = 0.0
-        self._drawn: deque[tuple[int, list[_Entry]]] = deque(maxlen=DRAWS)
-        """The trainer's version and what it was given, of each of the last draws."""
+        self._drawn: deque[tuple[int, list[Entry]]] = deque(maxlen=DRAWS)  # trainer version, and its batch
 
     @property
     def segments(self) -> list[Segment]:
@@ -88,16 +198,20 @@ class Replay:
 
     def may_insert(self) -> bool:
         """True if rollouts should bring another segment now; `insert` does not refuse one too many."""
-        return self.config.may_insert(self.stored_decisions, self.available_decisions)
+        if self.stored_decisions < self.config.min_decisions:
+            return True
+        return self.available_decisions < self.config.max_unlearned_decisions
 
     def may_sample(self, batch_decisions: int) -> bool:
         """True if the trainer should draw a batch now; `sample` itself does not wait for the warm start.
 
-        Once all segments have come, few decisions may be less than a batch: then they are one.
+        Once collection has ended, a share of a batch is enough.
         """
         if self.ended:
             return self.available_decisions >= BATCH_SHARE * batch_decisions
-        return self.config.may_sample(self.stored_decisions, self.available_decisions, batch_decisions)
+        if self.stored_decisions < self.config.min_decisions:
+            return False
+        return self.available_decisions >= batch_decisions
 
     def exhausted(self, batch_decisions: int) -> bool:
         """True if there is no batch and never will be."""
@@ -106,31 +220,31 @@ class Replay:
     def insert(self, segment: Segment) -> bool:
         """Stores a segment, by reference, and evicts the oldest ones if room is needed.
 
-        A non-finite one is counted and not stored: False.
+        A non-finite segment is counted and not stored: False.
         """
-        n = len(segment)  # at most the capacity, see `ReplayConfig.check`
         if not is_finite(segment):
             self.counters.dropped_nonfinite += 1
             return False
+        n = len(segment)  # at most the capacity, see `ReplayConfig.check`
         while self.stored_decisions + n > self.config.capacity:
-            self._depart(self._entries.popleft(), "evicted")
+            self._remove(self._entries[0], "evicted")
         draws, self._remainder = draws_for(self.config.samples_per_insert, n, self._remainder)
-        self._add(_Entry(segment, draws))
+        entry = Entry(segment, draws)
+        self._add(entry)
         self.counters.inserted_segments += 1
         self.counters.inserted_decisions += n
-        if segment.source == REAL:
-            if self._journal is not None:
-                self._journal.write(segment)
-        else:
+        if entry.imagined:
             self.counters.inserted_imagined += n
+        elif self._journal is not None:
+            self._journal.write(segment)
         return True
 
     def sample(self, num_decisions: int, trainer_version: int, rng: np.random.Generator) -> list[Segment]:
-        """Draws the available segments that were used least, in random order; retires those too old first.
+        """Draws the available segments that were used least, in random order; first retires too old ones.
 
-        Whole segments are drawn until there are `num_decisions`, none twice; `rng` decides among those used
-        equally often. Empty, with nothing counted as used, if fewer decisions are available. That can happen
-        although `may_sample` held, when segments were too old: try again later.
+        Whole segments are drawn until there are `num_decisions`, none twice; `rng` decides among segments
+        used equally often. Empty, with nothing counted as used, if fewer decisions are available. That can
+        happen although `may_sample` held, when segments were too old: try again later.
         """
         self.retire(trainer_version)
         if self.ended and self.may_sample(num_decisions):
@@ -139,76 +253,93 @@ class Replay:
             return []
         available = [entry for entry in self._entries if entry.available]
         shuffled = [available[i] for i in rng.permutation(len(available))]
-        drawn: list[_Entry] = []
+        drawn: list[Entry] = []
         for entry in sorted(shuffled, key=lambda entry: entry.uses):
-            self.counters.trained_decisions += entry.size
-            self.counters.trained_imagined += entry.size if entry.imagined else 0
-            self.counters.unique_decisions += 0 if entry.uses else entry.size
-            entry.uses += 1
-            self.available_decisions -= 0 if entry.available else entry.size
-            drawn.append(entry)
-            num_decisions -= entry.size
             if num_decisions <= 0:
                 break
+            self._use(entry)
+            drawn.append(entry)
+            num_decisions -= entry.size
         self._drawn.append((trainer_version, drawn))
         return [entry.segment for entry in drawn]
 
+    def retire(self, trainer_version: int) -> None:
+        """Removes segments that are too old for a trainer that has made so many updates."""
+        cutoff = trainer_version - self.config.max_lag
+        for entry in [entry for entry in self._entries if entry.oldest < cutoff]:
+            self._remove(entry, "retired")
+
     def metrics(self) -> dict[str, float]:
-        counts = asdict(self.counters) | {"stored_segments": len(self._entries)}
-        counts |= {name: getattr(self, name) for name in ("stored_decisions", "available_decisions")}
+        counts = asdict(self.counters)
+        counts["stored_segments"] = len(self._entries)
+        counts["stored_decisions"] = self.stored_decisions
+        counts["available_decisions"] = self.available_decisions
         return {name: float(count) for name, count in counts.items()}
 
     def state(self, version: int | None = None) -> dict[str, Any]:
         """All that `restore` needs; see `snapshot`. Shares the segments, which nobody changes.
 
-        What the trainer has drawn for updates after `version` counts as not drawn; None: it has learnt from
-        all it drew.
+        Batches drawn for updates after `version` count as not drawn. None: the trainer has learned from all.
         """
-        late = [] if version is None else [entries for made, entries in self._drawn if made >= version]
-        if late and len(late) == self._drawn.maxlen:
-            raise RuntimeError(f"replay has given more than {DRAWS} batches since update {version}")
-        back = Counter(entry for entries in late for entry in entries)
+        unlearned: Counter[Entry] = Counter()
+        for drawn_at, batch in self._drawn:
+            if version is not None and drawn_at >= version:
+                unlearned.update(batch)
         counters = replace(self.counters)
-        for entry, count in back.items():
-            counters.trained_decisions -= count * entry.size
-            counters.trained_imagined -= count * entry.size if entry.imagined else 0
-            if count == entry.uses:
+        for entry, times in unlearned.items():
+            counters.trained(entry, -times)
+            if times == entry.uses:
                 counters.unique_decisions -= entry.size
                 if entry.left:
-                    vars(counters)[f"{entry.left}_unused"] += 1
-        entries = [{"segment": e.segment, "draws": e.draws, "uses": e.uses - back[e]} for e in self._entries]
-        journal = None if self._journal is None else self._journal.save()
-        state = {"counters": counters, "entries": entries, "remainder": self._remainder}
-        return state | {"ended": self.ended, "journal": journal}
+                    _count(counters, f"{entry.left}_unused", 1)
+        entries = [
+            {"segment": e.segment, "draws": e.draws, "uses": e.uses - unlearned[e]} for e in self._entries
+        ]
+        return {
+            "counters": counters,
+            "entries": entries,
+            "remainder": self._remainder,
+            "ended": self.ended,
+            "journal": None if self._journal is None else self._journal.save(),
+        }
 
     def restore(self, state: dict[str, Any]) -> None:
         """Resumes from `state`, before the first insert."""
-        self.counters, self._remainder = state["counters"], state["remainder"]
+        self.counters = state["counters"]
         self.ended = state["ended"]
+        self._remainder = state["remainder"]
         for entry in state["entries"]:
-            self._add(_Entry(**entry))
+            self._add(Entry(**entry))
         if self._journal is not None and state["journal"] is not None:
             self._journal.cut(state["journal"])
 
-    def retire(self, trainer_version: int) -> None:
-        """Takes out what is too old for a trainer that has made so many updates."""
-        cutoff = trainer_version - self.config.max_lag
-        for entry in [entry for entry in self._entries if entry.oldest < cutoff]:
-            self._entries.remove(entry)
-            self._depart(entry, "retired")
-
-    def _add(self, entry: _Entry) -> None:
+    def _add(self, entry: Entry) -> None:
         self._entries.append(entry)
         self.stored_decisions += entry.size
-        self.available_decisions += entry.size if entry.available else 0
+        if entry.available:
+            self.available_decisions += entry.size
 
-    def _depart(self, entry: _Entry, how: str) -> None:
-        entry.segment, entry.left = None, how
+    def _use(self, entry: Entry) -> None:
+        self.counters.trained(entry, 1)
+        if entry.uses == 0:
+            self.counters.unique_decisions += entry.size
+        entry.uses += 1
+        if not entry.available:
+            self.available_decisions -= entry.size
+
+    def _remove(self, entry: Entry, how: str) -> None:
+        self._entries.remove(entry)
         self.stored_decisions -= entry.size
-        self.available_decisions -= entry.size if entry.available else 0
-        counts = vars(self.counters)
-        for name, amount in (("segments", 1), ("decisions", entry.size), ("unused", entry.uses == 0)):
-            counts[f"{how}_{name}"] += int(amount)
+        if entry.available:
+            self.available_decisions -= entry.size
+        entry.segment, entry.left = None, how
+        _count(self.counters, f"{how}_segments", 1)
+        _count(self.counters, f"{how}_decisions", entry.size)
+        _count(self.counters, f"{how}_unused", int(entry.uses == 0))
+
+
+def _count(counters: ReplayCounters, name: str, amount: int) -> None:
+    setattr(counters, name, getattr(counters, name) + amount)
 
 
 def is_finite(segment: Segment) -> bool:

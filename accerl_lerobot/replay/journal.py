@@ -43,7 +43,8 @@ class Journal:
     """Appends; when `write` returns, a segment reaches the disk whatever becomes of this process."""
 
     def __init__(self, path: Path) -> None:
-        self._path, self._file = path, path.open("ab")
+        self._path = path
+        self._file = path.open("ab")
 
     def save(self) -> int:
         """Has the disk hold it; the bytes so far."""
@@ -82,29 +83,22 @@ def read_journal(path: Path) -> Iterator[JournalEntry]:
         for number, line in enumerate(file, start=1):
             if line.endswith(b"\n"):
                 with reading("path", str(path), f"line {number}"):
-                    done = _entry(json.loads(line))
-                yield done
+                    entry = _entry(json.loads(line))
+                yield entry
 
 
 def _entry(line: dict[str, Any]) -> JournalEntry:
     actions = np.frombuffer(base64.b64decode(line["actions"], validate=True), "<f4")
-    actions = actions.reshape(-1, int(line["action_dim"]))
-    steps = tuple(int(n) for n in line["steps"])
-    if (
-        min(steps) < 1
-        or sum(steps) != len(actions)
-        or not len(steps) == len(line["versions"]) == len(line["rewards"])
-    ):
-        raise ValueError("its parts are of different lengths")
+    steps = tuple(line["steps"])
     return JournalEntry(
-        key=str(line["key"]),
-        origin=SegmentStart(str(line["task"]), int(line["seed"]), int(line["decision"])),
-        actions=actions,
+        key=line["key"],
+        origin=SegmentStart(line["task"], int(line["seed"]), int(line["decision"])),
+        actions=actions.reshape(sum(steps), line["action_dim"]),
         steps=steps,
-        versions=tuple(int(v) for v in line["versions"]),
-        rewards=tuple(float(r) for r in line["rewards"]),
-        ended=bool(line["ended"]),
-        success=bool(line["success"]),
+        versions=tuple(line["versions"]),
+        rewards=tuple(line["rewards"]),
+        ended=line["ended"],
+        success=line["success"],
     )
 
 
@@ -112,12 +106,12 @@ def whole_episodes(segments: Iterator[JournalEntry]) -> Iterator[list[JournalEnt
     """Episodes of which all segments are there, in the order of their ends."""
     under_way: dict[tuple[str, int], list[JournalEntry]] = {}
     for segment in segments:
-        name = segment.origin[:2]
-        parts = under_way.get(name, [])
+        episode = segment.origin.task, segment.origin.seed
         if segment.origin.decision == 0:
-            parts = []
-        elif sum(len(part.steps) for part in parts) != segment.origin.decision:
-            continue  # what came before is not there
-        under_way[name] = parts = [*parts, segment]
+            under_way[episode] = []
+        before = under_way.get(episode, [])
+        if sum(len(part.steps) for part in before) != segment.origin.decision:
+            continue  # a segment before this one is missing
+        before.append(segment)
         if segment.ended:
-            yield under_way.pop(name)
+            yield under_way.pop(episode)

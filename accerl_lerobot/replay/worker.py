@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The replay process, between rollout workers and the trainer.
 
-`insert` waits until rollouts are not too far ahead, and `sample` for enough that is new; where they take
-turns, each waits for the other too. `close` ends all waits.
+consumes    segments from rollout workers, and the trainer's notes that a batch has been learned from
+produces    batches for the trainer, and a line of the journal for each real segment
+waits for   in `insert`, until rollouts are not too far ahead; in `sample`, for enough that is new; and where
+            the schedule says so, each waits for the other
+ends        with `close`, which ends all waits, or with an exception in storing or drawing
 """
 
 from __future__ import annotations
@@ -20,12 +23,10 @@ from accerl_lerobot import errors
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.fault_points import fault_point
-from accerl_lerobot.replay.buffer import Replay
+from accerl_lerobot.replay.buffer import ASYNCHRONOUS, SYNCHRONOUS, Replay, ReplayConfig, Schedule
 from accerl_lerobot.replay.journal import EPISODES, Journal
-from accerl_lerobot.replay.pacing import ReplayConfig, Schedule, Turns
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, open_clock
-from accerl_lerobot.transport.connection import Address, Server, serve_on_loop, stopped
-from accerl_lerobot.transport.endpoint import node_address
+from accerl_lerobot.transport.connection import Address, Server, node_address, serve_on_loop, stopped
 
 
 class ReplayWorker:
@@ -46,12 +47,13 @@ class ReplayWorker:
         self._replay = Replay(config, journal)
         self._rng = np.random.default_rng(seed)
         self._changed = asyncio.Condition()
-        self._turns = Turns()
+        self._schedule: Schedule = ASYNCHRONOUS
+        self._learning = 0  # batches drawn of which the trainer has not handed over the weights
         self._batch = 0  # decisions the trainer asked for last
         self._closed = False
+        self._failure: Exception | None = None
         self._in_cluster = in_cluster
         self._server: Server | None = None
-        self._failure: Exception | None = None
         if state is not None:
             saved = snapshot.load(state / "replay")
             self._replay.restore(saved["replay"])
@@ -68,7 +70,7 @@ class ReplayWorker:
         return self._server.address
 
     async def run(self) -> None:
-        """Lasts until `close`; that it ends earlier is how the engine learns of this process's death."""
+        """Lasts until `close`. The engine learns of this process's death by an earlier end."""
         async with self._changed:
             await self._changed.wait_for(lambda: self._closed or self._failure is not None)
             if self._failure is not None:
@@ -88,7 +90,7 @@ class ReplayWorker:
                 for segment in segments:
                     fault_point("replay.insert")
                     self._replay.insert(segment)
-            await self._changed.wait_for(lambda: self._closed or self._turns.may_collect(self._ready))
+            await self._changed.wait_for(lambda: self._closed or self._may_collect())
         return True
 
     async def sample(self, num_decisions: int, trainer_version: int) -> list[Segment]:
@@ -100,34 +102,33 @@ class ReplayWorker:
         self._batch = num_decisions
         async with self._changed:
             while True:
-                await self._changed.wait_for(lambda: ended() or (self._turns.may_draw() and self._ready))
+                await self._changed.wait_for(lambda: ended() or self._may_draw())
                 if ended():
                     return []
                 with self._working():
                     fault_point("replay.sample")
                     segments = self._replay.sample(num_decisions, trainer_version, self._rng)
                 if segments:
-                    self._turns.under_way += 1
+                    self._learning += 1
                     return segments
 
-    @asynccontextmanager
-    async def _changing(self) -> AsyncIterator[None]:
-        async with self._changed:
-            yield
-            self._changed.notify_all()
-
     async def learnt(self) -> None:
+        """Note that the trainer has learned from a batch and handed over its weights."""
         async with self._changing():
-            self._turns.under_way -= 1
+            self._learning -= 1
 
     async def follow(self, schedule: Schedule) -> None:
         async with self._changing():
-            self._turns.schedule = schedule
+            self._schedule = schedule
 
     async def end(self) -> None:
         """Note that no segment will come any more."""
         async with self._changing():
             self._replay.ended = True
+
+    async def close(self) -> None:
+        async with self._changing():
+            self._closed = True
 
     async def save(self, directory: Path, version: int) -> None:
         """Writes its part of ``training_state``, as it was when the trainer had made `version` updates."""
@@ -138,6 +139,30 @@ class ReplayWorker:
         state = {"replay": self._replay.state(version), "rng": copy.deepcopy(self._rng)}
         self._clock.enter(WAIT_IN)
         await asyncio.to_thread(snapshot.save, directory / "replay", state)
+
+    async def metrics(self) -> dict[str, float]:
+        self._clock.beat()
+        return self._replay.metrics()
+
+    def _ready(self) -> bool:
+        return self._batch > 0 and self._replay.may_sample(self._batch)
+
+    def _may_collect(self) -> bool:
+        """True if rollouts may go on. Where not, a batch is ready or learned from, and an update follows."""
+        if self._schedule == ASYNCHRONOUS:
+            return True
+        if self._schedule == SYNCHRONOUS:
+            return not self._ready() and self._learning == 0
+        return not self._ready() or self._learning == 0
+
+    def _may_draw(self) -> bool:
+        return self._ready() and (self._schedule == ASYNCHRONOUS or self._learning <= 0)
+
+    @asynccontextmanager
+    async def _changing(self) -> AsyncIterator[None]:
+        async with self._changed:
+            yield
+            self._changed.notify_all()
 
     @contextmanager
     def _working(self) -> Iterator[None]:
@@ -153,15 +178,3 @@ class ReplayWorker:
         finally:
             self._clock.enter(WAIT_IN)
             self._changed.notify_all()
-
-    @property
-    def _ready(self) -> bool:
-        return self._batch > 0 and self._replay.may_sample(self._batch)
-
-    async def close(self) -> None:
-        async with self._changing():
-            self._closed = True
-
-    async def metrics(self) -> dict[str, float]:
-        self._clock.beat()
-        return self._replay.metrics()

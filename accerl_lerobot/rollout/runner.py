@@ -44,89 +44,6 @@ Starts = deque[tuple[str, Observation]]  # tasks and first observations of real 
 MOST_DROPPED = 20  # episodes in a row that may be dropped before the environment counts as broken
 
 
-@kind
-@dataclass(eq=False)
-class SegmentBuilder:
-    """Collects the decisions of one episode and cuts them into segments of at most `length` decisions."""
-
-    observations: list[Observation]
-    length: int
-    origin: SegmentStart
-    time_limit: int  # env steps of an episode at most
-    source: str = REAL
-    before: int = 0  # env steps of the episode before the first of `taken`
-    taken: list[tuple[Decision, np.ndarray, float, int]] = field(default_factory=list)
-    """Decisions, each with its actions, reward and env steps."""
-
-    @property
-    def latest(self) -> Observation:
-        """The observation that the next decision is about."""
-        return self.observations[-1]
-
-    @property
-    def full(self) -> bool:
-        return len(self.taken) >= self.length
-
-    @property
-    def elapsed(self) -> float:
-        """Share of the time limit that is gone at the next decision."""
-        return (self.before + sum(steps for *_, steps in self.taken)) / self.time_limit
-
-    def add(
-        self, decision: Decision, actions: np.ndarray, reward: float, steps: int, following: Observation
-    ) -> None:
-        self.taken.append((decision, actions, reward, steps))
-        self.observations.append(following)
-
-    def cut(self, key: str, terminated: bool = False, success: bool = False) -> Segment:
-        """Hands out what was collected as one segment and goes on from its last observation."""
-        keys = [k for k in self.observations[0] if k != TASK]
-        decisions, actions, rewards, steps = zip(*self.taken, strict=True)
-        segment = Segment(
-            observations={k: np.stack([np.asarray(o[k]) for o in self.observations]) for k in keys},
-            task=str(self.observations[0][TASK]),
-            latent={k: np.stack([d.latent[k] for d in decisions]) for k in decisions[0].latent},
-            log_prob=np.stack([d.log_prob for d in decisions]).astype(np.float32),
-            actions=np.stack(actions).astype(np.float32),
-            reward=np.array(rewards, np.float32),
-            version=np.array([d.version for d in decisions], np.int64),
-            steps=np.array(steps, np.int64),
-            before=self.before,
-            time_limit=self.time_limit,
-            terminated=terminated,
-            success=success,
-            key=key,
-            source=self.source,
-            origin=self.origin,
-        )
-        self.origin = self.origin._replace(decision=self.origin.decision + len(decisions))
-        self.observations, self.taken = [self.latest], []
-        self.before += int(segment.steps.sum())
-        return segment
-
-
-@kind
-@dataclass(eq=False)
-class ActiveEpisode:
-    """State of one episode under way in `RolloutRunner`."""
-
-    plan: EpisodePlan
-    builder: SegmentBuilder
-    episode_return: float = 0.0
-    steps: int = 0
-    versions: list[int] = field(default_factory=list)  # of the weights of each decision
-    frames: list[np.ndarray] = field(default_factory=list)
-    chunks: list[np.ndarray] = field(default_factory=list)
-    """All that was executed, by which `RolloutRunner.restore` brings the environment back to where it was."""
-
-    def request(self) -> Request:
-        seed = noise_seed(self.plan.seed, len(self.versions))
-        builder = self.builder
-        return Request(
-            observation=builder.latest, noise_seed=seed, elapsed=builder.elapsed, explore=self.plan.explore
-        )
-
-
 @dataclass(frozen=True, kw_only=True)
 class RolloutConfig(Section, section="rollout"):
     """How experience is collected."""
@@ -219,13 +136,14 @@ class EpisodePlans:
             return None
         if self._budget is not None:
             self._budget -= 1
-        number, self.starts = self.starts, self.starts + 1
+        seed = train_seed(self._seed, self.worker, self.starts)
+        self.starts += 1
         shares = {task: max(failing, LEAST_SHARE) for task, failing in self._failing.items()}
         for task, share in shares.items():
             self._owed[task] += share / sum(shares.values())
         task = max(self._tasks, key=self._owed.__getitem__)
         self._owed[task] -= 1
-        return EpisodePlan(task=task, seed=train_seed(self._seed, self.worker, number), explore=True)
+        return EpisodePlan(task=task, seed=seed, explore=True)
 
     def next_imagined(self, exploring: bool, starts: Starts) -> EpisodePlan | None:
         """The same for an imagined environment, which begins at one of `starts`."""
@@ -248,14 +166,22 @@ class EpisodePlans:
         return self._budget is not None and self._budget <= 0
 
     def state(self) -> dict[str, Any]:
-        state: dict[str, Any] = {"budget": self._budget, "starts": self.starts, "imagined": self.imagined}
-        state |= {"queued": list(self._queued)}
-        return state | {"failing": dict(self._failing), "owed": dict(self._owed)}
+        return {
+            "budget": self._budget,
+            "starts": self.starts,
+            "imagined": self.imagined,
+            "queued": list(self._queued),
+            "failing": dict(self._failing),
+            "owed": dict(self._owed),
+        }
 
     def restore(self, state: dict[str, Any]) -> None:
-        self._budget, self.starts, self.imagined = state["budget"], state["starts"], state["imagined"]
+        self._budget = state["budget"]
+        self.starts = state["starts"]
+        self.imagined = state["imagined"]
         self._queued.extend(state["queued"])
-        self._failing, self._owed = dict(state["failing"]), dict(state["owed"])
+        self._failing = dict(state["failing"])
+        self._owed = dict(state["owed"])
 
 
 @kind
@@ -287,6 +213,66 @@ class Counters:
     dropped_episodes: int = 0  # episodes that ended so
     imagined_decisions: int = 0  # those and the next are in no other counter
     imagined_episodes: int = 0
+
+
+@kind
+@dataclass(eq=False)
+class ActiveEpisode:
+    """An episode under way in `RolloutRunner`, and the segment that is collected of it."""
+
+    plan: EpisodePlan
+    time_limit: int  # env steps of an episode at most
+    observations: list[Observation]  # of the segment; the next decision is about the last one
+    taken: list[tuple[Decision, np.ndarray, float, int]] = field(default_factory=list)
+    """Decisions of the segment, each with its actions, reward and env steps."""
+    episode_return: float = 0.0
+    steps: int = 0
+    versions: list[int] = field(default_factory=list)  # of the weights of each decision
+    frames: list[np.ndarray] = field(default_factory=list)
+    chunks: list[np.ndarray] = field(default_factory=list)
+    """All that was executed, by which `RolloutRunner.restore` brings the environment back to where it was."""
+
+    def request(self) -> Request:
+        return Request(
+            observation=self.observations[-1],
+            noise_seed=noise_seed(self.plan.seed, len(self.versions)),
+            elapsed=self.steps / self.time_limit,
+            explore=self.plan.explore,
+        )
+
+    def add(
+        self, decision: Decision, actions: np.ndarray, reward: float, steps: int, following: Observation
+    ) -> None:
+        """Note a decision, of which so many steps were executed, and the observation after them."""
+        self.taken.append((decision, actions, reward, steps))
+        self.observations.append(following)
+        self.episode_return += reward
+        self.steps += steps
+        self.versions.append(decision.version)
+
+    def cut(self, key: str, terminated: bool = False, success: bool = False) -> Segment:
+        """Hands out what was collected as one segment and goes on from its last observation."""
+        observations, self.observations = self.observations, self.observations[-1:]
+        decisions, actions, rewards, steps = zip(*self.taken, strict=True)
+        self.taken = []
+        names = [name for name in observations[0] if name != TASK]
+        return Segment(
+            observations={name: np.stack([np.asarray(o[name]) for o in observations]) for name in names},
+            task=str(observations[0][TASK]),
+            latent={name: np.stack([d.latent[name] for d in decisions]) for name in decisions[0].latent},
+            log_prob=np.stack([d.log_prob for d in decisions]).astype(np.float32),
+            actions=np.stack(actions).astype(np.float32),
+            reward=np.array(rewards, np.float32),
+            version=np.array([d.version for d in decisions], np.int64),
+            steps=np.array(steps, np.int64),
+            before=self.steps - sum(steps),
+            time_limit=self.time_limit,
+            terminated=terminated,
+            success=success,
+            key=key,
+            source=self.plan.source,
+            origin=SegmentStart(self.plan.task, self.plan.seed, len(self.versions) - len(decisions)),
+        )
 
 
 @dataclass(eq=False)
@@ -330,11 +316,10 @@ class RolloutRunner:
             self._episodes[slot] = None
             return None
         observation = environment.reset(plan.seed, plan.task)
-        origin = SegmentStart(plan.task, plan.seed, decision=0)
-        limit = environment.spec.max_steps
-        builder = SegmentBuilder([observation], self.config.segment_length, origin, limit, plan.source)
-        episode = self._episodes[slot] = ActiveEpisode(plan, builder)
-        if bad := nonfinite(observation):
+        episode = ActiveEpisode(plan, environment.spec.max_steps, [observation])
+        self._episodes[slot] = episode
+        bad = nonfinite(observation)
+        if bad:
             return self._drop(slot, episode, f"{bad} of the first observation")
         if plan.explore and plan.source == REAL:
             self.starts.append((plan.task, observation))
@@ -342,7 +327,8 @@ class RolloutRunner:
 
     def advance(self, slot: int, decision: Decision) -> Request | None:
         """Executes `decision`; the request is about the same episode, or the first of the next one."""
-        environment, episode = self.environments[slot], self._episodes[slot]
+        environment = self.environments[slot]
+        episode = self._episodes[slot]
         assert episode is not None
         result = _execute(environment, episode, decision.chunk)
         episode.chunks.append(decision.chunk)
@@ -353,19 +339,16 @@ class RolloutRunner:
             self.counters.imagined_decisions += 1
         bad = nonfinite({"the reward": result.rewards, **result.observation})
         if bad or result.info.get("nonfinite"):
-            self.counters.dropped_nonfinite += len(episode.builder.taken) + 1
+            self.counters.dropped_nonfinite += len(episode.taken) + 1
             return self._drop(slot, episode, bad or "the state of the simulator")
         reward = float(result.rewards.sum())
         if episode.plan.explore:  # what is to be maximised; evaluation reports the environment's own return
             reward -= self.config.decision_cost
-        episode.episode_return += reward
-        episode.steps += result.steps
-        episode.versions.append(decision.version)
         actions = np.clip(decision.chunk, environment.spec.action_low, environment.spec.action_high)
-        episode.builder.add(decision, actions, reward, result.steps, result.observation)
-        if result.done or episode.builder.full:
+        episode.add(decision, actions, reward, result.steps, result.observation)
+        if result.done or len(episode.taken) >= self.config.segment_length:
             self._sequence += 1
-            segment = episode.builder.cut(f"{self.name}.{self._sequence}", result.done, result.success)
+            segment = episode.cut(f"{self.name}.{self._sequence}", result.done, result.success)
             if episode.plan.explore:
                 self.on_segment(segment)
         if result.done:
@@ -376,7 +359,8 @@ class RolloutRunner:
 
     def _drop(self, slot: int, episode: ActiveEpisode, bad: str) -> Request | None:
         """Throws away the rest of an episode; the request of the next one."""
-        plan, note = episode.plan, f"an episode is dropped: {bad} is not finite"
+        plan = episode.plan
+        note = f"an episode is dropped: {bad} is not finite"
         self.counters.dropped_episodes += 1
         self._dropped += 1
         if self._dropped >= MOST_DROPPED:
@@ -415,7 +399,7 @@ class RolloutRunner:
             if kept is not None:
                 environment.restore(kept)
                 continue
-            plan, latest = episode.plan, episode.builder.latest
+            plan, latest = episode.plan, episode.observations[-1]
             observation = environment.reset(plan.seed, plan.task)
             for chunk in episode.chunks:
                 observation = environment.step_chunk(chunk).observation
@@ -461,17 +445,10 @@ def _execute(environment: Environment, episode: ActiveEpisode, actions: np.ndarr
         result = environment.step_chunk(actions[i : i + every])
         rewards.append(result.rewards)
         with for_viewing("film"):
-            episode.frames.append(_frame(environment, side))
+            episode.frames.append(np.asarray(environment.render(side, side)))
         if result.done:
             break
     return replace(result, rewards=np.concatenate(rewards))
-
-
-def _frame(environment: Environment, side: int) -> np.ndarray:
-    frame = np.asarray(environment.render(side, side))
-    if frame.shape != (side, side, 3) or frame.dtype != np.uint8:
-        raise ValueError(f"a frame is {frame.dtype} {frame.shape}, not uint8 ({side}, {side}, 3)")
-    return frame
 
 
 def nonfinite(observation: Observation) -> str:

@@ -39,7 +39,7 @@ from accerl_lerobot.rollout.runner import (
     Starts,
 )
 from accerl_lerobot.timeline import COMPUTE, TRANSPORT, WAIT_IN, WAIT_OUT, WEIGHT_SYNC, open_clock
-from accerl_lerobot.transport.endpoint import Endpoint, ReconnectingClient
+from accerl_lerobot.transport.connection import Client, Endpoint, ReconnectingClient
 
 if TYPE_CHECKING:
     from accerl_lerobot.world_model.config import ImaginationConfig
@@ -49,6 +49,7 @@ PARTS = 2
 made."""
 MAX_PENDING = 2  # messages to replay that may be pending before exploring environments pause
 PAUSE_S = 0.005  # between two looks at whether there is something to do
+DECISION_S = 0.5  # longest wait for a decision before orders and replay are looked at
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +82,8 @@ class RolloutWorker:
         # A node that does not see the run's folder would write a timeline where it is not looked for.
         seen = timeline is not None and timeline.parent.is_dir()
         self._clock = open_clock(timeline if seen else None, name)
-        self._config, self._spent = config, False
+        self._config = config
+        self._spent = False
         self._max_pending = MAX_PENDING
         # Shared by the two threads: appending to and popping from a deque is atomic.
         self._results: deque[EpisodeResult] = deque()
@@ -89,6 +91,10 @@ class RolloutWorker:
         self._active: tuple[float, bool] | None = None  # since when the thread does what, see `Report`
         self._moves = 0
         self._outbox: list[Segment] = []
+        self._idle: list[int] = []  # slots without an episode
+        self._due: dict[int, Request] = {}  # slot → request to be sent
+        self._asked: dict[int, list[int]] = {}  # ticket of a message to inference → its slots
+        self._pending: dict[int, bool] = {}  # ticket of a message to replay → it has real segments
         self._environments = [
             make_environment(env, history, config.reward_model) for _ in range(config.environments)
         ]
@@ -97,6 +103,7 @@ class RolloutWorker:
         self._new_world: deque[tuple[int, Any]] = deque(maxlen=1)
         if imagination is not None and imagination.environments:
             self._imagine(imagination)
+        self._together = max(1, len(self._environments) // PARTS)  # requests in a message
         self._clock.enter(WAIT_IN)
 
     def ready(self, plans: EpisodePlans | None = None, begun: Sequence[tuple[str, int]] = ()) -> int:
@@ -106,13 +113,18 @@ class RolloutWorker:
         """
         if plans is not None:
             self._plans = plans
-            name = f"rollout{plans.worker}.{plans.incarnation}"
-            callbacks = self._outbox.append, self._end
             self._starts.clear()
-            for task, seed in begun if self._world is not None else ():
-                self._starts.append((task, self._environments[0].reset(seed, task)))
+            if self._world is not None:
+                for task, seed in begun:
+                    self._starts.append((task, self._environments[0].reset(seed, task)))
             self._runner = RolloutRunner(
-                self._environments, self._next, self._config, name, *callbacks, self._starts
+                self._environments,
+                self._next,
+                self._config,
+                f"rollout{plans.worker}.{plans.incarnation}",
+                self._outbox.append,
+                self._end,
+                self._starts,
             )
         return os.getpid()
 
@@ -144,47 +156,67 @@ class RolloutWorker:
 
     def run(self, inference: Endpoint, replay: Endpoint) -> None:
         """Steps environments until the process ends."""
-        deciding, storing = ReconnectingClient("inference"), replay.connect()
-        deciding.move(inference)
-        idle = list(range(len(self._runner)))
-        due: dict[int, Request] = {}
-        under_way: dict[int, list[int]] = {}
-        pending: dict[int, bool] = {}  # tickets of messages to replay; True: with real segments
-        size = max(1, len(self._runner) // PARTS)
-        patience = 0.0
+        deciding = ReconnectingClient(inference)
+        storing = replay.connect()
+        self._idle = list(range(len(self._runner)))
+        pause = 0.0
         while True:
             self._active = time.monotonic(), False
-            for ticket, _ in storing.done(patience):
-                pending.pop(ticket, None)
-            while self._outbox:
-                self._clock.enter(TRANSPORT)
-                if fault_point("rollout.send"):
-                    self._outbox[0].reward = self._outbox[0].reward * np.float32(np.nan)
-                is_real = any(segment.source == REAL for segment in self._outbox[:size])
-                pending[storing.send(self._outbox[:size])] = is_real
-                del self._outbox[:size]
-            self._spent = self._plans.spent and not self._runner.exploring and not any(pending.values())
+            for ticket, _ in storing.done(pause):
+                del self._pending[ticket]
+            self._send_segments(storing)
             if self._new_world:
                 self._clock.enter(WEIGHT_SYNC)
                 self._world.load(*self._new_world.popleft())
-            if not self._training.is_set():  # so that planned episodes need not wait for exploring ones
-                idle += [slot for slot, request in due.items() if request.explore]
-                due = {slot: request for slot, request in due.items() if not request.explore}
-            idle = [slot for slot in idle if not self._step(slot, None, due)]
-            sendable = [slot for slot in due if len(pending) < self._max_pending or not due[slot].explore]
-            for start in range(0, len(sendable), size):
-                self._clock.enter(TRANSPORT)
-                slots = sendable[start : start + size]
-                under_way[deciding.send([due.pop(slot) for slot in slots])] = slots
+            self._begin_episodes()
+            self._send_requests(deciding)
             # Where no decision is awaited, there is nothing to wait for but replay, and orders.
-            patience = 0.0 if under_way else PAUSE_S
-            self._clock.enter(WAIT_IN if under_way or not due else WAIT_OUT)
-            for ticket, decisions in deciding.done(0.5) if under_way else ():
-                for slot, decision in zip(under_way.pop(ticket), decisions, strict=True):
-                    self._clock.enter(COMPUTE)
-                    fault_point("rollout.decided")
-                    if not self._step(slot, decision, due):
-                        idle.append(slot)
+            pause = 0.0 if self._asked else PAUSE_S
+            self._execute_decisions(deciding)
+
+    def _send_segments(self, storing: Client) -> None:
+        while self._outbox:
+            self._clock.enter(TRANSPORT)
+            segments = self._outbox[: self._together]
+            if fault_point("rollout.send"):
+                segments[0].reward = segments[0].reward * np.float32(np.nan)
+            is_real = any(segment.source == REAL for segment in segments)
+            self._pending[storing.send(segments)] = is_real
+            del self._outbox[: self._together]
+        unstored = any(self._pending.values())
+        self._spent = self._plans.spent and not self._runner.exploring and not unstored
+
+    def _begin_episodes(self) -> None:
+        """In every idle slot; once training has ended, also where an exploring episode is under way."""
+        if not self._training.is_set():
+            for slot, request in list(self._due.items()):
+                if request.explore:
+                    del self._due[slot]
+                    self._idle.append(slot)
+        self._idle = [slot for slot in self._idle if not self._step(slot, None)]
+
+    def _send_requests(self, deciding: ReconnectingClient) -> None:
+        """Ask for decisions; not for exploring ones while replay does not take segments."""
+        paused = len(self._pending) >= self._max_pending
+        slots = [slot for slot, request in self._due.items() if not (paused and request.explore)]
+        for start in range(0, len(slots), self._together):
+            self._clock.enter(TRANSPORT)
+            part = slots[start : start + self._together]
+            ticket = deciding.send([self._due.pop(slot) for slot in part])
+            self._asked[ticket] = part
+
+    def _execute_decisions(self, deciding: ReconnectingClient) -> None:
+        """Wait for decisions, if any is under way, and execute them."""
+        if not self._asked:
+            self._clock.enter(WAIT_OUT if self._due else WAIT_IN)
+            return
+        self._clock.enter(WAIT_IN)
+        for ticket, decisions in deciding.done(DECISION_S):
+            for slot, decision in zip(self._asked.pop(ticket), decisions, strict=True):
+                self._clock.enter(COMPUTE)
+                fault_point("rollout.decided")
+                if not self._step(slot, decision):
+                    self._idle.append(slot)
 
     def _next(self, source: str) -> EpisodePlan | None:
         exploring = self._training.is_set()
@@ -211,7 +243,7 @@ class RolloutWorker:
         self._plans.ended(result)
         self._results.append(result)
 
-    def _step(self, slot: int, decision: Decision | None, due: dict[int, Request]) -> bool:
+    def _step(self, slot: int, decision: Decision | None) -> bool:
         """Begin an episode, or execute a decision; False if nothing is due in this slot then."""
         self._active = time.monotonic(), True
         if decision is None:
@@ -222,5 +254,5 @@ class RolloutWorker:
         self._active = time.monotonic(), False
         self._moves += decision is not None or request is not None
         if request is not None:
-            due[slot] = request
+            self._due[slot] = request
         return request is not None

@@ -4,7 +4,7 @@
     replay ──batch──► rank 0 ──its reference──► ranks 1, 2 …
                         ◄── torch.distributed: values, gradients, parts of weights ──►
 
-What takes all ranks is done within `Peers.joining`: the others are told, do the same, and are waited for. A
+Work of all ranks is done within `Peers.joining`: the others are told, do the same, and are waited for. A
 rank that is lost ends the wait, after `SHARE` of ``launch.stall_s`` at the latest, and with it the trainer.
 """
 
@@ -28,7 +28,6 @@ from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.policies.config import Load, PolicyConfig, loader
 
 if TYPE_CHECKING:
-    from accerl_lerobot.algorithms.ranks import Ranks, Rendezvous
     from accerl_lerobot.algorithms.ratio_update import BaseUpdate
 
 LOAD_S = 600.0  # how long a rank may take to load its policy
@@ -54,11 +53,11 @@ class LearnerSettings(NamedTuple):
         torch.manual_seed(self.seed)
         return loader(self.load)(self.policy)
 
-    def begin(self, adapter: Any, ranks: Ranks) -> BaseUpdate:
-        """The updates, from the state on; what ranks share out is shared out then."""
+    def begin(self, adapter: Any) -> BaseUpdate:
+        """The updates, from the state on, once all ranks have come together."""
         from accerl_lerobot.algorithms.ratio_update import make_update
 
-        update = make_update(adapter, self.algorithm, self.trainer, ranks)
+        update = make_update(adapter, self.algorithm, self.trainer)
         if self.state is not None:
             adapter.load_trainable(snapshot.load(self.state / WEIGHTS))
             update.restore(snapshot.load(self.state / "trainer"))
@@ -70,7 +69,8 @@ class TrainerRank:
 
     def __init__(self, rank: int, settings: LearnerSettings) -> None:
         errors.collect_warnings()
-        self._rank, self._settings, self._adapter = rank, settings, settings.adapter()
+        self._rank, self._settings = rank, settings
+        self._adapter = settings.adapter()
 
     def ready(self) -> int:
         """Answers once the policy is loaded; returns this process's id."""
@@ -83,42 +83,36 @@ class TrainerRank:
         """Nothing: the first rank reports for all. Answering shows that it is not stuck."""
         return {}
 
-    def join(self, rendezvous: Rendezvous) -> None:
+    def join(self, address: str, port: int) -> None:
         from accerl_lerobot.algorithms import ranks
 
         size, timeout_s = self._settings.trainer.ranks, self._settings.timeout_s
-        here = rendezvous.address == ranks.LOOPBACK
-        ranks.use_only(ranks.LOOPBACK if here else ray.util.get_node_ip_address())
-        store = ranks.join(rendezvous, size, timeout_s)
-        group = ranks.Group(store, self._rank, size, self._adapter.device, timeout_s)
-        self._update = self._settings.begin(self._adapter, group)
+        ranks.use_only(address if address == ranks.LOOPBACK else ray.util.get_node_ip_address())
+        store = ranks.store_at(address, port, size, timeout_s)
+        ranks.join(store, self._rank, size, self._adapter.device, timeout_s)
+        self._update = self._settings.begin(self._adapter)
 
     def step(self, segments: Sequence[Segment]) -> None:
         fault_point("rank.step")
         self._update.step(segments)
 
-    def lend_weights(self) -> None:
+    def gather_weights(self) -> None:
         """Its part of the trainable weights, for the first rank to export."""
-        from accerl_lerobot.checkpoint.tensors import lending
+        self._adapter.export_trainable()
 
-        with lending():
-            self._adapter.export_trainable()
-
-    def lend_state(self) -> None:
+    def gather_state(self) -> None:
         """Its part of all that is saved, in the order in which the first rank asks for it."""
-        from accerl_lerobot.checkpoint.tensors import lending
-
-        with lending():
-            self._adapter.copy_weights()
-            self.lend_weights()
-            self._update.state()
+        self._adapter.copy_weights()
+        self._adapter.export_trainable()
+        self._update.state()
 
 
 class Peers:
     """The others, as the first rank sees them: `actors` are handles of `TrainerRank`, of rank 1, 2 …."""
 
     def __init__(self, actors: Sequence[Any], config: TrainerConfig, timeout_s: float) -> None:
-        self._actors, self._config, self._timeout_s = list(actors), config, timeout_s
+        self._actors = list(actors)
+        self._config, self._timeout_s = config, timeout_s
 
     def begin(self, settings: LearnerSettings) -> BaseUpdate:
         """Loads the first rank's policy and meets the others, once they have loaded theirs."""
@@ -126,25 +120,26 @@ class Peers:
 
         adapter = settings.adapter()
         if not self._actors:
-            return settings.begin(adapter, ranks.ALONE)
+            return settings.begin(adapter)
         # Actors of one thread: by then they have loaded their policies.
         nodes = ray.get([actor.node.remote() for actor in self._actors], timeout=LOAD_S)
-        address = ranks.LOOPBACK
-        if set(nodes) != {str(ray.get_runtime_context().get_node_id())}:
-            address = ray.util.get_node_ip_address()
+        this_node = str(ray.get_runtime_context().get_node_id())
+        address = ranks.LOOPBACK if set(nodes) == {this_node} else ray.util.get_node_ip_address()
         ranks.use_only(address)
-        size, timeout_s = self._config.ranks, self._timeout_s
-        store, rendezvous = ranks.create(address, size, timeout_s)
-        with self.joining("join", rendezvous):
-            return settings.begin(adapter, ranks.Group(store, 0, size, adapter.device, timeout_s))
+        size = self._config.ranks
+        store, port = ranks.open_store(address, size, self._timeout_s)
+        with self.joining("join", address, port):
+            ranks.join(store, 0, size, adapter.device, self._timeout_s)
+            return settings.begin(adapter)
 
     @contextmanager
     def joining(self, method: str, *arguments: Any) -> Iterator[None]:
         """They do `method` while the first rank does its part inside; an error of theirs is raised here."""
         calls = [getattr(actor, method).remote(*arguments) for actor in self._actors]
         yield
-        ray.get(calls, timeout=self._timeout_s)
+        if calls:
+            ray.get(calls, timeout=self._timeout_s)
 
-    def lending(self, method: str) -> AbstractContextManager[None]:
-        """As `joining`, for what takes all ranks only where each keeps a part of the weights."""
+    def gathering(self, method: str) -> AbstractContextManager[None]:
+        """As `joining`, for work of all ranks only where each keeps a part of the weights."""
         return self.joining(method) if self._config.zero else nullcontext()

@@ -23,8 +23,9 @@ from accerl_lerobot import errors
 from accerl_lerobot.algorithms.batch import save_batch_if_not_finite
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import PRETRAINED, TRAINING_STATE, WEIGHTS
+from accerl_lerobot.experience import Segment
 from accerl_lerobot.fault_points import fault_point
-from accerl_lerobot.replay.pacing import ASYNCHRONOUS, Schedule
+from accerl_lerobot.replay.buffer import ASYNCHRONOUS, Schedule
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
 from accerl_lerobot.trainer.peers import LearnerSettings, Peers
 from accerl_lerobot.transport.weights import PublishDelay, WeightPublisher
@@ -75,7 +76,7 @@ class TrainerWorker:
         self._clock.enter(WEIGHT_SYNC)
         # A checkpoint need not hold a critic: all start from this one.
         with self._lock:
-            self._publish(PublishDelay(0), last=False)
+            self._publish(PublishDelay(0))
         self._train(replay)
         self._clock.enter(WEIGHT_SYNC)
         self._publisher.flush()
@@ -87,53 +88,61 @@ class TrainerWorker:
         return self._publisher.newer_than(reader, version)
 
     def _train(self, replay: Any) -> None:
-        held = PublishDelay(self._config.hold_back)
-        n, config = self._config.batch_decisions, self._config
-        upcoming = replay.sample.remote(n, self._update.version)
+        """Until the last update: take the batch, ask for the next one, step, publish."""
+        decisions, updates = self._config.batch_decisions, self._config.updates
+        delay = PublishDelay(self._config.hold_back)
+        upcoming = replay.sample.remote(decisions, self._update.version)
         asked = time.monotonic()
-        while self._update.version < config.updates:
+        while self._update.version < updates:
+            batch = upcoming
             self._clock.enter(WAIT_IN)
-            ray.wait([upcoming], timeout=None)
+            ray.wait([batch], timeout=None)
             self._clock.enter(TRANSPORT)
-            batch, segments = upcoming, ray.get(upcoming)
+            segments = ray.get(batch)
             if not segments:
                 break
             waited = time.monotonic() - asked
             if self._online is not None:
                 self._online.learn.remote(batch)
-            if self._update.version + 1 < config.updates:
-                upcoming = replay.sample.remote(n, self._update.version + 1)
-            self._clock.enter(CHECKPOINT)
+            if self._update.version + 1 < updates:
+                upcoming = replay.sample.remote(decisions, self._update.version + 1)
+            self._clock.enter(CHECKPOINT)  # while another thread holds the lock
             with self._lock:
-                self._clock.enter(COMPUTE)
-                started = time.monotonic()
-                fault_point("trainer.update")
-                with (
-                    self._peers.joining("step", batch),
-                    save_batch_if_not_finite(self._directory, self._update, segments),
-                ):
-                    metrics = self._update.step(segments)
-                updated = time.monotonic()
-                self._clock.enter(WEIGHT_SYNC)
-                self._publish(held, last=self._update.version == config.updates)
-                if self._in_turn:
-                    self._publisher.flush()
-                metrics |= {"update": float(self._update.version), "wait_s": waited}
-                metrics |= {"update_s": updated - started, "publish_s": time.monotonic() - updated}
-                self._history.append(metrics)
+                self._step(batch, segments, waited, delay)
             asked = time.monotonic()
             replay.learnt.remote()
         with self._lock:
             if self._publisher.version < self._update.version:
-                # It has ended early, and what is evaluated is to be what is saved.
-                self._publish(held, last=True)
+                # It has ended early, and the saved weights are evaluated.
+                self._publish(delay, last=True)
 
-    def _publish(self, held: PublishDelay, last: bool) -> None:
-        """Hands the weights of now over, or those that are old enough."""
+    def _step(self, batch: Any, segments: list[Segment], waited: float, delay: PublishDelay) -> None:
+        """Make an update on segments, of which `batch` is the reference, and publish its weights."""
+        self._clock.enter(COMPUTE)
+        started = time.monotonic()
+        fault_point("trainer.update")
+        with (
+            self._peers.joining("step", batch),
+            save_batch_if_not_finite(self._directory, self._update, segments),
+        ):
+            metrics = self._update.step(segments)
+        updated = time.monotonic()
+        self._clock.enter(WEIGHT_SYNC)
+        self._publish(delay, last=self._update.version == self._config.updates)
+        if self._in_turn:
+            self._publisher.flush()
+        metrics["update"] = float(self._update.version)
+        metrics["wait_s"] = waited
+        metrics["update_s"] = updated - started
+        metrics["publish_s"] = time.monotonic() - updated
+        self._history.append(metrics)
+
+    def _publish(self, delay: PublishDelay, last: bool = False) -> None:
+        """Hands over the weights of now, or those that are old enough."""
         adapter = self._update.adapter
-        with self._peers.lending("lend_weights"):
+        with self._peers.gathering("gather_weights"):
             weights = adapter.export_trainable() if self._config.hold_back else adapter.view_trainable()
-        for version, tensors in held.push(self._update.version, weights, last=last):
+        for version, tensors in delay.push(self._update.version, weights, last=last):
             fault_point("trainer.publish")
             self._publisher.publish(version, tensors)
 
@@ -152,7 +161,7 @@ class TrainerWorker:
         Returns its version, and the records up to it that `metrics` has not given.
         """
         with self._lock:
-            with self._peers.lending("lend_state"):
+            with self._peers.gathering("gather_state"):
                 adapter = self._update.adapter
                 self._kept = adapter.copy_weights(), adapter.export_trainable(), self._update.state()
             return self._update.version, self.metrics()

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import os
 import pickle
 import queue
@@ -40,16 +41,27 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-CONNECT_S = 10  # timeout for connecting to a service, and for each step of proving the key
-IN_PIECES = 4096  # bytes from which on an array is not copied into the pickle
-BACKLOG = 1024  # clients that may wait to be accepted
+logger = logging.getLogger(__name__)
+
+ADDRESS_S = 60.0  # timeout for a service to say where it is reached
+CONNECT_S = 30.0  # timeout of a client for connecting, and for each step of proving the key
+ACCEPT_S = 10.0  # timeout of a service for each step of proving the key; other clients wait meanwhile
+RETRY_S = 1.0  # pause between two attempts to reach a service that was lost, and timeout of each
 SEND_S = 0.05  # how long `Client.send` waits for the service to read, before it leaves the rest to `done`
 OLDEST_S = 60.0  # largest age of a message that is believed; clocks of other nodes differ
-_HEAD = struct.Struct("<II")
+IN_PIECES = 4096  # bytes from which on an array is not copied into the pickle
+BACKLOG = 1024  # clients that may wait to be accepted
+PIECES_AT_ONCE = 64  # pieces of memory per call of ``sendmsg``
+_HEAD = struct.Struct("<II")  # bytes of the pickle, number of arrays behind it
 
 
 class ServiceStoppedError(RuntimeError):
     """The service had failed or is gone; the caller did nothing wrong."""
+
+
+def stopped(error: BaseException) -> ServiceStoppedError:
+    """The error that a client gets for a failure of the service."""
+    return ServiceStoppedError(f"the service has stopped: {error!r}")
 
 
 class Address(NamedTuple):
@@ -59,8 +71,29 @@ class Address(NamedTuple):
     key: bytes
 
 
-def _family(at: str | tuple[str, int]) -> socket.AddressFamily:
-    return socket.AF_UNIX if isinstance(at, str) else socket.AF_INET
+def node_address(in_cluster: bool) -> str | None:
+    """This node's address if workers of other nodes are to reach services here; None: they need not."""
+    if not in_cluster:
+        return None
+    import ray
+
+    return str(ray.util.get_node_ip_address())
+
+
+def _socket(at: str | tuple[str, int]) -> socket.socket:
+    return socket.socket(socket.AF_UNIX if isinstance(at, str) else socket.AF_INET)
+
+
+def _proved(
+    end: socket.socket, key: bytes, timeout: float, *steps: Callable[[Any, bytes], object]
+) -> socket.socket:
+    """The socket again, once both ends have proved to each other that they know the key."""
+    end.settimeout(None)
+    end.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("ll", int(timeout), 0))
+    with Connection(end.detach()) as connection:
+        for step in steps:
+            step(connection, key)
+        return socket.socket(fileno=os.dup(connection.fileno()))
 
 
 class Stream:
@@ -71,6 +104,7 @@ class Stream:
         self.socket.setblocking(False)
         if self.socket.family != socket.AF_UNIX:
             self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self.closed = False
         self.unsent: deque[memoryview] = deque()
         self._received: list[Any] = []
         self._views = self._read_messages()
@@ -85,20 +119,22 @@ class Stream:
 
         def is_small(buffer: pickle.PickleBuffer) -> bool:
             raw = buffer.raw()
-            if raw.nbytes >= IN_PIECES:
+            small = raw.nbytes < IN_PIECES
+            if not small:
                 pieces.append(raw)
-            return raw.nbytes < IN_PIECES
+            return small
 
         head = pickle.dumps(message, protocol=5, buffer_callback=is_small)
         sizes = struct.pack(f"<{len(pieces)}Q", *(piece.nbytes for piece in pieces))
-        self.unsent += [memoryview(_HEAD.pack(len(head), len(pieces)) + sizes + head), *pieces]
+        self.unsent.append(memoryview(_HEAD.pack(len(head), len(pieces)) + sizes + head))
+        self.unsent.extend(pieces)
         self.flush()
 
     def flush(self) -> None:
         """Send what is left of messages, as far as the socket takes it."""
         while self.unsent:
             try:
-                sent = self.socket.sendmsg(list(self.unsent)[:64])
+                sent = self.socket.sendmsg(list(self.unsent)[:PIECES_AT_ONCE])
             except BlockingIOError:
                 return
             while self.unsent and sent >= self.unsent[0].nbytes:
@@ -113,18 +149,17 @@ class Stream:
     def receive(self) -> list[Any]:
         """Messages that have come. An `EOFError` if the other end is gone."""
         with contextlib.suppress(BlockingIOError):
-            size = self.socket.recv_into(self._view)
-            while size:
+            while size := self.socket.recv_into(self._view):
                 self._view = self._view[size:]
                 while not self._view:
                     self._view = next(self._views)
-                size = self.socket.recv_into(self._view)
             if not self._received:
                 raise EOFError("its end of the connection is closed")
         received, self._received = self._received, []
         return received
 
     def close(self) -> None:
+        self.closed = True
         self.socket.close()
         self.unsent.clear()
 
@@ -142,16 +177,6 @@ class Stream:
             self._received.append(pickle.loads(head[8 * count :], buffers=pieces))
 
 
-def _proved(end: socket.socket, *steps: Callable[[Any, bytes], object], key: bytes) -> socket.socket:
-    """The socket again, once both ends have proved to each other that they know the key."""
-    end.settimeout(None)
-    end.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("ll", CONNECT_S, 0))
-    with Connection(end.detach()) as connection:
-        for step in steps:
-            step(connection, key)
-        return socket.socket(fileno=os.dup(connection.fileno()))
-
-
 class Client:
     """One connection to a service, for one thread at a time.
 
@@ -160,11 +185,11 @@ class Client:
 
     def __init__(self, name: str, address: Address) -> None:
         self.name = name
-        end = socket.socket(_family(address.at))
+        end = _socket(address.at)
         end.settimeout(CONNECT_S)
         try:
             end.connect(address.at)
-            end = _proved(end, answer_challenge, deliver_challenge, key=address.key)
+            end = _proved(end, address.key, CONNECT_S, answer_challenge, deliver_challenge)
         except (OSError, EOFError, AuthenticationError) as error:
             end.close()
             raise ServiceStoppedError(f"{name} cannot be connected to: {error}") from error
@@ -173,25 +198,27 @@ class Client:
         self._replies: list[tuple[int, Any]] = []
         self._sent = 0
 
-    def send(self, message: Any) -> int:
-        """Send without waiting for a reply; returns a ticket."""
+    def send(self, message: Any, ticket: int | None = None) -> int:
+        """Send without waiting for a reply; returns the ticket, a new one unless the caller gives one."""
         self._sent += 1
+        if ticket is None:
+            ticket = self._sent
         try:
-            self._stream.send((self._sent, time.monotonic(), message))
+            self._stream.send((ticket, time.monotonic(), message))
             deadline = time.monotonic() + SEND_S
             while self._stream.unsent and time.monotonic() < deadline:
-                self._advance(SEND_S)
+                self._exchange(SEND_S)
         except OSError as error:
             raise self._gone(error) from error
         self._stream.detach()
-        return self._sent
+        return ticket
 
     def done(self, timeout: float) -> list[tuple[int, Any]]:
         """Tickets and replies that have come, each once; waits `timeout` seconds for the first."""
         deadline = time.monotonic() + timeout
         while not self._replies:
             left = deadline - time.monotonic()
-            self._advance(max(0.0, left))
+            self._exchange(max(0.0, left))
             if left <= 0:
                 break
         replies, self._replies = self._replies, []
@@ -201,7 +228,7 @@ class Client:
         """End the connection and forget what is under way. Safe to call twice."""
         self._stream.close()
 
-    def _advance(self, timeout: float) -> None:
+    def _exchange(self, timeout: float) -> None:
         """Wait until the socket can be read or, with something unsent, written; read and write."""
         events = select.POLLIN | (select.POLLOUT if self._stream.unsent else 0)
         try:
@@ -221,26 +248,109 @@ class Client:
         return ServiceStoppedError(f"{self.name} is gone: {reason}")
 
 
-@dataclass(eq=False)
-class PendingRequest:
-    """A message at the service; answered or failed once, on the thread that polls.
+@dataclass(frozen=True, kw_only=True)
+class Endpoint:
+    """A service of a worker, whose ``listen`` says where it is reached now."""
 
-    `sent` is on `time.monotonic`; `gone` tells that the answer is not awaited any more.
+    name: str
+    actor: Any = None  # Ray's handle of its process, and of the next one if that is restarted
+
+    def connect(self, timeout_s: float = ADDRESS_S) -> Client:
+        """A new connection. A `ServiceStoppedError` if the service does not answer in time."""
+        import ray
+
+        try:
+            address = ray.get(self.actor.listen.remote(), timeout=timeout_s)
+        except ray.exceptions.RayError as error:
+            raise ServiceStoppedError(f"{self.name}: {error}") from error
+        return Client(self.name, address)
+
+
+class ReconnectingClient:
+    """Connects again to a service that was lost, or to its successor, and asks what has not been answered.
+
+    For services without a state of their own: a request for a decision carries its noise, and the decision
+    the version of its weights. While the service is away no replies come and nothing fails. Messages must not
+    change until they are answered.
     """
 
+    def __init__(self, endpoint: Endpoint) -> None:
+        self._endpoint = endpoint
+        self._client: Client | None = None
+        self._retry_at = 0.0
+        self._unanswered: dict[int, Any] = {}  # ticket → message
+        self._sent = 0
+
+    def send(self, message: Any) -> int:
+        self._sent += 1
+        self._unanswered[self._sent] = message
+        if self._client is None:
+            self._connect()
+        else:
+            self._send(self._sent)
+        return self._sent
+
+    def done(self, timeout: float) -> list[tuple[int, Any]]:
+        if self._client is None:
+            self._connect()
+        if self._client is None:
+            time.sleep(min(timeout, RETRY_S / 10))
+            return []
+        try:
+            replies = self._client.done(timeout)
+        except ServiceStoppedError as error:
+            self._lose(error)
+            return []
+        for ticket, _ in replies:
+            del self._unanswered[ticket]
+        return replies
+
+    def _connect(self) -> None:
+        """Connect where the service is now, unless that was tried a moment ago, and ask again."""
+        if time.monotonic() < self._retry_at:
+            return
+        try:
+            self._client = self._endpoint.connect(RETRY_S)
+        except ServiceStoppedError as error:
+            self._lose(error)
+        for ticket in self._unanswered:
+            self._send(ticket)
+
+    def _send(self, ticket: int) -> None:
+        if self._client is not None:
+            try:
+                self._client.send(self._unanswered[ticket], ticket)
+            except ServiceStoppedError as error:
+                self._lose(error)
+
+    def _lose(self, error: ServiceStoppedError) -> None:
+        logger.info("%s", error)
+        self._retry_at = time.monotonic() + RETRY_S
+        if self._client is not None:
+            self._client.close()
+            self._client = None
+
+
+@dataclass(eq=False)
+class PendingRequest:
+    """A message at the service; answered or failed once, on the thread that polls."""
+
     message: Any
-    sent: float
-    gone: Callable[[], bool]
-    reply: Callable[[Any, bool], None]
+    sent: float  # on this process's `time.monotonic`
+    ticket: int
+    stream: Stream
+    server: Server
+
+    def gone(self) -> bool:
+        """True if the answer is not awaited any more."""
+        return self.stream.closed
 
     def answer(self, reply: Any) -> None:
-        if not self.gone():
-            self.reply(reply, False)
+        self.server.reply(self, reply)
 
     def fail(self, error: BaseException) -> None:
         """Raise a `ServiceStoppedError` that names this error at the client."""
-        if not self.gone():
-            self.reply(str(stopped(error)), True)
+        self.server.reply(self, str(stopped(error)), failed=True)
 
     def __len__(self) -> int:
         return len(self.message)
@@ -257,18 +367,18 @@ class Server:
         at: str | tuple[str, int] = (host or "127.0.0.1", 0)
         if host is None and sys.platform == "linux":
             at = f"\0accerl-{secrets.token_hex(16)}"
-        self._listener = socket.socket(_family(at))
+        self._listener = _socket(at)
         self._listener.bind(at)
         self._listener.listen(BACKLOG)
-        reached_at = at if isinstance(at, str) else self._listener.getsockname()
-        self.address = Address(reached_at, secrets.token_bytes(32))
+        if not isinstance(at, str):
+            at = self._listener.getsockname()
+        self.address = Address(at, secrets.token_bytes(32))
         self._accepted: queue.SimpleQueue[socket.socket] = queue.SimpleQueue()
         self._woken, self._waker = socket.socketpair()
-        for end in (self._woken, self._waker):
-            end.setblocking(False)
+        self._woken.setblocking(False)
+        self._waker.setblocking(False)
         self._selector = selectors.DefaultSelector()
         self._selector.register(self._woken, selectors.EVENT_READ)
-        self._streams: set[Stream] = set()
         self._closed = False
         threading.Thread(target=self._accept, daemon=True).start()
 
@@ -288,16 +398,25 @@ class Server:
             if key.fileobj is self._woken:
                 self._woken.recv(4096)
                 while not self._accepted.empty():
-                    stream = Stream(self._accepted.get())
-                    self._streams.add(stream)
-                    self._selector.register(stream, selectors.EVENT_READ)
-                continue
-            if events & selectors.EVENT_WRITE:
-                self._flush(key.fileobj)
-            if events & selectors.EVENT_READ:
-                requests += self._receive(key.fileobj)
+                    self._selector.register(Stream(self._accepted.get()), selectors.EVENT_READ)
+            else:
+                requests += self._exchange(key.fileobj, events)
         for request in sorted(requests, key=lambda request: request.sent):
             self._take(request)
+
+    def reply(self, request: PendingRequest, value: Any, failed: bool = False) -> None:
+        """Answer a request, unless its client is gone; see `PendingRequest`."""
+        stream = request.stream
+        if stream.closed:
+            return
+        try:
+            stream.send((request.ticket, value, failed))
+        except OSError:
+            self._drop(stream)
+            return
+        if stream.unsent:
+            stream.detach()
+            self._selector.modify(stream, selectors.EVENT_READ | selectors.EVENT_WRITE)
 
     def close(self) -> None:
         """End all connections."""
@@ -306,30 +425,23 @@ class Server:
             self._listener.shutdown(socket.SHUT_RDWR)  # ends the thread that accepts
         self._listener.close()
         self._close_accepted()
-        for stream in list(self._streams):
-            self._drop(stream)
+        for key in list(self._selector.get_map().values()):
+            if key.fileobj is not self._woken:
+                self._drop(key.fileobj)
 
     def _accept(self) -> None:
-        while True:
+        """Take in clients that know the key, on a thread of its own."""
+        while not self._closed:
             try:
                 end, _ = self._listener.accept()
             except OSError:
-                if self._closed:
-                    return
-                time.sleep(0.1)  # such as too many open files
+                time.sleep(0.1)  # closed, or too many open files
                 continue
-            # On a thread, as a stranger might connect and then not say a word.
-            threading.Thread(target=self._welcome, args=(end,), daemon=True).start()
-
-    def _welcome(self, end: socket.socket) -> None:
-        """Take a client in that knows the key."""
-        try:
-            self._accepted.put(_proved(end, deliver_challenge, answer_challenge, key=self.address.key))
-        except (OSError, EOFError, AuthenticationError):
-            return  # it does not know the key, or has gone again
-        self.wake()
-        if self._closed:
-            self._close_accepted()
+            with contextlib.suppress(OSError, EOFError, AuthenticationError):
+                end = _proved(end, self.address.key, ACCEPT_S, deliver_challenge, answer_challenge)
+                self._accepted.put(end)
+                self.wake()
+        self._close_accepted()
 
     def _close_accepted(self) -> None:
         """Close connections that `poll` has not taken over."""
@@ -337,51 +449,29 @@ class Server:
             while True:
                 self._accepted.get_nowait().close()
 
-    def _receive(self, stream: Any) -> list[PendingRequest]:
+    def _exchange(self, stream: Any, events: int) -> list[PendingRequest]:
+        """Send a client what is left of replies, and read its messages."""
+        messages = []
         try:
-            messages = stream.receive()
+            if events & selectors.EVENT_WRITE:
+                stream.flush()
+                if not stream.unsent:
+                    self._selector.modify(stream, selectors.EVENT_READ)
+            if events & selectors.EVENT_READ:
+                messages = stream.receive()
         except (OSError, EOFError):
             self._drop(stream)
-            return []
         now = time.monotonic()
         requests = []
         for ticket, sent, message in messages:
-            age = now - sent if now - OLDEST_S < sent <= now else 0.0
-            requests.append(self._request(stream, ticket, now - age, message))
+            believed = sent if now - OLDEST_S < sent <= now else now
+            requests.append(PendingRequest(message, believed, ticket, stream, self))
         return requests
 
-    def _request(self, stream: Stream, ticket: int, sent: float, message: Any) -> PendingRequest:
-        def reply(value: Any, failed: bool) -> None:
-            try:
-                stream.send((ticket, value, failed))
-            except OSError:
-                self._drop(stream)
-                return
-            if stream.unsent:
-                stream.detach()
-                self._selector.modify(stream, selectors.EVENT_READ | selectors.EVENT_WRITE)
-
-        return PendingRequest(message, sent, lambda: stream not in self._streams, reply)
-
-    def _flush(self, stream: Any) -> None:
-        try:
-            stream.flush()
-        except OSError:
-            self._drop(stream)
-            return
-        if not stream.unsent:
-            self._selector.modify(stream, selectors.EVENT_READ)
-
-    def _drop(self, stream: Stream) -> None:
-        if stream in self._streams:
-            self._streams.remove(stream)
+    def _drop(self, stream: Any) -> None:
+        if not stream.closed:
             self._selector.unregister(stream)
             stream.close()
-
-
-def stopped(error: BaseException) -> ServiceStoppedError:
-    """The error that a client gets for a failure of the service."""
-    return ServiceStoppedError(f"the service has stopped: {error!r}")
 
 
 def serve_on_loop(answer: Callable[[Any], Awaitable[Any]], host: str | None = None) -> Server:

@@ -58,9 +58,6 @@ class LinearAdapter(PolicyAdapter):
         assert len(tasks) == len(observations[STATE])
         return self.value_head(torch.from_numpy(observations[STATE]))[:, 0]
 
-    def example(self) -> tuple[dict[str, np.ndarray], Sequence[str], dict[str, Tensor]]:
-        return {STATE: np.zeros((1, 3), np.float32)}, ["task"], {"x": torch.zeros(1, 2)}
-
     def trainable(self) -> dict[str, nn.Parameter]:
         critic = {f"value_head.{k}": p for k, p in self.value_head.named_parameters()}
         return {"policy.weight": self.weight, **critic}

@@ -19,7 +19,6 @@ from torch.nn import functional
 
 from accerl_lerobot.algorithms import AlgorithmConfig, GIPOConfig, PPOConfig, ranks
 from accerl_lerobot.algorithms.config import TrainerConfig
-from accerl_lerobot.algorithms.ranks import LOOPBACK, Rendezvous, create, join, use_only
 from accerl_lerobot.algorithms.ratio_update import RatioUpdate
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.experience import Segment
@@ -49,6 +48,8 @@ class Cache(list[Tensor]):
 
 class LayeredAdapter(LinearAdapter):
     """A policy with every way in which LeRobot's use their layers."""
+
+    block_names = r"layers\.[01]|layers\.[23]\.(up|down)|frozen\.0"
 
     def __init__(self, seed: int = 0) -> None:
         super().__init__(seed)
@@ -101,14 +102,14 @@ class Case(NamedTuple):
     batches: list[list[Segment]]
 
 
-def run(case: Case, config: TrainerConfig, group: ranks.Ranks, state: Any = None) -> dict[str, Any]:
+def run(case: Case, config: TrainerConfig, state: Any = None) -> dict[str, Any]:
     """Makes the case's updates, those that `state` has not made; all that can be said of them."""
     adapter = case.adapter()
-    if group.rank:  # as if it had been loaded otherwise there
+    if ranks.rank():  # as if it had been loaded otherwise there
         with torch.no_grad():
             for parameter in adapter.trainable().values():
                 parameter.add_(1.0)
-    update = RatioUpdate(adapter, case.algorithm, config, group)
+    update = RatioUpdate(adapter, case.algorithm, config)
     if state is not None:
         adapter.load_trainable(state["weights"])
         update.restore(state["update"])
@@ -161,13 +162,13 @@ def work(rank: int, size: int, place: Any, names: Sequence[str], states: Path, r
     """One rank: every named case, in every way of sharing, from the beginning and from one rank's state."""
     faulthandler.enable()
     torch.set_num_threads(1)
-    group = joined(rank, size, place)
+    join(rank, size, place)
     for name in names:
         case = cases()[name]
         for sharding in ("ddp", "zero2", "zero3"):
             config = config_of(case, sharding, size)
-            result = run(case, config, group)
-            result["resumed"] = run(case, config, group, snapshot.load(states / name))
+            result = run(case, config)
+            result["resumed"] = run(case, config, snapshot.load(states / name))
             snapshot.save(results / f"{name}-{sharding}-{rank}", result)
     leave()
 
@@ -179,13 +180,13 @@ def leave() -> None:
     os._exit(0)
 
 
-def joined(rank: int, size: int, place: Any) -> ranks.Group:
-    """A rank of a group of `size`; the queue `place` tells where they meet."""
-    use_only(LOOPBACK)
+def join(rank: int, size: int, place: Any) -> None:
+    """Become a rank of a group of `size`; the queue `place` tells where they meet."""
+    ranks.use_only(ranks.LOOPBACK)
     if rank == 0:
-        store, rendezvous = create(LOOPBACK, size, TIMEOUT_S)
+        store, port = ranks.open_store(ranks.LOOPBACK, size, TIMEOUT_S)
         for _ in range(size - 1):
-            place.put(tuple(rendezvous))
+            place.put(port)
     else:
-        store = join(Rendezvous(*place.get()), size, TIMEOUT_S)
-    return ranks.Group(store, rank, size, torch.device("cpu"), TIMEOUT_S)
+        store = ranks.store_at(ranks.LOOPBACK, place.get(), size, TIMEOUT_S)
+    ranks.join(store, rank, size, torch.device("cpu"), TIMEOUT_S)

@@ -35,7 +35,7 @@ from accerl_lerobot.policies.family import Encoded
 from accerl_lerobot.policies.flow import FlowFamily, FlowShape
 from accerl_lerobot.policies.loading import load_adapter
 from accerl_lerobot.policies.teacher import Ensemble, Teacher, with_teacher
-from accerl_lerobot.replay.pacing import ReplayConfig
+from accerl_lerobot.replay.buffer import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.run.preflight import check_start
 from accerl_lerobot.seeds import noise_seed

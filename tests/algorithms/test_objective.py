@@ -123,4 +123,4 @@ def test_on_policy_batches_look_on_policy(config: GIPOConfig | PPOConfig) -> Non
     metrics = {k: v.item() for k, v in config.loss(make_inputs(spread=0.0)).metrics.items()}
     for name in ("approx_kl", "kl", "clip_fraction", "low_weight", "ratio_max_dev", "log_ratio_p50"):
         assert metrics[name] == 0.0, name
-    assert metrics["ess"] == pytest.approx(1.0) and metrics["decisions"] == 12.0
+    assert metrics["ess"] == pytest.approx(1.0)

@@ -149,26 +149,22 @@ def test_measuring_changes_nothing_that_is_learnt():
     assert all(torch.equal(p, without.adapter.copy()[k]) for k, p in with_.adapter.copy().items())
 
 
-@pytest.mark.parametrize("broken", ["evaluate", "copy", "nothing"])
-def test_the_live_weights_are_back_in_their_own_memory(broken: str, monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize("broken", [False, True])
+def test_the_live_weights_are_back_in_their_own_memory(broken: bool, monkeypatch: pytest.MonkeyPatch):
     adapter, batch = LinearAdapter(), collate(make_segments(LENGTHS))
-    adapter.second = torch.nn.Parameter(torch.ones(3))
-    monkeypatch.setattr(adapter, "trainable", lambda: {"a": adapter.weight, "b": adapter.second})
     probe, evaluate = Probe(adapter, CONFIG), adapter.evaluate
     with torch.no_grad():
         adapter.weight.add_(0.3)
     before, place = adapter.copy(), adapter.weight.data_ptr()
 
     def evaluated(*arguments: Any) -> Evaluation:
-        assert not torch.equal(adapter.weight, before["a"])
-        if broken == "evaluate":
+        assert not torch.equal(adapter.weight, before["policy.weight"])
+        if broken:
             raise MemoryError("too many rows")
         return evaluate(*arguments)
 
     monkeypatch.setattr(adapter, "evaluate", evaluated)
-    if broken == "copy":
-        probe._copy.pop()  # the first parameter is swapped, then it fails
-    with pytest.raises((MemoryError, ValueError)) if broken != "nothing" else nullcontext():
-        assert not probe.apart(batch, np.arange(len(batch))).requires_grad
+    with pytest.raises(MemoryError) if broken else nullcontext():
+        assert probe.read(batch)
     assert all(torch.equal(p, before[k]) for k, p in adapter.trainable().items())
     assert adapter.weight.data_ptr() == place and adapter.weight.grad is None

@@ -15,14 +15,12 @@ import pytest
 
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import CHECKPOINTS, TRAINING_STATE, save_checkpoint
-from accerl_lerobot.replay.buffer import Replay
+from accerl_lerobot.replay.buffer import Replay, ReplayConfig
 from accerl_lerobot.replay.journal import EPISODES, Journal
-from accerl_lerobot.replay.pacing import ReplayConfig
 from benchmarks.audit import audit_segments, audit_updates
 from benchmarks.fault_injection import POINTS
 from benchmarks.faults import BenchFaultsConfig, bench_faults
 from benchmarks.hits import ANYWHERE, FAULTS, places
-from benchmarks.soak import compare
 from benchmarks.victims import CLASSES, Victim, await_hit, descendants, hit, title
 from tests.replay.segments import make_segment
 
@@ -142,14 +140,3 @@ def test_a_run_of_time_survives_what_is_done_to_it(tmp_path: Path):
     assert run["books"] and run["segments"] > 0
     written = json.loads((root / "faults.json").read_text())
     assert written["hits"] == result["hits"]
-
-
-def test_a_soak_compares_each_block_with_its_neighbour():
-    rates = {"quiet": [10.0, 12.0], "struck": [9.0, 6.0]}
-    blocks = [
-        {"kind": kind, "updates": rates[kind][i], "decisions": 16 * rates[kind][i]}
-        for kind, i in (("quiet", 0), ("struck", 0), ("struck", 1), ("quiet", 1))
-    ]
-    found = compare(blocks)
-    assert found["left"]["updates"]["blocks"] == [0.9, 0.5]
-    assert found["rates"]["decisions"]["quiet"]["median"] == 16 * 11.0

@@ -1,11 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Memory of a policy: counted by hand, with real and with fake tensors, and against what a process takes."""
+"""Memory of a policy: counted by hand, with real and with fake tensors."""
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -14,13 +11,9 @@ import torch
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.config import PolicyConfig, TuningConfig
 from accerl_lerobot.policies.loading import load_adapter
-from accerl_lerobot.testing import stored
 from benchmarks import footprint
-from benchmarks.footprint import Counter, PolicyMemory, policy_memory
+from benchmarks.footprint import Counter, policy_memory
 from tests.policies.tiny_pi import small, write_pi
-
-MIB = 2**20
-USABLE = 0.8  # share of what a process takes that was estimated; SmolVLA took 1.19 times its estimate
 
 
 def test_tensors_are_counted_while_they_live():
@@ -77,57 +70,3 @@ def test_less_is_kept_by_imitation_by_few_trained_weights_and_by_blocks_that_for
         assert found.weights == whole.weights and found.learning < whole.learning
         forgetting = policy_memory(pi0(tmp_path / "pi0", mode="full"), imitates=False, checkpointing=True)
         assert forgetting.learning < whole.learning
-
-
-PROCESS = """
-import json, sys
-from pathlib import Path
-import torch
-from benchmarks.footprint import policy_memory
-from tests.benchmarks.test_footprint import published, resident
-adapter, observations, latent = published(Path(sys.argv[1]))
-base = resident()
-adapter.evaluate(*observations, latent).log_prob.sum().backward()
-taken = resident(peak=True) - base
-adapter.zero_grad(set_to_none=True)
-print(json.dumps([taken, policy_memory(adapter, imitates=False)]))
-"""
-DECISIONS = 2
-
-
-def published(folder: Path) -> tuple[LeRobotAdapter, tuple, dict]:
-    """SmolVLA of its published size, and two decisions."""
-    import numpy as np
-
-    from accerl_lerobot.experience import TASK, Request, stack_observations
-    from benchmarks.policy import STATE, BenchPolicyConfig, _adapter
-
-    adapter = _adapter(BenchPolicyConfig(), torch.device("cpu"), folder)
-    requests = [
-        Request(observation={STATE: np.full(1, i, np.float32), TASK: "do it"}, noise_seed=i)
-        for i in range(DECISIONS)
-    ]
-    return adapter, stack_observations(requests), stored(adapter.decide(requests, 0))[0]
-
-
-def resident(*, peak: bool = False) -> int:
-    """Bytes of this process in memory now, or the most since the last question about now."""
-    if not peak:
-        Path("/proc/self/clear_refs").write_text("5")
-    status = Path("/proc/self/status").read_text()
-    return int(status.split("VmHWM:" if peak else "VmRSS:")[1].split()[0]) * 1024
-
-
-@pytest.mark.slow
-def test_a_process_takes_what_was_estimated_at_published_size(tmp_path: Path):
-    """SmolVLA, 450 M parameters, 100 M of them trained: gradients and what two decisions keep for them."""
-    done = subprocess.run(
-        [sys.executable, "-c", PROCESS, str(tmp_path)], capture_output=True, text=True, check=True
-    )
-    taken, found = json.loads(done.stdout.splitlines()[-1])
-    memory = PolicyMemory(*found)
-    assert memory.weights > 1600 * MIB
-    # Gradients appear as what was kept for them goes, so not all of both is there at once.
-    most = memory.trained + memory.learning_batch + DECISIONS * memory.learning
-    # Further gradients under way, and fragmentation: see `USABLE`.
-    assert DECISIONS * memory.learning < taken < most / USABLE

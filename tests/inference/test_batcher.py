@@ -3,7 +3,9 @@
 
 import random
 
-from accerl_lerobot.inference.batcher import Batcher
+import pytest
+
+from accerl_lerobot.inference.batcher import Batcher, merge_metrics
 
 WAIT = 0.01
 
@@ -17,7 +19,7 @@ def test_an_empty_batcher_is_never_due() -> None:
     batcher = make_batcher()
     assert not batcher.due(now=1e9) and batcher.next_deadline() is None
     assert batcher.take(now=0.0) == [] and len(batcher) == 0
-    assert set(batcher.metrics().values()) == {0.0}
+    assert set(batcher.counts.values()) == {0.0}
 
 
 def test_a_batch_that_cannot_grow_is_full_and_the_clock_goes_on_with_the_rest() -> None:
@@ -70,7 +72,7 @@ def test_first_in_first_out_nothing_lost_nobody_starves() -> None:
     assert served == list(range(2000)) and len(batcher) == 0
 
 
-def test_statistics() -> None:
+def test_counts_of_all_replicas_are_merged() -> None:
     batcher = make_batcher()
     batcher.add("ab", now=0.0)
     batcher.add("cd", now=1.0)
@@ -78,7 +80,17 @@ def test_statistics() -> None:
     batcher.add("e", now=3.0)
     batcher.take(now=4.0)
     batcher.take(now=9.0)  # nothing there: not a batch
-    assert batcher.metrics() == {"batches": 2.0, "batch_size_mean": 2.5, "wait_mean_s": (3 + 2 + 1) / 3}
+    assert batcher.counts == {"batches": 2, "requests": 3, "observations": 5, "waited_s": 3 + 2 + 1}
+    one = batcher.counts | {"version": 7.0, "busy_share": 0.2}
+    found = merge_metrics([one, make_batcher().counts | {"version": 6.0, "busy_share": 0.6}])
+    assert found == {
+        "batches": 2,
+        "batch_size_mean": 2.5,
+        "wait_mean_s": 2.0,
+        "version": 6.0,
+        "busy_share": pytest.approx(0.4),
+    }
+    assert merge_metrics([]) == {}
 
 
 def test_in_lock_step_all_are_waited_for_and_served_in_as_many_batches_as_they_need() -> None:

@@ -151,21 +151,13 @@ def play(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     return run
 
 
-def test_a_lonely_request_is_served_when_it_has_waited(play):
-    async def scene(worker, adapter):
-        await ask(worker, 5)
-        assert adapter.batches == [[5]]
-        metrics = await worker.metrics()
-        assert metrics["wait_mean_s"] >= 0.05 and metrics["batches"] == 1
-
-    play(scene, max_batch=4, max_wait_s=0.05)
-
-
 def test_answers_go_to_those_who_asked_in_their_order(play):
     async def scene(worker, adapter):
         seeds = [[1, 2, 3], [4], [5, 6], [7, 8], [9]]
         answers = await asyncio.gather(*(ask(worker, *some) for some in seeds))
         assert [[int(d.latent["seed"]) for d in some] for some in answers] == seeds
+        metrics = await worker.metrics()
+        assert metrics["observations"] == 9 and metrics["requests"] == 5 and metrics["batches"] >= 3
 
     play(scene, max_batch=4, max_wait_s=0.01)
 
@@ -214,32 +206,26 @@ def test_a_process_that_comes_later_is_ready_with_the_newest_weights(play):
     play(scene)
 
 
-def test_a_failure_reaches_everyone_who_waits_and_everyone_after(play):
+@pytest.mark.parametrize("broken", ["decision", "weights"])
+def test_a_failure_reaches_all_that_wait_and_all_that_come_after(play, broken: str):
     async def scene(worker, adapter):
-        # A batch holds one request, so that of those who wait only one is in the batch that fails.
+        trainer = Trainer()
+        await worker.follow(trainer)
+        waiting = [asyncio.create_task(ask(worker, i)) for i in range(5)]
+        while broken == "weights" and not len(worker._batcher):
+            await asyncio.sleep(0.001)
         adapter.broken = ValueError("no such weights")
-        answers = await asyncio.gather(*(ask(worker, i) for i in range(5)), return_exceptions=True)
+        if broken == "weights":
+            trainer.publish(1)
+        answers = await asyncio.gather(*waiting, return_exceptions=True)
         assert all(isinstance(a, ServiceStoppedError) for a in answers), answers
         assert any("no such weights" in str(a) for a in answers)
         with pytest.raises(ServiceStoppedError):
             await ask(worker, 9)
 
-    play(scene, max_batch=1, max_wait_s=0.0)
-
-
-def test_weights_that_cannot_be_loaded_are_heard_of_by_those_who_wait_for_a_batch(play):
-    async def scene(worker, adapter):
-        trainer = Trainer()
-        await worker.follow(trainer)
-        waiting = [asyncio.create_task(ask(worker, i)) for i in range(2)]
-        while not worker._batcher.next_deadline():
-            await asyncio.sleep(0.001)
-        adapter.broken = ValueError("no such weights")
-        trainer.publish(1)
-        answers = await asyncio.gather(*waiting, return_exceptions=True)
-        assert all(isinstance(a, ServiceStoppedError) for a in answers)
-
-    play(scene, max_batch=4, max_wait_s=9.0)
+    # A batch holds one request, so that only one request is in the batch that fails; or all wait.
+    size, wait_s = (1, 0.0) if broken == "decision" else (9, 9.0)
+    play(scene, max_batch=size, max_wait_s=wait_s)
 
 
 def test_a_service_that_hangs_is_silent(play, monkeypatch: pytest.MonkeyPatch):

@@ -30,7 +30,7 @@ from accerl_lerobot.policies.config import (
     PolicyConfig,
     SamplerConfig,
 )
-from accerl_lerobot.replay.pacing import ReplayConfig
+from accerl_lerobot.replay.buffer import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.testing import TOLERANCE
 from tests.policies.checkpoints import write_act, write_bins, write_diffusion, write_smolvla

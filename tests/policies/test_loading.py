@@ -292,7 +292,7 @@ def test_weights_that_compute_nan_are_refused(written: Any):
     adapter = adapter_at(written("smolvla"))
     with torch.no_grad():
         adapter.policy.model.action_out_proj.bias.fill_(float("nan"))
-    observations, tasks, _ = adapter_at(written("smolvla")).example()
+    observations, tasks = stack_observations(adapter.example_requests())
     with pytest.raises(InputError, match="differs from its sampler by nan"):
         adapter.self_check(observations, tasks)
 
@@ -350,7 +350,8 @@ def test_overridden_steps_are_used_and_saved(written: Any, tmp_path: Path):
 def test_names_of_the_environment_s_features_are_mapped(written: Any):
     path, request = written("smolvla"), requests(1)[0]
     adapter = adapter_at(path, rename_map={"observation.images.top": "observation.images.front"})
-    assert adapter.example()[0].keys() == {"observation.images.top", "observation.state"}
+    observed, _ = stack_observations(adapter.example_requests())
+    assert observed.keys() == {"observation.images.top", "observation.state"}
     renamed = {k.replace("front", "top"): v for k, v in request.observation.items()}
     decision = adapter.decide([replace(request, observation=renamed)], 0)
     assert pickle.dumps(decision) == pickle.dumps(adapter_at(path).decide([request], 0))

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from accerl_lerobot.experience import TASK, Request, Segment, SegmentStart
+from accerl_lerobot.experience import TASK, Request, Segment
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.config import PolicyConfig, SamplerConfig
 from accerl_lerobot.policies.loading import load_adapter
-from accerl_lerobot.rollout.runner import SegmentBuilder
+from accerl_lerobot.rollout.runner import ActiveEpisode, EpisodePlan
 
 TEXTS = ("Match the target", "Go", "Mirror the target slowly, then stay")
 """Texts of different lengths, so that a batch pads some of them."""
@@ -61,11 +61,12 @@ def adapter_at(path: Path, sampler: SamplerConfig | None = None, **options: Any)
 
 def as_segment(asked: Sequence[Request], adapter: LeRobotAdapter, length: int) -> Segment:
     """Plays requests as one episode, in which each decision is made alone; it has been through a pickle."""
-    builder = SegmentBuilder([asked[0].observation], length, SegmentStart("task", seed=0, decision=0), 100)
+    plan = EpisodePlan(task="task", seed=0, explore=True)
+    episode = ActiveEpisode(plan, 100, [asked[0].observation])
     for i in range(length):
         decision = adapter.decide([asked[i]], 3)[0]
-        builder.add(decision, decision.chunk, 0.0, 3, asked[i + 1].observation)
-    return pickle.loads(pickle.dumps(builder.cut("test")))
+        episode.add(decision, decision.chunk, 0.0, 3, asked[i + 1].observation)
+    return pickle.loads(pickle.dumps(episode.cut("test")))
 
 
 def deviation(one: Tensor, other: Tensor) -> float:

@@ -13,9 +13,8 @@ import pytest
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, Segment, SegmentStart
-from accerl_lerobot.replay.buffer import Replay
+from accerl_lerobot.replay.buffer import Replay, ReplayConfig
 from accerl_lerobot.replay.journal import Journal, read_journal, whole_episodes
-from accerl_lerobot.replay.pacing import ReplayConfig
 from tests.replay.segments import make_segment
 
 
@@ -99,7 +98,7 @@ def test_a_torn_last_line_is_left_out_and_a_broken_one_is_named(tmp_path: Path):
     assert [d.key for d in read_journal(path)] == ["a"]
     line = json.loads(whole.splitlines()[0])
     for change in (
-        {"actions": "####"}, {"action_dim": 0}, {"steps": [1]}, {"versions": []}, {"seed": None},
+        {"actions": "####"}, {"action_dim": 0}, {"steps": [1]},  {"seed": None},
         {"rewards": 3}, {"seed": math.inf}, {"decision": math.nan},
     ):  # fmt: skip
         path.write_bytes(json.dumps(line | change).encode() + b"\n" + whole)

@@ -2,7 +2,7 @@
 """Pacing under thousands of random and hostile steps: never stuck, over-used, or staler than stated."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,21 +11,25 @@ import pytest
 
 from accerl_lerobot.engines.config import lag_limits
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.replay.buffer import Replay
-from accerl_lerobot.replay.pacing import ReplayConfig, draws_for, lag_bound
+from accerl_lerobot.replay.buffer import Replay, ReplayConfig, draws_for, lag_bound
 from accerl_lerobot.rollout.runner import RolloutConfig
 from tests.replay.segments import assert_books_balance, make_segment
 
 CONFIG = ReplayConfig(capacity=100, min_decisions=10, samples_per_insert=2.0, max_unlearned_decisions=30)
 
 
-def test_the_door_and_the_warm_start() -> None:
-    assert CONFIG.may_insert(9, 9)
-    assert CONFIG.may_insert(50, 29)
-    assert not CONFIG.may_insert(50, 30)
-    assert not CONFIG.may_sample(9, 9, 8)
-    assert CONFIG.may_sample(10, 8, 8)
-    assert not CONFIG.may_sample(50, 7, 8)
+def at(config: ReplayConfig, stored: int, available: int) -> Replay:
+    """A store as it is with so many decisions."""
+    replay = Replay(config)
+    replay.stored_decisions, replay.available_decisions = stored, available
+    return replay
+
+
+def test_the_warm_start_and_the_limits_of_both_sides() -> None:
+    assert at(CONFIG, 9, 9).may_insert() and at(CONFIG, 50, 29).may_insert()
+    assert not at(CONFIG, 50, 30).may_insert()
+    assert at(CONFIG, 10, 8).may_sample(8)
+    assert not at(CONFIG, 9, 9).may_sample(8) and not at(CONFIG, 50, 7).may_sample(8)
 
 
 def test_one_side_may_always_move_in_every_state() -> None:
@@ -34,8 +38,8 @@ def test_one_side_may_always_move_in_every_state() -> None:
         config.check(batch_decisions=batch, segment_decisions=4)
         for stored in range(41):
             for available in range(stored + 1):
-                inserting = config.may_insert(stored, available)
-                assert inserting or config.may_sample(stored, available, batch)
+                replay = at(config, stored, available)
+                assert replay.may_insert() or replay.may_sample(batch)
     with pytest.raises(InputError, match=r"replay\.max_unlearned_decisions=12"):
         config.check(batch_decisions=13, segment_decisions=4)
 
@@ -52,20 +56,23 @@ def test_entitlement_averages_to_the_rate_and_never_exceeds_it(rate: float) -> N
         assert -1e-6 < rate * inserted - granted < 16 + 1e-6
 
 
-def test_a_store_without_room_for_the_pace_is_refused() -> None:
+def test_a_pace_that_could_stall_or_waste_is_refused() -> None:
     config = ReplayConfig(capacity=32, min_decisions=8, max_unlearned_decisions=30)
     config.check(batch_decisions=30, segment_decisions=3)
     with pytest.raises(InputError, match="use at least 33"):
         config.check(batch_decisions=30, segment_decisions=4)
+    reused = replace(CONFIG, samples_per_insert=1.5, max_lag=0)
+    with pytest.raises(InputError, match=r"replay\.max_lag=0: .*samples_per_insert=1\.5 .* 1 updates old"):
+        reused.check(batch_decisions=8, segment_decisions=4)
+    replace(reused, max_lag=1).check(batch_decisions=8, segment_decisions=4)
+    replace(reused, samples_per_insert=1.0).check(batch_decisions=8, segment_decisions=4)
 
 
 def test_lag_bound_by_hand() -> None:
     # ⌊2·(30 + 2·12 + 100)/8⌋ − 1 = 37; pickup 4; prefetch 2
     arguments = {"batch_decisions": 8, "in_flight": 12, "pickup": 4, "prefetch": 2}
     assert lag_bound(CONFIG, **arguments) == 4 + 37 + 2
-    capped = ReplayConfig(
-        capacity=100, min_decisions=10, samples_per_insert=2.0, max_unlearned_decisions=30, max_lag=9
-    )
+    capped = replace(CONFIG, max_lag=9)
     assert lag_bound(capped, **arguments) == 9
     sections = {
         "trainer": SimpleNamespace(batch_decisions=8, hold_back=4),
@@ -168,36 +175,22 @@ class Simulation:
 
 @pytest.mark.parametrize("gate", ["begin", "insert"])
 @pytest.mark.parametrize(
-    ("settings", "batch", "longest"),
-    [
-        (
-            {"capacity": 64, "min_decisions": 16, "samples_per_insert": 1.0, "max_unlearned_decisions": 32},
-            16,
-            4,
-        ),
-        (
-            {"capacity": 48, "min_decisions": 40, "samples_per_insert": 2.0, "max_unlearned_decisions": 8},
-            8,
-            9,
-        ),
-        (
-            {"capacity": 200, "min_decisions": 1, "samples_per_insert": 3.5, "max_unlearned_decisions": 12},
-            12,
-            6,
-        ),
-        (
-            {"capacity": 31, "min_decisions": 16, "samples_per_insert": 1.25, "max_unlearned_decisions": 30},
-            7,
-            2,
-        ),
-    ],
+    ("capacity", "warm", "reuse", "ahead", "batch", "longest"),
+    [(64, 16, 1.0, 32, 16, 4), (48, 40, 2.0, 8, 8, 9), (200, 1, 3.5, 12, 12, 6), (31, 16, 1.25, 30, 7, 2)],
 )
 def test_promises_hold_under_hostile_schedules(
-    gate: str, settings: dict[str, Any], batch: int, longest: int
+    gate: str, capacity: int, warm: int, reuse: float, ahead: int, batch: int, longest: int
 ) -> None:
+    config = ReplayConfig(
+        capacity=capacity,
+        min_decisions=warm,
+        samples_per_insert=reuse,
+        max_unlearned_decisions=ahead,
+        max_lag=10_000,
+    )
     for seed in range(3):
         simulation = Simulation(
-            config=ReplayConfig(max_lag=10_000, **settings),
+            config=config,
             batch=batch,
             longest=longest,
             workers=5,
@@ -239,11 +232,3 @@ def test_evenly_matched_sides_waste_nothing() -> None:
     c = simulation.replay.counters
     assert c.evicted_unused == 0 and c.retired_segments == 0
     assert c.trained_decisions > 0.98 * 2.0 * c.inserted_decisions
-
-
-def test_reuse_that_the_largest_lag_does_not_allow_is_refused() -> None:
-    sizes = {"capacity": 64, "min_decisions": 8, "max_unlearned_decisions": 16}
-    with pytest.raises(InputError, match=r"replay\.max_lag=0: .*samples_per_insert=1\.5 .* 1 updates old"):
-        ReplayConfig(**sizes, samples_per_insert=1.5, max_lag=0).check(batch_decisions=8, segment_decisions=4)
-    ReplayConfig(**sizes, samples_per_insert=1.5, max_lag=1).check(batch_decisions=8, segment_decisions=4)
-    ReplayConfig(**sizes, max_lag=0).check(batch_decisions=8, segment_decisions=4)

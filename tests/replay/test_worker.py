@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from accerl_lerobot.replay.pacing import ReplayConfig
+from accerl_lerobot.replay.buffer import ReplayConfig
 from accerl_lerobot.replay.worker import ReplayWorker
 from accerl_lerobot.transport.connection import ServiceStoppedError
 from tests.replay.segments import make_segment
@@ -40,18 +40,6 @@ def start(call: Awaitable[Any]) -> asyncio.Task[Any]:
     return asyncio.ensure_future(call)
 
 
-def test_insert_waits_when_rollouts_are_ahead_and_goes_on_when_the_trainer_has_sampled():
-    async def scene(worker: ReplayWorker) -> None:
-        assert await worker.insert([make_segment("a", 8)])
-        late = start(worker.insert([make_segment("b", 8)]))
-        assert await waits(late)
-        assert len(await worker.sample(BATCH, 0)) == 1
-        assert await late is True
-        assert (await worker.metrics())["inserted_decisions"] == 16
-
-    play(scene)
-
-
 def test_only_as_many_are_let_in_as_the_pace_allows():
     async def scene(worker: ReplayWorker) -> None:
         await worker.insert([make_segment("first", 8)])
@@ -67,7 +55,7 @@ def test_only_as_many_are_let_in_as_the_pace_allows():
     play(scene)
 
 
-def test_sample_waits_for_the_warm_start_and_goes_on_when_there_is_enough():
+def test_sample_waits_for_the_warm_start_and_then_for_new_segments():
     async def scene(worker: ReplayWorker) -> None:
         early = start(worker.sample(BATCH, 0))
         assert await waits(early)
@@ -75,18 +63,10 @@ def test_sample_waits_for_the_warm_start_and_goes_on_when_there_is_enough():
         assert await waits(early)
         await worker.insert([make_segment("b", 4)])
         assert sorted(s.key for s in await early) == ["a", "b"]
-
-    play(scene)
-
-
-def test_sample_waits_for_what_is_new():
-    async def scene(worker: ReplayWorker) -> None:
-        await worker.insert([make_segment("a", 8)])
-        await worker.sample(BATCH, 0)
         again = start(worker.sample(BATCH, 1))
-        assert await waits(again), "what has been trained on as often as the pace allows is not drawn again"
-        await worker.insert([make_segment("b", 8)])
-        assert [s.key for s in await again] == ["b"]
+        assert await waits(again), "segments that were drawn as often as the pace allows are not drawn again"
+        await worker.insert([make_segment("c", 8)])
+        assert [s.key for s in await again] == ["c"]
 
     play(scene)
 

@@ -15,13 +15,13 @@ from accerl_lerobot.envs import Environment, SimulatedConfig, make_environment
 from accerl_lerobot.envs.making import JudgedEnvironment
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import summarise
-from accerl_lerobot.experience import TASK, Decision, Observation, Request, Segment, SegmentStart
+from accerl_lerobot.experience import TASK, Decision, Observation, Request
 from accerl_lerobot.rollout.runner import (
+    ActiveEpisode,
     EpisodePlan,
     EpisodePlans,
     EpisodeResult,
     RolloutConfig,
-    SegmentBuilder,
     budgets,
     incarnation_after,
 )
@@ -60,8 +60,7 @@ def test_the_last_segment_says_how_the_episode_ended(end, success):
 def test_an_episode_that_ends_within_a_chunk_counts_the_steps_that_were_made():
     recorder = Recorder([ScriptedEnvironment(steps=2 * CHUNK + 1)], [explore()], CONFIG)
     recorder.play()
-    (segment,) = recorder.segments
-    assert segment.steps.tolist() == [2, 2, 1] and segment.reward.tolist() == [2, 2, 1]
+    assert recorder.segments[0].steps.tolist() == recorder.segments[0].reward.tolist() == [2, 2, 1]
     assert recorder.runner.counters.env_steps == 5 and recorder.runner.counters.decisions == 3
 
 
@@ -74,15 +73,6 @@ def test_every_decision_costs():
     evaluation = Recorder([ScriptedEnvironment(steps=8)], [replace(explore(), explore=False)], config)
     evaluation.play()
     assert evaluation.results[0].episode_return == 8.0, "the environment's own"
-
-
-def test_a_result_has_the_totals_of_its_episode():
-    recorder = Recorder([ScriptedEnvironment(steps=9)], [explore()], CONFIG)
-    recorder.play(version=7)
-    assert [s.terminated for s in recorder.segments] == [False, True]
-    (result,) = recorder.results
-    assert (result.success, result.episode_return, result.steps, result.decisions) == (True, 9.0, 9, 5)
-    assert result.versions == (7, 7) and recorder.runner.counters.episodes == 1
 
 
 def test_a_world_that_does_not_show_the_same_again_cannot_be_resumed_in_an_episode():
@@ -100,16 +90,15 @@ def test_a_world_that_does_not_show_the_same_again_cannot_be_resumed_in_an_episo
         resumed.restore(state)
 
 
-def test_results_name_the_oldest_and_the_newest_weights():
-    recorder = Recorder([ScriptedEnvironment(steps=6)], [explore()], CONFIG)
+def test_a_result_has_the_totals_of_its_episode_and_the_oldest_and_newest_weights():
+    recorder = Recorder([ScriptedEnvironment(steps=5)], [explore()], CONFIG)
     request = recorder.runner.start(0)
     for version in (4, 3, 5):
         assert request is not None
-        chunk = np.zeros((CHUNK, 1), np.float32)
-        empty = np.zeros(1, np.float32)
-        decision = Decision(chunk=chunk, latent={"x": empty}, log_prob=empty, version=version)
-        request = recorder.runner.advance(0, decision)
-    assert recorder.results[0].versions == (3, 5)
+        request = recorder.runner.advance(0, decide(request, version))
+    (result,) = recorder.results
+    assert (result.success, result.episode_return, result.steps, result.decisions) == (True, 5.0, 5, 3)
+    assert result.versions == (3, 5) and recorder.runner.counters.episodes == 1
     assert recorder.segments[0].version.tolist() == [4, 3, 5]
 
 
@@ -247,46 +236,25 @@ def test_filming_changes_nothing(seed: int, tolerance: float, success: bool):
         asked.clear()
 
 
-def observation(step: int) -> Observation:
-    return {"observation.state": np.array([step], np.float32), TASK: "push"}
-
-
-def decision(step: int, version: int = 0) -> Decision:
-    return Decision(
-        chunk=np.zeros((2, 1), np.float32),
-        latent={"x": np.array([step, -step], np.float32)},
-        log_prob=np.array([step / 10], np.float64),
-        version=version,
-    )
-
-
-def collected(count: int) -> SegmentBuilder:
-    builder = SegmentBuilder([observation(0)], 4, SegmentStart("push-v3", seed=7, decision=0), 100)
-    for step in range(count):
-        add(builder, step, float(step), step + 1)
-    return builder
-
-
-def add(builder: SegmentBuilder, step: int, reward: float, steps: int) -> None:
-    actions = np.full((2, 1), step / 10, np.float32)
-    builder.add(decision(step, version=step), actions, reward, steps, following=observation(step + 1))
-
-
-def states(segment: Segment) -> list[float]:
-    return segment.observations["observation.state"][:, 0].tolist()
-
-
 def test_everything_about_a_decision_stays_together():
-    segment = collected(3).cut("k")
-    assert len(segment) == 3 and states(segment) == [0, 1, 2, 3]
+    plan = EpisodePlan(task="push-v3", seed=7, explore=True)
+    seen = [{"observation.state": np.array([step], np.float32), TASK: "push"} for step in range(4)]
+    episode = ActiveEpisode(plan, 100, seen[:1])
+    for step in range(3):
+        latent = {"x": np.array([step, -step], np.float32)}
+        log_prob = np.array([step / 10], np.float64)
+        decision = Decision(chunk=np.zeros((2, 1)), latent=latent, log_prob=log_prob, version=step)
+        actions = np.full((2, 1), step / 10, np.float32)
+        episode.add(decision, actions, float(step), step + 1, following=seen[step + 1])
+    segment = episode.cut("k")
+    assert segment.observations["observation.state"][:, 0].tolist() == [0, 1, 2, 3]
     assert segment.latent["x"].tolist() == [[0, 0], [1, -1], [2, -2]]
     np.testing.assert_allclose(segment.log_prob[:, 0], [0, 0.1, 0.2], rtol=1e-6)
     np.testing.assert_allclose(segment.actions[:, 0, 0], [0, 0.1, 0.2], rtol=1e-6)
     assert segment.reward.tolist() == [0, 1, 2] and segment.origin == ("push-v3", 7, 0)
     assert segment.version.tolist() == [0, 1, 2] and segment.steps.tolist() == [1, 2, 3]
-    assert segment.log_prob.dtype == segment.reward.dtype == np.float32
+    assert segment.log_prob.dtype == segment.reward.dtype == segment.elapsed.dtype == np.float32
     np.testing.assert_allclose(segment.elapsed, [0, 0.01, 0.03], rtol=1e-6)
-    assert segment.elapsed.dtype == np.float32
     assert segment.version.dtype == segment.steps.dtype == np.int64
     assert segment.task == "push" and TASK not in segment.observations
 
@@ -356,7 +324,8 @@ def test_no_more_episodes_than_were_paid_for():
     assert len(take(endless, 9)) == 9 and not endless.spent
 
 
-def test_a_budget_is_shared_among_workers():
-    assert budgets(RolloutConfig(episodes=7, workers=3)) == [3, 2, 2]
-    assert budgets(RolloutConfig(episodes=1, workers=2)) == [1, 0]
-    assert budgets(RolloutConfig(workers=2)) == [None, None]
+@pytest.mark.parametrize(
+    ("episodes", "workers", "shares"), [(7, 3, [3, 2, 2]), (1, 2, [1, 0]), (0, 2, [None, None])]
+)
+def test_a_budget_is_shared_among_workers(episodes: int, workers: int, shares: list[int | None]):
+    assert budgets(RolloutConfig(episodes=episodes, workers=workers)) == shares

@@ -18,7 +18,7 @@ from accerl_lerobot.experience import Decision, Request, Segment
 from accerl_lerobot.rollout import worker as module
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodePlans, EpisodeResult, RolloutConfig
 from accerl_lerobot.rollout.worker import MAX_PENDING, RolloutWorker
-from accerl_lerobot.transport import endpoint
+from accerl_lerobot.transport import connection
 from accerl_lerobot.transport.connection import ServiceStoppedError
 from tests.rollout.environments import evaluate
 from tests.runs import HANGS_S
@@ -134,23 +134,15 @@ def stage() -> Iterator[Callable[..., Stage]]:
         assert not one.thread.is_alive()
 
 
-def test_training_episodes_reach_replay_and_the_report(stage):
+def test_episodes_reach_replay_and_the_report_once_each(stage):
     inserted: list[Segment] = []
     one = stage(lambda segments: inserted.extend(segments) or True)
-    one.until(lambda: len(one.episodes) >= 5)
-    assert all(e.plan.explore for e in one.episodes)
+    one.order(True, planned(10))
+    one.until(lambda: len(one.evaluated) >= 10 and len(one.episodes) >= 15)
+    assert sorted(e.plan.index for e in one.evaluated) == list(range(10))
     seeds = [e.plan.seed for e in one.episodes]
     assert len(set(seeds)) == len(seeds), "an episode was reported twice or run twice"
     assert len({s.key for s in inserted}) == len(inserted) > 0
-
-
-def test_planned_episodes_are_reported_once_each(stage):
-    one = stage(lambda segments: True)
-    one.order(True, planned(10))
-    one.until(lambda: len(one.evaluated) >= 10)
-    before = len(one.episodes)
-    one.until(lambda: len(one.episodes) >= before + 4)
-    assert sorted(e.plan.index for e in one.evaluated) == list(range(10))
 
 
 def test_exploring_pauses_while_replay_does_not_take_segments_and_evaluation_goes_on(stage):
@@ -191,7 +183,7 @@ def test_a_worker_outlives_its_inference_and_plays_what_it_would_have_played(
     stage, monkeypatch: pytest.MonkeyPatch
 ):
     """Decisions are of their requests alone; the service is lost with requests under way, and comes back."""
-    monkeypatch.setattr(endpoint, "RETRY_S", 0.05)
+    monkeypatch.setattr(connection, "RETRY_S", 0.05)
     played_out = []
     for lost in (False, True):
         one = stage(lambda segments: True)
@@ -209,38 +201,28 @@ def test_a_worker_outlives_its_inference_and_plays_what_it_would_have_played(
     assert played_out[0] == played_out[1]
 
 
-def test_a_world_that_hangs_shows_in_the_report(stage, monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize("in_environment", [True, False])
+def test_a_thread_that_hangs_shows_in_the_report(
+    stage, monkeypatch: pytest.MonkeyPatch, in_environment: bool
+):
     release = threading.Event()
-    one = stage(lambda segments: True)
-    advance = one.worker._runner.advance
-    monkeypatch.setattr(one.worker._runner, "advance", lambda *a: (release.wait(HANGS_S), advance(*a))[1])
-    one.until(lambda: (report := one.order(True)).in_environment and report.busy_s > 0.2)
-    release.set()
-    one.until(lambda: len(one.episodes) >= 2)
-    one.until(lambda: one.order(True).busy_s < 0.2)
-
-
-def test_who_has_not_been_set_to_work_does_not_hang():
-    """Others may take long to start."""
-    worker = RolloutWorker(WORLD, RolloutConfig(environments=1))
-    worker.ready(EpisodePlans(("match",), 0, None))
-    time.sleep(0.05)
-    report = worker.report(True, [])
-    assert (report.busy_s, report.in_environment) == (0.0, False)
-
-
-def test_a_thread_that_hangs_outside_of_a_world_shows_in_the_report(stage, monkeypatch: pytest.MonkeyPatch):
-    release = threading.Event()
-    hangs = iter([True])
+    hanging = "rollout.step" if in_environment else "rollout.send"
 
     def fault_point(point: str) -> bool:
-        if point == "rollout.send" and next(hangs, False):
+        if point == hanging:
             release.wait(HANGS_S)
         return False
 
     monkeypatch.setattr(module, "fault_point", fault_point)
     one = stage(lambda segments: True)
     one.until(lambda: one.order(True).busy_s > 0.4)
-    assert not one.order(True).in_environment
+    assert one.order(True).in_environment is in_environment
     release.set()
     one.until(lambda: len(one.episodes) >= 2 and one.order(True).busy_s < 0.4)
+
+
+def test_a_worker_that_does_not_run_yet_does_not_hang():
+    worker = RolloutWorker(WORLD, RolloutConfig(environments=1))
+    worker.ready(EpisodePlans(("match",), 0, None))
+    report = worker.report(True, [])
+    assert (report.busy_s, report.in_environment) == (0.0, False)

@@ -86,16 +86,16 @@ def test_an_error_of_the_first_is_its_own(peers: Callable[[str, str], Peers]):
 
 
 def test_ranks_talk_over_the_interface_that_has_the_address(monkeypatch: pytest.MonkeyPatch):
-    from accerl_lerobot.algorithms import ranks as rendezvous
+    from accerl_lerobot.algorithms import ranks
 
     for name in ("GLOO_SOCKET_IFNAME", "NCCL_SOCKET_IFNAME"):
         monkeypatch.setenv(name, "")
     at = SimpleNamespace
     faces = {"lo": [at(address="127.0.0.1")], "a": [at(address="fe80::1"), at(address="10.0.0.2")], "b": []}
-    monkeypatch.setattr(rendezvous.psutil, "net_if_addrs", lambda: faces)
-    rendezvous.use_only("127.0.0.1")
+    monkeypatch.setattr(ranks.psutil, "net_if_addrs", lambda: faces)
+    ranks.use_only("127.0.0.1")
     assert (os.environ["GLOO_SOCKET_IFNAME"], os.environ["NCCL_SOCKET_IFNAME"]) == ("lo", "")
-    rendezvous.use_only("10.0.0.2")
+    ranks.use_only("10.0.0.2")
     assert (os.environ["GLOO_SOCKET_IFNAME"], os.environ["NCCL_SOCKET_IFNAME"]) == ("a", "a")
     with pytest.raises(RuntimeError, match=r"no interface of this machine has the address 10\.0\.0\.3"):
-        rendezvous.use_only("10.0.0.3")
+        ranks.use_only("10.0.0.3")

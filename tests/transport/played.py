@@ -7,7 +7,7 @@ from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from typing import Any
 
-from accerl_lerobot.transport.endpoint import Endpoint
+from accerl_lerobot.transport.connection import Endpoint
 
 
 class PlayedClient:
@@ -19,15 +19,16 @@ class PlayedClient:
         self._under_way: dict[int, Future[Any]] = {}
         self._sent = 0
 
-    def send(self, message: Any) -> int:
+    def send(self, message: Any, ticket: int | None = None) -> int:
         answer = self._answer(message)
         if not isinstance(answer, Future):
             future: Future[Any] = Future()
             future.set_result(answer)
             answer = future
         self._sent += 1
-        self._under_way[self._sent] = answer
-        return self._sent
+        ticket = self._sent if ticket is None else ticket
+        self._under_way[ticket] = answer
+        return ticket
 
     def done(self, timeout: float) -> list[tuple[int, Any]]:
         wait(self._under_way.values(), timeout=timeout, return_when=FIRST_COMPLETED)

@@ -8,88 +8,71 @@ from typing import Any
 
 import pytest
 
-from accerl_lerobot.transport import endpoint
-from accerl_lerobot.transport.connection import ServiceStoppedError
-from accerl_lerobot.transport.endpoint import Endpoint, ReconnectingClient
-from tests.transport.played import played
+from accerl_lerobot.transport import connection
+from accerl_lerobot.transport.connection import ReconnectingClient, ServiceStoppedError
+from tests.transport.played import PlayedClient
 
 
 class Service:
-    """Answers what the test says, when it says so, until it is stopped."""
+    """Answers when the test says so; may be away, or die while it is asked."""
 
-    def __init__(self, name: str) -> None:
-        self.name = name
+    def __init__(self) -> None:
         self.held: list[tuple[str, Future[Any]]] = []
-        self.endpoint = played(self._take)
+        self.state = "there"
 
-    def _take(self, message: str) -> Future[Any]:
-        self.held.append((message, Future()))
-        return self.held[-1][1]
+    def become(self, state: str) -> None:
+        self.state = state
+        if state != "there":
+            for _, future in self.held:
+                future.set_exception(ServiceStoppedError("the service has stopped"))
+            self.held.clear()
+
+    def connect(self, timeout_s: float = 0.0) -> Any:
+        if self.state == "away":
+            raise ServiceStoppedError("nobody listens there")
+        return PlayedClient("inference", self._take)
 
     def answer(self, number: int = 0) -> None:
         message, future = self.held.pop(number)
-        future.set_result(f"{self.name} {message}")
+        future.set_result(f"answer to {message}")
 
-    def stop(self) -> None:
-        for _, future in self.held:
-            future.set_exception(ServiceStoppedError("the service has stopped"))
-
-
-class Nowhere(Endpoint):
-    def connect(self, timeout_s: float = 0.0) -> Any:
-        raise ServiceStoppedError("nobody listens there")
+    def _take(self, message: str) -> Future[Any]:
+        if self.state == "dying":
+            raise ServiceStoppedError("it dies")
+        self.held.append((message, Future()))
+        return self.held[-1][1]
 
 
-def connected(service: Service) -> ReconnectingClient:
-    caller = ReconnectingClient("inference")
-    caller.move(service.endpoint)
-    return caller
+@pytest.fixture(autouse=True)
+def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connection, "RETRY_S", 0.0)
 
 
-def test_what_was_not_answered_is_asked_of_the_next_in_order_and_under_the_same_ticket():
-    first, second = Service("first"), Service("second")
-    caller = connected(first)
-    a, b, c = (caller.send(name) for name in "abc")
-    first.answer(1)
-    assert caller.done(60.0) == [(b, "first b")]
-    first.stop()
-    assert caller.done(0.0) == []
-    d = caller.send("d")  # while nobody is there
-    assert caller.done(0.01) == []
-    caller.move(second.endpoint)
-    assert caller.done(0.0) == [] and [message for message, _ in second.held] == ["a", "c", "d"]
+@pytest.mark.parametrize("lost", ["away", "dying"])
+def test_what_was_not_answered_is_asked_again_in_order_and_under_the_same_ticket(lost: str):
+    service = Service()
+    client = ReconnectingClient(service)
+    a, b, c = (client.send(name) for name in "abc")
+    service.answer(1)
+    assert client.done(60.0) == [(b, "answer to b")]
+    service.become(lost)
+    assert client.done(0.0) == []
+    d = client.send("d")  # while nobody is there
+    assert client.done(0.0) == [] and not service.held
+    service.become("there")
+    assert client.done(0.0) == [] and [message for message, _ in service.held] == ["a", "c", "d"]
     for _ in range(3):
-        second.answer()
-    assert sorted(caller.done(60.0)) == [(a, "second a"), (c, "second c"), (d, "second d")]
+        service.answer()
+    assert sorted(client.done(60.0)) == [(a, "answer to a"), (c, "answer to c"), (d, "answer to d")]
 
 
-def test_a_service_that_dies_while_it_is_asked_and_one_that_is_gone_when_it_is_connected_to():
-    caller = ReconnectingClient("inference")
-    ticket = caller.send("early")
-    caller.move(Nowhere(name="nowhere"))
-    assert caller.done(0.0) == []
-
-    def refuse(message: str) -> Any:
-        raise ServiceStoppedError("it dies")
-
-    caller.move(played(refuse))
-    assert caller.done(0.0) == []
-    last = Service("last")
-    caller.move(last.endpoint)
-    caller.done(0.0)
-    last.answer()
-    assert caller.done(60.0) == [(ticket, "last early")]
-
-
-def test_a_connection_that_was_lost_is_made_again_though_nobody_says_where(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(endpoint, "RETRY_S", 0.05)
-    service = Service("only")
-    caller = connected(service)
-    ticket = caller.send("question")
-    service.stop()
-    assert caller.done(0.0) == []
-    service.held.clear()
-    while not service.held:
-        assert caller.done(0.0) == []
+def test_a_service_that_was_away_at_first_is_asked_when_it_is_there():
+    service = Service()
+    service.become("away")
+    client = ReconnectingClient(service)
+    ticket = client.send("early")
+    assert client.done(0.0) == []
+    service.become("there")
+    client.done(0.0)
     service.answer()
-    assert caller.done(60.0) == [(ticket, "only question")]
+    assert client.done(60.0) == [(ticket, "answer to early")]

@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 
 from accerl_lerobot.envs import SimulatedConfig, make_environment
-from accerl_lerobot.experience import Decision, Segment, SegmentStart
-from accerl_lerobot.rollout.runner import SegmentBuilder
+from accerl_lerobot.experience import Decision, Segment
+from accerl_lerobot.rollout.runner import ActiveEpisode, EpisodePlan
 from accerl_lerobot.world_model.contract import WorldModelSpec
 
 K = 4
@@ -36,8 +36,8 @@ def real_episode(seed: int, *, length: int = 8, solve_at: int = 99) -> list[Segm
     """An episode of random chunks, which are right from decision `solve_at` on."""
     environment = make_environment(WORLD)
     rng = np.random.default_rng(seed)
-    origin = SegmentStart("match", seed, 0)
-    builder = SegmentBuilder([environment.reset(seed, "match")], length, origin, environment.spec.max_steps)
+    plan = EpisodePlan(task="match", seed=seed, explore=True)
+    episode = ActiveEpisode(plan, environment.spec.max_steps, [environment.reset(seed, "match")])
     segments: list[Segment] = []
     for t in range(99):
         chunk = rng.uniform(-0.2, 0.2, (K, 2)).astype(np.float32)
@@ -45,10 +45,10 @@ def real_episode(seed: int, *, length: int = 8, solve_at: int = 99) -> list[Segm
             chunk = np.repeat(environment.solution[None], K, 0)  # type: ignore[attr-defined]
         result = environment.step_chunk(chunk)
         reward = float(result.rewards.sum()) - 0.01
-        builder.add(decided(chunk), chunk, reward, result.steps, result.observation)
-        if result.done or builder.full:
+        episode.add(decided(chunk), chunk, reward, result.steps, result.observation)
+        if result.done or len(episode.taken) == length:
             key = f"{seed}.{len(segments)}"
-            segments.append(builder.cut(key, result.done, result.success))
+            segments.append(episode.cut(key, result.done, result.success))
         if result.done:
             break
     return segments

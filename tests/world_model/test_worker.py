@@ -17,7 +17,7 @@ from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import CHECKPOINTS, TRAINING_STATE, save_checkpoint, saved_version
 from accerl_lerobot.engines.contract import Engine
 from accerl_lerobot.engines.stopping import WorkerError
-from accerl_lerobot.replay.pacing import ReplayConfig
+from accerl_lerobot.replay.buffer import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.run.train import make_engine
 from accerl_lerobot.world_model import worker as module

@@ -14,6 +14,7 @@ class SmolVLABins(TokenModel):
     """Drives `SmolVLABinsPolicy`; queries of rows that are not executed have no token."""
 
     backbone = "model.vlm."
+    blocks = r"model\.vlm\.(vision_model\.encoder|text_model)\.layers\.\d+"
     terminator = None
 
     def __init__(self, policy: Any) -> None:
