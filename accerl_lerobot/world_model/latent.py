@@ -8,6 +8,8 @@ A convolutional encoder as in TD-MPC2 (arXiv 2310.16828), contrasted with a slow
 later (InfoNCE, arXiv 1807.03748; the slow copy as in SPR, arXiv 2007.05929). Return, executed chunk and the
 chunks of successes are read off the state too, so that it holds what decides them. Without the random shift
 (DrQ-v2, arXiv 2107.09645) it recognises episodes by their pixels, and a critic on it judges no action.
+Each pixel is measured from its own mean, in its own standard deviations, so that a small object that moves
+on a still background is as loud as the robot's arm.
 
 Shapes: B rows, Z latent numbers, S numbers of proprioception, K executed actions of A dims.
 """
@@ -38,10 +40,12 @@ FOLLOW = 0.02  # share of the encoder that its slow copy takes over in a step
 TEMPERATURE = 0.1  # of the contrast
 CONTRAST, RETURN, INVERSE, CLONING = 0.1, 4.0, 0.3, 0.5  # weights of the losses; proprioception's is 1
 SMALLEST_STD = 1e-3
+SMALLEST_PIXEL_STD, FARTHEST = 0.05, 5.0  # of a pixel's range, and in standard deviations
+PIXEL_RATE = 0.002  # share of the newest images in the pixels' means, at least
 
 
 class Encoder(nn.Module):
-    """Images, float (B, C, 64, 64) in [−½, ½], to latents (B, Z) of mean 0 and variance 1.
+    """Images, float (B, C, 64, 64), to latents (B, Z) of mean 0 and variance 1.
 
     While it learns, it convolves in bf16 where the device computes in that; to act, in float32.
     """
@@ -82,11 +86,15 @@ class LatentModel(StateModel):
         self.value = network(seen + 1 + TASK_BITS, 1, hidden=1)
         self.inverse = network(2 * seen, chunk, hidden=1)
         self.cloned = network(seen + TASK_BITS, chunk, hidden=1)
+        pixels = sum(spec.cameras.values()), SIDE, SIDE
+        self.pixel_mean = nn.Parameter(torch.zeros(pixels), requires_grad=False)
+        self.pixel_square = nn.Parameter(torch.ones(pixels), requires_grad=False)
+        self.batches = nn.Parameter(torch.zeros(()), requires_grad=False)  # that the two above are means of
         self.mean = nn.Parameter(torch.zeros(spec.state), requires_grad=False)
         self.std = nn.Parameter(torch.ones(spec.state), requires_grad=False)
 
     def encode(self, observations: Observations, tasks: Sequence[str], elapsed: np.ndarray) -> Tensor:
-        latent = self.encoder(torch.cat(self._images(observations), 1))
+        latent = self.encoder(torch.cat(self._scaled(self._images(observations)), 1))
         late = torch.from_numpy(elapsed.astype(np.float32))[:, None].to(latent)
         return torch.cat([latent, self._proprioception(observations), late], 1)
 
@@ -103,6 +111,8 @@ class LatentModel(StateModel):
     def loss(self, transitions: Transitions) -> tuple[Tensor, dict[str, float]]:
         self._follow()
         now, following = self._images(transitions.observations), self._images(transitions.following)
+        self._fit_pixels(torch.cat(now, 1))
+        now, following = self._scaled(now), self._scaled(following)
         robot, robot_then = (
             (self._proprioception(seen) - self.mean) / self.std
             for seen in (transitions.observations, transitions.following)
@@ -136,6 +146,22 @@ class LatentModel(StateModel):
     def _follow(self) -> None:
         for slow, fast in zip(self.slow.parameters(), self.encoder.parameters(), strict=True):
             slow.lerp_(fast, FOLLOW)
+
+    @torch.no_grad()
+    def _fit_pixels(self, images: Tensor) -> None:
+        """Take another batch of images (B, channels, 64, 64) into the pixels' means."""
+        self.batches.add_(1)
+        rate = max(1 / float(self.batches), PIXEL_RATE)
+        self.pixel_mean.lerp_(images.mean(0), rate)
+        self.pixel_square.lerp_(images.square().mean(0), rate)
+
+    def _scaled(self, cameras: Sequence[Tensor]) -> list[Tensor]:
+        """The images of each camera in units of what each pixel varies by."""
+        variance = self.pixel_square - self.pixel_mean.square()
+        std = variance.clamp(min=SMALLEST_PIXEL_STD**2).sqrt()
+        channels = [images.shape[1] for images in cameras]
+        parts = zip(cameras, self.pixel_mean.split(channels), std.split(channels), strict=True)
+        return [((images - mean) / scale).clamp(-FARTHEST, FARTHEST) for images, mean, scale in parts]
 
     def _images(self, observations: Observations) -> list[Tensor]:
         """Each camera's, float (B, C, 64, 64) in [−½, ½]; of several env steps the newest."""

@@ -78,7 +78,11 @@ def test_the_loss_by_hand(monkeypatch: pytest.MonkeyPatch):
         made.std.fill_(2.0)
 
     def latents(observations: Observations, encoder: torch.nn.Module) -> np.ndarray:
-        images = torch.from_numpy(observations[FRONT]).permute(0, 3, 1, 2).float() / 255 - 0.5
+        seen, all_seen = (
+            each[FRONT].transpose(0, 3, 1, 2) / 255 for each in (observations, batch.observations)
+        )
+        scaled = (seen - all_seen.mean(0)) / np.maximum(all_seen.std(0), 0.05)
+        images = torch.from_numpy(scaled.clip(-5, 5).astype(np.float32))
         return encoder(images).detach().double().numpy()
 
     before = [parameter.detach().clone() for parameter in made.slow.parameters()]
