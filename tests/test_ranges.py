@@ -35,7 +35,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.hub.card import PullConfig
 from accerl_lerobot.policies.config import TuningConfig
 from accerl_lerobot.replay.pacing import ReplayConfig
-from accerl_lerobot.timeline.read import TimelineConfig
+from accerl_lerobot.timeline import TimelineConfig
 from accerl_lerobot.world_model.config import PixelModelConfig, WorldModelConfig
 from benchmarks.__main__ import CONFIGS as BENCHMARKS
 from benchmarks.async_vs_sync import BenchAsyncVsSyncConfig

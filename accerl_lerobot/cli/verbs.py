@@ -37,7 +37,7 @@ from accerl_lerobot.hub.card import PullConfig, PushConfig
 from accerl_lerobot.metrics import plain
 from accerl_lerobot.policies.config import Load
 from accerl_lerobot.report import ReportConfig, write_report
-from accerl_lerobot.timeline.read import TimelineConfig, write_trace
+from accerl_lerobot.timeline import TimelineConfig, write_trace
 
 OUTCOME = (
     "success_before", "ci95_before", "success_after", "ci95_after", "n_after", "episodes", "env_steps",
@@ -216,7 +216,7 @@ def _validated(
 def push(arguments: list[str]) -> int:
     """``accerl push``."""
     config: PushConfig = parse(PushConfig, arguments)
-    from accerl_lerobot.hub.push import push as to_hub
+    from accerl_lerobot.hub.transfer import push as to_hub
 
     with redirect_stdout(sys.stderr):
         found = to_hub(config)
@@ -228,7 +228,7 @@ def push(arguments: list[str]) -> int:
 def pull(arguments: list[str]) -> int:
     """``accerl pull``."""
     config: PullConfig = parse(PullConfig, arguments)
-    from accerl_lerobot.hub.pull import pull as from_hub
+    from accerl_lerobot.hub.transfer import pull as from_hub
 
     with redirect_stdout(sys.stderr):
         found = from_hub(config)

@@ -123,7 +123,6 @@ def checked(origin: FileSource, whole: bool = False) -> Iterator[None]:
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
     from lerobot.datasets.dataset_reader import DatasetReader
 
-    from accerl_lerobot.hub.errors import guard_client
     from datasets import Image
 
     load_metadata, load_data = LeRobotDatasetMetadata._load_metadata, DatasetReader._load_hf_dataset
@@ -173,7 +172,6 @@ def checked(origin: FileSource, whole: bool = False) -> Iterator[None]:
             hint = "an image that is no PNG, JPEG or TIFF, or broken; record it again"
             raise origin.refuse(DATA, hint) from error
 
-    guard_client()
     with (
         patch.object(Image, "decode_example", checked_decode),
         patch.object(LeRobotDatasetMetadata, "_load_metadata", checked_metadata),

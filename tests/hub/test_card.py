@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 import yaml
+from accerl_lerobot.hub.push import stage
 from huggingface_hub import ModelCard
 
 from accerl_lerobot.cli.verbs import CONFIGS
 from accerl_lerobot.engines.config import RunConfig, parse
 from accerl_lerobot.hub.card import MARK, PushConfig
-from accerl_lerobot.hub.push import stage
 from accerl_lerobot.policies.config import PLUGINS
 from tests.hub.folders import write_json, write_policy_folder, write_run_folder
 

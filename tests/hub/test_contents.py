@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 import yaml
+from accerl_lerobot.hub.push import contents, scrubbed, stage
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.hub.card import PullConfig, PushConfig, recognise, repo_type, run_files
-from accerl_lerobot.hub.push import contents, scrubbed, stage
 from tests.hub.folders import SUMMARY, write_json, write_policy_folder, write_run_folder
 
 TINY = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
