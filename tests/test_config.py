@@ -122,7 +122,7 @@ MISTAKES: list[tuple[list[str], str]] = [
     ),
     (["--policy.path=x", "--sft.steps=5"], "policy.path='x': add --sft.steps=0 to improve this checkpoint"),
     (["--sft.policy.chunk_size=5"], "sft.policy={'chunk_size': 5}: name LeRobot's policy type, e.g."),
-    (["--steps=3"], "steps=3: the name is LeRobot's; use trainer.updates or sft.steps"),
+    (["--steps=3"], "steps=3: the name is LeRobot's; use trainer.updates, or sft.steps"),
     (["--env.discover_packages_path=a/b"], "env.discover_packages_path='a/b': cannot be imported"),
     (["--seed=1", "--seed=2"], "seed=2: it is set to 1 already; give it once"),
     (["here.yaml", "--config_path=there.yaml"], "config_path='here.yaml': there is there.yaml already"),

@@ -31,7 +31,6 @@ import yaml
 
 from accerl_lerobot.checkpoint.layout import CONFIG
 from accerl_lerobot.checkpoint.safety import brief
-from accerl_lerobot.config.lerobot import FLAGS, hint_for
 from accerl_lerobot.config.ranges import annotations_of, check, defaults_of, fits, is_optional, is_union
 from accerl_lerobot.errors import InputError, expanded
 
@@ -51,6 +50,28 @@ CONSENT = {"trust_remote_code", "hub_path", DISCOVER, "extra_args", "address"}
 further arguments of ``lerobot-train``, or from a Ray cluster, which exchanges pickles with the run. Only the
 command line can set them. A recipe may have come with the very code that it would allow."""
 UNSET: tuple[Any, ...] = (None, False, "", [], {})
+OF_LEROBOT = {
+    "steps": "use trainer.updates, or sft.steps",
+    "batch_size": "use trainer.batch_decisions, or sft.batch_size",
+    "num_workers": "use rollout.workers",
+    "save_freq": "use save_every_updates",
+    "eval_freq": "use evaluation.every_updates",
+    "env_eval_freq": "use evaluation.every_updates",
+    "eval.n_episodes": "use evaluation.episodes",
+    "eval.batch_size": "use rollout.environments",
+    "rename_map": "use policy.rename_map",
+    "optimizer.lr": "use trainer.lr, or sft.lr",
+    "policy.type": "use policy.path, or sft.policy.type",
+    "policy.pretrained_path": "use policy.path, or sft.init_path",
+    "policy.use_amp": "use policy.precision=bf16",
+    "policy.push_to_hub": "use accerl push afterwards",
+    "policy.repo_id": "use accerl push afterwards",
+    "peft.r": "use policy.tuning.mode=lora and policy.tuning.rank",
+    "peft.method_type": "use policy.tuning.mode=lora",
+    "wandb.mode": "set WANDB_MODE in the environment",
+    "wandb.entity": "set WANDB_ENTITY in the environment",
+}
+"""Flags of ``lerobot-train`` that people type here, and what stands for each."""
 
 
 def imported(path: str) -> Any:
@@ -361,24 +382,22 @@ def _decoded(
     """
     annotations, sections = annotations_of(cls), sections_of(cls)
     usual = defaults_of(cls)
-    values = {}
+    values: dict[str, Any] = {}
     if type(default) is cls:
-        values = {name: getattr(default, name) for name in annotations}
-        usual = values
+        usual = {name: getattr(default, name) for name in annotations}
+        values = dict(usual)
     for key, value in tree.items():
         place = (*path, str(key))
         name = ".".join(place)
         if key not in annotations:
             raise _unknown(place, value, list(annotations), whole)
         if key not in sections:
-            converted = _converted(annotations[key], value)
-            check(annotations[key], converted, name)
-            values = values | {key: converted}
+            values[key] = _converted(annotations[key], value)
+            check(annotations[key], values[key], name)
         elif value is None and is_optional(annotations[key]):
-            values = values | {key: None}
+            values[key] = None
         elif isinstance(value, dict | None):
-            section = _section(sections[key], value or {}, usual[key], place, whole)
-            values = values | {key: section}
+            values[key] = _section(sections[key], value or {}, usual[key], place, whole)
         else:
             raise InputError(name, value, f"a config section; use --{key}.field=value")
     try:
@@ -457,18 +476,12 @@ def dotted_fields(cls: type[Any], path: str = "") -> Iterator[str]:
 def _unknown(place: tuple[str, ...], value: Any, names: list[str], whole: type[Any]) -> InputError:
     """The error for a field that a config does not have: what it resembles, or where it belongs."""
     *path, key = place
-    name = full_name = ".".join(place)
-    leaf = value
-    while isinstance(leaf, dict) and leaf:
-        below, leaf = next(iter(leaf.items()))
-        full_name += f".{below}"
-    fields = list(dotted_fields(whole))
+    name = ".".join(place)
+    for flag, leaf in _leaves(value, name):
+        if flag in OF_LEROBOT:
+            return InputError(flag, leaf, f"the name is LeRobot's; {OF_LEROBOT[flag]}")
     near = [".".join((*path, other)) for other in difflib.get_close_matches(key, names, n=3)]
-    if full_name in FLAGS or name in FLAGS or not near:  # else it is a misspelling
-        hint = hint_for(full_name, leaf, set(fields))
-        if hint is not None:
-            return InputError(full_name, leaf, f"the name is LeRobot's; {hint}")
-    near += [other for other in fields if other.rpartition(".")[2] == key]
+    near += [other for other in dotted_fields(whole) if other.rpartition(".")[2] == key]
     if near:
         return InputError(name, value, f"no such field; did you mean {' or '.join(dict.fromkeys(near))}?")
     where = f"{'.'.join(path)} has" if path else "there are"

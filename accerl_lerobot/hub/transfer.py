@@ -102,7 +102,7 @@ def stage(config: card.PushConfig, folder: Path, artifact: str) -> card.Files:
     source = FileSource("path", str(folder))
     found: card.Files = {**matching_files(folder, (*card.CONTENTS[artifact], "LICENSE*"), source)}
     if artifact == card.POLICY:
-        _bring_backbone(found, folder)
+        _point_at_backbone(found, folder)
     found |= card.run_files(folder, artifact, config.evaluation)
     files = {name: without_paths(name, content) for name, content in found.items()}
     written = matching_files(folder, [card.CARD], source).get(card.CARD)
@@ -115,21 +115,15 @@ def stage(config: card.PushConfig, folder: Path, artifact: str) -> card.Files:
     return files
 
 
-def _bring_backbone(files: card.Files, folder: Path) -> None:
-    """Points a policy at the backbone beside it, which is copied there if it is elsewhere on this machine."""
+def _point_at_backbone(files: card.Files, folder: Path) -> None:
+    """Makes a policy name the backbone beside it instead of one elsewhere on this machine."""
     config = card.read_json(folder / card.CONFIG)
     processor = card.read_json(folder / layout.PREPROCESSOR)
-    elsewhere = Path(config.get("vlm_model_name") or "")
-    if elsewhere.is_absolute() and not (folder / layout.BACKBONE).is_dir():
-        # The policy's own file holds its weights, unless LeRobot builds it from the backbone's.
-        names = card.OF_BACKBONE if config.get("load_vlm_weights") else layout.BACKBONE_FILES
-        for name, path in matching_files(elsewhere, names, FileSource("path", str(elsewhere))).items():
-            files[f"{layout.BACKBONE}/{name}"] = path
     for fields, key, place in layout.places_of_names(config, processor):
         named = fields.get(key) or ""
         if not Path(named).is_absolute():
             continue
-        if not any(name.startswith(f"{place}/") for name in files):
+        if not (folder / place).is_dir():
             hint = f"put a copy into {layout.BACKBONE}/ beside {card.CONFIG}"
             raise InputError("path", str(folder), f"it needs {named}, which is not in it; {hint}")
         fields[key] = place

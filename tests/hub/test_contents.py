@@ -117,46 +117,27 @@ def test_no_link_that_leads_out_is_pushed(tmp_path: Path, name: str):
         stage(PushConfig(path=str(folder), repo_id="a/b"), folder, "policy")
 
 
-def test_a_linked_file_of_a_run_or_of_a_backbone_elsewhere_is_not_pushed(tmp_path: Path):
+def test_a_linked_file_of_a_run_is_not_pushed(tmp_path: Path):
     write_json(tmp_path / "secret.json", SUMMARY)
     run = write_run_folder(tmp_path / "run")
     (run / "summary.json").unlink()
     (run / "summary.json").symlink_to(tmp_path / "secret.json")
     with pytest.raises(InputError, match="summary.json: a link that leads out"):
         run_files(run / "checkpoints" / "last" / "pretrained_model", "policy", None)
-    write_json(tmp_path / "backbone" / "id_rsa.json", {})
-    (tmp_path / "backbone" / "config.json").symlink_to(tmp_path / "secret.json")
-    folder = write_policy_folder(tmp_path / "policy", vlm_model_name=str(tmp_path / "backbone"))
-    with pytest.raises(InputError, match="config.json: a link that leads out"):
-        staged(folder)
-    (tmp_path / "backbone" / "config.json").unlink()
-    (tmp_path / "backbone" / "config.json").write_text("{}")
-    brought = {name for name in staged(folder) if name.startswith("backbone/")}
-    assert brought == {"backbone/config.json"}
 
 
-def test_a_backbone_elsewhere_is_brought(tmp_path: Path):
-    backbone = tmp_path / "backbone"
-    write_json(backbone / "config.json", {"model_type": "smolvlm"})
-    (backbone / "model.safetensors").write_bytes(b"weights that are in the policy as well")
-    folder = write_policy_folder(
-        tmp_path / "policy", type="smolvla", vlm_model_name=str(backbone), load_vlm_weights=False
-    )
-    step = TOKENIZER | {"config": {"tokenizer_name": str(backbone)}}
+def test_a_backbone_is_named_by_its_place_beside_the_weights(tmp_path: Path):
+    folder = write_policy_folder(tmp_path / "policy", type="smolvla", vlm_model_name=str(tmp_path / "gone"))
+    step = TOKENIZER | {"config": {"tokenizer_name": str(tmp_path / "gone")}}
     write_json(folder / "policy_preprocessor.json", {"steps": [step]})
+    with pytest.raises(InputError, match="put a copy into backbone/"):
+        staged(folder)
+    write_json(folder / "backbone" / "config.json", {"model_type": "smolvlm"})
     files = staged(folder)
     assert json.loads(bytes(files["config.json"]))["vlm_model_name"] == "backbone"
     stored = json.loads(bytes(files["policy_preprocessor.json"]))
     assert stored["steps"][0]["config"]["tokenizer_name"] == "backbone"
-    assert "backbone/config.json" in files and "backbone/model.safetensors" not in files
-    assert str(backbone) in (folder / "config.json").read_text(), "the folder itself is as it was"
-    write_json(
-        folder / "config.json", json.loads((folder / "config.json").read_text()) | {"load_vlm_weights": True}
-    )
-    assert "backbone/model.safetensors" in staged(folder)
-    backbone.rename(tmp_path / "gone")
-    with pytest.raises(InputError, match="put a copy into backbone/"):
-        staged(folder)
+    assert str(tmp_path / "gone") in (folder / "config.json").read_text(), "the folder itself is as it was"
 
 
 def test_numbers_go_only_with_the_policy_they_are_of(tmp_path: Path):
