@@ -65,7 +65,6 @@ MISTAKES: list[tuple[str, list[str]]] = [
     ("train", ["--env.type=simulated", "--algorithm.type=chunk_critic", "--world_model.type=simulator"]),
     ("train", ["--algorithm.type=awr", "--replay.samples_per_insert=4"]),
     ("eval", ["--eval.n_episodes=3"]),
-    ("sft", ["--policy.device=cpu"]),
 ]
 
 

@@ -31,7 +31,7 @@ import yaml
 
 from accerl_lerobot.checkpoint.layout import CONFIG
 from accerl_lerobot.checkpoint.safety import brief
-from accerl_lerobot.config.ranges import annotations_of, check, defaults_of, fits, is_optional, is_union
+from accerl_lerobot.config.ranges import annotations_of, defaults_of, fits, is_optional, is_union, wanted
 from accerl_lerobot.errors import InputError, expanded
 
 DISCOVER = "discover_packages_path"
@@ -393,7 +393,8 @@ def _decoded(
             raise _unknown(place, value, list(annotations), whole)
         if key not in sections:
             values[key] = _converted(annotations[key], value)
-            check(annotations[key], values[key], name)
+            if not fits(annotations[key], values[key]):
+                raise InputError(name, value, f"use {wanted(annotations[key])}")
         elif value is None and is_optional(annotations[key]):
             values[key] = None
         elif isinstance(value, dict | None):
