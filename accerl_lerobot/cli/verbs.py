@@ -171,15 +171,16 @@ def evaluate(arguments: list[str]) -> int:
     if out is not None:
         make_folder(out, "output_dir")
         (out / "evaluation.json").write_text(json.dumps(summary, indent=2) + "\n")
-        for result in (result for result in results if result.frames):
+        for result in results:
+            if not result.frames:
+                continue
             outcome = "success" if result.success else "failure"
             name = f"{result.plan.task.replace('/', '-')}_{result.plan.seed}_{outcome}.mp4"
             write_video(out / name, [[result.frames]], fps=20)
-    rates = {
-        task: {name: value for name, value in of.items() if "seeds" not in name}
-        for task, of in summary["tasks"].items()
-    }
-    return tell(summary | {"tasks": rates})
+    for rates in summary["tasks"].values():  # seeds are in the file alone
+        rates.pop("seeds", None)
+        rates.pop("failed_seeds", None)
+    return tell(summary)
 
 
 def world_model(arguments: list[str]) -> int:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import datetime
 import io
 import os
@@ -15,13 +16,12 @@ from urllib.parse import quote
 import numpy as np
 
 from accerl_lerobot import __version__
-from accerl_lerobot.checkpoint.layout import CHECKPOINTS, LAST, PRETRAINED, SUMMARY
+from accerl_lerobot.checkpoint.layout import SUMMARY
 from accerl_lerobot.config.help import shown
 from accerl_lerobot.config.parsing import decode
 from accerl_lerobot.console import ABSENT, count, duration, number, percent, rate
 from accerl_lerobot.engines.config import RunConfig, lag_limits
 from accerl_lerobot.errors import ERROR_LOG, InputError
-from accerl_lerobot.hub.card import lerobot_eval_command, read_json
 from accerl_lerobot.report.read import Record, Run, changed_fields, column, differences, finite, newest
 from accerl_lerobot.timeline import read_timeline
 
@@ -117,7 +117,6 @@ class Block(NamedTuple):
     charts: Sequence[Chart] = ()
     columns: Sequence[str] = ()
     rows: Sequence[Sequence[str]] = ()
-    commands: Sequence[tuple[str, str]] = ()
     videos: Sequence[Path] = ()
     shares: dict[str, dict[str, float]] | None = None
     needs: object = True
@@ -141,13 +140,10 @@ def html(page: dict[str, Any], folder: Path) -> str:
 
 def one_run(run: Run, now: float) -> dict[str, Any]:
     """Values of a page about one run."""
-    unknown = ""
     bound = None
-    try:
+    with contextlib.suppress(InputError):  # another version, or a package of the user's, may have written it
         if not run.offline:
             bound = lag_limits(decode(RunConfig, run.config))[0]
-    except InputError as error:  # another version, or a package of the user's, wrote it
-        unknown = f"This accerl does not know all of the recipe's types or fields: {error}."
     success = {"while exploring": exploring(run), "evaluation": evaluated(run)}
     changed = changed_fields(run.config)
     blocks = [
@@ -161,7 +157,6 @@ def one_run(run: Run, now: float) -> dict[str, Any]:
         ),
         Block("Evaluations", columns=("", "env steps", "task", "success", "n"), rows=_evaluations(run)),
         Block("Videos", videos=run.videos),
-        Block("Policy", commands=_commands(run)),
         Block(
             "Imagined rollouts",
             charts=[over_updates(run.rollout, ("success_imagined", "success_exploring"), share=True)],
@@ -173,7 +168,6 @@ def one_run(run: Run, now: float) -> dict[str, Any]:
             "Recipe: fields that differ from the defaults",
             columns=("field", "value", "default"),
             rows=[(name, shown(value), shown(default)) for name, (value, default) in changed],
-            note=unknown,
             text=run.config_text,
         ),
     ]
@@ -299,18 +293,6 @@ def evaluated(run: Run) -> Series:
     intervals = np.array([e["ci95"] for e in run.evaluations], dtype=np.float64).reshape(-1, 2).T
     steps = column(run.evaluations, "env_steps")
     return Series(steps, column(run.evaluations, "success"), intervals)
-
-
-def _commands(run: Run) -> list[tuple[str, str]]:
-    """Uses of the run's policy, and the commands for them."""
-    policy = run.path.resolve() / CHECKPOINTS / LAST / PRETRAINED
-    if not policy.is_dir():
-        return []
-    rows = [("Publish it:", f"accerl push --path={policy} --repo_id=USER/NAME")]
-    stock = lerobot_eval_command(str(policy), read_json(policy / "config.json"), run.section("env"))
-    if stock:
-        rows.insert(0, ("Evaluate the newest checkpoint with LeRobot alone:", stock))
-    return rows
 
 
 def _time_shares(run: Run) -> dict[str, dict[str, float]]:
