@@ -176,24 +176,47 @@ def resources(config: RunConfig, history: int = 1) -> Iterator[Check]:
     cores = len(os.sched_getaffinity(0))
     workers = config.rollout.workers
     threads = max(config.trainer.num_threads, config.inference.num_threads)
-    text, status = f"{cores} for {workers} rollout workers, 1 inference, 1 trainer", OK
+    text = f"{cores} for {workers} rollout workers, 1 inference, 1 trainer"
+    status = OK
     if workers > cores or threads > cores:
         status = WARN
         text += ": lower rollout.workers, trainer.num_threads or inference.num_threads"
     yield Check("cores", status, text)
     need = sizes.policy_gib(config) + sum(sizes.memory_parts_gib(config, history).values())
-    text, status = f"about {need:.1f} GiB of memory needed", OK
+    text = f"about {need:.1f} GiB of memory needed"
+    status = OK
     if need > memory_gib("MemAvailable"):
         status = WARN
         text += ": lower rollout.workers, rollout.environments or replay.capacity, or use a smaller policy"
+    yield Check("needs", status, text)
+    yield from gpu_memory(config)
+
+
+def gpu_memory(config: RunConfig) -> Iterator[Check]:
+    """Memory that a given policy takes on the GPU of its trainer, without what a batch adds."""
+    import torch
+
+    from accerl_lerobot.policies.loading import policy_sizes, resolve_device
+
+    if config.policy.path is None or resolve_device(config.policy.device).type == "cpu":
+        return
+    policy = policy_sizes(config.policy)
+    need = 4 * (policy.policy + policy.trained * sizes.trained_copies(config)) / GIB
+    text = f"weights, gradients and AdamW take {need:.1f} GiB of GPU memory"
+    status = OK
+    if need > torch.cuda.get_device_properties(0).total_memory / GIB:
+        status = WARN
+        text += ": use policy.tuning.mode=lora, or several GPUs and trainer.sharding=zero3"
     yield Check("needs", status, text)
 
 
 def pace(config: RunConfig) -> Iterator[Check]:
     """How far apart collecting and learning may run under this recipe, and how much it collects."""
-    replay, trainer = config.replay, config.trainer
+    replay = config.replay
+    trainer = config.trainer
     bound, of_pace = lag_limits(config)
-    text, status = f"at most {bound} updates with {config.rollout.in_flight} decisions under way", OK
+    text = f"at most {bound} updates with {config.rollout.in_flight} decisions under way"
+    status = OK
     if of_pace > bound:
         status = WARN
         text += (

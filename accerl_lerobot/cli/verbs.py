@@ -140,7 +140,8 @@ def _in_new_folder[Result](
     """Does work in the folder that a config names, which goes if the input turns out to be bad."""
     from accerl_lerobot.run.train import discard_unused, make_output_dir
 
-    directory, console = make_output_dir(config), Console()
+    directory = make_output_dir(config)
+    console = Console()
     console.say(f"run {directory}")
     write_atomically(directory / CONFIG, yaml.safe_dump(encode(config), sort_keys=False))
     try:

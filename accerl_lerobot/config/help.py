@@ -47,7 +47,8 @@ def help_text(command: str, config_class: type[Any], what: str, section: str = "
 
     `what` says in one line what the command does; `section` is that of ``--help=SECTION``, or ``all``.
     """
-    lines, sections = list(_lines(config_class)), sections_of(config_class)
+    lines = list(_lines(config_class))
+    sections = sections_of(config_class)
     if section not in ("", "all"):
         inside = [line for line in lines if f"{line.name}.".startswith(f"{section}.")]
         if not inside:
@@ -95,7 +96,9 @@ def _lines(cls: type[Any], prefix: str = "", default: Any = None, usual: bool = 
 
     Of a choice, the fields of all types follow.
     """
-    texts, defaults, sections = docstrings(cls), defaults_of(cls), sections_of(cls)
+    texts = docstrings(cls)
+    defaults = defaults_of(cls)
+    sections = sections_of(cls)
     for name, annotation in annotations_of(cls).items():
         if name not in sections:
             value = getattr(default, name, defaults[name])
@@ -132,7 +135,8 @@ def _in_full(line: Line) -> str:
     start = f"  --{line.name}={line.default}"
     above = ""
     if len(start) >= COLUMN:
-        above, start = f"{start}\n", ""
+        above = f"{start}\n"
+        start = ""
     indent = " " * COLUMN
     return above + textwrap.fill(
         line.text or " ", WIDTH, initial_indent=start.ljust(COLUMN), subsequent_indent=indent

@@ -147,7 +147,8 @@ def parse(config_class: type[Any], arguments: list[str], *, recipe_class: type[A
 
 def _for_verb(tree: dict[str, Any], config_class: type[Any], recipe_class: type[Any]) -> dict[str, Any]:
     """The part of a run's recipe that is for the config of another verb."""
-    known, taken = annotations_of(recipe_class), annotations_of(config_class)
+    known = annotations_of(recipe_class)
+    taken = annotations_of(config_class)
     left = {}
     for key, value in tree.items():
         if key in known and (key not in taken or key == "output_dir"):
@@ -339,9 +340,11 @@ def _overridden(config_class: type[Any], tree: dict[str, Any], given: dict[str, 
     values fit: ``--algorithm.type=ppo`` replaces GIPO together with its ``sigma``.
     """
     merged = tree | given
-    sections, defaults = sections_of(config_class), defaults_of(config_class)
+    sections = sections_of(config_class)
+    defaults = defaults_of(config_class)
     for name in tree.keys() & given.keys():
-        under, over = tree[name], given[name]
+        under = tree[name]
+        over = given[name]
         if not isinstance(under, dict) or not isinstance(over, dict):
             continue
         if name not in sections:
@@ -380,7 +383,8 @@ def _decoded(
 
     `path` is where the section stands in the config `whole`.
     """
-    annotations, sections = annotations_of(cls), sections_of(cls)
+    annotations = annotations_of(cls)
+    sections = sections_of(cls)
     usual = defaults_of(cls)
     values: dict[str, Any] = {}
     if type(default) is cls:
@@ -405,7 +409,8 @@ def _decoded(
         return cls(**values)
     except InputError as error:
         # A section that stands in several places, such as a dataset, has one name for itself.
-        own, actual = f"{getattr(cls, 'SECTION', '')}.", f"{'.'.join(path)}."
+        own = f"{getattr(cls, 'SECTION', '')}."
+        actual = f"{'.'.join(path)}."
         if own in (".", actual) or not error.field.startswith(own):
             raise
         field = actual + error.field.removeprefix(own)
@@ -433,7 +438,8 @@ def _converted(kind: Any, value: Any) -> Any:
 
     ``a,b`` and a lone value are the list that a field holds.
     """
-    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    origin = typing.get_origin(kind)
+    arguments = typing.get_args(kind)
     if origin is Annotated:
         return _converted(arguments[0], value)
     if is_union(kind):

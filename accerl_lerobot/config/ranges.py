@@ -37,8 +37,11 @@ class Range:
         match = re.fullmatch(r"([\[(])(\S+), (\S+)([\])])", text)
         if match is None:
             raise ValueError(f"{text}: write an interval such as [0, 1)")
-        self.text, self._low_open, self._high_open = text, match[1] == "(", match[4] == ")"
-        self.low, self.high = float(match[2]), float(match[3])
+        self.text = text
+        self._low_open = match[1] == "("
+        self._high_open = match[4] == ")"
+        self.low = float(match[2])
+        self.high = float(match[3])
 
     def __repr__(self) -> str:
         return f"Range({self.text!r})"
@@ -52,7 +55,8 @@ class Pattern:
     """Texts that match a regular expression; `words` says which these are."""
 
     def __init__(self, pattern: str, words: str) -> None:
-        self.pattern, self.words = re.compile(pattern), words
+        self.pattern = re.compile(pattern)
+        self.words = words
 
     def __repr__(self) -> str:
         return f"Pattern({self.pattern.pattern!r})"
@@ -154,7 +158,8 @@ def check(annotation: Any, value: Any, field: str) -> None:
 
 def fits(annotation: Any, value: Any) -> bool:
     """True if a value fits an annotation and its range."""
-    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
+    origin = typing.get_origin(annotation)
+    arguments = typing.get_args(annotation)
     if origin is Annotated:
         kind, mark = arguments
         kind_fits = _is_number(value) if kind is float else fits(kind, value)
@@ -190,7 +195,8 @@ PLAIN = {int: "a whole number", float: "a number", bool: "true or false", str: "
 
 def wanted(annotation: Any) -> str:
     """Values that fit an annotation, in words."""
-    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
+    origin = typing.get_origin(annotation)
+    arguments = typing.get_args(annotation)
     if origin is Annotated:
         kind, mark = arguments
         return mark.words if isinstance(mark, Pattern) else f"{wanted(kind)} in {mark.text}"

@@ -120,8 +120,10 @@ def recognise(folder: Path, field: str = "path") -> str:
     else:
         raise InputError(field, str(folder), _hint(folder))
     needed = list(NEEDED[artifact])
-    if (folder / ADAPTER_CONFIG).is_file():  # of LeRobot's PEFT training, whose policy is elsewhere
-        needed.remove(WEIGHTS)
+    if (
+        artifact == POLICY and (folder / ADAPTER_CONFIG).is_file()
+    ):  # of LeRobot's PEFT training, whose policy is elsewhere
+        needed[needed.index(WEIGHTS)] = ADAPTER
     missing = [name for name in needed if not (folder / name).exists()]
     if missing:
         hint = f"looks like a {artifact} but lacks {', '.join(missing)}; name a complete folder"
@@ -156,7 +158,8 @@ def run_files(folder: Path, artifact: str, evaluation: str | None) -> dict[str, 
     names: Collection[str] = ()
     run = place.parent
     if not carried and artifact == POLICY and run.parent.name == CHECKPOINTS:
-        step, run = run.name, run.parents[1]
+        step = run.name
+        run = run.parents[1]
         is_last = step.isdigit() and int(step) == read_json(run / SUMMARY).get("updates")
         names = KEPT[POLICY] if is_last else (RECIPE,)
     elif not carried and artifact == WORLD_MODEL and (run / VALIDATION).is_file():

@@ -36,7 +36,7 @@ from huggingface_hub.errors import HfHubHTTPError, RepositoryNotFoundError, Revi
 from huggingface_hub.utils import filter_repo_objects
 
 from accerl_lerobot.checkpoint import layout
-from accerl_lerobot.checkpoint.safety import FileSource, brief, matching_files, unsafe_name
+from accerl_lerobot.checkpoint.safety import FileSource, matching_files, unsafe_name
 from accerl_lerobot.errors import InputError, check_absent, expanded, make_folder, reading
 from accerl_lerobot.hub import card
 
@@ -72,14 +72,13 @@ def hub_errors(repo_id: str, revision: str | None) -> Iterator[None]:
         hint = f"{repo_id} has no such commit, tag or branch"
         raise InputError("revision", revision, hint) from None
     except Exception as error:
-        logger.debug("the Hub failed", exc_info=error)
         code = error.response.status_code if isinstance(error, HfHubHTTPError) else 0
         if code == 401 and get_token() is None:  # so the Hub answers where there is nothing, or it is private
             code = 404
-        text = str(error).replace(get_token() or "<token>", "<token>").strip()
-        why = brief(ConnectionError(text.splitlines()[-1] if text else type(error).__name__))
+        lines = str(error).replace(get_token() or "<token>", "<token>").strip().splitlines()
+        why = lines[-1][:160] if lines else type(error).__name__
         hint = STATUS.get(code) or f"the Hub, the network or this disk does not work ({why}); {AGAIN}"
-        raise InputError("repo_id", repo_id, hint) from None
+        raise InputError("repo_id", repo_id, hint) from None  # the client's own words may hold a header
 
 
 def push(config: card.PushConfig) -> dict[str, Any]:
@@ -171,7 +170,8 @@ def _is_ours(text: str) -> bool:
 
 
 def _upload(config: card.PushConfig, artifact: str, files: card.Files) -> dict[str, Any]:
-    api, repo_id = HfApi(), config.repo_id
+    api = HfApi()
+    repo_id = config.repo_id
     repo_type = "dataset" if artifact == card.DATASET else "model"
     where: dict[str, Any] = {"repo_id": repo_id, "repo_type": repo_type}
     api.create_repo(**where, private=config.private, exist_ok=True)

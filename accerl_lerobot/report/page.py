@@ -252,7 +252,8 @@ def warnings(run: Run, now: float) -> Iterator[str]:
     if len(low_weight) and low_weight.mean() > STALE:
         share = percent(float(low_weight.mean()))
         yield f"Many samples hardly counted, {share} at the end: too stale, or trainer.lr too high."
-    imagined, real = newest(run.rollout, "success_imagined"), newest(run.rollout, "success_exploring")
+    imagined = newest(run.rollout, "success_imagined")
+    real = newest(run.rollout, "success_exploring")
     if imagined is not None and real is not None and imagined - real > MOST_GAP:
         rates = f"{percent(imagined)} and {percent(real)}"
         yield f"Imagined episodes succeed far more often than real ones, {rates}: the world model misleads."
@@ -320,7 +321,7 @@ def _headline(run: Run) -> str:
 
 def _tasks(run: Run) -> str:
     """The run's task, or how many it has."""
-    names = [name for e in run.evaluations[-1:] for name in e.get("tasks") or ()]
+    names = list(run.evaluations[-1].get("tasks") or ()) if run.evaluations else []
     if len(names) > 1:
         return count(len(names), "task")
     env = run.section("env")

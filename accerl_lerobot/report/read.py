@@ -73,7 +73,9 @@ class Run:
 def read_run(path: Path) -> Run:
     source = FileSource("runs", str(path))
     check_folder(path, source)
-    config_path, summary, log = path / CONFIG, path / SUMMARY, path / ERROR_LOG
+    config_path = path / CONFIG
+    summary = path / SUMMARY
+    log = path / ERROR_LOG
     config = read_recipe(config_path) if config_path.is_file() else {}
     if not {"algorithm", "trainer"} <= config.keys():
         raise InputError("runs", str(path), f"no run in it: there is no {CONFIG} of accerl train")
@@ -141,8 +143,11 @@ def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 def differences(trees: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[Any]]]:
     """Fields in which configs differ, with the value of each; a dash where one does not have it."""
     flats = [flat(tree) for tree in trees]
+    names: dict[str, Any] = {}
+    for fields in flats:
+        names |= fields
     rows = []
-    for name in dict.fromkeys(name for fields in flats for name in fields):
+    for name in names:
         values = [fields.get(name, ABSENT) for fields in flats]
         if name not in PLACES and any(value != values[0] for value in values):
             rows.append((name, values))

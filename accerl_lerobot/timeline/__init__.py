@@ -20,7 +20,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -219,9 +219,10 @@ def read_timeline(run_directory: Path) -> Timeline:
     if not processes:
         hint = "no timeline in it: it is no run of accerl train, or no worker has begun"
         raise InputError("runs", str(run_directory), hint)
-    began = min(int(row.starts[0]) for rows in processes.values() for row in rows)
-    rows = [_whole_row(rows, began) for rows in processes.values()]
-    return Timeline(run=run_directory, rows=tuple(sorted(rows, key=_place)))
+    rows = sorted(map(_whole_row, processes.values()), key=_place)
+    began = min(int(row.starts[0]) for row in rows)
+    since_began = [replace(row, starts=row.starts - began, ends=row.ends - began) for row in rows]
+    return Timeline(run=run_directory, rows=tuple(since_began))
 
 
 def _read_process(path: Path) -> Row:
@@ -235,10 +236,10 @@ def _read_process(path: Path) -> Row:
     return Row(worker=content["worker"], starts=starts, ends=ends, states=states)
 
 
-def _whole_row(processes: list[Row], began: int) -> Row:
+def _whole_row(processes: list[Row]) -> Row:
     """All intervals of a worker; one that was being ended when the next process began is cut there."""
-    starts = np.concatenate([row.starts for row in processes]) - began
-    ends = np.concatenate([row.ends for row in processes]) - began
+    starts = np.concatenate([row.starts for row in processes])
+    ends = np.concatenate([row.ends for row in processes])
     states = np.concatenate([row.states for row in processes])
     order = np.argsort(starts, kind="stable")
     next_starts = np.append(starts[order][1:], ends.max())
