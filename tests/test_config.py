@@ -125,7 +125,7 @@ MISTAKES: list[tuple[list[str], str]] = [
     (["--steps=3"], "steps=3: the name is LeRobot's; use trainer.updates, or sft.steps"),
     (["--env.discover_packages_path=a/b"], "env.discover_packages_path='a/b': cannot be imported"),
     (["--seed=1", "--seed=2"], "seed=2: it is set to 1 already; give it once"),
-    (["here.yaml", "--config_path=there.yaml"], "config_path='here.yaml': there is there.yaml already"),
+    (["here.yaml", "--config_path=there.yaml"], "config_path='here.yaml': there is another one already"),
     (["seed=2"], "config_path='seed=2': no such file"),
     (["--seed=1", "--seed.x=2"], "seed.x=2: seed is set to 1 already"),
 ]

@@ -153,11 +153,12 @@ def recipe(arguments: list[str]) -> Iterator[Check]:
         InputError: it is refused.
     """
     from accerl_lerobot.engines.config import RunConfig, parse
+
+    config: RunConfig = parse(RunConfig, arguments)
     from accerl_lerobot.engines.placement import check_placement
     from accerl_lerobot.run.preflight import check_start
     from accerl_lerobot.world_model.imagined import check_imagination
 
-    config: RunConfig = parse(RunConfig, arguments)
     _, history = check_start(config)
     yield Check("recipe", OK, "resolves")
     yield rendering(needed=config.env.type in ("metaworld", "libero"))

@@ -221,7 +221,7 @@ def read_arguments(arguments: list[str], bare: str | None = None) -> tuple[Path 
     elif entries:
         _set(given, bare, entries)
     if len(recipes) > 1:
-        raise InputError("config_path", recipes[1], f"there is {recipes[0]} already; give one recipe")
+        raise InputError("config_path", recipes[1], "there is another one already; give one recipe")
     return (_recipe_path(expanded(recipes[0], "config_path")) if recipes else None), given
 
 
