@@ -174,8 +174,11 @@ def _upload(config: card.PushConfig, artifact: str, files: card.Files) -> dict[s
     repo_id = config.repo_id
     repo_type = "dataset" if artifact == card.DATASET else "model"
     where: dict[str, Any] = {"repo_id": repo_id, "repo_type": repo_type}
-    api.create_repo(**where, private=config.private, exist_ok=True)
-    before = api.repo_info(**where)
+    try:
+        before = api.repo_info(**where)
+    except RepositoryNotFoundError:
+        api.create_repo(**where, private=config.private)
+        before = api.repo_info(**where)
     if config.private and before.private is False:
         hint = "this repository is public: add --private=false, or choose another name"
         raise InputError("private", True, hint)
