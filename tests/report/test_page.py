@@ -103,7 +103,7 @@ def test_everything_needed_is_inside(pictures: None, tmp_path: Path) -> None:
     assert "default-src 'none'" in policy and "script" not in policy
 
 
-def test_a_chart_is_drawn_whatever_its_numbers_and_names() -> None:
+def test_a_chart_is_drawn_whatever_its_numbers_and_names(pictures: None) -> None:
     line = Series(np.arange(30.0), np.full(30, np.nan))
     point = Series(np.array([1.0]), np.array([0.5]), np.array([[0.4], [0.6]]))
     assert not Chart("none", "x", {"a": line}).drawable
