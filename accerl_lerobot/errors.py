@@ -27,10 +27,8 @@ logger = logging.getLogger(__name__)
 ERROR_LOG = "error.log"  # file of a run's folder with the tracebacks of unexpected errors
 TOKEN = re.compile(r"\bhf_\w{6,}")  # of the Hub, which somebody may have typed where it does not belong
 BAR = re.compile(r"[^\r\n]*?\d%\|[^\]\r\n]*\]|\r")  # of progress, which no line end follows
-LONGEST, LONGEST_REMEDY, MOST_SHOWN = 200, 1200, 600
-"""Characters that are shown of a value, of a hint and of an unexpected error; a whole section may have been
-given where a number belongs, and some hints repeat a part of it."""
-
+LONGEST, MOST_SHOWN = 200, 600
+"""Characters that are shown of a value, and of an unexpected error."""
 
 MAX_NONFINITE = 5  # steps in a row with a non-finite loss or gradient that are an error; fewer are skipped
 
@@ -53,12 +51,11 @@ class InputError(ValueError):
         super().__init__(field, value, hint)
 
     def __str__(self) -> str:
-        value, hint, half = repr(self.value), self.hint, LONGEST_REMEDY // 2
+        value = repr(self.value)
         if len(value) > LONGEST:
             value = f"{value[: LONGEST - 1]}…"
-        if len(hint) > LONGEST_REMEDY:  # what to do stands at its end
-            hint = f"{hint[:half]}…{hint[-half:]}"
-        return TOKEN.sub("<token>", printable(" ".join(f"{self.field}={value}: {hint}".split())))
+        line = " ".join(f"{self.field}={value}: {self.hint}".split())
+        return TOKEN.sub("<token>", printable(line))
 
 
 def printable(text: str, keep: str = "") -> str:

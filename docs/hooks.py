@@ -8,15 +8,13 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from accerl_lerobot.cli import VERBS  # noqa: E402
 from accerl_lerobot.cli.verbs import CONFIGS  # noqa: E402
-from accerl_lerobot.config.help import docstrings  # noqa: E402
+from accerl_lerobot.config.help import docstrings, shown  # noqa: E402
 from accerl_lerobot.config.parsing import choices_of, section_of  # noqa: E402
-from accerl_lerobot.config.ranges import annotations_of, range_in_words  # noqa: E402
+from accerl_lerobot.config.ranges import annotations_of, defaults_of, wanted  # noqa: E402
 
 
 def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
@@ -42,12 +40,13 @@ def options() -> str:
 def section(config_class: type[Any], prefix: str, seen: set[tuple[str, type]]) -> str:
     """Table of the fields of a config, then the sections inside it."""
     hints, texts = annotations_of(config_class), docstrings(config_class)
+    defaults = defaults_of(config_class)
     rows, inner = [], []
     for field in dataclasses.fields(config_class):
         name, nested = f"{prefix}{field.name}", section_of(hints[field.name])
         if nested is None:
-            span = range_in_words(hints[field.name])
-            cells = (f"`{name}`", f"`{default_of(field)}`", span, texts[field.name])
+            span = wanted(hints[field.name])
+            cells = (f"`{name}`", f"`{shown(defaults[field.name])}`", span, texts[field.name])
             rows.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
         elif (name, nested) not in seen:
             seen.add((name, nested))
@@ -57,14 +56,3 @@ def section(config_class: type[Any], prefix: str, seen: set[tuple[str, type]]) -
                 inner.append(f"\n### {title}\n\n{about}\n\n{section(one, f'{name}.', seen)}")
     head = ["| field | default | values | meaning |", "|---|---|---|---|"]
     return "\n".join([*(head + rows if rows else []), *inner])
-
-
-def default_of(field: Any) -> str:
-    """The default as one would type it."""
-    if field.default_factory is not dataclasses.MISSING:
-        value = field.default_factory()
-    else:
-        value = None if field.default is dataclasses.MISSING else field.default
-    value = list(value) if isinstance(value, tuple) else value
-    text = value if isinstance(value, str) else yaml.safe_dump(value, default_flow_style=True, width=1000)
-    return text.removesuffix("\n...\n").strip() or '""'

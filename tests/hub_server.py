@@ -17,7 +17,7 @@ import json
 import re
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -37,8 +37,8 @@ ACCOUNTS = {WRITER: ("alice", "write"), READER: ("alice", "read"), STRANGER: ("m
 class Fault:
     """Something that goes wrong with requests of a method whose path has `match` in it, so many `times`.
 
-    Either a `status` is answered, which `says` something; or nothing happens for `hang_s`, `cut_after` bytes
-    of the body are read, and the connection is cut.
+    Either a `status` is answered, which `says` something; or `cut_after` bytes of the body are read, and the
+    connection is cut.
     """
 
     method: str
@@ -46,18 +46,7 @@ class Fault:
     status: int = 0
     says: str = "as it was told to"
     cut_after: int = -1
-    hang_s: float = 0.0
     times: int = 1
-
-
-@dataclass
-class Answer:
-    """An answer about to be sent."""
-
-    path: str
-    status: int
-    headers: dict[str, str]
-    body: bytes
 
 
 @dataclass
@@ -113,14 +102,10 @@ class HubServer(ThreadingHTTPServer):
         self.blobs = folder
         self.repos: dict[tuple[str, str], Repo] = {}
         self.faults: list[Fault] = []
-        self.change: Callable[[Answer], Answer] | None = None
-        """Makes another answer of every answer."""
         self.journal: list[tuple[str, str, int]] = []
         """(method, path, status) of every request that was answered."""
         self.uploaded: list[str] = []
         """sha256 of every large file that came whole."""
-        self.seen: list[str] = []
-        """Every line of every request's head but the token's, to look for what should not be there."""
         self.lock = threading.Lock()
 
     @property
@@ -177,15 +162,9 @@ class Handler(BaseHTTPRequestHandler):
 
     def _answer(self) -> None:
         path = unquote(urlsplit(self.path).path)
-        self.server.seen += [
-            self.path,
-            *(f"{k}: {v}" for k, v in self.headers.items() if k != "authorization"),
-        ]
-        self.fault = self.server.fault(self.command, path)
-        fault = self.fault
-        if fault is not None and (fault.hang_s or fault.cut_after >= 0):
-            time.sleep(fault.hang_s)
-            self.rfile.read(max(0, fault.cut_after))
+        fault = self.server.fault(self.command, path)
+        if fault is not None and fault.cut_after >= 0:
+            self.rfile.read(fault.cut_after)
             self._note(path, 0)
             self.close_connection = True
             self.connection.shutdown(2)
@@ -219,17 +198,12 @@ class Handler(BaseHTTPRequestHandler):
     def _send(self, status: int, data: bytes, headers: dict[str, str]) -> None:
         self._note(unquote(urlsplit(self.path).path), status)
         headers = {"Content-Length": str(len(data))} | headers
-        answer = Answer(unquote(urlsplit(self.path).path), status, headers, data)
-        if self.server.change is not None:
-            answer = self.server.change(answer)
-            answer.headers["Connection"] = "close"  # its length may be wrong
-            self.close_connection = True
-        self.send_response(answer.status)
-        for key, value in answer.headers.items():
+        self.send_response(status)
+        for key, value in headers.items():
             self.send_header(key, value)
         self.end_headers()
         if self.command != "HEAD":
-            self.wfile.write(answer.body)
+            self.wfile.write(data)
 
     def _json(self, value: Any, status: int = 200) -> None:
         self._send(status, json.dumps(value).encode(), {"Content-Type": "application/json"})

@@ -11,7 +11,6 @@ import signal
 import subprocess
 import sys
 import time
-import traceback
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +23,7 @@ from accerl_lerobot.cli import verbs
 from accerl_lerobot.console import Console
 from accerl_lerobot.engines.config import encode
 from accerl_lerobot.engines.stopping import WorkerError
-from accerl_lerobot.errors import InputError, kept_traceback, last_exception, one_line
+from accerl_lerobot.errors import InputError, kept_traceback, one_line
 
 if TYPE_CHECKING:
     from accerl_lerobot.run.train import Run
@@ -44,38 +43,27 @@ def test_help_answers_without_torch_or_lerobot() -> None:
         assert f"\n  {verb} " in done.stdout
 
 
-def test_every_verb_has_a_function_and_a_config() -> None:
-    assert verbs.CONFIGS.keys() == cli.VERBS.keys()
-
-
 @pytest.mark.parametrize("verb", list(cli.VERBS))
 def test_verb_help_lists_fields_with_their_docstrings(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main([verb, "--help"]) == 0
     out = capsys.readouterr().out
     assert out.startswith(f"usage: accerl {verb}")
     assert out.count("\n") <= 60 and max(map(len, out.splitlines())) <= 115
-    if verb in ("train", "doctor"):
+    if verb == "train":
         assert "  --trainer.lr=" in out and "--algorithm.clip_low" not in out
         assert "--algorithm.type=gipo" in out and "| ppo" in out
         assert "--help=SECTION" in out and "\n  trainer     How the policy is updated." in out
         assert "recipes: act_pusht, deploy, few_shot" in out
-    assert cli.main([verb, "--help=all"]) == 0
-    out = capsys.readouterr().out
-    assert out.startswith(f"usage: accerl {verb}") and max(map(len, out.splitlines())) <= 140
-    if verb in ("train", "doctor"):
-        assert "  --trainer.lr=" in out and "Peak learning rate of the policy" in out
-        assert "algorithm.type=gipo (default)" in out and "--algorithm.clip_low" in out
-        assert "env.type=metaworld (default)" in out and "--env.tolerance" in out
-        assert "--algorithm.gamma=0.99                    Discount per decision" in out  # of the base class
 
 
-def test_help_of_a_section(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["train", "--help=policy.sampler"]) == 0
+def test_help_of_all_and_of_a_section(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["train", "--help=all"]) == 0
     out = capsys.readouterr().out
-    assert "--policy.sampler.noise_level" in out and "--policy.path" not in out
+    assert "algorithm.type=gipo (default)" in out and "--algorithm.clip_low" in out
+    assert "--algorithm.gamma=0.99                    Discount per decision" in out  # of the base class
     assert cli.main(["train", "--help=trainer"]) == 0
     out = capsys.readouterr().out
-    assert "0 freezes it. In [0, 1)." in out and "In [1, 1000000]." in out and "--policy" not in out
+    assert "0 freezes it. A number in [0, 1)." in out and "--policy" not in out
     assert cli.main(["train", "--help=trainr"]) == 2
     assert "--help='trainr': use all or one of env, dataset" in capsys.readouterr().err
 
@@ -83,7 +71,7 @@ def test_help_of_a_section(capsys: pytest.CaptureFixture[str]) -> None:
 def test_unknown_verb(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["trian"]) == 2
     err = capsys.readouterr().err
-    assert err.startswith("accerl: no verb 'trian'; did you mean train? Otherwise use one of train, demos, ")
+    assert err.startswith("accerl: VERB='trian': did you mean train? Otherwise use one of train, demos, ")
 
 
 class RayTaskError(InputError):
@@ -102,7 +90,6 @@ class RayTaskError(InputError):
         (RayTaskError("", "", ""), 2, "policy.path='here': give another"),
         (KeyboardInterrupt(), 130, "interrupted"),
         (RuntimeError("a worker\n\n  failed"), 1, "RuntimeError: a worker … failed; ACCERL_LOG=DEBUG shows"),
-        (MemoryError(), 1, "MemoryError; ACCERL_LOG=DEBUG"),
         (BrokenPipeError(32, "Broken pipe"), 1, "BrokenPipeError: [Errno 32] Broken pipe; ACCERL_LOG"),
     ],
     ids=lambda value: type(value).__name__,
@@ -139,18 +126,6 @@ def test_control_characters_are_escaped_where_a_message_becomes_a_line(error, mo
     err = capsys.readouterr().err
     assert all(character.isprintable() or character == "\n" for character in err)
     assert err.count("\\x1b[2J") == 5 + isinstance(error, InputError) and "\\u202e" in err
-
-
-def test_the_reason_is_the_exception_at_the_end_of_a_traceback() -> None:
-    try:
-        raise ValueError("no q01,\nno q99") from KeyError("stats")
-    except ValueError as error:
-        text = "".join(traceback.format_exception(error))
-    assert last_exception(f"10%|\r{text}") == "ValueError: no q01, no q99"
-    assert last_exception("usage: x\n\nerror: no such flag\n") == "error: no such flag"
-    assert one_line(RuntimeError(f"rollout 0 worker failed:\n{text}")).startswith(
-        "RuntimeError: rollout 0 worker failed: … ValueError: no q01, no q99; "
-    )
 
 
 def test_an_error_in_a_run_leaves_its_traceback_in_the_folder(tmp_path: Path) -> None:
@@ -200,10 +175,8 @@ class TestTrain:
         assert (told["success_after"], told["ci95_after"], told["env_steps"]) == (0.75, [0.7, 0.8], 43210)
         assert told["policy"] == str(policy) and told["summary"] == str(tmp_path / "run/summary.json")
         assert "seeds" not in told and "tasks_before" not in told
-        said = err.replace("\N{NO-BREAK SPACE}", " ")
         counts = "412 episodes, 43,210 env steps; 4 min 39 s"
-        assert f"success 25 % [20, 30] → 75 % [70, 80] of 100; {counts}\n" in said
-        assert f"policy {policy}\n" in err and f"the rest {told['summary']}; accerl report " in err
+        assert f"success 25\xa0% [20, 30] → 75\xa0% [70, 80] of 100; {counts}\n" in err
         assert seen["directory"] == tmp_path / "run" and seen["directory"].is_dir()
         assert seen["config"].trainer.lr == 1e-5
         monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
@@ -229,16 +202,9 @@ class TestTrain:
 class TestSFT:
     """`accerl sft` refuses before it imports a trainer."""
 
-    @pytest.mark.parametrize(
-        ("arguments", "words"),
-        [
-            (["--sft.steps=5"], "dataset.repo_id=None: name a LeRobotDataset"),
-            (["--dataset.repo_id=a/b"], "sft.steps=0: use at least 1\n"),
-        ],
-    )
-    def test_needs_a_dataset_and_steps(self, arguments, words, capsys):
-        assert cli.main(["sft", *arguments]) == 2
-        assert capsys.readouterr().err.startswith(f"accerl: {words}")
+    def test_needs_a_dataset(self, capsys):
+        assert cli.main(["sft", "--sft.steps=5"]) == 2
+        assert capsys.readouterr().err.startswith("accerl: dataset.repo_id=None: name a LeRobotDataset")
 
     def test_checks_the_dataset_against_the_world(self, capsys: pytest.CaptureFixture[str]) -> None:
         data = ROOT / "datasets" / "metaworld_tiny"  # camera corner2, as the recipe

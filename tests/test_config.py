@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import pytest
 import yaml
@@ -13,8 +13,6 @@ import yaml
 from accerl_lerobot import cli
 from accerl_lerobot.algorithms import GIPOConfig, PPOConfig
 from accerl_lerobot.cli.configs import DemosRun, EvalRun, SFTRun, WorldModelRun
-from accerl_lerobot.config import parsing
-from accerl_lerobot.config.ranges import Positive, Range, Share
 from accerl_lerobot.demos.backbone import BackboneConfig
 from accerl_lerobot.demos.sft import SFTConfig
 from accerl_lerobot.engines.config import DatasetConfig, RunConfig, decode, encode, parse
@@ -63,8 +61,6 @@ class TestOverrides:
         assert parse(RunConfig, [recipe, "--algorithm.type=gipo"]).algorithm.sigma == 0.5
         config = parse(RunConfig, [recipe, "--env.type=metaworld", "--env.task=door-open-v3"])
         assert config.env == MetaWorldConfig(task="door-open-v3", image_size=64)
-        config = parse(RunConfig, [recipe, "--env.type=lerobot", "--env.name=pusht", "--env.task="])
-        assert config.env == LeRobotEnvConfig(name="pusht", task="")
 
     def test_but_a_field_of_another_type_is_refused(self, recipe: str) -> None:
         with pytest.raises(InputError, match=r"algorithm.sigma=1: no such field"):
@@ -115,8 +111,6 @@ MISTAKES: list[tuple[list[str], str]] = [
     (["--trainer.updates"], "trainer.updates='': give it a value: --trainer.updates=…"),
     (["--trainer=3"], "trainer=3: a config section; use --trainer.field=value"),
     (["--trainer.betas=[1]"], "trainer.betas=[1]: use a list of 2, each a number"),
-    (["--policy.rename_map=3"], "policy.rename_map=3: use a mapping such as {key: value}"),
-    (["--wandb.enable=perhaps"], "wandb.enable='perhaps': use true or false"),
     (["--env.task=[a]"], "env.task=['a']: use text"),
     (["--algorithm.type=gippo"], "algorithm.type='gippo': did you mean gipo? Otherwise use one of awr, "),
     (["--env.type=mujoco"], "env.type='mujoco': use one of gym, lerobot, libero, metaworld, simulated"),
@@ -126,17 +120,13 @@ MISTAKES: list[tuple[list[str], str]] = [
         ["--replay.max_unlearned_decisions=3"],
         "replay.max_unlearned_decisions=3: use at least one batch, 128, or both sides wait for each other",
     ),
-    (["--dataset.root=x"], "dataset.repo_id=None: name the dataset in dataset.root"),
     (["--policy.path=x", "--sft.steps=5"], "policy.path='x': add --sft.steps=0 to improve this checkpoint"),
     (["--sft.policy.chunk_size=5"], "sft.policy={'chunk_size': 5}: name LeRobot's policy type, e.g."),
-    (["--steps=3"], "steps=3: the name is LeRobot's; use trainer.updates or sft.steps"),
-    (["--policy.push_to_hub=false"], "policy.push_to_hub=False: the name is LeRobot's; leave it out"),
+    (["--steps=3"], "steps=3: the name is LeRobot's; use trainer.updates, or sft.steps"),
     (["--env.discover_packages_path=a/b"], "env.discover_packages_path='a/b': cannot be imported"),
     (["--seed=1", "--seed=2"], "seed=2: it is set to 1 already; give it once"),
-    (["--trainer..lr=1"], "argument='--trainer..lr=1': write --section.field=value"),
-    (["here.yaml", "there.yaml"], "argument='there.yaml': write --section.field=value"),
-    (["--config_path=here.yaml", "--config_path=there.yaml"], "config_path='there.yaml': there is here.yaml"),
-    (["--seed=1", "seed=2"], "argument='seed=2': write --section.field=value"),
+    (["here.yaml", "--config_path=there.yaml"], "config_path='here.yaml': there is another one already"),
+    (["seed=2"], "config_path='seed=2': no such file"),
     (["--seed=1", "--seed.x=2"], "seed.x=2: seed is set to 1 already"),
 ]
 
@@ -150,12 +140,10 @@ def test_mistakes(arguments: list[str], message: str, capsys: pytest.CaptureFixt
 
 
 FILES: list[tuple[str, str]] = [
-    ("sft: &a {steps: 1}\ndemos: *a\n", "not good YAML: line 2: an alias; write the value itself"),
-    ("env: {type: metaworld\n", "not good YAML: line 2: expected ',' or '}'"),
-    ("env:\n\ttype: metaworld\n", "not good YAML: line 2: found character '\\t'"),
-    ("trainer: {lr: 1}\nseed: 1\ntrainer: {lr: 2}\n", "not good YAML: line 3: trainer is given twice"),
+    ("env: {type: metaworld\n", "not good YAML: while parsing a flow mapping"),
+    ("trainer: {lr: 1}\nseed: 1\ntrainer: {lr: 2}\n", "not good YAML: trainer is given twice in "),
     ("- 1\n- 2\n", "a recipe is a mapping"),
-    ("a: !!python/object:os.system {}\n", "not good YAML: line 1: could not determine a constructor"),
+    ("a: !!python/object:os.system {}\n", "not good YAML: could not determine a constructor"),
 ]
 
 
@@ -177,7 +165,7 @@ def test_missing_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
 
 
 def test_odd_text_stays_text() -> None:
-    for text in ("{[1]: 2}", "[" * 900, "2024-13-45", "!!timestamp x", "&a [*a]", "*x"):
+    for text in ("{[1]: 2}", "[" * 900, "2024-13-45", "*x"):
         assert parse(RunConfig, [f"--job_name={text}"]).job_name == text
 
 
@@ -203,15 +191,11 @@ class TestConsent:
             ("policy: {trust_remote_code: abc}", "--policy.trust_remote_code=abc"),
             ("sft: {extra_args: [--a=x]}", "'--sft.extra_args=[\"--a=x\"]'"),
             ("sft: {policy: {discover_packages_path: os}}", "--sft.policy.discover_packages_path=os"),
-            ("sft: {policy: {vision.trust_remote_code: 1}}", "--sft.policy.vision.trust_remote_code=1"),
-            ("sft: {policy: {vision.extra_args: {a: 1}}}", "'--sft.policy.vision.extra_args={\"a\": 1}'"),
             ("env: {type: lerobot, trust_remote_code: true}", "--env.trust_remote_code=true"),
             (f"env: {{type: lerobot, kwargs: {{hub_path: {ARENA}}}}}", f"--env.kwargs.hub_path={ARENA}"),
             ("imagination: {discover_packages_path: os}", "--imagination.discover_packages_path=os"),
             ("env: {type: gym, id: a/B, discover_packages_path: os}", "--env.discover_packages_path=os"),
-            ("imagination: {success: {hub_path: a}}", "--imagination.success.hub_path=a"),
             ("launch: {address: 'them:6379'}", "--launch.address=them:6379"),
-            ('sft: {extra_args: ["\\e[2J"]}', "\\u001b"),
         ],
     )
     def test_of_a_file_is_none(self, tmp_path: Path, text: str, flag: str) -> None:
@@ -220,7 +204,7 @@ class TestConsent:
         with pytest.raises(InputError) as caught:
             parse(RunConfig, [str(path)])
         assert "a file cannot allow this, only the command line can" in str(caught.value)
-        assert flag in str(caught.value) and "\x1b" not in caught.value.hint
+        assert flag in str(caught.value)
 
     def test_is_given_again_where_a_file_has_it(self, tmp_path: Path) -> None:
         path = tmp_path / "config.yaml"
@@ -288,31 +272,6 @@ class TestPreflight:
             repo_id="accerl/metaworld_tiny", root=str(ROOT / "datasets" / "metaworld_tiny")
         )
         check_start(RunConfig(sft=SFTConfig(steps=1, policy=policy), dataset=dataset))
-
-
-def test_every_field_has_a_name_on_the_command_line() -> None:
-    names = set(parsing.dotted_fields(RunConfig))
-    assert {"seed", "env.task", "env.hold", "algorithm.sigma", "algorithm.clip_low"} <= names
-    assert {"policy.sampler.noise_level", "sft.backbone.hidden"} <= names
-    assert not any(name in names for name in ("env", "trainer", "sft.backbone"))
-
-
-@pytest.mark.parametrize(
-    ("hint", "words"),
-    [
-        (int, "a whole number"),
-        (float | None, "a number or null"),
-        (list[str], "a list such as [a, b], each text"),
-        (dict[str, int], "a mapping such as {key: value}"),
-        (Literal["a", "b"], "a or b"),
-        (Share, "a number in [0, 1]"),
-        (Positive | None, "a number in (0, inf) or null"),
-        (Annotated[float, Range("[1, inf]")], "a number in [1, inf]"),
-        (Path, "Path"),
-    ],
-)
-def test_types_in_words(hint: Any, words: str) -> None:
-    assert parsing.wanted(hint) == words
 
 
 def test_the_world_model_of_a_run_is_not_that_of_pixels(tmp_path: Path):

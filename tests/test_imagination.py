@@ -31,7 +31,7 @@ from accerl_lerobot.experience import IMAGINED, REAL, Segment
 from accerl_lerobot.rollout.runner import EpisodePlans, RolloutConfig
 from accerl_lerobot.rollout.worker import RolloutWorker
 from accerl_lerobot.run.train import Run, make_engine
-from accerl_lerobot.timeline.read import read_timeline
+from accerl_lerobot.timeline import read_timeline
 from accerl_lerobot.world_model.config import (
     ImaginationConfig,
     LearnableModelConfig,

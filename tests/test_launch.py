@@ -22,7 +22,7 @@ from accerl_lerobot.engines.contract import Progress
 from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.replay.buffer import ReplayConfig, lag_bound
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
-from accerl_lerobot.timeline.read import read_timeline
+from accerl_lerobot.timeline import read_timeline
 from benchmarks.simulated_environment import LatencyConfig
 from tests.runs import collect, polls, tiny_run
 from tests.timeline.test_engines import adds_up, gaps

@@ -9,7 +9,6 @@ import os
 import random
 import subprocess
 from collections.abc import Iterator
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -23,32 +22,20 @@ from accerl_lerobot.config.parsing import dotted_fields
 CASES = 120
 
 
-def _bomb(first: str, form: str) -> str:
-    """YAML whose aliases stand for billions of values."""
-    lines = [f"{b}: &{b} {form.format(', '.join(['*' + a] * 9))}" for a, b in pairwise("abcdefghi")]
-    return "\n".join([f"a: &a {first}", *lines])
-
-
 VALUES = [
-    "-1", "0", "1e400", "-1e400", "99999999999999999999", ".nan", ".inf", "-.inf", "1e999", "0x_", "0b",
-    "0o9", "1__0", "1:99:99", "2024-13-45", "null", "true", "[]", "{}", "[1]", "[[1]]", "{a: 1}",
-    "{[1]: 2}", "{{a: 1}: 2}", "[" * 500, "[" * 9000, "{a: " * 600, "x" * 5000, "", " ", "\t", "~", "*x",
-    "&a [*a]", "&a *a", "!!python/name:os.system", "!!python/object/apply:os.system [ls]", "!!binary 1",
-    "!!int x", "!!timestamp x", "!!set {a, b}", "%TAG", "@x", "`x`", "'", '"', '"\\x', "- a\n- b: [",
-    "a: b: c", "a: 1\na: 2", "\x00", "\x1b[2J", "\udcff", "💥", "𝟙", "\u202e1", "½", "Ⅷ", "foo", "cuda:99",
-    "/dev/null/x", "../" * 2000, "~nobody/x", "hf_aaaaaaaaaaaaaaaaaaaa", "1,2,3", "1,,2", "1 2", "1e-4.5",
+    "-1", "0", "1e400", "99999999999999999999", ".nan", "-.inf", "0x_", "1:99:99", "2024-13-45", "null",
+    "true", "[]", "{}", "[[1]]", "{a: 1}", "{[1]: 2}", "[" * 9000, "x" * 5000, "", " ", "*x",
+    "!!python/object/apply:os.system [ls]", "!!timestamp x", "'", '"\\x', "- a\n- b: [", "a: b: c",
+    "a: 1\na: 2", "\x00", "\x1b[2J", "\udcff", "💥", "𝟙", "\u202e1", "½", "foo", "cuda:99", "/dev/null/x",
+    "../" * 2000, "~nobody/x", "hf_aaaaaaaaaaaaaaaaaaaa", "1,,2", "1e-4.5",
 ]  # fmt: skip
 RECIPES = [
-    "[", "{", "a: [1, 2", "- 1\n- 2\n", "3", "text", "a: 1\na: 2\n", "trainer: {lr: 1, lr: 2}\n",
-    "trainer: 3\n", "trainer: [lr]\n", "trainer:\n\tlr: 1\n", "---\na: 1\n---\nb: 2\n",
-    "!!python/object/apply:os.system [ls]\n", "seed: &s 1\nsave_every_s: *t\n", "env: {type: [a]}\n",
-    "env: {type: {a: b}}\n", "env: {type: 3}\n", "algorithm: {type: null}\n", "null: 3\n", "3: {a: 1}\n",
-    "? [a, b]\n: 3\n", "{[1]: 2}: 3\n", "seed: 0x_\n", "job_name: 2024-13-45\n",
-    "trainer: {betas: {a: 1}}\n", "seed: 1e400\n", "sft: {policy: 3}\n",
-    "sft: {policy: {type: 3, chunk_size: [1]}}\n", "policy: {rename_map: [a, b]}\n", "seed: !!float x\n",
-    "a: &a\n  b: *a\n", "[" * 20_000, "a:\n" + "".join(" " * n + "a:\n" for n in range(1, 400)),
-    "\ufeff\ufeffseed: 1", "seed: \ud83d\n",
-    _bomb("[1, 1]", "[{}]"), _bomb("{k: 1}", "{{<<: [{}]}}"),
+    "[", "a: [1, 2", "- 1\n- 2\n", "3", "text", "trainer: {lr: 1, lr: 2}\n", "trainer: 3\n",
+    "trainer: [lr]\n", "trainer:\n\tlr: 1\n", "---\na: 1\n---\nb: 2\n",
+    "!!python/object/apply:os.system [ls]\n", "save_every_s: *t\n", "env: {type: [a]}\n",
+    "env: {type: {a: b}}\n", "algorithm: {type: null}\n", "null: 3\n", "3: {a: 1}\n", "{[1]: 2}: 3\n",
+    "seed: 0x_\n", "job_name: 2024-13-45\n", "trainer: {betas: {a: 1}}\n", "sft: {policy: 3}\n",
+    "policy: {rename_map: [a, b]}\n", "[" * 20_000, "\ufeff\ufeffseed: 1", "seed: \ud83d\n",
 ]  # fmt: skip
 
 
@@ -118,7 +105,7 @@ def nothing_is_begun(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     monkeypatch.setattr(subprocess, "Popen", refuse)
     monkeypatch.setattr(multiprocessing.process.BaseProcess, "start", refuse)
     monkeypatch.setattr(os, "mkdir", refuse)
-    monkeypatch.setattr(doctor, "machine", lambda *_: ())  # it draws a frame in a process
+    monkeypatch.setattr(doctor, "machine", lambda **_: ())  # it draws a frame in a process
     monkeypatch.setattr(logging, "basicConfig", lambda **_: None)
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     return work

@@ -38,39 +38,20 @@ FUNCTIONS = {"eval": "verbs:evaluate", "doctor": "doctor:main"}
 
 def usage() -> str:
     """The text of ``accerl --help``."""
-    lines = [
-        f"accerl {__version__}: online reinforcement learning of LeRobot policies",
-        "",
-        "usage: accerl VERB [recipe.yaml] [--section.field=value …]",
-        "",
-    ]
-    lines += [f"  {verb:16} {what}" for verb, what in VERBS.items()]
-    lines += [
-        "",
-        "examples:",
-        "  accerl doctor quickstart",
-        "  accerl train --config_path=quickstart --trainer.lr=2e-4",
-        "  accerl eval --config_path=RUN/config.yaml --policy.path=RUN/checkpoints/last/pretrained_model",
-        "",
-        "accerl VERB --help lists what people change, --help=all every field. ACCERL_LOG=INFO says more.",
-    ]
-    return "\n".join(lines)
+    verbs = "\n".join(f"  {verb:16} {what}" for verb, what in VERBS.items())
+    return f"""accerl {__version__}: online reinforcement learning of LeRobot policies
 
+usage: accerl VERB [recipe.yaml] [--section.field=value …]
 
-def show_help(verb: str, rest: list[str], section: str) -> int:
-    """``accerl VERB --help``, or of one section of its fields."""
-    from accerl_lerobot.cli.verbs import CONFIGS
-    from accerl_lerobot.config.help import help_text
-    from accerl_lerobot.config.parsing import DISCOVER, read_arguments, register_types, shipped_recipes
+{verbs}
 
-    packages = [argument for argument in rest if f"{DISCOVER}=" in argument]
-    register_types(CONFIGS[verb], read_arguments(packages)[1])
-    text = help_text(f"accerl {verb}", CONFIGS[verb], VERBS[verb], section)
-    if verb in ("train", "doctor") and not section:
-        recipes = f"recipes: {', '.join(shipped_recipes())}, or a YAML file of your own"
-        text = "\n".join([text, "", *textwrap.wrap(recipes, 100)])
-    sys.stdout.write(f"{text}\n")
-    return 0
+examples:
+  accerl doctor quickstart
+  accerl train --config_path=quickstart --trainer.lr=2e-4
+  accerl eval --config_path=RUN/config.yaml --policy.path=RUN/checkpoints/last/pretrained_model
+
+accerl VERB --help lists what people change, --help=all every field. ACCERL_LOG=INFO says more.
+"""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -78,39 +59,11 @@ def main(arguments: list[str] | None = None) -> int:
     if arguments is None:  # this process is all ours
         arguments = sys.argv[1:]
         os.environ.setdefault("ACCERL_ONE_POLICY", "1")  # see `policies.deferred`
-    if not arguments or arguments[0] in ("-h", "--help", "help"):
-        sys.stdout.write(usage() + "\n")
+    verb, *rest = arguments or ["--help"]
+    if verb in ("-h", "--help", "help", "--version"):
+        sys.stdout.write(f"{__version__}\n" if verb == "--version" else usage())
         return 0
-    if arguments[0] == "--version":
-        sys.stdout.write(__version__ + "\n")
-        return 0
-    verb, rest = arguments[0], arguments[1:]
-    if verb not in VERBS:
-        near = difflib.get_close_matches(verb, VERBS, n=1)
-        hint = f"did you mean {near[0]}? Otherwise " if near else ""
-        return _refuse("accerl", f"no verb {verb!r}; {hint}use one of {', '.join(VERBS)}")
     return exit_code("accerl", lambda: run(verb, rest))
-
-
-def exit_code(program: str, work: Callable[[], int]) -> int:
-    """The exit code of `work`, or of the error that ends it, which is told in one line."""
-    try:
-        code = work()
-        sys.stdout.flush()
-    except InputError as error:
-        logging.getLogger(__name__).debug("%s refuses", program, exc_info=error)
-        # Ray raises a subclass whose text is a whole traceback; the error itself is inside.
-        return _refuse(program, str(getattr(error, "cause", error)))
-    except KeyboardInterrupt as stop:
-        _refuse(program, "interrupted")
-        return 143 if isinstance(stop, TerminatedError) else 130
-    except Exception as error:
-        if isinstance(error, BrokenPipeError) and not _output_is_open():
-            return 128 + signal.SIGPIPE
-        logging.getLogger(__name__).debug("%s failed", program, exc_info=error)
-        _refuse(program, one_line(error))
-        return 1
-    return code
 
 
 def run(verb: str, rest: list[str]) -> int:
@@ -118,7 +71,12 @@ def run(verb: str, rest: list[str]) -> int:
     from accerl_lerobot.config.parsing import imported
 
     set_up_logging()
-    if (section := help_asked(rest)) is not None:
+    if verb not in VERBS:
+        near = difflib.get_close_matches(verb, VERBS, n=1)
+        hint = f"did you mean {near[0]}? Otherwise use" if near else "use"
+        raise InputError("VERB", verb, f"{hint} one of {', '.join(VERBS)}")
+    section = help_asked(rest)
+    if section is not None:
         return show_help(verb, rest, section)
     path = FUNCTIONS.get(verb, f"verbs:{verb.replace('-', '_')}")
     with guarded():
@@ -133,6 +91,58 @@ def help_asked(rest: list[str]) -> str | None:
         if flag in ("-h", "--help"):
             return section
     return None
+
+
+def show_help(verb: str, rest: list[str], section: str) -> int:
+    """``accerl VERB --help``, or of one section of its fields."""
+    from accerl_lerobot.cli.verbs import CONFIGS
+    from accerl_lerobot.config.help import help_text
+    from accerl_lerobot.config.parsing import DISCOVER, read_arguments, register_types, shipped_recipes
+
+    packages = [argument for argument in rest if f"{DISCOVER}=" in argument]
+    register_types(CONFIGS[verb], read_arguments(packages)[1])
+    sys.stdout.write(help_text(f"accerl {verb}", CONFIGS[verb], VERBS[verb], section) + "\n")
+    if verb in ("train", "doctor") and not section:
+        recipes = f"recipes: {', '.join(shipped_recipes())}, or a YAML file of your own"
+        sys.stdout.write(f"\n{textwrap.fill(recipes, 100)}\n")
+    return 0
+
+
+def exit_code(program: str, work: Callable[[], int]) -> int:
+    """The exit code of `work`, or of the error that ends it, which is told in one line."""
+    try:
+        code = work()
+        sys.stdout.flush()
+        return code
+    except InputError as error:
+        logging.getLogger(__name__).debug("%s refuses", program, exc_info=error)
+        # Ray raises a subclass whose text is a whole traceback; the error itself is inside.
+        return _refuse(program, str(getattr(error, "cause", error)))
+    except KeyboardInterrupt as stop:
+        _refuse(program, "interrupted")
+        return 143 if isinstance(stop, TerminatedError) else 130
+    except Exception as error:
+        if isinstance(error, BrokenPipeError) and not _output_is_open():
+            return 128 + signal.SIGPIPE
+        logging.getLogger(__name__).debug("%s failed", program, exc_info=error)
+        _refuse(program, one_line(error))
+        return 1
+
+
+def _refuse(program: str, text: str) -> int:
+    with contextlib.suppress(OSError):  # whoever reads it may be gone
+        sys.stderr.write(f"{program}: {printable(text)}\n")
+    return 2
+
+
+def _output_is_open() -> bool:
+    """False if the reader of the standard output has gone, as ``head`` does; then nothing more is written."""
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return False
+    return True
 
 
 def set_up_logging() -> None:
@@ -161,19 +171,3 @@ def guarded() -> Iterator[None]:
     guardian.start()  # before anything that it is to clean up
     with interrupted():
         yield
-
-
-def _refuse(program: str, text: str) -> int:
-    with contextlib.suppress(OSError):  # whoever reads it may be gone
-        sys.stderr.write(f"{program}: {printable(text)}\n")
-    return 2
-
-
-def _output_is_open() -> bool:
-    """False if the reader of the standard output has gone, as ``head`` does; then nothing more is written."""
-    try:
-        sys.stdout.flush()
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return False
-    return True

@@ -21,7 +21,7 @@ import numpy as np
 
 from accerl_lerobot.checkpoint.layout import CONFIG
 from accerl_lerobot.checkpoint.safety import FileSource, check_folder
-from accerl_lerobot.config.parsing import decode, parse, read_arguments, read_recipe
+from accerl_lerobot.config.parsing import parse, read_arguments, read_recipe
 from accerl_lerobot.config.ranges import DatasetName, NewFolder, Section
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos import record
@@ -117,14 +117,11 @@ def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
 
 def _decision_cost(run: Path) -> float:
     """The cost of a decision in a run, which the rewards of its journal have in them."""
-    rollout = read_recipe(run / CONFIG).get("rollout")
-    rollout = rollout if isinstance(rollout, dict) else {}
-    reward_model = rollout.get("reward_model")
-    if isinstance(reward_model, dict) and reward_model.get("path"):
+    rollout = read_recipe(run / CONFIG).get("rollout") or {}
+    if (rollout.get("reward_model") or {}).get("path"):
         hint = "rollout.reward_model told its successes, which a repeated episode does not have"
         raise InputError("path", str(run), hint)
-    given = {"decision_cost": rollout["decision_cost"]} if "decision_cost" in rollout else {}
-    return decode(RolloutConfig, given).decision_cost
+    return float(rollout.get("decision_cost", RolloutConfig().decision_cost))
 
 
 def _replay(cost: float, parts: list[JournalEntry]) -> record.Episode | None:

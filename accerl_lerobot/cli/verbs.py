@@ -37,7 +37,7 @@ from accerl_lerobot.hub.card import PullConfig, PushConfig
 from accerl_lerobot.metrics import plain
 from accerl_lerobot.policies.config import Load
 from accerl_lerobot.report import ReportConfig, write_report
-from accerl_lerobot.timeline.read import TimelineConfig, write_trace
+from accerl_lerobot.timeline import TimelineConfig, write_trace
 
 OUTCOME = (
     "success_before", "ci95_before", "success_after", "ci95_after", "n_after", "episodes", "env_steps",
@@ -140,7 +140,8 @@ def _in_new_folder[Result](
     """Does work in the folder that a config names, which goes if the input turns out to be bad."""
     from accerl_lerobot.run.train import discard_unused, make_output_dir
 
-    directory, console = make_output_dir(config), Console()
+    directory = make_output_dir(config)
+    console = Console()
     console.say(f"run {directory}")
     write_atomically(directory / CONFIG, yaml.safe_dump(encode(config), sort_keys=False))
     try:
@@ -171,15 +172,16 @@ def evaluate(arguments: list[str]) -> int:
     if out is not None:
         make_folder(out, "output_dir")
         (out / "evaluation.json").write_text(json.dumps(summary, indent=2) + "\n")
-        for result in (result for result in results if result.frames):
+        for result in results:
+            if not result.frames:
+                continue
             outcome = "success" if result.success else "failure"
             name = f"{result.plan.task.replace('/', '-')}_{result.plan.seed}_{outcome}.mp4"
             write_video(out / name, [[result.frames]], fps=20)
-    rates = {
-        task: {name: value for name, value in of.items() if "seeds" not in name}
-        for task, of in summary["tasks"].items()
-    }
-    return tell(summary | {"tasks": rates})
+    for rates in summary["tasks"].values():  # seeds are in the file alone
+        rates.pop("seeds", None)
+        rates.pop("failed_seeds", None)
+    return tell(summary)
 
 
 def world_model(arguments: list[str]) -> int:
@@ -218,7 +220,7 @@ def _checked(
 def push(arguments: list[str]) -> int:
     """``accerl push``."""
     config: PushConfig = parse(PushConfig, arguments)
-    from accerl_lerobot.hub.push import push as to_hub
+    from accerl_lerobot.hub.transfer import push as to_hub
 
     with redirect_stdout(sys.stderr):
         found = to_hub(config)
@@ -230,7 +232,7 @@ def push(arguments: list[str]) -> int:
 def pull(arguments: list[str]) -> int:
     """``accerl pull``."""
     config: PullConfig = parse(PullConfig, arguments)
-    from accerl_lerobot.hub.pull import pull as from_hub
+    from accerl_lerobot.hub.transfer import pull as from_hub
 
     with redirect_stdout(sys.stderr):
         found = from_hub(config)

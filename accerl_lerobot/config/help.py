@@ -8,13 +8,14 @@ import dataclasses
 import inspect
 import sys
 import textwrap
+from collections.abc import Iterator
 from itertools import pairwise
 from typing import Any, NamedTuple
 
 import yaml
 
 from accerl_lerobot.config.parsing import TYPE, choices_of, sections_of
-from accerl_lerobot.config.ranges import annotations_of, defaults_of, range_in_words
+from accerl_lerobot.config.ranges import annotations_of, defaults_of, wanted
 from accerl_lerobot.errors import InputError
 
 WIDTH = 110
@@ -38,7 +39,7 @@ class Line(NamedTuple):
     name: str  # dotted
     default: str | None  # as one would type it; None: a heading
     text: str
-    choices: str = ""  # its range
+    usual: bool  # False in a type that is not the default one
 
 
 def help_text(command: str, config_class: type[Any], what: str, section: str = "") -> str:
@@ -46,24 +47,21 @@ def help_text(command: str, config_class: type[Any], what: str, section: str = "
 
     `what` says in one line what the command does; `section` is that of ``--help=SECTION``, or ``all``.
     """
-    listed, sections = _listed(config_class), sections_of(config_class)
+    lines = list(_lines(config_class))
+    sections = sections_of(config_class)
     if section not in ("", "all"):
-        inside = [line for line in listed if f"{line.name}.".startswith(f"{section}.")]
+        inside = [line for line in lines if f"{line.name}.".startswith(f"{section}.")]
         if not inside:
-            hint = f"use all or one of {', '.join(sections)}" if sections else "use all"
-            raise InputError("--help", section, hint)
-        return "\n".join(_in_full(inside))
-    head = [
-        f"usage: {command} {_bare(config_class)} [--section.field=value …]",
-        "",
-        textwrap.fill(f"{what[0].upper()}{what[1:]}. Shown are defaults; a recipe counts more.", WIDTH),
-        "",
-    ]
-    full = _in_full(listed)
-    if section == "all" or len(head) + len(full) <= PAGE:
-        return "\n".join(head + full)
-    usual = {line.name: line for line in _listed(config_class, all_types=False)}
-    head += [_in_brief(usual[name]) for name in COMMON if name in usual]
+            raise InputError("--help", section, f"use all or one of {', '.join(sections) or 'none'}")
+        return "\n".join(map(_in_full, inside))
+    bare: str = getattr(config_class, "BARE", "")
+    recipe = f"{bare.upper()} …" if bare else "[recipe.yaml | --config_path=recipe.yaml]"
+    about = f"{what[0].upper()}{what[1:]}. Shown are defaults; a recipe counts more."
+    head = [f"usage: {command} {recipe} [--section.field=value …]", "", textwrap.fill(about, WIDTH), ""]
+    full = "\n".join([*head, *map(_in_full, lines)])
+    if section == "all" or full.count("\n") < PAGE:
+        return full
+    head += [_in_brief(line) for line in lines if line.name in COMMON and line.usual]
     head += ["", f"more: {command} --help=all, or --help=SECTION:"]
     for name, kind in sections.items():
         head.append(f"  {name:12}{' | '.join(choices_of(kind)) or _summary(kind)}"[:WIDTH])
@@ -76,17 +74,9 @@ def brief(config_class: type[Any]) -> str:
     return doc.partition("\n\n")[0].replace("\n", " ")
 
 
-def _bare(config_class: type[Any]) -> str:
-    name: str | None = getattr(config_class, "BARE", None)
-    if name is None:
-        return "[recipe.yaml | --config_path=recipe.yaml]"
-    one = name.removesuffix("s").upper()
-    return f"{one} [{one} …]"
-
-
 def docstrings(cls: type[Any]) -> dict[str, str]:
     """Field name → the docstring under it, those of base classes included; "" where there is none."""
-    found: dict[str, str] = {}
+    texts: dict[str, str] = {}
     for base in reversed(cls.__mro__):
         if not dataclasses.is_dataclass(base):
             continue
@@ -95,71 +85,68 @@ def docstrings(cls: type[Any]) -> dict[str, str]:
         for pair in pairwise([*node.body, ast.Pass()]):
             match pair:
                 case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(text))):
-                    found[name] = " ".join(text.split())
+                    texts[name] = " ".join(text.split())
                 case ast.AnnAssign(target=ast.Name(id=name)), _:
-                    found.setdefault(name, "")
-    return found
+                    texts.setdefault(name, "")
+    return texts
 
 
-def _listed(cls: type[Any], prefix: str = "", usual: Any = None, all_types: bool = True) -> list[Line]:
-    """Fields of a config and of its sections, with the defaults of `usual`, which is one of it, or its own.
+def _lines(cls: type[Any], prefix: str = "", default: Any = None, usual: bool = True) -> Iterator[Line]:
+    """Fields of a config and of its sections, with the defaults of `default`, which is one of it, or its own.
 
-    Of a choice, all types, or, with `all_types` off, the default one and the choice itself as a field.
+    Of a choice, the fields of all types follow.
     """
-    texts, defaults, sections = docstrings(cls), defaults_of(cls), sections_of(cls)
-    fields: list[Line] = []
-    below: list[Line] = []
+    texts = docstrings(cls)
+    defaults = defaults_of(cls)
+    sections = sections_of(cls)
     for name, annotation in annotations_of(cls).items():
-        default = getattr(usual, name, defaults[name])
-        if name in sections:
-            below += _section(sections[name], f"{prefix}{name}", default, all_types)
-        else:
-            line = Line(f"{prefix}{name}", shown(default), texts[name], range_in_words(annotation))
-            fields.append(line)
-    return fields + below
+        if name not in sections:
+            value = getattr(default, name, defaults[name])
+            yield Line(f"{prefix}{name}", shown(value), f"{texts[name]} {in_words(annotation)}", usual)
+    for name, section in sections.items():
+        dotted = f"{prefix}{name}"
+        inner = getattr(default, name, defaults[name])
+        types = choices_of(section)
+        if not types:
+            note = " (off unless given)" if inner is None else ""
+            yield Line(dotted, None, f"{dotted}{note}: {_summary(section)}", usual)
+            yield from _lines(section, f"{dotted}.", inner, usual)
+        chosen = getattr(inner, TYPE, None)
+        if chosen is not None:
+            yield Line(f"{dotted}.{TYPE}", chosen, " | ".join(types), usual)
+        for kind, subclass in types.items():
+            is_default = kind == chosen
+            note = " (default)" if is_default else ""
+            yield Line(dotted, None, f"{dotted}.{TYPE}={kind}{note}: {_summary(subclass)}", usual)
+            yield from _lines(subclass, f"{dotted}.", inner if is_default else None, usual and is_default)
 
 
-def _section(section: type[Any], name: str, default: Any, all_types: bool) -> list[Line]:
-    """Headings and fields of a section, see `_listed`."""
-    choices, chosen = choices_of(section), getattr(default, TYPE, None)
-    if not choices:
-        note = " (off unless given)" if default is None else ""
-        heading = Line(name, None, f"{name}{note}: {_summary(section)}")
-        return [heading, *_listed(section, f"{name}.", default)]
-    lines: list[Line] = []
-    if all_types:
-        for kind, subclass in choices.items():
-            note = " (default)" if kind == chosen else ""
-            lines.append(Line(name, None, f"{name}.{TYPE}={kind}{note}: {_summary(subclass)}"))
-            lines += _listed(subclass, f"{name}.", default if kind == chosen else None)
-    elif default is not None:
-        lines.append(Line(f"{name}.{TYPE}", chosen, "", " | ".join(choices)))
-        lines += _listed(type(default), f"{name}.", default, all_types=False)
-    return lines
+def in_words(annotation: Any) -> str:
+    """The values of a field as a sentence; empty for any text."""
+    words = wanted(annotation)
+    plain = words.startswith(("text", "true", "the ", "a list", "a mapping"))
+    return "" if plain else f"{words[0].upper()}{words[1:]}."
 
 
-def _in_full(listed: list[Line]) -> list[str]:
-    lines: list[str] = []
-    for line in listed:
-        if line.default is None:
-            lines += ["", line.text]
-            continue
-        text = line.text
-        if line.choices and not all(choice in text for choice in line.choices.split(" | ")):
-            text = f"{text} {line.choices[0].upper()}{line.choices[1:]}.".strip()
-        start = f"  --{line.name}={line.default}"
-        if not text or len(start) >= COLUMN:
-            lines.append(start)
-            start = ""
-        first, others = start.ljust(COLUMN), " " * COLUMN
-        lines += textwrap.wrap(text, WIDTH, initial_indent=first, subsequent_indent=others)
-    return lines
+def _in_full(line: Line) -> str:
+    """A field with all that is said about it, or a heading."""
+    if line.default is None:
+        return f"\n{line.text}"
+    start = f"  --{line.name}={line.default}"
+    above = ""
+    if len(start) >= COLUMN:
+        above = f"{start}\n"
+        start = ""
+    indent = " " * COLUMN
+    return above + textwrap.fill(
+        line.text or " ", WIDTH, initial_indent=start.ljust(COLUMN), subsequent_indent=indent
+    )
 
 
 def _in_brief(line: Line) -> str:
-    """A field in one line: its choices, or the first sentence about it."""
-    text = line.choices if " | " in line.choices else line.text.partition(". ")[0].removesuffix(".")
+    """A field in one line: the first sentence about it."""
     start = f"  --{line.name}={line.default}".ljust(COLUMN - 1)
+    text = line.text.partition(". ")[0].strip().removesuffix(".")
     return f"{start} {textwrap.shorten(text, WIDTH - COLUMN, placeholder=' …')}"
 
 

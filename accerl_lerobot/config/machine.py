@@ -8,6 +8,8 @@ import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import psutil
+
 from accerl_lerobot.errors import InputError, expanded
 
 if TYPE_CHECKING:
@@ -19,17 +21,16 @@ SIMULATOR_GIB = {"metaworld": 0.17, "libero": 0.17}
 DISK_BYTES = 2**29  # disk space that demonstrations, checkpoints and videos take at least
 
 
-def memory_gib(entry: str) -> float | None:
-    """``MemTotal`` or ``MemAvailable`` of this machine within its container's limit; None: unknown."""
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-    except OSError:
-        return None
-    found = next((1024.0 * int(line.split()[1]) for line in lines if line.startswith(f"{entry}:")), 0.0)
+def memory_gib(entry: str) -> float:
+    """``MemTotal`` or ``MemAvailable`` of this machine within its container's limit."""
+    memory = psutil.virtual_memory()
+    free = entry == "MemAvailable"
+    found = float(memory.available if free else memory.total)
     group = Path("/sys/fs/cgroup")
     with contextlib.suppress(OSError, ValueError):  # no such file, or no limit
-        limit, taken = (int((group / f"memory.{name}").read_text()) for name in ("max", "current"))
-        found = min(found, limit - taken * (entry == "MemAvailable"))
+        limit = int((group / "memory.max").read_text())
+        used = int((group / "memory.current").read_text())
+        found = min(found, limit - used if free else limit)
     return found / GIB
 
 
@@ -38,9 +39,10 @@ def check_disk(folder: str | None, field: str = "output_dir") -> None:
     path = expanded(folder or ".", field).absolute()
     while not path.exists():
         path = path.parent
-    if (free := shutil.disk_usage(path).free) < DISK_BYTES:
-        hint = f"{free / GIB:.2f} GiB are free on this disk, and {DISK_BYTES / GIB:.1f} are needed at least"
-        raise InputError(field, folder, f"{hint}; make room or choose another")
+    free = shutil.disk_usage(path).free
+    if free < DISK_BYTES:
+        hint = f"{free / GIB:.2f} GiB are free on this disk; make room or choose another"
+        raise InputError(field, folder, hint)
 
 
 def computes_bf16(device: torch.device) -> bool:

@@ -37,8 +37,11 @@ class Range:
         match = re.fullmatch(r"([\[(])(\S+), (\S+)([\])])", text)
         if match is None:
             raise ValueError(f"{text}: write an interval such as [0, 1)")
-        self.text, self._low_open, self._high_open = text, match[1] == "(", match[4] == ")"
-        self.low, self.high = float(match[2]), float(match[3])
+        self.text = text
+        self._low_open = match[1] == "("
+        self._high_open = match[4] == ")"
+        self.low = float(match[2])
+        self.high = float(match[3])
 
     def __repr__(self) -> str:
         return f"Range({self.text!r})"
@@ -52,7 +55,8 @@ class Pattern:
     """Texts that match a regular expression; `words` says which these are."""
 
     def __init__(self, pattern: str, words: str) -> None:
-        self.pattern, self.words = re.compile(pattern), words
+        self.pattern = re.compile(pattern)
+        self.words = words
 
     def __repr__(self) -> str:
         return f"Pattern({self.pattern.pattern!r})"
@@ -117,17 +121,21 @@ class DatasetConfig(Section, section="dataset"):
 
 def annotations_of(cls: type[Any]) -> dict[str, Any]:
     """Field name → annotation, with its range."""
-    return _hints_of(typing.cast(Hashable, cls))
+    return _annotations_of(typing.cast(Hashable, cls))
 
 
 @functools.cache
-def _hints_of(cls: Any) -> dict[str, Any]:
+def _annotations_of(cls: Any) -> dict[str, Any]:
     annotations: dict[str, Any] = {}
-    for base in reversed([base for base in cls.__mro__ if dataclasses.is_dataclass(base)]):
+    inherited: dict[str, Any] = {}  # without ranges
+    for base in reversed(cls.__mro__):
+        if not dataclasses.is_dataclass(base):
+            continue
         for name, annotation in typing.get_type_hints(base, include_extras=True).items():
             # A subclass that gives a field another default need not repeat its range.
-            if name not in annotations or annotation != unmarked(annotations[name]):
+            if annotation != inherited.get(name):
                 annotations[name] = annotation
+        inherited = typing.get_type_hints(base)
     return {field.name: annotations[field.name] for field in dataclasses.fields(cls)}
 
 
@@ -135,12 +143,10 @@ def defaults_of(cls: type[Any]) -> dict[str, Any]:
     """Field name → default; None where there is none."""
     defaults: dict[str, Any] = {}
     for field in dataclasses.fields(cls):
-        if field.default is not dataclasses.MISSING:
-            defaults[field.name] = field.default
-        elif field.default_factory is not dataclasses.MISSING:
+        if field.default_factory is not dataclasses.MISSING:
             defaults[field.name] = field.default_factory()
         else:
-            defaults[field.name] = None
+            defaults[field.name] = None if field.default is dataclasses.MISSING else field.default
     return defaults
 
 
@@ -152,10 +158,12 @@ def check(annotation: Any, value: Any, field: str) -> None:
 
 def fits(annotation: Any, value: Any) -> bool:
     """True if a value fits an annotation and its range."""
-    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
+    origin = typing.get_origin(annotation)
+    arguments = typing.get_args(annotation)
     if origin is Annotated:
         kind, mark = arguments
-        return (_is_number(kind, value) if kind in (int, float) else fits(kind, value)) and value in mark
+        kind_fits = _is_number(value) if kind is float else fits(kind, value)
+        return kind_fits and value in mark
     if is_union(annotation):
         return any(fits(kind, value) for kind in arguments)
     if origin is typing.Literal:
@@ -165,53 +173,44 @@ def fits(annotation: Any, value: Any) -> bool:
     if origin in (list, tuple):
         if not isinstance(value, (list, tuple)):
             return False
-        if origin is tuple and Ellipsis not in arguments and len(value) != len(arguments):
+        fixed = origin is tuple and Ellipsis not in arguments
+        if fixed and len(value) != len(arguments):
             return False
         return all(fits(arguments[0], entry) for entry in value)
-    if annotation in (int, float):
-        return _is_number(annotation, value) and math.isfinite(value)
-    if annotation is Any or not isinstance(annotation, type) or dataclasses.is_dataclass(annotation):
-        return True
-    return isinstance(value, annotation)
+    if annotation is float:
+        return _is_number(value) and math.isfinite(value)
+    if annotation is int:
+        return _is_number(value) and isinstance(value, numbers.Integral)
+    if annotation in (bool, str, type(None)):
+        return isinstance(value, annotation)
+    return True
 
 
-def _is_number(kind: type, value: Any) -> bool:
-    numeric = numbers.Integral if kind is int else numbers.Real
-    return isinstance(value, numeric) and not isinstance(value, bool)
+def _is_number(value: Any) -> bool:
+    return isinstance(value, numbers.Real) and not isinstance(value, bool)
+
+
+PLAIN = {int: "a whole number", float: "a number", bool: "true or false", str: "text", type(None): "null"}
 
 
 def wanted(annotation: Any) -> str:
     """Values that fit an annotation, in words."""
-    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
+    origin = typing.get_origin(annotation)
+    arguments = typing.get_args(annotation)
     if origin is Annotated:
         kind, mark = arguments
         return mark.words if isinstance(mark, Pattern) else f"{wanted(kind)} in {mark.text}"
     if is_union(annotation):
-        parts = [wanted(kind) for kind in arguments if kind is not type(None)]
-        return " or ".join(parts + (["null"] if is_optional(annotation) else []))
-    plain = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
-    if annotation in plain:
-        return plain[annotation]
+        return " or ".join(wanted(kind) for kind in arguments)
     if origin is typing.Literal:
-        *others, last = map(str, arguments)
-        return f"{', '.join(others)} or {last}" if others else last
+        return " or ".join(map(str, arguments))
     if origin is tuple and Ellipsis not in arguments:
         return f"a list of {len(arguments)}, each {wanted(arguments[0])}"
     if origin in (list, tuple):
         return f"a list such as [a, b], each {wanted(arguments[0])}"
     if origin is dict:
         return "a mapping such as {key: value}"
-    return getattr(annotation, "__name__", str(annotation))
-
-
-def range_in_words(annotation: Any) -> str:
-    """The range of an annotation as ``--help`` shows it; empty where there is none."""
-    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
-    if origin is Annotated:
-        return f"in {arguments[1].text}" if isinstance(arguments[1], Range) else ""
-    if origin is typing.Literal:
-        return " | ".join(map(str, arguments))
-    return next((text for kind in arguments if (text := range_in_words(kind))), "")
+    return PLAIN.get(annotation, str(annotation))
 
 
 def is_union(annotation: Any) -> bool:
@@ -222,8 +221,3 @@ def is_union(annotation: Any) -> bool:
 def is_optional(annotation: Any) -> bool:
     """True for ``X | None``."""
     return is_union(annotation) and type(None) in typing.get_args(annotation)
-
-
-def unmarked(annotation: Any) -> Any:
-    """An annotation without its ranges."""
-    return typing.get_type_hints(type("", (), {"__annotations__": {"x": annotation}}))["x"]

@@ -139,7 +139,6 @@ def checked(origin: FileSource, whole: bool = False) -> Iterator[None]:
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
     from lerobot.datasets.dataset_reader import DatasetReader
 
-    from accerl_lerobot.hub.errors import guard_client
     from datasets import Image
 
     load_metadata, try_load = LeRobotDatasetMetadata._load_metadata, DatasetReader.try_load
@@ -172,7 +171,6 @@ def checked(origin: FileSource, whole: bool = False) -> Iterator[None]:
             raise origin.refuse(DATA, "an image whose row does not hold it as PNG, JPEG or TIFF") from error
         return decode(self, {"bytes": content, "path": None}, token_per_repo_id)
 
-    guard_client()
     with (
         patch.object(Image, "decode_example", checked_decode),
         patch.object(LeRobotDatasetMetadata, "_load_metadata", checked_metadata),

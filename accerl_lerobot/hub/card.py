@@ -12,10 +12,10 @@ import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import yaml
-from huggingface_hub import DatasetCard, ModelCard, ModelCardData
+from huggingface_hub import ModelCard, ModelCardData
 
 from accerl_lerobot.checkpoint import safety
 from accerl_lerobot.checkpoint.layout import (
@@ -30,7 +30,7 @@ from accerl_lerobot.checkpoint.layout import (
     SUMMARY,
 )  # fmt: skip
 from accerl_lerobot.checkpoint.layout import CONFIG as RECIPE
-from accerl_lerobot.config.ranges import DatasetConfig, NewFolder, Pattern, Section
+from accerl_lerobot.config.ranges import NewFolder, Pattern, Section
 from accerl_lerobot.console import number
 from accerl_lerobot.envs.base import lerobot_eval_arguments
 from accerl_lerobot.errors import InputError
@@ -38,20 +38,45 @@ from accerl_lerobot.policies.config import discovery
 
 POLICY, WORLD_MODEL, DATASET = "policy", "world model", "dataset"
 
-CONFIG, WEIGHTS, POSTPROCESSOR = "config.json", "model.safetensors", "policy_postprocessor.json"
+CONFIG, WEIGHTS = "config.json", "model.safetensors"
 ADAPTER_CONFIG, ADAPTER = "adapter_config.json", "adapter_model.safetensors"
 INFO, CARD = "meta/info.json", "README.md"
+EVALUATION, VALIDATION = "evaluation.json", "validation.json"
 RECORD = "accerl_pulled.json"  # file that a pull adds: the commit that the others are from
+FOLDER = "accerl_run"  # folder in which a policy or world model carries files of its run
 NEEDED = {
-    POLICY: (CONFIG, WEIGHTS, PREPROCESSOR, POSTPROCESSOR),
+    POLICY: (CONFIG, WEIGHTS, PREPROCESSOR, "policy_postprocessor.json"),
     WORLD_MODEL: (CONFIG, WEIGHTS),
     DATASET: (INFO, "meta/tasks.parquet", "meta/episodes", "data"),
 }
-CODEBASE_VERSION = "v3.0"
-"""Version of LeRobotDatasets, and the tag under which LeRobot looks for them on the Hub."""
+KEPT = {
+    POLICY: (RECIPE, SUMMARY, EVALUATION, "success_curve.png", "success_by_task.png", "before_after.mp4"),
+    WORLD_MODEL: (RECIPE, VALIDATION, "preview.mp4", "preview_online.mp4"),
+    DATASET: (),
+}
+"""Artifact type → files of its run that go with it."""
+OF_BACKBONE = BACKBONE_FILES + BACKBONE_WEIGHTS
+CONTENTS = {
+    POLICY: (
+        CONFIG, "train_config.json", "model*.safetensors", "model.safetensors.index.json",
+        ADAPTER_CONFIG, ADAPTER,
+        "policy_*processor.json", "*processor_step_*.safetensors",
+        "accerl.json", "value_head.safetensors", "family.safetensors",
+        *(f"{BACKBONE}/{name}" for name in OF_BACKBONE),
+        *(f"{FAST}/{name}" for name in OF_BACKBONE),
+        *(f"{FOLDER}/{name}" for name in KEPT[POLICY]),
+    ),
+    WORLD_MODEL: (
+        CONFIG, WEIGHTS,
+        *(f"{FOLDER}/{name}" for name in KEPT[WORLD_MODEL]),
+    ),
+    DATASET: ("meta/*", "meta/*/*/*.parquet", "data/*/*.parquet", "videos/*/*/*.mp4"),
+}  # fmt: skip
+"""Artifact type → its files, the only ones that are pushed beside a card and a licence."""
+MARK = "<!-- Written by accerl push, and anew each time. Delete this line to keep what you change. -->"
 REPO_ID = r"(?=.{3,192}\Z)(?!.*\.\.)[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*"
 RepoId = Annotated[str, Pattern(REPO_ID, "the name of a repository, user/name")]
-RepoType = Literal["model", "dataset"]
+Files = dict[str, Path | bytes]  # name in the repository → a file, or its content
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,25 +106,24 @@ class PullConfig(Section):
     """Folder to create."""
 
 
-def repo_type(artifact: str) -> RepoType:
-    """Repository type for an artifact type."""
-    return "dataset" if artifact == DATASET else "model"
-
-
 def recognise(folder: Path, field: str = "path") -> str:
     """The artifact type of a complete folder; an unknown or incomplete one is refused, blaming `field`."""
     if not folder.is_dir():
         raise InputError(field, str(folder), "no such folder")
-    artifact = likely([INFO] if (folder / INFO).exists() else [], read_json(folder / CONFIG))
-    if artifact is None:
+    config = read_json(folder / CONFIG)
+    if (folder / INFO).exists():
+        artifact = DATASET
+    elif {"spec", "model"} <= config.keys():
+        artifact = WORLD_MODEL
+    elif {"type", "n_obs_steps"} <= config.keys():  # a reward model's config has no n_obs_steps
+        artifact = POLICY
+    else:
         raise InputError(field, str(folder), _hint(folder))
-    if artifact == DATASET:
-        from accerl_lerobot.demos.dataset_files import OLD_VERSION, another_version
-
-        if OLD_VERSION.match(str(read_json(folder / INFO).get("codebase_version"))):
-            old = DatasetConfig(repo_id="USER/NAME", root=str(folder))
-            raise InputError(field, str(folder), another_version(old).hint)
-    needed = (ADAPTER if name == WEIGHTS and is_adapter(folder) else name for name in NEEDED[artifact])
+    needed = list(NEEDED[artifact])
+    if (
+        artifact == POLICY and (folder / ADAPTER_CONFIG).is_file()
+    ):  # of LeRobot's PEFT training, whose policy is elsewhere
+        needed[needed.index(WEIGHTS)] = ADAPTER
     missing = [name for name in needed if not (folder / name).exists()]
     if missing:
         hint = f"looks like a {artifact} but lacks {', '.join(missing)}; name a complete folder"
@@ -107,9 +131,12 @@ def recognise(folder: Path, field: str = "path") -> str:
     return artifact
 
 
-def is_adapter(folder: Path) -> bool:
-    """True for an adapter of LeRobot's PEFT training, whose policy is elsewhere."""
-    return (folder / ADAPTER_CONFIG).is_file() and not (folder / WEIGHTS).is_file()
+def _hint(folder: Path) -> str:
+    last = f"{CHECKPOINTS}/last/{PRETRAINED}"
+    for below in (last, f"sft/{last}", PRETRAINED, "world_model"):
+        if (folder / below).is_dir():
+            return f"name the folder {below} in it"
+    return "neither a policy, a world model nor a LeRobotDataset v3.0; name the folder of one"
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -120,133 +147,70 @@ def read_json(path: Path) -> dict[str, Any]:
         return {}
 
 
-def likely(names: Collection[str], config: dict[str, Any]) -> str | None:
-    """The artifact type, by names of files at hand and the content of ``config.json``."""
-    if INFO in names:
-        return DATASET
-    if {"spec", "model"} <= config.keys():
-        return WORLD_MODEL
-    # LeRobot stores n_obs_steps in a policy's config, and nothing like it in a reward model's.
-    return POLICY if {"type", "n_obs_steps"} <= config.keys() else None
-
-
-def _hint(folder: Path) -> str:
-    last = f"{CHECKPOINTS}/last/{PRETRAINED}"
-    for below in (last, f"sft/{last}", PRETRAINED, "world_model"):
-        if (folder / below).is_dir():
-            return f"name the folder {below} in it"
-    shapes = [f"a {artifact} has {', '.join(NEEDED[artifact])}" for artifact in NEEDED]
-    return f"no known artifact: {'; '.join(shapes)}"
-
-
-Files = dict[str, Path | bytes]  # name in the repository → a file, or its content
-FOLDER = "accerl_run"  # folder in which a policy or world model carries files of its run
-EVALUATION, VALIDATION = "evaluation.json", "validation.json"
-KEPT = {
-    POLICY: (RECIPE, SUMMARY, EVALUATION, "success_curve.png", "success_by_task.png", "before_after.mp4"),
-    WORLD_MODEL: (RECIPE, VALIDATION, "preview.mp4", "preview_online.mp4"),
-    DATASET: (),
-}
-"""Artifact type → files of its run that go with it."""
-CONTENTS = {
-    POLICY: (
-        CONFIG, "train_config.json", "model*.safetensors", "model.safetensors.index.json",
-        ADAPTER_CONFIG, ADAPTER,
-        "policy_*processor.json", "*processor_step_*.safetensors",
-        "accerl.json", "value_head.safetensors", "family.safetensors",
-        *(f"{BACKBONE}/{name}" for name in BACKBONE_FILES + BACKBONE_WEIGHTS),
-        *(f"{FAST}/{name}" for name in BACKBONE_FILES + BACKBONE_WEIGHTS),
-        *(f"{FOLDER}/{name}" for name in KEPT[POLICY]),
-    ),
-    WORLD_MODEL: (
-        CONFIG, WEIGHTS,
-        *(f"{FOLDER}/{name}" for name in KEPT[WORLD_MODEL]),
-    ),
-    DATASET: ("meta/*", "meta/*/*/*.parquet", "data/*/*.parquet", "videos/*/*/*.mp4"),
-}  # fmt: skip
-"""Artifact type → its files, the only ones that are pushed beside a card and a licence."""
-MARK = "<!-- Written by accerl push, and anew each time. Delete this line to keep what you change. -->"
-
-
 def run_files(folder: Path, artifact: str, evaluation: str | None) -> dict[str, Path]:
     """Name in the repository → file of the run of a folder, if it lies in one, and of an evaluation.
 
     `evaluation` is a folder or file of ``accerl eval``; one of another policy is refused.
     """
     files: dict[str, Path] = {}
-    home = None if (folder / FOLDER).is_dir() else _run_of(folder.resolve(), artifact)
-    if home is not None:
-        measured = artifact != POLICY or _is_last(folder.resolve().parent.name, home)
-        names = KEPT[artifact] if measured else (RECIPE,)
-        for name, path in safety.matching_files(home, names, safety.FileSource("path", str(folder))).items():
-            files[f"{FOLDER}/{name}"] = path
+    place = folder.resolve()
+    carried = (folder / FOLDER).is_dir()
+    names: Collection[str] = ()
+    run = place.parent
+    if not carried and artifact == POLICY and run.parent.name == CHECKPOINTS:
+        step = run.name
+        run = run.parents[1]
+        is_last = step.isdigit() and int(step) == read_json(run / SUMMARY).get("updates")
+        names = KEPT[POLICY] if is_last else (RECIPE,)
+    elif not carried and artifact == WORLD_MODEL and (run / VALIDATION).is_file():
+        names = KEPT[WORLD_MODEL]
+    for name, path in safety.matching_files(run, names, safety.FileSource("path", str(folder))).items():
+        files[f"{FOLDER}/{name}"] = path
     if evaluation is not None:
-        if artifact != POLICY:
-            raise InputError("evaluation", evaluation, f"only a policy is evaluated, this is a {artifact}")
         path = Path(evaluation).expanduser()
         path = path / EVALUATION if path.is_dir() else path
-        _check_evaluation(path, folder)
+        policy = read_json(path).get("policy")
+        if policy is None or Path(policy).expanduser().resolve() != place:
+            hint = f"not an evaluation of {folder}; name the output_dir of accerl eval"
+            raise InputError("evaluation", str(path), hint)
         files[f"{FOLDER}/{EVALUATION}"] = path
     return files
 
 
-def _run_of(folder: Path, artifact: str) -> Path | None:
-    """The folder of the run, or of the training of a world model, in which a folder lies."""
-    if artifact == POLICY and folder.name == PRETRAINED and folder.parents[1].name == CHECKPOINTS:
-        home, sign = folder.parents[2], RECIPE
-    elif artifact == WORLD_MODEL:
-        home, sign = folder.parent, VALIDATION
-    else:
-        return None
-    return home if (home / sign).is_file() else None
-
-
-def _is_last(step: str, run: Path) -> bool:
-    """True if the checkpoint of a step is the one that the run's summary is about."""
-    return step.isdigit() and int(step) == read_json(run / SUMMARY).get("updates")
-
-
-def _check_evaluation(path: Path, policy: Path) -> None:
-    content = read_json(path)
-    if "success" not in content or "ci95" not in content:
-        raise InputError("evaluation", str(path), "not a file of accerl eval; name its output_dir")
-    if Path(str(content.get("policy"))).expanduser().resolve() != policy.resolve():
-        raise InputError("evaluation", str(path), f"it is of another policy, {content.get('policy')}")
-
-
 def model_card(repo_id: str, artifact: str, folder: Path, files: Files) -> str:
     """README.md of a model repository; pictures and videos among `files` are shown."""
-    recipe_text = _carried(files, RECIPE)
-    recipe = yaml.safe_load(recipe_text) or {}
-    summary = json.loads(_carried(files, SUMMARY) or "{}")
+    texts = {}
+    for name in (RECIPE, SUMMARY, EVALUATION, VALIDATION):
+        content = files.get(f"{FOLDER}/{name}", b"")
+        texts[name] = content.read_text() if isinstance(content, Path) else content.decode()
+    recipe = yaml.safe_load(texts[RECIPE]) or {}
+    summary = json.loads(texts[SUMMARY] or "{}")
     config = read_json(folder / CONFIG)
-    env = dict(recipe.get("env") or {})
-    env.pop("assets", None)
+    env = {name: value for name, value in (recipe.get("env") or {}).items() if name != "assets"}
     tags = ["accerl-lerobot", artifact.replace(" ", "-"), config.get("type"), env.get("type")]
     if summary:
-        tags += ["reinforcement-learning", (recipe.get("algorithm") or {}).get("type")]
-    data = ModelCardData(
-        library_name="lerobot",
-        pipeline_tag="robotics",
-        tags=list(dict.fromkeys(str(tag) for tag in tags if tag)),
-        datasets=_datasets(recipe) or None,
-        base_model=_base_model(recipe),
-    )
+        tags += ["reinforcement-learning", summary.get("algorithm")]
     local = repo_id.split("/")[1]
     card = ModelCard.from_template(
-        data,
+        ModelCardData(
+            library_name="lerobot",
+            pipeline_tag="robotics",
+            tags=[tag for tag in tags if tag],
+            datasets=_datasets(recipe) or None,
+            base_model=_base_model(recipe),
+        ),
         template_str=Path(__file__).with_name("card.md.jinja").read_text(),
         mark=MARK,
         repo_id=repo_id,
         local=local,
         artifact=artifact,
         config=config,
-        measurements=_measurements(summary, json.loads(_carried(files, EVALUATION) or "{}")),
         summary=summary,
-        validation=json.loads(_carried(files, VALIDATION) or "{}"),
+        evaluation=json.loads(texts[EVALUATION] or "{}"),
+        validation=json.loads(texts[VALIDATION] or "{}"),
         number=number,
         shown=sorted(name for name in files if name.startswith(f"{FOLDER}/")),
-        recipe=recipe_text,
+        recipe=texts[RECIPE],
         recipe_path=f"{local}/{FOLDER}/{RECIPE}",
         learns_online=bool(env),  # only runs of `accerl offline` have no environment
         stock=lerobot_eval_command(local, config, env),
@@ -254,12 +218,6 @@ def model_card(repo_id: str, artifact: str, folder: Path, files: Files) -> str:
         has_backbone=str(config.get("vlm_model_name") or "").startswith(("/", BACKBONE)),
     )
     return f"{card}\n"
-
-
-def _carried(files: Files, name: str) -> str:
-    """Text of a record of the run that goes with a folder; empty if there is none."""
-    content = files.get(f"{FOLDER}/{name}", b"")
-    return content.read_text() if isinstance(content, Path) else content.decode()
 
 
 def lerobot_eval_command(policy: str, config: Mapping[str, Any], env: Mapping[str, Any]) -> str | None:
@@ -277,44 +235,23 @@ def dataset_card(repo_id: str, folder: Path) -> str:
     from lerobot.datasets.utils import create_lerobot_dataset_card
 
     command = f"accerl sft --config_path=RECIPE --dataset.repo_id={repo_id}"
-    card: DatasetCard = create_lerobot_dataset_card(
+    card = create_lerobot_dataset_card(
         tags=["accerl-lerobot"],
         dataset_info=load_info(folder),
         repo_id=repo_id,
-        dataset_description=f"```bash\n{command}\n```",
+        dataset_description=f"{MARK}\n\n```bash\n{command}\n```",
     )
-    head, _, body = str(card).partition("\n---\n")
-    return f"{head}\n---\n\n{MARK}\n{body}"
+    return str(card)
 
 
 def _datasets(recipe: Mapping[str, Any]) -> list[str]:
+    """Datasets on the Hub; beside a folder the name is a label."""
     sections = [recipe.get(name) or {} for name in ("dataset", "online")]
-    # Beside a folder the name is a label, and no dataset on the Hub.
     return [section["repo_id"] for section in sections if section.get("repo_id") and not section.get("root")]
 
 
 def _base_model(recipe: Mapping[str, Any]) -> str | None:
-    for name in ((recipe.get("policy") or {}).get("path"), (recipe.get("sft") or {}).get("init_path")):
-        if name and re.fullmatch(REPO_ID, name) and not name.startswith(f"{AWAY}/"):
-            return str(name)
-    return None
-
-
-def _measurements(
-    summary: dict[str, Any], evaluation: dict[str, Any]
-) -> list[tuple[str, str, dict[str, Any]]]:
-    """(when, task, {success, n, ci95}) of every measurement: all tasks together first, then each."""
-    sources = []
-    for when in ("before", "after"):
-        if summary.get(f"success_{when}") is not None:
-            result = {key: summary.get(f"{key}_{when}") for key in ("success", "n", "ci95", "tasks")}
-            sources.append((f"{when} RL", result))
-    if evaluation:
-        sources.append(("accerl eval", evaluation))
-    rows = []
-    for when, result in sources:
-        tasks = result.get("tasks") or {}
-        rows.append((when, next(iter(tasks)) if len(tasks) == 1 else "all tasks", result))
-        if len(tasks) > 1:
-            rows += [(when, task, each) for task, each in tasks.items()]
-    return rows
+    policy = (recipe.get("policy") or {}).get("path")
+    name = str(policy or (recipe.get("sft") or {}).get("init_path"))
+    is_on_hub = re.fullmatch(REPO_ID, name) and not name.startswith(f"{AWAY}/")
+    return name if is_on_hub else None

@@ -43,9 +43,6 @@ def fetched_checkpoint(path: str, revision: str | None, field: str) -> Path:
     """Where a checkpoint's files are, once checked; those of a Hub repository are fetched."""
     from huggingface_hub import snapshot_download
 
-    from accerl_lerobot.hub.errors import guard_client
-
-    guard_client()
     folder = expanded(path, field)
     local = folder.exists()
     if not local and not path.startswith((".", "/", "~")):

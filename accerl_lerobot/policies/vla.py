@@ -183,9 +183,6 @@ class FastTokenizer:
         from huggingface_hub import snapshot_download
         from transformers import PreTrainedTokenizerFast
 
-        from accerl_lerobot.hub.errors import guard_client
-
-        guard_client()
         folder = Path(name)
         if not folder.is_dir():
             folder = Path(snapshot_download(name, allow_patterns=["*.json"]))

@@ -36,7 +36,9 @@ class Run:
     path: Path
     config: Record
     config_text: str
-    records: dict[str, list[Record]]  # lines of metrics.jsonl by their kind, in order
+    train: list[Record]  # records of the trainer
+    rollout: list[Record]  # records of all other workers
+    evaluations: list[Record]  # in the order of the policy's experience
     result: Record | None  # summary.json; None: not finished
     truncated: bool
     written: float
@@ -50,39 +52,17 @@ class Run:
     @property
     def offline(self) -> bool:
         """True if it learned from recorded episodes alone."""
-        return "rollout" not in self.config and "env" not in self.config
+        return "env" not in self.config
 
     @property
-    def train(self) -> list[Record]:
-        """Records of the trainer, one per update."""
-        return self.records.get("train", [])
+    def before(self) -> list[Record]:
+        """Evaluations before training."""
+        return [e for e in self.evaluations if e.get("group") == "before"]
 
     @property
-    def rollout(self) -> list[Record]:
-        """Records of all other workers."""
-        return self.records.get("rollout", [])
-
-    @property
-    def evaluations(self) -> list[Record]:
-        """In the order of the policy's experience."""
-        return sorted(self.records.get("evaluation", []), key=lambda e: e["env_steps"])
-
-    def evaluated(self, *groups: str) -> list[Record]:
-        """Evaluations of these groups, such as ``before``."""
-        return [e for e in self.evaluations if e.get("group") in groups]
-
-    @property
-    def outcomes(self) -> list[Record]:
-        """Evaluations before and after training; of a run that is not finished, the newest."""
-        return self.evaluations[-1:] if self.result is None else self.evaluated("before", "after")
-
-    @property
-    def wall_s(self) -> float | None:
-        """Seconds that it took, or has taken so far."""
-        if self.result is not None and "wall_s" in self.result:
-            return float(self.result["wall_s"])
-        walls = [newest(records, "wall_s") for records in self.records.values()]
-        return max((wall for wall in walls if wall is not None), default=None)
+    def newest(self) -> list[Record]:
+        """The newest evaluation, unless it is the one before training."""
+        return [e for e in self.evaluations[-1:] if e.get("group") != "before"]
 
     def section(self, name: str) -> Record:
         """Section of its config; empty if another version wrote it without."""
@@ -94,33 +74,27 @@ def read_run(path: Path) -> Run:
     source = FileSource("runs", str(path))
     check_folder(path, source)
     config_path = path / CONFIG
-    if not config_path.is_file():
-        hint = f"no run in it: there is no {CONFIG}, which every run writes first"
-        raise InputError("runs", str(path), hint)
-    config = read_recipe(config_path)
+    summary = path / SUMMARY
+    log = path / ERROR_LOG
+    config = read_recipe(config_path) if config_path.is_file() else {}
     if not {"algorithm", "trainer"} <= config.keys():
-        raise InputError("runs", str(path), f"no run in it: its {CONFIG} is not one of accerl train")
+        raise InputError("runs", str(path), f"no run in it: there is no {CONFIG} of accerl train")
     records, truncated = _records(path / METRICS)
     written = max(file.stat().st_mtime for file in path.iterdir() if file.suffix != ".html")
-    summary = path / SUMMARY
+    failed = log.is_file() and log.stat().st_mtime >= written
     return Run(
         path=path,
         config=config,
         config_text=config_path.read_text(),
-        records=records,
+        train=records.get("train", []),
+        rollout=records.get("rollout", []),
+        evaluations=sorted(records.get("evaluation", []), key=lambda e: float(e["env_steps"])),
         result=read_json(summary, source) if summary.is_file() else None,
         truncated=truncated,
         written=written,
-        error=_error(path / ERROR_LOG, written),
+        error=log.read_text(errors="replace").strip().rpartition("\n")[2] if failed else "",
         videos=tuple(sorted(path.glob("*.mp4"))),
     )
-
-
-def _error(log: Path, written: float) -> str:
-    if not log.is_file() or log.stat().st_mtime < written:
-        return ""
-    lines = log.read_text(errors="replace").splitlines()
-    return lines[-1] if lines else "?"
 
 
 def _records(path: Path) -> tuple[dict[str, list[Record]], bool]:
@@ -131,7 +105,7 @@ def _records(path: Path) -> tuple[dict[str, list[Record]], bool]:
         try:
             record = json.loads(text)
             records.setdefault(record["kind"], []).append(record)
-        except (ValueError, KeyError, TypeError, RecursionError) as error:
+        except (ValueError, KeyError, TypeError) as error:
             if number == len(lines):
                 return records, True
             hint = f"{text[:60].decode(errors='replace')!r} is not a whole record; mend or remove this line"
@@ -145,17 +119,16 @@ def column(records: Sequence[Record], name: str) -> np.ndarray:
     return np.array([v if isinstance(v, (int, float)) else np.nan for v in values], dtype=np.float64)
 
 
+def finite(records: Sequence[Record], name: str) -> np.ndarray:
+    """The finite values of this number."""
+    values = column(records, name)
+    return values[np.isfinite(values)]
+
+
 def newest(records: Sequence[Record], name: str) -> float | None:
     """The last finite value of this number."""
-    values = column(records, name)
-    finite = values[np.isfinite(values)]
-    return float(finite[-1]) if len(finite) else None
-
-
-def largest(records: Sequence[Record], name: str) -> float:
-    """The largest value of this number; 0 if there is none above."""
-    values = column(records, name)
-    return float(np.max(values[np.isfinite(values)], initial=0.0))
+    values = finite(records, name)
+    return float(values[-1]) if len(values) else None
 
 
 def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -182,15 +155,6 @@ def differences(trees: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[Any]
 
 
 def changed_fields(tree: Mapping[str, Any]) -> list[tuple[str, list[Any]]]:
-    """Fields of a config that differ from the defaults, with value and default.
-
-    Fields of stages that the run skips are left out.
-    """
+    """Fields of a config that differ from the defaults, with value and default."""
     fields = flat(tree)
-    skipped: tuple[str, ...] = ()
-    if not fields.get("sft.steps"):
-        skipped = ("demos.", "sft.")
-    elif fields.get("dataset.repo_id"):
-        skipped = ("demos.",)
-    rows = differences([tree, encode(RunConfig())])
-    return [row for row in rows if row[0] in fields and not row[0].startswith(skipped)]
+    return [row for row in differences([tree, encode(RunConfig())]) if row[0] in fields]

@@ -7,13 +7,12 @@ import shlex
 from pathlib import Path
 
 import pytest
-import yaml
 from huggingface_hub import ModelCard
 
 from accerl_lerobot.cli.verbs import CONFIGS
 from accerl_lerobot.engines.config import RunConfig, parse
 from accerl_lerobot.hub.card import MARK, PushConfig
-from accerl_lerobot.hub.push import stage
+from accerl_lerobot.hub.transfer import stage
 from accerl_lerobot.policies.config import PLUGINS
 from tests.hub.folders import write_json, write_policy_folder, write_run_folder
 
@@ -45,19 +44,6 @@ def test_numbers_films_and_recipe_for_people(tmp_path: Path):
     assert "| env steps | 12,345 |" in text and "| updates | 12 |" in text and "| seed | 3 |" in text
     assert 'src="accerl_run/before_after.mp4"' in text and "](accerl_run/success_curve.png)" in text
     assert "task: door-open-v3" in text and str(tmp_path) not in text
-
-
-def test_what_was_learnt_from_recorded_episodes_is_not_said_to_be_learnt_online(tmp_path: Path):
-    run = write_run_folder(tmp_path / "run")
-    policy, recipe = run / "checkpoints/last/pretrained_model", run / "config.yaml"
-    assert "A LeRobot policy improved by online RL, made with" in card_of(policy, "policy")
-    fields = yaml.safe_load(recipe.read_text())
-    del fields["env"]
-    recipe.write_text(yaml.safe_dump(fields))
-    text = card_of(policy, "policy")
-    assert "A LeRobot policy improved on recorded episodes, made with" in text
-    assert "accerl eval" not in text and "accerl train" not in text
-    assert "A LeRobot policy, made with" in card_of(write_policy_folder(tmp_path / "bare"), "policy")
 
 
 def test_an_evaluation_is_what_counts_last(tmp_path: Path):

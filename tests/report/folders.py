@@ -14,7 +14,7 @@ import yaml
 from accerl_lerobot.algorithms import PPOConfig
 from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.engines.config import RunConfig, encode
-from accerl_lerobot.envs import MetaWorldConfig, SimulatedConfig
+from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.evaluation import Rate
 from accerl_lerobot.world_model.config import ImaginationConfig
 
@@ -33,11 +33,6 @@ def run_config(**fields: Any) -> RunConfig:
 def ppo(**fields: Any) -> RunConfig:
     """The same with another algorithm."""
     return run_config(algorithm=PPOConfig(), **fields)
-
-
-def metaworld(**fields: Any) -> RunConfig:
-    """The same on an environment that LeRobot can evaluate on, too."""
-    return run_config(env=MetaWorldConfig(task="door-open-v3", max_steps=150), **fields)
 
 
 def imagining() -> RunConfig:

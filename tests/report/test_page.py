@@ -7,6 +7,7 @@ import json
 import os
 import re
 import time
+from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
@@ -17,15 +18,37 @@ from accerl_lerobot.console import Console
 from accerl_lerobot.engines.config import LaunchConfig
 from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.report import ReportConfig, write_report
-from accerl_lerobot.report.charts import Chart
-from accerl_lerobot.report.content import evaluated, exploring
+from accerl_lerobot.report.page import Chart, Series, evaluated, exploring
 from accerl_lerobot.report.read import read_run
 from accerl_lerobot.run import train as run
 from accerl_lerobot.timeline import COMPUTE, RECOVERY, TRAINING, WAIT_IN
-from tests.report.folders import HOSTILE, imagined, imagining, metaworld, ppo, write_run
-from tests.report.html import Seen
+from tests.report.folders import HOSTILE, imagined, imagining, ppo, run_config, write_run
 from tests.runs import tiny_run
 from tests.timeline.folders import write_worker
+
+
+class Seen(HTMLParser):
+    """Text and elements of a page; its style is no text."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.elements: list[tuple[str, dict[str, str]]] = []
+        self._words: list[str] = []
+        self._in_style = False
+        self.feed(html)
+        self.text = " ".join(" ".join(self._words).split())
+
+    def named(self, tag: str) -> list[dict[str, str]]:
+        """Attributes of all elements of a kind."""
+        return [attributes for name, attributes in self.elements if name == tag]
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, {name: value or "" for name, value in attrs}))
+        self._in_style = tag == "style"
+
+    def handle_data(self, data: str) -> None:
+        if not self._in_style:
+            self._words.append(data)
 
 
 def page_of(*runs: Path, **fields: Any) -> Seen:
@@ -42,10 +65,10 @@ def pictures() -> None:
 @pytest.fixture(autouse=True)
 def stand_in(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     if "pictures" not in request.fixturenames:
-        monkeypatch.setattr(Chart, "svg", lambda chart: "")
+        monkeypatch.setattr(Chart, "png", lambda chart: "")
 
 
-def test_a_run_that_was_really_made(tiny_checkpoint: Path, tmp_path: Path) -> None:
+def test_a_run_that_was_really_made(pictures: None, tiny_checkpoint: Path, tmp_path: Path) -> None:
     evaluation = EvaluationConfig(episodes=8, every_updates=6, episodes_during=4, videos=1)
     launch, directory = LaunchConfig(engine="local"), tmp_path / "run"
     config = tiny_run(tiny_checkpoint, evaluation=evaluation, launch=launch, output_dir=str(directory))
@@ -53,17 +76,17 @@ def test_a_run_that_was_really_made(tiny_checkpoint: Path, tmp_path: Path) -> No
     seen = page_of(directory)
     summary = json.loads((directory / "summary.json").read_text())
     after, (low, high) = summary["success_after"], (f"{100 * end:.0f}" for end in summary["ci95_after"])
-    assert f"success after {100 * after:.3g} % [{low}, {high}] %, n = 8" in seen.text
-    assert f"{100 * after:.3g} % [{low}, {high}] 8" in seen.text, "the evaluation's row"
-    for part in (f"env steps {summary['env_steps']:,}", "gipo", "seed 0", "finished", "updates 12 of 12"):
+    for part in (
+        f"success {100 * after:.3g} % [{low}, {high}]", f"{100 * after:.3g} % [{low}, {high}] 8",
+        f"env steps {summary['env_steps']:,}", "gipo", "seed 0", "finished", "updates 12",
+        "trainer.updates 12 1000", "env.type simulated metaworld",
+    ):  # fmt: skip
         assert part in seen.text
-    for name in ("lag", "env steps", "updates", "policy loss", "value loss"):
-        assert f" {name} " in seen.text
-    assert len(evaluated(read_run(directory), "").x) == 3
+    charts = [image["alt"] for image in seen.named("img")]
+    assert {"Success rate", "lag_mean, lag_max", "policy_loss", "value_loss"} <= set(charts)
+    assert len(evaluated(read_run(directory)).x) == 3
     (video,) = seen.named("video")
     assert video["src"].startswith("data:video/mp4;base64,") and "controls" in video
-    assert "trainer.updates 12 1000" in seen.text and "env.type simulated metaworld" in seen.text
-    assert f"lerobot-eval --policy.path={directory}/checkpoints/last/pretrained_model --env.disc" in seen.text
 
 
 def test_everything_needed_is_inside(pictures: None, tmp_path: Path) -> None:
@@ -78,50 +101,37 @@ def test_everything_needed_is_inside(pictures: None, tmp_path: Path) -> None:
     assert not re.search(r"@import|url\((?!#)", html) and seen.named("script") == []
     (policy,) = [m["content"] for m in seen.named("meta") if m.get("http-equiv") == "Content-Security-Policy"]
     assert "default-src 'none'" in policy and "script" not in policy
-    assert seen.named("html")[0]["lang"] == "en"
-    assert any(m.get("name") == "viewport" for m in seen.named("meta"))
 
 
-@pytest.mark.parametrize(
-    ("successes", "said"),
-    [
-        ((40, 90), "Success on door-open-v3 rose from 40 % to 90 %"),
-        ((90, 40), "Success on door-open-v3 fell from 90 % to 40 %"),
-        ((50, 55), "Success on door-open-v3 went from 50 % to 55 %, and the intervals overlap"),
-        ((50, 50), "Success on door-open-v3 stayed at 50 %"),
-    ],
-)
-def test_the_headline_does_not_promise_more_than_was_measured(tmp_path, successes, said):
-    assert said in page_of(write_run(tmp_path / "run", successes=successes)).text
+def test_a_chart_is_drawn_whatever_its_numbers_and_names(pictures: None) -> None:
+    line = Series(np.arange(30.0), np.full(30, np.nan))
+    point = Series(np.array([1.0]), np.array([0.5]), np.array([[0.4], [0.6]]))
+    assert not Chart("none", "x", {"a": line}).drawable
+    chart = Chart("some", "x", {HOSTILE: line, "$\\frac{": point}, share=True, limit=3.0)
+    assert chart.drawable and chart.png().startswith("iVBOR"), "a PNG"
 
 
 def test_numbers_of_a_known_run(tmp_path: Path) -> None:
     folder = write_run(tmp_path / "run")
     seen, run = page_of(folder), read_run(folder)
-    text = seen.text
+    assert "Success on door-open-v3: 40 % [31, 50] → 90 % [83, 94]" in seen.text
     assert not [a for _, a in seen.elements if a.get("class") == "warnings"], "nothing went wrong"
-    points = evaluated(run, "evaluation")
+    points = evaluated(run)
     assert (points.x.tolist(), points.y.tolist()) == ([0, 4000], [0.4, 0.9])
     # The 1000 env steps of the evaluation before are not experience; the first 24 episodes say nothing.
-    steps, share = exploring(run)
-    assert steps[np.isfinite(share)].tolist() == [100.0 * i for i in range(25, 41)]
-    assert "while exploring 45 % → 60 % evaluation 40 % → 90 %" in text
-    assert "mean of a batch 4 → 3 largest 8 → 8" in text and "the bound of the recipe, 39" in text
+    assert exploring(run).x.tolist() == [100.0 * i for i in range(25, 41)]
+    assert "mean lag 3.5" in seen.text and "bound of the lag 39 updates" in seen.text
 
 
 @pytest.mark.parametrize(
     ("numbers", "said"),
     [
         ({"restarts": 2.0}, "2 restarts of a rollout worker"),
-        ({"dropped_episodes": 3.0}, "3 episodes dropped, because the environment returned NaN or infinity"),
-        ({"dropped_nonfinite": 1.0}, "1 decision thrown away, because the environment returned NaN"),
-        (
-            {"replay_retired_unused": 7.0},
-            "7 segments left the replay buffer unused, being older than replay.max_lag",
-        ),
-        ({"lr": 0.0}, "The policy was not changed"),
+        ({"dropped_nonfinite": 1.0}, "1 decisions thrown away, because the environment returned NaN"),
+        ({"skipped": 4.0}, "4 updates skipped"),
         ({"success_exploring": 0.0}, "No exploring episode succeeded"),
         ({"low_weight": 0.4}, "Many samples hardly counted"),
+        (imagined(success=1.0), "Imagined episodes succeed far more often than real ones, 100 % and"),
     ],
 )
 def test_what_went_wrong_is_said(tmp_path: Path, numbers: dict[str, float], said: str) -> None:
@@ -144,7 +154,6 @@ def test_a_recipe_with_types_of_another_package_is_compared_with_the_usual_defau
     recipe = (folder / "config.yaml").read_text()
     (folder / "config.yaml").write_text(recipe.replace("type: gipo", "type: cispo\n  cap: 7.5"))
     text = page_of(folder).text
-    assert "does not know all of the recipe's types or fields: algorithm.type='cispo'" in text
     assert "algorithm.type cispo gipo" in text and "algorithm.cap 7.5 –" in text
 
 
@@ -160,41 +169,23 @@ def test_a_run_that_is_going_on_and_one_that_has_died(tmp_path: Path) -> None:
     with (folder / "metrics.jsonl").open("a") as file:
         file.write('{"kind": "tr')
     going = page_of(folder)
-    assert "still going" in going.text and "there is no summary.json yet" in going.text
-    assert "40 of 40 updates on door-open-v3 so far, with 60 % success while exploring" in going.text
+    assert "The run is still going: there is no summary.json" in going.text
+    assert "40 of 40 updates on door-open-v3" in going.text and "success – algorithm" in going.text
     assert "The last line of metrics.jsonl is incomplete" in going.text and len(going.named("img")) >= 9
     (folder / "error.log").write_text("Traceback …\nValueError: no film\n")
-    failed = page_of(folder).text
-    assert "The run failed: ValueError: no film The traceback is in error.log." in failed
-    filmed = write_run(tmp_path / "filmed")  # its summary is written before the video
-    (filmed / "error.log").write_text("ValueError: no film\n")
-    assert "The run failed: ValueError: no film" in page_of(filmed).text
+    assert "The run failed: ValueError: no film The traceback is in error.log." in page_of(folder).text
     for path in folder.iterdir():
         os.utime(path, (time.time() - 7200, time.time() - 7200 - (path.name == "error.log")))
-    died = page_of(folder).text
-    assert "not finished" in died and "it ended early, or waits" in died
-    assert "2 h 00 min ago" in died
-
-
-def test_a_run_that_died_before_its_first_record(tmp_path: Path) -> None:
-    folder = write_run(tmp_path / "run", finished=False)
+    assert "The run is not finished" in page_of(folder).text
     (folder / "metrics.jsonl").unlink()
-    seen = page_of(folder)
-    assert "the run has not come to its first record" in seen.text and seen.named("img") == []
-    assert "0 of 40 updates on match so far" in seen.text
+    begun = page_of(folder)
+    assert begun.named("img") == [] and "0 of 40 updates on match" in begun.text
 
 
 def test_imagined_rollouts(tmp_path: Path) -> None:
-    text = page_of(write_run(tmp_path / "on", config=imagining(), rollout=imagined())).text
-    assert "Imagined rollouts" in text and "imagined 60 % → 60 %" in text
-    far = page_of(write_run(tmp_path / "far", config=imagining(), rollout=imagined(success=1.0))).text
-    assert "Imagined episodes succeed far more often than real ones, 100 % and" in far
-    none = imagined() | {"imagined_episodes": 0.0}
-    assert (
-        "No episode was imagined to its end."
-        in page_of(write_run(tmp_path / "none imagined", config=imagining(), rollout=none)).text
-    )
-    assert "Imagined rollouts" not in page_of(write_run(tmp_path / "none")).text
+    for name, numbers, shown in (("on", imagined(), True), ("off", {}, False)):
+        text = page_of(write_run(tmp_path / name, config=imagining(), rollout=numbers)).text
+        assert ("Imagined rollouts" in text) is shown
 
 
 def test_runs_side_by_side(tmp_path: Path) -> None:
@@ -203,22 +194,20 @@ def test_runs_side_by_side(tmp_path: Path) -> None:
     c = write_run(tmp_path / "c", finished=False)
     text = page_of(a, b, c, output=str(tmp_path / "all.html")).text
     assert "2 of 3 finished" in text and "3 training runs" in text
-    assert f"{a} 40 % [31, 50] 90 % [83, 94] gipo 0 4,000 3.5" in text
-    assert f"{b} 30 % [22, 40] 60 % [50, 69] ppo 1 4,000 3.5" in text
-    assert "c 40 % [31, 50] 40 % [31, 50] gipo" in text and "c: The run is still going" in text
+    assert f"{a} 40 % [31, 50] 90 % [83, 94] gipo 0 40 40 4,000 3.5" in text
+    assert f"{b} 30 % [22, 40] 60 % [50, 69] ppo 1 40 40 4,000 3.5" in text
+    assert "c 40 % [31, 50] – gipo" in text and "c: The run is still going" in text
     assert "algorithm.type gipo ppo gipo" in text and "replay.capacity" not in text
-    assert f"{a} 40 % → 90 %" in text
 
 
-def test_text_of_a_run_is_text(pictures: None, tmp_path: Path) -> None:
-    """In tasks, recipes, file names and on the axes of every chart; no element of it comes to be."""
-    config = metaworld(job_name=HOSTILE, output_dir=HOSTILE)
+def test_text_of_a_run_is_text(tmp_path: Path) -> None:
+    """In tasks, recipes and file names; no element of it comes to be."""
+    config = run_config(job_name=HOSTILE, output_dir=HOSTILE)
     folder = write_run(tmp_path / "<b>&run", config=config, tasks=(HOSTILE, "door-open-v3"))
     (folder / "<i onclick='x'>.mp4").write_bytes(b"")
     other = write_run(tmp_path / "<script>2", config=config, tasks=(HOSTILE,))
     for seen in (page_of(folder), page_of(folder, other, output=str(tmp_path / "both.html"))):
         assert seen.named("script") == seen.named("i onclick") == []
-        assert all(image["src"].startswith("data:") for image in seen.named("img"))
         assert not any(name.startswith("on") for _, attributes in seen.elements for name in attributes)
         assert "<b>&run" in seen.text
     assert HOSTILE in page_of(folder).text
@@ -228,6 +217,4 @@ def test_a_large_video_is_linked(tmp_path: Path) -> None:
     folder = write_run(tmp_path / "a run")
     (folder / "before_after.mp4").write_bytes(bytes(20_000_001))
     seen = page_of(folder, output=str(tmp_path / "elsewhere.html"))
-    assert seen.named("video") == []
-    assert {"href": "a%20run/before_after.mp4"} in seen.named("a")
-    assert "before_after.mp4 is 20 MB, too large" in seen.text
+    assert seen.named("video") == [] and {"href": "a%20run/before_after.mp4"} in seen.named("a")

@@ -1,35 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``accerl report`` as it is typed, and numbers as people read them."""
+"""``accerl report`` as it is typed, a run's folder as data, and numbers as people read them."""
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
-import random
-import shutil
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
-import yaml
 
 from accerl_lerobot import cli
+from accerl_lerobot.algorithms import PPOConfig
 from accerl_lerobot.console import count, duration, number, percent, rate
-from accerl_lerobot.report.charts import Chart
-from accerl_lerobot.timeline import TRAINING
-from tests.report.folders import imagined, imagining, write_run
-from tests.report.html import Seen
-from tests.timeline.folders import write_worker
+from accerl_lerobot.demos.backbone import BackboneConfig
+from accerl_lerobot.demos.sft import SFTConfig
+from accerl_lerobot.engines.config import RunConfig, encode
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.report.read import changed_fields, column, differences, newest, read_run
+from tests.report.folders import run_config, write_run
+from tests.report.test_page import Seen
 
 
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
         ([], "runs='': name the folder of a run: accerl report RUN"),
-        (["a", "--runs=b"], "runs='b': leave out --runs or a: name them in one way"),
         (["a", "--outptu=1"], "no such field; did you mean output"),
         (["nowhere"], "runs='nowhere': no such folder"),
     ],
@@ -94,8 +93,7 @@ def test_a_run_of_offline_has_a_page(tmp_path: Path, capsys: pytest.CaptureFixtu
     text = Seen((run / "report.html").read_text()).text
     for part in ("accerl offline", "50 updates on recorded episodes: imitation loss 0.04 → 0.02", "finished"):
         assert part in text
-    assert "episodes 60 30 successes" in text and "updates 50 of 50" in text and "seed 3" in text
-    assert "env steps" not in text and "does not know" not in text
+    assert "episodes 60" in text and "updates 50" in text and "seed 3" in text and "does not know" not in text
     both = [str(run), str(write_run(tmp_path / "other"))]
     assert cli.main(["report", *both, f"--output={tmp_path / 'x.html'}"]) == 0
     capsys.readouterr()
@@ -105,58 +103,55 @@ def test_a_run_of_offline_has_a_page(tmp_path: Path, capsys: pytest.CaptureFixtu
         assert "accerl train" in err and err.count("\n") == 1
 
 
-VALUES = [None, "x", [], {}, -1, 10**400, 1e308, True, [1], {"a": 1}]
+@pytest.mark.parametrize("tail", [b'{"kind": "tra', b"\xff\xfe", b"7"])
+def test_a_last_line_that_is_no_record_is_left_out(tmp_path: Path, tail: bytes) -> None:
+    folder = write_run(tmp_path / "run")
+    with (folder / "metrics.jsonl").open("ab") as file:
+        file.write(tail)
+    run = read_run(folder)
+    assert run.truncated and len(run.train) == 40 and len(run.evaluations) == 2
 
 
-def changed(content: Any, rng: random.Random) -> Any:
-    """The content with one of its values removed or replaced."""
-    if isinstance(content, (dict, list)) and content and rng.random() < 0.9:
-        keys = list(content) if isinstance(content, dict) else range(len(content))
-        key = rng.choice(keys)
-        if isinstance(content, dict) and rng.random() < 0.2:
-            return {name: value for name, value in content.items() if name != key}
-        content[key] = changed(content[key], rng)
-        return content
-    return rng.choice(VALUES)
+def test_a_line_in_the_middle_that_is_no_record_is_named(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run")
+    lines = (folder / "metrics.jsonl").read_text().splitlines()
+    lines[6] = lines[6][:30]
+    (folder / "metrics.jsonl").write_text("\n".join(lines) + "\n")
+    with pytest.raises(InputError, match=r"metrics\.jsonl:7.*is not a whole record; mend or remove"):
+        read_run(folder)
 
 
-def damage(file: Path, rng: random.Random) -> None:
-    """Cuts a file off, or changes a value in it."""
-    data = file.read_bytes()
-    if rng.random() < 0.3:
-        file.write_bytes(data[: rng.randrange(len(data))])
-    elif file.suffix == ".bin":
-        head, _, rest = data.partition(b"\n")
-        file.write_bytes(json.dumps(changed(json.loads(head), rng)).encode() + b"\n" + rest[3:])
-    elif file.suffix == ".jsonl":
-        lines = data.splitlines()
-        number = rng.choice([0, len(lines) - 1, rng.randrange(len(lines))])
-        lines[number] = json.dumps(changed(json.loads(lines[number]), rng)).encode()
-        file.write_bytes(b"\n".join(lines) + b"\n")
-    else:
-        file.write_text(json.dumps(changed(yaml.safe_load(data), rng)))
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("config.yaml", b"a: [1,", "not good YAML"),
+        ("config.yaml", b"job: else\n", "no run in it: there is no config.yaml of accerl train"),
+        ("summary.json", b'{"success_before": null', "summary.json: not good JSON"),
+    ],
+)
+def test_damaged_files_are_named(tmp_path: Path, name: str, content: bytes, said: str) -> None:
+    folder = write_run(tmp_path / "run")
+    (folder / name).write_bytes(content)
+    with pytest.raises(InputError, match=said) as caught:
+        read_run(folder)
+    assert name in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_a_damaged_run_is_read_or_one_line_names_its_file(tmp_path, monkeypatch, capsys) -> None:
-    monkeypatch.setattr(Chart, "svg", lambda chart: "")
-    monkeypatch.setattr(cli, "guarded", contextlib.nullcontext)
-    whole = write_run(tmp_path / "whole", config=imagining(), rollout=imagined())
-    write_worker(whole, "driver", [(0, TRAINING), (5, TRAINING)])
-    (whole / "checkpoints/last/pretrained_model/config.json").write_text(json.dumps({"type": "act"}))
-    files = [file.relative_to(whole) for file in whole.rglob("*") if file.is_file()]
-    rng, refused = random.Random(0), 0
-    for case in range(150):
-        run = Path(shutil.copytree(whole, tmp_path / f"run{case}"))
-        file = rng.choice(files)
-        damage(run / file, rng)
-        verbs: list[list[str]] = [["report", str(run)]]
-        verbs += [["timeline", str(run)]] if file.suffix == ".bin" else []
-        for verb in verbs:
-            code = cli.main(verb)
-            err = capsys.readouterr().err
-            assert code in (0, 2), (file, err)
-            if code:
-                assert err.count("\n") == 1 and file.name in err or "timeline" in err, (file, err)
-                refused += 1
-        shutil.rmtree(run)
-    assert refused > 20
+def test_columns_hold_numbers_only() -> None:
+    records: list[dict[str, Any]] = [{"a": 1}, {}, {"a": None}, {"a": "x"}, {"a": 2.5}]
+    assert np.array_equal(column(records, "a"), [1, np.nan, np.nan, np.nan, 2.5], equal_nan=True)
+    assert newest(records, "a") == 2.5 and newest(records, "b") is None
+
+
+def test_fields_that_differ() -> None:
+    assert changed_fields(encode(RunConfig())) == []
+    sft = SFTConfig(steps=5, backbone=BackboneConfig(hidden=8))
+    changed = dict(changed_fields(encode(RunConfig(algorithm=PPOConfig(clip_high=0.3), sft=sft))))
+    assert changed["algorithm.type"][0] == "ppo" and changed["algorithm.clip_high"][0] == 0.3
+    assert changed["sft.backbone.hidden"][0] == 8 and "algorithm.gamma" not in changed
+    a, b = (encode(run_config(seed=seed)) for seed in (1, 2))
+    b["algorithm"] = {"type": "ppo"}
+    b["output_dir"] = "elsewhere"
+    rows = dict(differences([a, b]))
+    assert rows["seed"] == [1, 2] and rows["algorithm.type"] == ["gipo", "ppo"]
+    assert rows["algorithm.sigma"] == [1.0, "–"] and "output_dir" not in rows

@@ -23,12 +23,12 @@ class Hands:
 
 
 def a_clock(
-    run: Path, worker: str = "trainer", *, at_s: float = 0.0, part_bytes: int = 10**6
+    run: Path, worker: str = "trainer", *, at_s: float = 0.0, most_bytes: int = 10**6
 ) -> tuple[Clock, Hands]:
     """A worker's clock, whose process begins at a second of the calendar, and its hands."""
     hands = Hands()
     wall = 2 * UP + round(at_s * SECOND)
-    clock = Clock(run / TIMELINE, worker, part_bytes=part_bytes, now=hands, calendar=lambda: wall)
+    clock = Clock(run / TIMELINE, worker, most_bytes=most_bytes, now=hands, calendar=lambda: wall)
     return clock, hands
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from accerl_lerobot.engines.config import LaunchConfig
 from accerl_lerobot.engines.local import LocalEngine
-from accerl_lerobot.timeline.read import Row, Timeline, read_timeline
+from accerl_lerobot.timeline import Row, Timeline, read_timeline
 from tests.runs import drive, tiny_run
 
 

@@ -10,8 +10,18 @@ import pytest
 
 from accerl_lerobot.cli import main
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, EVALUATION, RECOVERY, TRAINING, WAIT_IN, WAIT_OUT
-from accerl_lerobot.timeline.read import TimelineConfig, read_timeline, write_trace
+from accerl_lerobot.timeline import (
+    CHECKPOINT,
+    COMPUTE,
+    EVALUATION,
+    RECOVERY,
+    TRAINING,
+    WAIT_IN,
+    WAIT_OUT,
+    TimelineConfig,
+    read_timeline,
+    write_trace,
+)
 from tests.timeline.folders import SECOND, write_worker
 
 

@@ -1,0 +1,349 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Values for the template of the page, about one run or several side by side, and charts by matplotlib."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import datetime
+import io
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+from urllib.parse import quote
+
+import numpy as np
+
+from accerl_lerobot import __version__
+from accerl_lerobot.checkpoint.layout import SUMMARY
+from accerl_lerobot.config.help import shown
+from accerl_lerobot.config.parsing import decode
+from accerl_lerobot.console import ABSENT, count, duration, number, percent, rate
+from accerl_lerobot.engines.config import RunConfig, lag_limits
+from accerl_lerobot.errors import ERROR_LOG, InputError
+from accerl_lerobot.report.read import Record, Run, changed_fields, column, differences, finite, newest
+from accerl_lerobot.timeline import read_timeline
+
+RECENT_S = 120.0
+VIDEO_MB = 20
+FEW = 25  # exploring episodes below which their success says nothing; the first to end are the short ones
+LATE = 20  # updates at the end of a run that tell whether its samples are too old
+STALE = 0.3
+MOST_GAP = 0.3  # success of imagined episodes less that of real ones above which a report warns
+STEPS = "env steps of online experience"
+MEASURED = (
+    "Evaluation is with LeRobot's own sampler on seeds that no run trains on, with 95 % Wilson intervals. "
+    "While exploring, the policy has its noise, and success is that of the newest 100 episodes."
+)
+WARNINGS = {
+    "restarts": "restarts of a rollout worker, which crashed or hung",
+    "dropped_episodes": "episodes dropped, because the environment returned NaN or infinity",
+    "dropped_nonfinite": "decisions thrown away, because the environment returned NaN or infinity",
+    "replay_evicted_unused": "segments left the replay buffer unused because it was full",
+    "replay_retired_unused": "segments left the replay buffer unused, being older than replay.max_lag",
+    "replay_dropped_nonfinite": "segments refused by the replay buffer because of a NaN or infinity",
+    "skipped": "updates skipped, because loss or gradient was not finite",
+}
+"""Counter → what it counts; a run in which it is 0 needs no warning."""
+LEARNING = (
+    ("policy_loss",), ("imitation_loss",), ("value_loss",), ("approx_kl", "kl"),
+    ("clip_fraction", "low_weight"), ("explained_variance",), ("grad_norm", "value_grad_norm"), ("lr",),
+)  # fmt: skip
+"""Metrics of each chart of learning."""
+STYLE = {
+    "text.parse_math": False, "font.size": 9, "axes.grid": True, "grid.color": "#e9ecf1",
+    "axes.spines.top": False, "axes.spines.right": False,
+}  # fmt: skip
+
+
+class Series(NamedTuple):
+    """Points of one line, and their intervals if there are any."""
+
+    x: np.ndarray
+    y: np.ndarray
+    interval: np.ndarray | None = None  # (2, n)
+
+
+class Chart(NamedTuple):
+    """Series over a common x, by their names."""
+
+    title: str
+    x_label: str
+    series: dict[str, Series]
+    share: bool = False
+    limit: float | None = None
+
+    @property
+    def drawable(self) -> bool:
+        return any(np.isfinite(series.y).any() for series in self.series.values())
+
+    def png(self) -> str:
+        """The picture as base64."""
+        import matplotlib as mpl
+        from matplotlib.figure import Figure
+        from matplotlib.ticker import PercentFormatter
+
+        buffer = io.BytesIO()
+        with mpl.rc_context(STYLE):
+            figure = Figure(figsize=(5.2, 2.6), dpi=150, layout="constrained")
+            axes = figure.subplots()
+            for name, (x, y, interval) in self.series.items():
+                axes.plot(x, y, label=name, marker="o" if len(x) < 20 else "")
+                if interval is not None:
+                    axes.fill_between(x, interval[0], interval[1], alpha=0.2)
+            if self.limit is not None:
+                axes.axhline(self.limit, color="grey", linestyle="--")
+            if self.share:
+                axes.set_ylim(-0.03, 1.04)
+                axes.yaxis.set_major_formatter(PercentFormatter(1.0))
+            axes.set_xlabel(self.x_label)
+            axes.legend()
+            figure.savefig(buffer, format="png")
+        return base64.b64encode(buffer.getvalue()).decode()
+
+
+def over_updates(records: Sequence[Record], names: Sequence[str], **options: Any) -> Chart:
+    """A chart of some numbers of records."""
+    updates = column(records, "update")
+    series = {name: Series(updates, column(records, name)) for name in names}
+    return Chart(", ".join(names), "updates", series, **options)
+
+
+class Block(NamedTuple):
+    """A chapter of the page; what is empty is not shown."""
+
+    title: str
+    charts: Sequence[Chart] = ()
+    columns: Sequence[str] = ()
+    rows: Sequence[Sequence[str]] = ()
+    videos: Sequence[Path] = ()
+    shares: dict[str, dict[str, float]] | None = None
+    needs: object = True
+    note: str = ""
+    text: str = ""
+
+
+def html(page: dict[str, Any], folder: Path) -> str:
+    """The template filled in, as a page in this folder."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("accerl_lerobot", "report"), autoescape=True, undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    environment.filters["percent"] = percent
+    environment.filters["base64"] = lambda path: base64.b64encode(path.read_bytes()).decode()
+    environment.filters["address"] = lambda path: quote(os.path.relpath(path.resolve(), folder))
+    return environment.get_template("page.html").render(**page, version=__version__, video_mb=VIDEO_MB)
+
+
+def one_run(run: Run, now: float) -> dict[str, Any]:
+    """Values of a page about one run."""
+    bound = None
+    with contextlib.suppress(InputError):  # another version, or a package of the user's, may have written it
+        if not run.offline:
+            bound = lag_limits(decode(RunConfig, run.config))[0]
+    success = {"while exploring": exploring(run), "evaluation": evaluated(run)}
+    changed = changed_fields(run.config)
+    blocks = [
+        Block(
+            "Success and staleness",
+            charts=[
+                Chart("Success rate", STEPS, success, share=True),
+                over_updates(run.train, ("lag_mean", "lag_max"), limit=bound),
+            ],
+            note=f"{MEASURED} The dashed line is the bound of the recipe for the lag.",
+        ),
+        Block("Evaluations", columns=("", "env steps", "task", "success", "n"), rows=_evaluations(run)),
+        Block("Videos", videos=run.videos),
+        Block(
+            "Imagined rollouts",
+            charts=[over_updates(run.rollout, ("success_imagined", "success_exploring"), share=True)],
+            needs=newest(run.rollout, "success_imagined"),
+        ),
+        Block("Time of each role while training", shares=_time_shares(run)),
+        Block("Learning", charts=[over_updates(run.train, names) for names in LEARNING]),
+        Block(
+            "Recipe: fields that differ from the defaults",
+            columns=("field", "value", "default"),
+            rows=[(name, shown(value), shown(default)) for name, (value, default) in changed],
+            text=run.config_text,
+        ),
+    ]
+    return {
+        "about": f"accerl {'offline' if run.offline else 'train'} · {run.name} · {status(run, now)}",
+        "title": _headline(run),
+        "facts": _facts(run) | ({} if bound is None else {"bound of the lag": f"{bound} updates"}),
+        "warnings": list(warnings(run, now)),
+        "blocks": blocks,
+    }
+
+
+def comparison(runs: Sequence[Run], now: float) -> dict[str, Any]:
+    """Values of a page about several runs. No winner is named."""
+    names = [run.name for run in runs]
+    each = {}
+    for name, run in zip(names, runs, strict=True):
+        each[name if names.count(name) == 1 else str(run.path)] = run
+    rows = []
+    notes = []
+    for name, run in each.items():
+        rows.append((name, *_facts(run).values(), status(run, now)))
+        notes += [f"{name}: {text}" for text in warnings(run, now)]
+    evaluations = {name: evaluated(run) for name, run in each.items()}
+    explored = {name: exploring(run) for name, run in each.items()}
+    unlike = differences([run.config for run in runs])
+    blocks = [
+        Block("Runs", columns=("run", *_facts(runs[0]), "status"), rows=rows),
+        Block(
+            "Success",
+            charts=[
+                Chart("In evaluation", STEPS, evaluations, share=True),
+                Chart("While exploring", STEPS, explored, share=True),
+            ],
+            note=MEASURED,
+        ),
+        Block(
+            "Recipes: fields that are not the same in all of them",
+            columns=("field", *each),
+            rows=[(name, *map(shown, values)) for name, values in unlike],
+        ),
+    ]
+    finished = sum(run.result is not None for run in runs)
+    return {
+        "about": f"accerl report · {finished} of {len(runs)} finished",
+        "title": count(len(runs), "training run"),
+        "facts": {},
+        "warnings": notes,
+        "blocks": blocks,
+    }
+
+
+def status(run: Run, now: float) -> str:
+    if run.error:
+        return "failed"
+    if run.result is None:
+        return "still going" if now - run.written < RECENT_S else "not finished"
+    return "finished"
+
+
+def warnings(run: Run, now: float) -> Iterator[str]:
+    """Caveats of a run's numbers: one plain sentence each, none if all is well."""
+    if run.error:
+        yield f"The run failed: {run.error} The traceback is in {ERROR_LOG}."
+    elif run.result is None:
+        at = datetime.datetime.fromtimestamp(run.written).strftime("%d %B %Y, %H:%M")
+        yield f"The run is {status(run, now)}: there is no {SUMMARY}. It last wrote at {at}."
+    if run.truncated:
+        yield "The last line of metrics.jsonl is incomplete and left out: the run was writing it, or crashed."
+    for name, what in WARNINGS.items():
+        n = newest(run.rollout, name) or newest(run.train, name)
+        if n:
+            yield f"{n:,.0f} {what}."
+    for evaluation in (*run.before, *run.newest):
+        for note in evaluation.get("notes", ()):
+            yield f"Evaluation {evaluation.get('group')}, {note}."
+    if run.result is not None and run.result.get("note"):
+        yield f"While exploring, {run.result['note']}."
+    if run.rollout and not finite(run.rollout, "success_exploring").any():
+        yield "No exploring episode succeeded: there was nothing to learn from, unless rewards say more."
+    low_weight = finite(run.train[-LATE:], "low_weight")
+    if len(low_weight) and low_weight.mean() > STALE:
+        share = percent(float(low_weight.mean()))
+        yield f"Many samples hardly counted, {share} at the end: too stale, or trainer.lr too high."
+    imagined = newest(run.rollout, "success_imagined")
+    real = newest(run.rollout, "success_exploring")
+    if imagined is not None and real is not None and imagined - real > MOST_GAP:
+        rates = f"{percent(imagined)} and {percent(real)}"
+        yield f"Imagined episodes succeed far more often than real ones, {rates}: the world model misleads."
+
+
+def _evaluations(run: Run) -> list[tuple[str, ...]]:
+    """Group, env steps, task, success and episodes of every evaluation."""
+    rows: list[tuple[str, ...]] = []
+    for e in run.evaluations:
+        tasks = dict(e.get("tasks") or {})
+        if len(tasks) != 1:
+            tasks["all"] = e
+        for task, one in tasks.items():
+            success = rate(one["success"], one["ci95"])
+            rows.append((str(e.get("group")), number(e["env_steps"]), task, success, number(one["n"])))
+    return rows
+
+
+def exploring(run: Run) -> Series:
+    """Success of the newest exploring episodes over the env steps since training began.
+
+    Counters of workers include the evaluation before training, which is subtracted: its episodes times their
+    mean length.
+    """
+    steps = column(run.rollout, "env_steps")
+    episodes = column(run.rollout, "episodes")
+    for e in run.before:
+        steps = steps - e["steps_mean"] * e["n"]
+        episodes = episodes - e["n"]
+    counts = episodes >= FEW
+    if run.result is not None:  # workers go on during the final evaluation
+        counts &= steps <= run.result.get("env_steps", np.inf)
+    return Series(steps[counts], column(run.rollout, "success_exploring")[counts])
+
+
+def evaluated(run: Run) -> Series:
+    """Success of the evaluations, with intervals."""
+    intervals = np.array([e["ci95"] for e in run.evaluations], dtype=np.float64).reshape(-1, 2).T
+    steps = column(run.evaluations, "env_steps")
+    return Series(steps, column(run.evaluations, "success"), intervals)
+
+
+def _time_shares(run: Run) -> dict[str, dict[str, float]]:
+    """How the time of each role divides in the training; nothing without a timeline."""
+    try:
+        timeline = read_timeline(run.path)
+    except InputError:
+        return {}
+    shares = timeline.shares(timeline.training())
+    shares.pop("driver", None)  # which neither works nor waits
+    return shares
+
+
+def _headline(run: Run) -> str:
+    made = int(newest(run.train, "update") or 0)
+    if run.offline:
+        losses = finite(run.train, "imitation_loss")
+        ends = " → ".join(number(loss) for loss in losses[[0, -1]]) if len(losses) else ABSENT
+        return f"{count(made, 'update')} on recorded episodes: imitation loss {ends}"
+    if run.result is None:
+        return f"{made} of {run.section('trainer').get('updates')} updates on {_tasks(run)}"
+    rates = [rate(e["success"], e["ci95"]) for e in (*run.before, *run.newest)]
+    return f"Success on {_tasks(run)}: {' → '.join(rates)}"
+
+
+def _tasks(run: Run) -> str:
+    """The run's task, or how many it has."""
+    names = list(run.evaluations[-1].get("tasks") or ()) if run.evaluations else []
+    if len(names) > 1:
+        return count(len(names), "task")
+    env = run.section("env")
+    return str(names[0] if names else env.get("task") or env.get("name") or env.get("type"))
+
+
+def _facts(run: Run) -> dict[str, str]:
+    """Numbers at the top of a page, and of a run's row in the table of several."""
+    result = run.result or {}
+    success = {}
+    for name, ends in (("success before", run.before), ("success", run.newest)):
+        success[name] = rate(ends[0]["success"], ends[0]["ci95"]) if ends else ABSENT
+    seen = exploring(run).x
+    steps = result.get("env_steps", seen[-1] if len(seen) else None)
+    lags = finite(run.train, "lag_mean")
+    return {
+        **success,
+        "algorithm": str(run.section("algorithm").get("type")),
+        "seed": str(run.config.get("seed")),
+        "updates": number(result.get("updates", newest(run.train, "update"))),
+        "episodes": number(result.get("episodes", newest(run.rollout, "episodes"))),
+        "env steps": number(steps),
+        "mean lag": number(float(lags.mean()) if len(lags) else None, 2),
+        "wall time": duration(result.get("wall_s", newest(run.train, "wall_s"))),
+    }
