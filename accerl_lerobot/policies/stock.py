@@ -14,6 +14,7 @@ A dims.
 from __future__ import annotations
 
 import copy
+import logging
 from collections import OrderedDict
 from collections.abc import Sequence
 from typing import Any, NoReturn
@@ -23,6 +24,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from accerl_lerobot.checkpoint.safety import brief
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Decision, Request, stack_observations
 from accerl_lerobot.policies.adapter import Evaluation, PretrainedAdapter
@@ -30,6 +32,8 @@ from accerl_lerobot.policies.config import ChunkNoiseConfig, SamplerConfig, exec
 from accerl_lerobot.policies.features import ACTION
 from accerl_lerobot.policies.processing import Processing
 from accerl_lerobot.seeds import episode_of
+
+logger = logging.getLogger(__name__)
 
 EPISODES = 256  # episodes whose state is kept; the one that acted longest ago goes first
 NOISE = 6  # distinguishes the seeds of the noise on executed chunks
@@ -48,6 +52,7 @@ class StockAdapter(PretrainedAdapter):
         super().__init__(policy, processing, precision)
         self._sampler = sampler
         self.explores = sampler is not None
+        self._takes_batches = True
         self._episodes: OrderedDict[tuple[int, str], Any] = OrderedDict()
 
     @property
@@ -78,10 +83,10 @@ class StockAdapter(PretrainedAdapter):
             self.policy.eval()
 
     def self_check(self) -> None:
-        """Acts once for two environments, and computes the training loss once.
+        """Proves that the policy can be asked twice for a chunk, and that its training loss can be computed.
 
         Raises:
-            InputError: LeRobot trains the policy on more than its chunks.
+            InputError: it answers the same question differently, or is trained on more than its chunks.
         """
         config = self.policy.config
         later = [delta for delta in config.observation_delta_indices or () if delta > 0]
@@ -89,8 +94,21 @@ class StockAdapter(PretrainedAdapter):
             hint = "LeRobot trains it on what follows a chunk, rewards or observations, and not on chunks"
             raise InputError("policy.type", config.type, f"{hint} alone; it can be evaluated (accerl eval)")
         requests = self.example_requests()
-        acted = self.decide(requests, 0)[0]
-        chunk = torch.zeros(len(requests), *acted.chunk.shape, device=self.device)
+        first, second = (self.decide(requests[:1], 0)[0].chunk for _ in range(2))
+        if not np.array_equal(first, second):
+            hint = "asked twice with the same noise, it gives two chunks: it changes while it acts"
+            raise InputError("policy.type", config.type, f"{hint}; it can be evaluated (accerl eval)")
+        try:
+            with torch.no_grad():
+                self._chunk(requests)
+        except Exception as error:  # a policy of another package, which may fail in any way
+            self._takes_batches = False
+            reason = f"{type(error).__name__}: {brief(error)}"
+            logger.warning(
+                "%s policies decide for one environment at a time, which takes as many calls as there are "
+                "environments: a batch of two fails (%s)", config.type, reason,
+            )  # fmt: skip
+        chunk = torch.zeros(len(requests), *first.shape, device=self.device)
         buffers = {name: buffer.clone() for name, buffer in self.policy.named_buffers()}
         with torch.no_grad(), torch.random.fork_rng(), self.autocast():
             self.imitate(*stack_observations(requests), chunk)
@@ -139,9 +157,10 @@ class StockAdapter(PretrainedAdapter):
         """Exploring environments are decided for together, the others one by one, each with its own noise."""
         assert self._sampler is not None
         exploring = [i for i, request in enumerate(requests) if request.explore]
-        groups = [[i] for i, request in enumerate(requests) if not request.explore]
-        if exploring:
-            groups.append(exploring)
+        together = exploring if self._takes_batches else []
+        groups = [[i] for i in range(len(requests)) if i not in together]
+        if together:
+            groups.append(together)
         chunks: dict[int, Tensor] = {}
         for rows in groups:
             chunk = self._chunk([requests[i] for i in rows])

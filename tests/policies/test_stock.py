@@ -281,3 +281,32 @@ def test_a_type_that_is_missing_and_a_package_that_is_broken_are_two_lines(
     with pytest.raises(InputError, match=f"no such policy type here; {why}") as caught:
         load_acting(config)
     assert "\n" not in str(caught.value) and "lerobot_policy_theirs" not in sys.modules
+
+
+def test_a_policy_that_takes_no_batch_decides_one_by_one(
+    written: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    from lerobot.policies.vqbet.modeling_vqbet import VQBeTPolicy
+
+    stock = VQBeTPolicy.select_action
+
+    def one_at_a_time(self: Any, batch: dict[str, torch.Tensor]) -> torch.Tensor:
+        if len(batch["observation.state"]) > 1:
+            raise RuntimeError("one at a time, please")
+        return stock(self, batch)
+
+    monkeypatch.setattr(VQBeTPolicy, "select_action", one_at_a_time)
+    adapter = learning(written("vqbet"))
+    assert "vqbet policies decide for one environment at a time" in caplog.text
+    assert len(adapter.decide(adapter.example_requests(), 0)) == 2
+
+
+def test_a_policy_that_changes_while_it_acts_is_refused(written: Any, monkeypatch: pytest.MonkeyPatch):
+    from lerobot.policies.vqbet.modeling_vqbet import VQBeTPolicy
+
+    stock, count = VQBeTPolicy.select_action, iter(range(10_000))
+    monkeypatch.setattr(VQBeTPolicy, "select_action", lambda self, batch: stock(self, batch) + next(count))
+    with pytest.raises(
+        InputError, match="policy.type='vqbet': asked twice with the same noise, it gives two"
+    ):
+        learning(written("vqbet"))
