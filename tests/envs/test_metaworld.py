@@ -180,3 +180,20 @@ def test_a_missing_opengl_names_the_package(headless: pytest.MonkeyPatch):
     headless.setattr(graphics, "_LIBRARIES", {"egl": ("libNoEGL.so",), "osmesa": ("libNoMesa.so",)})
     with pytest.raises(InputError, match="MUJOCO_GL='': .*apt-get install -y libosmesa6"):
         make_environment(MetaWorldConfig(task=TASK)).reset(0, TASK)
+
+
+def test_touch_is_told_as_metaworld_tells_it(monkeypatch: pytest.MonkeyPatch):
+    task, told = "push-v3", []
+    environment = MetaWorld(MetaWorldConfig(task=task))
+    environment.reset(0, task)
+    expert, sim = make_expert(environment.config, environment, task), environment.simulator.env
+    ours, theirs = sim.touching_object, type(sim).touching_object
+
+    def both(geom: int) -> bool:
+        told.append((ours(geom), theirs(sim, geom)))
+        return told[-1][0]
+
+    monkeypatch.setattr(sim, "touching_object", both)
+    while not environment.step_chunk(np.clip(expert(), -1, 1).astype(np.float32)[None]).done:
+        pass
+    assert {(False, False), (True, True)} == set(told)
