@@ -27,17 +27,25 @@ REACH, TURN = 0.05, 0.5  # movement in m and rad for an action of 1
 GRIP_STEPS = 10  # env steps in which the fingers open or close
 OFFSETS = {
     "basket": (0, 0, -0.055),
+    "heating_region": (-0.04, -0.01, -0.06),
+    "moka_pot_1": (-0.05, 0, 0.035),
+    "moka_pot_2": (0.05, 0, 0.035),
     "cook_region": (0, 0, 0.035),
     "wine_rack": (0, -0.01, 0.008),
+    "plate_right_region": (0, 0.015, 0.035),
     "bowl": (0, 0, 0.03),
 }
-"""Target of an object's lowest point, relative to the position of the object or region it is placed on."""
+"""Target of an object's lowest point, relative to the position of the object or region it is placed on, by
+the object's name or a part of the region's."""
 HANDLES = {
     "top": (-0.002, -0.1015, 0.184),
     "middle": (-0.002, -0.1015, 0.1105),
     "bottom": (-0.002, -0.1015, 0.041),
 }
 """Centre of the handle of each of a cabinet's drawers, in the drawer's frame."""
+LID = (0, 0, 0.077)  # place of the fingers at the knob of a moka pot's lid, in the pot's frame
+MUG_HANDLE = (0.062, 0, 0.056)  # centre of the yellow and white mug's handle in its frame
+DOOR = (0.2, 0.06)  # point on a microwave's door: distance from its hinge, and height above its middle
 KNOB = 0.038  # height of the grasp above the origin of the stove's knob
 PRESS = 0.008  # height of the fingers above a plate's origin while they push it
 
@@ -109,14 +117,14 @@ class Hand:
 
         return (yield from self.move(waypoint, within=0.02, given=given))
 
-    def pick(self, name: str, place: Callable[[], np.ndarray]) -> Script:
+    def pick(self, name: str, place: Callable[[], np.ndarray], known: Grasp | None = None) -> Script:
         """Grasps an object and lifts it a little; repeats until it holds the object."""
         scene, simulator = self.scene, self.simulator
         while True:
             if self.grip > 0:  # the object was lost
                 yield from self.set_grip(-1.0, simulator.hand[0], 5)
                 yield from self.rise(0.08, 12)
-            grasp = scene.grasp(name, place(), self.rng)
+            grasp = known or scene.grasp(name, place(), self.rng)
             self.turn = functools.partial(scene.turn, grasp)
             hand = simulator.hand[0]
 
@@ -142,7 +150,8 @@ def pick_and_place(hand: Hand, name: str, region: str) -> Script:
     """Carries an object to a region or another object and releases it there."""
     scene, simulator = hand.scene, hand.simulator
     heights = scene.corners(name)[..., 2] - simulator.pose(name)[0][2]
-    x, y, up = next((offset for part, offset in OFFSETS.items() if part in region), (0, 0, 0.01))
+    known = (offset for part, offset in OFFSETS.items() if part == name or part in region)
+    x, y, up = next(known, (0, 0, 0.01))
     up = up - heights.min()
     if "basket" in region:  # the palm stays above the basket's rim
         up = max(up, 0.045 - heights.max())
@@ -157,7 +166,8 @@ def pick_and_place(hand: Hand, name: str, region: str) -> Script:
     def held() -> bool:
         return hand.holds(name)
 
-    yield from hand.pick(name, place)
+    lid = Grasp(np.array(LID), 0.0, 0.0)
+    yield from hand.pick(name, place, lid if "moka_pot" in name else None)
     position = simulator.hand[0]
     below = position[2] - scene.corners(name)[..., 2].min()
     clear = scene.height(name, position, goal()) + below + hand.rng.uniform(0.02, 0.04)
@@ -188,17 +198,57 @@ def slide(hand: Hand, name: str, region: str) -> Script:
     return (yield from hand.rise(0.08, 12))
 
 
-def open_drawer(hand: Hand, region: str) -> Script:
-    """Opens the drawer with this region: grasps the handle from the front, pulls, and lets it go."""
+def put_in_microwave(hand: Hand, name: str, region: str) -> Script:
+    """Carries a mug by its handle into a microwave, whose door is toward −y."""
+    simulator = hand.simulator
+    turn = Rotation.from_quat(simulator.pose(name)[1], scalar_first=True)
+    grasp = Grasp(turn.apply(MUG_HANDLE), np.pi / 2, 1.4, np.array([0.0, 1]))
+
+    def place() -> np.ndarray:
+        return simulator.pose(region)[0] + OFFSETS["heating_region"]
+
+    def goal(ahead: float = 0.0) -> np.ndarray:
+        return place() + simulator.hand[0] - simulator.pose(name)[0] - [0, ahead, 0]
+
+    def held() -> bool:
+        return hand.holds(name)
+
+    yield from hand.pick(name, place, grasp)
+    yield from hand.move(lambda: goal(0.2), within=0.02, given=held)
+    if not (yield from hand.move(goal, given=held)):
+        return False
+    yield from hand.set_grip(-1.0, simulator.hand[0])
+    back = simulator.hand[0] - [0, 0.12, 0]
+    return (yield from hand.move(lambda: back, within=0.02))
+
+
+def close_microwave(hand: Hand, name: str) -> Script:
+    """Pushes a microwave's door from outside until it is closed."""
+    door = hand.simulator.data.body(f"{name}_microdoorroot")
+
+    def outside(distance: float, height: float = 0.0) -> np.ndarray:
+        return door.xpos + door.xmat.reshape(3, 3) @ [DOOR[0], -distance, DOOR[1] + height]
+
+    hand.grip, hand.turn = 1.0, lambda at: DOWN
+    yield from hand.over(lambda: outside(0.1), outside(0, 0.15)[2], lambda: True)
+    yield from hand.move(lambda: outside(0.1), within=0.02)
+    return (yield from hand.move(lambda: outside(-0.06), steps=150))
+
+
+def in_front(hand: Hand, region: str) -> Callable[..., np.ndarray]:
+    """Turns the hand toward a cabinet; returns positions ahead of the handle of this region's drawer."""
     simulator = hand.simulator
     cabinet, level, _ = region.rsplit("_", 2)
     drawer = simulator.data.body(f"{cabinet}_cabinet_{level}")
     turn = Rotation.from_quat(simulator.pose(cabinet)[1], scalar_first=True)
     front = turn.apply([0, -1.0, 0])
-    hand.turn = lambda at: Rotation.from_rotvec(1.4 * np.cross([0, 0, 1], front)).as_matrix() @ DOWN
+    hand.turn = functools.partial(hand.scene.turn, Grasp(np.zeros(3), 0.0, 1.4, -front[:2]))
+    return lambda ahead=0.0: drawer.xpos + turn.apply(HANDLES[level]) + ahead * front
 
-    def handle(ahead: float = 0.0) -> np.ndarray:
-        return drawer.xpos + turn.apply(HANDLES[level]) + ahead * front
+
+def open_drawer(hand: Hand, region: str) -> Script:
+    """Opens the drawer with this region: grasps the handle from the front, pulls, and lets it go."""
+    simulator, handle = hand.simulator, in_front(hand, region)
 
     def holds() -> bool:
         return bool(np.linalg.norm(handle() - simulator.hand[0]) < 0.03)
@@ -210,6 +260,15 @@ def open_drawer(hand: Hand, region: str) -> Script:
     yield from hand.move(lambda: pulled, steps=40, given=holds)
     yield from hand.set_grip(-1.0, simulator.hand[0], 5)
     return (yield from hand.move(lambda: handle(0.1), within=0.02))
+
+
+def close_drawer(hand: Hand, region: str) -> Script:
+    """Closes the drawer with this region: pushes its handle with closed fingers."""
+    handle = in_front(hand, region)
+    hand.grip = 1.0
+    yield from hand.over(lambda: handle(0.1), hand.simulator.hand[0][2], lambda: True)
+    yield from hand.move(lambda: handle(0.1), within=0.02)
+    return (yield from hand.move(lambda: handle(-0.05), steps=80))
 
 
 def turn_knob(hand: Hand, name: str) -> Script:
@@ -237,10 +296,22 @@ SKILLS: dict[str, Callable[..., Script]] = {
     "on": pick_and_place,
     "open": open_drawer,
     "turnon": turn_knob,
+    "close": close_drawer,
+    "microwave_1": close_microwave,
+    "microwave_1_heating_region": put_in_microwave,
     "main_table_stove_front_region": slide,
 }
 """Skill that makes a predicate of LIBERO's true, by the name of its last object or else by its own name."""
-PLANS: dict[str, list[list[str]]] = {}
+PLANS = {
+    "libero_10/3": [
+        ["in", "akita_black_bowl_1", "white_cabinet_1_bottom_region"],
+        ["close", "white_cabinet_1_bottom_region"],
+    ],
+    "libero_10/6": [
+        ["on", "chocolate_pudding_1", "living_room_table_plate_right_region"],
+        ["on", "porcelain_mug_1", "plate_1"],
+    ],
+}
 """Predicates of LIBERO's that a task needs, in the order of work, where its goal alone does not tell them."""
 
 

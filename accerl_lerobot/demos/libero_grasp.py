@@ -33,7 +33,8 @@ class Grasp(NamedTuple):
 
     offset: np.ndarray  # (3,) of the grip site from the object's position
     yaw: float  # turn of the hand about the vertical
-    lean: float  # tilt of the hand toward the robot, which extends its reach
+    lean: float  # tilt of the hand, so that it points more to the side
+    ahead: np.ndarray | None = None  # (2,) direction in which it then points; None: away from the robot
 
 
 class Scene:
@@ -48,7 +49,7 @@ class Scene:
         model = simulator.model
         self.base = simulator.data.body("robot0_base").xpos[:2].copy()
         self._root = model.body_rootid[model.geom_bodyid]
-        self._solid = (model.geom_contype > 0) & np.isin(self._root, list(simulator.env.obj_body_id.values()))
+        self._solid = (model.geom_contype | model.geom_conaffinity > 0) & np.isin(self._root, list(simulator.env.obj_body_id.values()))
 
     def _geoms(self, name: str, others: bool) -> np.ndarray:
         own = self._root == self.simulator.env.obj_body_id[name]
@@ -84,8 +85,8 @@ class Scene:
 
     def turn(self, grasp: Grasp, at: np.ndarray) -> np.ndarray:
         """Rotation (3, 3) of a hand at position `at` that holds a grasp."""
-        away = (at[:2] - self.base) / np.linalg.norm(at[:2] - self.base)
-        lean = Rotation.from_rotvec(grasp.lean * np.array([away[1], -away[0], 0]))
+        ahead = at[:2] - self.base if grasp.ahead is None else grasp.ahead
+        lean = Rotation.from_rotvec(grasp.lean * np.array([ahead[1], -ahead[0], 0]) / np.linalg.norm(ahead))
         return (lean * Rotation.from_euler("z", grasp.yaw)).as_matrix() @ DOWN
 
     def grasp(self, name: str, goal: np.ndarray, rng: np.random.Generator) -> Grasp:
