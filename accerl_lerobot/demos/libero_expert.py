@@ -21,13 +21,14 @@ from accerl_lerobot.errors import InputError
 Script = Generator[np.ndarray, None, bool]
 """Yields actions, float64 (7,); returns True if the movement was completed."""
 
-SUITES = ("libero_object", "libero_spatial", "libero_goal")
+SUITES = ("libero_object", "libero_spatial", "libero_goal", "libero_10")
 UNSOLVED = "libero_goal/3"  # the task without an expert: open the top drawer and put the bowl inside
 REACH, TURN = 0.05, 0.5  # movement in m and rad for an action of 1
 GRIP_STEPS = 10  # env steps in which the fingers open or close
 OFFSETS = {
     "basket": (0, 0, -0.055),
     "heating_region": (-0.04, -0.01, -0.06),
+    "bottom_region": (0, -0.022, 0.033),
     "moka_pot_1": (-0.05, 0, 0.035),
     "moka_pot_2": (0.05, 0, 0.035),
     "cook_region": (0, 0, 0.035),
@@ -235,20 +236,20 @@ def close_microwave(hand: Hand, name: str) -> Script:
     return (yield from hand.move(lambda: outside(-0.06), steps=150))
 
 
-def in_front(hand: Hand, region: str) -> Callable[..., np.ndarray]:
+def in_front(hand: Hand, region: str, yaw: float) -> Callable[..., np.ndarray]:
     """Turns the hand toward a cabinet; returns positions ahead of the handle of this region's drawer."""
     simulator = hand.simulator
     cabinet, level, _ = region.rsplit("_", 2)
     drawer = simulator.data.body(f"{cabinet}_cabinet_{level}")
     turn = Rotation.from_quat(simulator.pose(cabinet)[1], scalar_first=True)
     front = turn.apply([0, -1.0, 0])
-    hand.turn = functools.partial(hand.scene.turn, Grasp(np.zeros(3), 0.0, 1.4, -front[:2]))
+    hand.turn = functools.partial(hand.scene.turn, Grasp(np.zeros(3), yaw, 1.4, -front[:2]))
     return lambda ahead=0.0: drawer.xpos + turn.apply(HANDLES[level]) + ahead * front
 
 
 def open_drawer(hand: Hand, region: str) -> Script:
     """Opens the drawer with this region: grasps the handle from the front, pulls, and lets it go."""
-    simulator, handle = hand.simulator, in_front(hand, region)
+    simulator, handle = hand.simulator, in_front(hand, region, 0.0)
 
     def holds() -> bool:
         return bool(np.linalg.norm(handle() - simulator.hand[0]) < 0.03)
@@ -264,9 +265,9 @@ def open_drawer(hand: Hand, region: str) -> Script:
 
 def close_drawer(hand: Hand, region: str) -> Script:
     """Closes the drawer with this region: pushes its handle with closed fingers."""
-    handle = in_front(hand, region)
+    handle = in_front(hand, region, np.pi / 2)  # a hand that lies flat
     hand.grip = 1.0
-    yield from hand.over(lambda: handle(0.1), hand.simulator.hand[0][2], lambda: True)
+    yield from hand.over(lambda: handle(0.1), handle()[2] + 0.25, lambda: True)
     yield from hand.move(lambda: handle(0.1), within=0.02)
     return (yield from hand.move(lambda: handle(-0.05), steps=80))
 

@@ -49,7 +49,8 @@ class Scene:
         model = simulator.model
         self.base = simulator.data.body("robot0_base").xpos[:2].copy()
         self._root = model.body_rootid[model.geom_bodyid]
-        self._solid = (model.geom_contype | model.geom_conaffinity > 0) & np.isin(self._root, list(simulator.env.obj_body_id.values()))
+        solid = (model.geom_contype | model.geom_conaffinity) > 0
+        self._solid = solid & np.isin(self._root, list(simulator.env.obj_body_id.values()))
 
     def _geoms(self, name: str, others: bool) -> np.ndarray:
         own = self._root == self.simulator.env.obj_body_id[name]
