@@ -45,7 +45,7 @@ HANDLES = {
 }
 """Centre of the handle of each of a cabinet's drawers, in the drawer's frame."""
 LID = (0, 0, 0.077)  # place of the fingers at the knob of a moka pot's lid, in the pot's frame
-MUG_HANDLE = (0.062, 0, 0.056)  # centre of the yellow and white mug's handle in its frame
+MUG_HANDLE = (0.062, 0, 0.068)  # centre of the yellow and white mug's handle in its frame
 DOOR = (0.2, 0.06)  # point on a microwave's door: distance from its hinge, and height above its middle
 KNOB = 0.038  # height of the grasp above the origin of the stove's knob
 PRESS = 0.008  # height of the fingers above a plate's origin while they push it
@@ -236,20 +236,20 @@ def close_microwave(hand: Hand, name: str) -> Script:
     return (yield from hand.move(lambda: outside(-0.06), steps=150))
 
 
-def in_front(hand: Hand, region: str, yaw: float) -> Callable[..., np.ndarray]:
+def in_front(hand: Hand, region: str, yaw: float, lean: float) -> Callable[..., np.ndarray]:
     """Turns the hand toward a cabinet; returns positions ahead of the handle of this region's drawer."""
     simulator = hand.simulator
     cabinet, level, _ = region.rsplit("_", 2)
     drawer = simulator.data.body(f"{cabinet}_cabinet_{level}")
     turn = Rotation.from_quat(simulator.pose(cabinet)[1], scalar_first=True)
     front = turn.apply([0, -1.0, 0])
-    hand.turn = functools.partial(hand.scene.turn, Grasp(np.zeros(3), yaw, 1.4, -front[:2]))
+    hand.turn = functools.partial(hand.scene.turn, Grasp(np.zeros(3), yaw, lean, -front[:2]))
     return lambda ahead=0.0: drawer.xpos + turn.apply(HANDLES[level]) + ahead * front
 
 
 def open_drawer(hand: Hand, region: str) -> Script:
     """Opens the drawer with this region: grasps the handle from the front, pulls, and lets it go."""
-    simulator, handle = hand.simulator, in_front(hand, region, 0.0)
+    simulator, handle = hand.simulator, in_front(hand, region, 0.0, 1.4)
 
     def holds() -> bool:
         return bool(np.linalg.norm(handle() - simulator.hand[0]) < 0.03)
@@ -265,10 +265,11 @@ def open_drawer(hand: Hand, region: str) -> Script:
 
 def close_drawer(hand: Hand, region: str) -> Script:
     """Closes the drawer with this region: pushes its handle with closed fingers."""
-    handle = in_front(hand, region, np.pi / 2)  # a hand that lies flat
+    yaw = np.copysign(np.pi / 2, -hand.simulator.hand[1][0, 0])  # the one that needs the smaller turn
+    handle = in_front(hand, region, yaw, 0.8)
     hand.grip = 1.0
-    yield from hand.over(lambda: handle(0.1), handle()[2] + 0.25, lambda: True)
-    yield from hand.move(lambda: handle(0.1), within=0.02)
+    yield from hand.over(lambda: handle(0.06), handle()[2] + 0.15, lambda: True)
+    yield from hand.move(lambda: handle(0.06), within=0.02)
     return (yield from hand.move(lambda: handle(-0.05), steps=80))
 
 

@@ -87,7 +87,8 @@ class Scene:
     def turn(self, grasp: Grasp, at: np.ndarray) -> np.ndarray:
         """Rotation (3, 3) of a hand at position `at` that holds a grasp."""
         ahead = at[:2] - self.base if grasp.ahead is None else grasp.ahead
-        lean = Rotation.from_rotvec(grasp.lean * np.array([ahead[1], -ahead[0], 0]) / np.linalg.norm(ahead))
+        x, y = ahead / np.linalg.norm(ahead)
+        lean = Rotation.from_rotvec(grasp.lean * np.array([y, -x, 0]))
         return (lean * Rotation.from_euler("z", grasp.yaw)).as_matrix() @ DOWN
 
     def grasp(self, name: str, goal: np.ndarray, rng: np.random.Generator) -> Grasp:
