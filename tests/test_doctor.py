@@ -57,7 +57,7 @@ class TestRecipe:
         found = capsys.readouterr().out
         assert found.count("\n") <= 60 and "warn" not in found
         assert "ok    recipe     resolves" in found
-        assert "lag        at most" in found and "work " in found and "env steps" in found
+        assert "lag        at most" in found and "work " in found and "decisions" in found
 
     def test_a_mistake_fails_with_its_line(self, capsys: pytest.CaptureFixture[str]) -> None:
         assert cli.main(["doctor", str(QUICKSTART), "--env.type=x"]) == 1

@@ -317,7 +317,7 @@ def test_one_command_records_play_trains_a_world_model_on_it_and_practises(
     )  # fmt: skip
     launch = replace(config.launch, engine="local")
     config = replace(config, imagination=play, launch=launch, env=replace(ENV, image_size=32))
-    stopped = mock.patch("accerl_lerobot.world_model.pretrain.pretrain", side_effect=KeyboardInterrupt)
+    stopped = mock.patch("accerl_lerobot.run.play.pretrain", side_effect=KeyboardInterrupt)
     with stopped, pytest.raises(KeyboardInterrupt):
         Run(config, tmp_path, Console()).execute()
     recorded = load_episodes(DatasetConfig(repo_id="a/b", root=str(tmp_path / "play")), SPEC)

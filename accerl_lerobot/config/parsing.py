@@ -488,7 +488,7 @@ def _unknown(place: tuple[str, ...], value: Any, names: list[str], whole: type[A
         if flag in OF_LEROBOT:
             return InputError(flag, leaf, f"the name is LeRobot's; {OF_LEROBOT[flag]}")
     near = [".".join((*path, other)) for other in difflib.get_close_matches(key, names, n=3)]
-    near += [other for other in dotted_fields(whole) if other.rpartition(".")[2] == key]
+    near += [other for other in dotted_fields(whole) if other.rpartition(".")[2] == key and other != name]
     if near:
         return InputError(name, value, f"no such field; did you mean {' or '.join(dict.fromkeys(near))}?")
     where = f"{'.'.join(path)} has" if path else "there are"

@@ -109,6 +109,11 @@ def load_judge(config: RewardModelConfig) -> Callable[[Observation], bool]:
         trusted = config.trust_remote_code
         with untrusted.guarded(REWARD_MODEL, trusted), contextlib.redirect_stdout(sys.stderr):
             settings = LeRobotConfig.from_pretrained(folder)
+            if settings.observation_delta_indices is not None:
+                hint = (
+                    f"{settings.type} looks at several observations at once; use one that judges each alone"
+                )
+                raise InputError(origin.field, config.path, hint)
             settings.device = "cpu"
             model = get_reward_model_class(settings.type).from_pretrained(folder, config=settings)
             on_cpu = {"device_processor": {"device": "cpu"}}
@@ -118,9 +123,6 @@ def load_judge(config: RewardModelConfig) -> Callable[[Observation], bool]:
     except Exception as error:  # LeRobot takes the files at their word, and may fail over any of them
         hint = f"it cannot be loaded as one of LeRobot's reward models ({brief(error)})"
         raise InputError(origin.field, config.path, hint) from error
-    if settings.observation_delta_indices is not None:
-        hint = f"{settings.type} looks at several observations at once; use one that judges each alone"
-        raise InputError(origin.field, config.path, hint)
 
     @torch.no_grad()
     def succeeded(observation: Observation) -> bool:

@@ -12,8 +12,8 @@ import functools
 import json
 from collections import deque
 from dataclasses import dataclass, field, replace
-from importlib.resources import files
 from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
@@ -29,7 +29,11 @@ if TYPE_CHECKING:
 @functools.cache
 def _tables() -> dict[str, Any]:
     """LeRobot's MetaWorld tables: a JSON file in its package, as importing it costs seconds and memory."""
-    return json.loads((files("lerobot") / "envs" / "metaworld_config.json").read_text())
+    spec = find_spec("lerobot")
+    if spec is None or not spec.submodule_search_locations:
+        raise ModuleNotFoundError("LeRobot is not installed: pip install lerobot[metaworld]", name="lerobot")
+    path = Path(spec.submodule_search_locations[0]) / "envs" / "metaworld_config.json"
+    return json.loads(path.read_text())
 
 
 @functools.cache

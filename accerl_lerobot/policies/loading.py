@@ -236,6 +236,10 @@ def open_checkpoint(config: PolicyConfig) -> Checkpoint:
     source = FileSource("policy.path", config.path)
     discover(config.discover_packages_path, "policy")
     kind = read_json(folder / untrusted.CONFIG, source).get("type")
+    if kind is None:
+        known = ", ".join(sorted(PreTrainedConfig.get_known_choices()))
+        hint = f'{untrusted.CONFIG} of {config.path} names no type; add "type": one of {known}'
+        raise InputError("policy.type", None, hint)
     register_policies(str(kind))
     check_registered(kind, "policy.type", f"{config.path} is of this type: ")
     what = "its config.json is not one of this LeRobot's policies; remove the fields of another version"

@@ -43,11 +43,12 @@ def write_report(config: ReportConfig) -> Path:
     from accerl_lerobot.report.page import comparison, html, one_run
     from accerl_lerobot.report.read import read_run
 
-    runs = [read_run(expanded(name, "runs")) for name in config.runs]
-    output = runs[0].path / NAME if len(runs) == 1 else Path(NAME)
-    if config.output is not None:
-        output = expanded(config.output, "output")
+    output = Path(NAME) if config.output is None else expanded(config.output, "output")
     check_output(output)
+    runs = [read_run(expanded(name, "runs")) for name in config.runs]
+    if config.output is None and len(runs) == 1:
+        output = runs[0].path / NAME
+        check_output(output)
     now = time.time()
     with reading("runs", ",".join(config.runs), f"{CONFIG}, {METRICS} or {SUMMARY}"):
         page = one_run(runs[0], now) if len(runs) == 1 else comparison(runs, now)

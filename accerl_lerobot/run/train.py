@@ -211,7 +211,6 @@ class Run:
 
     def do(self) -> dict[str, Any]:
         """`execute`, in a folder that is locked meanwhile; says how to resume whatever ends the run."""
-        self.console.say(f"run {self.directory}")
         guardian.explain(hint=printable(f"to resume: {self.how}"))
         try:
             with (
@@ -235,8 +234,8 @@ class Run:
             self.console.say(f"{reason}; to resume: {self.how}")
             raise
 
-    def execute(self) -> dict[str, Any]:
-        """Do all phases; returns the summary, which is also in ``summary.json``."""
+    def begin(self) -> Path | None:
+        """Check the run and write its config; returns the checkpoint that it goes on from."""
         checkpoint = None
         if self.resume_from is None:
             self.pin()
@@ -249,6 +248,12 @@ class Run:
                 self.config = resuming.continued(recipe, self.directory, checkpoint)
             self.check()
             self.keep(recipe)  # only now: a resume that is refused leaves the run as it was
+        return checkpoint
+
+    def execute(self) -> dict[str, Any]:
+        """Do all phases; returns the summary, which is also in ``summary.json``."""
+        checkpoint = self.begin()
+        self.console.say(f"run {self.directory}")
         if checkpoint is None:
             self.config = warm_start(self.config, self.directory, self.console)
         else:
@@ -256,7 +261,7 @@ class Run:
             self.console.say(f"going on from {checkpoint}")
             self.times.before_s = None
         if self.config.imagination.environments and self.config.imagination.path is None:
-            from accerl_lerobot.world_model.pretrain import prepared
+            from accerl_lerobot.run.play import prepared
 
             self.config = prepared(self.config, self.directory, self.console, self.load)
         self.times.warm_s = time.monotonic() - self.times.started

@@ -272,11 +272,12 @@ class TimelineConfig(Section):
 
 def write_trace(config: TimelineConfig) -> dict[str, Any]:
     """Writes the ``trace``; of the ``runs``, when each trained and its roles' shares of that time."""
-    timelines = [read_timeline(expanded(name, "runs")) for name in config.runs]
-    trace = timelines[0].run / TRACE if len(timelines) == 1 else Path(TRACE)
-    if config.output is not None:
-        trace = expanded(config.output, "output")
+    trace = Path(TRACE) if config.output is None else expanded(config.output, "output")
     check_output(trace)
+    timelines = [read_timeline(expanded(name, "runs")) for name in config.runs]
+    if config.output is None and len(timelines) == 1:
+        trace = timelines[0].run / TRACE
+        check_output(trace)
     runs = []
     events: list[dict[str, Any]] = []
     for number, timeline in enumerate(timelines):

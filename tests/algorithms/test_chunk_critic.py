@@ -554,7 +554,7 @@ SECTIONS: dict[str, Any] = {
     [
         (
             {"env": SimulatedConfig(), "world_model": SimulatorStateConfig()},
-            r"world_model\.type='simulator': .*add --env\.environment_state=true",
+            r"world_model\.type='simulator': .*add env\.environment_state",
         ),
         (
             {"algorithm": SelfImitationConfig(), "world_model": LatentConfig()},

@@ -213,7 +213,7 @@ def test_the_environment_has_its_own_limit():
             {"fails": ModuleNotFoundError("x", name="arms.left")},
             r"env\.id='Odd-v0': the package arms is not installed",
         ),
-        ({"fast": True}, r"env\.kwargs={'fast': True}: the environment fails \(TypeError: .*'fast'"),
+        ({"fast": True}, r"env\.kwargs={'fast': True}: Odd-v0: the environment fails \(TypeError: .*'fast'"),
     ],
 )
 def test_an_environment_that_fails_is_one_line_without_a_question(fields: dict[str, Any], message: str):

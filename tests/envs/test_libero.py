@@ -70,7 +70,7 @@ def test_names_and_texts_are_liberos_own():
         ({"task": "libero_goal/10"}, "'libero_goal/10' is no task"),
         ({"task": ""}, "'' is no task; use names such as libero_spatial/0"),
         ({"camera": "agentview,agentview"}, "name each camera once"),
-        ({"camera": "agentview_image"}, "'agentview_image' is none of: agentview, robot0_eye_in_hand, "),
+        ({"camera": "agentview_image"}, "separated by commas, of: agentview, robot0_eye_in_hand, "),
     ],
 )
 def test_wrong_fields_are_refused(fields: dict[str, str], message: str):

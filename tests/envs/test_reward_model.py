@@ -136,6 +136,8 @@ def test_what_cannot_judge_is_refused_in_one_line(
     path = tmp_path / "b"
     (path / "classifier_preprocessor.json").unlink()
     refused("it cannot be loaded as one of LeRobot's reward models")
+    write_classifier(tmp_path / "c", encoder)
+    path = tmp_path / "c"
     with monkeypatch.context() as context:
         context.setattr(RewardClassifierConfig, "observation_delta_indices", [-1, 0])
         refused("looks at several observations at once")

@@ -202,7 +202,7 @@ def test_no_place_of_this_machine_is_named(hub, policy, refused, tmp_path, monke
         write_json(policy / file, json.loads(json.dumps(content).replace("SECRET", name)))
         with pytest.raises(InputError, match=f"{file}: .* is a place on this machine"):
             check_names(policy, FileSource("policy.path", "theirs"))
-    hub.plant(NAME, {file: (policy / file).read_bytes()})
+    hub.plant(NAME, {file: (policy / file).read_bytes(), "adapter_model.safetensors": b"x"})
     assert f"{file}: " in (line := refused()) and "is a place on this machine" in line
 
 

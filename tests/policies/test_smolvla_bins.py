@@ -116,7 +116,7 @@ def test_the_loss_by_hand(loaded: tuple[Any, Any, Any]):
         ({"chunk_size": 2, "n_action_steps": 3}, "n_action_steps=3: use 1 to chunk_size=2"),
         ({"num_bins": 1}, "num_bins=1: use at least 2"),
         ({"normalization_mapping": {"ACTION": "MEAN_STD"}}, "bins need MIN_MAX or QUANTILES"),
-        ({"nun_bins": 8}, "no such field; did you mean num_bins"),
+        ({"nun_bins": 8}, "no such field; use num_bins"),
     ],
 )
 def test_bad_fields_are_refused_before_any_training(fields: dict[str, Any], message: str):

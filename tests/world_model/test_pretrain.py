@@ -134,7 +134,7 @@ def test_its_fields_are_fields_of_the_command_line():
         ("size", "not a world model of accerl world-model"),
         ("chunk", r"config.json: spec.chunk=0: use a whole number in \[1, "),
         ("learnt", "config.json: learnt: not one of accerl world-model"),
-        ("nan", "model.safetensors: 'model.change' holds NaN or infinity; train it again"),
+        ("nan", "model.safetensors: model.change holds NaN or infinity; train it again"),
     ],
 )
 def test_what_cannot_be_loaded(tmp_path: Path, harm: str, why: str):
