@@ -258,6 +258,11 @@ def policy_fields(kind: str, field: str) -> set[str]:
 
 
 def _step(progress: re.Match[str]) -> int:
-    """The step of a line of progress: the bar's, or without a bar (under Slurm) the rounded number."""
+    """The step of a line of progress.
+
+    From 1000 on it is the bar's, which may be a moment old, or without a bar (under Slurm) a rounded number.
+    """
     scale = {"": 1, "K": 1_000, "M": 1_000_000}[progress["suffix"]]
-    return int(progress["bar"] or float(progress["step"]) * scale)
+    if scale > 1 and progress["bar"]:
+        return int(progress["bar"])
+    return int(float(progress["step"]) * scale)

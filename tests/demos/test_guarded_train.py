@@ -82,9 +82,7 @@ def test_a_hostile_dataset_ends_the_training_in_a_line(tmp_path: Path):
     info = json.loads((root / "meta/info.json").read_text())
     (root / "meta/info.json").write_text(json.dumps(info | {"data_path": "{chunk_index:999999999}"}))
     small = {"type": "act", "chunk_size": 4, "n_action_steps": 4, "pretrained_backbone_weights": None}
-    with pytest.raises(
-        InputError, match="^dataset.root=.*data_path: .*is no template of a file"
-    ):
+    with pytest.raises(InputError, match="^dataset.root=.*data_path: .*is no template of a file"):
         run_sft(
             SFTConfig(steps=1, policy=small),
             DatasetConfig(repo_id="a/b", root=str(root)),
