@@ -226,7 +226,7 @@ def test_progress_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     command_that(monkeypatch, f"print({chr(10).join(lines)!r})")
     seen: list[tuple[int, float]] = []
     run_sft(TINY, HUB, tmp_path / "sft", seed=0, on_step=lambda step, loss: seen.append((step, loss)))
-    assert seen[:4] == [(25, 1.25), (48, 1.0), (2000, 0.5), (2975, 0.259)]
+    assert seen[:4] == [(25, 1.25), (50, 1.0), (2000, 0.5), (2975, 0.259)]
     assert seen[4][0] == 1_000_000 and np.isnan(seen[4][1]) and len(seen) == 5
 
 
