@@ -17,7 +17,7 @@ import re
 import traceback
 import unicodedata
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -83,10 +83,20 @@ def check_absent(path: Path, field: str = "output_dir") -> None:
         raise InputError(field, str(path), f"{above} cannot be written to; name another folder")
 
 
-def check_output(path: Path) -> None:
-    """Refuses an ``output`` that is a folder, or in none."""
-    if path.is_dir() or not path.parent.is_dir():
+def output_of(given: str | None, runs: Sequence[str], name: str) -> Path:
+    """The file that is made of runs: the one that is given, or `name` in the folder of a single run, or here.
+
+    Raises:
+        InputError: it is a folder, or in none. Whether a run is there is for its reader to say.
+    """
+    path = Path(name)
+    if given is not None:
+        path = expanded(given, "output")
+    elif len(runs) == 1:
+        path = expanded(runs[0], "runs") / name
+    if path.is_dir() or (given is not None and not path.parent.is_dir()):
         raise InputError("output", str(path), "name a file in a folder that exists")
+    return path
 
 
 @contextmanager

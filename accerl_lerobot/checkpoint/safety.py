@@ -22,7 +22,6 @@ from safetensors import SafetensorError, safe_open
 
 from accerl_lerobot.errors import InputError
 
-REVISION = re.compile(r"[0-9a-f]{40}")
 _INSIDE = re.compile(r"(?![~/]|[A-Za-z]:)[^\\\x00-\x1f\x7f\ud800-\udfff]+")
 _ABSOLUTE = re.compile(r"(~[^/\s]*)?/[\w.]|[A-Za-z]:[\\/]|file:|~$")
 

@@ -130,7 +130,7 @@ def exit_code(program: str, work: Callable[[], int]) -> int:
 
 
 def _refuse(program: str, text: str) -> int:
-    with contextlib.suppress(OSError):  # whoever reads it may be gone
+    with contextlib.suppress(OSError):  # the reader of the pipe may be gone
         sys.stderr.write(f"{program}: {printable(text)}\n")
     return 2
 

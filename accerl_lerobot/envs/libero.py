@@ -28,7 +28,7 @@ from accerl_lerobot.envs.base import EnvConfig, SuiteConfig
 from accerl_lerobot.errors import InputError, expanded
 
 ASSETS = "lerobot/libero-assets"
-REMEDY = f"hf download {ASSETS} --repo-type=dataset --local-dir=FOLDER, and name the folder"
+FETCH = f"hf download {ASSETS} --repo-type=dataset --local-dir=FOLDER, and name the folder"
 """How to get LIBERO's meshes and textures where a run cannot."""
 LEROBOT_NAMES = {"agentview": "image", "robot0_eye_in_hand": "image2"}
 """LeRobot's names of the two cameras that policies see."""
@@ -113,7 +113,7 @@ def assets_folder(given: str) -> Path:
         return Path(snapshot_download(ASSETS, repo_type="dataset"))
     except Exception as error:
         why = f"LIBERO's meshes are not installed, and the Hub did not give them ({brief(error)})"
-        raise InputError("env.assets", given, f"{why}; {REMEDY}") from error
+        raise InputError("env.assets", given, f"{why}; {FETCH}") from error
 
 
 def load_libero(assets: str) -> None:

@@ -23,9 +23,9 @@ from accerl_lerobot.checkpoint.safety import brief
 from accerl_lerobot.envs.base import SuiteEnvironment, unit_spec
 from accerl_lerobot.envs.graphics import import_mujoco, new_renderer
 from accerl_lerobot.envs.libero import (
+    FETCH,
     LEROBOT_NAMES,
     MAX_OBJECTS,
-    REMEDY,
     LiberoConfig,
     bddl_file,
     instruction,
@@ -384,7 +384,7 @@ def _build(task: str, assets: str) -> tuple[Any, list[np.ndarray]]:
             with patch.object(MjSim, "from_xml_string", smaller):
                 env = _placed(lambda: liberos_own(task).env, 0)
         except (OSError, ValueError) as error:
-            why = f"the scene of {task} does not load ({brief(error)}); if the folder is incomplete, {REMEDY}"
+            why = f"the scene of {task} does not load ({brief(error)}); if the folder is incomplete, {FETCH}"
             raise InputError("env.assets", assets, why) from error
     env.hard_reset = False  # the scene is always the same: no need to compile it anew for each episode
     return env, bodies

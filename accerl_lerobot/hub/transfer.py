@@ -150,7 +150,7 @@ def _without_paths(value: Any) -> Any:
     if isinstance(value, dict):
         tree = {key: _without_paths(below) for key, below in value.items()}
         if tree.get("output_dir") != value.get("output_dir"):
-            tree["output_dir"] = None  # whoever repeats the run chooses a folder
+            tree["output_dir"] = None  # a repeated run gets a folder of its own
         return tree
     if isinstance(value, list):
         return [_without_paths(below) for below in value]

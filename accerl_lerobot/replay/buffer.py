@@ -11,7 +11,7 @@ segment with draws left is *available*. With batch ≤ max_unlearned_decisions, 
 `may_insert` holds at any time. Rollouts wait on insert instead of having their segments thrown away later:
 the oldest segments are thrown away first, and those are of the longest episodes, which failed.
 
-    asynchronous   nobody waits for anybody, within the pace
+    asynchronous   collecting and learning do not wait for each other, within the pace
     overlap        the next batch is collected while one is learned from, and then both wait for each other
     synchronous    a batch is collected, then learned from, then the weights are handed over
 

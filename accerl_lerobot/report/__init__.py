@@ -14,7 +14,7 @@ from typing import ClassVar
 
 from accerl_lerobot.checkpoint.layout import CONFIG, SUMMARY
 from accerl_lerobot.config.ranges import Section
-from accerl_lerobot.errors import InputError, check_output, expanded, reading
+from accerl_lerobot.errors import InputError, expanded, output_of, reading
 from accerl_lerobot.metrics import METRICS
 
 NAME = "report.html"
@@ -43,12 +43,8 @@ def write_report(config: ReportConfig) -> Path:
     from accerl_lerobot.report.page import comparison, html, one_run
     from accerl_lerobot.report.read import read_run
 
-    output = Path(NAME) if config.output is None else expanded(config.output, "output")
-    check_output(output)
+    output = output_of(config.output, config.runs, NAME)
     runs = [read_run(expanded(name, "runs")) for name in config.runs]
-    if config.output is None and len(runs) == 1:
-        output = runs[0].path / NAME
-        check_output(output)
     now = time.time()
     with reading("runs", ",".join(config.runs), f"{CONFIG}, {METRICS} or {SUMMARY}"):
         page = one_run(runs[0], now) if len(runs) == 1 else comparison(runs, now)

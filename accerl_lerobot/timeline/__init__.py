@@ -28,7 +28,7 @@ import numpy as np
 
 from accerl_lerobot.checkpoint.safety import FileSource, check_folder
 from accerl_lerobot.config.ranges import Section
-from accerl_lerobot.errors import InputError, check_output, expanded, reading
+from accerl_lerobot.errors import InputError, expanded, output_of, reading
 from accerl_lerobot.fault_points import fault_point
 
 STATES = (
@@ -272,12 +272,8 @@ class TimelineConfig(Section):
 
 def write_trace(config: TimelineConfig) -> dict[str, Any]:
     """Writes the ``trace``; of the ``runs``, when each trained and its roles' shares of that time."""
-    trace = Path(TRACE) if config.output is None else expanded(config.output, "output")
-    check_output(trace)
+    trace = output_of(config.output, config.runs, TRACE)
     timelines = [read_timeline(expanded(name, "runs")) for name in config.runs]
-    if config.output is None and len(timelines) == 1:
-        trace = timelines[0].run / TRACE
-        check_output(trace)
     runs = []
     events: list[dict[str, Any]] = []
     for number, timeline in enumerate(timelines):

@@ -137,10 +137,10 @@ def split_episodes(
     """Episodes to train on, and a held-out share; each part gets successes and failures if there are two."""
     held: set[int] = set()
     for outcome in (False, True):
-        alike = [i for i, episode in enumerate(episodes) if episode.success is outcome]
-        rng.shuffle(alike)
-        count = min(max(1, round(HELD_OUT * len(alike))), len(alike) - 1)
-        held.update(alike[: max(0, count)])
+        of_outcome = [i for i, episode in enumerate(episodes) if episode.success is outcome]
+        rng.shuffle(of_outcome)
+        count = min(max(1, round(HELD_OUT * len(of_outcome))), len(of_outcome) - 1)
+        held.update(of_outcome[: max(0, count)])
     learnt = [episode for i, episode in enumerate(episodes) if i not in held]
     return learnt, [episodes[i] for i in sorted(held)]
 

@@ -125,10 +125,10 @@ class Trainer:
         """Frames of as many successes as failures, half of them replayed from their first frame on."""
         succeeded = np.array([episode.success for episode in episodes])
         at = []
-        for alike in (weights * succeeded, weights * ~succeeded):
-            if not alike.any():
+        for of_outcome in (weights * succeeded, weights * ~succeeded):
+            if not of_outcome.any():
                 return None
-            for e in self.rng.choice(len(episodes), size=REPLAYED // 2, p=alike / alike.sum()):
+            for e in self.rng.choice(len(episodes), size=REPLAYED // 2, p=of_outcome / of_outcome.sum()):
                 later = int(self.rng.integers(episodes[e].starts_before_success))
                 at.append(WindowStart(int(e), 0 if self.rng.random() < 0.5 else later))
         windows = whole_windows(episodes, at, self.world)
@@ -142,8 +142,8 @@ class Trainer:
     def _halves(self, labelled: Labelled) -> Labelled:
         """A batch of as many successes as failures."""
         rows = [
-            self.rng.choice(alike.nonzero()[:, 0].numpy(), SUCCESS_BATCH // 2)
-            for alike in (labelled.success, ~labelled.success)
+            self.rng.choice(of_outcome.nonzero()[:, 0].numpy(), SUCCESS_BATCH // 2)
+            for of_outcome in (labelled.success, ~labelled.success)
         ]
         chosen = torch.from_numpy(np.concatenate(rows))
         return Labelled(*(part[chosen] for part in labelled))
