@@ -3,8 +3,11 @@
 
 from __future__ import annotations
 
+import atexit
 import os
+import shutil
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +20,10 @@ if TYPE_CHECKING:
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+if "LIBERO_CONFIG_PATH" not in os.environ:
+    # LIBERO remembers folders in the user's home, which may be those of another installation.
+    os.environ["LIBERO_CONFIG_PATH"] = tempfile.mkdtemp()
+    atexit.register(shutil.rmtree, os.environ["LIBERO_CONFIG_PATH"], ignore_errors=True)
 # A policy type in a package of its own, as if it were installed; in LeRobot's commands too.
 EXAMPLE = str(Path(__file__).parents[1] / "docs" / "examples" / "lerobot_policy_smolvla_bins")
 sys.path.insert(0, EXAMPLE)
