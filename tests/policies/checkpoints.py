@@ -88,6 +88,61 @@ def write_smolvla(
     return write_policy(directory, "smolvla", **(with_backbone(directory, image) | small | options))
 
 
+def write_multi_task_dit(directory: Path, **options: Any) -> Path:
+    """A multi-task DiT of 0.07 M parameters; its CLIP models are written beside it."""
+    from transformers import CLIPTextConfig, CLIPTextModel, CLIPVisionConfig, CLIPVisionModel
+
+    vision, text = (str(directory.parent / name) for name in ("clip-vision", "clip-text"))
+    small = {"hidden_size": 16, "intermediate_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2}
+    CLIPVisionModel(CLIPVisionConfig(**small, image_size=224, patch_size=32)).save_pretrained(vision)
+    words = write_words(text, pad_token="[PAD]", cls_token="[CLS]", sep_token="[SEP]")
+    ends = {"pad_token_id": 0, "bos_token_id": 1, "eos_token_id": 2}
+    language = CLIPTextConfig(**small, vocab_size=words, max_position_embeddings=16, **ends)
+    CLIPTextModel(language).save_pretrained(text)
+    fields = {
+        "n_obs_steps": 2, "horizon": 6, "n_action_steps": 3, "hidden_dim": 16, "num_layers": 1,
+        "num_heads": 2, "timestep_embed_dim": 16, "num_train_timesteps": 10, "image_resize_shape": (224, 224),
+        "tokenizer_max_length": 16, "vision_encoder_name": vision, "text_encoder_name": text,
+    }  # fmt: skip
+    return write_policy(directory, "multi_task_dit", **(fields | options))
+
+
+def write_xvla(directory: Path, *, image: int = 64, **options: Any) -> Path:
+    """An X-VLA of 0.03 M parameters on a tiny Florence-2; its tokeniser is written beside it."""
+    tokenizer = str(directory.parent / "xvla-words")
+    words = write_words(tokenizer, pad_token="<pad>", cls_token="<s>", sep_token="</s>")
+    stages = {"embed_dim": [8, 8, 8, 16], "num_heads": [1, 1, 1, 2], "num_groups": [1, 1, 1, 2]}
+    patches = {"patch_size": [7, 3, 3, 3], "patch_stride": [4, 2, 2, 2], "patch_padding": [3, 1, 1, 1]}
+    ends = {"max_position_embeddings": 10, "max_temporal_embeddings": 4}
+    vision = stages | patches | ends | {"depths": [1] * 4, "window_size": 4, "projection_dim": 16}
+    layers = {f"{part}_layers": 1 for part in ("encoder", "decoder")}
+    layers |= {f"{part}_attention_heads": 2 for part in ("encoder", "decoder")}
+    layers |= {f"{part}_ffn_dim": 16 for part in ("encoder", "decoder")}
+    text = layers | {"model_type": "bart", "d_model": 16, "vocab_size": words, "max_position_embeddings": 64}
+    text |= {"pad_token_id": 0, "bos_token_id": 1, "eos_token_id": 2}
+    fields = {
+        "florence_config": {"vision_config": vision, "text_config": text, "image_token_id": 5},
+        "tokenizer_name": tokenizer, "tokenizer_max_length": 16, "chunk_size": 4, "n_action_steps": 4,
+        "hidden_size": 16, "depth": 1, "num_heads": 2, "num_domains": 2, "len_soft_prompts": 2, "dim_time": 8,
+        "max_len_seq": 128, "action_mode": "auto", "max_state_dim": 4, "max_action_dim": 4,
+        "num_denoising_steps": 2, "resize_imgs_with_padding": (image, image), "num_image_views": 1,
+    }  # fmt: skip
+    return write_policy(directory, "xvla", image=image, **(fields | options))
+
+
+def write_words(folder: str, **marks: str) -> int:
+    """Saves a tokeniser that knows `marks` and the words of ``SimulatedConfig()``'s task.
+
+    Returns:
+        The number of words.
+    """
+    from transformers import BertTokenizer
+
+    words = [*marks.values(), "[UNK]", "[MASK]", "<image>", "match", "the", "target"]
+    BertTokenizer(vocab={word: i for i, word in enumerate(words)}, **marks).save_pretrained(folder)
+    return len(words)
+
+
 def write_act(directory: Path, *, chunk: int = 5, executed: int = 3, **options: Any) -> Path:
     """An ACT of 11 M parameters, nearly all of them in the smallest ResNet that LeRobot allows."""
     small = {

@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,8 +24,16 @@ from accerl_lerobot.policies.config import ChunkNoiseConfig, PolicyConfig
 from accerl_lerobot.policies.loading import load_acting, load_adapter
 from accerl_lerobot.policies.stock import StockAdapter
 from accerl_lerobot.seeds import noise_seed
-from tests.policies.checkpoints import write_act, write_diffusion, write_policy, write_smolvla
+from tests.policies.checkpoints import (
+    write_act,
+    write_diffusion,
+    write_multi_task_dit,
+    write_policy,
+    write_smolvla,
+    write_xvla,
+)
 from tests.policies.tiny import requests
+from tests.policies.tiny_pi import small, write_pi
 
 KINDS: dict[str, dict[str, Any]] = {
     "vqbet": {
@@ -212,35 +220,69 @@ def test_exploring_is_the_chunk_and_noise_of_the_request(written: Any):
     np.testing.assert_array_equal(noisy[2].chunk, adapter.decide(asked, 0)[2].chunk)
 
 
+@pytest.fixture
+def small_pi() -> Iterator[None]:
+    with small():
+        yield
+
+
+def write_vqbet(folder: Path, image: int) -> Path:
+    return write_policy(folder, "vqbet", image=image, **KINDS["vqbet"])
+
+
+def write_pi0(folder: Path, image: int) -> Path:
+    return write_pi(folder, "pi0")
+
+
+def write_pi05(folder: Path, image: int) -> Path:
+    return write_pi(folder, "pi05")
+
+
 @pytest.mark.parametrize("algorithm", ["self_imitation", "chunk_critic"])
+@pytest.mark.parametrize(
+    "write",
+    [
+        write_vqbet,
+        write_multi_task_dit,
+        *(
+            pytest.param(write, marks=pytest.mark.slow)
+            for write in (write_xvla, write_act, write_diffusion, write_smolvla, write_pi0, write_pi05)
+        ),
+    ],
+)
 def test_any_policy_learns_and_is_saved_for_stock_lerobot(
-    algorithm: str, written: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    write: Callable[..., Path],
+    algorithm: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    small_pi: None,
 ):
+    from lerobot.configs.policies import PreTrainedConfig
     from lerobot.policies.factory import get_policy_class
 
     monkeypatch.setattr(chunk_critic, "FIRST_STEPS", 50)
-    root, out = tmp_path / "data", tmp_path / "run"
-    data = ["--env.type=simulated", "--env.max_steps=12", "--env.image_size=64"]
+    size = 32 if write in (write_pi0, write_pi05) else 64
+    policy, root, out = write(tmp_path / "policy", image=size), tmp_path / "data", tmp_path / "run"
+    data = ["--env.type=simulated", "--env.max_steps=12", f"--env.image_size={size}"]
     data += [f"--env.environment_state={'true' if algorithm == 'chunk_critic' else 'false'}"]
     assert cli.main(["demos", *data, "--demos.episodes=3", f"--root={root}"]) == 0
     fields = [
-        f"--policy.path={written('vqbet')}", "--policy.device=cpu", "--sft.steps=0", "--launch.engine=local",
-        "--dataset.repo_id=a/b", f"--dataset.root={root}", f"--algorithm.type={algorithm}",
-        "--algorithm.policy_steps=1", "--rollout.environments=2", "--rollout.segment_length=4",
-        "--trainer.updates=6", "--trainer.batch_decisions=8", "--trainer.value_warmup_updates=1",
+        f"--policy.path={policy}", "--policy.device=cpu", "--sft.steps=0", "--launch.engine=local",
+        "--policy.sampler.type=chunk_noise", f"--algorithm.type={algorithm}",
+        "--dataset.repo_id=a/b", f"--dataset.root={root}",
+        "--algorithm.policy_steps=1", "--rollout.environments=2", "--rollout.segment_length=6",
+        "--trainer.updates=10", "--trainer.batch_decisions=8", "--trainer.value_warmup_updates=1",
         "--replay.min_decisions=8", "--replay.max_unlearned_decisions=16", "--replay.samples_per_insert=1",
         "--replay.max_lag=100", "--evaluation.episodes=2", "--evaluation.videos=0", f"--output_dir={out}",
     ]  # fmt: skip
     assert cli.main(["train", *data, *fields]) == 0
     saved = out / "checkpoints" / "last" / "pretrained_model"
-    before, after = (get_policy_class("vqbet").from_pretrained(path) for path in (written("vqbet"), saved))
-    changed = [
-        name
-        for name, tensor in before.state_dict().items()
-        if not torch.equal(tensor, after.state_dict()[name])
-    ]
-    assert changed and all(bool(torch.isfinite(tensor).all()) for tensor in after.state_dict().values())
-    load_acting(PolicyConfig(path=str(saved), device="cpu"))
+    kind = get_policy_class(PreTrainedConfig.from_pretrained(saved).type)
+    before, after = (kind.from_pretrained(path).state_dict() for path in (policy, saved))
+    changed = [name for name, tensor in before.items() if not torch.equal(tensor, after[name])]
+    assert changed and all(bool(torch.isfinite(tensor).all()) for tensor in after.values())
+    evaluation = ["--evaluation.episodes=2", f"--output_dir={tmp_path / 'eval'}", f"--policy.path={saved}"]
+    assert cli.main(["eval", *data, *evaluation]) == 0
 
 
 def test_in_python_an_episode_begins_with_reset(written: Any):
