@@ -166,8 +166,12 @@ class RunConfig(Section):
             raise InputError("world_model.type", self.world_model.type, no_use_for_states(self.algorithm))
         if isinstance(self.algorithm, OffPolicyConfig):
             self._check_off_policy()
-        if (held := self.trainer.hold_back) >= self.replay.max_lag:
-            hint = f"use more than trainer.hold_back, {held}, or all is thrown away as too old"
+        held_back = self.trainer.hold_back
+        if held_back and self.launch.engine != "local":
+            hint = "weights are held back to study lag, in one process; use launch.engine=local, or 0"
+            raise InputError("trainer.hold_back", held_back, hint)
+        if held_back >= self.replay.max_lag:
+            hint = f"use more than trainer.hold_back, {held_back}, or all is thrown away as too old"
             raise InputError("replay.max_lag", self.replay.max_lag, hint)
         for name, count in (
             ("inference.workers", self.inference.workers),

@@ -37,7 +37,6 @@ from accerl_lerobot.rollout.runner import (
 )
 from accerl_lerobot.seeds import global_generators, restore_global_generators
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, WEIGHT_SYNC, open_clock
-from accerl_lerobot.transport.weights import PublishDelay
 
 logger = logging.getLogger(__name__)
 
@@ -65,7 +64,7 @@ class LocalEngine(Engine):
         self._config = config
         self._adapter = loader(load)(config.policy)
         self._update = make_update(self._adapter, config.algorithm, config.trainer)
-        self._delay = PublishDelay(config.trainer.hold_back)
+        self._held_back: deque[tuple[int, Any]] = deque()  # versions and weights that do not act yet
         self._acting, self._acting_version = self._adapter, 0
         if config.trainer.hold_back:
             self._acting = loader(load)(config.policy)
@@ -147,7 +146,7 @@ class LocalEngine(Engine):
             "generators": global_generators(),
             "rng": self._rng,
             "acting": (self._acting_version, acting),
-            "held_back": self._delay.state(),
+            "held_back": list(self._held_back),
             "outbox": list(self._outbox),
             "plans": self._plans.state(),
             "runner": self._runner.state(),
@@ -175,7 +174,7 @@ class LocalEngine(Engine):
         self._acting_version, acting = engine["acting"]
         if acting is not None:
             self._acting.load_trainable(acting)
-        self._delay.restore(engine["held_back"])
+        self._held_back.extend(engine["held_back"])
         self._outbox.extend(engine["outbox"])
         self._plans.restore(engine["plans"])
         self._runner.restore(engine["runner"])
@@ -241,10 +240,10 @@ class LocalEngine(Engine):
             return
         self._clock.enter(WEIGHT_SYNC)
         last = version == updates or not self._exploring
-        weights = self._adapter.export_trainable()
-        for number, tensors in self._delay.push(version, weights, last=last):
-            self._acting.load_trainable(tensors)
-            self._acting_version = number
+        self._held_back.append((version, self._adapter.export_trainable()))
+        while self._held_back and (last or self._held_back[0][0] <= version - self._config.trainer.hold_back):
+            self._acting_version, weights = self._held_back.popleft()
+            self._acting.load_trainable(weights)
 
     def _store(self) -> None:
         while self._outbox and self._replay.may_insert():

@@ -28,7 +28,7 @@ from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.replay.buffer import ASYNCHRONOUS, Schedule
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
 from accerl_lerobot.trainer.peers import LearnerSettings, Peers
-from accerl_lerobot.transport.weights import PublishDelay, WeightPublisher
+from accerl_lerobot.transport.weights import WeightPublisher
 
 
 class TrainerWorker:
@@ -76,7 +76,7 @@ class TrainerWorker:
         self._clock.enter(WEIGHT_SYNC)
         # A checkpoint need not hold a critic: all start from this one.
         with self._lock:
-            self._publish(PublishDelay(0))
+            self._publish()
         self._train(replay)
         self._clock.enter(WEIGHT_SYNC)
         self._publisher.flush()
@@ -90,7 +90,6 @@ class TrainerWorker:
     def _train(self, replay: Any) -> None:
         """Until the last update: take the batch, ask for the next one, step, publish."""
         decisions, updates = self._config.batch_decisions, self._config.updates
-        delay = PublishDelay(self._config.hold_back)
         upcoming = replay.sample.remote(decisions, self._update.version)
         asked = time.monotonic()
         while self._update.version < updates:
@@ -108,15 +107,11 @@ class TrainerWorker:
                 upcoming = replay.sample.remote(decisions, self._update.version + 1)
             self._clock.enter(CHECKPOINT)  # while another thread holds the lock
             with self._lock:
-                self._step(batch, segments, waited, delay)
+                self._step(batch, segments, waited)
             asked = time.monotonic()
             replay.learnt.remote()
-        with self._lock:
-            if self._publisher.version < self._update.version:
-                # It has ended early, and the saved weights are evaluated.
-                self._publish(delay, last=True)
 
-    def _step(self, batch: Any, segments: list[Segment], waited: float, delay: PublishDelay) -> None:
+    def _step(self, batch: Any, segments: list[Segment], waited: float) -> None:
         """Make an update on segments, of which `batch` is the reference, and publish its weights."""
         self._clock.enter(COMPUTE)
         started = time.monotonic()
@@ -128,7 +123,7 @@ class TrainerWorker:
             metrics = self._update.step(segments)
         updated = time.monotonic()
         self._clock.enter(WEIGHT_SYNC)
-        self._publish(delay, last=self._update.version == self._config.updates)
+        self._publish()
         if self._in_turn:
             self._publisher.flush()
         metrics["update"] = float(self._update.version)
@@ -137,14 +132,12 @@ class TrainerWorker:
         metrics["publish_s"] = time.monotonic() - updated
         self._history.append(metrics)
 
-    def _publish(self, delay: PublishDelay, last: bool = False) -> None:
-        """Hands over the weights of now, or those that are old enough."""
-        adapter = self._update.adapter
+    def _publish(self) -> None:
+        """Hand over the weights of now."""
         with self._peers.gathering("gather_weights"):
-            weights = adapter.export_trainable() if self._config.hold_back else adapter.view_trainable()
-        for version, tensors in delay.push(self._update.version, weights, last=last):
-            fault_point("trainer.publish")
-            self._publisher.publish(version, tensors)
+            weights = self._update.adapter.view_trainable()
+        fault_point("trainer.publish")
+        self._publisher.publish(self._update.version, weights)
 
     def metrics(self) -> list[dict[str, float]]:
         """One record per update since the last call."""

@@ -95,23 +95,6 @@ def test_it_makes_its_updates_publishes_each_and_draws_no_batch_more():
     assert all(np.array_equal(newest[name], last[name]) for name in last)
 
 
-def test_weights_held_back_are_published_late_and_the_last_at_once():
-    stage = Stage(updates=6, hold_back=2)
-    weights: list[dict[str, Any]] = []
-    step = stage.worker._update.step
-
-    def watched(segments: list[Segment]) -> dict[str, float]:
-        metrics = step(segments)
-        weights.append(stage.worker._update.adapter.export_trainable())
-        return metrics
-
-    stage.worker._update.step = watched  # type: ignore[method-assign]
-    stage.run()
-    assert [version for version, _ in stage.received] == [0, 1, 2, 3, 6]
-    for version, tensors in stage.received[1:]:
-        assert all(np.array_equal(tensors[k], weights[version - 1][k]) for k in tensors)
-
-
 def test_a_batch_that_nothing_can_be_learnt_from_is_kept(tmp_path: Path):
     stage = Stage(updates=9, directory=tmp_path)
     good = stage._sample
