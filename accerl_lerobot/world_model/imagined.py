@@ -45,7 +45,7 @@ from accerl_lerobot.world_model.contract import (
     WorldModelSpec,
     new_model,
 )
-from accerl_lerobot.world_model.data import check_dataset, model_arrays, resize
+from accerl_lerobot.world_model.data import check_dataset, difference, model_arrays, resize
 from accerl_lerobot.world_model.pixels import SuccessModel
 
 if TYPE_CHECKING:
@@ -132,24 +132,23 @@ def load_world(directory: Path, package: str | None = None, *, section: str = ""
     origin = _origin(directory, section)
     discover(package, section)
     content = read_content(directory, section)
-    named, types = content.get("model"), sorted(LearnableModelConfig.get_known_choices())
-    kind = named.get("type") if isinstance(named, dict) else None
-    if kind not in types:
-        package_field = origin.field.removesuffix("path") + DISCOVER
-        hint = f"use one of {', '.join(types)}, or name its package: {package_field}"
-        raise origin.refuse(f"{CONFIG}: model.type", f"{str(kind)[:60]!r}; {hint}")
     weights = safe_join(directory, WEIGHTS, origin)
     try:
         with Unfilled():
             spec = draccus.decode(WorldModelSpec, content.get("spec"))
-            world = World(new_model(spec, draccus.decode(LearnableModelConfig, named)))
+            world = World(new_model(spec, draccus.decode(LearnableModelConfig, content.get("model"))))
         world.load_state_dict(dict(read_tensors(weights, origin)))
     except Exception as error:  # the files may hold anything
-        ours = input_error(error)  # draccus wraps what a config refuses
-        if ours is None:
-            hint = f"not a world model of accerl world-model ({brief(error)})"
-            raise InputError(origin.field, origin.value, hint) from error
-        raise (ours if ours.field == origin.field else origin.refuse(CONFIG, brief(ours))) from error
+        refusal = input_error(error)  # draccus wraps what a config refuses
+        if refusal is not None:
+            raise (
+                refusal if refusal.field == origin.field else origin.refuse(CONFIG, brief(refusal))
+            ) from error
+        hint = (
+            f"not a world model of accerl world-model ({brief(error)}); if its type is of another package, "
+        )
+        hint += f"name that: {origin.field.removesuffix('path')}{DISCOVER}"
+        raise InputError(origin.field, origin.value, hint) from error
     return world.requires_grad_(False).eval()
 
 
@@ -270,7 +269,7 @@ def check_imagination(config: RunConfig) -> None:
                 make_expert(config.env, environment, spec.tasks[0])
             return
     world = world_of(imagination)
-    _check_fit(world.model.spec, spec, getattr(policy, "n_action_steps", 1))
+    _check_fit(imagination.path, world.model.spec, spec, getattr(policy, "n_action_steps", 1))
     if imagination.learns and imagination.learn.dataset.repo_id is not None:
         check_dataset(imagination.learn.dataset, world.model.spec, LEARN)
     failed = read_content(world_path(imagination), "imagination").get("failed_checks")
@@ -280,18 +279,15 @@ def check_imagination(config: RunConfig) -> None:
         logger.warning(text, imagination.path, why)
 
 
-def _check_fit(spec: WorldModelSpec, environment: EnvironmentSpec, executed: int) -> None:
+def _check_fit(path: str | None, spec: WorldModelSpec, environment: EnvironmentSpec, executed: int) -> None:
     """Refuses a world model that does not fit environment and policy, which executes so many actions per
     decision."""
     field, again = "imagination.path", "train one of this environment"
     if missing := [camera for camera in environment.images if camera not in spec.cameras]:
         hint = f"the environment shows this camera, the world model {spec.cameras!r}; {again}"
         raise InputError(field, missing[0], hint)
-    for name in ("state_dim", "action_dim", "fps"):
-        modelled, real = getattr(spec, name), getattr(environment, name)
-        if modelled != real:
-            hint = f"is the world model's {name}, and the environment's is {real}; {again}"
-            raise InputError(field, modelled, hint)
+    if why := difference(spec, environment.state_dim, environment.action_dim, environment.fps):
+        raise InputError(field, path, f"does not fit the environment: {why}; {again}")
     unknown = [text for text in environment.instructions if spec.tasks and text not in spec.tasks]
     if unknown:
         raise InputError(field, unknown[0], f"the world model was trained on {spec.tasks!r}; {again}")

@@ -13,12 +13,12 @@ from torch import Tensor
 
 from accerl_lerobot.experience import task_codes
 from accerl_lerobot.world_model import pixels
-from accerl_lerobot.world_model.check import auroc, skill_and_sensitivity
 from accerl_lerobot.world_model.config import PixelModelConfig
 from accerl_lerobot.world_model.contract import Context, Prediction, Windows, WorldModelSpec
 from accerl_lerobot.world_model.data import Episode, WindowStart, cut_windows
 from accerl_lerobot.world_model.imagined import World
 from accerl_lerobot.world_model.pixels import FrameNetwork, PixelWorldModel, SuccessModel
+from accerl_lerobot.world_model.pretrain import auroc, skill_and_sensitivity
 from accerl_lerobot.world_model.training import Trainer, uniform
 from tests.rounding import assert_close
 
