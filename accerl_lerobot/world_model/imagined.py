@@ -141,13 +141,11 @@ def load_world(directory: Path, package: str | None = None, *, section: str = ""
     except Exception as error:  # the files may hold anything
         refusal = input_error(error)  # draccus wraps what a config refuses
         if refusal is not None:
-            raise (
-                refusal if refusal.field == origin.field else origin.refuse(CONFIG, brief(refusal))
-            ) from error
-        hint = (
-            f"not a world model of accerl world-model ({brief(error)}); if its type is of another package, "
-        )
-        hint += f"name that: {origin.field.removesuffix('path')}{DISCOVER}"
+            other = origin.refuse(CONFIG, brief(refusal))
+            raise (refusal if refusal.field == origin.field else other) from error
+        package = origin.field.removesuffix("path") + DISCOVER
+        hint = f"not a world model of accerl world-model ({brief(error)}); if its type is of another package"
+        hint += f", name that: {package}"
         raise InputError(origin.field, origin.value, hint) from error
     return world.requires_grad_(False).eval()
 

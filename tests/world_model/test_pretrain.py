@@ -109,7 +109,7 @@ def test_a_model_of_another_package_is_learned_and_checked_by_naming_it(
     told += [f"--dataset.root={demos}", f"--output_dir={tmp_path / 'again'}"]
     forget()
     assert cli.main(told) == 2
-    assert "or name its package: discover_packages_path" in capsys.readouterr().err
+    assert "name that: discover_packages_path" in capsys.readouterr().err
     cli.main([*told, f"--discover_packages_path={PACKAGE}"])
     assert json.loads(capsys.readouterr().out)["checks"] == found["checks"]
 
@@ -129,7 +129,7 @@ def test_its_fields_are_fields_of_the_command_line():
     ("harm", "why"),
     [
         ("nowhere", "config.json: is missing"),
-        ("config", "config.json: model.type: 'None'; use one of"),
+        ("config", "not a world model of accerl world-model"),
         ("weights", "model.safetensors: not safetensors"),
         ("size", "not a world model of accerl world-model"),
         ("chunk", r"config.json: spec.chunk=0: use a whole number in \[1, "),
