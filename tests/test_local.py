@@ -11,7 +11,7 @@ import pytest
 
 from accerl_lerobot.algorithms import AlgorithmConfig
 from accerl_lerobot.algorithms.config import TrainerConfig
-from accerl_lerobot.engines.config import RunConfig
+from accerl_lerobot.engines.config import LaunchConfig, RunConfig
 from accerl_lerobot.engines.contract import Progress
 from accerl_lerobot.engines.local import LocalEngine
 from accerl_lerobot.evaluation import evaluation_plans
@@ -60,7 +60,8 @@ def test_weights_held_back_act_so_many_updates_late(tiny_checkpoint: Path):
     def lags(hold_back: int) -> tuple[list[float], Progress]:
         fields: dict[str, Any] = {"updates": 14, "batch_decisions": 16, "lr": 1e-3, "value_warmup_updates": 0}
         trainer = TrainerConfig(**fields, hold_back=hold_back, probe_every=4)
-        history, _ = train(tiny_run(tiny_checkpoint, trainer=trainer))
+        launch = LaunchConfig(engine="local")
+        history, _ = train(tiny_run(tiny_checkpoint, trainer=trainer, launch=launch))
         assert max(u.get("logprob/mismatch_max", 0.0) for u in updates(history)) < 1e-4
         return [u["lag_mean"] for u in updates(history)], history[-1]
 
