@@ -114,10 +114,7 @@ def test_the_rollout_workers_part_of_a_checkpoint(tmp_path: Path):
     explored = EpisodePlan(task="match", seed=7, explore=True)
     for slot in first:
         slot.assign(planned[slot.index :: 2])
-    assert [len(first[0].take(report(explored, explored, planned[0]))), len(first[1].take(report()))] == [
-        3,
-        0,
-    ]
+    assert len(first[0].take(report(explored, explored, planned[0]))) == 3
     assert first[0].take(report(planned[0])) == [], "it was reported before"
     save_rollouts(tmp_path, first)
     second = slots()
