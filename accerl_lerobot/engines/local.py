@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from accerl_lerobot.algorithms.batch import save_batch_if_not_finite
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import PRETRAINED, TRAINING_STATE, WEIGHTS
 from accerl_lerobot.engines.config import RunConfig
@@ -117,8 +116,7 @@ class LocalEngine(Engine):
         if self._exploring and self._replay.may_sample(n):
             segments = self._replay.sample(n, self._update.version, self._rng)
             if segments:
-                with save_batch_if_not_finite(self._config.folder, self._update, segments):
-                    updates.append(self._update.step(segments) | {"update": float(self._update.version)})
+                updates.append(self._update.step(segments) | {"update": float(self._update.version)})
                 self._publish()
         self._clock.enter(WAIT_IN)
         episodes, self._episodes[:] = list(self._episodes), []

@@ -240,7 +240,7 @@ class RayEngine(Engine):
             )
             online = self._world_learner.actor
         replicas = numbered("inference", config.inference.workers)
-        training = (settings, timeline, ranks, config.folder, world_model, replicas, online)
+        training = (settings, timeline, ranks, world_model, replicas, online)
         self._trainer = add("trainer", "trainer", TrainerWorker, 4 + len(replicas), *training)
         for name in replicas:
             deciding = (config.policy, config.inference, self._version, state, load, timeline, name)

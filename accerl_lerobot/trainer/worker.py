@@ -20,7 +20,6 @@ from typing import Any
 import ray
 
 from accerl_lerobot import errors
-from accerl_lerobot.algorithms.batch import save_batch_if_not_finite
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import PRETRAINED, TRAINING_STATE, WEIGHTS
 from accerl_lerobot.experience import Segment
@@ -34,9 +33,9 @@ from accerl_lerobot.transport.weights import WeightPublisher
 class TrainerWorker:
     """Becomes a threaded Ray actor in `launch`: `run` on one thread, everything else beside it.
 
-    The run's `directory` is for batches that nothing could be learnt from; `world_model` is the handle of a
-    `WorldModelWorker`, where the algorithm learns on its states; `readers` are the inference replicas;
-    `online` is the handle of an `OnlineLearningWorker`, which gets the batches too.
+    `world_model` is the handle of a `WorldModelWorker`, where the algorithm learns on its states; `readers`
+    are the inference replicas; `online` is the handle of an `OnlineLearningWorker`, which gets the batches
+    too.
     """
 
     def __init__(
@@ -44,14 +43,13 @@ class TrainerWorker:
         settings: LearnerSettings,
         timeline: Path | None = None,
         peers: Sequence[Any] = (),
-        directory: Path | None = None,
         world_model: Any = None,
         readers: Sequence[str] = (),
         online: Any = None,
     ) -> None:
         errors.collect_warnings()
         self._clock = open_clock(timeline, "trainer")
-        self._policy, self._config, self._directory = settings.policy, settings.trainer, directory
+        self._policy, self._config = settings.policy, settings.trainer
         self._peers = Peers(peers, self._config, settings.timeout_s)
         self._update = self._peers.begin(settings)
         if world_model is not None:
@@ -116,10 +114,7 @@ class TrainerWorker:
         self._clock.enter(COMPUTE)
         started = time.monotonic()
         fault_point("trainer.update")
-        with (
-            self._peers.joining("step", batch),
-            save_batch_if_not_finite(self._directory, self._update, segments),
-        ):
+        with self._peers.joining("step", batch):
             metrics = self._update.step(segments)
         updated = time.monotonic()
         self._clock.enter(WEIGHT_SYNC)

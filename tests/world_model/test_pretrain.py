@@ -77,7 +77,7 @@ def test_from_a_dataset_to_a_check_and_another_check(
     assert set(found["checks"]) == {"skill", "sensitivity", "auroc"}
     losses = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
     assert [line["step"] for line in losses] == [20] and {"image", "state", "success"} <= losses[0].keys()
-    assert all(name in stderr for name in found["checks"]) and "FAILED; see" in stderr
+    assert all(name in stderr for name in found["checks"]) and "FAILED on 2 episodes; see" in stderr
     world, content = load_world(out / "world_model"), read_content(out / "world_model")
     assert float(world.success.threshold) == pytest.approx(found["threshold"])
     failed = [name for name, outcome in found["checks"].items() if not outcome["holds"]]
