@@ -40,7 +40,8 @@ class Batch:
 
 
 def collate(segments: Sequence[Segment]) -> Batch:
-    keys, names = segments[0].observations.keys(), segments[0].latent.keys()
+    keys = segments[0].observations.keys()
+    names = segments[0].latent.keys()
     return Batch(
         observations={k: np.concatenate([s.observations[k][:-1] for s in segments]) for k in keys},
         tasks=[s.task for s in segments for _ in range(len(s))],

@@ -64,7 +64,8 @@ class LocalEngine(Engine):
         self._adapter = loader(load)(config.policy)
         self._update = make_update(self._adapter, config.algorithm, config.trainer)
         self._held_back: deque[tuple[int, Any]] = deque()  # versions and weights that do not act yet
-        self._acting, self._acting_version = self._adapter, 0
+        self._acting = self._adapter
+        self._acting_version = 0
         if config.trainer.hold_back:
             self._acting = loader(load)(config.policy)
             self._acting.load_trainable(self._adapter.export_trainable())
@@ -119,7 +120,8 @@ class LocalEngine(Engine):
                 updates.append(self._update.step(segments) | {"update": float(self._update.version)})
                 self._publish()
         self._clock.enter(WAIT_IN)
-        episodes, self._episodes[:] = list(self._episodes), []
+        episodes = list(self._episodes)
+        self._episodes[:] = []
         learner = self._world_learner
         return Progress(
             version=self._update.version,
@@ -208,7 +210,8 @@ class LocalEngine(Engine):
 
     def _act(self) -> None:
         """One decision in every environment that may continue."""
-        runner, may_explore = self._runner, self._replay.may_insert()
+        runner = self._runner
+        may_explore = self._replay.may_insert()
         due: dict[int, Request] = {}
         for slot in range(len(runner)):
             request = runner.request(slot)
@@ -232,7 +235,8 @@ class LocalEngine(Engine):
 
     def _publish(self) -> None:
         """Give weights to the acting policy, which is the trainer's own unless they are delayed."""
-        version, updates = self._update.version, self._config.trainer.updates
+        version = self._update.version
+        updates = self._config.trainer.updates
         if self._acting is self._adapter:
             self._acting_version = version
             return

@@ -49,7 +49,8 @@ class TrainerWorker:
     ) -> None:
         errors.collect_warnings()
         self._clock = open_clock(timeline, "trainer")
-        self._policy, self._config = settings.policy, settings.trainer
+        self._policy = settings.policy
+        self._config = settings.trainer
         self._peers = Peers(peers, self._config, settings.timeout_s)
         self._update = self._peers.begin(settings)
         if world_model is not None:
@@ -87,7 +88,8 @@ class TrainerWorker:
 
     def _train(self, replay: Any) -> None:
         """Until the last update: take the batch, ask for the next one, step, publish."""
-        decisions, updates = self._config.batch_decisions, self._config.updates
+        decisions = self._config.batch_decisions
+        updates = self._config.updates
         upcoming = replay.sample.remote(decisions, self._update.version)
         asked = time.monotonic()
         while self._update.version < updates:
@@ -156,7 +158,8 @@ class TrainerWorker:
 
     def write(self, directory: Path) -> None:
         """Writes what is kept: ``pretrained_model`` and its part of ``training_state``."""
-        (weights, trained, state), self._kept = self._kept, None
+        (weights, trained, state) = self._kept
+        self._kept = None
         fault_point("trainer.write")
         self._update.adapter.save(directory / PRETRAINED, self._policy, weights)
         snapshot.save(directory / TRAINING_STATE / WEIGHTS, trained)

@@ -31,13 +31,15 @@ class WeightPublisher:
         self._put = put
         self._changed = threading.Condition()
         self._applied = dict.fromkeys(readers, -1)
-        self.version, self._reference = -1, None
+        self.version = -1
+        self._reference = None
 
     def publish(self, version: int, tensors: Tensors) -> None:
         """Copy a set; the tensors may change afterwards."""
         reference = self._put(tensors)
         with self._changed:
-            self.version, self._reference = version, reference
+            self.version = version
+            self._reference = reference
             self._changed.notify_all()
 
     def newer_than(self, reader: str, version: int) -> tuple[int, list[Any]]:

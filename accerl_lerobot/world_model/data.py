@@ -108,7 +108,8 @@ def cut_windows(
 
 def _window(episode: Episode, first: int, spec: WorldModelSpec, chunks: int) -> dict[str, np.ndarray]:
     """Arrays of one window; ``frames`` and ``robot`` are those of the context and those after each chunk."""
-    size, before = spec.chunk, spec.context - 1
+    size = spec.chunk
+    before = spec.context - 1
     start = int(episode.times[first])
     begins = start + size * np.arange(chunks)  # env step with which each chunk begins
     boundaries = start + size * np.arange(-before, chunks + 1)

@@ -62,13 +62,15 @@ class World(nn.Module):
 
     def __init__(self, model: LearnableWorldModel) -> None:
         super().__init__()
-        self.model, self.success = model, SuccessModel()
+        self.model = model
+        self.success = SuccessModel()
         self.version = 0  # gradient steps that they have made in the run
 
     def begin(self, frames: np.ndarray, robot: np.ndarray, task: str) -> State:
         """The model's state at the start of an episode, uint8 (V, H, W, 3) and float32 (S,)."""
         spec = self.model.spec
-        images, numbers = torch.from_numpy(frames[None]), torch.from_numpy(robot[None])
+        images = torch.from_numpy(frames[None])
+        numbers = torch.from_numpy(robot[None])
         # Nothing has moved before the start, and no action was executed.
         context = Context(
             frames=images[:, None].repeat(1, spec.context, 1, 1, 1, 1),
@@ -164,7 +166,9 @@ class ImaginedEnvironment(Environment):
     source = IMAGINED
 
     def __init__(self, world: World, spec: EnvironmentSpec, starts: Starts) -> None:
-        self.spec, self._world, self._starts = spec, world, starts
+        self.spec = spec
+        self._world = world
+        self._starts = starts
         self._task = ""
         self._seed = self._steps = 0
         self._done = True
@@ -175,7 +179,10 @@ class ImaginedEnvironment(Environment):
         _, first = start_of(self._starts, seed)
         arrays = {name: np.asarray(value)[None] for name, value in first.items() if name != TASK}
         frames, robot = model_arrays(arrays, self._world.model.spec)
-        self._task, self._seed, self._steps, self._done = str(first[TASK]), seed, 0, False
+        self._task = str(first[TASK])
+        self._seed = seed
+        self._steps = 0
+        self._done = False
         self._frames = frames[0]
         self._state = self._world.begin(frames[0], robot[0], self._task)
         return self._observation(robot[0])
@@ -186,7 +193,8 @@ class ImaginedEnvironment(Environment):
         actions = checked_actions(actions, self.spec)
         seed = int(np.random.default_rng((self._seed, self._steps)).integers(2**31))
         prediction = self._world.step(self._state, actions, seed)
-        self._state, self._frames = prediction.state, prediction.frames[0].cpu().numpy()
+        self._state = prediction.state
+        self._frames = prediction.frames[0].cpu().numpy()
         success = self._world.succeeds(self._frames, self._task)
         self._steps += len(actions)
         late = self._steps >= self.spec.max_steps
@@ -248,7 +256,8 @@ def check_imagination(config: RunConfig) -> None:
     """
     from accerl_lerobot.run.preflight import policy_to_be
 
-    policy, imagination = policy_to_be(config), config.imagination
+    policy = policy_to_be(config)
+    imagination = config.imagination
     if (reward := getattr(config.env, "reward", "success")) != "success":
         hint = (
             "use success with imagination.environments: imagined episodes end with a success, and pay for it"
@@ -280,7 +289,8 @@ def check_imagination(config: RunConfig) -> None:
 def _check_fit(path: str | None, spec: WorldModelSpec, environment: EnvironmentSpec, executed: int) -> None:
     """Refuses a world model that does not fit environment and policy, which executes so many actions per
     decision."""
-    field, again = "imagination.path", "train one of this environment"
+    field = "imagination.path"
+    again = "train one of this environment"
     if missing := [camera for camera in environment.images if camera not in spec.cameras]:
         hint = f"the environment shows this camera, the world model {spec.cameras!r}; {again}"
         raise InputError(field, missing[0], hint)

@@ -102,7 +102,8 @@ def pretrain(
     torch.manual_seed(seed)
     # The networks are initialised on the CPU, so alike on every device.
     world = World(new_model(spec, config.model)).to(torch_device)
-    trainer, weights = Trainer(world, config.lr, seed, config.steps), uniform(learnt)
+    trainer = Trainer(world, config.lr, seed, config.steps)
+    weights = uniform(learnt)
     trainer.fit_statistics(learnt)
     with (
         console.stage("world model", total=config.steps) as stage,
@@ -169,7 +170,8 @@ def check(world: World, episodes: Sequence[Episode], seed: int = 0) -> dict[str,
         ``checks``: value, bound and outcome of each of the three numbers; ``passed``; ``threshold`` of the
         success model, chosen on these episodes; numbers of ``episodes`` and ``env_steps``.
     """
-    rng, chunk = np.random.default_rng((seed, 1)), world.model.spec.chunk
+    rng = np.random.default_rng((seed, 1))
+    chunk = world.model.spec.chunk
     at = []
     for e, episode in enumerate(episodes):
         followed = np.flatnonzero(episode.times + chunk <= episode.times[-1])
@@ -196,11 +198,14 @@ def check(world: World, episodes: Sequence[Episode], seed: int = 0) -> dict[str,
 
 def skill_and_sensitivity(world: World, windows: Windows) -> dict[str, float]:
     """Both numbers, on the first chunk of windows."""
-    recorded, newest = windows.frames[:, 0], windows.context.frames[:, -1]
+    recorded = windows.frames[:, 0]
+    newest = windows.context.frames[:, -1]
     other = replace(windows, actions=windows.actions[donors(windows.episode)])
-    predicted, misled = replay(world.model, windows)[:, 0], replay(world.model, other)[:, 0]
+    predicted = replay(world.model, windows)[:, 0]
+    misled = replay(world.model, other)[:, 0]
     changed = (recorded.int() - newest.int()).abs().amax(-1) > CHANGED
-    errors, copied = squared_errors(predicted, recorded), squared_errors(newest, recorded)
+    errors = squared_errors(predicted, recorded)
+    copied = squared_errors(newest, recorded)
     misled_error = squared_errors(misled, recorded).mean()
     skill = 1 - errors[changed].mean() / copied[changed].mean()  # NaN where nothing changes
     return {"skill": float(skill), "sensitivity": float(misled_error / errors.mean().clamp(min=1e-9))}
@@ -223,7 +228,8 @@ def donors(episode: Tensor) -> Tensor:
 def replay_scores(world: World, episodes: Sequence[Episode]) -> tuple[np.ndarray, np.ndarray]:
     """Highest P(success) in each episode's imagined replay, until it really ended, and the real outcome."""
     windows = whole_windows(episodes, [WindowStart(e, 0) for e in range(len(episodes))], world)
-    known, frames = windows.known, replay(world.model, windows)
+    known = windows.known
+    frames = replay(world.model, windows)
     codes = torch.from_numpy(task_codes(windows.tasks))
     codes = codes[:, None].expand(-1, known.shape[1], -1)
     probabilities = torch.zeros(known.shape)
@@ -238,7 +244,8 @@ def choose_threshold(scores: np.ndarray, achieved: np.ndarray) -> float:
     largest share of successes less share of failures above it. The strictest would be safe, and a policy that
     never sees a success learns nothing.
     """
-    failures, successes = scores[~achieved], scores[achieved]
+    failures = scores[~achieved]
+    successes = scores[achieved]
     # Only thresholds just above a failure are worth trying.
     candidates = [0.5, *np.nextafter(failures[failures >= 0.5], np.inf, dtype=np.float32).tolist()]
     allowed = [least for least in candidates if share_above(failures, least) <= FALSE_POSITIVES]
