@@ -154,7 +154,8 @@ class OffPolicyUpdate(BaseUpdate):
         lr = self.config.lr * self.lr_share(start)
         self.optimizer.param_groups[0]["lr"] = lr
         metrics = {"lr": lr}
-        if self.version >= start and len(rows := self.imitable()):
+        rows = self.imitable()
+        if self.version >= start and len(rows):
             metrics |= mean(self._policy_step(rows) for _ in self.steps("policy", self.policy_steps, new))
         return metrics
 

@@ -38,14 +38,21 @@ from accerl_lerobot.policies.untrusted import Unfilled, input_error
 from accerl_lerobot.rollout.runner import Starts, start_of
 from accerl_lerobot.world_model.config import ImaginationConfig, LearnableModelConfig
 from accerl_lerobot.world_model.contract import (
-    Context,
     LearnableWorldModel,
     Prediction,
     State,
     WorldModelSpec,
     new_model,
 )
-from accerl_lerobot.world_model.data import check_dataset, difference, model_arrays, resize
+from accerl_lerobot.world_model.data import (
+    Episode,
+    WindowStart,
+    check_dataset,
+    cut_windows,
+    difference,
+    model_arrays,
+    resize,
+)
 from accerl_lerobot.world_model.pixels import SuccessModel
 
 if TYPE_CHECKING:
@@ -68,18 +75,15 @@ class World(nn.Module):
 
     def begin(self, frames: np.ndarray, robot: np.ndarray, task: str) -> State:
         """The model's state at the start of an episode, uint8 (V, H, W, 3) and float32 (S,)."""
-        spec = self.model.spec
-        images = torch.from_numpy(frames[None])
-        numbers = torch.from_numpy(robot[None])
-        # Nothing has moved before the start, and no action was executed.
-        context = Context(
-            frames=images[:, None].repeat(1, spec.context, 1, 1, 1, 1),
-            robot=numbers[:, None].repeat(1, spec.context, 1),
-            actions=torch.zeros(1, spec.context - 1, spec.chunk, spec.action_dim),
-            first_frame=images,
-            first_robot=numbers,
-            commanded_sum=torch.zeros(1, spec.action_dim),
+        start = Episode(
+            frames=frames[None],
+            times=np.zeros(1, np.int64),
+            state=robot[None],
+            actions=np.zeros((0, self.model.spec.action_dim), np.float32),
+            success_at=-1,
+            task=task,
         )
+        context = cut_windows([start], [WindowStart(0, 0)], self.model.spec, chunks=0).context
         return self.model.begin(context, [task])
 
     @torch.no_grad()
