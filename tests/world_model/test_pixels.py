@@ -202,7 +202,7 @@ def learnt() -> Trainer:
 def test_it_learns_where_dot_and_robot_go(learnt: Trainer):
     of = windows(dots(12, seed=5))
     found = skill_and_sensitivity(learnt.serving, of)
-    assert found["skill"] > 0.5 and found["sensitivity"] > 2
+    assert found["skill"] > 0.5 and found["sensitivity"] > 1.5
     predictions = rollout(learnt.serving.model, of)  # type: ignore[arg-type]
     for depth, most in ((0, 0.5), (2, 1.0)):
         assert (predictions[depth].robot - of.robot[:, depth]).abs().mean() < most
@@ -234,7 +234,7 @@ def test_the_success_model_learns_how_replayed_episodes_end():
     trainer = Trainer(World(model()), 2e-3, seed=0)
     episodes = ending_on_the_right(dots(80, steps=20, seed=1))
     trainer.fit_statistics(episodes)
-    for _ in range(100):
+    for _ in range(120):
         metrics = trainer.step(episodes, uniform(episodes))
     assert metrics["success"] < 0.6
     batch = trainer._halves(trainer._labelled)  # type: ignore[arg-type]
