@@ -54,6 +54,7 @@ def config_of(checkpoint: Path, case: str) -> RunConfig:
 def few_first_steps() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(LatentModel, "first_steps", 5)
+        patch.setattr(LatentModel, "steps_per_decision", 0.1)
         patch.setattr(chunk_critic, "LEAST_TRANSITIONS", 40)
         yield
 
