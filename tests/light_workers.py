@@ -30,7 +30,6 @@ from accerl_lerobot.transport.connection import (
 )
 from accerl_lerobot.transport.weights import WeightPublisher
 
-NO_WEIGHTS = "a path without weights"
 HANGS = "hangs"  # a folder that whoever writes into it hangs
 FULL = "full"  # a folder that nothing can be written into
 
@@ -104,15 +103,12 @@ class WarningRollout(RolloutWorker):
 
 
 class LightTrainer:
-    """Takes batches and learns nothing from them but what they were; breaks or idles on request."""
+    """Takes batches and learns nothing from them but what they were; idles on request."""
 
     def __init__(self, settings: LearnerSettings, *others: Any) -> None:
-        if settings.policy.path == NO_WEIGHTS:
-            raise FileNotFoundError("no weights there")
         self._config, state = settings.trainer, settings.state
         self._records: list[dict[str, float]] = []
         self._lock = threading.Lock()
-        self._failure: str | None = None
         self._idle = False
         self._publisher = WeightPublisher(others[-2], put=lambda tensors: None)
         self._ledger: list[dict[str, int]] = []  # keys of each update's segments, and their decisions
@@ -121,9 +117,6 @@ class LightTrainer:
 
     def ready(self) -> int:
         return os.getpid()
-
-    def fail(self) -> None:
-        self._failure = "the optimiser fell over"
 
     def idle(self) -> None:
         self._idle = True
@@ -141,8 +134,6 @@ class LightTrainer:
             segments = ray.get(upcoming)
             upcoming = replay.sample.remote(n, len(self._ledger) + 1)
             time.sleep(0.02)
-            if self._failure is not None:
-                raise ArithmeticError(self._failure)
             with self._lock:
                 self._ledger.append({segment.key: len(segment) for segment in segments})
                 version = len(self._ledger)

@@ -70,11 +70,6 @@ def tiny_run(checkpoint: Path, **sections: Any) -> RunConfig:
     return RunConfig(**{**defaults, **sections})
 
 
-def adjusted(kind: type[Any], **constants: Any) -> type[Any]:
-    """A config class with other constants, which pickle copies to other processes."""
-    return type(kind.__name__, (kind,), constants)
-
-
 def polls(engine: Engine) -> Iterator[Progress]:
     """Polls again and again; a test that waits for minutes hangs."""
     deadline = time.monotonic() + HANGS_S

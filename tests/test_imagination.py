@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import importlib
+import itertools
 import os
 import signal
 import sys
@@ -16,7 +17,6 @@ import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot import cli
 from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE, WORLD_MODEL
@@ -30,7 +30,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, REAL, Segment
 from accerl_lerobot.rollout.runner import EpisodePlans, RolloutConfig
 from accerl_lerobot.rollout.worker import RolloutWorker
-from accerl_lerobot.run.train import Run, make_engine
+from accerl_lerobot.run.train import Run
 from accerl_lerobot.timeline import read_timeline
 from accerl_lerobot.world_model.config import (
     ImaginationConfig,
@@ -100,8 +100,16 @@ def decisions(segments: list[Segment], source: str) -> int:
     return sum(len(s) for s in segments if s.source == source)
 
 
-def test_once_the_real_episodes_are_played_all_is_imagined(tiny_checkpoint: Path, world_model: Path):
-    history, batches, _ = run_locally(imagining(tiny_checkpoint, world_model))
+Played = tuple[list[Progress], list[list[Segment]], LocalEngine]
+
+
+@pytest.fixture(scope="module")
+def played(tiny_checkpoint: Path, world_model: Path) -> Played:
+    return run_locally(imagining(tiny_checkpoint, world_model))
+
+
+def test_once_the_real_episodes_are_played_all_is_imagined(played: Played):
+    history, batches, _ = played
     ended = [e for p in history for e in p.episodes]
     real, imagined = ([e for e in ended if e.plan.source == source] for source in (REAL, IMAGINED))
     counters, replay = history[-1].rollout, history[-1].replay
@@ -114,11 +122,9 @@ def test_once_the_real_episodes_are_played_all_is_imagined(tiny_checkpoint: Path
     assert history[-1].world_model["learn_episodes"] == 6 == history[-1].world_model["learn_steps"]
 
 
-def test_imagined_episodes_begin_where_real_ones_did(tiny_checkpoint: Path, world_model: Path):
-    _, batches, _ = run_locally(imagining(tiny_checkpoint, world_model))
-    segments = [segment for batch in batches for segment in batch]
-    firsts = {REAL: set(), IMAGINED: set()}  # type: ignore[var-annotated]
-    for segment in segments:
+def test_imagined_episodes_begin_where_real_ones_did(played: Played):
+    firsts: dict[str, set[bytes]] = {REAL: set(), IMAGINED: set()}
+    for segment in itertools.chain(*played[1]):
         if segment.origin.decision == 0:
             firsts[segment.source].add(segment.observations["observation.images.front"][0].tobytes())
     assert firsts[IMAGINED] and firsts[IMAGINED] <= firsts[REAL]
@@ -130,18 +136,17 @@ def test_without_imagination_a_run_ends_when_its_episodes_are_used_up(tiny_check
     assert history[-1].replay["available_decisions"] < 16 and history[-1].world_model == {}
 
 
-def test_two_runs_are_equal_to_the_last_bit(tiny_checkpoint: Path, world_model: Path):
-    config = imagining(tiny_checkpoint, world_model, episodes=24)
-    runs = [run_locally(config) for _ in range(2)]
-    one, other = ([u for p in history for u in p.updates] for history, _, _ in runs)
+def test_two_runs_are_equal_to_the_last_bit(played: Played, tiny_checkpoint: Path, world_model: Path):
+    again = run_locally(imagining(tiny_checkpoint, world_model))
+    one, other = ([u for p in history for u in p.updates] for history, _, _ in (played, again))
     assert len(one) == 12 and one == other
-    assert runs[0][0][-1].world_model == runs[1][0][-1].world_model
-    for key, tensor in runs[0][2]._adapter.export_trainable().items():
-        np.testing.assert_array_equal(tensor, runs[1][2]._adapter.export_trainable()[key])
+    assert played[0][-1].world_model == again[0][-1].world_model
+    for key, tensor in played[2]._adapter.export_trainable().items():
+        np.testing.assert_array_equal(tensor, again[2]._adapter.export_trainable()[key])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("steps", "left_at"), [(1.0, 0.1), (1.0, 0.6), (3.0, 0.5), (0.0, 0.7)])
+@pytest.mark.parametrize(("steps", "left_at"), [(3.0, 0.5), (0.0, 0.7)])
 def test_a_run_that_was_left_goes_on_as_if_it_had_not(
     steps: float, left_at: float, tiny_checkpoint: Path, world_model: Path, tmp_path: Path
 ):
@@ -220,29 +225,22 @@ def test_a_process_that_takes_anothers_place_imagines_from_its_episodes(world_mo
 
 
 def test_what_does_not_fit_is_refused_before_the_run_begins(
-    tiny_checkpoint: Path, world_model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tiny_checkpoint: Path, world_model: Path, tmp_path: Path
 ):
-    def told(*options: str) -> str:
-        arguments = [
-            "train", "--env.type=simulated", f"--policy.path={tiny_checkpoint}",
-            "--imagination.environments=4", f"--output_dir={tmp_path / 'out'}", *options,
-        ]  # fmt: skip
-        assert cli.main(arguments) == 2
-        return capsys.readouterr().err
-
-    path = f"--imagination.path={world_model}"
-    assert "imagination.path='nowhere': config.json: is missing" in told("--imagination.path=nowhere")
-    paid = told(path, "--env.reward=dense")
-    assert "env.reward='dense': use success with imagination.environments" in paid
-    seen = told(path, "--env.environment_state=true")
-    assert "env.environment_state=True: no policy reads it, and nothing imagined has it" in seen
-    few = told(path, "--rollout.workers=4", "--rollout.episodes=2")
-    assert "rollout.episodes=2: use at least 4: each rollout worker needs a real episode" in few
-    looks = told(path, "--env.image_size=32", "--policy.n_action_steps=2")
-    assert "executes 2 actions per decision; train one with world_model.chunk=2" in looks
-    tiny_checkpoint = write_diffusion(tmp_path / "back", image=32, n_obs_steps=2)
-    assert "policy.n_obs_steps=2: the policy looks back so many env steps" in told(path)
-    assert not (tmp_path / "out" / "checkpoints").exists()
+    config = imagining(tiny_checkpoint, world_model)
+    nowhere = replace(config.imagination, path="nowhere")
+    back = str(write_diffusion(tmp_path / "back", image=32, n_obs_steps=2))
+    for changed, line in (
+        (replace(config, env=replace(ENV, reward="dense")), "env.reward='dense': use success with"),
+        (replace(config, env=replace(ENV, environment_state=True)), "state=True: no policy reads it"),
+        (replace(config, policy=replace(config.policy, n_action_steps=2)), "one with world_model.chunk=2"),
+        (replace(config, policy=replace(config.policy, path=back)), "policy.n_obs_steps=2: the policy looks"),
+        (replace(config, imagination=nowhere), "imagination.path='nowhere': config.json: is missing"),
+    ):
+        with pytest.raises(InputError, match=line):
+            check_imagination(changed)
+    with pytest.raises(InputError, match=r"rollout\.episodes=2: use at least 4: each rollout worker needs"):
+        replace(config, rollout=replace(config.rollout, workers=4, episodes=2))
 
 
 def test_it_goes_on_with_what_it_has_learned_from_and_never_with_what_was_held_out(
@@ -280,9 +278,8 @@ def test_of_a_world_model_that_has_not_passed_a_run_warns(
     assert bool(warnings) == (told is not None) and all(str(told) in text for text in warnings)
 
 
-@pytest.mark.parametrize("engine", ["local", pytest.param("ray", marks=pytest.mark.slow)])
 def test_a_world_model_of_another_package_imagines_and_goes_on_learning(
-    engine: str, tiny_checkpoint: Path, tmp_path: Path
+    tiny_checkpoint: Path, tmp_path: Path
 ):
     package = "tests.world_model.linear_world"
     linear = importlib.import_module(package).LinearModelConfig
@@ -291,14 +288,11 @@ def test_a_world_model_of_another_package_imagines_and_goes_on_learning(
     sys.modules.pop(package)
     config = imagining(tiny_checkpoint, path, episodes=24)
     config = replace(config, imagination=replace(config.imagination, discover_packages_path=package))
-    config = replace(config, launch=replace(config.launch, engine=engine), output_dir=str(tmp_path))
-    running = make_engine(config, ("match",), history=1)
-    try:
-        running.train()
-        last = drive(running)[-1]
-        running.save(tmp_path / "saved")
-    finally:
-        running.close()
+    running = LocalEngine(config, ("match",))
+    running.train()
+    last = drive(running)[-1]
+    running.save(tmp_path / "saved")
+    running.close()
     assert last.world_model["learn_steps"] > 0 < last.replay["trained_imagined"]
     before, after = load_world(path, package), load_world(tmp_path / "saved" / WORLD_MODEL)
     moved = after.get_parameter("model.motion.weight") - before.get_parameter("model.motion.weight")
@@ -327,16 +321,8 @@ def test_one_command_records_play_trains_a_world_model_on_it_and_practises(
     summary = Run(config, tmp_path, Console(), "last").execute()
     assert "episodes of play" not in capsys.readouterr().err, "they are there"
     assert summary["updates"] == 12 and summary["imagined_episodes"] > 0
-    assert summary["episodes_explored"] == 6
+    assert summary["episodes_explored"] == 6 and summary["imagined_decisions"] > 0
     learnt = read_content(tmp_path / "pretraining" / "world_model")["learnt"]
     assert {episode.key for episode in recorded} > set(learnt)
     saved = read_content(tmp_path / "checkpoints" / "last" / WORLD_MODEL)["learnt"]
     assert len(saved) == len(learnt) + 6, "and the real episodes of the run"
-
-
-def test_the_summary_says_how_much_was_imagined(tiny_checkpoint: Path, world_model: Path, tmp_path: Path):
-    config = imagining(tiny_checkpoint, world_model, steps=0.0)
-    config = replace(config, launch=replace(config.launch, engine="local"))
-    summary = Run(config, tmp_path, Console()).execute()
-    assert summary["episodes_explored"] == 6 and summary["imagined_decisions"] > 0
-    assert summary["updates"] == 12 and summary["imagined_episodes"] > 0

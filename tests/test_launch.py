@@ -27,8 +27,8 @@ from benchmarks.simulated_environment import LatencyConfig
 from tests.runs import collect, polls, tiny_run
 from tests.timeline.test_engines import adds_up, gaps
 
-UPDATES = 40
-DURING = 12
+UPDATES = 24
+DURING = 8
 
 
 @dataclass
@@ -41,7 +41,6 @@ class Story:
     after: list[EpisodeResult] = field(default_factory=list)
     history: list[Progress] = field(default_factory=list)
     saved: int = -1  # version saved in the middle of training
-    pids: set[int] = field(default_factory=set)
 
     @property
     def updates(self) -> list[dict[str, float]]:
@@ -56,7 +55,9 @@ class Story:
 
 
 @pytest.fixture(scope="module")
-def story(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Story]:
+def story(
+    tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory, light_ray: None
+) -> Iterator[Story]:
     from accerl_lerobot.engines.ray_engine import RayEngine
 
     config = tiny_run(
@@ -83,7 +84,7 @@ def story(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> It
         engine.plan(evaluation_plans(("match",), 6, "before", filmed=1))
         told.before = collect(engine, "before", 6)
         engine.train()
-        planned = killed = lost = False
+        planned = killed = False
         for progress in polls(engine):
             told.history.append(progress)
             if progress.done and told.has("during") >= DURING:
@@ -97,13 +98,9 @@ def story(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> It
                 saved = engine.save(told.directory / "middle")
                 told.saved = saved.version
                 told.history.append(replace(progress, updates=saved.updates, episodes=[]))
-            elif killed and not lost and progress.version >= UPDATES // 2:
-                lost = True
-                os.kill(pids["inference"], signal.SIGKILL)
         engine.plan(evaluation_plans(("match",), 6, "after"))
         told.after = collect(engine, "after", 6)
         engine.save(told.directory / "end")
-        told.pids = {*pids.values(), *engine.pids().values()}
         yield told
     finally:
         engine.close()
@@ -145,9 +142,8 @@ def test_the_books_of_replay_balance(story: Story):
     assert books["trained_decisions"] <= story.config.replay.samples_per_insert * books["inserted_decisions"]
 
 
-def test_workers_that_were_killed_came_back_once(story: Story):
-    """Inference with the newest weights: its decisions agree with the trainer, and no version is older."""
-    assert story.history[-1].rollout["restarts"] == story.history[-1].inference["restarts"] == 1.0
+def test_the_worker_that_was_killed_came_back_once_and_counters_never_fall(story: Story):
+    assert story.history[-1].rollout["restarts"] == 1.0
     served = [p.inference["version"] for p in story.history if "version" in p.inference]
     assert served == sorted(served) and UPDATES // 2 < served[-1] <= UPDATES
     for name in ("env_steps", "decisions", "episodes", "restarts"):
@@ -199,7 +195,7 @@ def test_every_worker_has_left_its_timeline(story: Story):
     timeline = read_timeline(story.directory)
     rows = {row.worker: row for row in timeline.rows}
     assert list(rows) == ["rollout 0", "rollout 1", "inference", "replay", "trainer"]
-    assert [name for name, row in rows.items() if len(gaps(row))] == ["rollout 1", "inference"]
+    assert [name for name, row in rows.items() if len(gaps(row))] == ["rollout 1"]
     adds_up(timeline)
     spent = timeline.shares()
     assert {"recovery", "compute", "transport", "wait_in"} <= spent["rollout"].keys()

@@ -1,16 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The asynchronous engine with a trainer of two ranks, everything real: LeRobot's SmolVLA, Ray, gloo, FSDP2.
 
-One run learns with two ranks, is saved, and loses a rank that hangs; another one goes on with a single rank.
+The run is saved, and loses a rank that hangs.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -20,12 +19,11 @@ from safetensors.torch import load_file
 
 from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.checkpoint import snapshot
-from accerl_lerobot.checkpoint.layout import PRETRAINED, STEP, TRAINING_STATE, WEIGHTS
-from accerl_lerobot.engines.config import LaunchConfig, RunConfig
+from accerl_lerobot.checkpoint.layout import PRETRAINED, TRAINING_STATE, WEIGHTS
+from accerl_lerobot.engines.config import LaunchConfig
 from accerl_lerobot.engines.ray_engine import RayEngine
 from accerl_lerobot.engines.stopping import WorkerError
-from accerl_lerobot.evaluation import evaluation_plans
-from tests.runs import collect, drive, polls, tiny_run
+from tests.runs import drive, polls, tiny_run
 from tests.test_ray_session import LOOPBACK, listening
 
 pytestmark = pytest.mark.slow
@@ -41,7 +39,6 @@ TWO = TrainerConfig(
 class Story:
     """Events of the run with two ranks."""
 
-    config: RunConfig
     saved: Path
     version: int
     updates: list[dict[str, float]]
@@ -75,7 +72,7 @@ def story(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> It
         with pytest.raises(WorkerError) as lost:
             drive(engine)
         updates += saved.updates
-        yield Story(config, directory, saved.version, updates, served, str(lost.value), addresses)
+        yield Story(directory, saved.version, updates, served, str(lost.value), addresses)
     finally:
         engine.close()
 
@@ -110,21 +107,3 @@ def test_ranks_listen_on_the_loopback_interface_only(story: Story):
 
 def test_a_rank_that_hangs_ends_the_trainer(story: Story):
     assert story.error.startswith("trainer worker failed for good:")
-
-
-def test_one_rank_goes_on_from_what_two_have_saved(story: Story):
-    updates = story.version + 4
-    config = replace(story.config, trainer=replace(TWO, updates=updates, ranks=1))
-    state = story.saved / TRAINING_STATE
-    (state / STEP).write_text(json.dumps({"step": story.version}))
-    engine = RayEngine(config, ("match",), state=state)
-    try:
-        assert "trainer rank 1" not in engine.pids()
-        engine.plan(evaluation_plans(("match",), 2, "before"))
-        assert {e.versions for e in collect(engine, "before", 2)} == {(story.version, story.version)}
-        engine.train()
-        made = [u for progress in drive(engine) for u in progress.updates]
-        assert [u["update"] for u in made] == [story.version + i + 1.0 for i in range(4)]
-        assert all(np.isfinite(u["loss"]) and u["ratio_max_dev"] < 5 for u in made)
-    finally:
-        engine.close()

@@ -11,12 +11,11 @@ import pytest
 
 from accerl_lerobot.algorithms import AlgorithmConfig
 from accerl_lerobot.algorithms.config import TrainerConfig
-from accerl_lerobot.engines.config import RunConfig
+from accerl_lerobot.engines.config import LaunchConfig, RunConfig
 from accerl_lerobot.engines.contract import Progress
 from accerl_lerobot.engines.local import LocalEngine
-from accerl_lerobot.evaluation import evaluation_plans
 from benchmarks.simulated_environment import LatencyConfig
-from tests.runs import ALGORITHMS, collect, drive, tiny_run
+from tests.runs import ALGORITHMS, drive, tiny_run
 
 
 def train(config: RunConfig) -> tuple[list[Progress], dict[str, np.ndarray]]:
@@ -60,7 +59,8 @@ def test_weights_held_back_act_so_many_updates_late(tiny_checkpoint: Path):
     def lags(hold_back: int) -> tuple[list[float], Progress]:
         fields: dict[str, Any] = {"updates": 14, "batch_decisions": 16, "lr": 1e-3, "value_warmup_updates": 0}
         trainer = TrainerConfig(**fields, hold_back=hold_back, probe_every=4)
-        history, _ = train(tiny_run(tiny_checkpoint, trainer=trainer))
+        launch = LaunchConfig(engine="local")
+        history, _ = train(tiny_run(tiny_checkpoint, trainer=trainer, launch=launch))
         assert max(u.get("logprob/mismatch_max", 0.0) for u in updates(history)) < 1e-4
         return [u["lag_mean"] for u in updates(history)], history[-1]
 
@@ -68,17 +68,6 @@ def test_weights_held_back_act_so_many_updates_late(tiny_checkpoint: Path):
     assert late[:1] == prompt[:1] == [0.0]
     assert all(lag >= 4 for lag in late[5:]) and max(prompt) < 4, "samples of an acting policy 4 updates old"
     assert end.inference["version"] == other_end.inference["version"] == 14, "the last weights act at once"
-
-
-def test_planned_episodes_run_without_training_and_are_not_learned_from(tiny_checkpoint: Path):
-    engine = LocalEngine(tiny_run(tiny_checkpoint), ("match",))
-    engine.plan(evaluation_plans(("match",), 9, "test", filmed=1))
-    results = collect(engine, "test", 9)
-    progress = engine.poll()
-    engine.close()
-    assert sorted(r.plan.index for r in results) == list(range(9))
-    assert progress.version == 0 and progress.replay["inserted_segments"] == 0
-    assert [bool(r.frames) for r in sorted(results, key=lambda r: r.plan.index)] == [True] + [False] * 8
 
 
 def test_closing_does_not_hide_why_it_is_called(tiny_checkpoint: Path, caplog: pytest.LogCaptureFixture):
@@ -97,11 +86,3 @@ def test_a_nan_from_the_world_is_counted_and_the_run_goes_on(tiny_checkpoint: Pa
     history, _ = train(config)
     assert history[-1].done and history[-1].rollout["dropped_nonfinite"] > 0
     assert history[-1].replay["dropped_nonfinite"] == 0, "the runner should have kept it from replay"
-
-
-def test_a_world_that_crashes_ends_the_run_with_its_own_error(tiny_checkpoint: Path):
-    engine = LocalEngine(tiny_run(tiny_checkpoint, env=LatencyConfig(crash_after=9)), ("match",))
-    engine.train()
-    with pytest.raises(RuntimeError, match="simulated crash after 9 env steps"):
-        drive(engine)
-    engine.close()

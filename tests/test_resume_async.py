@@ -9,7 +9,9 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -19,14 +21,15 @@ from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE
 from accerl_lerobot.engines.contract import Progress
 from accerl_lerobot.engines.ray_engine import RayEngine
+from accerl_lerobot.engines.supervision import RolloutSlot, restore_rollouts, save_rollouts
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.replay.buffer import ReplayConfig
-from accerl_lerobot.rollout.runner import RolloutConfig
+from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutConfig
 from benchmarks.simulated_environment import LatencyConfig
-from tests.runs import drive, polls, until
+from tests.runs import drive, tiny_run, until
 
-UPDATES, DURING = 60, 12
+UPDATES, DURING = 40, 12
 TWO = RolloutConfig(workers=2, environments=2, segment_length=3)
 
 
@@ -51,11 +54,11 @@ def test_nothing_committed_is_lost_or_doubled_and_no_update_made_twice(engine, t
     first = engine()
     first.plan(evaluation_plans(("match",), DURING, "during"))
     first.train()
-    history = until(first, 20)
+    history = until(first, 14)
     saved = first.save(tmp_path)
     assert updates(history) + [u["update"] for u in saved.updates] == [i + 1.0 for i in range(saved.version)]
     counters = first.poll().rollout
-    until(first, saved.version + 10)  # what comes after the checkpoint is to be forgotten
+    until(first, saved.version + 6)  # what comes after the checkpoint is to be forgotten
     first.close()
 
     state = tmp_path / TRAINING_STATE
@@ -90,31 +93,35 @@ def test_nothing_committed_is_lost_or_doubled_and_no_update_made_twice(engine, t
     assert sorted(during) == list(range(DURING)), "planned episodes have one result each"
 
 
-def test_episodes_that_were_paid_for_are_played_once(engine, tmp_path: Path):
-    rollout = RolloutConfig(workers=2, environments=2, segment_length=3, episodes=40)
-    endless = TrainerConfig(updates=10_000, batch_decisions=16)
-    first = engine(rollout=rollout, trainer=endless)
-    first.train()
-    played = [e for p in until(first, 4) for e in p.episodes]
-    first.save(tmp_path)
-    first.close()
-    second = engine(tmp_path / TRAINING_STATE, rollout=rollout, trainer=endless)
-    second.train()
-    episodes = []
-    for progress in polls(second):
-        episodes += progress.episodes
-        if second._collected:
-            break
-    # Episodes that were under way are begun anew; one that had ended but not been told of counts as such.
-    assert len(played) + len(episodes) == 40
+def test_the_rollout_workers_part_of_a_checkpoint(tmp_path: Path):
+    """Episodes that were paid for are played once; planned ones without a result are played again."""
 
+    def slots(**fields: Any) -> list[RolloutSlot]:
+        config = tiny_run(Path("nowhere"), rollout=replace(TWO, episodes=41, **fields))
+        return [RolloutSlot(i, None, config, ("match",)) for i in range(config.rollout.workers)]
 
-def test_a_run_of_another_engine_or_size_is_refused(engine, tmp_path: Path):
-    (tmp_path / "training_step.json").write_text('{"step": 3}')
+    def report(*plans: EpisodePlan) -> Any:
+        ended = [
+            EpisodeResult(plan=plan, success=True, episode_return=0.0, steps=3, decisions=1, versions=(0, 0))
+            for plan in plans
+        ]
+        return SimpleNamespace(episodes=ended)
+
     with pytest.raises(InputError, match=r"launch\.engine='ray': this run was in one process"):
-        engine(tmp_path)
-    first = engine()
-    first.save(tmp_path)
-    three = RolloutConfig(workers=3, environments=2, segment_length=3)
+        restore_rollouts(tmp_path, slots())
+    first = slots()
+    planned = evaluation_plans(("match",), 4, "during")
+    explored = EpisodePlan(task="match", seed=7, explore=True)
+    for slot in first:
+        slot.assign(planned[slot.index :: 2])
+    assert len(first[0].take(report(explored, explored, planned[0]))) == 3
+    assert first[0].take(report(planned[0])) == [], "it was reported before"
+    save_rollouts(tmp_path, first)
+    second = slots()
+    restore_rollouts(tmp_path, second)
+    assert [slot.budget for slot in second] == [19, 20]
+    assert [sorted(slot.outstanding) for slot in second] == [[("during", 2)], [("during", 1), ("during", 3)]]
+    assert [slot.incarnation for slot in second] == [1, 1], "keys are new, and so are the seeds"
+    assert second[0].begun == [("match", 7), ("match", 7)]
     with pytest.raises(InputError, match=r"rollout\.workers=3: this run has 2"):
-        engine(tmp_path / TRAINING_STATE, rollout=three)
+        restore_rollouts(tmp_path, slots(workers=3))

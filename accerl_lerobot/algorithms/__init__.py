@@ -10,7 +10,7 @@ parsed before torch is loaded.
 
 from __future__ import annotations
 
-from accerl_lerobot.algorithms.contract import (
+from accerl_lerobot.algorithms.config import (
     AlgorithmConfig,
     AWRConfig,
     ChunkCriticConfig,

@@ -1,23 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Segments laid end to end, as one update sees them; those of an update that is not finite are kept.
+"""Segments laid end to end, as one update sees them.
 
 Shapes: S segments, N decisions in all, L log-prob factors of one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from accerl_lerobot.checkpoint import snapshot
-from accerl_lerobot.errors import NonFiniteError
 from accerl_lerobot.experience import Segment
 
 
@@ -45,7 +40,8 @@ class Batch:
 
 
 def collate(segments: Sequence[Segment]) -> Batch:
-    keys, names = segments[0].observations.keys(), segments[0].latent.keys()
+    keys = segments[0].observations.keys()
+    names = segments[0].latent.keys()
     return Batch(
         observations={k: np.concatenate([s.observations[k][:-1] for s in segments]) for k in keys},
         tasks=[s.task for s in segments for _ in range(len(s))],
@@ -64,22 +60,3 @@ def pick(
     observations: dict[str, np.ndarray], tasks: Sequence[str], rows: np.ndarray
 ) -> tuple[dict[str, np.ndarray], list[str]]:
     return {k: v[rows] for k, v in observations.items()}, [tasks[i] for i in rows]
-
-
-@contextmanager
-def save_batch_if_not_finite(
-    directory: Path | None, update: Any, segments: Sequence[Segment]
-) -> Iterator[None]:
-    """Saves the segments of an update, made inside, that raises `NonFiniteError`, for `snapshot.load`.
-
-    ``nonfinite-000123.json`` and ``.safetensors`` in the run's `directory` hold the batch of update 123; the
-    error names them.
-    """
-    try:
-        yield
-    except NonFiniteError as error:
-        if directory is None:
-            raise
-        path = directory / f"nonfinite-{update.version + 1:06d}"
-        snapshot.save(path, {"update": update.version + 1, "said": str(error), "segments": list(segments)})
-        raise NonFiniteError(f"{error}; its batch is in {path}.json") from error

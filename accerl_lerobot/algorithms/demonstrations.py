@@ -89,7 +89,8 @@ def recorded(
             actions = columns.pop("action")
             for phase in range(min(phases, end)):
                 starts = np.arange(phase, end, chunk)
-                t, reward = len(starts), np.add.reduceat(rewards, starts)
+                t = len(starts)
+                reward = np.add.reduceat(rewards, starts)
                 yield Segment(
                     observations={name: rows[[*starts, end - 1]] for name, rows in columns.items()},
                     task=episode.tasks[0],

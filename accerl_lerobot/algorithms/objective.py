@@ -24,7 +24,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
-from accerl_lerobot.algorithms.contract import AlgorithmConfig, Level, LossInputs
+from accerl_lerobot.algorithms.config import AlgorithmConfig, Level, LossInputs
 from accerl_lerobot.config.ranges import NonNegative, Range, Share
 
 if TYPE_CHECKING:

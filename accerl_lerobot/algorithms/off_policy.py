@@ -37,7 +37,9 @@ class Memory:
     """Rows of whole episodes; `following` points `n_step` decisions ahead."""
 
     def __init__(self, capacity: int, gamma: float, n_step: int) -> None:
-        self.capacity, self.gamma, self.n_step = capacity, gamma, n_step
+        self.capacity = capacity
+        self.gamma = gamma
+        self.n_step = n_step
         self.total = 0  # rows ever added
         self._columns: dict[str, np.ndarray] = {}
         self.tasks: list[str] = []
@@ -109,7 +111,9 @@ class Memory:
         return {"total": self.total, "tasks": list(self.tasks), "columns": columns}
 
     def restore(self, state: dict[str, Any]) -> None:
-        self.total, self.tasks, self._columns = state["total"], list(state["tasks"]), dict(state["columns"])
+        self.total = state["total"]
+        self.tasks = list(state["tasks"])
+        self._columns = dict(state["columns"])
 
 
 class OffPolicyUpdate(BaseUpdate):
@@ -150,7 +154,8 @@ class OffPolicyUpdate(BaseUpdate):
         lr = self.config.lr * self.lr_share(start)
         self.optimizer.param_groups[0]["lr"] = lr
         metrics = {"lr": lr}
-        if self.version >= start and len(rows := self.imitable()):
+        rows = self.imitable()
+        if self.version >= start and len(rows):
             metrics |= mean(self._policy_step(rows) for _ in self.steps("policy", self.policy_steps, new))
         return metrics
 

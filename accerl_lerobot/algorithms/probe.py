@@ -30,7 +30,8 @@ class Probe:
     """One copy of the policy's trainable weights after the other, without the critic's."""
 
     def __init__(self, adapter: PolicyAdapter, config: TrainerConfig) -> None:
-        self.adapter, self._config = adapter, config
+        self.adapter = adapter
+        self._config = config
         self._live = [p for name, p in adapter.trainable().items() if not name.startswith(CRITIC_PREFIX)]
         self._copy: list[Tensor] = []
         self._version: int | None = None  # version of the copy; None: there is none
@@ -42,7 +43,8 @@ class Probe:
         return {"version": self._version, "next": self._next, "weights": weights}
 
     def restore(self, state: dict[str, Any]) -> None:
-        self._version, self._next = state["version"], state["next"]
+        self._version = state["version"]
+        self._next = state["next"]
         # There are no weights in the state where there was no copy.
         self._copy = [part_of(t, live) for t, live in zip(state["weights"], self._live, strict=False)]
 
@@ -53,7 +55,8 @@ class Probe:
             return
         if self._version is None and version >= self._next:
             self._copy = [parameter.detach().clone() for parameter in self._live]
-            self._version, self._next = version, version + every
+            self._version = version
+            self._next = version + every
 
     def read(self, batch: Batch) -> dict[str, float]:
         """The mismatch, if the batch holds decisions of the probed version; else nothing."""
@@ -75,7 +78,8 @@ class Probe:
             self._next = 0
         else:
             return {}
-        self._copy, self._version = [], None
+        self._copy = []
+        self._version = None
         return metrics
 
     @torch.no_grad()

@@ -47,7 +47,8 @@ class BaseUpdate(ABC):
 
     def __init__(self, adapter: Any, config: TrainerConfig) -> None:
         ranks.prepare(adapter, config)
-        self.adapter, self.config = adapter, config
+        self.adapter = adapter
+        self.config = config
         self.version = 0  # updates made
         self.skipped = self._skipped_in_a_row = 0
         self._schedule_updates = config.updates
@@ -233,7 +234,8 @@ class RatioUpdate(BaseUpdate):
             for parameter in self._policy:  # its moments in the optimiser begin with its learning rate
                 parameter.grad = None
         # Each by itself, or the larger gradient would scale the other one down.
-        norm, value_norm = self._clip(self._policy), self._clip(self._value)
+        norm = self._clip(self._policy)
+        value_norm = self._clip(self._value)
         self.apply(self.optimizer, "an update", loss, norm + value_norm)
         return {
             "grad_norm": norm,

@@ -166,8 +166,12 @@ class RunConfig(Section):
             raise InputError("world_model.type", self.world_model.type, no_use_for_states(self.algorithm))
         if isinstance(self.algorithm, OffPolicyConfig):
             self._check_off_policy()
-        if (held := self.trainer.hold_back) >= self.replay.max_lag:
-            hint = f"use more than trainer.hold_back, {held}, or all is thrown away as too old"
+        held_back = self.trainer.hold_back
+        if held_back and self.launch.engine != "local":
+            hint = "weights are held back to study lag, in one process; use launch.engine=local, or 0"
+            raise InputError("trainer.hold_back", held_back, hint)
+        if held_back >= self.replay.max_lag:
+            hint = f"use more than trainer.hold_back, {held_back}, or all is thrown away as too old"
             raise InputError("replay.max_lag", self.replay.max_lag, hint)
         for name, count in (
             ("inference.workers", self.inference.workers),
@@ -180,10 +184,12 @@ class RunConfig(Section):
         if self.inference.workers > self.rollout.workers:
             hint = f"use at most rollout.workers, {self.rollout.workers}, or some have nobody to answer"
             raise InputError("inference.workers", self.inference.workers, hint)
-        batch, length = self.trainer.batch_decisions, self.rollout.segment_length
+        batch = self.trainer.batch_decisions
+        length = self.rollout.segment_length
         if self.trainer.updates:
             self.replay.check(batch_decisions=batch, segment_decisions=length)
-        imagined, workers = self.imagination.environments, self.rollout.workers
+        imagined = self.imagination.environments
+        workers = self.rollout.workers
         if imagined and 0 < self.rollout.episodes < workers:
             hint = f"use at least {workers}: each rollout worker needs a real episode to imagine from"
             raise InputError("rollout.episodes", self.rollout.episodes, hint)
@@ -211,7 +217,8 @@ class RunConfig(Section):
 def lag_limits(config: RunConfig) -> tuple[int, int]:
     """The largest lag under this recipe, and what its pace alone would allow; in updates."""
     early = 1 if config.launch.engine == "ray" else 0  # publications under way, and batches drawn early
-    batch, rollout = config.trainer.batch_decisions, config.rollout
+    batch = config.trainer.batch_decisions
+    rollout = config.rollout
     environments = rollout.environments + config.imagination.environments
     in_flight = replace(rollout, environments=environments).in_flight
     counts = {"batch_decisions": batch, "in_flight": in_flight, "prefetch": early}

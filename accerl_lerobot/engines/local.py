@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from accerl_lerobot.algorithms.batch import save_batch_if_not_finite
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import PRETRAINED, TRAINING_STATE, WEIGHTS
 from accerl_lerobot.engines.config import RunConfig
@@ -37,7 +36,6 @@ from accerl_lerobot.rollout.runner import (
 )
 from accerl_lerobot.seeds import global_generators, restore_global_generators
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, WEIGHT_SYNC, open_clock
-from accerl_lerobot.transport.weights import PublishDelay
 
 logger = logging.getLogger(__name__)
 
@@ -65,8 +63,9 @@ class LocalEngine(Engine):
         self._config = config
         self._adapter = loader(load)(config.policy)
         self._update = make_update(self._adapter, config.algorithm, config.trainer)
-        self._delay = PublishDelay(config.trainer.hold_back)
-        self._acting, self._acting_version = self._adapter, 0
+        self._held_back: deque[tuple[int, Any]] = deque()  # versions and weights that do not act yet
+        self._acting = self._adapter
+        self._acting_version = 0
         if config.trainer.hold_back:
             self._acting = loader(load)(config.policy)
             self._acting.load_trainable(self._adapter.export_trainable())
@@ -118,11 +117,11 @@ class LocalEngine(Engine):
         if self._exploring and self._replay.may_sample(n):
             segments = self._replay.sample(n, self._update.version, self._rng)
             if segments:
-                with save_batch_if_not_finite(self._config.folder, self._update, segments):
-                    updates.append(self._update.step(segments) | {"update": float(self._update.version)})
+                updates.append(self._update.step(segments) | {"update": float(self._update.version)})
                 self._publish()
         self._clock.enter(WAIT_IN)
-        episodes, self._episodes[:] = list(self._episodes), []
+        episodes = list(self._episodes)
+        self._episodes[:] = []
         learner = self._world_learner
         return Progress(
             version=self._update.version,
@@ -147,7 +146,7 @@ class LocalEngine(Engine):
             "generators": global_generators(),
             "rng": self._rng,
             "acting": (self._acting_version, acting),
-            "held_back": self._delay.state(),
+            "held_back": list(self._held_back),
             "outbox": list(self._outbox),
             "plans": self._plans.state(),
             "runner": self._runner.state(),
@@ -175,7 +174,7 @@ class LocalEngine(Engine):
         self._acting_version, acting = engine["acting"]
         if acting is not None:
             self._acting.load_trainable(acting)
-        self._delay.restore(engine["held_back"])
+        self._held_back.extend(engine["held_back"])
         self._outbox.extend(engine["outbox"])
         self._plans.restore(engine["plans"])
         self._runner.restore(engine["runner"])
@@ -211,7 +210,8 @@ class LocalEngine(Engine):
 
     def _act(self) -> None:
         """One decision in every environment that may continue."""
-        runner, may_explore = self._runner, self._replay.may_insert()
+        runner = self._runner
+        may_explore = self._replay.may_insert()
         due: dict[int, Request] = {}
         for slot in range(len(runner)):
             request = runner.request(slot)
@@ -235,16 +235,17 @@ class LocalEngine(Engine):
 
     def _publish(self) -> None:
         """Give weights to the acting policy, which is the trainer's own unless they are delayed."""
-        version, updates = self._update.version, self._config.trainer.updates
+        version = self._update.version
+        updates = self._config.trainer.updates
         if self._acting is self._adapter:
             self._acting_version = version
             return
         self._clock.enter(WEIGHT_SYNC)
         last = version == updates or not self._exploring
-        weights = self._adapter.export_trainable()
-        for number, tensors in self._delay.push(version, weights, last=last):
-            self._acting.load_trainable(tensors)
-            self._acting_version = number
+        self._held_back.append((version, self._adapter.export_trainable()))
+        while self._held_back and (last or self._held_back[0][0] <= version - self._config.trainer.hold_back):
+            self._acting_version, weights = self._held_back.popleft()
+            self._acting.load_trainable(weights)
 
     def _store(self) -> None:
         while self._outbox and self._replay.may_insert():

@@ -28,7 +28,9 @@ class Placement:
 
     def __init__(self, config: RunConfig, nodes: list[dict[str, float]], this_node: str = "") -> None:
         """`nodes` are the resources of each node, this one first; `this_node` is Ray's id of that."""
-        self._nodes, self._this_node, self._selectors = nodes, this_node, config.launch.placement
+        self._nodes = nodes
+        self._this_node = this_node
+        self._selectors = config.launch.placement
         learns = learns_states(config)
         self._workers = {
             "trainer": config.trainer.ranks,
@@ -61,7 +63,8 @@ class Placement:
         """The plan in words, one line a role."""
         rows = []
         for role, count in (self._workers | {"replay": 1}).items():
-            selector, share = self._selectors.get(role, "this node"), self._shares.get(role, 0.0)
+            selector = self._selectors.get(role, "this node")
+            share = self._shares.get(role, 0.0)
             where = "all nodes" if selector == ALL else selector
             if role in self._selectors and selector != ALL:
                 where = f"nodes with {selector}"

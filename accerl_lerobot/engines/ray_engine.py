@@ -82,7 +82,8 @@ class RayEngine(Engine):
         state: Path | None = None,
         load: Load | None = None,
     ) -> None:
-        self._config, self._limit = config, config.launch.stall_s
+        self._config = config
+        self._limit = config.launch.stall_s
         self._version = 0 if state is None else saved_version(state)
         self._rollouts: list[RolloutSlot] = []
         self._inference: list[InferenceReplica] = []
@@ -112,7 +113,8 @@ class RayEngine(Engine):
         self._last_change = time.monotonic()  # time before this call is the caller's
 
     def train(self) -> None:
-        self._training, self._last_change = True, time.monotonic()
+        self._training = True
+        self._last_change = time.monotonic()
         self.follow(self._config.launch.schedule)
         self._trainer.work = self._trainer.actor.run.remote(self._replay.actor)
         for replica in self._inference:
@@ -139,7 +141,8 @@ class RayEngine(Engine):
         episodes = self._listen()
         self._hand_over_world()
         self._supervise()
-        updates, self._updates = self._updates, []
+        updates = self._updates
+        self._updates = []
         if updates:
             self._version = int(updates[-1]["update"])
         served = [replica.last_answer for replica in self._inference if replica.last_answer]
@@ -170,7 +173,8 @@ class RayEngine(Engine):
         self._trainer.call("write", directory)
         save_rollouts(state, self._rollouts)
         self._last_change = time.monotonic()
-        updates, self._updates = self._updates + records, []
+        updates = self._updates + records
+        self._updates = []
         return Saved(version, updates)
 
     def close(self) -> None:
@@ -203,7 +207,8 @@ class RayEngine(Engine):
         from accerl_lerobot.trainer.worker import TrainerWorker
         from accerl_lerobot.world_model.worker import WORLD_MODEL_WORKER, WorldModelWorker
 
-        config, timeline = self._config, self._config.timeline_folder
+        config = self._config
+        timeline = self._config.timeline_folder
         in_cluster = config.launch.address is not None
         placement = place_workers(config)
         for row in placement.rows():
@@ -240,7 +245,7 @@ class RayEngine(Engine):
             )
             online = self._world_learner.actor
         replicas = numbered("inference", config.inference.workers)
-        training = (settings, timeline, ranks, config.folder, world_model, replicas, online)
+        training = (settings, timeline, ranks, world_model, replicas, online)
         self._trainer = add("trainer", "trainer", TrainerWorker, 4 + len(replicas), *training)
         for name in replicas:
             deciding = (config.policy, config.inference, self._version, state, load, timeline, name)
@@ -313,7 +318,8 @@ class RayEngine(Engine):
 
     def _finish(self, version: int) -> None:
         """The trainer has made its updates: complete its records and those of replay."""
-        self._done, self._version = True, version
+        self._done = True
+        self._version = version
         self.follow(ASYNCHRONOUS)
         self._hear(self._trainer, self._limit)
         self._updates += self._trainer.call("metrics")
@@ -379,7 +385,8 @@ class RayEngine(Engine):
         awaited = planned or (self._training and not self._done)
         now = time.monotonic()
         if state != self._last_state or not awaited:
-            self._last_state, self._last_change = state, now
+            self._last_state = state
+            self._last_change = now
         elif now - self._last_change > 2 * self._limit:  # a single worker that hangs is found earlier
             hint = "raise launch.stall_s if a single step takes that long"
             raise WorkerError(

@@ -75,7 +75,8 @@ class Stopping:
 
     def __init__(self, how: str = "") -> None:
         self.asked: int | None = None  # the signal's number
-        self._how, self._waits = how, True
+        self._how = how
+        self._waits = True
 
     def check(self) -> None:
         """End the run if a signal has come."""

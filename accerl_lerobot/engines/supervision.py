@@ -51,7 +51,8 @@ class Worker:
     """
 
     def __init__(self, name: str, actor: Any, launch: LaunchConfig) -> None:
-        self.name, self.actor = name, actor
+        self.name = name
+        self.actor = actor
         self._launch = launch
         self.endpoint = Endpoint(name=name, actor=actor)
         self.pid = 0  # of its process, once that is ready
@@ -81,7 +82,8 @@ class Worker:
         """The answer to the last question, once; None if there is none yet."""
         if self._question is None or not ray.wait([self._question], timeout=timeout)[0]:
             return None
-        question, self._question = self._question, None
+        question = self._question
+        self._question = None
         self.last_answer = ray.get(question)
         return self.last_answer
 
@@ -131,7 +133,8 @@ class RestartedWorker(Worker):
 
     def begin(self, reference: Any) -> None:
         """Note the long call of a process that is ready."""
-        self.work, self._since = reference, time.monotonic()
+        self.work = reference
+        self._since = time.monotonic()
 
     def lost(self, error: Exception) -> None:
         """Have another process take the place of the lost one, unless that was so too often."""
@@ -173,7 +176,8 @@ class RestartedWorker(Worker):
             ray.kill(self.actor, no_restart=False)
             self._ask_ready()
             return False
-        self.pid, self._starting = pid, None
+        self.pid = pid
+        self._starting = None
         logger.info("%s worker is up again", self.name)
         return True
 
@@ -198,7 +202,8 @@ class RolloutSlot(RestartedWorker):
         self.begun: list[tuple[str, int]] = []  # newest real episodes, for imagined ones to begin like them
         self.world: Any = None  # reference of a version of the world model, and its weights
         self._unsent: list[EpisodePlan] = []
-        self._tasks, self._seed = tasks, config.seed
+        self._tasks = tasks
+        self._seed = config.seed
 
     @property
     def counters(self) -> Counter[str]:
@@ -296,7 +301,8 @@ def restore_rollouts(directory: Path, workers: Sequence[RolloutSlot]) -> None:
     workers[0].past = Counter(saved["past"])
     for worker, slot in zip(workers, saved["slots"], strict=True):
         worker.incarnation = slot["incarnation"] + 1
-        worker.budget, worker.begun = slot["budget"], slot["begun"]
+        worker.budget = slot["budget"]
+        worker.begun = slot["begun"]
         worker.assign(slot["outstanding"])
 
 

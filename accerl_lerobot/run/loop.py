@@ -102,7 +102,9 @@ class Times:
         return {"rl_s": self.rl_s + training_s, "wall_s": wall_s, "warm_s": self.warm_s}
 
     def restore(self, state: dict[str, float]) -> None:
-        self.rl_s, self.warm_s, self.training_since = state["rl_s"], state["warm_s"], None
+        self.rl_s = state["rl_s"]
+        self.warm_s = state["warm_s"]
+        self.training_since = None
         if self.before_s is None:
             self.before_s = state["wall_s"]
 
@@ -134,7 +136,10 @@ class Recorder:
     """Counts and logs what an engine reports."""
 
     def __init__(self, config: RunConfig, log: MetricsLog, console: Console, times: Times) -> None:
-        self.config, self.log, self.console, self.times = config, log, console, times
+        self.config = config
+        self.log = log
+        self.console = console
+        self.times = times
         self.state = RunState()
 
     def record(self, progress: Progress) -> None:
@@ -192,7 +197,8 @@ class Recorder:
 
     def status(self, progress: Progress) -> str:
         """The words beside the bar of training."""
-        recent, lags = self.state.recent, self.state.lags
+        recent = self.state.recent
+        lags = self.state.lags
         success = f"{np.mean(recent):.0%} of {len(recent)}" if recent else "…"
         lag = f"{lags[-1]:.0f}" if lags else "…"
         decisions = self.since(progress, "decisions")
@@ -208,7 +214,8 @@ class Recorder:
             )  # fmt: skip
 
     def _count(self, explored: list[EpisodeResult]) -> None:
-        state, before = self.state, self.state.explored
+        state = self.state
+        before = self.state.explored
         for episode in explored:
             state.explored += 1
             state.won += episode.success
@@ -248,10 +255,15 @@ class Loop:
         recorder: Recorder,
         stop: Stopping,
     ) -> None:
-        self.config, self.directory = config, directory
-        self.engine, self.tasks, self.stop = engine, tasks, stop
+        self.config = config
+        self.directory = directory
+        self.engine = engine
+        self.tasks = tasks
+        self.stop = stop
         self.recorder = recorder
-        self.state, self.times, self.console = recorder.state, recorder.times, recorder.console
+        self.state = recorder.state
+        self.times = recorder.times
+        self.console = recorder.console
         self._checkpoints = directory / layout.CHECKPOINTS
         self._began_at: str | None = None  # name of the checkpoint that this engine has begun from
         self._saved_at = time.monotonic()
@@ -283,7 +295,8 @@ class Loop:
 
     def _resume(self, folder: Path) -> list[EpisodeResult]:
         """Restore the state of a checkpoint; returns the filmed episodes of the evaluation before."""
-        state, version = self.state, layout.saved_version(folder)
+        state = self.state
+        version = layout.saved_version(folder)
         self._began_at = folder.parent.name
         saved = snapshot.load(folder / layout.RUN_STATE)
         for each in fields(RunState):
@@ -301,7 +314,8 @@ class Loop:
 
     def _train(self) -> Progress:
         """Poll until all updates are made, evaluate and save when it is due; returns the last report."""
-        config, times = self.config, self.times
+        config = self.config
+        times = self.times
         self.engine.train()
         times.clock.enter(TRAINING)
         times.training_since = self._saved_at = time.monotonic()
@@ -317,7 +331,8 @@ class Loop:
                 if self._save_is_due(progress) or self.stop.asked is not None:
                     self._save()
                 self.stop.check()
-        times.rl_s, times.training_since = times.state()["rl_s"], None
+        times.rl_s = times.state()["rl_s"]
+        times.training_since = None
         self.state.steps = self.recorder.env_steps(progress)
         return progress
 
@@ -376,7 +391,8 @@ class Loop:
             left.unlink()
 
     def _summary(self, after: dict[str, Any], last: Progress) -> dict[str, Any]:
-        state, times = self.state, self.times.state()
+        state = self.state
+        times = self.times.state()
         before = state.before or {}
         return {
             **{f"{name}_before": before.get(name) for name in RATE},

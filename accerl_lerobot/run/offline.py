@@ -47,7 +47,8 @@ def learn_offline(config: OfflineRun, directory: Path, console: Console) -> dict
     started = time.monotonic()
     torch.manual_seed(config.seed)
     torch.set_num_threads(config.trainer.num_threads)
-    policy, meta = learning_config(config.policy), open_metadata(config.dataset)
+    policy = learning_config(config.policy)
+    meta = open_metadata(config.dataset)
     shapes = _check(config, policy, meta)
     # One step for each update, instead of so many for each new decision.
     assert isinstance(config.algorithm, OffPolicyConfig)
@@ -123,7 +124,8 @@ def _check(config: OfflineRun, policy: Any, meta: Any) -> dict[str, tuple[int, .
     from accerl_lerobot.run.preflight import check_imitates
 
     check_imitates(config.algorithm, config.policy, policy)
-    offered, renames = dataset_features(meta), config.policy.rename_map
+    offered = dataset_features(meta)
+    renames = config.policy.rename_map
     check_features(policy_features(policy), offered, renames, "policy.path", config.policy.path, "dataset")
     if policy.n_obs_steps > 1:
         hint = "it sees several env steps at once, which offline learning does not; use accerl sft"
@@ -131,7 +133,8 @@ def _check(config: OfflineRun, policy: Any, meta: Any) -> dict[str, tuple[int, .
     if not {SUCCESS, REWARD} & set(meta.features):
         hint = f"its episodes are labelled neither by {SUCCESS} nor {REWARD}; use accerl sft"
         raise InputError("dataset.repo_id", config.dataset.repo_id, hint)
-    shapes, read = dataset_shapes(meta), policy_features(policy).shapes.keys() | {ACTION}
+    shapes = dataset_shapes(meta)
+    read = policy_features(policy).shapes.keys() | {ACTION}
     if isinstance(config.algorithm, ChunkCriticConfig):
         read |= {ENVIRONMENT_STATE}
     if isinstance(config.world_model, SimulatorStateConfig) and ENVIRONMENT_STATE not in shapes:

@@ -42,7 +42,8 @@ def prepared(config: RunConfig, directory: Path, console: Console, load: Load | 
     A part that is complete is not done again.
     """
     imagination = config.imagination
-    play, pretraining = directory.absolute() / PLAY, directory.absolute() / PRETRAINING
+    play = directory.absolute() / PLAY
+    pretraining = directory.absolute() / PRETRAINING
     dataset = DatasetConfig(repo_id="accerl/play", root=str(play))
     if not play.exists():
         record_play(config, play, console, load)
@@ -61,7 +62,8 @@ def prepared(config: RunConfig, directory: Path, console: Console, load: Load | 
 
 def record_play(config: RunConfig, root: Path, console: Console, load: Load | None) -> None:
     """Records exploring episodes of a run's policy, and episodes of the disturbed expert, as one dataset."""
-    policy_episodes, expert_episodes = config.imagination.policy_episodes, config.imagination.expert_episodes
+    policy_episodes = config.imagination.policy_episodes
+    expert_episodes = config.imagination.expert_episodes
     tally = {"episodes": 0, "frames": 0, "successes": 0}
     # Of other starts than the demonstrations.
     expert = partial(record.record_one, config.env, DISTURBED, config.seed + 1)

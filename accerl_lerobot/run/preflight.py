@@ -64,7 +64,8 @@ VISIBLE = 25  # levels of a pixel that rendering alone does not change
 def check_environment(env: EnvConfig, reward_model: RewardModelConfig | None = None) -> EnvironmentSpec:
     """Build and reset an environment, so that what is wrong with it shows before anything long."""
     with contextlib.closing(make_environment(env, reward_model=reward_model)) as environment:
-        task, began = environment.spec.tasks[0], time.monotonic()
+        task = environment.spec.tasks[0]
+        began = time.monotonic()
         try:
             first = environment.reset(0, task)
             slow = time.monotonic() - began > SLOW_S
@@ -113,7 +114,9 @@ def check_policy(config: RunConfig, spec: EnvironmentSpec, *, own: bool = False)
     from accerl_lerobot.policies.loading import dry_run_config, load_lerobot_config
 
     policy = (load_lerobot_config if own else dry_run_config)(config.policy)
-    needed, offered, renames = policy_features(policy), env_features(spec), config.policy.rename_map
+    needed = policy_features(policy)
+    offered = env_features(spec)
+    renames = config.policy.rename_map
     check_features(needed, offered, renames, "policy.path", config.policy.path)
     return env_steps_seen(policy, learns=isinstance(config.algorithm, OffPolicyConfig))
 
@@ -155,7 +158,9 @@ def check_start(config: RunConfig, say: Callable[[str], object] = str) -> tuple[
         check_likelihood(algorithm.type, sampler_config(config.policy, policy.type), policy.type, field)
     check_memory(config)
     spec = check_environment(config.env, config.rollout.reward_model)
-    renames, history, meta = config.policy.rename_map, int(policy.n_obs_steps), None
+    renames = config.policy.rename_map
+    history = int(policy.n_obs_steps)
+    meta = None
     if config.policy.path is None:
         trained = policy if config.sft.init_path is None else sft_policy(config.sft)
         meta = check_training_data(config.sft, config.dataset, trained, spec, renames)
@@ -190,7 +195,8 @@ def check_state_model(config: RunConfig, policy: Any, decisions: int) -> None:
     from accerl_lerobot.policies.teacher import state_spec
     from accerl_lerobot.world_model.states import new_state_model
 
-    model, learns = config.state_model, not isinstance(config.state_model, SimulatorStateConfig)
+    model = config.state_model
+    learns = not isinstance(config.state_model, SimulatorStateConfig)
     if policy.input_features and policy.output_features:  # a new policy reads the features that are offered
         spec = state_spec(policy, config.policy.rename_map, config.env.state_size * policy.n_obs_steps)
         learns = new_state_model(spec, model).learns
@@ -205,7 +211,8 @@ def _check_remembered(config: RunConfig, spec: EnvironmentSpec, meta: Any, histo
     from accerl_lerobot.demos.dataset_files import opened
     from accerl_lerobot.demos.episodes import numbers, read_labels
 
-    dataset, about = config.dataset, ("dataset.repo_id", config.dataset.repo_id)
+    dataset = config.dataset
+    about = ("dataset.repo_id", config.dataset.repo_id)
     shapes: dict[str, tuple[int, ...]] = {STATE: (spec.state_dim,), **spec.images}
     if config.env.state_size:
         shapes[ENV_STATE] = (config.env.state_size,)

@@ -60,7 +60,8 @@ def resumed_run(path: Path | None, config: RunConfig) -> tuple[Path, str]:
     how = "name RUN/config.yaml or RUN/checkpoints/last/config.yaml"
     if path is None:
         raise InputError("resume", True, f"add --config_path: {how}")
-    directory, checkpoint = path.absolute().parent, layout.LAST
+    directory = path.absolute().parent
+    checkpoint = layout.LAST
     if directory.parent.name == layout.CHECKPOINTS:
         directory, checkpoint = directory.parent.parent, directory.name
     if not (directory / layout.CONFIG).is_file() or not (directory / LOCK).is_file():

@@ -23,7 +23,8 @@ def check_memory(config: RunConfig) -> None:
     if total is None or config.launch.address is not None:
         return
     parts = memory_parts_gib(config)
-    needed, largest = sum(parts.values()), max(parts, key=lambda name: parts[name])
+    needed = sum(parts.values())
+    largest = max(parts, key=lambda name: parts[name])
     if needed > ABSURD * total:
         hint = f"the run needs about {needed:,.0f} GiB of memory, this machine has {total:.0f}; lower it"
         section, _, name = largest.partition(".")
@@ -72,7 +73,9 @@ def policy_gib(config: RunConfig) -> float:
 
     if config.policy.path is None or resolve_device(config.policy.device).type != "cpu":
         return 0.0
-    sizes, processes, copies = policy_sizes(config.policy), 1, trained_copies(config)
+    sizes = policy_sizes(config.policy)
+    processes = 1
+    copies = trained_copies(config)
     if config.launch.engine == "ray":
         processes = config.trainer.ranks + config.inference.workers
         copies += 2 * config.inference.workers  # sets under way

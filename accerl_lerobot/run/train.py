@@ -204,8 +204,11 @@ class Run:
         resume_from: str | None = None,
         load: Load | None = None,
     ) -> None:
-        self.config, self.directory, self.console = config, directory, console
-        self.resume_from, self.load = resume_from, load
+        self.config = config
+        self.directory = directory
+        self.console = console
+        self.resume_from = resume_from
+        self.load = load
         self.times = Times(started=time.monotonic())
         self.how = resuming.resume_command(directory, config)
 
@@ -296,7 +299,9 @@ class Run:
 
     def practise(self, checkpoint: Path | None) -> dict[str, Any]:
         """Evaluate, train and evaluate by one engine after another, each from the last checkpoint."""
-        stop, lost, most = Stopping(self.how), 0, self.config.launch.max_restarts
+        stop = Stopping(self.how)
+        lost = 0
+        most = self.config.launch.max_restarts
         with (
             handled(stop.note),
             closing(open_clock(self.config.timeline_folder, "driver")) as self.times.clock,
@@ -364,7 +369,8 @@ class ActingPolicy:
 
     def reset(self) -> None:
         """Begins another episode, for policies that remember former observations or actions."""
-        self._episode, self._decisions = self._episode + 1, 0
+        self._episode = self._episode + 1
+        self._decisions = 0
 
     def act(self, observation: Observation) -> np.ndarray:
         """The next K actions by LeRobot's own sampler, float32 (K, A), in the environment's units.

@@ -69,7 +69,8 @@ class TrainerRank:
 
     def __init__(self, rank: int, settings: LearnerSettings) -> None:
         errors.collect_warnings()
-        self._rank, self._settings = rank, settings
+        self._rank = rank
+        self._settings = settings
         self._adapter = settings.adapter()
 
     def ready(self) -> int:
@@ -86,7 +87,8 @@ class TrainerRank:
     def join(self, address: str, port: int) -> None:
         from accerl_lerobot.algorithms import ranks
 
-        size, timeout_s = self._settings.trainer.ranks, self._settings.timeout_s
+        size = self._settings.trainer.ranks
+        timeout_s = self._settings.timeout_s
         ranks.use_only(address if address == ranks.LOOPBACK else ray.util.get_node_ip_address())
         store = ranks.store_at(address, port, size, timeout_s)
         ranks.join(store, self._rank, size, self._adapter.device, timeout_s)
@@ -112,7 +114,8 @@ class Peers:
 
     def __init__(self, actors: Sequence[Any], config: TrainerConfig, timeout_s: float) -> None:
         self._actors = list(actors)
-        self._config, self._timeout_s = config, timeout_s
+        self._config = config
+        self._timeout_s = timeout_s
 
     def begin(self, settings: LearnerSettings) -> BaseUpdate:
         """Loads the first rank's policy and meets the others, once they have loaded theirs."""

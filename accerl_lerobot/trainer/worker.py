@@ -20,7 +20,6 @@ from typing import Any
 import ray
 
 from accerl_lerobot import errors
-from accerl_lerobot.algorithms.batch import save_batch_if_not_finite
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import PRETRAINED, TRAINING_STATE, WEIGHTS
 from accerl_lerobot.experience import Segment
@@ -28,15 +27,15 @@ from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.replay.buffer import ASYNCHRONOUS, Schedule
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
 from accerl_lerobot.trainer.peers import LearnerSettings, Peers
-from accerl_lerobot.transport.weights import PublishDelay, WeightPublisher
+from accerl_lerobot.transport.weights import WeightPublisher
 
 
 class TrainerWorker:
     """Becomes a threaded Ray actor in `launch`: `run` on one thread, everything else beside it.
 
-    The run's `directory` is for batches that nothing could be learnt from; `world_model` is the handle of a
-    `WorldModelWorker`, where the algorithm learns on its states; `readers` are the inference replicas;
-    `online` is the handle of an `OnlineLearningWorker`, which gets the batches too.
+    `world_model` is the handle of a `WorldModelWorker`, where the algorithm learns on its states; `readers`
+    are the inference replicas; `online` is the handle of an `OnlineLearningWorker`, which gets the batches
+    too.
     """
 
     def __init__(
@@ -44,14 +43,14 @@ class TrainerWorker:
         settings: LearnerSettings,
         timeline: Path | None = None,
         peers: Sequence[Any] = (),
-        directory: Path | None = None,
         world_model: Any = None,
         readers: Sequence[str] = (),
         online: Any = None,
     ) -> None:
         errors.collect_warnings()
         self._clock = open_clock(timeline, "trainer")
-        self._policy, self._config, self._directory = settings.policy, settings.trainer, directory
+        self._policy = settings.policy
+        self._config = settings.trainer
         self._peers = Peers(peers, self._config, settings.timeout_s)
         self._update = self._peers.begin(settings)
         if world_model is not None:
@@ -76,7 +75,7 @@ class TrainerWorker:
         self._clock.enter(WEIGHT_SYNC)
         # A checkpoint need not hold a critic: all start from this one.
         with self._lock:
-            self._publish(PublishDelay(0))
+            self._publish()
         self._train(replay)
         self._clock.enter(WEIGHT_SYNC)
         self._publisher.flush()
@@ -89,8 +88,8 @@ class TrainerWorker:
 
     def _train(self, replay: Any) -> None:
         """Until the last update: take the batch, ask for the next one, step, publish."""
-        decisions, updates = self._config.batch_decisions, self._config.updates
-        delay = PublishDelay(self._config.hold_back)
+        decisions = self._config.batch_decisions
+        updates = self._config.updates
         upcoming = replay.sample.remote(decisions, self._update.version)
         asked = time.monotonic()
         while self._update.version < updates:
@@ -108,27 +107,20 @@ class TrainerWorker:
                 upcoming = replay.sample.remote(decisions, self._update.version + 1)
             self._clock.enter(CHECKPOINT)  # while another thread holds the lock
             with self._lock:
-                self._step(batch, segments, waited, delay)
+                self._step(batch, segments, waited)
             asked = time.monotonic()
             replay.learnt.remote()
-        with self._lock:
-            if self._publisher.version < self._update.version:
-                # It has ended early, and the saved weights are evaluated.
-                self._publish(delay, last=True)
 
-    def _step(self, batch: Any, segments: list[Segment], waited: float, delay: PublishDelay) -> None:
+    def _step(self, batch: Any, segments: list[Segment], waited: float) -> None:
         """Make an update on segments, of which `batch` is the reference, and publish its weights."""
         self._clock.enter(COMPUTE)
         started = time.monotonic()
         fault_point("trainer.update")
-        with (
-            self._peers.joining("step", batch),
-            save_batch_if_not_finite(self._directory, self._update, segments),
-        ):
+        with self._peers.joining("step", batch):
             metrics = self._update.step(segments)
         updated = time.monotonic()
         self._clock.enter(WEIGHT_SYNC)
-        self._publish(delay, last=self._update.version == self._config.updates)
+        self._publish()
         if self._in_turn:
             self._publisher.flush()
         metrics["update"] = float(self._update.version)
@@ -137,14 +129,12 @@ class TrainerWorker:
         metrics["publish_s"] = time.monotonic() - updated
         self._history.append(metrics)
 
-    def _publish(self, delay: PublishDelay, last: bool = False) -> None:
-        """Hands over the weights of now, or those that are old enough."""
-        adapter = self._update.adapter
+    def _publish(self) -> None:
+        """Hand over the weights of now."""
         with self._peers.gathering("gather_weights"):
-            weights = adapter.export_trainable() if self._config.hold_back else adapter.view_trainable()
-        for version, tensors in delay.push(self._update.version, weights, last=last):
-            fault_point("trainer.publish")
-            self._publisher.publish(version, tensors)
+            weights = self._update.adapter.view_trainable()
+        fault_point("trainer.publish")
+        self._publisher.publish(self._update.version, weights)
 
     def metrics(self) -> list[dict[str, float]]:
         """One record per update since the last call."""
@@ -168,7 +158,8 @@ class TrainerWorker:
 
     def write(self, directory: Path) -> None:
         """Writes what is kept: ``pretrained_model`` and its part of ``training_state``."""
-        (weights, trained, state), self._kept = self._kept, None
+        (weights, trained, state) = self._kept
+        self._kept = None
         fault_point("trainer.write")
         self._update.adapter.save(directory / PRETRAINED, self._policy, weights)
         snapshot.save(directory / TRAINING_STATE / WEIGHTS, trained)

@@ -155,7 +155,8 @@ class Stream:
                     self._view = next(self._views)
             if not self._received:
                 raise EOFError("its end of the connection is closed")
-        received, self._received = self._received, []
+        received = self._received
+        self._received = []
         return received
 
     def close(self) -> None:
@@ -221,7 +222,8 @@ class Client:
             self._exchange(max(0.0, left))
             if left <= 0:
                 break
-        replies, self._replies = self._replies, []
+        replies = self._replies
+        self._replies = []
         return replies
 
     def close(self) -> None:

@@ -8,7 +8,6 @@ one before, so a slow replica skips versions and the trainer waits for none.
 from __future__ import annotations
 
 import threading
-from collections import deque
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -32,13 +31,15 @@ class WeightPublisher:
         self._put = put
         self._changed = threading.Condition()
         self._applied = dict.fromkeys(readers, -1)
-        self.version, self._reference = -1, None
+        self.version = -1
+        self._reference = None
 
     def publish(self, version: int, tensors: Tensors) -> None:
         """Copy a set; the tensors may change afterwards."""
         reference = self._put(tensors)
         with self._changed:
-            self.version, self._reference = version, reference
+            self.version = version
+            self._reference = reference
             self._changed.notify_all()
 
     def newer_than(self, reader: str, version: int) -> tuple[int, list[Any]]:
@@ -63,28 +64,3 @@ class WeightPublisher:
         with self._changed:
             if not self._changed.wait_for(lambda: not late(), timeout_s):
                 raise TimeoutError(f"weights not applied within {timeout_s:g} s by {', '.join(late())}")
-
-
-class PublishDelay:
-    """Publishes weights some `updates` after they were made, for studies of what lag does."""
-
-    def __init__(self, updates: int) -> None:
-        self.updates = updates
-        self._waiting: deque[tuple[int, Tensors]] = deque()
-
-    def push(self, version: int, tensors: Tensors, *, last: bool = False) -> list[tuple[int, Tensors]]:
-        """Take the newest weights, which must not change; return those that are due, oldest first.
-
-        Version 0 always is due, and only the newest if no update follows (`last`).
-        """
-        self._waiting.append((version, tensors))
-        due = []
-        while self._waiting and (last or self._waiting[0][0] <= max(0, version - self.updates)):
-            due.append(self._waiting.popleft())
-        return due[-1:] if last else due
-
-    def state(self) -> list[tuple[int, Tensors]]:
-        return list(self._waiting)
-
-    def restore(self, state: list[tuple[int, Tensors]]) -> None:
-        self._waiting.extend(state)

@@ -12,9 +12,8 @@ import draccus
 from accerl_lerobot.config.ranges import DatasetConfig, LearningRate, Range, Section, registered_name
 from accerl_lerobot.errors import InputError
 
-WORLD_LEARNING = "world-model learning"  # name of the worker that trains the pixel world model
 SPACE_TO_DEPTH = 4  # side of the pixel blocks that become channels in the network of `PixelModelConfig`
-WORLD_LEARNING = "world-model learning"  # name of the worker that trains the world model
+WORLD_LEARNING = "world-model learning"  # name of the worker that trains the pixel world model
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -96,7 +96,8 @@ class LearnableWorldModel(nn.Module):
 
     def __init__(self, spec: WorldModelSpec, config: LearnableModelConfig) -> None:
         super().__init__()
-        self.spec, self.config = spec, config
+        self.spec = spec
+        self.config = config
 
     @abstractmethod
     def fit_statistics(self, windows: Windows) -> None:

@@ -11,6 +11,7 @@ Shapes: F frames of an episode, T env steps; see `contract.py` for the others.
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -25,6 +26,7 @@ from accerl_lerobot.demos.dataset_files import open_metadata, opened
 from accerl_lerobot.demos.episodes import numbers, observations, read_labels
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import REWARD, SUCCESS
+from accerl_lerobot.policies.features import STATE
 from accerl_lerobot.world_model.contract import Context, Windows, WorldModelSpec
 
 if TYPE_CHECKING:
@@ -106,7 +108,8 @@ def cut_windows(
 
 def _window(episode: Episode, first: int, spec: WorldModelSpec, chunks: int) -> dict[str, np.ndarray]:
     """Arrays of one window; ``frames`` and ``robot`` are those of the context and those after each chunk."""
-    size, before = spec.chunk, spec.context - 1
+    size = spec.chunk
+    before = spec.context - 1
     start = int(episode.times[first])
     begins = start + size * np.arange(chunks)  # env step with which each chunk begins
     boundaries = start + size * np.arange(-before, chunks + 1)
@@ -158,7 +161,7 @@ def resize(frames: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 def model_arrays(arrays: dict[str, np.ndarray], spec: WorldModelSpec) -> tuple[np.ndarray, np.ndarray]:
     """Frames uint8 (N, V, H, W, 3) and states float32 (N, S) of N observations."""
     frames = np.stack([resize(arrays[camera], spec.image_size) for camera in spec.cameras], 1)
-    state = arrays["observation.state"] if spec.state_dim else np.zeros((len(frames), 0))
+    state = arrays[STATE] if spec.state_dim else np.zeros((len(frames), 0))
     return frames, state.astype(np.float32)
 
 
@@ -170,7 +173,7 @@ def load_episodes(dataset: DatasetConfig, spec: WorldModelSpec, section: str = "
     with _named(section):
         meta = check_dataset(dataset, spec, section)
         with opened(dataset, meta) as data:
-            names = ["action", "observation.state"] if spec.state_dim else ["action"]
+            names = ["action", STATE] if spec.state_dim else ["action"]
             vectors = {name: numbers(data, name, dataset) for name in names}
             episodes = {}
             for labels in read_labels(data, dataset):
@@ -194,8 +197,27 @@ def check_dataset(dataset: DatasetConfig, spec: WorldModelSpec, section: str = "
     """The metadata of a dataset; one that a world model of `spec` cannot be trained on is refused."""
     with _named(section):
         meta = open_metadata(dataset)
-        _check_metadata(meta, dataset.repo_id, spec)
+        sizes = {name: math.prod(feature["shape"]) for name, feature in meta.features.items()}
+        missing = [camera for camera in spec.cameras if camera not in sizes]
+        state_dim = sizes.get(STATE, 0) if spec.state_dim else 0
+        why = difference(spec, state_dim, sizes.get("action", 0), meta.fps)
+        if missing:
+            cameras = ", ".join(meta.camera_keys) or "no camera"
+            why = f"no {missing[0]!r}: the dataset has {cameras}; choose env.camera accordingly"
+        elif not {SUCCESS, REWARD} & sizes.keys():
+            why = f"no {SUCCESS}: record it, as accerl demos does, or add it to the dataset"
+        if why:
+            raise InputError("dataset.repo_id", dataset.repo_id, why)
     return meta
+
+
+def difference(spec: WorldModelSpec, state_dim: int, action_dim: int, fps: int) -> str:
+    """The first size that differs from a world model's; empty: none does."""
+    for name, other in {"state_dim": state_dim, "action_dim": action_dim, "fps": fps}.items():
+        modelled = getattr(spec, name)
+        if other != modelled:
+            return f"its {name} is {other}, and the world model's is {modelled}"
+    return ""
 
 
 @contextmanager
@@ -208,24 +230,3 @@ def _named(section: str) -> Iterator[None]:
         if field.startswith("dataset."):
             field = f"{section}.{field.removeprefix('dataset.')}"
         raise InputError(field, error.value, error.hint) from error
-
-
-def _check_metadata(meta: Any, name: str | None, spec: WorldModelSpec) -> None:
-    shapes = {key: tuple(feature["shape"]) for key, feature in meta.features.items()}
-    missing = [camera for camera in spec.cameras if camera not in shapes]
-    if missing:
-        cameras = ", ".join(meta.camera_keys) or "no camera"
-        hint = f"no {missing[0]!r}: the dataset has {cameras}; choose env.camera accordingly"
-        raise InputError("dataset.repo_id", name, hint)
-    for key, size in {"action": spec.action_dim, "observation.state": spec.state_dim}.items():
-        if size and shapes.get(key) != (size,):
-            hint = (
-                f"{key} has shape {shapes.get(key)}, the environment's has ({size},): it is another robot's"
-            )
-            raise InputError("dataset.repo_id", name, hint)
-    if not {SUCCESS, REWARD} & shapes.keys():
-        hint = f"no {SUCCESS}: record it, as accerl demos does, or add it to the dataset"
-        raise InputError("dataset.repo_id", name, hint)
-    if meta.fps != spec.fps:
-        hint = f"{meta.fps} frames a second, and the environment makes {spec.fps} steps; record at its rate"
-        raise InputError("dataset.repo_id", name, hint)

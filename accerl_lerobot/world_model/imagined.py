@@ -38,14 +38,21 @@ from accerl_lerobot.policies.untrusted import Unfilled, input_error
 from accerl_lerobot.rollout.runner import Starts, start_of
 from accerl_lerobot.world_model.config import ImaginationConfig, LearnableModelConfig
 from accerl_lerobot.world_model.contract import (
-    Context,
     LearnableWorldModel,
     Prediction,
     State,
     WorldModelSpec,
     new_model,
 )
-from accerl_lerobot.world_model.data import check_dataset, model_arrays, resize
+from accerl_lerobot.world_model.data import (
+    Episode,
+    WindowStart,
+    check_dataset,
+    cut_windows,
+    difference,
+    model_arrays,
+    resize,
+)
 from accerl_lerobot.world_model.pixels import SuccessModel
 
 if TYPE_CHECKING:
@@ -62,22 +69,21 @@ class World(nn.Module):
 
     def __init__(self, model: LearnableWorldModel) -> None:
         super().__init__()
-        self.model, self.success = model, SuccessModel()
+        self.model = model
+        self.success = SuccessModel()
         self.version = 0  # gradient steps that they have made in the run
 
     def begin(self, frames: np.ndarray, robot: np.ndarray, task: str) -> State:
         """The model's state at the start of an episode, uint8 (V, H, W, 3) and float32 (S,)."""
-        spec = self.model.spec
-        images, numbers = torch.from_numpy(frames[None]), torch.from_numpy(robot[None])
-        # Nothing has moved before the start, and no action was executed.
-        context = Context(
-            frames=images[:, None].repeat(1, spec.context, 1, 1, 1, 1),
-            robot=numbers[:, None].repeat(1, spec.context, 1),
-            actions=torch.zeros(1, spec.context - 1, spec.chunk, spec.action_dim),
-            first_frame=images,
-            first_robot=numbers,
-            commanded_sum=torch.zeros(1, spec.action_dim),
+        start = Episode(
+            frames=frames[None],
+            times=np.zeros(1, np.int64),
+            state=robot[None],
+            actions=np.zeros((0, self.model.spec.action_dim), np.float32),
+            success_at=-1,
+            task=task,
         )
+        context = cut_windows([start], [WindowStart(0, 0)], self.model.spec, chunks=0).context
         return self.model.begin(context, [task])
 
     @torch.no_grad()
@@ -132,24 +138,21 @@ def load_world(directory: Path, package: str | None = None, *, section: str = ""
     origin = _origin(directory, section)
     discover(package, section)
     content = read_content(directory, section)
-    named, types = content.get("model"), sorted(LearnableModelConfig.get_known_choices())
-    kind = named.get("type") if isinstance(named, dict) else None
-    if kind not in types:
-        package_field = origin.field.removesuffix("path") + DISCOVER
-        hint = f"use one of {', '.join(types)}, or name its package: {package_field}"
-        raise origin.refuse(f"{CONFIG}: model.type", f"{str(kind)[:60]!r}; {hint}")
     weights = safe_join(directory, WEIGHTS, origin)
     try:
         with Unfilled():
             spec = draccus.decode(WorldModelSpec, content.get("spec"))
-            world = World(new_model(spec, draccus.decode(LearnableModelConfig, named)))
+            world = World(new_model(spec, draccus.decode(LearnableModelConfig, content.get("model"))))
         world.load_state_dict(dict(read_tensors(weights, origin)))
     except Exception as error:  # the files may hold anything
-        ours = input_error(error)  # draccus wraps what a config refuses
-        if ours is None:
-            hint = f"not a world model of accerl world-model ({brief(error)})"
-            raise InputError(origin.field, origin.value, hint) from error
-        raise (ours if ours.field == origin.field else origin.refuse(CONFIG, brief(ours))) from error
+        refusal = input_error(error)  # draccus wraps what a config refuses
+        if refusal is not None:
+            other = origin.refuse(CONFIG, brief(refusal))
+            raise (refusal if refusal.field == origin.field else other) from error
+        package = origin.field.removesuffix("path") + DISCOVER
+        hint = f"not a world model of accerl world-model ({brief(error)}); if its type is of another package"
+        hint += f", name that: {package}"
+        raise InputError(origin.field, origin.value, hint) from error
     return world.requires_grad_(False).eval()
 
 
@@ -167,7 +170,9 @@ class ImaginedEnvironment(Environment):
     source = IMAGINED
 
     def __init__(self, world: World, spec: EnvironmentSpec, starts: Starts) -> None:
-        self.spec, self._world, self._starts = spec, world, starts
+        self.spec = spec
+        self._world = world
+        self._starts = starts
         self._task = ""
         self._seed = self._steps = 0
         self._done = True
@@ -178,7 +183,10 @@ class ImaginedEnvironment(Environment):
         _, first = start_of(self._starts, seed)
         arrays = {name: np.asarray(value)[None] for name, value in first.items() if name != TASK}
         frames, robot = model_arrays(arrays, self._world.model.spec)
-        self._task, self._seed, self._steps, self._done = str(first[TASK]), seed, 0, False
+        self._task = str(first[TASK])
+        self._seed = seed
+        self._steps = 0
+        self._done = False
         self._frames = frames[0]
         self._state = self._world.begin(frames[0], robot[0], self._task)
         return self._observation(robot[0])
@@ -189,7 +197,8 @@ class ImaginedEnvironment(Environment):
         actions = checked_actions(actions, self.spec)
         seed = int(np.random.default_rng((self._seed, self._steps)).integers(2**31))
         prediction = self._world.step(self._state, actions, seed)
-        self._state, self._frames = prediction.state, prediction.frames[0].cpu().numpy()
+        self._state = prediction.state
+        self._frames = prediction.frames[0].cpu().numpy()
         success = self._world.succeeds(self._frames, self._task)
         self._steps += len(actions)
         late = self._steps >= self.spec.max_steps
@@ -251,7 +260,8 @@ def check_imagination(config: RunConfig) -> None:
     """
     from accerl_lerobot.run.preflight import policy_to_be
 
-    policy, imagination = policy_to_be(config), config.imagination
+    policy = policy_to_be(config)
+    imagination = config.imagination
     if (reward := getattr(config.env, "reward", "success")) != "success":
         hint = (
             "use success with imagination.environments: imagined episodes end with a success, and pay for it"
@@ -270,7 +280,7 @@ def check_imagination(config: RunConfig) -> None:
                 make_expert(config.env, environment, spec.tasks[0])
             return
     world = world_of(imagination)
-    _check_fit(world.model.spec, spec, getattr(policy, "n_action_steps", 1))
+    _check_fit(imagination.path, world.model.spec, spec, getattr(policy, "n_action_steps", 1))
     if imagination.learns and imagination.learn.dataset.repo_id is not None:
         check_dataset(imagination.learn.dataset, world.model.spec, LEARN)
     failed = read_content(world_path(imagination), "imagination").get("failed_checks")
@@ -280,18 +290,16 @@ def check_imagination(config: RunConfig) -> None:
         logger.warning(text, imagination.path, why)
 
 
-def _check_fit(spec: WorldModelSpec, environment: EnvironmentSpec, executed: int) -> None:
+def _check_fit(path: str | None, spec: WorldModelSpec, environment: EnvironmentSpec, executed: int) -> None:
     """Refuses a world model that does not fit environment and policy, which executes so many actions per
     decision."""
-    field, again = "imagination.path", "train one of this environment"
+    field = "imagination.path"
+    again = "train one of this environment"
     if missing := [camera for camera in environment.images if camera not in spec.cameras]:
         hint = f"the environment shows this camera, the world model {spec.cameras!r}; {again}"
         raise InputError(field, missing[0], hint)
-    for name in ("state_dim", "action_dim", "fps"):
-        modelled, real = getattr(spec, name), getattr(environment, name)
-        if modelled != real:
-            hint = f"is the world model's {name}, and the environment's is {real}; {again}"
-            raise InputError(field, modelled, hint)
+    if why := difference(spec, environment.state_dim, environment.action_dim, environment.fps):
+        raise InputError(field, path, f"does not fit the environment: {why}; {again}")
     unknown = [text for text in environment.instructions if spec.tasks and text not in spec.tasks]
     if unknown:
         raise InputError(field, unknown[0], f"the world model was trained on {spec.tasks!r}; {again}")

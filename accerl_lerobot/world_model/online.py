@@ -139,7 +139,8 @@ class OnlineLearner:
 
     def restore(self, state: dict[str, Any]) -> None:
         """Continues from a `state`."""
-        self.pending_steps, self.learnt = state["pending_steps"], set(state["learnt"])
+        self.pending_steps = state["pending_steps"]
+        self.learnt = set(state["learnt"])
         self._trainer.restore(state["trainer"])
         self._own.extend(state["own"])
         self._unfinished.update(state["unfinished"])
@@ -151,7 +152,8 @@ class OnlineLearner:
 
 def make_learner(config: RunConfig) -> OnlineLearner:
     """The learner of a run's world model, which starts at the saved one and goes on with its episodes."""
-    imagination, dataset = config.imagination, config.imagination.learn.dataset
+    imagination = config.imagination
+    dataset = config.imagination.learn.dataset
     world = world_of(imagination)
     learnt = set(read_content(world_path(imagination), "imagination").get("learnt") or ())
     offline: list[Episode] = []

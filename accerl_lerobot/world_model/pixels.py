@@ -46,7 +46,9 @@ class PixelWorldModel(LearnableWorldModel):
 
     def __init__(self, spec: WorldModelSpec, config: PixelModelConfig) -> None:
         super().__init__(spec, config)
-        channels, robot, action = 3 * len(spec.cameras), spec.state_dim, spec.action_dim
+        channels = 3 * len(spec.cameras)
+        robot = spec.state_dim
+        action = spec.action_dim
         numbers = spec.chunk * (action * spec.context + 1) + action + robot * (spec.context + 1) + TASK_BITS
         self.network = FrameNetwork(channels, (spec.context + 1) * channels, numbers, config.channels)
         self.motion = nn.Sequential(
@@ -61,7 +63,8 @@ class PixelWorldModel(LearnableWorldModel):
 
     def fit_statistics(self, windows: Windows) -> None:
         valid = windows.steps[:, 0] > 0
-        state, newest = windows.context.robot[:, -1], windows.context.frames[:, -1]
+        state = windows.context.robot[:, -1]
+        newest = windows.context.frames[:, -1]
         samples = {
             "robot": state,
             "motion": (windows.robot[:, 0] - state)[valid],
@@ -87,7 +90,8 @@ class PixelWorldModel(LearnableWorldModel):
         device = self.change.device
         frames, robot, steps = (x.to(device) for x in (windows.frames, windows.robot, windows.steps))
         state = self.begin(windows.context, windows.tasks)
-        images, motions = [], []
+        images = []
+        motions = []
         for r in range(steps.shape[1]):
             executed = self._executed(steps[:, r])
             actions = windows.actions[:, r].to(device) * executed[..., None]
@@ -228,7 +232,8 @@ class FrameNetwork(nn.Module):
     def __init__(self, image: int, frames: int, numbers: int, channels: Sequence[int]) -> None:
         super().__init__()
         pixels = SPACE_TO_DEPTH**2
-        hidden, condition = nn.Linear(numbers, HIDDEN), nn.Linear(HIDDEN, 4 * channels[0])
+        hidden = nn.Linear(numbers, HIDDEN)
+        condition = nn.Linear(HIDDEN, 4 * channels[0])
         self.condition = nn.Sequential(hidden, nn.SiLU(), condition)
         self.planes = nn.Linear(numbers, PLANES)
         self.unet = UNet2DModel(

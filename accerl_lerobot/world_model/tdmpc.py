@@ -39,13 +39,15 @@ class TDMPCModel(StateModel):
     def __init__(self, spec: StateSpec, config: TDMPCStateConfig) -> None:
         super().__init__()
         policy, processing = _loaded(config)
-        self.config, self.keeps_learning = policy.config, config.learn
+        self.config = policy.config
+        self.keeps_learning = config.learn
         self.image = next(iter(self.config.image_features), None)
         self.camera = _camera(spec, self.image, config)
         self.numbers = spec.state
         _check_sizes(spec, policy.config, config)
         self.size = self.config.latent_dim + spec.state + 1
-        self.encoder, self.dynamics = policy.model._encoder, policy.model._dynamics
+        self.encoder = policy.model._encoder
+        self.dynamics = policy.model._dynamics
         self.value = policy.model._V
         self.slow = policy.model_target._encoder
         self.requires_grad_(config.learn)
@@ -56,13 +58,16 @@ class TDMPCModel(StateModel):
             scale = one - zero
             if spec.units is not None:  # of the policy's normalised actions
                 first, each = (torch.from_numpy(part) for part in spec.units)
-                zero, scale = zero + scale * first, scale * each
-            self.action_zero, self.action_scale = _fixed(zero), _fixed(scale)
+                zero = zero + scale * first
+                scale = scale * each
+            self.action_zero = _fixed(zero)
+            self.action_scale = _fixed(scale)
             if self.numbers:
                 ends = np.stack([np.zeros(self.numbers, np.float32), np.ones(self.numbers, np.float32)])
                 seen = {STATE: ends} | self._blank(2)
                 low, high = processing.prepare(seen, ["", ""])[STATE]
-                self.state_zero, self.state_scale = _fixed(low), _fixed(high - low)
+                self.state_zero = _fixed(low)
+                self.state_scale = _fixed(high - low)
 
     @property
     def learns(self) -> bool:
@@ -92,7 +97,8 @@ class TDMPCModel(StateModel):
 
     def _read(self, observations: Observations, shift: bool = False) -> dict[str, Tensor]:
         """Inputs of TD-MPC's encoder."""
-        device, batch = self.action_zero.device, {}
+        device = self.action_zero.device
+        batch = {}
         if self.image is not None:
             pixels = torch.from_numpy(np.ascontiguousarray(observations[self.camera])).to(device)
             images = pixels.permute(0, 3, 1, 2).float() / 255

@@ -56,7 +56,8 @@ class Trainer:
         self.serving = copy.deepcopy(world).requires_grad_(False).eval()
         self.count = 0
         self.rng = np.random.default_rng((seed, 1))
-        self._lr, self._steps = lr, steps
+        self._lr = lr
+        self._steps = steps
         self._generator = torch.Generator().manual_seed(seed)
         self._optimizer = torch.optim.AdamW(world.parameters(), lr=lr, weight_decay=WEIGHT_DECAY)
         self._labelled: Labelled | None = None
@@ -111,7 +112,9 @@ class Trainer:
         """Continues from a `state`."""
         self.world.load_state_dict(state["world"])
         self.serving.load_state_dict(state["serving"])
-        self.count, self.rng, self._labelled = state["count"], state["rng"], state["labelled"]
+        self.count = state["count"]
+        self.rng = state["rng"]
+        self._labelled = state["labelled"]
         self._generator.set_state(state["generator"])
         restore_optimizer(self._optimizer, state["optimizer"])
 
@@ -135,7 +138,8 @@ class Trainer:
         known = windows.known
         codes = torch.from_numpy(task_codes(windows.tasks))
         tasks = codes[:, None].expand(-1, known.shape[1], -1)[known]
-        recorded, imagined = windows.frames[known], replay(self.serving.model, windows)[known]
+        recorded = windows.frames[known]
+        imagined = replay(self.serving.model, windows)[known]
         success = windows.success[known]
         return Labelled(torch.cat([recorded, imagined]), tasks.repeat(2, 1), success.repeat(2))
 

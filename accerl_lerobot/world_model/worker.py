@@ -100,7 +100,8 @@ class RemoteStateLearner:
     """
 
     def __init__(self, actor: Any, learner: StateLearner, timeout_s: float) -> None:
-        self._actor, self._timeout_s = actor, timeout_s
+        self._actor = actor
+        self._timeout_s = timeout_s
         self._first_steps = learner.model.first_steps
         self._submitted = self._count = learner.count
         self._pending: deque[Any] = deque()  # calls without an answer, in their order
@@ -135,7 +136,8 @@ class RemoteStateLearner:
 
     def collect(self) -> list[dict[str, float]]:
         self._take()
-        made, self._made = self._made, []
+        made = self._made
+        self._made = []
         return made
 
     def publish(self, model: StateModel) -> None:
@@ -160,7 +162,8 @@ class RemoteStateLearner:
         self._pending.popleft()
         self._since = time.monotonic()
         self._made += learned.metrics
-        self._count, self._weights = learned.steps, learned.weights
+        self._count = learned.steps
+        self._weights = learned.weights
 
     def _answer(self, reference: Any) -> Any:
         return ray.get(reference, timeout=self._timeout_s)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Several ranks make the updates that one makes, and go on from each other's checkpoints.
 
-Ranks are processes that talk through gloo on the loopback, one group of 2 and one of 4 for the whole module;
+Ranks are processes that talk through gloo on the loopback, one group of 2 and one of 3 for the whole module;
 PyTorch's collectives are real, so is FSDP2.
 """
 
@@ -26,14 +26,14 @@ from tests.algorithms.linear import LinearAdapter
 from tests.rounding import assert_close
 
 TOLERANCE = 1e-4
-SHARDINGS = ("ddp", "zero2", "zero3")
-NAMES = tuple(sharded.cases())
 OF_A_PART = ("ess", "explained_variance", "log_ratio_p05", "log_ratio_p50", "log_ratio_p95")
 """No means over decisions: what is reported is the mean over parts of the batch, as with micro-batches."""
 OF_RATIOS = ("approx_kl", "clip_fraction", "low_weight")
 """Means over ratios; the same where decisions have different numbers of them."""
-GROUPS = {2: NAMES, 4: ("parts", "few", "layers")}
-RUNS = [(size, how, name) for size, names in GROUPS.items() for how in SHARDINGS for name in names]
+GROUPS = {2: ("whole", "broken", "counted", "forgetful", "layers"), 3: ("parts", "few")}
+RUNS = [
+    (size, how, name) for size, names in GROUPS.items() for name in names for how in sharded.shardings(name)
+]
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def alone() -> dict[str, dict[str, Any]]:
 
 @pytest.fixture(scope="module")
 def folder(alone: dict[str, dict[str, Any]], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Results of groups of 2 and of 4, from the beginning and from one rank's checkpoint."""
+    """Results of groups of 2 and of 3, from the beginning and from one rank's checkpoint."""
     directory = tmp_path_factory.mktemp("ranks")
     for name, result in alone.items():
         snapshot.save(directory / "alone" / name, result["half"])
@@ -133,14 +133,14 @@ def test_one_goes_on_from_the_checkpoint_of_ranks(made: Any, alone: dict[str, di
 def test_the_cases_meet_what_they_are_for(alone: dict[str, dict[str, Any]]):
     assert alone["broken"]["metrics"][-1]["skipped"] == 2
     assert any("logprob/mismatch_mean" in metrics for metrics in alone["whole"]["metrics"])
-    assert min(metrics["decisions"] for metrics in alone["few"]["metrics"]) == 1, "four ranks, one decision"
+    assert min(metrics["decisions"] for metrics in alone["few"]["metrics"]) == 1, "three ranks, one decision"
     whole = alone["whole"]["metrics"]
     assert all(metrics["value_grad_norm"] > 0.05 for metrics in whole), "clipped"
     assert all(metrics["grad_norm"] > 0.05 for metrics in whole[1:]), "clipped, once the policy learns"
 
 
-@pytest.mark.parametrize("ranks", [1, 2, 3, 4, 7])
-@pytest.mark.parametrize(("count", "size"), [(1, 1), (1, 5), (2, 1), (5, 2), (13, 3), (13, 100), (64, 4)])
+@pytest.mark.parametrize("ranks", [1, 2, 7])
+@pytest.mark.parametrize(("count", "size"), [(1, 5), (5, 2), (13, 3), (13, 100)])
 def test_every_row_is_somebodys_and_all_run_equally_often(count: int, size: int, ranks: int):
     rows = 100 + np.arange(count)
     shares = [split_rows(rows, size, rank, ranks) for rank in range(ranks)]

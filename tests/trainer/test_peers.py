@@ -39,49 +39,39 @@ class LightRank:
         return self.steps
 
 
-class Split:
-    """Rank 2 does something else than rank 1."""
-
-    def __init__(self, actor: Any, how: str) -> None:
-        self.step = self
-        self._actor, self._how = actor, how
-
-    def remote(self, _: str) -> Any:
-        return self._actor.step.remote(self._how)
-
-
 @pytest.fixture
-def peers(light_ray: None) -> Iterator[Callable[[str, str], Peers]]:
+def ranks_of(light_ray: None) -> Iterator[Callable[[int], list[Any]]]:
     actors: list[Any] = []
 
-    def make(first: str, second: str) -> Peers:
-        actors.extend(ray.remote(LightRank).options(num_cpus=0).remote() for _ in range(2))
+    def make(count: int) -> list[Any]:
+        actors.extend(ray.remote(LightRank).options(num_cpus=0).remote() for _ in range(count))
         ray.get([actor.made.remote() for actor in actors])
-        return Peers([Split(actors[-2], first), Split(actors[-1], second)], THREE, WAIT_S)
+        return actors
 
     yield make
     for actor in actors:
         ray.kill(actor)
 
 
-def test_they_have_done_it_when_the_first_goes_on(peers: Callable[[str, str], Peers]):
-    both = peers("fine", "fine")
+def test_they_have_done_it_when_the_first_goes_on(ranks_of: Callable[[int], list[Any]]):
+    actors = ranks_of(2)
     for _ in range(3):
-        with both.joining("step", ""):
+        with Peers(actors, THREE, WAIT_S).joining("step", "fine"):
             pass
-    assert [ray.get(actor._actor.made.remote()) for actor in both._actors] == [3, 3]
+    assert [ray.get(actor.made.remote()) for actor in actors] == [3, 3]
 
 
 @pytest.mark.parametrize(
     ("how", "error"), [("fails", "the gradient fell over"), ("dies", "died"), ("hangs", "Get timed out")]
 )
-def test_a_rank_that_is_lost_ends_the_wait(peers: Callable[[str, str], Peers], how: str, error: str):
-    with pytest.raises(ray.exceptions.RayError, match=error), peers("fine", how).joining("step", ""):
+def test_a_rank_that_is_lost_ends_the_wait(ranks_of: Callable[[int], list[Any]], how: str, error: str):
+    peers = Peers(ranks_of(1), THREE, WAIT_S)
+    with pytest.raises(ray.exceptions.RayError, match=error), peers.joining("step", how):
         pass
 
 
-def test_an_error_of_the_first_is_its_own(peers: Callable[[str, str], Peers]):
-    with pytest.raises(KeyError, match="mine"), peers("hangs", "hangs").joining("step", ""):
+def test_an_error_of_the_first_is_its_own(ranks_of: Callable[[int], list[Any]]):
+    with pytest.raises(KeyError, match="mine"), Peers(ranks_of(1), THREE, WAIT_S).joining("step", "hangs"):
         raise KeyError("mine")
 
 

@@ -16,7 +16,6 @@ from accerl_lerobot.algorithms import GIPOConfig
 from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import PRETRAINED, TRAINING_STATE
-from accerl_lerobot.errors import NonFiniteError
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies import loading
 from accerl_lerobot.policies.config import PolicyConfig
@@ -52,14 +51,14 @@ class NotingPublisher(WeightPublisher):
 class Stage:
     """A trainer, a replay that counts what it is asked for, and a publisher that keeps what it is given."""
 
-    def __init__(self, batches: int = 1000, directory: Path | None = None, **config: Any) -> None:
+    def __init__(self, batches: int = 1000, **config: Any) -> None:
         self.asked: list[tuple[int, int]] = []
         self.replay = handle(sample=self._sample, learnt=lambda: None)
         self._batches = batches
         defaults = {"updates": 6, "batch_decisions": 7, "warmup_updates": 0, "value_warmup_updates": 0}
         trainer = TrainerConfig(**{**defaults, **config})
         settings = LearnerSettings(PolicyConfig(path="nowhere"), GIPOConfig(), trainer, 0)
-        self.worker = TrainerWorker(settings, directory=directory)
+        self.worker = TrainerWorker(settings)
         self.received = self.worker._publisher.received  # type: ignore[attr-defined]
 
     def run(self) -> int:
@@ -93,43 +92,6 @@ def test_it_makes_its_updates_publishes_each_and_draws_no_batch_more():
     version, (newest,) = stage.worker.newer_than("inference", -1)
     assert version == 6 and any(not np.array_equal(stage.received[0][1][name], last[name]) for name in last)
     assert all(np.array_equal(newest[name], last[name]) for name in last)
-
-
-def test_weights_held_back_are_published_late_and_the_last_at_once():
-    stage = Stage(updates=6, hold_back=2)
-    weights: list[dict[str, Any]] = []
-    step = stage.worker._update.step
-
-    def watched(segments: list[Segment]) -> dict[str, float]:
-        metrics = step(segments)
-        weights.append(stage.worker._update.adapter.export_trainable())
-        return metrics
-
-    stage.worker._update.step = watched  # type: ignore[method-assign]
-    stage.run()
-    assert [version for version, _ in stage.received] == [0, 1, 2, 3, 6]
-    for version, tensors in stage.received[1:]:
-        assert all(np.array_equal(tensors[k], weights[version - 1][k]) for k in tensors)
-
-
-def test_a_batch_that_nothing_can_be_learnt_from_is_kept(tmp_path: Path):
-    stage = Stage(updates=9, directory=tmp_path)
-    good = stage._sample
-
-    def sample(decisions: int, version: int) -> list[Segment]:
-        segments = good(decisions, version)
-        for segment in segments if version >= 2 else []:
-            segment.reward[0] = np.nan
-        return segments
-
-    stage.replay = handle(sample=sample, learnt=lambda: None)
-    with pytest.raises(NonFiniteError, match=r"5 steps in a row.*its batch is in .*nonfinite-000007\.json"):
-        stage.run()
-    kept = snapshot.load(tmp_path / "nonfinite-000007")
-    assert kept["update"] == 7 and "loss nan" in kept["said"]
-    assert [segment.key for segment in kept["segments"]] == ["7.0", "7.1"]
-    assert np.isnan(kept["segments"][0].reward[0])
-    assert [record["update"] for record in stage.worker.metrics()] == [1, 2, 3, 4, 5, 6]
 
 
 def test_a_closed_replay_ends_it_early():

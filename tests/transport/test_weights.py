@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from accerl_lerobot.transport import weights
-from accerl_lerobot.transport.weights import PublishDelay, Tensors, WeightPublisher
+from accerl_lerobot.transport.weights import Tensors, WeightPublisher
 
 
 def copied(tensors: Tensors) -> Tensors:
@@ -46,17 +46,3 @@ def test_flush_waits_until_each_replica_has_applied_the_newest(monkeypatch: pyte
         publisher.flush(0.1)
     threading.Timer(0.05, publisher.newer_than, ("inference 1", 1)).start()
     publisher.flush(30)
-
-
-@pytest.mark.parametrize(
-    ("updates", "published"),
-    [(0, [[0], [1], [2], [3], [4], [5], [6]]), (2, [[0], [], [], [1], [2], [3], [6]])],
-)
-def test_each_version_comes_so_many_updates_late_and_the_last_at_once(
-    updates: int, published: list[list[int]]
-):
-    delay = PublishDelay(updates)
-    for version, expected in enumerate(published):
-        due = delay.push(version, {"w": np.full(1, version)}, last=version == 6)
-        assert [number for number, _ in due] == expected
-        assert all(int(tensors["w"][0]) == number for number, tensors in due)

@@ -12,8 +12,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from accerl_lerobot.world_model.check import auroc, check, choose_threshold, donors, replay_scores
 from accerl_lerobot.world_model.contract import Context, LearnableWorldModel, Prediction, State
+from accerl_lerobot.world_model.pretrain import auroc, check, choose_threshold, donors, replay_scores
 from tests.world_model.test_pixels import SIZE, SPEC, K, dots, drawn, ending_on_the_right
 
 
