@@ -10,20 +10,18 @@ from typing import Any
 
 from accerl_lerobot.cli import exit_code, guarded, help_asked, set_up_logging
 from accerl_lerobot.cli.verbs import tell
-from accerl_lerobot.config.help import brief, help_text
+from accerl_lerobot.config.help import help_text
 from accerl_lerobot.config.parsing import parse
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError
 from benchmarks.async_vs_sync import BenchAsyncVsSyncConfig
-from benchmarks.efficiency import BenchEfficiencyConfig
 from benchmarks.environment import BenchEnvironmentConfig
 from benchmarks.faults import BenchFaultsConfig
-from benchmarks.few_shot import BenchFewShotConfig
 from benchmarks.gpu import BenchGpuConfig
-from benchmarks.lag import BenchLagConfig
 from benchmarks.latency import BenchLatencyConfig
 from benchmarks.policy import BenchPolicyConfig
 from benchmarks.scaling import BenchScalingConfig
+from benchmarks.study import BenchStudyConfig
 from benchmarks.third_party import BenchThirdPartyConfig
 from benchmarks.throughput import BenchThroughputConfig
 from benchmarks.transport import BenchTransportConfig
@@ -32,9 +30,7 @@ CONFIGS: dict[str, type[Any]] = {
     "environment": BenchEnvironmentConfig,
     "policy": BenchPolicyConfig,
     "throughput": BenchThroughputConfig,
-    "few_shot": BenchFewShotConfig,
-    "lag": BenchLagConfig,
-    "efficiency": BenchEfficiencyConfig,
+    "study": BenchStudyConfig,
     "faults": BenchFaultsConfig,
     "async_vs_sync": BenchAsyncVsSyncConfig,
     "latency": BenchLatencyConfig,
@@ -46,9 +42,15 @@ CONFIGS: dict[str, type[Any]] = {
 """Module with a function ``bench_NAME`` and a ``table`` of what it returns → its fields."""
 
 
+def brief(name: str) -> str:
+    """The first sentence of a benchmark's module, on one line, without its period."""
+    doc = sys.modules[f"benchmarks.{name}"].__doc__ or ""
+    return doc.partition("\n\n")[0].replace("\n", " ").rstrip(".")
+
+
 def usage() -> str:
     """The list of all benchmarks."""
-    lines = [f"  {name:14} {brief(config).rstrip('.')}" for name, config in CONFIGS.items()]
+    lines = [f"  {name:14} {brief(name)}" for name in CONFIGS]
     return "\n".join(["usage: python -m benchmarks NAME [--field=value …]", "", *lines])
 
 
@@ -57,11 +59,9 @@ def run(name: str, rest: list[str]) -> int:
     set_up_logging()
     if name not in CONFIGS:
         raise InputError("NAME", name, f"use one of {', '.join(CONFIGS)}")
-    if (section := help_asked(rest)) is not None:
-        config_class = CONFIGS[name]
-        text = help_text(
-            f"python -m benchmarks {name}", config_class, brief(config_class).rstrip("."), section
-        )
+    section = help_asked(rest)
+    if section is not None:
+        text = help_text(f"python -m benchmarks {name}", CONFIGS[name], brief(name), section)
         sys.stdout.write(f"{text}\n")
         return 0
     with guarded():

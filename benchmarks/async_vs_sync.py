@@ -29,9 +29,8 @@ from accerl_lerobot.evaluation import Rate, drawing, evaluation_plans
 from accerl_lerobot.replay.buffer import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, Schedule
 from benchmarks.latency import TRACE
 from benchmarks.machinery import MOST_BUSY, MachineryConfig
-from benchmarks.records import as_markdown, output_folder, write
 from benchmarks.simulated_environment import read_trace
-from benchmarks.tables import as_table, host, ranged, spread
+from benchmarks.tables import as_markdown, as_table, host, output_folder, ranged, spread, write
 from benchmarks.throughput import ARMS, Block
 
 LEARNING = MachineryConfig(environments=4, latency_ms=4.0, image_size=16, decide_ms=1.0, update_ms=8.0)
@@ -164,12 +163,13 @@ def _learning(config: BenchAsyncVsSyncConfig, console: Console) -> dict[str, Any
     with console.stage("learning", total=len(ARMS) * len(config.seeds)) as stage:
         for seed in config.seeds:
             for arm in ARMS:
-                found[arm].append(_success(config.learning_updates, arm, seed))
+                found[arm].append(success(config.learning_updates, arm, seed))
                 stage.update(sum(map(len, found.values())), f"{arm} {found[arm][-1]:.0%}")
     return {"success": found, "n": TRIALS, "updates": config.learning_updates, "seeds": list(config.seeds)}
 
 
-def _success(updates: int, arm: Schedule, seed: int) -> float:
+def success(updates: int, arm: Schedule, seed: int) -> float:
+    """Success after so many updates under a schedule."""
     from accerl_lerobot.engines.ray_engine import RayEngine
 
     run = LEARNING.run_config(updates=updates, seed=seed)

@@ -33,9 +33,7 @@ from accerl_lerobot.evaluation import Rate
 from benchmarks.audit import audit_segments, audit_updates
 from benchmarks.hits import FAULTS, START_S, TIDY_S, places, strike
 from benchmarks.light_run import light_config
-from benchmarks.records import as_markdown, write
-from benchmarks.study import last_words
-from benchmarks.tables import as_table, host
+from benchmarks.tables import as_markdown, as_table, host, last_words, write
 from benchmarks.victims import CLASSES, DRIVER, EVERYTHING, LIGHT, TRAIN, Victim, alive
 
 IMAGINING = "world-model learning"

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Everything that needs a GPU to be known, in one command: ``make gpu-check``.
 
-SmolVLA of its published size decides and learns in both precisions: seconds, memory beside its estimate, and
+SmolVLA of its published size decides and learns in both precisions: seconds, memory, and
 how far its log-probs are from each other at equal weights. Then recipes/gipo.yaml is trained for a few
 updates with trainer and inference on the GPU, so that weights travel from one to the other; and once more by
 two ranks where there are two GPUs.
@@ -22,10 +22,8 @@ from rich.table import Table
 from accerl_lerobot.config.ranges import Device, Range, Repeats, Section
 from accerl_lerobot.console import Console
 from accerl_lerobot.policies.config import TuningConfig
-from benchmarks.footprint import PolicyMemory
 from benchmarks.policy import BenchPolicyConfig, bench_policy
-from benchmarks.records import as_markdown, output_folder, write
-from benchmarks.tables import as_table, host
+from benchmarks.tables import as_markdown, as_table, host, output_folder, write
 
 COLUMNS = ("check", "result")
 GIB = 2**30
@@ -112,12 +110,13 @@ def _rows(result: dict[str, Any]) -> list[list[str]]:
     rows = []
     batch = result["config"]["batch"]
     for precision, found in result["policies"].items():
-        name, seconds, gap = f"SmolVLA, {precision}", found["seconds"], found["mismatch"]
-        memory = PolicyMemory(**found["estimate"])
+        name = f"SmolVLA, {precision}"
+        seconds = found["seconds"]
+        gap = found["mismatch"]
         for part in ("decide", "score", "update"):
             rows.append([f"{name}: {part} {batch}", f"{batch / seconds[part]['median']:.2g} decisions/s"])
-        taken, estimated = found["memory_gb"]["updated"] * 1e9 / GIB, memory.trainer(batch) / GIB
-        rows.append([f"{name}: memory of an update", f"{taken:.1f} GiB, estimated {estimated:.1f}"])
+        taken = found["memory_gb"]["updated"] * 1e9 / GIB
+        rows.append([f"{name}: memory of an update", f"{taken:.1f} GiB"])
         text = (
             f"{gap['mean']:.1e} nats, at most {gap['max']:.1e}; {gap['clip']:.0%} of ratios outside 1 ± 0.2"
         )

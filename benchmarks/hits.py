@@ -19,7 +19,7 @@ from pathlib import Path
 from accerl_lerobot.errors import MAX_NONFINITE
 from benchmarks.audit import audit_updates
 from benchmarks.fault_injection import FULL, NAN, POINTS, TORN, inject, proof, withdraw
-from benchmarks.study import last_words
+from benchmarks.tables import last_words
 from benchmarks.victims import DRIVER, EVERYTHING, Victim, alive, await_hit, hit
 
 SIGNALS = {"kill": signal.SIGKILL, "stop": signal.SIGSTOP}

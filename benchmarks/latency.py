@@ -19,8 +19,7 @@ from accerl_lerobot.config.ranges import Range, Section, Seed
 from accerl_lerobot.console import Console
 from accerl_lerobot.envs import EnvConfig, Environment, MetaWorldConfig, make_environment
 from accerl_lerobot.seeds import train_seed
-from benchmarks.records import output_folder
-from benchmarks.tables import as_table, host
+from benchmarks.tables import as_table, host, output_folder
 
 TRACE = "trace.txt"
 RESET = "reset"  # first word of a trace's lines about resets

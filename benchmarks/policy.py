@@ -10,7 +10,6 @@ import resource
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -49,8 +48,6 @@ class BenchPolicyConfig(Section):
     """cpu, cuda, or auto."""
     imitates: bool = False
     """Learn by LeRobot's imitation loss, as off-policy algorithms do, instead of by a likelihood ratio."""
-    memory_only: bool = False
-    """Estimate the memory as ``accerl doctor`` does, and run nothing: for policies too large to run here."""
     repeats: Repeats = 3
     """Times each part is measured after a first one that does not count."""
 
@@ -61,34 +58,29 @@ def bench_policy(config: BenchPolicyConfig) -> dict[str, Any]:
     Returns:
         ``parameters`` (all, trained), ``seconds`` (build; then median, min, max of decide_one, decide, score
         and update), ``memory_gb`` after each stage, ``mismatch`` at equal weights (mean and largest
-        |Δ log-prob| of a decision in nats, share of chunk ratios outside 1 ± 0.2), ``estimate``, the bytes of
-        `footprint.PolicyMemory`, ``config`` and ``host``. Seconds, memory and mismatch are absent with
-        ``memory_only``.
+        |Δ log-prob| of a decision in nats, share of chunk ratios outside 1 ± 0.2), ``config`` and ``host``.
     """
     import numpy as np
     import torch
 
     from accerl_lerobot.experience import TASK, Request, stack_observations
     from accerl_lerobot.policies.loading import resolve_device, sizes_of
-    from accerl_lerobot.policies.untrusted import Unfilled
     from accerl_lerobot.testing import stored
-    from benchmarks.footprint import policy_memory
 
-    device = resolve_device("cpu" if config.memory_only else config.device, "device")
+    device = resolve_device(config.device, "device")
     on = torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu"
     seconds: dict[str, Any] = {}
     memory: dict[str, float] = {}
     started = time.perf_counter()
-    with tempfile.TemporaryDirectory() as directory, Unfilled() if config.memory_only else nullcontext():
+    with tempfile.TemporaryDirectory() as directory:
         adapter = _adapter(config, device, Path(directory))
-    seconds["build"], sizes = time.perf_counter() - started, sizes_of(adapter)
+    seconds["build"] = time.perf_counter() - started
+    sizes = sizes_of(adapter)
     result = {
         "config": asdict(config),
         "parameters": {"all": sizes.policy, "trained": sizes.trained},
         "host": host() | {"device": on, "threads": torch.get_num_threads()},
     }
-    if config.memory_only:
-        return result | {"estimate": policy_memory(adapter, imitates=config.imitates)._asdict()}
 
     def measure(name: str, work: Callable[[], Any]) -> None:
         times = []
@@ -141,7 +133,6 @@ def bench_policy(config: BenchPolicyConfig) -> dict[str, Any]:
             "max": float(gap.max()),
             "clip": float(clipped.float().mean()),
         },
-        "estimate": policy_memory(adapter, imitates=config.imitates)._asdict(),
     }
 
 
@@ -157,25 +148,19 @@ def _peak_gb(device: Any) -> float:
 
 
 def table(result: dict[str, Any]) -> Table:
-    from benchmarks.footprint import PolicyMemory
-
-    config, parameters, batch = result["config"], result["parameters"], result["config"]["batch"]
+    config = result["config"]
+    parameters = result["parameters"]
+    batch = config["batch"]
     millions = [f"{parameters[which] / 1e6:,.0f} M" for which in ("all", "trained")]
     title = f"{config['type']} {config['precision']}, {config['tuning']['mode']}: {millions[0]} parameters, "
     title += f"{millions[1]} trained, on {result['host']['device']}"
-    rows = []
-    if "seconds" in result:
-        rows.append(("build", f"{result['seconds']['build']:.1f}", ""))
-        for name, count in (("decide_one", 1), ("decide", batch), ("score", batch), ("update", batch)):
-            seconds = result["seconds"][name]
-            rows.append((f"{name} ({count})", ranged(seconds, ".3f"), f"{count / seconds['median']:.1f}"))
-        rows += [(f"memory, {stage}", f"{size:.1f} GB", "") for stage, size in result["memory_gb"].items()]
-        gap = result["mismatch"]
-        rows.append(("mismatch at equal weights", f"{gap['mean']:.1e} nats, at most {gap['max']:.1e}", ""))
-    memory = PolicyMemory(**result["estimate"])
-    shown = {"estimate, weights": memory.weights, "weights, gradients, Adam": memory.trainer(0)}
-    shown |= {"for each decision to make": memory.acting, "for each to learn from": memory.learning}
-    rows += [(name, f"{size / 2**30:.2f} GiB", "") for name, size in shown.items()]
+    rows = [("build", f"{result['seconds']['build']:.1f}", "")]
+    for name, count in (("decide_one", 1), ("decide", batch), ("score", batch), ("update", batch)):
+        seconds = result["seconds"][name]
+        rows.append((f"{name} ({count})", ranged(seconds, ".3f"), f"{count / seconds['median']:.1f}"))
+    rows += [(f"memory, {stage}", f"{size:.1f} GB", "") for stage, size in result["memory_gb"].items()]
+    gap = result["mismatch"]
+    rows.append(("mismatch at equal weights", f"{gap['mean']:.1e} nats, at most {gap['max']:.1e}", ""))
     return as_table(title, ("part", "seconds (range)", "decisions/s"), rows)
 
 

@@ -22,9 +22,8 @@ from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.replay.buffer import ASYNCHRONOUS
 from benchmarks.machinery import MOST_BUSY, MachineryConfig
-from benchmarks.records import as_markdown, output_folder, write
 from benchmarks.simulated_environment import read_trace
-from benchmarks.tables import as_table, host, ranged, spread
+from benchmarks.tables import as_markdown, as_table, host, output_folder, ranged, spread, write
 from benchmarks.throughput import Block
 
 

@@ -1,21 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many runs of one recipe, to be compared: every seed is warm-started once, and each cell begins there.
+"""Runs of one recipe, to be compared: arms and settings from the same SFT policies, over several seeds.
+
+    python -m benchmarks study --recipe=recipes/gipo.yaml --updates=200 \\
+      --arms='[--algorithm.type=gipo, --algorithm.type=ppo]' \\
+      --settings='[--trainer.hold_back=0, --trainer.hold_back=16]'
 
 Runs are in the single-process engine, each on one thread, where lag is what settings make it and not what
-else the machine is doing. Finished runs are kept: the same command continues a study that was stopped. Other
-settings need another folder.
+else the machine is doing. Finished runs are kept: the same command continues a study that was stopped, and
+adds seeds, arms or settings to one that is finished. Another recipe needs another folder.
 """
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
+import re
+import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -27,27 +34,31 @@ from accerl_lerobot.config.ranges import Range, Section, Seed, Steps
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.record import REPO_ID
 from accerl_lerobot.engines.config import RunConfig, encode, parse
-from accerl_lerobot.errors import InputError, expanded
 from accerl_lerobot.evaluation import Rate, drawing
-from benchmarks.records import mean_interval
-from benchmarks.tables import as_table
+from benchmarks.tables import as_markdown, as_table, last_words, mean_interval, named, output_folder, write
 
-INTERVALS = "intervals are 95 %, over seeds where there are several"
-"""For people, see `together`."""
-LOG_LINES = 12
-"""Log lines of a failed run that its error shows."""
+NOTE = "intervals are 95 %, over policies where there are several"
+NUMBERS = ("episodes_explored", "env_steps", "updates", "lag_mean", "rl_s")
+"""Fields of a run's summary that a study keeps."""
+ALL = "all starts"
 
 
 @dataclass(frozen=True, kw_only=True)
-class StudyConfig(Section):
-    """Fields that all studies have."""
+class BenchStudyConfig(Section):
+    """Fields of ``python -m benchmarks study``. An arm, setting or start is options, separated by spaces."""
 
     recipe: str = "recipes/gipo.yaml"
-    """The run that every cell is a variation of; read once, when the study starts."""
+    """The run that every cell is a variation of."""
     output_dir: str = "outputs/study"
-    """Folder of the runs and of what they say together; finished runs in it are kept."""
+    """Folder of the runs and of study.json, .md and .png; finished runs in it are kept."""
+    starts: tuple[str, ...] = ("",)
+    """Options of demonstrations and SFT, such as a task; each has an SFT policy of its own for each seed."""
+    arms: tuple[str, ...] = ("",)
+    """Options that are compared: rows of the table, lines of the picture."""
+    settings: tuple[str, ...] = ("",)
+    """Options that every arm is tried with: columns of the table, places of the picture."""
     seeds: tuple[Seed, ...] = (0, 1, 2)
-    """Each a warm start of its own."""
+    """Each with demonstrations, an SFT policy and evaluation starts of its own."""
     updates: Steps | None = None
     """Updates of each cell; None: the recipe's."""
     episodes: Annotated[int, Range("[1, 1000000]")] = 100
@@ -57,227 +68,220 @@ class StudyConfig(Section):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        named(self, "seeds")
+        named(self, "starts", "arms", "settings", "seeds")
 
 
-def named(config: Any, name: str) -> None:
-    """Refuses a list that is empty, or names something twice."""
-    values = getattr(config, name)
-    if not values or len(set(values)) < len(values):
-        raise InputError(name, values, "name at least one, none of them twice")
+class Cell(NamedTuple):
+    """One run of a study, in the order in which they are made."""
 
-
-@dataclass(frozen=True, kw_only=True)
-class Cell:
-    """One run of a study."""
-
-    name: str
-    """Name of its folder."""
+    start: str
     seed: int
-    of: dict[str, Any]
-    """Values that distinguish it from the others of its seed, for people."""
-    chosen: tuple[str, ...]
-    """Arguments that it adds to the command line."""
-
-
-class Results(NamedTuple):
-    """Summaries of the runs of a study."""
-
-    starts: dict[int, dict[str, Any]]
-    """Summary of each seed's warm start."""
-    cells: list[tuple[Cell, dict[str, Any]]]
-    """Each with its summary."""
+    setting: str
+    arm: str
 
     @property
-    def before(self) -> dict[str, float]:
-        """Success of each seed's warm start."""
-        return {str(seed): summary["success_after"] for seed, summary in self.starts.items()}
+    def folder(self) -> str:
+        return _folder(self.start, self.arm, self.setting, f"seed{self.seed}")
 
-    def table(self, shown: Sequence[str]) -> list[dict[str, Any]]:
-        """Table of the cells: their values, seed, success and n, and these fields of the summary."""
-        return [
-            cell.of
-            | {"seed": cell.seed, "success": summary["success_after"], "n": summary["n_after"]}
-            | {key: summary[key] for key in shown}
-            for cell, summary in self.cells
-        ]
+    @property
+    def start_folder(self) -> str:
+        """Folder of the run that makes its SFT policy."""
+        return _folder("start", self.start, f"seed{self.seed}")
 
 
-def pooled(rows: Sequence[dict[str, Any]]) -> Rate:
-    """All episodes of some rows of `Results.table`, as if one policy had played them."""
-    successes = sum(round(row["success"] * row["n"]) for row in rows)
-    return Rate(successes=successes, n=sum(row["n"] for row in rows))
+def _folder(*parts: str) -> str:
+    words = "-".join(part.replace("--", "") for part in parts if part)
+    return re.sub(r"[^\w.=-]+", "_", words)
 
 
-def together(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Successes and episodes of some rows of `Results.table`, one per seed.
+def bench_study(config: BenchStudyConfig) -> dict[str, Any]:
+    """Runs what is missing, and compares all of it.
 
     Returns:
-        ``successes`` and ``n`` of all, ``by_seed``, the success of each, and ``ci95`` of their mean. That is
-        `mean_interval` over seeds, where there are several, and never narrower than if one policy had played
-        all episodes: seeds may be alike by chance.
+        ``config``, ``cells`` (one per run) and ``groups`` (one per start, arm and setting, see `together`).
     """
-    rate, by_seed = pooled(rows), [row["success"] for row in rows]
-    of = [rate.interval()] + ([mean_interval(by_seed)] if len(rows) > 1 else [])
-    ci95 = (max(0.0, min(i.low for i in of)), min(1.0, max(i.high for i in of)))
-    return {"successes": rate.successes, "n": rate.n, "by_seed": by_seed, "ci95": ci95}
+    from accerl_lerobot.run.preflight import check_start
+
+    console = Console()
+    root = output_folder(config.output_dir).resolve()
+    cells = list(itertools.starmap(Cell, itertools.product(
+        config.starts, config.seeds, config.settings, config.arms
+    )))  # fmt: skip
+    starts = {}
+    runs = {}
+    for cell in cells:
+        made = root / cell.start_folder
+        if made not in starts:
+            starts[made] = _start(config, cell, made)
+        runs[root / cell.folder] = _run(config, cell, starts[made], made, root / cell.folder)
+    for folder, start in starts.items():
+        check_start(replace(start, resume=folder.exists()))  # a run that is there is resumed
+    _do("SFT policies", starts, config.jobs, console)
+    _do("cells", runs, config.jobs, console)
+    rows = [_row(root, cell) for cell in cells]
+    result = {"config": asdict(config), "cells": rows, "groups": groups(config, rows)}
+    write(root, "study", result, markdown(result), draw)
+    console.say(f"wrote study.json, .md and .png into {root}")
+    return result
 
 
-def rated(group: dict[str, Any]) -> str:
-    """Rate, interval and n of what `together` gives, and each seed's success."""
-    seeds = " ".join(f"{100 * s:.0f}" for s in group["by_seed"])
-    low, high = (100 * end for end in group["ci95"])
-    rate = 100 * group["successes"] / group["n"]
-    return f"{rate:.1f} % [{low:.1f}, {high:.1f}] n={group['n']} ({seeds})"
+def _start(config: BenchStudyConfig, cell: Cell, folder: Path) -> RunConfig:
+    """The run that makes an SFT policy; it pins the revision of a policy that is given."""
+    from accerl_lerobot.policies.loading import pinned
+
+    options = ["--trainer.updates=0", "--imagination.environments=0"]
+    run = _parsed(config, cell, folder, options)
+    return run if run.policy.path is None else replace(run, policy=pinned(run.policy))
 
 
-def tabled(
-    title: str, result: dict[str, Any], columns: Sequence[str], rows: Sequence[Sequence[str]]
-) -> Table:
-    """Rows for people; the title ends with the success of each warm start, and what intervals are."""
-    starts = ", ".join(f"{s:.0%}" for s in result["starts"].values())
-    return as_table(f"{title} {starts}; {INTERVALS}", columns, rows)
+def _run(config: BenchStudyConfig, cell: Cell, start: RunConfig, made: Path, folder: Path) -> RunConfig:
+    """A cell's run; `made` is the folder of the run that makes its SFT policy."""
+    options = [*shlex.split(cell.setting), *shlex.split(cell.arm)]
+    if config.updates is not None:
+        options.append(f"--trainer.updates={config.updates}")
+    if start.policy.revision is not None:
+        options.append(f"--policy.revision={start.policy.revision}")
+    if start.policy.path is None:
+        checkpoint = made / CHECKPOINTS / LAST / PRETRAINED
+        options += ["--sft.steps=0", f"--policy.path={checkpoint}"]
+        if start.dataset.repo_id is None:
+            options += [f"--dataset.repo_id={REPO_ID}", f"--dataset.root={made / DEMOS}"]
+    return _parsed(config, cell, folder, options)
 
 
-def draw_lines(
-    path: Path,
-    result: dict[str, Any],
-    key: str,
-    names: Sequence[str],
-    places: Callable[[float], list[float]],
-    dress: Callable[[Any], object],
-) -> None:
-    """Success, one line per name with its 95 % interval, one dot per seed.
-
-    `places` gives x of a line that lies so many lines from the middle one; `dress` labels the axes.
-    """
-    with drawing(path) as axes:
-        for i, name in enumerate(names):
-            groups = [g for g in result["groups"] if g[key] == name]
-            x = places(i - (len(names) - 1) / 2)
-            y = [g["successes"] / g["n"] for g in groups]
-            low = [max(0.0, rate - g["ci95"][0]) for rate, g in zip(y, groups, strict=True)]
-            high = [max(0.0, g["ci95"][1] - rate) for rate, g in zip(y, groups, strict=True)]
-            axes.errorbar(x, y, yerr=[low, high], marker="o", capsize=3, color=f"C{i}", label=name)
-            for place, group in zip(x, groups, strict=True):
-                seeds = group["by_seed"]
-                axes.scatter([place] * len(seeds), seeds, s=12, color=f"C{i}", alpha=0.4, linewidths=0)
-        start = sum(result["starts"].values()) / len(result["starts"])
-        axes.axhline(start, color="0.6", ls="--", lw=1, label="before")
-        axes.set(ylabel="success", ylim=(-0.02, 1.02))
-        dress(axes)
+def _parsed(config: BenchStudyConfig, cell: Cell, folder: Path, options: list[str]) -> RunConfig:
+    fixed = [
+        f"--config_path={config.recipe}",
+        f"--seed={cell.seed}",
+        "--launch.engine=local",
+        "--trainer.num_threads=1",
+        "--sft.num_threads=1",
+        "--evaluation.before=false",
+        f"--evaluation.episodes={config.episodes}",
+        "--evaluation.every_updates=0",
+        "--evaluation.videos=0",
+        f"--output_dir={folder}",
+    ]
+    run: RunConfig = parse(RunConfig, [*fixed, *shlex.split(cell.start), *options])
+    return run
 
 
-class Study:
-    """The runs of a study, all of them settled before the first one starts."""
-
-    def __init__(self, config: StudyConfig, cells: Sequence[Cell], common: Sequence[str] = ()) -> None:
-        self.config, self.root = config, expanded(config.output_dir, "output_dir").resolve()
-        self.common = list(common)
-        self.cells = list(cells)
-        policy = self._parse(config.seeds[0], [], self.root).policy
-        if policy.path is not None:
-            from accerl_lerobot.policies.loading import pinned
-
-            if revision := pinned(policy).revision:
-                self.common.append(f"--policy.revision={revision}")
-        self.starts = {
-            seed: self._parse(seed, ["--trainer.updates=0", "--imagination.environments=0"], self.start(seed))
-            for seed in config.seeds
-        }
-        self.runs = [self._of(cell) for cell in self.cells]
-
-    def start(self, seed: int) -> Path:
-        """The folder of a seed's warm start."""
-        return self.root / f"start-seed{seed}"
-
-    def folder(self, cell: Cell) -> Path:
-        """The folder of a cell's run."""
-        return self.root / cell.name
-
-    def run(self, console: Console) -> Results:
-        """Does the runs that are missing."""
-        from accerl_lerobot.run.preflight import check_start
-
-        for seed, start in self.starts.items():
-            check_start(replace(start, resume=self.start(seed).exists()))  # a run that is there is resumed
-        self._do("warm starts", {self.start(seed): start for seed, start in self.starts.items()}, console)
-        folders = [self.folder(cell) for cell in self.cells]
-        self._do("cells", dict(zip(folders, self.runs, strict=True)), console)
-        return Results(
-            {seed: _summary(self.start(seed)) for seed in self.config.seeds},
-            [(cell, _summary(folder)) for cell, folder in zip(self.cells, folders, strict=True)],
-        )
-
-    def _do(self, name: str, runs: dict[Path, RunConfig], console: Console) -> None:
-        """Does the runs that have no summary yet, some at a time."""
-        missing = [(folder, run) for folder, run in runs.items() if not (folder / SUMMARY).is_file()]
-        with console.stage(name, total=len(runs)) as stage, ThreadPoolExecutor(self.config.jobs) as pool:
-            done = len(runs) - len(missing)
+def _do(name: str, runs: dict[Path, RunConfig], jobs: int, console: Console) -> None:
+    """Does the runs that have no summary yet, some at a time."""
+    missing = [(folder, run) for folder, run in runs.items() if not (folder / SUMMARY).is_file()]
+    done = len(runs) - len(missing)
+    with console.stage(name, total=len(runs)) as stage, ThreadPoolExecutor(jobs) as pool:
+        stage.update(done)
+        for _ in pool.map(lambda run: train(*run), missing):
+            done += 1
             stage.update(done)
-            for _ in pool.map(lambda run: _train(*run), missing):
-                done += 1
-                stage.update(done)
-
-    def _of(self, cell: Cell) -> RunConfig:
-        chosen = list(cell.chosen)
-        if self.config.updates is not None:
-            chosen.append(f"--trainer.updates={self.config.updates}")
-        if self.starts[cell.seed].policy.path is None:
-            checkpoint = self.start(cell.seed) / CHECKPOINTS / LAST / PRETRAINED
-            chosen += ["--sft.steps=0", f"--policy.path={checkpoint}"]
-            if self.starts[cell.seed].dataset.repo_id is None:
-                root = self.start(cell.seed) / DEMOS
-                chosen += [f"--dataset.repo_id={REPO_ID}", f"--dataset.root={root}"]
-        return self._parse(cell.seed, chosen, self.folder(cell))
-
-    def _parse(self, seed: int, chosen: list[str], folder: Path) -> RunConfig:
-        config: RunConfig = parse(
-            RunConfig,
-            [
-                f"--config_path={self.config.recipe}",
-                f"--seed={seed}",
-                "--launch.engine=local",
-                "--trainer.num_threads=1",
-                "--sft.num_threads=1",
-                "--evaluation.before=false",
-                f"--evaluation.episodes={self.config.episodes}",
-                "--evaluation.every_updates=0",
-                "--evaluation.videos=0",
-                f"--output_dir={folder}",
-                *self.common,
-                *chosen,
-            ],
-        )
-        return config
 
 
-def _train(folder: Path, config: RunConfig) -> None:
+def train(folder: Path, config: RunConfig) -> None:
     """Runs ``accerl train``; resumes a run that was stopped."""
     command = [sys.executable, "-m", "accerl_lerobot.cli", "train"]
     if (folder / CHECKPOINTS).is_dir():
         command += ["--resume=true", f"--config_path={folder / CONFIG}"]
     else:
         shutil.rmtree(folder, ignore_errors=True)
-        recipe = folder.with_suffix(".yaml")
-        recipe.parent.mkdir(parents=True, exist_ok=True)
+        recipe = folder.with_name(f"{folder.name}.yaml")
         recipe.write_text(yaml.safe_dump(encode(config), sort_keys=False))
         command.append(f"--config_path={recipe}")
-    log = folder.with_suffix(".log")
+    log = folder.with_name(f"{folder.name}.log")
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE"}
     with log.open("ab") as out:
-        threads = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE"}
-        code = subprocess.run(
-            command, stdout=out, stderr=out, env=os.environ | threads, check=False
-        ).returncode
-    if code:
+        done = subprocess.run(command, stdout=out, stderr=out, env=environment, check=False)
+    if done.returncode:
         raise RuntimeError(f"the run {folder.name} failed, see {log}:\n{last_words(log)}")
 
 
-def last_words(log: Path) -> str:
-    """The end of what a run has said."""
-    return "\n".join(log.read_text(errors="replace").splitlines()[-LOG_LINES:])
+def _row(root: Path, cell: Cell) -> dict[str, Any]:
+    before = json.loads((root / cell.start_folder / SUMMARY).read_text())
+    after = json.loads((root / cell.folder / SUMMARY).read_text())
+    success = {"sft": before["success_after"], "success": after["success_after"], "n": after["n_after"]}
+    return cell._asdict() | success | {name: after[name] for name in NUMBERS}
 
 
-def _summary(folder: Path) -> dict[str, Any]:
-    summary: dict[str, Any] = json.loads((folder / SUMMARY).read_text())
-    return summary
+def groups(config: BenchStudyConfig, rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Comparisons of the cells of each start, arm and setting, and of all starts if there are several."""
+    found = []
+    starts = [*config.starts, ALL] if len(config.starts) > 1 else config.starts
+    for start, arm, setting in itertools.product(starts, config.arms, config.settings):
+        of = [row for row in rows if (row["arm"], row["setting"]) == (arm, setting)]
+        if start != ALL:
+            of = [row for row in of if row["start"] == start]
+        means = {name: sum(row[name] for row in of) / len(of) for name in ("sft", *NUMBERS)}
+        found.append({"start": start, "arm": arm, "setting": setting, **together(of), **means})
+    return found
+
+
+def together(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Successes and episodes of some runs.
+
+    Returns:
+        ``successes`` and ``n`` of all, ``by_policy``, the success of each, and ``ci95`` of their mean. That
+        is `mean_interval` over policies, where there are several, and never narrower than if one policy had
+        played all episodes: policies may be alike by chance.
+    """
+    successes = sum(round(row["success"] * row["n"]) for row in rows)
+    rate = Rate(successes=successes, n=sum(row["n"] for row in rows))
+    by_policy = [row["success"] for row in rows]
+    intervals = [rate.interval()]
+    if len(rows) > 1:
+        intervals.append(mean_interval(by_policy))
+    low = max(0.0, min(interval.low for interval in intervals))
+    high = min(1.0, max(interval.high for interval in intervals))
+    return {"successes": rate.successes, "n": rate.n, "by_policy": by_policy, "ci95": [low, high]}
+
+
+def table(result: dict[str, Any]) -> Table:
+    """`result` for people: a row per start and arm, a column per setting."""
+    return as_table(f"success; {NOTE}", _columns(result), _rows(result))
+
+
+def markdown(result: dict[str, Any]) -> str:
+    """`table` for the docs."""
+    return as_markdown(_columns(result), _rows(result)) + f"\n{NOTE.capitalize()}.\n"
+
+
+def _columns(result: dict[str, Any]) -> list[str]:
+    return ["start", "arm", "SFT", *(setting or "success" for setting in result["config"]["settings"])]
+
+
+def _rows(result: dict[str, Any]) -> list[list[str]]:
+    rows: dict[tuple[str, str], list[str]] = {}
+    for group in result["groups"]:
+        key = (group["start"], group["arm"])
+        row = rows.setdefault(key, [*key, f"{group['sft']:.0%}"])
+        row.append(_rated(group))
+    return list(rows.values())
+
+
+def _rated(group: dict[str, Any]) -> str:
+    """Rate, interval, n and each policy's success, and its real episodes and lag."""
+    policies = " ".join(f"{100 * success:.0f}" for success in group["by_policy"])
+    low, high = (100 * end for end in group["ci95"])
+    rate = 100 * group["successes"] / group["n"]
+    practice = f"{group['episodes_explored']:,.0f} episodes, lag {group['lag_mean']:.1f}"
+    return f"{rate:.1f} % [{low:.1f}, {high:.1f}] n={group['n']} ({policies}), {practice}"
+
+
+def draw(path: Path, result: dict[str, Any]) -> None:
+    """Success over starts and settings: one line per arm with its interval, one dot per policy."""
+    config = result["config"]
+    places = list(itertools.product(config["starts"], config["settings"]))
+    with drawing(path) as axes:
+        for number, arm in enumerate(config["arms"]):
+            shift = 0.08 * (number - (len(config["arms"]) - 1) / 2)
+            for group in result["groups"]:
+                if group["arm"] != arm or group["start"] == ALL:
+                    continue
+                place = places.index((group["start"], group["setting"])) + shift
+                rate = group["successes"] / group["n"]
+                error = [[max(0.0, rate - group["ci95"][0])], [max(0.0, group["ci95"][1] - rate)]]
+                axes.errorbar(place, rate, yerr=error, marker="o", capsize=3, color=f"C{number}")
+                axes.scatter([place] * len(group["by_policy"]), group["by_policy"], s=12, alpha=0.4)
+            axes.plot([], [], marker="o", color=f"C{number}", label=arm or "success")
+        axes.set_xticks(range(len(places)), [" ".join(place) for place in places], rotation=20, ha="right")
+        axes.set(ylabel="success", ylim=(-0.02, 1.02))
+        axes.legend()

@@ -26,8 +26,7 @@ from rich.table import Table
 
 from accerl_lerobot.config.ranges import Range, Section
 from accerl_lerobot.console import Console
-from benchmarks.records import as_markdown, output_folder, write
-from benchmarks.tables import as_table, host
+from benchmarks.tables import as_markdown, as_table, host, output_folder, write
 
 COLUMNS = ("package", "version", "tried", "came out", "right")
 HIDDEN = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "DISPLAY")

@@ -22,7 +22,7 @@ import psutil
 from accerl_lerobot.checkpoint.layout import CONFIG
 from accerl_lerobot.metrics import METRICS
 from benchmarks.fault_injection import environment
-from benchmarks.study import last_words
+from benchmarks.tables import last_words
 
 CLASSES = {
     "rollout": "RolloutWorker",

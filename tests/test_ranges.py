@@ -37,7 +37,6 @@ from accerl_lerobot.replay.buffer import ReplayConfig
 from accerl_lerobot.timeline import TimelineConfig
 from accerl_lerobot.world_model.config import PixelModelConfig, WorldModelConfig
 from benchmarks.__main__ import CONFIGS as BENCHMARKS
-from benchmarks.efficiency import BenchEfficiencyConfig
 from benchmarks.machinery import MachineryConfig
 from benchmarks.scaling import BenchScalingConfig
 
@@ -89,7 +88,6 @@ def test_every_field_refuses_a_value_that_is_not_in_its_range(cls: type[Any]):
 RULES = [
     (BackboneConfig, {"image": 48}, "sft.backbone.image=48: use a multiple of 32"),
     (BackboneConfig, {"hidden": 12}, "sft.backbone.hidden=12: use a multiple of 8"),
-    (BenchEfficiencyConfig, {"arms": ("none", "rollouts")}, "arms=('none', 'rollouts'): use a list"),
     (BenchScalingConfig, {"counts": (2, 2)}, "counts="),
     (MachineryConfig, {"segment_length": 5}, "segment_length="),
     (PixelModelConfig, {"channels": ()}, "world_model.model.channels="),

@@ -6,7 +6,6 @@ from __future__ import annotations
 import ast
 import dataclasses
 import inspect
-import sys
 import textwrap
 from collections.abc import Iterator
 from itertools import pairwise
@@ -66,12 +65,6 @@ def help_text(command: str, config_class: type[Any], what: str, section: str = "
     for name, kind in sections.items():
         head.append(f"  {name:12}{' | '.join(choices_of(kind)) or _summary(kind)}"[:WIDTH])
     return "\n".join(head)
-
-
-def brief(config_class: type[Any]) -> str:
-    """The first sentence of the module that a config is in, on one line."""
-    doc = sys.modules[config_class.__module__].__doc__ or ""
-    return doc.partition("\n\n")[0].replace("\n", " ")
 
 
 def docstrings(cls: type[Any]) -> dict[str, str]:

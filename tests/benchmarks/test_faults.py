@@ -128,12 +128,10 @@ def test_every_point_is_somewhere_that_a_target_can_be_hit():
 def test_a_run_of_time_survives_what_is_done_to_it(tmp_path: Path):
     """Everything real: a run, Ray, a rollout worker that raises where it was told to, and its successor."""
     root = tmp_path / "faults"
-    targets, faults = ("rollout",), ("exception", "nan")
-    result = bench_faults(BenchFaultsConfig(output_dir=str(root), targets=targets, faults=faults, repeats=1))
-    assert sorted(one["fault"] for one in result["hits"]) == ["exception", "nan"]
-    for one in result["hits"]:
-        assert one["fired"] and one["outcome"] == "survived" and one["books"], one
-        assert (one["seconds"] is None) == (one["fault"] == "nan")
+    config = BenchFaultsConfig(output_dir=str(root), targets=("rollout",), faults=("exception",), repeats=1)
+    result = bench_faults(config)
+    (one,) = result["hits"]
+    assert one["fired"] and one["outcome"] == "survived" and one["books"] and one["seconds"] > 0, one
     (run,) = result["runs"]
     assert (run["exit"], run["left_behind"], run["skipped_updates"]) == (143, 0, 0)
     assert run["lost"] == run["doubled"] == run["segments_lost"] == run["segments_doubled"] == 0

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from accerl_lerobot.errors import InputError
-from benchmarks import gpu
+from benchmarks import gpu, policy
 from benchmarks.gpu import BenchGpuConfig, bench_gpu, table
 from tests.benchmarks.test_machine import small
 
@@ -34,8 +34,15 @@ def test_it_measures_both_precisions_and_a_run_of_one_and_of_two_ranks(tmp_path,
         ("--trainer.ranks=2", "--trainer.sharding=zero2"),
     ]
     assert set(result["policies"]) == {"fp32", "bf16"}
-    written = json.loads((tmp_path / "gpu.json").read_text())
-    assert written["policies"]["fp32"]["estimate"]["learning"] > 0
+    for (precision, found), most in zip(result["policies"].items(), (1e-4, 30.0), strict=True):
+        assert 0 < found["parameters"]["trained"] < found["parameters"]["all"]
+        assert list(found["memory_gb"]) == ["built", "decided", "updated"]
+        assert all(
+            found["seconds"][part]["median"] > 0 for part in ("decide_one", "decide", "score", "update")
+        )
+        assert 0 <= found["mismatch"]["mean"] <= found["mismatch"]["max"] <= most, precision
+    assert "memory, updated" in list(policy.table(found).columns[0].cells)
+    assert json.loads((tmp_path / "gpu.json").read_text()) == json.loads(json.dumps(result))
     cells = list(table(result).columns[0].cells)
     assert "SmolVLA, bf16: memory of an update" in cells and "asynchronous run, sharding zero2" in cells
 

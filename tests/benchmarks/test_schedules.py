@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import math
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
@@ -56,23 +57,35 @@ def test_speed_ups_are_of_neighbouring_blocks():
     assert found["processor_bound"] and len(found["blocks"]) == 6
 
 
-@pytest.mark.slow
-def test_a_small_run_of_everything(light_ray: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    small = {"environments": 2, "latency_ms": 5.0, "update_ms": 20.0, "image_size": 16, "decide_ms": 1.0}
+class FakeEngine(AbstractContextManager["FakeEngine"]):
+    """Gives blocks at once, each a decision per second faster than the one before."""
+
+    def __init__(self) -> None:
+        self.rate = 10.0
+
+    def __exit__(self, *_: object) -> None: ...
+
+    def block(self, schedule: str, seconds: float) -> Block:
+        self.rate += 1.0
+        return block(schedule, self.rate)
+
+
+@pytest.fixture
+def fake_engine(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(MachineryConfig, "open", lambda config: FakeEngine())
+    monkeypatch.setattr(async_vs_sync, "success", lambda updates, arm, seed: 0.5)
+
+
+def test_a_law_is_measured_forth_and_back_and_written(fake_engine: None, tmp_path: Path):
     trace = tmp_path / "drawers.txt"
     trace.write_text("1\n3\n")
     config = BenchAsyncVsSyncConfig(
-        **small, cvs=(), traces=(str(trace),), seconds=0.2, rounds=1, learning_updates=2, seeds=(0,),
-        output_dir=str(tmp_path),
-    )  # fmt: skip
-    monkeypatch.setattr(async_vs_sync, "TRIALS", 4)
+        cvs=(), traces=(str(trace),), rounds=1, learning_updates=2, seeds=(0,), output_dir=str(tmp_path)
+    )
     result = bench_async_vs_sync(config)
     (law,) = result["laws"]
     assert law["cv"] == 0.5 and law["trace"] == str(trace)
     assert [b["schedule"] for b in law["blocks"]] == [*ARMS, *reversed(ARMS)]
-    assert all(b["decisions_per_s"] > 0 and b["updates"] >= 1 for b in law["blocks"])
-    # In lock step the service sees both environments at once.
-    assert {b["batch_size"] for b in law["blocks"] if b["schedule"] == "synchronous"} == {2.0}
     assert set(result["learning"]["success"]) == set(ARMS)
     assert json.loads((tmp_path / "async_vs_sync.json").read_text()) == json.loads(json.dumps(result))
     text = (tmp_path / "async_vs_sync.md").read_text()
@@ -82,13 +95,23 @@ def test_a_small_run_of_everything(light_ray: None, tmp_path: Path, monkeypatch:
         Console().rich.print(schedules_table(result))
 
 
-def test_a_small_run_of_scaling(light_ray: None, tmp_path: Path):
-    config = BenchScalingConfig(
-        counts=(1, 2), latency_ms=5.0, image_size=16, seconds=0.2, blocks=1, output_dir=str(tmp_path)
-    )
-    rows = bench_scaling(config)["counts"]
+def test_scaling_is_measured_forth_and_back(fake_engine: None, tmp_path: Path):
+    rows = bench_scaling(BenchScalingConfig(counts=(1, 2), blocks=2, output_dir=str(tmp_path)))["counts"]
     assert [row["environments"] for row in rows] == [1, 2] and rows[0]["efficiency"]["median"] == 1.0
+    assert [[b["decisions_per_s"] for b in row["blocks"]] for row in rows] == [[11.0, 11.0]] * 2
+    assert rows[1]["efficiency"]["median"] == 0.5
     assert "E(N)" in (tmp_path / "scaling.md").read_text()
+
+
+@pytest.mark.slow
+def test_an_engine_is_measured_and_learns(light_ray: None, monkeypatch: pytest.MonkeyPatch):
+    machine = MachineryConfig(environments=2, latency_ms=5.0, update_ms=20.0, image_size=16, decide_ms=1.0)
+    with machine.open() as engine:
+        blocks = [engine.block(arm, 0.2) for arm in ARMS]
+    assert all(found.decisions_per_s > 0 and found.updates >= 1 for found in blocks)
+    assert blocks[ARMS.index("synchronous")].batch_size == 2.0, "in lock step both environments ask at once"
+    monkeypatch.setattr(async_vs_sync, "TRIALS", 4)
+    assert 0 <= async_vs_sync.success(2, "synchronous", 0) <= 1
 
 
 @pytest.mark.slow
