@@ -31,7 +31,7 @@ import yaml
 
 from accerl_lerobot.checkpoint.layout import CONFIG
 from accerl_lerobot.checkpoint.safety import brief
-from accerl_lerobot.config.ranges import annotations_of, defaults_of, fits, is_optional, is_union, wanted
+from accerl_lerobot.config.ranges import annotations_of, defaults_of, fits, is_optional, is_union
 from accerl_lerobot.errors import InputError, expanded
 
 DISCOVER = "discover_packages_path"
@@ -385,42 +385,36 @@ def _decoded(
     """
     annotations = annotations_of(cls)
     sections = sections_of(cls)
-    usual = defaults_of(cls)
+    base = default if type(default) is cls else None
     values: dict[str, Any] = {}
-    if type(default) is cls:
-        usual = {name: getattr(default, name) for name in annotations}
-        values = dict(usual)
     for key, value in tree.items():
         place = (*path, str(key))
-        name = ".".join(place)
         if key not in annotations:
             raise _unknown(place, value, list(annotations), whole)
-        if key not in sections:
+        if key not in sections or (value is None and is_optional(annotations[key])):
             values[key] = _converted(annotations[key], value)
-            if not fits(annotations[key], values[key]):
-                raise InputError(name, value, f"use {wanted(annotations[key])}")
-        elif value is None and is_optional(annotations[key]):
-            values[key] = None
-        elif isinstance(value, dict | None):
-            values[key] = _section(sections[key], value or {}, usual[key], place, whole)
         else:
-            raise InputError(name, value, f"a config section; use --{key}.field=value")
+            usual = defaults_of(cls)[key] if base is None else getattr(base, key)
+            values[key] = _section(sections[key], value, usual, place, whole)
+    own = getattr(cls, "SECTION", "")
+    actual = ".".join(path)
     try:
-        return cls(**values)
+        return cls(**values) if base is None else dataclasses.replace(base, **values)
     except InputError as error:
         # A section that stands in several places, such as a dataset, has one name for itself.
-        own = f"{getattr(cls, 'SECTION', '')}."
-        actual = f"{'.'.join(path)}."
-        if own in (".", actual) or not error.field.startswith(own):
+        section, _, key = error.field.rpartition(".")
+        if section not in (own, actual):
             raise
-        field = actual + error.field.removeprefix(own)
-        raise InputError(field, error.value, error.hint.replace(own, actual)) from error
+        value = tree.get(key, error.value)  # as it was typed
+        hint = error.hint.replace(f"{own}.", f"{actual}.") if own else error.hint
+        raise InputError(".".join(filter(None, (actual, key))), value, hint) from error
 
 
-def _section(
-    section: type[Any], value: dict[str, Any], default: Any, path: tuple[str, ...], whole: type[Any]
-) -> Any:
+def _section(section: type[Any], value: Any, default: Any, path: tuple[str, ...], whole: type[Any]) -> Any:
     """A section of the type that `value` names, or of its default's."""
+    if not isinstance(value, dict | None):
+        raise InputError(".".join(path), value, f"a config section; use --{path[-1]}.field=value")
+    value = value or {}
     choices = choices_of(section)
     if choices:
         kind = value.get(TYPE, getattr(default, TYPE, None))
