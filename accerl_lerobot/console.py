@@ -23,7 +23,9 @@ class Stage:
     """One stage's bar."""
 
     def __init__(self, console: RichConsole, progress: Progress, task: Task) -> None:
-        self._console, self._progress, self._task = console, progress, task
+        self._console = console
+        self._progress = progress
+        self._task = task
         self._said = time.monotonic()
 
     def update(self, done: int, status: str = "") -> None:
@@ -31,9 +33,13 @@ class Stage:
         self._progress.update(self._task.id, completed=done)
         total = self._task.total
         parts = [f"{done}/{total:.0f} ({done / total:.0%})" if total else str(done)]
-        if seconds := self._task.time_remaining:
-            parts.append(f"{datetime.timedelta(seconds=round(seconds))} left")
-        text = " · ".join(parts + ([status] if status else []))
+        seconds = self._task.time_remaining
+        if seconds:
+            left = datetime.timedelta(seconds=round(seconds))
+            parts.append(f"{left} left")
+        if status:
+            parts.append(status)
+        text = " · ".join(parts)
         self._progress.update(self._task.id, text=text)
         if not self._console.is_terminal and time.monotonic() - self._said > PLAIN_EVERY_S:
             self._said = time.monotonic()

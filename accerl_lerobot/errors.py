@@ -132,7 +132,8 @@ def is_full(error: BaseException | None) -> bool:
 def expanded(path: str, field: str) -> Path:
     """A path in which ``~`` stands for a home folder."""
     try:
-        os.fspath(found := Path(path).expanduser()).encode()
+        found = Path(path).expanduser()
+        os.fspath(found).encode()
         os.lstat(found)
     except FileNotFoundError:
         pass
@@ -229,7 +230,8 @@ class Once(logging.Filter):
     def filter(self, record: logging.LogRecord) -> bool:
         if record.levelno != logging.WARNING or not super().filter(record):
             return True
-        known = (text := record.getMessage()) in self._passed
+        text = record.getMessage()
+        known = text in self._passed
         self._passed.add(text)
         return not known
 

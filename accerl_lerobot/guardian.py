@@ -108,7 +108,8 @@ def _ends_by_itself(process: psutil.Process) -> bool:
 def _listen(parent: int) -> tuple[list[Path], str]:
     """Messages until the parent has ended: the folders to remove, and the line to print."""
     folders: list[Path] = []
-    hint, text = "", b""
+    hint = ""
+    text = b""
     while True:
         if not select.select([0], [], [], LOOK_S)[0]:
             if os.getppid() != parent:

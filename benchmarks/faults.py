@@ -141,7 +141,9 @@ class Start:
     def __init__(
         self, path: str | None, recipe: RunConfig, stall_s: float, root: Path, console: Console
     ) -> None:
-        self._root, self._module, self.recipe = root, TRAIN if path is not None else LIGHT, recipe
+        self._root = root
+        self._module = LIGHT if path is None else TRAIN
+        self.recipe = recipe
         self._stall_s = stall_s
         self._arguments = [f"--config_path={path}", f"--launch.stall_s={stall_s}"]
         if path is None:

@@ -86,7 +86,10 @@ def strike(victim: Victim, orders: Path, name: str, target: str, fault: str, rng
     """Does it once, and waits until the run has recovered, or has not."""
     place, count = rng.choice(places(target, fault)), len(victim.pids(target))
     said_before = victim.log.stat().st_size
-    fired, outcome, said, seconds = False, "survived", "", None
+    fired = False
+    outcome = "survived"
+    said = ""
+    seconds = None
     try:
         began, pid = _befall(victim, orders, name, target, fault, place, rng)
         fired = True
@@ -95,14 +98,16 @@ def strike(victim: Victim, orders: Path, name: str, target: str, fault: str, rng
         except RuntimeError as error:
             if victim.process.poll() is None:
                 raise
-            outcome, said = "stopped", _reason(victim, error, said_before)
+            outcome = "stopped"
+            said = _reason(victim, error, said_before)
             # What has ended may have left workers behind, which end with it, if not at once.
             last = max(victim.updates(), default=0)
             victim.go_on()
             victim.await_update(last + 1, START_S)
         seconds = None if fault == NAN else round(time.monotonic() - began, 2)
     except RuntimeError as error:
-        outcome, said = "lost", str(error)
+        outcome = "lost"
+        said = str(error)
     found = audit_updates(victim.records())
     return Hit(
         target=target, fault=fault, place=place, fired=fired, outcome=outcome, seconds=seconds, said=said,
@@ -132,10 +137,10 @@ def _befall(
     pid, began = rng.choice(pids), time.monotonic()
     if target == EVERYTHING:
         killed = victim.kill()
-        while (left := [p for p in killed if alive(p)]) and time.monotonic() - began < TIDY_S:
+        while any(map(alive, killed)):
+            if time.monotonic() - began > TIDY_S:
+                raise RuntimeError("processes outlived SIGKILL")
             time.sleep(0.02)
-        if left:
-            raise RuntimeError(f"{len(left)} processes outlived SIGKILL")
     elif not (hit(pid, SIGNALS[fault]) and await_hit(pid, SIGNALS[fault])):
         raise RuntimeError(f"{target} {pid} took no notice of {fault}")
     return began, pid

@@ -63,7 +63,8 @@ def bench_scaling(config: BenchScalingConfig) -> dict[str, Any]:
     console, root = Console(), output_folder(config.output_dir)
     result: dict[str, Any] = {"config": asdict(config), "host": host()}
     blocks: dict[int, list[Block]] = {n: [] for n in config.counts}
-    forth, back = config.blocks - config.blocks // 2, config.blocks // 2
+    back = config.blocks // 2
+    forth = config.blocks - back
     legs = [(n, forth) for n in config.counts] + [(n, back) for n in reversed(config.counts) if back]
     with console.stage("counts", total=len(legs)) as stage:
         for done, (n, repeats) in enumerate(legs, start=1):

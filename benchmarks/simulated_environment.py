@@ -56,7 +56,9 @@ class LatencyEnvironment(SimulatedEnvironment):
         super().__init__(config)
         path = config.latency_trace
         self._trace = None if path is None else read_trace(path, "env.latency_trace")
-        self._clock, self._at, self._lifetime = np.random.default_rng(0), 0, 0
+        self._clock = np.random.default_rng(0)
+        self._at = 0
+        self._lifetime = 0
 
     def reset(self, seed: int, task: str) -> Observation:
         """See the base class."""
@@ -120,7 +122,8 @@ def read_trace(path: str, field: str = "latency_trace") -> Trace:
         raise InputError(field, path, f"it cannot be read ({error}); use a text file") from None
     found: dict[bool, list[float]] = {True: [], False: []}
     for number, line in enumerate(text.splitlines(), start=1):
-        if not (words := line.partition("#")[0].split()):
+        words = line.partition("#")[0].split()
+        if not words:
             continue
         try:
             value = float(words[-1]) if words[:-1] in ([], [RESET]) else math.nan

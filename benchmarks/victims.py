@@ -53,7 +53,9 @@ class Victim:
         module: tuple[str, ...] = TRAIN,
         orders: Path | None = None,
     ) -> None:
-        self.folder, self.log, self._module = folder, log, module
+        self.folder = folder
+        self.log = log
+        self._module = module
         self._environment = dict(os.environ) if orders is None else os.environ | environment(orders)
         self._start([*arguments, f"--output_dir={folder}"])
 

@@ -53,21 +53,24 @@ def place(tensor: Tensor) -> tuple[object, ...]:
 def optimizer_state(optimizer: torch.optim.Optimizer) -> dict[int, dict[str, torch.Tensor]]:
     """A copy on the CPU of what it knows of each parameter, in order; rates are not its own."""
     known: dict[int, dict[str, Any]] = optimizer.state_dict()["state"]
-    return {
-        place: {name: copy_of(torch.as_tensor(value)) for name, value in of.items()}
-        for place, of in known.items()
-    }
+    copies = {}
+    for number, values in known.items():
+        copies[number] = {name: copy_of(torch.as_tensor(value)) for name, value in values.items()}
+    return copies
 
 
 def restore_optimizer(optimizer: torch.optim.Optimizer, state: dict[int, dict[str, torch.Tensor]]) -> None:
     """Sets it to what `optimizer_state` gave of one for the same parameters."""
-    parameters = [p for group in optimizer.param_groups for p in group["params"]]
-    mine = {
-        # What has no dimension, the number of steps, is everybody's and stays where it is.
-        at: {name: part_of(value, parameters[at]) if value.dim() else value for name, value in of.items()}
-        for at, of in state.items()
-    }
-    optimizer.load_state_dict({"state": mine, "param_groups": optimizer.state_dict()["param_groups"]})
+    parameters: list[Tensor] = []
+    for group in optimizer.param_groups:
+        parameters += group["params"]
+    parts: dict[int, dict[str, Tensor]] = {}
+    for number, values in state.items():
+        parts[number] = dict(values)
+        for name, value in values.items():
+            if value.dim():  # the number of steps has no dimension and is the same for every process
+                parts[number][name] = part_of(value, parameters[number])
+    optimizer.load_state_dict({"state": parts, "param_groups": optimizer.state_dict()["param_groups"]})
 
 
 def copied(module: torch.nn.Module) -> dict[str, torch.Tensor]:

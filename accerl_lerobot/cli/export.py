@@ -77,8 +77,8 @@ def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
     root = record.check_free(config.root)
     episodes = list(whole_episodes(read_journal(run / EPISODES)))
     if config.pick != "all":
-        wanted = config.pick == "successes"
-        episodes = [parts for parts in episodes if parts[-1].success is wanted]
+        picks_successes = config.pick == "successes"
+        episodes = [parts for parts in episodes if parts[-1].success is picks_successes]
     if not episodes:
         hint = f"no whole episode in its {EPISODES} of those asked for ({config.pick})"
         raise InputError("path", str(run), hint)
@@ -103,8 +103,9 @@ def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
                 if episode is None:
                     tally["left_out"] += 1
                     continue
-                versions = np.concatenate([np.repeat(part.versions, part.steps) for part in parts])
-                record.save_episode(dataset, episode, tally, {VERSION: versions[:, None].astype(np.int64)})
+                by_part = [np.repeat(part.versions, part.steps) for part in parts]
+                versions = np.concatenate(by_part).astype(np.int64)
+                record.save_episode(dataset, episode, tally, {VERSION: versions[:, None]})
         if not tally["episodes"]:
             hint = "none of its episodes could be repeated: this environment is not deterministic"
             raise InputError("path", str(run), hint)

@@ -43,12 +43,12 @@ class Range:
         self.low = float(match[2])
         self.high = float(match[3])
 
-    def __repr__(self) -> str:
-        return f"Range({self.text!r})"
-
     def __contains__(self, value: Any) -> bool:
-        above = value > self.low if self._low_open else value >= self.low
-        return bool(above and (value < self.high if self._high_open else value <= self.high))
+        if value == self.low:
+            return not self._low_open
+        if value == self.high:
+            return not self._high_open
+        return bool(self.low < value < self.high)
 
 
 class Pattern:
@@ -57,9 +57,6 @@ class Pattern:
     def __init__(self, pattern: str, words: str) -> None:
         self.pattern = re.compile(pattern)
         self.words = words
-
-    def __repr__(self) -> str:
-        return f"Pattern({self.pattern.pattern!r})"
 
     def __contains__(self, value: Any) -> bool:
         return self.pattern.fullmatch(value) is not None

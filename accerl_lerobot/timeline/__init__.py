@@ -192,14 +192,15 @@ class Timeline:
 
     def shares(self, windows: Sequence[Window] = ()) -> Shares:
         """How the time of each role divides in `windows`, as far as it is kept; empty: in all of it."""
+        times: dict[str, np.ndarray] = {}
+        for row in self.rows:
+            for window in windows or [(0.0, self.seconds)]:
+                times[row.role] = times.get(row.role, np.zeros(len(STATES))) + row.spent(window)
         shares: Shares = {}
-        for role in dict.fromkeys(row.role for row in self.rows):
-            times = np.zeros(len(STATES))
-            for row in self.rows:
-                for window in windows or [(0.0, self.seconds)]:
-                    times += row.spent(window) * (row.role == role)
-            if times.any():
-                shares[role] = {STATES[i]: float(times[i] / times.sum()) for i in np.flatnonzero(times)}
+        for role, spent in times.items():
+            if spent.any():
+                share = spent / spent.sum()
+                shares[role] = {STATES[state]: float(share[state]) for state in np.flatnonzero(spent)}
         return shares
 
 
