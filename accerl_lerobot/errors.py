@@ -17,7 +17,7 @@ import re
 import traceback
 import unicodedata
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -81,22 +81,6 @@ def check_absent(path: Path, field: str = "output_dir") -> None:
     above = next(folder for folder in path.absolute().parents if folder.exists())
     if not os.access(above, os.W_OK | os.X_OK):
         raise InputError(field, str(path), f"{above} cannot be written to; name another folder")
-
-
-def output_of(given: str | None, runs: Sequence[str], name: str) -> Path:
-    """The file that is made of runs: the one that is given, or `name` in the folder of a single run, or here.
-
-    Raises:
-        InputError: it is a folder, or in none. Whether a run is there is for its reader to say.
-    """
-    path = Path(name)
-    if given is not None:
-        path = expanded(given, "output")
-    elif len(runs) == 1:
-        path = expanded(runs[0], "runs") / name
-    if path.is_dir() or (given is not None and not path.parent.is_dir()):
-        raise InputError("output", str(path), "name a file in a folder that exists")
-    return path
 
 
 @contextmanager

@@ -22,9 +22,10 @@ import types
 import typing
 from collections.abc import Hashable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.errors import InputError, expanded
 
 
 class Range:
@@ -114,6 +115,34 @@ class DatasetConfig(Section, section="dataset"):
         if self.root is not None and self.repo_id is None:
             hint = "name the dataset in dataset.root; any owner/name will do"
             raise InputError("dataset.repo_id", None, hint)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunsConfig(Section):
+    """Runs that a verb reads, and the file that it makes of them."""
+
+    BARE: ClassVar[str] = "runs"
+
+    runs: tuple[str, ...] = ()
+    """Folders of runs; several go into one file. Bare arguments are runs."""
+    output: str | None = None
+    """The file. None: in the run's folder, or here if there are several."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.runs:
+            raise InputError("runs", "", "name the folder of a run")
+
+    def file(self, name: str) -> Path:
+        """The file to write, which is called `name` by default; refused if it is a folder, or in none."""
+        path = Path(name)
+        if self.output is not None:
+            path = expanded(self.output, "output")
+        elif len(self.runs) == 1:
+            path = expanded(self.runs[0], "runs") / name
+        if path.is_dir() or (self.output is not None and not path.parent.is_dir()):
+            raise InputError("output", str(path), "name a file in a folder that exists")
+        return path
 
 
 def annotations_of(cls: type[Any]) -> dict[str, Any]:

@@ -10,32 +10,18 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 from accerl_lerobot.checkpoint.layout import CONFIG, SUMMARY
-from accerl_lerobot.config.ranges import Section
-from accerl_lerobot.errors import InputError, expanded, output_of, reading
+from accerl_lerobot.config.ranges import RunsConfig
+from accerl_lerobot.errors import expanded, reading
 from accerl_lerobot.metrics import METRICS
 
 NAME = "report.html"
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReportConfig(Section):
+class ReportConfig(RunsConfig):
     """Fields of ``accerl report``."""
-
-    BARE: ClassVar[str] = "runs"
-
-    runs: tuple[str, ...] = ()
-    """Folders of runs of ``accerl train`` or ``accerl offline``; several make a page that compares them. Bare
-    ones are runs."""
-    output: str | None = None
-    """The page. None: ``report.html`` in the run's folder, or here if there are several."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.runs:
-            raise InputError("runs", "", "name the folder of a run: accerl report RUN")
 
 
 def write_report(config: ReportConfig) -> Path:
@@ -43,7 +29,7 @@ def write_report(config: ReportConfig) -> Path:
     from accerl_lerobot.report.page import comparison, html, one_run
     from accerl_lerobot.report.read import read_run
 
-    output = output_of(config.output, config.runs, NAME)
+    output = config.file(NAME)
     runs = [read_run(expanded(name, "runs")) for name in config.runs]
     now = time.time()
     with reading("runs", ",".join(config.runs), f"{CONFIG}, {METRICS} or {SUMMARY}"):

@@ -22,13 +22,13 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
 from accerl_lerobot.checkpoint.safety import FileSource, check_folder
-from accerl_lerobot.config.ranges import Section
-from accerl_lerobot.errors import InputError, expanded, output_of, reading
+from accerl_lerobot.config.ranges import RunsConfig
+from accerl_lerobot.errors import InputError, expanded, reading
 from accerl_lerobot.fault_points import fault_point
 
 STATES = (
@@ -254,26 +254,13 @@ def _place(row: Row) -> tuple[int, str, int]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TimelineConfig(Section):
+class TimelineConfig(RunsConfig):
     """Fields of ``accerl timeline``."""
-
-    BARE: ClassVar[str] = "runs"
-
-    runs: tuple[str, ...] = ()
-    """Folders of runs of ``accerl train``; several stand below each other in one trace. Bare arguments are
-    runs."""
-    output: str | None = None
-    """The trace. None: ``timeline.json`` in the run's folder, or here if there are several."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.runs:
-            raise InputError("runs", "", "name the folder of a run: accerl timeline RUN")
 
 
 def write_trace(config: TimelineConfig) -> dict[str, Any]:
     """Writes the ``trace``; of the ``runs``, when each trained and its roles' shares of that time."""
-    trace = output_of(config.output, config.runs, TRACE)
+    trace = config.file(TRACE)
     timelines = [read_timeline(expanded(name, "runs")) for name in config.runs]
     runs = []
     events: list[dict[str, Any]] = []

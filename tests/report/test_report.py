@@ -28,7 +28,7 @@ from tests.report.test_page import Seen
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ([], "runs='': name the folder of a run: accerl report RUN"),
+        ([], "runs='': name the folder of a run"),
         (["a", "--outptu=1"], "no such field; did you mean output"),
         (["nowhere"], "runs='nowhere': no such folder"),
     ],
