@@ -4,13 +4,13 @@
 from __future__ import annotations
 
 import json
-import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 import accerl_lerobot
 from accerl_lerobot import RunConfig, evaluate, load_config, load_policy, resume, train
@@ -83,13 +83,18 @@ def test_a_refused_run_leaves_no_folder(tiny_checkpoint: Path, tmp_path: Path):
 
 @pytest.mark.slow
 def test_the_notebook_runs_from_top_to_bottom(tmp_path: Path):
-    """Its cells one after another, as Jupyter runs them."""
+    """Its cells one after another, as Jupyter runs them, on a recipe that is cut short."""
     cells = json.loads((EXAMPLES / "improve_a_policy.ipynb").read_text())["cells"]
     code = "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
     script = tmp_path / "notebook.py"
     # The recorder's workers import the main module again.
     script.write_text("if __name__ == '__main__':\n" + "".join(f"    {line}\n" for line in code.splitlines()))
-    shutil.copy(EXAMPLES / "simulated.yaml", tmp_path)
+    recipe = yaml.safe_load((EXAMPLES / "simulated.yaml").read_text())
+    recipe["demos"]["episodes"] = 4
+    recipe["sft"]["steps"] = 5
+    recipe["trainer"]["updates"] = 4
+    recipe["evaluation"]["episodes"] = 8
+    (tmp_path / "simulated.yaml").write_text(yaml.safe_dump(recipe))
     command = [sys.executable, str(script)]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stderr
