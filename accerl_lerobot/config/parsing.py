@@ -442,15 +442,11 @@ def _converted(kind: Any, value: Any) -> Any:
             if fits(one, made):
                 return made
         return value
-    if origin in (list, tuple):
+    if origin in (list, tuple) and not isinstance(value, dict | None):
         if isinstance(value, str):
-            parts = [part.strip() for part in value.split(",")]
-            value = parts if arguments[0] is str else [_value(part) for part in parts]
-        elif isinstance(value, (bool, int, float)):
-            value = [value]
-        return (
-            origin(_converted(arguments[0], entry) for entry in value) if isinstance(value, list) else value
-        )
+            value = [part.strip() for part in value.split(",")]
+        entries = value if isinstance(value, (list, tuple)) else [value]
+        return origin(_converted(arguments[0], entry) for entry in entries)
     if origin is dict and isinstance(value, dict):
         return {str(key): _converted(arguments[1], entry) for key, entry in value.items()}
     if kind is str and isinstance(value, (int, float, datetime.date)) and not isinstance(value, bool):
