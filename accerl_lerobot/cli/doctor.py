@@ -53,6 +53,11 @@ class Check(NamedTuple):
     text: str  # the finding and, unless it is fine, the hint
 
 
+def compared(name: str, text: str, suffices: bool, hint: str) -> Check:
+    """A comparison of a recipe with this machine; if it does not suffice, the hint is added."""
+    return Check(name, OK, text) if suffices else Check(name, WARN, f"{text}: {hint}")
+
+
 def main(arguments: list[str]) -> int:
     """``accerl doctor``; 0 if everything needed is there, otherwise 1."""
     checks: list[Check] = []
@@ -79,8 +84,7 @@ def machine(*, joins: bool = False) -> Iterator[Check]:
     yield Check("cpu", OK, f"{len(os.sched_getaffinity(0))} cores")
     yield Check("memory", OK, f"{memory_gib('MemAvailable'):.1f} GiB free")
     disk = shutil.disk_usage(Path.cwd()).free / GIB
-    status = OK if disk >= DISK_GIB else WARN
-    yield Check("disk", status, f"{disk:.0f} GiB free here; a run may need {DISK_GIB:.0f}")
+    yield compared("disk", f"{disk:.0f} GiB free here", disk >= DISK_GIB, f"a run may need {DISK_GIB:.0f}")
 
 
 def packages() -> Check:
@@ -178,18 +182,13 @@ def resources(config: RunConfig, history: int = 1) -> Iterator[Check]:
     workers = config.rollout.workers
     threads = max(config.trainer.num_threads, config.inference.num_threads)
     text = f"{cores} for {workers} rollout workers, 1 inference, 1 trainer"
-    status = OK
-    if workers > cores or threads > cores:
-        status = WARN
-        text += ": lower rollout.workers, trainer.num_threads or inference.num_threads"
-    yield Check("cores", status, text)
+    hint = "lower rollout.workers, trainer.num_threads or inference.num_threads"
+    yield compared("cores", text, max(workers, threads) <= cores, hint)
     need = sizes.policy_gib(config) + sum(sizes.memory_parts_gib(config, history).values())
-    text = f"about {need:.1f} GiB of memory needed"
-    status = OK
-    if need > memory_gib("MemAvailable"):
-        status = WARN
-        text += ": lower rollout.workers, rollout.environments or replay.capacity, or use a smaller policy"
-    yield Check("needs", status, text)
+    hint = "lower rollout.workers, rollout.environments or replay.capacity, or use a smaller policy"
+    yield compared(
+        "needs", f"about {need:.1f} GiB of memory needed", need <= memory_gib("MemAvailable"), hint
+    )
     yield from gpu_memory(config)
 
 
@@ -204,11 +203,8 @@ def gpu_memory(config: RunConfig) -> Iterator[Check]:
     policy = policy_sizes(config.policy)
     need = 4 * (policy.policy + policy.trained * sizes.trained_copies(config)) / GIB
     text = f"weights, gradients and AdamW take {need:.1f} GiB of GPU memory"
-    status = OK
-    if need > torch.cuda.get_device_properties(0).total_memory / GIB:
-        status = WARN
-        text += ": use policy.tuning.mode=lora, or several GPUs and trainer.sharding=zero3"
-    yield Check("needs", status, text)
+    hint = "use policy.tuning.mode=lora, or several GPUs and trainer.sharding=zero3"
+    yield compared("needs", text, need <= torch.cuda.get_device_properties(0).total_memory / GIB, hint)
 
 
 def pace(config: RunConfig) -> Iterator[Check]:
@@ -217,15 +213,11 @@ def pace(config: RunConfig) -> Iterator[Check]:
     trainer = config.trainer
     bound, of_pace = lag_limits(config)
     text = f"at most {bound} updates with {config.rollout.in_flight} decisions under way"
-    status = OK
-    if of_pace > bound:
-        status = WARN
-        text += (
-            f"; the pace alone allows {of_pace}, so segments may be thrown away as too old: "
-            "lower replay.capacity, replay.max_unlearned_decisions or replay.samples_per_insert, "
-            "or raise replay.max_lag"
-        )
-    yield Check("lag", status, text)
+    hint = (
+        f"the pace alone allows {of_pace}, so segments may be thrown away as too old; lower replay.capacity, "
+        "replay.max_unlearned_decisions or replay.samples_per_insert, or raise replay.max_lag"
+    )
+    yield compared("lag", text, of_pace <= bound, hint)
     collected = math.ceil(trainer.updates * trainer.batch_decisions / replay.samples_per_insert)
     text = f"{trainer.updates:,} updates of {trainer.batch_decisions} on about {collected:,} decisions"
     yield Check("work", OK, text)
