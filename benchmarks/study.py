@@ -104,9 +104,8 @@ def bench_study(config: BenchStudyConfig) -> dict[str, Any]:
 
     console = Console()
     root = output_folder(config.output_dir).resolve()
-    cells = list(itertools.starmap(Cell, itertools.product(
-        config.starts, config.seeds, config.settings, config.arms
-    )))  # fmt: skip
+    choices = itertools.product(config.starts, config.seeds, config.settings, config.arms)
+    cells = [Cell(*choice) for choice in choices]
     starts = {}
     runs = {}
     for cell in cells:
