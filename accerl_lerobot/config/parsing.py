@@ -114,12 +114,9 @@ def import_plugins(*prefixes: str) -> dict[str, str]:
             try:
                 importlib.import_module(package)
             except (Exception, SystemExit) as error:  # it is somebody's code, which may do anything
-                broken[package] = not_imported(package, error)
+                why = f"{type(error).__name__}: {brief(error)}"
+                broken[package] = f"{package} is installed and cannot be imported ({why})"
     return broken
-
-
-def not_imported(package: str, error: BaseException) -> str:
-    return f"{package} is installed and cannot be imported ({type(error).__name__}: {brief(error)})"
 
 
 def parse(config_class: type[Any], arguments: list[str], *, recipe_class: type[Any] | None = None) -> Any:
