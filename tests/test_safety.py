@@ -56,15 +56,6 @@ def test_twenty_thousand_hostile_names_stay_inside(tmp_path: Path):
     assert sorted(tmp_path.rglob("*")) == before
 
 
-@pytest.mark.parametrize("name", ["/etc/passwd", "../../etc/passwd", "C:/x", "a\\..\\x", "~/x", "", None])
-def test_names_that_are_refused(tmp_path: Path, name: object):
-    with pytest.raises(
-        InputError, match="^policy.path='runs/theirs': .*only files inside the folder"
-    ) as caught:
-        safe_join(tmp_path, name, ORIGIN)
-    assert "\n" not in str(caught.value)
-
-
 def test_links_lead_about_inside_and_in_the_hub_s_cache_only(tmp_path: Path):
     root = tmp_path / "root"
     (root / "data").mkdir(parents=True)

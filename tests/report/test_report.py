@@ -8,9 +8,7 @@ import math
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
 
 from accerl_lerobot import cli
@@ -20,7 +18,7 @@ from accerl_lerobot.demos.backbone import BackboneConfig
 from accerl_lerobot.demos.sft import SFTConfig
 from accerl_lerobot.engines.config import RunConfig, encode
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.report.read import changed_fields, column, differences, newest, read_run
+from accerl_lerobot.report.read import changed_fields, differences, read_run
 from tests.report.folders import run_config, write_run
 from tests.report.test_page import Seen
 
@@ -135,12 +133,6 @@ def test_damaged_files_are_named(tmp_path: Path, name: str, content: bytes, said
     with pytest.raises(InputError, match=said) as caught:
         read_run(folder)
     assert name in str(caught.value) and "\n" not in str(caught.value)
-
-
-def test_columns_hold_numbers_only() -> None:
-    records: list[dict[str, Any]] = [{"a": 1}, {}, {"a": None}, {"a": "x"}, {"a": 2.5}]
-    assert np.array_equal(column(records, "a"), [1, np.nan, np.nan, np.nan, 2.5], equal_nan=True)
-    assert newest(records, "a") == 2.5 and newest(records, "b") is None
 
 
 def test_fields_that_differ() -> None:
