@@ -119,7 +119,6 @@ class Block(NamedTuple):
     rows: Sequence[Sequence[str]] = ()
     videos: Sequence[Path] = ()
     shares: dict[str, dict[str, float]] | None = None
-    needs: object = True
     note: str = ""
     text: str = ""
 
@@ -145,6 +144,7 @@ def one_run(run: Run, now: float) -> dict[str, Any]:
         if not run.offline:
             bound = lag_limits(decode(RunConfig, run.config))[0]
     success = {"while exploring": exploring(run), "evaluation": evaluated(run)}
+    imagined = over_updates(run.rollout, ("success_imagined", "success_exploring"), share=True)
     changed = changed_fields(run.config)
     blocks = [
         Block(
@@ -157,11 +157,7 @@ def one_run(run: Run, now: float) -> dict[str, Any]:
         ),
         Block("Evaluations", columns=("", "env steps", "task", "success", "n"), rows=_evaluations(run)),
         Block("Videos", videos=run.videos),
-        Block(
-            "Imagined rollouts",
-            charts=[over_updates(run.rollout, ("success_imagined", "success_exploring"), share=True)],
-            needs=newest(run.rollout, "success_imagined"),
-        ),
+        Block("Imagined rollouts", charts=[imagined] if len(finite(run.rollout, "success_imagined")) else []),
         Block("Time of each role while training", shares=_time_shares(run)),
         Block("Learning", charts=[over_updates(run.train, names) for names in LEARNING]),
         Block(
