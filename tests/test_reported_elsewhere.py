@@ -1,10 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Problems that users of other projects reported, tried here.
-
-LeRobot: #211, #470, #850, #888, #898, #933, #959, #1105, #1672, #1739, #1783, #1875, #2250, #2284, #2850,
-#3415, #3479, #3771, #4027, #4143, #4152, #4245. Gymnasium: #77, #453. Gym: #2210. RLinf: #584. OpenVLA: #342.
-starVLA: #285. Grid2Op: #331. Ray: #6662. TinyZero: #75.
-"""
+"""Situations of docs/reported_elsewhere.md: what other projects' users reported, tried here."""
 
 from __future__ import annotations
 
