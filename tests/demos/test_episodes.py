@@ -17,7 +17,7 @@ from accerl_lerobot.demos.sft import picked
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.contract import WorldModelSpec
 from accerl_lerobot.world_model.data import load_episodes
-from tests.tiny_datasets import ACTION, FPS, FRONT, IMAGE, STATE, STEPS, labels, rewrite, write_dataset
+from tests.tiny_datasets import ACTION, FPS, FRONT, IMAGE, STATE, STEPS, labels, write_dataset
 
 SUCCESS, REWARD = "next.success", "next.reward"
 
@@ -115,9 +115,3 @@ def test_an_instruction_that_changes_is_refused_where_one_is_read(tmp_path: Path
         read(dataset)
     with opened(dataset, open_metadata(dataset)) as data:  # SFT reads it where it stands
         assert [data[i]["task"] for i in (STEPS + 2, STEPS + 3)] == ["go", "stop"]
-
-
-def test_instructions_are_looked_up_by_their_index(tmp_path: Path):
-    dataset = write_dataset(tmp_path / "data", ("open", "close", "open"))
-    rewrite(tmp_path / "data/meta/tasks.parquet", lambda table: table.take([1, 0]))
-    assert [episode.tasks for episode in read(dataset)] == [("open",), ("close",), ("open",)]

@@ -68,13 +68,6 @@ def test_every_whole_episode_is_in_the_dataset_step_by_step(run, tmp_path, capsy
     check_features(written, env_features(make_environment(settings.env).spec), {}, "dataset.repo_id", "")
 
 
-def test_some_of_them(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    capsys.readouterr()
-    assert exported(run, tmp_path / "set", "--pick=successes") == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["episodes"] == found["successes"] > 0
-
-
 def test_a_run_with_types_of_other_packages(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     other = tmp_path / "run"
     other.mkdir()

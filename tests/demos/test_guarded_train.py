@@ -76,19 +76,21 @@ def test_a_refusal_is_one_line_of_the_run(tmp_path: Path, monkeypatch: pytest.Mo
     assert str(caught.value) == "sft.trust_remote_code='x.py': read it"
 
 
-def test_a_hostile_dataset_ends_the_training_in_a_line(tmp_path: Path):
-    """The real trainer, in a process of its own."""
+def test_a_hostile_dataset_ends_the_training_in_a_line(tmp_path: Path, monkeypatch: Any, capsys: Any):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
     root = Path(shutil.copytree(ROOT, tmp_path / "data"))
     info = json.loads((root / "meta/info.json").read_text())
     (root / "meta/info.json").write_text(json.dumps(info | {"data_path": "{chunk_index:999999999}"}))
-    small = {"type": "act", "chunk_size": 4, "n_action_steps": 4, "pretrained_backbone_weights": None}
-    with pytest.raises(InputError, match="^dataset.root=.*data_path: .*is no template of a file"):
-        run_sft(
-            SFTConfig(steps=1, policy=small),
-            DatasetConfig(repo_id="a/b", root=str(root)),
-            tmp_path / "sft",
-            seed=0,
+    with pytest.raises(SystemExit):
+        run(
+            monkeypatch,
+            lambda: LeRobotDataset("a/b", root=root),
+            "--dataset.repo_id=a/b",
+            f"--dataset.root={root}",
         )
+    answer = json.loads(capsys.readouterr().out.rpartition(ANSWER)[2])
+    assert answer["field"] == "dataset.root" and "is no template of a file" in answer["why"]
 
 
 def test_a_hostile_start_is_refused_before_anything_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -24,7 +24,6 @@ from accerl_lerobot.demos.record import (
 from accerl_lerobot.envs import EnvConfig, MetaWorldConfig, SimulatedConfig, make_environment
 from accerl_lerobot.envs.gym_env import GymConfig
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.seeds import demo_seed
 from tests.rounding import assert_close
 
 TINY = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
@@ -72,18 +71,6 @@ def test_the_expert_succeeds_at_the_last_frame_of_each_episode(recorded: Path):
     assert len(last) == 2
     for name in ("next.reward", "next.done", "next.success"):
         assert [i for i, row in enumerate(data) if row[name]] == last, name
-
-
-def test_frames_are_what_the_world_showed_when_the_action_was_chosen(recorded: Path):
-    data = rows(recorded)
-    environment = make_environment(MetaWorldConfig(task=TASKS))
-    observation = environment.reset(demo_seed(0, 0), "handle-press-v3")
-    for row in data[:10]:
-        stored = (row["observation.images.corner2"] * 255).round().astype(np.uint8).transpose(1, 2, 0)
-        assert np.array_equal(stored, observation["observation.images.corner2"])
-        assert np.array_equal(row["observation.state"], observation["observation.state"])
-        observation = environment.step_chunk(row["action"][None]).observation
-    environment.close()
 
 
 def test_the_content_does_not_depend_on_the_processes(recorded, tmp_path, monkeypatch):

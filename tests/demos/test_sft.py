@@ -175,12 +175,13 @@ def command_that(monkeypatch: pytest.MonkeyPatch, program: str) -> None:
 
 BAR = r"print('\rTraining:   0%|          | 0/8 [00:00<?, ?step/s]', end='', flush=True)"
 TRAINER = f"""
-import sys
+import logging, sys
 from lerobot.scripts import lerobot_train
 from accerl_lerobot.demos import guarded_train
 def main():
     {BAR}
-    {{}}
+    logging.getLogger('accerl_lerobot.x').warning('tasks differ')
+    raise KeyError('observation.state.joints')
 lerobot_train.main = main
 sys.argv = ["lerobot-train"]
 guarded_train.main()
@@ -193,24 +194,18 @@ guarded_train.main()
         (f"{BAR}\nraise SystemExit('out of disk')", "out of disk"),
         (f"{BAR}\nraise ValueError('no q01,\\nno q99')", "ValueError: no q01, no q99"),
         (f"{BAR}\nimport os; os.kill(os.getpid(), 9)", "was ended by SIGKILL"),
-        (TRAINER.format("raise KeyError('observation.state.joints')"), "KeyError: 'observation.st"),
-        (TRAINER.format("raise SystemExit('error: no such argument: --x')"), "error: no such argum"),
+        (TRAINER, "KeyError: 'observation.st"),
     ],
-    ids=["exit", "exception", "killed", "trainer", "trainer's exit"],
+    ids=["exit", "exception", "killed", "trainer"],
 )
-def test_a_failing_trainer_s_last_exception_is_the_reason(program, reason, tmp_path, monkeypatch):
+def test_a_failing_trainer_s_last_exception_is_the_reason(program, reason, tmp_path, monkeypatch, caplog):
     command_that(monkeypatch, program)
     with pytest.raises(RuntimeError) as caught:
         run_sft(TINY, HUB, tmp_path / "sft", seed=0)
     assert str(caught.value).startswith(f"lerobot-train failed, see {tmp_path / 'sft.log'}: {reason}")
     assert not any(words in str(caught.value) for words in ("%|", "\n", ANSWER))
-
-
-def test_a_trainer_s_warnings_are_shown(tmp_path, monkeypatch, caplog):
-    warn = "import logging; logging.getLogger('accerl_lerobot.x').warning('tasks differ')"
-    command_that(monkeypatch, TRAINER.format(warn))
-    run_sft(TINY, HUB, tmp_path / "sft", seed=0)
-    assert [r.getMessage() for r in caplog.records if r.levelname == "WARNING"] == ["tasks differ"]
+    warned = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert warned == (["tasks differ"] if program == TRAINER else [])
 
 
 def test_progress_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -128,18 +128,12 @@ def test_actions_are_clipped_to_the_bounds(case: Case):
     assert_equal(clipped, case.environment.step_chunk(beyond).observation)
 
 
-@pytest.mark.parametrize("wrong", ["one dimension", "too wide", "empty", "nan"])
-def test_a_wrong_chunk_is_refused_and_changes_nothing(case: Case, wrong: str):
+def test_a_wrong_chunk_is_refused_and_changes_nothing(case: Case):
     good = case.actions(3)
-    bad = {
-        "one dimension": good[0],
-        "too wide": np.concatenate([good, good], 1),
-        "empty": good[:0],
-        "nan": np.full_like(good, np.nan),
-    }[wrong]
     case.environment.reset(4, case.task)
-    with pytest.raises(ValueError, match="actions"):
-        case.environment.step_chunk(bad)
+    for bad in (good[0], np.concatenate([good, good], 1), good[:0], np.full_like(good, np.nan)):
+        with pytest.raises(ValueError, match="actions"):
+            case.environment.step_chunk(bad)
     after = case.environment.step_chunk(good)
     case.environment.reset(4, case.task)
     assert_equal(after.observation, case.environment.step_chunk(good).observation)
@@ -157,10 +151,3 @@ def test_render_has_the_size_asked_for_and_changes_nothing(case: Case):
     frame = case.environment.render(48, 80)
     assert frame.shape == (48, 80, 3) and frame.dtype == np.uint8 and frame.std() > 5
     assert_equal(plain.observation, case.environment.step_chunk(case.actions(4)).observation)
-
-
-def test_stepping_before_a_reset_is_refused(case: Case):
-    fresh = type(case.environment)(case.config)  # type: ignore[call-arg]
-    with pytest.raises(RuntimeError, match="reset"):
-        fresh.step_chunk(case.actions(1))
-    fresh.close()

@@ -83,11 +83,7 @@ def test_images_are_what_the_environment_drew(pusht: LeRobotEnvironment):
     ("values", "message"),
     [
         ({"name": "nope"}, "env.name='nope': LeRobot has: .*pusht"),
-        (
-            {"kwargs": {"colour": 1}},
-            "env.kwargs=.*colour.*pusht has the fields .*obs_type, .*observation_height",
-        ),
-        ({"kwargs": {"obs_type": "colours"}}, "env.kwargs=.*pusht: the environment fails .*colours"),
+        ({"kwargs": {"colour": 1}}, "env.kwargs=.*colour.*pusht has the fields .*obs_type"),
         ({"kwargs": {"obs_type": "environment_state_agent_pos"}}, "pixels_agent_pos"),
     ],
 )
@@ -95,21 +91,6 @@ def test_bad_values_name_field_and_remedy(values: dict, message: str):
     pytest.importorskip("gym_pusht")
     with pytest.raises(InputError, match=message):
         make_environment(LeRobotEnvConfig(**values))
-
-
-def test_a_package_that_is_broken_is_told_in_the_line_of_an_unknown_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-):
-    """LeRobot would log its traceback, and the line would not name it."""
-    (tmp_path / "lerobot_env_theirs.py").write_text("import no_such_module_of_theirs")
-    (tmp_path / "lerobot_env_theirs-1.0.dist-info").mkdir()
-    text = "Metadata-Version: 2.1\nName: lerobot-env-theirs\nVersion: 1.0\n"
-    (tmp_path / "lerobot_env_theirs-1.0.dist-info" / "METADATA").write_text(text)
-    monkeypatch.syspath_prepend(str(tmp_path))
-    why = "lerobot_env_theirs is installed and cannot be imported .ModuleNotFoundError: No module named"
-    with pytest.raises(InputError, match=f"env.name='theirs': {why} .*; LeRobot has: "):
-        make_environment(LeRobotEnvConfig(name="theirs"))
-    assert not caplog.records
 
 
 @pytest.fixture
@@ -165,7 +146,7 @@ def test_stock_lerobot_sees_our_world(plugin):
 
 
 @pytest.mark.usefixtures("plugin")
-@pytest.mark.parametrize("asynchronous", [False, True])
+@pytest.mark.parametrize("asynchronous", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_stock_lerobot_runs_a_gymnasium_environment(monkeypatch: pytest.MonkeyPatch, asynchronous: bool):
     from lerobot.envs.factory import make_env, make_env_config
     from lerobot.envs.utils import NEW_ROLLOUT_OPTION
@@ -211,9 +192,7 @@ def arena(tmp_path, monkeypatch: pytest.MonkeyPatch):
     ("hub_path", "trust", "said"),
     [
         (f"them/arena@{COMMIT}", False, "env.trust_remote_code=False: isaaclab_arena is code of them/arena"),
-        ("them/arena", True, "env.kwargs.hub_path='them/arena': name a commit"),
         ("them/arena@main", True, "env.kwargs.hub_path='them/arena@main': name a commit"),
-        (f"them/arena@{COMMIT[:12]}:env.py", True, "env.kwargs.hub_path="),
         (f"them/arena@{COMMIT}:../../env.py", True, "env.kwargs.hub_path="),
     ],
 )

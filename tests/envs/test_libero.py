@@ -68,7 +68,6 @@ def test_names_and_texts_are_liberos_own():
     [
         ({"task": "libero_objects"}, "'libero_objects' is no task; did you mean libero_object or"),
         ({"task": "libero_goal/10"}, "'libero_goal/10' is no task"),
-        ({"task": ""}, "'' is no task; use names such as libero_spatial/0"),
         ({"camera": "agentview,agentview"}, "name each camera once"),
         ({"camera": "agentview_image"}, "separated by commas, of: agentview, robot0_eye_in_hand, "),
     ],

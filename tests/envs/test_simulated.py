@@ -30,22 +30,3 @@ def test_with_dense_rewards_no_success_ends_the_episode():
     environment.reset(0, "match")
     results = [environment.step_chunk(held(environment)) for _ in range(2)]
     assert results[-1].truncated and results[-1].success and results[-1].rewards.min() > 0.99
-
-
-def test_the_picture_shows_the_target_and_the_actions():
-    environment = SimulatedEnvironment(SimulatedConfig(tolerance=0.01))
-    pictures = [environment.reset(seed, "match")["observation.images.front"] for seed in (0, 1)]
-    assert not np.array_equal(*pictures)
-    moved = environment.step_chunk(np.full((2, 2), 0.9, np.float32)).observation["observation.images.front"]
-    assert not np.array_equal(pictures[1], moved)
-
-
-def test_no_picture_is_drawn_inside_a_chunk(monkeypatch: pytest.MonkeyPatch):
-    drawn = []
-    render = SimulatedEnvironment.render
-    monkeypatch.setattr(SimulatedEnvironment, "render", lambda *args: drawn.append(1) or render(*args))
-    environment = SimulatedEnvironment(SimulatedConfig())
-    environment.reset(0, "match")
-    environment.step_chunk(np.zeros((10, 2), np.float32))
-    environment.step_chunk(held(environment))
-    assert len(drawn) == 3

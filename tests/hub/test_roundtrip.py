@@ -43,19 +43,14 @@ for path, revision in json.loads(sys.argv[1]):
 stock = get_policy_class("smolvla").from_pretrained(sys.argv[2])
 make_pre_post_processors(stock.config, pretrained_path=sys.argv[2])
 found["stock"] = digest(stock.state_dict())
-print(json.dumps(found))
-"""
-
-FRAMES = """
-import hashlib, json, sys
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-def digest(dataset):
+def content(dataset):
     frames = [dataset[i] for i in range(0, len(dataset), 30)]
     values = (f[k].numpy().tobytes() for f in frames for k in sorted(f) if hasattr(f[k], "numpy"))
-    content = hashlib.sha256(b"".join(values)).hexdigest()
-    return [len(dataset), dataset.num_episodes, frames[0]["task"], content]
-here = digest(LeRobotDataset("any/name", root=sys.argv[2]))
-print(json.dumps([here, digest(LeRobotDataset(sys.argv[1]))]))
+    digest = hashlib.sha256(b"".join(values)).hexdigest()
+    return [len(dataset), dataset.num_episodes, frames[0]["task"], digest]
+found["data"] = [content(LeRobotDataset("any/name", root=sys.argv[4])), content(LeRobotDataset(sys.argv[3]))]
+print(json.dumps(found))
 """
 
 
@@ -89,7 +84,7 @@ def run(tiny_checkpoint: Path, tmp_path: Path) -> Path:
     return tmp_path / "run"
 
 
-def test_policies_load_wherever_they_are(hub: HubServer, run: Path, tmp_path: Path):
+def test_policies_and_datasets_load_wherever_they_are(hub: HubServer, run: Path, tmp_path: Path):
     accerl("push", f"--path={run / LAST}", "--repo_id=alice/policy")
     commit = hub.repo("alice/policy").branches["main"]
     original = run.rename(tmp_path / "moved") / LAST  # whatever still names the old place is found out
@@ -99,24 +94,22 @@ def test_policies_load_wherever_they_are(hub: HubServer, run: Path, tmp_path: Pa
     hub.plant("alice/policy", {"model.safetensors": b"what came later"})
     pulled = str(tmp_path / "policy")
     places = [(str(original), None), (pulled, None), ("alice/policy", commit)]
-    found = fresh(hub, tmp_path / "home", LOAD, json.dumps(places), pulled)
-    assert {path: found[path] for path, _ in places} == dict.fromkeys(found.keys() - {"stock"}, found[pulled])
+    accerl("push", f"--path={TINY}", "--repo_id=alice/tiny")
+    accerl("pull", "--repo_id=alice/tiny", f"--output_dir={tmp_path / 'tiny'}")
+    data = "alice/tiny", str(tmp_path / "tiny")
+    found = fresh(hub, tmp_path / "home", LOAD, json.dumps(places), pulled, *data)
+    assert all(found[path] == found[pulled] for path, _ in places)
     assert found["stock"] == found[pulled][0]
+    here, there = found["data"]
+    assert here == there and here[:3] == [365, 4, "Open a drawer"]
+    files = {p.relative_to(tmp_path / "tiny"): p.read_bytes() for p in (tmp_path / "tiny").rglob("*.*")}
+    assert {p.relative_to(TINY): p.read_bytes() for p in TINY.rglob("*.*")}.items() <= files.items()
     carried = tmp_path / "policy" / "accerl_run"
     assert json.loads((carried / "summary.json").read_text()) == SUMMARY
     assert (carried / "config.yaml").read_text() == "output_dir: null\njob_name: tiny\n"
     before = hub.files("alice/policy", revision=commit)
     accerl("push", f"--path={pulled}", "--repo_id=alice/policy")
     assert hub.files("alice/policy") == before, "there and back changes nothing"
-
-
-def test_a_dataset_is_one_that_lerobot_finds(hub: HubServer, tmp_path: Path):
-    accerl("push", f"--path={TINY}", "--repo_id=alice/tiny")
-    accerl("pull", "--repo_id=alice/tiny", f"--output_dir={tmp_path / 'tiny'}")
-    here, there = fresh(hub, tmp_path / "home", FRAMES, "alice/tiny", str(tmp_path / "tiny"))
-    assert here == there and here[:3] == [365, 4, "Open a drawer"]
-    pulled = {p.relative_to(tmp_path / "tiny"): p.read_bytes() for p in (tmp_path / "tiny").rglob("*.*")}
-    assert {p.relative_to(TINY): p.read_bytes() for p in TINY.rglob("*.*")}.items() <= pulled.items()
 
 
 def test_a_world_model_brings_its_success_model(hub: HubServer, tmp_path: Path):

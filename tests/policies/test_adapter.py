@@ -13,7 +13,6 @@ import torch
 from accerl_lerobot.experience import stack_observations
 from accerl_lerobot.policies.adapter import ValueHead
 from accerl_lerobot.policies.config import GaussianSamplerConfig
-from tests.policies.checkpoints import write_act
 from tests.policies.tiny import adapter_at, requests
 from tests.rounding import assert_close
 
@@ -27,17 +26,6 @@ def test_images_are_scaled_and_states_normalised(tiny_checkpoint: Path):
         image[1, 2, 5, 7].numpy(), np.float32(raw["observation.images.front"][1, 5, 7, 2]) / 255
     )
     assert np.allclose(batch["observation.state"], raw["observation.state"] / 0.5, rtol=1e-6)
-
-
-def test_a_lone_camera_may_be_called_as_in_lerobot_s_pusht(tmp_path: Path):
-    # What `env.camera=""` names it, and what policies trained on LeRobot's PushT dataset expect.
-    adapter = adapter_at(write_act(tmp_path / "one", camera="observation.image"))  # compared with LeRobot's
-    request = requests(1, image=16)[0]
-    image = request.observation["observation.images.front"]
-    observations = {"observation.image": image[None], "observation.state": np.zeros((1, 4), np.float32)}
-    batch = adapter.processing.prepare(observations, ["Push"])
-    assert batch["observation.image"].shape == (1, 3, 16, 16)
-    assert np.array_equal(batch["observation.image"][0, 2, 5, 7].numpy(), np.float32(image[5, 7, 2]) / 255)
 
 
 def test_act_s_std_starts_where_it_is_configured_and_stays_within_bounds(written: Callable[[str], Path]):
@@ -79,16 +67,6 @@ def test_initial_weights_depend_on_the_seed_alone_and_not_on_what_was_drawn_befo
         heads.append(ValueHead(6).hidden.weight.detach())
     assert torch.equal(heads[0], heads[1]) and not torch.equal(heads[0], heads[2])
     assert heads[0].abs().max() <= 6**-0.5 and heads[0].std() == pytest.approx(6**-0.5 / 3**0.5, rel=0.1)
-
-
-def test_padding_is_not_read():
-    critic, (features, mask) = head(), inputs()
-    value = critic(features, mask)
-    assert value.shape == (2,) and value.std() > 0
-    other = torch.where(mask[..., None], features, 100.0)
-    assert torch.equal(critic(other, mask), value)
-    alone = critic(features[1:, :2], mask[1:, :2])
-    assert_close(alone, value[1:])
 
 
 def test_attention_by_hand():

@@ -123,7 +123,7 @@ def test_every_type_has_a_run():
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[] if name == "smolvla" else pytest.mark.slow) for name in RUNS]
+    "name", [pytest.param(name, marks=[] if name == "act" else pytest.mark.slow) for name in RUNS]
 )
 def test_a_random_policy_gets_better(name: str, tmp_path: Path):
     run = RUNS[name]

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import copy
-import math
 from pathlib import Path
 
 import numpy as np
@@ -36,16 +35,6 @@ def path(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
 @pytest.fixture
 def adapter(path: Path) -> LeRobotAdapter:
     return adapter_at(path)
-
-
-def test_the_state_counts_in_full_however_the_critic_weights_its_tokens(tmp_path: Path):
-    adapter = adapter_at(write_pi(tmp_path / "pi0", "pi0"))
-    first = requests(1)[0]
-    arrays, tasks = stack_observations([first])
-    encoded = adapter.encode(arrays, tasks)
-    weights = torch.softmax(torch.randn(encoded.mask.shape).masked_fill(~encoded.mask, -math.inf), -1)
-    pooled = (weights[..., None] * encoded.features).sum(1)
-    assert_close(pooled[0, -4:], first.observation["observation.state"] / 0.5)
 
 
 def test_the_first_decision_of_a_process_is_lerobot_s_too(path: Path):

@@ -144,14 +144,6 @@ def test_what_cannot_learn_is_evaluated_and_refused_in_one_line(written: Any, tm
     assert not (tmp_path / "new").exists()
 
 
-def test_loaded_to_be_evaluated_it_does_not_explore(written: Any):
-    adapter = load_acting(config_of(written("tdmpc"), "tdmpc"))
-    (asked,) = requests(1, image=64)
-    for refused in (lambda: adapter.decide([asked], 0), lambda: adapter.values(*stack_observations([asked]))):
-        with pytest.raises(InputError, match="policy.type='tdmpc': it has no likelihood here"):
-            refused()
-
-
 def learning(path: Path, **fields: Any) -> StockAdapter:
     """A policy of any type, loaded to learn."""
     sampler = ChunkNoiseConfig(**fields)
@@ -160,7 +152,7 @@ def learning(path: Path, **fields: Any) -> StockAdapter:
     return adapter
 
 
-@pytest.mark.parametrize("write", [write_act, write_smolvla, write_diffusion])
+@pytest.mark.parametrize("write", [write_act, write_diffusion])
 def test_types_that_are_known_act_as_in_lerobot_s_loop(write: Callable[..., Path], tmp_path: Path):
     adapter = learning(write(tmp_path / "policy", image=32))
     (asked,) = requests(1, explore=False)

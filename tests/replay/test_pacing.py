@@ -188,7 +188,7 @@ def test_promises_hold_under_hostile_schedules(
         max_unlearned_decisions=ahead,
         max_lag=10_000,
     )
-    for seed in range(3):
+    for seed in range(2):
         simulation = Simulation(
             config=config,
             batch=batch,
@@ -199,8 +199,8 @@ def test_promises_hold_under_hostile_schedules(
             gate=gate,
             seed=seed,
         )
-        simulation.run(4000)
-        assert simulation.version > 30
+        simulation.run(2000)
+        assert simulation.version > 15
 
 
 @pytest.mark.parametrize("max_lag", [0, 1, 4])
@@ -212,9 +212,9 @@ def test_a_tight_max_lag_retires_but_never_stalls(max_lag: int) -> None:
     simulation = Simulation(
         config=config, batch=8, longest=4, workers=5, in_flight=40, publish_every=1, gate="insert", seed=1
     )
-    simulation.run(12_000)
+    simulation.run(4000)
     assert simulation.replay.counters.retired_segments > 0
-    assert simulation.version > 100 and simulation.worst_lag == max_lag
+    assert simulation.version > 30 and simulation.worst_lag == max_lag
 
 
 def test_evenly_matched_sides_waste_nothing() -> None:

@@ -219,10 +219,3 @@ def test_a_thread_that_hangs_shows_in_the_report(
     assert one.order(True).in_environment is in_environment
     release.set()
     one.until(lambda: len(one.episodes) >= 2 and one.order(True).busy_s < 0.4)
-
-
-def test_a_worker_that_does_not_run_yet_does_not_hang():
-    worker = RolloutWorker(WORLD, RolloutConfig(environments=1))
-    worker.ready(EpisodePlans(("match",), 0, None))
-    report = worker.report(True, [])
-    assert (report.busy_s, report.in_environment) == (0.0, False)
