@@ -12,9 +12,11 @@ from __future__ import annotations
 import contextlib
 import io
 import itertools
+import multiprocessing
 import os
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
@@ -23,7 +25,6 @@ import numpy as np
 from rich.table import Table
 
 from accerl_lerobot.config.ranges import Positive, Range, Repeats, Section
-from accerl_lerobot.demos.record import simulators
 from accerl_lerobot.envs import EnvConfig, LiberoConfig, MetaWorldConfig, make_environment
 from accerl_lerobot.envs.graphics import import_mujoco
 from accerl_lerobot.envs.libero import load_libero
@@ -78,7 +79,10 @@ def bench_environment(config: BenchEnvironmentConfig) -> dict[str, Any]:
     blocks: dict[str, list[tuple[float, float]]] = {name: [] for name in names}
     with contextlib.ExitStack() as stack:
         # A process for each arm: two OpenGL contexts in one process disturb each other.
-        pools = {name: stack.enter_context(simulators(1, _start, name, config)) for name in names}
+        spawn = multiprocessing.get_context("spawn")
+        pools = {
+            name: stack.enter_context(ProcessPoolExecutor(1, spawn, _start, (name, config))) for name in names
+        }
         for name in (*names, *config.rounds * (*names, *reversed(names))):
             blocks[name].append(pools[name].submit(_measure, config.seconds).result())
         machine = pools[OURS].submit(_host).result()

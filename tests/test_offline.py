@@ -15,7 +15,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from accerl_lerobot.algorithms import chunk_critic
 from accerl_lerobot.cli import main
 from accerl_lerobot.config.ranges import DatasetConfig
-from accerl_lerobot.demos.episodes import read_labels
+from accerl_lerobot.demos.dataset_files import read_labels
 from accerl_lerobot.demos.record import DemosConfig, record_demos
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.metrics import METRICS

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from accerl_lerobot.config.ranges import DatasetConfig
-from accerl_lerobot.demos.dataset_files import open_metadata, opened
-from accerl_lerobot.demos.episodes import numbers, observations, read_labels
+from accerl_lerobot.demos.dataset_files import numbers, observations, open_metadata, opened, read_labels
 from accerl_lerobot.experience import Segment, SegmentStart
 from accerl_lerobot.policies.features import dataset_shapes
 

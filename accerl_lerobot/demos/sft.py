@@ -233,8 +233,7 @@ def picked(dataset: DatasetConfig, pick: str) -> list[int] | None:
     """
     if pick == "all":
         return None
-    from accerl_lerobot.demos.dataset_files import open_metadata, opened
-    from accerl_lerobot.demos.episodes import read_labels
+    from accerl_lerobot.demos.dataset_files import open_metadata, opened, read_labels
 
     meta = open_metadata(dataset)
     if not {SUCCESS, REWARD} & set(meta.features):

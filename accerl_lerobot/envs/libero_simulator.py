@@ -74,7 +74,6 @@ class Arm(NamedTuple):
     bias: np.ndarray
     qpos: np.ndarray
     qvel: np.ndarray
-    dofs: np.ndarray  # int (7,): the arm's, equal for `qpos` and `qvel`, as it comes first
     position: np.ndarray
     rotation: np.ndarray  # (3, 3) of the hand
 
@@ -121,8 +120,7 @@ class Simulator:
         self._position, self._rotation = data.site_xpos[self._site], data.site_xmat[self._site].reshape(3, 3)
         self._ctrl, self._torques = data.ctrl, _compiled_torques()
         self._arm = Arm(
-            self._jacobian, self._mass, data.qfrc_bias, data.qpos, data.qvel, self._dofs,
-            self._position, self._rotation,
+            self._jacobian, self._mass, data.qfrc_bias, data.qpos, data.qvel, self._position, self._rotation
         )  # fmt: skip
         # What is looked at: the data of the last reading of the sensors, without its velocities.
         self._seen = self._mujoco.MjData(self.model)
@@ -287,17 +285,11 @@ def operational_space_torques(arm: Arm, aim: Aim) -> np.ndarray:
 
     Position and rotation are uncoupled; what freedom is left to the joints goes to the pose of rest.
     """
-    dofs = arm.dofs
-    n = len(dofs)
-    mass, joined, velocity = np.empty((n, n)), np.empty((6, n)), np.zeros(6)
-    for i in range(n):
-        for j in range(n):
-            mass[i, j] = arm.mass[dofs[i], dofs[j]]
-        for k in range(3):
-            joined[k, i] = arm.jacobian[0, k, dofs[i]]
-            joined[3 + k, i] = arm.jacobian[1, k, dofs[i]]
-    for i in range(n):
-        velocity += joined[:, i] * arm.qvel[dofs[i]]
+    n = len(aim.rest)  # joints of the arm, which come first
+    mass = np.ascontiguousarray(arm.mass[:n, :n])
+    joined = np.ascontiguousarray(arm.jacobian.reshape(6, arm.jacobian.shape[2])[:, :n])
+    qpos, qvel = arm.qpos[:n], arm.qvel[:n]
+    velocity = np.dot(joined, qvel)
     error = np.zeros(6)
     error[:3] = aim.position - arm.position
     for k in range(3):
@@ -305,16 +297,11 @@ def operational_space_torques(arm: Arm, aim: Aim) -> np.ndarray:
     wanted = aim.gains[0] * error - aim.gains[1] * velocity
     weighed = np.linalg.solve(mass, joined.T)
     inertia = np.dot(joined, weighed)  # inverse of the hand's
-    free = np.empty(n)
-    for i in range(n):
-        free[i] = 10.0 * (aim.rest[i] - arm.qpos[dofs[i]]) - 2 * np.sqrt(10.0) * arm.qvel[dofs[i]]
+    free = 10.0 * (aim.rest - qpos) - 2 * np.sqrt(10.0) * qvel
     wrench = -np.linalg.solve(inertia, np.dot(joined, free))
     wrench[:3] += np.linalg.solve(np.ascontiguousarray(inertia[:3, :3]), wanted[:3])
     wrench[3:] += np.linalg.solve(np.ascontiguousarray(inertia[3:, 3:]), wanted[3:])
-    torques = np.dot(joined.T, wrench) + np.dot(mass, free)
-    for i in range(n):
-        torques[i] += arm.bias[dofs[i]]
-    return torques
+    return np.dot(joined.T, wrench) + np.dot(mass, free) + arm.bias[:n]
 
 
 class SensorClock:

@@ -103,26 +103,21 @@ def load_judge(config: RewardModelConfig) -> Callable[[Observation], bool]:
     origin = FileSource(f"{REWARD_MODEL}.path", config.path)
     folder = untrusted.fetched_checkpoint(str(config.path), config.revision, origin.field)
     import_plugins(*PLUGINS)
-    try:
+    with (
+        untrusted.refusing(origin, "it cannot be loaded as one of LeRobot's reward models"),
+        untrusted.guarded(REWARD_MODEL, config.trust_remote_code),
+        contextlib.redirect_stdout(sys.stderr),
+    ):
         (name,) = [path.name for path in folder.glob("*_preprocessor.json")]
         untrusted.check_processor(folder, name, origin)
-        trusted = config.trust_remote_code
-        with untrusted.guarded(REWARD_MODEL, trusted), contextlib.redirect_stdout(sys.stderr):
-            settings = LeRobotConfig.from_pretrained(folder)
-            if settings.observation_delta_indices is not None:
-                hint = (
-                    f"{settings.type} looks at several observations at once; use one that judges each alone"
-                )
-                raise InputError(origin.field, config.path, hint)
-            settings.device = "cpu"
-            model = get_reward_model_class(settings.type).from_pretrained(folder, config=settings)
-            on_cpu = {"device_processor": {"device": "cpu"}}
-            prepare = PolicyProcessorPipeline.from_pretrained(folder, name, overrides=on_cpu)
-    except InputError:
-        raise
-    except Exception as error:  # LeRobot takes the files at their word, and may fail over any of them
-        hint = f"it cannot be loaded as one of LeRobot's reward models ({brief(error)})"
-        raise InputError(origin.field, config.path, hint) from error
+        settings = LeRobotConfig.from_pretrained(folder)
+        if settings.observation_delta_indices is not None:
+            hint = f"{settings.type} looks at several observations at once; use one that judges each alone"
+            raise InputError(origin.field, config.path, hint)
+        settings.device = "cpu"
+        model = get_reward_model_class(settings.type).from_pretrained(folder, config=settings)
+        on_cpu = {"device_processor": {"device": "cpu"}}
+        prepare = PolicyProcessorPipeline.from_pretrained(folder, name, overrides=on_cpu)
 
     @torch.no_grad()
     def succeeded(observation: Observation) -> bool:

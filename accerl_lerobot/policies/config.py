@@ -11,7 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import draccus
 
 from accerl_lerobot.config.parsing import import_plugins, imported
-from accerl_lerobot.config.ranges import Commit, Device, Range, Section, check, registered_name
+from accerl_lerobot.config.ranges import Commit, Device, Range, Section, registered_name
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE
 from accerl_lerobot.policies.deferred import import_policies
@@ -173,11 +173,6 @@ POLICIES: dict[str, tuple[str, tuple[str, ...]]] = {
 ANY = "chunk_noise"  # the family of a type that has no other
 NOT_IMPORTED: dict[str, str] = {}  # installed ``lerobot_policy_*`` → words on why it cannot be imported
 PLUGINS: dict[str, str] = {}  # policy type that is not LeRobot's own → package that registers it with LeRobot
-SIZES = (
-    "chunk_size", "n_action_steps", "n_obs_steps", "horizon", "num_steps", "num_inference_steps",
-    "max_state_dim", "max_action_dim", "num_train_timesteps", "max_decoding_steps", "tokenizer_max_length",
-)  # fmt: skip
-"""Numbers of LeRobot's policy configs by which is divided or which are shapes: at least 1."""
 USES_HISTORY = ("diffusion",)  # types that read observations of ``n_obs_steps`` env steps; others read one
 
 
@@ -262,13 +257,6 @@ def executed_rows(policy_config: Any) -> int:
     """Actions that a policy executes for each of its decisions, in LeRobot's loop and here."""
     rows = getattr(policy_config, "n_action_steps", None) or getattr(policy_config, "action_chunk_size", None)
     return int(rows or 1)
-
-
-def check_size(name: str, value: Any, field: str) -> None:
-    """Refuses a whole number of a LeRobot policy config that no policy can be built or can act with."""
-    if isinstance(value, int):
-        span = Range("[1, 10000]" if name in SIZES else "[-1, 1000000]")
-        check(Annotated[int, span], int(value), field)
 
 
 def predicted_rows(policy_config: Any) -> int | None:

@@ -208,8 +208,7 @@ def check_state_model(config: RunConfig, policy: Any, decisions: int) -> None:
 def _check_remembered(config: RunConfig, spec: EnvironmentSpec, meta: Any, history: int) -> None:
     """Compare a dataset that joins the memory with the environment, or warn that it does not join."""
     from accerl_lerobot.algorithms.demonstrations import unlike
-    from accerl_lerobot.demos.dataset_files import opened
-    from accerl_lerobot.demos.episodes import numbers, read_labels
+    from accerl_lerobot.demos.dataset_files import numbers, opened, read_labels
 
     dataset = config.dataset
     about = ("dataset.repo_id", config.dataset.repo_id)
@@ -236,8 +235,7 @@ def check_training_data(
     rename_map: dict[str, str],
 ) -> Any:
     """Compare dataset, policy and environment of an SFT; returns the dataset's metadata, if there is one."""
-    from accerl_lerobot.demos.dataset_files import open_metadata, opened
-    from accerl_lerobot.demos.episodes import numbers
+    from accerl_lerobot.demos.dataset_files import numbers, open_metadata, opened
     from accerl_lerobot.demos.sft import picked
 
     meta = None if dataset.repo_id is None else open_metadata(dataset)
@@ -334,7 +332,6 @@ def check_sft_policy(config: SFTConfig) -> Any:
     from lerobot.configs.policies import PreTrainedConfig
 
     from accerl_lerobot.demos.sft import policy_fields
-    from accerl_lerobot.policies.config import check_size
 
     kind = config.policy["type"]
     fields = {name: value for name, value in config.policy.items() if name != "type"}
@@ -346,7 +343,6 @@ def check_sft_policy(config: SFTConfig) -> Any:
         if name not in names:
             near = " or ".join(difflib.get_close_matches(name, names)) or "one of its own"
             raise InputError(f"sft.policy.{name}", value, f"LeRobot's {kind} has no such field; use {near}")
-        check_size(name, value, f"sft.policy.{name}")
     try:
         # Without a device LeRobot looks for one.
         return draccus.decode(PreTrainedConfig.get_choice_class(kind), {"device": "cpu"} | fields)

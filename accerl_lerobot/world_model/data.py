@@ -22,8 +22,7 @@ import torch
 from torch.nn import functional
 
 from accerl_lerobot.checkpoint.snapshot import kind
-from accerl_lerobot.demos.dataset_files import open_metadata, opened
-from accerl_lerobot.demos.episodes import numbers, observations, read_labels
+from accerl_lerobot.demos.dataset_files import numbers, observations, open_metadata, opened, read_labels
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import REWARD, SUCCESS
 from accerl_lerobot.policies.features import STATE

@@ -11,8 +11,14 @@ import pytest
 
 from accerl_lerobot.algorithms.demonstrations import recorded
 from accerl_lerobot.config.ranges import DatasetConfig
-from accerl_lerobot.demos.dataset_files import open_metadata, opened
-from accerl_lerobot.demos.episodes import EpisodeLabels, read_labels, step_of_reward, step_of_success
+from accerl_lerobot.demos.dataset_files import (
+    EpisodeLabels,
+    open_metadata,
+    opened,
+    read_labels,
+    step_of_reward,
+    step_of_success,
+)
 from accerl_lerobot.demos.sft import picked
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.contract import WorldModelSpec

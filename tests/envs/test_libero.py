@@ -122,7 +122,7 @@ def test_torques_against_the_definition():
     full = full @ full.T + 9 * np.eye(9)
     arm = Arm(
         jacobian=rng.normal(size=(2, 3, 9)), mass=full, bias=rng.normal(size=9), qpos=rng.normal(size=9),
-        qvel=rng.normal(size=9), dofs=np.arange(7), position=rng.normal(size=3),
+        qvel=rng.normal(size=9), position=rng.normal(size=3),
         rotation=np.linalg.qr(rng.normal(size=(3, 3)))[0],
     )  # fmt: skip
     turned = np.linalg.qr(rng.normal(size=(3, 3)))[0]
