@@ -303,12 +303,6 @@ class LeRobotAdapter(PretrainedAdapter):
             encoded = self.encode(observations, tasks)
         return self.value_head(encoded.features, encoded.mask)
 
-    def example(self) -> tuple[dict[str, np.ndarray], Sequence[str], dict[str, Tensor]]:
-        requests = self.example_requests()
-        latents = [decision.latent for decision in self.decide(requests, 0)]
-        stacked = {k: torch.from_numpy(np.stack([latent[k] for latent in latents])) for k in latents[0]}
-        return *stack_observations(requests), stacked
-
     @torch.no_grad()
     def self_check(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> float:
         """Largest difference between our sampler without exploration and LeRobot's own on equal noise.

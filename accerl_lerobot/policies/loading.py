@@ -104,15 +104,9 @@ def load_lerobot_config(config: PolicyConfig) -> Any:
     return open_checkpoint(config).config
 
 
-def dry_run_config(config: PolicyConfig, *, fine_tuned: bool = False) -> Any:
+def dry_run_config(config: PolicyConfig, *, fine_tuned: bool = False, learns: bool = False) -> Any:
     """`load_lerobot_config` of a checkpoint that has passed `policy_sizes`."""
-    policy_sizes(config, fine_tuned=fine_tuned)
-    return load_lerobot_config(config)
-
-
-def learning_config(config: PolicyConfig, *, fine_tuned: bool = False) -> Any:
-    """`dry_run_config` of a policy that learns."""
-    policy_sizes(config, fine_tuned=fine_tuned, learns=True)
+    policy_sizes(config, fine_tuned=fine_tuned, learns=learns)
     return load_lerobot_config(config)
 
 

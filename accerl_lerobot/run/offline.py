@@ -42,12 +42,12 @@ def learn_offline(config: OfflineRun, directory: Path, console: Console) -> dict
     """Learns, writes ``checkpoints/NNNNNN`` and ``summary.json`` into `directory`; returns the summary."""
     from accerl_lerobot.algorithms.ratio_update import make_update
     from accerl_lerobot.demos.dataset_files import open_metadata
-    from accerl_lerobot.policies.loading import learning_config
+    from accerl_lerobot.policies.loading import dry_run_config
 
     started = time.monotonic()
     torch.manual_seed(config.seed)
     torch.set_num_threads(config.trainer.num_threads)
-    policy = learning_config(config.policy)
+    policy = dry_run_config(config.policy, learns=True)
     meta = open_metadata(config.dataset)
     shapes = _check(config, policy, meta)
     # One step for each update, instead of so many for each new decision.

@@ -307,14 +307,14 @@ def check_imitates(algorithm: AlgorithmConfig, config: PolicyConfig, policy: Any
 def policy_to_be(config: RunConfig) -> Any:
     """LeRobot's config of the policy that a run will act with, as far as it is known before an SFT."""
     from accerl_lerobot.policies.config import check_observations, override, sampler_config
-    from accerl_lerobot.policies.loading import learning_config
+    from accerl_lerobot.policies.loading import dry_run_config
 
     if config.policy.path is not None:
-        return learning_config(config.policy)
+        return dry_run_config(config.policy, learns=True)
     if config.sft.init_path is not None:  # fine-tuning changes its weights alone
         start = replace(config.policy, path=config.sft.init_path, revision=None)
         try:
-            return learning_config(start, fine_tuned=True)
+            return dry_run_config(start, fine_tuned=True, learns=True)
         except InputError as error:
             if error.field not in ("policy.path", "policy.type", "policy.n_obs_steps"):
                 raise

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +25,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.run.preflight import check_environment, check_start
 from accerl_lerobot.run.train import make_engine
-from tests.policies.checkpoints import write_smolvla
+from tests.policies.checkpoints import edit_config, write_smolvla
 from tests.runs import collect, tiny_run
 
 CAMERA = "observation.images.front"
@@ -112,43 +113,33 @@ def test_a_run_learns_from_what_it_says(encoder: Path, tmp_path: Path):
     assert all(result.success and result.decisions == 1 for result in results)
 
 
-def edited(folder: Path, **fields: Any) -> None:
-    file = folder / "config.json"
-    file.write_text(json.dumps(json.loads(file.read_text()) | fields))
-
-
-def test_what_cannot_judge_is_refused_in_one_line(
-    encoder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    def refused(message: str, env: SimulatedConfig = ENV) -> None:
-        with pytest.raises(InputError, match=message):
-            check_environment(env, RewardModelConfig(path=str(path)))
-
-    path = tmp_path / "absent"
-    refused(r"^rollout\.reward_model\.path=.*no config\.json there")
-    path = tmp_path / "classifier"
-    write_classifier(path, encoder)
-    refused(
-        r"its observation\.images\.front is \(3, 128, 128\), the environment's \(3, 32, 32\)",
-        SimulatedConfig(),
-    )
-    write_classifier(tmp_path / "b", encoder)
-    path = tmp_path / "b"
-    (path / "classifier_preprocessor.json").unlink()
-    refused("it cannot be loaded as one of LeRobot's reward models")
-    write_classifier(tmp_path / "c", encoder)
-    path = tmp_path / "c"
-    with monkeypatch.context() as context:
-        context.setattr(RewardClassifierConfig, "observation_delta_indices", [-1, 0])
-        refused("looks at several observations at once")
-    path = tmp_path / "another type"
-    write_classifier(path, encoder)
-    edited(path, type="sarm")
-    refused("it cannot be loaded|looks at several observations at once")
-    path = tmp_path / "d"
-    write_classifier(path, encoder)
-    edited(path, latent_dim=3)
-    refused("it cannot be loaded as one of LeRobot's reward models")
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda path: shutil.rmtree(path), r"^rollout\.reward_model\.path=.*no config\.json there"),
+        (
+            lambda path: None,
+            r"its observation\.images\.front is \(3, 128, 128\), the environment's \(3, 32, 32\)",
+        ),
+        (
+            lambda path: (path / "classifier_preprocessor.json").unlink(),
+            "it cannot be loaded as one of LeRobot's",
+        ),
+        (
+            lambda path: edit_config(path, type="sarm"),
+            "it cannot be loaded|looks at several observations at once",
+        ),
+        (
+            lambda path: edit_config(path, latent_dim=3),
+            "it cannot be loaded as one of LeRobot's reward models",
+        ),
+    ],
+)
+def test_what_cannot_judge_is_refused_in_one_line(encoder: Path, tmp_path: Path, damage: Any, message: str):
+    write_classifier(tmp_path / "model", encoder)
+    damage(tmp_path / "model")
+    with pytest.raises(InputError, match=message):
+        check_environment(SimulatedConfig(), RewardModelConfig(path=str(tmp_path / "model")))
 
 
 def test_no_code_of_an_encoder_runs_unasked(encoder: Path, tmp_path: Path):
@@ -159,7 +150,7 @@ def test_no_code_of_an_encoder_runs_unasked(encoder: Path, tmp_path: Path):
     (hostile / "code.py").write_text(f"open({str(marker)!r}, 'w')\n")
     mapping = {"AutoConfig": "code.Config", "AutoModel": "code.Model"}
     (hostile / "config.json").write_text(json.dumps({"model_type": "odd", "auto_map": mapping}))
-    edited(tmp_path / "classifier", model_name=str(hostile))
+    edit_config(tmp_path / "classifier", model_name=str(hostile))
     with pytest.raises(InputError, match=r"^rollout\.reward_model\.trust_remote_code=.*code that came with"):
         load_judge(RewardModelConfig(path=str(tmp_path / "classifier")))
     assert not marker.exists()

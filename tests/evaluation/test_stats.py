@@ -3,13 +3,11 @@
 
 from __future__ import annotations
 
-import io
 import math
 
 import pytest
-from rich.console import Console
 
-from accerl_lerobot.evaluation import FILM, Rate, evaluation_plans, summarise, table
+from accerl_lerobot.evaluation import FILM, Rate, evaluation_plans, summarise
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.seeds import DEMO_SEEDS, EVAL_SEEDS, TRAIN_SEEDS
 
@@ -68,17 +66,6 @@ def test_a_summary_in_all_and_per_task() -> None:
     assert [(t["success"], t["n"]) for t in tasks.values()] == [(0.8, 10), (0.1, 10)]
     assert all(t["ci95"][0] < t["success"] < t["ci95"][1] for t in tasks.values())
     assert tasks["door"]["seeds"] == [0, 9] and tasks["door"]["failed_seeds"] == [8, 9]
-
-
-def test_a_table_has_a_row_per_task_and_one_for_all() -> None:
-    def printed(results: list[EpisodeResult]) -> str:
-        file = io.StringIO()
-        Console(file=file, width=100).print(table(summarise(results), "policy"))
-        return file.getvalue()
-
-    text = printed(RESULTS)
-    assert "door" in text and "80.0 %" in text and "all" in text and "45.0 %" in text and "n=20" in text
-    assert "all" not in printed(RESULTS[:10]), "one task needs no sum"
 
 
 def test_plans_are_paired_across_evaluations_and_runs_of_any_size() -> None:

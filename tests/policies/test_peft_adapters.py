@@ -16,7 +16,6 @@ from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos.sft import SFTConfig, sft_command
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import stack_observations
-from accerl_lerobot.policies import loading
 from accerl_lerobot.policies.config import PolicyConfig, TuningConfig
 from accerl_lerobot.policies.loading import load_adapter, policy_sizes
 from accerl_lerobot.policies.saving import save_pretrained
@@ -103,23 +102,6 @@ def test_an_adapter_without_its_policy_is_refused(copied: Path, tmp_path: Path):
     refused(copied, why)
     with pytest.raises(InputError, match=f"^sft.init_path=.*{why}"):
         sft_policy(SFTConfig(init_path=str(copied)))
-
-
-def test_the_policy_of_an_adapter_is_of_the_revision_that_it_names(
-    copied: Path, monkeypatch: pytest.MonkeyPatch
-):
-    file = copied / "adapter_config.json"
-    stored = json.loads(file.read_text())
-    file.write_text(json.dumps(stored | {"base_model_name_or_path": "me/base", "revision": "a" * 40}))
-    asked: list[tuple[Any, ...]] = []
-
-    def fetched(*where: Any) -> Path:
-        asked.append(where)
-        return copied if where[0] == str(copied) else Path(stored["base_model_name_or_path"])
-
-    monkeypatch.setattr(loading, "fetched_checkpoint", fetched)
-    load_adapter(PolicyConfig(path=str(copied), device="cpu"))
-    assert ("me/base", "a" * 40, "policy.path") in asked
 
 
 def test_an_adapter_of_another_policy_is_refused(copied: Path):

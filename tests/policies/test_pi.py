@@ -98,17 +98,6 @@ def test_relative_actions_are_added_to_their_own_state(tmp_path: Path):
         check_ratio_one(relative, asked, relative.decide(asked, 0))
 
 
-def test_a_camera_the_world_does_not_have_is_masked(tmp_path: Path):
-    for kind in KINDS:
-        one = adapter_at(write_pi(tmp_path / f"{kind}-one", kind))
-        two = adapter_at(write_pi(tmp_path / f"{kind}-two", kind, empty_cameras=1))
-        asked = requests(5)
-        chunks = [np.stack([d.chunk for d in a.decide(asked, 0)]) for a in (one, two)]
-        assert_close(chunks[1], chunks[0])
-        values = [a.values(*stack_observations(asked)) for a in (one, two)]
-        assert_close(values[1], values[0])
-
-
 @pytest.fixture(scope="module")
 def loaded(tmp_path_factory: pytest.TempPathFactory) -> LeRobotAdapter:
     """Ends about every tenth time it could."""

@@ -19,9 +19,7 @@ from accerl_lerobot.checkpoint.layout import PRETRAINED
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos.backbone import BackboneConfig
 from accerl_lerobot.demos.sft import SFTConfig, run_sft, sft_command
-from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import PLUGINS, discovery
-from accerl_lerobot.run.preflight import check_sft_policy
 from tests.policies.checkpoints import write_bins
 from tests.policies.tiny import adapter_at, requests
 from tests.rounding import assert_close
@@ -142,21 +140,6 @@ def test_the_loss_by_hand(loaded: tuple[Any, Any, Any]):
     assert_close(each, sums / counts)
     del batch["action_is_pad"]
     assert policy.forward(batch)[0].item() != pytest.approx(loss.item(), rel=1e-3)
-
-
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"chunk_size": 2, "n_action_steps": 3}, "n_action_steps=3: use 1 to chunk_size=2"),
-        ({"num_bins": 1}, "num_bins=1: use at least 2"),
-        ({"normalization_mapping": {"ACTION": "MEAN_STD"}}, "bins need MIN_MAX or QUANTILES"),
-        ({"nun_bins": 8}, "no such field; use num_bins"),
-    ],
-)
-def test_bad_fields_are_refused_before_any_training(fields: dict[str, Any], message: str):
-    with pytest.raises(InputError, match=f"^sft.policy.*{message}"):
-        check_sft_policy(SFTConfig(policy={"type": "smolvla_bins"} | fields))
-    check_sft_policy(SFTConfig(policy={"type": "smolvla_bins", "num_bins": 2}))
 
 
 def test_where_lerobot_finds_the_type(path: Path, tmp_path: Path):

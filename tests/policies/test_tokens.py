@@ -185,19 +185,6 @@ def test_scores_are_the_oracle_s_for_all_that_can_be_said(kind: Any, temperature
         assert factors is None
 
 
-@pytest.mark.parametrize("kind", MODELS)
-def test_without_exploring_the_most_likely_tokens_and_no_log_prob(kind: Any):
-    model, starts = kind(), observations(30)
-    action = family(model, 10.0).act(encoded(model, starts), requests(30, explore=False))
-    greedy = [_greedy(model, s.double().numpy()) for s in starts]
-    assert action.latent["tokens"].tolist() == greedy
-    assert not action.log_prob.any()
-    mixed = requests(15, explore=False) + requests(15, first=15)
-    action = family(model, 10.0).act(encoded(model, starts), mixed)
-    assert action.latent["tokens"][:15].tolist() == greedy[:15] and not action.log_prob[:15].any()
-    assert action.latent["tokens"][15:].tolist() != greedy[15:] and (action.log_prob[15:, 0] < 0).all()
-
-
 @pytest.mark.parametrize("temperature", [1.0, 0.4, 3.0])
 @pytest.mark.parametrize("kind", MODELS)
 def test_sequences_are_as_frequent_as_their_probability(kind: Any, temperature: float):
@@ -213,19 +200,6 @@ def test_sequences_are_as_frequent_as_their_probability(kind: Any, temperature: 
         squares += (seen[sequence] - count * p) ** 2 / (count * p)
     freedom = len(said) - 1
     assert squares < freedom + 5 * math.sqrt(2 * freedom), "χ²"
-
-
-def test_nothing_after_the_terminator_counts():
-    model = Recurrent()
-    tokens_family, read = family(model, 2.0), encoded(model, observations(60))
-    action = tokens_family.act(read, requests(60))
-    said = action.latent["tokens"]
-    after = (said == END).long().cumsum(1) - (said == END).long() > 0
-    assert after.any() and (said[after] == END).all() and not action.log_prob[after].any()
-    assert (action.log_prob[(said == END) & ~after] < 0).all(), "the terminator itself counts"
-    score = tokens_family.score(read, action.latent)
-    again = tokens_family.score(read, {"tokens": torch.where(after, 1, said)})
-    assert all(map(torch.equal, again, score))
 
 
 @pytest.mark.parametrize("kind", MODELS)
@@ -291,13 +265,3 @@ def test_the_self_check_catches_another_layout_a_changed_sampler_and_nan():
         model = kind()
         model.stock = lambda batch, model=model: model.chunk(torch.zeros(2, LENGTH, dtype=torch.int64))  # type: ignore[method-assign]
         assert math.isnan(family(model).difference(broken, model.encode(broken)))
-
-
-def test_other_tokens_behind_the_same_chunk_are_caught():
-    model, batch = Recurrent(), {"observation": observations(6)}
-    model.chunk = lambda tokens: torch.zeros(len(tokens), 1, 2)  # type: ignore[method-assign]
-    said = torch.tensor([_greedy(model, s.double().numpy()) for s in batch["observation"]])
-    model.stock_tokens = lambda batch: said  # type: ignore[method-assign]
-    assert family(model).difference(batch, model.encode(batch)) == 0.0
-    said[2, 0] = (said[2, 0] + 1) % VOCABULARY
-    assert family(model).difference(batch, model.encode(batch)) >= 1.0

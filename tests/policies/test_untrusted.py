@@ -19,9 +19,8 @@ from torch import nn
 from accerl_lerobot.checkpoint.layout import BACKBONE
 from accerl_lerobot.checkpoint.safety import FileSource
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.policies import loading
 from accerl_lerobot.policies.config import PolicyConfig
-from accerl_lerobot.policies.loading import dry_run_config, load_adapter
+from accerl_lerobot.policies.loading import load_adapter
 from accerl_lerobot.policies.saving import save_pretrained
 from accerl_lerobot.policies.untrusted import Unfilled, check_checkpoint, guarded
 from tests.hub_cache import cached_repo
@@ -116,24 +115,6 @@ def test_attention_is_not_fetched_as_compiled_code(copied: Path):
 def test_files_that_lerobot_has_not_saved_are_one_line(copied: Path, content: dict[str, Any]):
     (copied / PRE).write_text(json.dumps(content))
     refused(copied, "not a checkpoint that LeRobot has saved")
-
-
-def test_a_checkpoint_is_tried_once_without_a_random_number_or_a_word(
-    good: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
-    config = PolicyConfig(path=str(good), device="cpu")
-    load = loading.load_acting
-
-    def talkative(*given: Any, **options: Any) -> Any:
-        sys.stdout.write("a word of LeRobot's")
-        return load(*given, **options)
-
-    monkeypatch.setattr(loading, "load_acting", talkative)
-    before = torch.get_rng_state()
-    assert dry_run_config(config).type == "act"
-    assert torch.equal(torch.get_rng_state(), before) and capsys.readouterr().out == ""
-    monkeypatch.setattr(loading, "load_acting", None)
-    assert dry_run_config(config).type == "act"
 
 
 def test_a_critic_of_another_size(copied: Path):

@@ -152,20 +152,6 @@ def test_nothing_but_dropped_episodes_ends_the_rollout_with_one_line():
         recorder.play()
 
 
-def test_a_film_that_cannot_be_made_ends_nothing(caplog: pytest.LogCaptureFixture):
-    class Unseen(ScriptedEnvironment):
-        def render(self, height, width):
-            if height == 16:
-                raise AttributeError("no display")
-            return super().render(height, width)
-
-    plans = [replace(evaluate(seed, seed), film=(16, 1)) for seed in range(3)]
-    recorder = Recorder([Unseen()], plans, CONFIG)
-    recorder.play()
-    assert [(r.success, r.frames) for r in recorder.results] == [(True, [])] * 3
-    assert [m for m in caplog.messages if "no display" in m] == caplog.messages[:1]
-
-
 def test_evaluation_asks_for_the_stock_sampler_and_makes_no_segment():
     recorder = Recorder([ScriptedEnvironment()], [evaluate(1), explore(2)], CONFIG)
     requests = recorder.play()[0]
