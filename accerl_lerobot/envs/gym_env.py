@@ -119,7 +119,7 @@ class GymnasiumEnvironment(EpisodeEnvironment):
         if self.config.success:
             told = flattened(info)
             self._info_keys |= told.keys()
-            success = any(bool(np.any(told[name])) for name in self._success_keys & told.keys())
+            success = bool(np.any(told.get(self.config.success, False)))
         return Step(
             success=success,
             ended=bool(ended) or (success and self.ends_at_success),
@@ -127,23 +127,14 @@ class GymnasiumEnvironment(EpisodeEnvironment):
             cut=bool(cut),
         )
 
-    @property
-    def _success_keys(self) -> set[str]:
-        """Keys that tell success; a vector environment keeps the last step's beside the next ones."""
-        return {self.config.success, f"final_info.{self.config.success}"}
-
     def step_chunk(self, actions: np.ndarray) -> ChunkResult:
         result, key = super().step_chunk(actions), self.config.success
-        if not result.done or not key or self._success_keys & self._info_keys:
+        if not result.done or not key or key in self._info_keys:
             return result
         has = ", ".join(sorted(self._info_keys)) or "no keys"
-        note = (
-            f"env.success={key!r}: the environment's info has no such key, which counts as a failure; it has "
-        )
-        note += (
-            f"{has}; name the key that tells success, or use --env.success= to take terminated for success"
-        )
-        return replace(result, note=note)
+        why = f"the environment's info has no such key, which counts as a failure; it has {has}"
+        hint = "name the key that tells success, or use --env.success= to take terminated for success"
+        return replace(result, note=f"env.success={key!r}: {why}; {hint}")
 
     def render(self, height: int, width: int) -> np.ndarray:
         env = self.environments[self._task]

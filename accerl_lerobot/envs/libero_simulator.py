@@ -118,7 +118,6 @@ class Simulator:
         self._visible.geomgroup[:2] = 0, 1  # visual meshes, not what collides
         data = self.data
         self._position, self._rotation = data.site_xpos[self._site], data.site_xmat[self._site].reshape(3, 3)
-        self._ctrl, self._torques = data.ctrl, _compiled_torques()
         self._arm = Arm(
             self._jacobian, self._mass, data.qfrc_bias, data.qpos, data.qvel, self._position, self._rotation
         )  # fmt: skip
@@ -185,10 +184,10 @@ class Simulator:
             self._goal = self._new_goal(action)
         self._mujoco.mj_jacSite(self.model, self.data, *self._jacobian, self._site)
         self._mujoco.mj_fullM(self.model, self._mass, self.data.qM)
-        torques = self._torques(self._arm, Aim(*self._goal, self._rest, self._gains))
-        self._ctrl[self._motors] = np.clip(torques, *self._limits)
+        torques = _compiled_torques()(self._arm, Aim(*self._goal, self._rest, self._gains))
+        self.data.ctrl[self._motors] = np.clip(torques, *self._limits)
         self._grip = np.clip(self._grip + self._closing, -1.0, 1.0)
-        self._ctrl[self._grip_motors] = self._grip_centre + self._grip_half * self._grip
+        self.data.ctrl[self._grip_motors] = self._grip_centre + self._grip_half * self._grip
 
     def state(self) -> np.ndarray:
         """LeRobot's ``observation.state``, float32 (8,): hand's position and axis-angle, both fingers."""

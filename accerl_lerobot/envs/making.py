@@ -85,9 +85,11 @@ def environment_error(config: EnvConfig, error: Exception) -> InputError:
         if value in (metadata(package).get_all("Provides-Extra") or ()):
             hint += f"; pip install '{package}[{value}]'"
         return InputError(field, value, hint)
-    why = f"the environment fails ({type(error).__name__}: {brief(error)}); ACCERL_LOG=DEBUG shows where"
+    hint = f"the environment fails ({type(error).__name__}: {brief(error)}); ACCERL_LOG=DEBUG shows where"
     kwargs = getattr(config, "kwargs", None)
-    return InputError("env.kwargs", kwargs, f"{value}: {why}") if kwargs else InputError(field, value, why)
+    if kwargs:
+        return InputError("env.kwargs", kwargs, f"{value}: {hint}")
+    return InputError(field, value, hint)
 
 
 @functools.lru_cache(maxsize=1)

@@ -276,18 +276,14 @@ class LeRobotAdapter(PretrainedAdapter):
         with self.autocast():
             encoded = self.encode(arrays, tasks)
             action = self.family.act(encoded, requests)
-        chunk = self.execute(action.chunk.float(), requests)
-        log_prob = action.log_prob.float().cpu().numpy()
-        latents = {k: v.cpu().numpy() for k, v in action.latent.items()}
-        return [
-            Decision(
-                chunk=chunk[i],
-                latent={k: v[i] for k, v in latents.items()},
-                log_prob=log_prob[i],
-                version=version,
-            )
-            for i in range(len(requests))
-        ]
+        chunks = self.execute(action.chunk.float(), requests)
+        log_probs = action.log_prob.float().cpu().numpy()
+        latents = {name: values.cpu().numpy() for name, values in action.latent.items()}
+        decisions: list[Decision] = []
+        for i, chunk in enumerate(chunks):
+            latent = {name: values[i] for name, values in latents.items()}
+            decisions.append(Decision(chunk=chunk, latent=latent, log_prob=log_probs[i], version=version))
+        return decisions
 
     def evaluate(
         self, observations: dict[str, np.ndarray], tasks: Sequence[str], latent: dict[str, Tensor]

@@ -259,12 +259,11 @@ def executed_rows(policy_config: Any) -> int:
     return int(rows or 1)
 
 
-def predicted_rows(policy_config: Any) -> int | None:
-    """Rows of a predicted chunk that can be executed; None where LeRobot's config does not tell."""
-    rows = getattr(policy_config, "chunk_size", None) or getattr(policy_config, "horizon", None)
-    if rows is not None and policy_config.type in USES_HISTORY:
-        rows -= policy_config.n_obs_steps - 1  # rows that stand for the past
-    return rows
+def predicted_rows(policy_config: Any) -> int:
+    """Rows of a predicted chunk that can be executed; 0 where LeRobot's config does not tell."""
+    rows = getattr(policy_config, "chunk_size", 0) or getattr(policy_config, "horizon", 0)
+    past = policy_config.n_obs_steps - 1 if policy_config.type in USES_HISTORY else 0
+    return int(rows) - past
 
 
 def override(policy_config: Any, config: PolicyConfig) -> None:
@@ -289,11 +288,8 @@ def override(policy_config: Any, config: PolicyConfig) -> None:
             raise InputError("policy.num_steps", config.num_steps, hint)
         setattr(policy_config, names[0], config.num_steps)
     if config.n_action_steps is not None:
-        rows = predicted_rows(policy_config)
-        if rows is None or not hasattr(policy_config, "n_action_steps"):
-            hint = f"a {policy_config.type} policy has no such choice; leave the field out"
-            raise InputError("policy.n_action_steps", config.n_action_steps, hint)
+        rows = predicted_rows(policy_config) if hasattr(policy_config, "n_action_steps") else 0
         if config.n_action_steps > rows:
-            hint = f"use 1 to {rows}, the chunk the policy predicts"
+            hint = f"a {policy_config.type} policy predicts a chunk of which up to {rows} can be executed"
             raise InputError("policy.n_action_steps", config.n_action_steps, hint)
         policy_config.n_action_steps = config.n_action_steps

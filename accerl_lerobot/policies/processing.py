@@ -59,14 +59,18 @@ class Processing:
         """(B, K, A) from normalised to environment units."""
         return self.postprocessor(chunk)
 
+    def units(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Place of a normalised 0 in environment units, and the length of a normalised 1, like `rows` (K, A)."""
+        ends = torch.stack([torch.zeros_like(rows), torch.ones_like(rows)])
+        zero, one = self.unnormalise(ends.to(self.device)).to(rows)
+        return zero, one - zero
+
     def normalise(self, chunk: Tensor) -> Tensor:
         """(B, K, A) from environment to normalised units; every normalisation that LeRobot has is affine.
 
         An action that is constant in the policy's dataset has no scale; it is 0.
         """
-        ends = torch.stack([torch.zeros_like(chunk[0]), torch.ones_like(chunk[0])])
-        zero, one = self.unnormalise(ends.to(self.device)).to(chunk)
-        scale = one - zero
+        zero, scale = self.units(chunk[0])
         varies = scale.abs() > CONSTANT
         return torch.where(varies, (chunk - zero) / torch.where(varies, scale, 1), 0)
 

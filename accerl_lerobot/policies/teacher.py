@@ -138,10 +138,8 @@ def with_teacher(
 
     adapter: Any = load(config)
     spec = state_spec(adapter.policy.config, config.rename_map, environment_state)
-    ends = torch.zeros(2, 1, spec.chunk[1])
-    ends[1] = 1
-    zero, one = adapter.processing.unnormalise(ends.to(adapter.device)).cpu().numpy()[:, 0]
-    spec = spec._replace(units=(zero, one - zero))
+    zero, scale = adapter.processing.units(torch.zeros(1, spec.chunk[1]))
+    spec = spec._replace(units=(zero[0].numpy(), scale[0].numpy()))
     adapter.teacher = Teacher(new_state_model(spec, model), spec.chunk, share, noise).to(adapter.device)
     return adapter
 

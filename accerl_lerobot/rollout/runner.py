@@ -404,11 +404,9 @@ class RolloutRunner:
             for chunk in episode.chunks:
                 observation = environment.step_chunk(chunk).observation
             if not all(np.array_equal(observation[key], latest[key]) for key in latest):
-                raise RuntimeError(
-                    f"{plan.task} with seed {plan.seed} does not show again what it had shown after "
-                    f"{len(episode.chunks)} decisions, so its episodes cannot be resumed in the middle; "
-                    "use launch.engine=ray, which begins them anew"
-                )
+                why = "does not show again what it had shown, so its episodes cannot be resumed in the middle"
+                hint = "use launch.engine=ray, which begins them anew"
+                raise RuntimeError(f"{plan.task} with seed {plan.seed} {why}; {hint}")
 
     def close(self) -> None:
         for environment in self.environments:

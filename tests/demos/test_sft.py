@@ -279,20 +279,6 @@ def test_a_preset_gets_only_what_it_has(tmp_path: Path, kind: str, schedule: set
     assert "--policy.pretrained_backbone_weights=null" in command, "the checkpoint replaces them"
 
 
-@pytest.mark.parametrize(
-    ("stored", "sentence"),
-    [
-        (None, "sft.init_path=.*: config.json: is missing; give the whole folder"),
-        ({"type": "mine"}, "sft.init_path='mine': no such policy type here; install the package"),
-    ],
-)
-def test_a_start_that_cannot_be_fine_tuned(tmp_path: Path, stored: dict | None, sentence: str):
-    if stored is not None:
-        (tmp_path / "config.json").write_text(json.dumps(stored))
-    with pytest.raises(InputError, match=f"^{sentence}"):
-        sft_command(SFTConfig(steps=1, init_path=str(tmp_path)), HUB, tmp_path / "sft", 0, "cpu")
-
-
 def test_a_moved_checkpoint_is_started_from_a_copy(tiny_checkpoint, tmp_path, monkeypatch):
     from accerl_lerobot.checkpoint.layout import relocate
     from accerl_lerobot.policies.config import PolicyConfig

@@ -157,19 +157,11 @@ def ended(config: GymConfig, steps: int = 9) -> Any:
     return environment.step_chunk(np.zeros((steps, 1), np.float32))
 
 
-def test_only_what_is_read_is_judged():
-    result = ended(odd(success=""))
-    assert result.success and result.terminated and result.steps == 5 and result.info == {}
-    assert result.rewards.tolist() == [0, 0, 0, 0, 1], "its own reward is not a number, and not asked for"
-    assert np.isnan(ended(odd(success="", reward="env")).rewards).all()
-
-
 @pytest.mark.parametrize(
     ("key", "told"),
     [
         ("succeed", {"succeed": lambda step: np.array([step >= 3])}),
         ("metrics.success", {"metrics": lambda step: {"success": step >= 3}}),
-        ("won", {"final_info": lambda step: {"won": step >= 3}, "other": lambda step: True}),
     ],
 )
 def test_success_is_read_by_its_key(key: str, told: dict[str, Any]):

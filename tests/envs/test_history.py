@@ -3,12 +3,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from accerl_lerobot.envs import Environment, HistoryEnvironment, SimulatedConfig, make_environment
+from accerl_lerobot.envs import Environment, SimulatedConfig, make_environment
 from accerl_lerobot.envs.base import ChunkResult
 from accerl_lerobot.experience import TASK, Observation
 
@@ -78,45 +76,3 @@ def test_a_termination_inside_a_chunk_ends_it():
     result = environment.step_chunk(np.zeros((5, 2), np.float32))
     assert result.terminated and result.success and result.steps == len(results)
     same(result.observation, seen[-2:])
-
-
-@pytest.mark.parametrize(
-    ("length", "rows", "cut", "shown"),
-    [
-        (2, 6, 2, (2, 2)),  # among those that are passed unseen
-        (3, 6, 5, (4, 5, 5)),  # among the last ones
-        (4, 6, 5, (3, 4, 5, 5)),
-        (3, 6, 1, (0, 0, 1)),  # at the first step, nothing was passed
-        (4, 3, 2, (0, 0, 1, 2)),  # where all are seen
-        (2, 6, 6, (5, 6)),
-    ],
-)
-def test_a_world_that_ends_early_shows_its_last_state_for_those_it_did_not_show(
-    length: int, rows: int, cut: int, shown: tuple[int, ...]
-):
-    inner = make_environment(WORLD)
-
-    class Early(Environment):
-        """Truncates after `cut` steps, whatever its spec says."""
-
-        spec = inner.spec
-        taken = 0
-
-        def reset(self, seed: int, task: str) -> Observation:
-            return inner.reset(seed, task)
-
-        def step_chunk(self, actions: np.ndarray) -> ChunkResult:
-            result = inner.step_chunk(actions[: cut - self.taken])
-            self.taken += result.steps
-            return replace(result, truncated=self.taken == cut)
-
-        def render(self, height: int, width: int) -> np.ndarray:
-            return inner.render(height, width)
-
-    actions = np.full((rows, 2), 0.3, np.float32)
-    states, _ = one_by_one(make_environment(WORLD), "match", actions)
-    environment = HistoryEnvironment(Early(), length)
-    environment.reset(5, "match")
-    result = environment.step_chunk(actions)
-    assert result.truncated and result.steps == cut and result.observation is not None
-    same(result.observation, [states[i] for i in shown])

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from accerl_lerobot import evaluation
-from accerl_lerobot.evaluation import GAP, before_after, success_curve, write_video
+from accerl_lerobot.evaluation import GAP, before_after, success_curve
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 
 
@@ -53,16 +53,6 @@ def test_the_curve_is_drawn(tmp_path: Path) -> None:
     assert higher == pytest.approx(scale[0] * (np.mean(rates[2]["ci95"]) - 0.5), rel=0.06)
     grey = [drawn(rates[0], training)[1].sum() for training in ([], [(0, 0.2), (5000, 0.8)])]
     assert grey[1] > grey[0] + 500
-
-
-def test_clips_stand_side_by_side_and_hold_their_last_frame(tmp_path: Path) -> None:
-    path = tmp_path / "film.mp4"
-    write_video(path, [[clip(3, (200, 0, 0)), clip(6, (0, 0, 200))]], fps=10)
-    film = read(path)
-    assert film.shape == (6 + 10, 32, 32 + GAP + 32, 3)
-    left, right = film[:, 8:24, 8:24].mean((1, 2)), film[:, 8:24, -24:-8].mean((1, 2))
-    assert (abs(left - (200, 0, 0)) < 25).all() and (abs(right - (0, 0, 200)) < 25).all()
-    assert (film[:, :, 33 : 32 + GAP - 1] > 150).all()
 
 
 def test_before_beside_after_with_outcomes(tmp_path: Path) -> None:

@@ -15,13 +15,6 @@ def make_batcher(max_batch: int = 4, max_wait_s: float = WAIT) -> Batcher[str]:
     return Batcher(max_batch=max_batch, max_wait_s=max_wait_s)
 
 
-def test_an_empty_batcher_is_never_due() -> None:
-    batcher = make_batcher()
-    assert not batcher.due(now=1e9) and batcher.next_deadline() is None
-    assert batcher.take(now=0.0) == [] and len(batcher) == 0
-    assert set(batcher.counts.values()) == {0.0}
-
-
 def test_a_batch_that_cannot_grow_is_full_and_the_clock_goes_on_with_the_rest() -> None:
     batcher = make_batcher()
     batcher.add("abc", now=0.0)
@@ -40,14 +33,6 @@ def test_the_oldest_request_sets_the_clock() -> None:
     assert batcher.next_deadline() == WAIT
     assert not batcher.due(now=0.99 * WAIT)
     assert batcher.due(now=WAIT)
-
-
-def test_a_request_larger_than_a_batch_is_served_alone() -> None:
-    batcher = make_batcher()
-    batcher.add("a", now=0.0)
-    batcher.add("bbbbbbb", now=0.0)
-    batcher.add("c", now=0.0)
-    assert [batcher.take(now=0.0) for _ in range(4)] == [["a"], ["bbbbbbb"], ["c"], []]
 
 
 def test_first_in_first_out_nothing_lost_nobody_starves() -> None:
@@ -106,11 +91,3 @@ def test_in_lock_step_all_are_waited_for_and_served_in_as_many_batches_as_they_n
     assert batcher.due(now=2.0) and batcher.take(now=2.0) == ["cd"]
     assert batcher.due(now=2.0) and batcher.take(now=2.0) == ["e"]
     assert not batcher.due(now=1e6) and len(batcher) == 1
-
-
-def test_who_waits_is_served_when_lock_step_ends() -> None:
-    batcher = make_batcher()
-    batcher.lock_step(5)
-    batcher.add("ab", now=0.0)
-    batcher.lock_step(0)
-    assert batcher.next_deadline() == WAIT and batcher.due(now=WAIT)

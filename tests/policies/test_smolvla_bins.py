@@ -63,40 +63,6 @@ def observed(count: int, seed: int = 0) -> dict[str, Any]:
     }
 
 
-@torch.no_grad()
-def test_who_sees_whom(loaded: tuple[Any, Any, Any]):
-    """Prefix, state and queries see themselves and what is to the left; padding is seen by none."""
-    policy, pre, _ = loaded
-    draw = torch.Generator().manual_seed(3)
-    for parameter in policy.parameters():  # fresh weights hardly attend to anything in particular
-        parameter += 0.3 * torch.randn(parameter.shape, generator=draw)
-    batch, text = pre(observed(3)), policy.model.vlm.text_model
-    given: dict[str, Any] = {}
-    hook = text.register_forward_pre_hook(lambda m, a, k: given.update(k), with_kwargs=True)
-    hidden = policy.hidden(batch)
-    hook.remove()
-    assert hidden.shape == (3, CHUNK * DIMS, 32) and hidden.std() > 0.1
-    embedded, queries = given["inputs_embeds"], CHUNK * DIMS
-    real = torch.ones(embedded.shape[:2])
-    mask = batch["observation.language.attention_mask"].bool()
-    words = slice(embedded.shape[1] - queries - 1 - mask.shape[1], embedded.shape[1] - queries - 1)
-    real[:, words] = mask.float()
-    assert not mask.all() and torch.equal(given["position_ids"], (real.cumsum(1) - 1).clamp(min=0).long())
-
-    def reached(place: int) -> set[int]:
-        """Places whose hidden states change with the input at this one."""
-        other = embedded.clone()
-        other[0, place] += 1
-        before, after = (text(**given | {"inputs_embeds": x})[0][0] for x in (embedded, other))
-        return {i for i in range(len(before)) if (before[i] - after[i]).abs().max() > 1e-6}
-
-    every = set(range(embedded.shape[1]))
-    first, state, padding = 0, words.stop, words.start + int(mask[0].sum())
-    assert reached(first) == every and reached(padding) == {padding}
-    assert reached(state) == set(range(state, len(every)))
-    assert reached(len(every) - 1) == reached(state + 1) == set(range(state + 1, len(every)))
-
-
 def test_bins_by_hand(loaded: tuple[Any, Any, Any]):
     policy = loaded[0]
     actions = torch.tensor([-1.0, -0.751, -0.749, 0.0, 0.999, 1.0, 7.0, -7.0])

@@ -215,20 +215,3 @@ def test_a_tight_max_lag_retires_but_never_stalls(max_lag: int) -> None:
     simulation.run(4000)
     assert simulation.replay.counters.retired_segments > 0
     assert simulation.version > 30 and simulation.worst_lag == max_lag
-
-
-def test_evenly_matched_sides_waste_nothing() -> None:
-    """With room to spare, every decision is trained on just as often as asked, none goes unused."""
-    config = ReplayConfig(
-        capacity=128, min_decisions=16, samples_per_insert=2.0, max_unlearned_decisions=32, max_lag=200
-    )
-    simulation = Simulation(
-        config=config, batch=16, longest=4, workers=4, in_flight=32, publish_every=1, gate="insert", seed=0
-    )
-    for i in range(6000):
-        simulation.begin(i % 4)
-        simulation.insert(i % 4)
-        simulation.update()
-    c = simulation.replay.counters
-    assert c.evicted_unused == 0 and c.retired_segments == 0
-    assert c.trained_decisions > 0.98 * 2.0 * c.inserted_decisions

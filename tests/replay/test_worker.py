@@ -120,15 +120,3 @@ def test_close_releases_everyone_and_stores_nothing_more():
         assert (await worker.metrics())["inserted_segments"] == 2
 
     play(scene)
-
-
-def test_the_end_of_collection_gives_a_smaller_batch():
-    async def scene(worker: ReplayWorker) -> None:
-        await worker.insert([make_segment("a", 8)])
-        sampling = start(worker.sample(16, 0))
-        assert await waits(sampling)
-        await worker.end()
-        assert [segment.key for segment in await sampling] == ["a"]
-        assert await worker.sample(16, 1) == []
-
-    play(scene)

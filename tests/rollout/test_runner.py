@@ -15,9 +15,8 @@ from accerl_lerobot.envs import Environment, SimulatedConfig, make_environment
 from accerl_lerobot.envs.making import JudgedEnvironment
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import summarise
-from accerl_lerobot.experience import TASK, Decision, Observation, Request
+from accerl_lerobot.experience import Decision, Observation, Request
 from accerl_lerobot.rollout.runner import (
-    ActiveEpisode,
     EpisodePlan,
     EpisodePlans,
     EpisodeResult,
@@ -86,7 +85,7 @@ def test_a_world_that_does_not_show_the_same_again_cannot_be_resumed_in_an_episo
     resumed.restore(state)
     assert environment.now == CHUNK and resumed.counters.decisions == 1
     environment.render = lambda height, width: np.full((height, width, 3), 99, np.uint8)
-    with pytest.raises(RuntimeError, match=r"does not show again .* after 1 decisions"):
+    with pytest.raises(RuntimeError, match="does not show again .*use launch.engine=ray"):
         resumed.restore(state)
 
 
@@ -209,29 +208,6 @@ def test_filming_changes_nothing(seed: int, tolerance: float, success: bool):
         episode = simulated_episode(film, seed, 0.001, judge=lambda seen: bool(asked.append(seen)))
         assert len(asked) == episode.decisions, "a reward model is asked as often of a filmed episode"
         asked.clear()
-
-
-def test_everything_about_a_decision_stays_together():
-    plan = EpisodePlan(task="push-v3", seed=7, explore=True)
-    seen = [{"observation.state": np.array([step], np.float32), TASK: "push"} for step in range(4)]
-    episode = ActiveEpisode(plan, 100, seen[:1])
-    for step in range(3):
-        latent = {"x": np.array([step, -step], np.float32)}
-        log_prob = np.array([step / 10], np.float64)
-        decision = Decision(chunk=np.zeros((2, 1)), latent=latent, log_prob=log_prob, version=step)
-        actions = np.full((2, 1), step / 10, np.float32)
-        episode.add(decision, actions, float(step), step + 1, following=seen[step + 1])
-    segment = episode.cut("k")
-    assert segment.observations["observation.state"][:, 0].tolist() == [0, 1, 2, 3]
-    assert segment.latent["x"].tolist() == [[0, 0], [1, -1], [2, -2]]
-    np.testing.assert_allclose(segment.log_prob[:, 0], [0, 0.1, 0.2], rtol=1e-6)
-    np.testing.assert_allclose(segment.actions[:, 0, 0], [0, 0.1, 0.2], rtol=1e-6)
-    assert segment.reward.tolist() == [0, 1, 2] and segment.origin == ("push-v3", 7, 0)
-    assert segment.version.tolist() == [0, 1, 2] and segment.steps.tolist() == [1, 2, 3]
-    assert segment.log_prob.dtype == segment.reward.dtype == segment.elapsed.dtype == np.float32
-    np.testing.assert_allclose(segment.elapsed, [0, 0.01, 0.03], rtol=1e-6)
-    assert segment.version.dtype == segment.steps.dtype == np.int64
-    assert segment.task == "push" and TASK not in segment.observations
 
 
 TASKS = ("push", "pull", "lift")
