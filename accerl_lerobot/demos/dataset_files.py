@@ -47,7 +47,8 @@ def open_metadata(dataset: DatasetConfig) -> Any:
     """LeRobot's metadata of a local or Hub dataset; anything wrong with it is one line."""
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
-    name, root = dataset.repo_id, dataset.root
+    name = dataset.repo_id
+    root = dataset.root
     if name is None:
         hint = "name a LeRobotDataset; with dataset.root any label will do"
         raise InputError("dataset.repo_id", None, hint)
@@ -83,7 +84,8 @@ def opened(dataset: DatasetConfig, meta: Any, episodes: Sequence[int] | None = N
 
 def _check_rows(data: Any, origin: FileSource) -> None:
     """Refuse rows that LeRobot would take for those of another episode or, in videos, of another time."""
-    meta, names = data.meta, ["index", "episode_index", "frame_index", "timestamp"]
+    meta = data.meta
+    names = ["index", "episode_index", "frame_index", "timestamp"]
     rows = data.hf_dataset.with_format("numpy", columns=names)[:]
     by_borders = np.searchsorted(meta.episodes["dataset_to_index"], rows["index"], side="right")
     regular = np.isclose(rows["timestamp"], rows["frame_index"] / meta.fps, rtol=1e-6, atol=1e-4)
@@ -147,7 +149,8 @@ def checked(origin: FileSource, whole: bool = False) -> Iterator[None]:
 
     from datasets import Image
 
-    load_metadata, try_load = LeRobotDatasetMetadata._load_metadata, DatasetReader.try_load
+    load_metadata = LeRobotDatasetMetadata._load_metadata
+    try_load = DatasetReader.try_load
     decode = Image.decode_example
 
     def checked_metadata(self: Any) -> None:
@@ -237,7 +240,8 @@ def read_labels(data: Any, dataset: DatasetConfig, one_task: bool = True) -> lis
 
     With `one_task`, an episode whose instruction changes is refused.
     """
-    origin, texts = origin_of(dataset), task_texts(data.meta)
+    origin = origin_of(dataset)
+    texts = task_texts(data.meta)
     read = ("episode_index", "frame_index", "task_index", REWARD, SUCCESS)
     columns = {name: numbers(data, name, dataset) for name in read if name in data.meta.features}
     episode = columns["episode_index"]
@@ -251,7 +255,8 @@ def read_labels(data: Any, dataset: DatasetConfig, one_task: bool = True) -> lis
         if one_task and len(tasks) > 1:
             hint = f"its instruction changes from {tasks[0]!r} to {tasks[1]!r}, and one is read here"
             raise origin.refuse(f"episode {index}", f"{hint}; split the episode, or use accerl sft")
-        success_at, rewards = None, own.get(REWARD)
+        success_at = None
+        rewards = own.get(REWARD)
         if SUCCESS in own:
             success_at = step_of_success(own[SUCCESS])
         elif rewards is not None:

@@ -109,7 +109,8 @@ def main() -> None:
 
     from accerl_lerobot.policies.vla import data_only
 
-    commit, root = _argument(TRUST), _argument("--dataset.root=")
+    commit = _argument(TRUST)
+    root = _argument("--dataset.root=")
     dataset = DatasetConfig(repo_id=_argument("--dataset.repo_id="), root=root)
     lerobot_train.make_train_eval_datasets = _adapted(lerobot_train.make_train_eval_datasets)
     DatasetReader._query_hf_dataset = query_rows

@@ -96,14 +96,16 @@ class Scene:
 
     def corners(self, name: str, others: bool = False) -> np.ndarray:
         """Corners (G, 8, 3) of the boxes of one object, or of all others."""
-        geoms, data = self._geoms(name, others), self.simulator.data
+        geoms = self._geoms(name, others)
+        data = self.simulator.data
         middle, half = np.split(self.simulator.model.geom_aabb[geoms][:, None], 2, axis=-1)
         turn = data.geom_xmat[geoms].reshape(-1, 3, 3)
         return (middle + _CORNERS * half) @ turn.transpose(0, 2, 1) + data.geom_xpos[geoms][:, None]
 
     def collisions(self, name: str, points: np.ndarray, margin: float = 0.004) -> np.ndarray:
         """Number of points (..., P, 3) that are inside an object other than `name`, int (...)."""
-        model, data = self.simulator.model, self.simulator.data
+        model = self.simulator.model
+        data = self.simulator.data
         centre = points.reshape(-1, 3).mean(0)
         spread = np.linalg.norm(points - centre, axis=-1).max() + margin
         inside = np.zeros(points.shape[:-1], bool)
@@ -135,8 +137,10 @@ class Scene:
         `goal` is the position (3,) where the object is to be placed, as the hand must fit there too; `rng`
         chooses among grasps of similar cost.
         """
-        corners, position = self.corners(name), self.simulator.pose(name)[0]
-        bottom, top = corners[..., 2].min(1), corners[..., 2].max(1)
+        corners = self.corners(name)
+        position = self.simulator.pose(name)[0]
+        bottom = corners[..., 2].min(1)
+        top = corners[..., 2].max(1)
         height = max(top.max() - DEPTH, (top.max() + bottom.min()) / 2)
         yaws = np.radians(np.arange(-90, 90, 7.5))
         across = np.stack([-np.sin(yaws), np.cos(yaws)], -1)  # axes of the fingers
@@ -174,7 +178,9 @@ class Hand:
     """Movements of the robot's hand in a scene; `rng` is for the differences between episodes."""
 
     def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
-        self.scene, self.simulator, self.rng = scene, scene.simulator, rng
+        self.scene = scene
+        self.simulator = scene.simulator
+        self.rng = rng
         self.speed = rng.uniform(0.85, 1)
         self.grip = -1.0
         self.held = np.zeros(3)  # offset of the grasped object from the hand
@@ -230,7 +236,8 @@ class Hand:
         """Moves to `height` above a goal: up first, then sideways."""
 
         def waypoint() -> np.ndarray:
-            position, aim = self.simulator.hand[0], goal()
+            position = self.simulator.hand[0]
+            aim = goal()
             late = np.clip((height - position[2]) / 0.03 - 0.3, 0, 1)  # 1: stay above the current place
             aim = aim + late * (position - aim)
             return np.array([*aim[:2], height])
@@ -239,7 +246,8 @@ class Hand:
 
     def pick(self, name: str, place: Callable[[], np.ndarray], known: Grasp | None = None) -> Script:
         """Grasps an object and lifts it a little; repeats until it holds the object."""
-        scene, simulator = self.scene, self.simulator
+        scene = self.scene
+        simulator = self.simulator
         while True:
             if self.grip > 0:  # the object was lost
                 yield from self.set_grip(-1.0, simulator.hand[0], 5)
@@ -268,7 +276,8 @@ class Hand:
 
 def pick_and_place(hand: Hand, name: str, region: str) -> Script:
     """Carries an object to a region or another object and releases it there."""
-    scene, simulator = hand.scene, hand.simulator
+    scene = hand.scene
+    simulator = hand.simulator
     heights = scene.corners(name)[..., 2] - simulator.pose(name)[0][2]
     known = (offset for part, offset in OFFSETS.items() if part == name or part in region)
     x, y, up = next(known, (0, 0, 0.01))
@@ -349,7 +358,8 @@ def close_microwave(hand: Hand, name: str) -> Script:
     def outside(distance: float, height: float = 0.0) -> np.ndarray:
         return door.xpos + door.xmat.reshape(3, 3) @ [DOOR[0], -distance, DOOR[1] + height]
 
-    hand.grip, hand.turn = 1.0, lambda at: DOWN
+    hand.grip = 1.0
+    hand.turn = lambda at: DOWN
     yield from hand.over(lambda: outside(0.1), outside(0, 0.15)[2], lambda: True)
     yield from hand.move(lambda: outside(0.1), within=0.02)
     return (yield from hand.move(lambda: outside(-0.06), steps=150))
@@ -368,7 +378,8 @@ def in_front(hand: Hand, region: str, yaw: float, lean: float) -> Callable[..., 
 
 def open_drawer(hand: Hand, region: str) -> Script:
     """Opens the drawer with this region: grasps the handle from the front, pulls, and lets it go."""
-    simulator, handle = hand.simulator, in_front(hand, region, 0.0, 1.4)
+    simulator = hand.simulator
+    handle = in_front(hand, region, 0.0, 1.4)
 
     def holds() -> bool:
         return bool(np.linalg.norm(handle() - simulator.hand[0]) < 0.03)

@@ -122,7 +122,8 @@ def disturbed(
 
     With `fail`, actions are a random drift from a random early step on; for the others see `DemosConfig`.
     """
-    rng, push_rng = np.random.default_rng((seed, 1)), np.random.default_rng((seed, 2))
+    rng = np.random.default_rng((seed, 1))
+    push_rng = np.random.default_rng((seed, 2))
     low, high = spec.action_low, spec.action_high
     direction = push_rng.standard_normal(spec.action_dim)
     pushed = push * push_rng.random() * direction / np.linalg.norm(direction)
@@ -313,7 +314,8 @@ def record_demos(
     Returns:
         The dataset's folder; open it with ``LeRobotDataset(REPO_ID, root=...)``.
     """
-    folder, console = check_free(root), console or Console()
+    folder = check_free(root)
+    console = console or Console()
     env_config = env_config.nominal()
     environment = make_environment(env_config)
     spec = environment.spec
@@ -388,8 +390,10 @@ def features(spec: EnvironmentSpec, environment_state: int) -> dict[str, dict[st
 def record_one(env_config: EnvConfig, config: DemosConfig, seed: int, slot: int) -> tuple[Episode, int]:
     """The episode at place `slot` of the dataset, and how many tries were thrown away for it."""
     environment = this_environment()
-    tasks, share = environment.spec.tasks, config.failure_share
-    task, rank = tasks[slot % len(tasks)], slot // len(tasks)
+    tasks = environment.spec.tasks
+    share = config.failure_share
+    task = tasks[slot % len(tasks)]
+    rank = slot // len(tasks)
     fail = math.floor((rank + 1) * share) > math.floor(rank * share)
     for attempt in range(_MAX_TRIES):
         own_seed = demo_seed(seed, slot + attempt * _MAX_EPISODES)

@@ -89,16 +89,19 @@ def sft_command(
     """The ``lerobot-train`` command line of this warm start; `episodes`: see `picked`."""
     from accerl_lerobot.policies.untrusted import is_adapter  # imports torch
 
-    start, adapts = config.init_path, False
+    start = config.init_path
+    adapts = False
     if start is None:
-        kind, policy = str(config.policy["type"]), dict(config.policy)
+        kind = str(config.policy["type"])
+        policy = dict(config.policy)
         if config.backbone is not None:
             policy["vlm_model_name"] = str((output_dir.parent / "backbone").resolve())
             policy["load_vlm_weights"] = False
         known = policy_fields(kind, "sft.policy.type")
     else:
         stored = read_json(Path(start) / "config.json", FileSource("sft.init_path", start))
-        kind, policy = str(stored.get("type")), {"path": start}
+        kind = str(stored.get("type"))
+        policy = {"path": start}
         adapts = is_adapter(Path(start))
         if adapts or stored.get("use_peft"):
             policy["use_peft"] = adapts
@@ -214,7 +217,8 @@ def _check_end(code: int, log: Path) -> None:
     answer: dict[str, Any] = {}
     if found:
         line, _, after = rest.partition("\n")
-        answer, rest = json.loads(line), text + after
+        answer = json.loads(line)
+        rest = text + after
     errors.show_warnings(answer.get("warnings", ()))
     if code == 0:
         return

@@ -149,7 +149,10 @@ class EpisodeEnvironment(Environment):
             raise InputError("seed", seed, "use 0 to 2**32 - 1")
         self._done = True  # an error below leaves an environment that must be reset
         self._begin(seed, task)
-        self._task, self._steps, self._success, self._done = task, 0, False, False
+        self._task = task
+        self._steps = 0
+        self._success = False
+        self._done = False
         return self._observe()
 
     def step_chunk(self, actions: np.ndarray) -> ChunkResult:
@@ -317,7 +320,8 @@ class SuiteEnvironment(EpisodeEnvironment):
     simulator: Any = None  # of the current task; for experts, not for policies
 
     def __init__(self, config: SuiteConfig, spec: EnvironmentSpec) -> None:
-        self.config, self.spec = config, spec
+        self.config = config
+        self.spec = spec
         self._spare = _spare[repr(config)]
 
     @abstractmethod
@@ -357,7 +361,8 @@ class SuiteEnvironment(EpisodeEnvironment):
         self._done = True
 
     def _observe(self) -> Observation:
-        simulator, spec = self.simulator, self.spec
+        simulator = self.simulator
+        spec = self.spec
         size = self.config.image_size
         observation: Observation = {}
         for camera, key in zip(self.config.cameras, spec.images, strict=True):
@@ -372,7 +377,8 @@ class SuiteEnvironment(EpisodeEnvironment):
 
 def lerobot_eval_arguments(env: Mapping[str, Any]) -> list[str]:
     """``--env.…`` and seed of stock ``lerobot-eval`` for an environment; none if LeRobot cannot have it."""
-    kind, fields = env.get("type"), dict[str, Any]()
+    kind = env.get("type")
+    fields = dict[str, Any]()
     if kind == "lerobot" and env.get("success", IS_SUCCESS) == IS_SUCCESS:  # the only key that LeRobot reads
         fields = {"type": env.get("name"), **(env.get("kwargs") or {})}
         if env.get("max_steps"):
@@ -395,7 +401,8 @@ class WrappedEnvironment(Environment):
     """Base of environments that change what another one shows."""
 
     def __init__(self, environment: Environment) -> None:
-        self._environment, self.spec = environment, environment.spec
+        self._environment = environment
+        self.spec = environment.spec
 
     def reset(self, seed: int, task: str) -> Observation:
         return self._environment.reset(seed, task)
@@ -419,7 +426,8 @@ class HistoryEnvironment(WrappedEnvironment):
     def __init__(self, environment: Environment, length: int) -> None:
         super().__init__(environment)
         self._seen: deque[Observation] = deque(maxlen=length)
-        self._length, self._left = length, 0
+        self._length = length
+        self._left = 0
 
     def reset(self, seed: int, task: str) -> Observation:
         self._seen.extend([self._environment.reset(seed, task)] * self._length)

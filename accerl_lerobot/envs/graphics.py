@@ -86,7 +86,8 @@ def drawing_error(error: BaseException) -> InputError | None:
 
 def new_renderer(model: Any, height: int, width: int) -> Any:
     """A `mujoco.Renderer` whose framebuffer is exactly (height, width)."""
-    model.vis.global_.offheight, model.vis.global_.offwidth = height, width
+    model.vis.global_.offheight = height
+    model.vis.global_.offwidth = width
     renderer = import_mujoco().Renderer(model, height, width)
     close_at_exit(renderer)
     return renderer

@@ -128,7 +128,8 @@ class GymnasiumEnvironment(EpisodeEnvironment):
         )
 
     def step_chunk(self, actions: np.ndarray) -> ChunkResult:
-        result, key = super().step_chunk(actions), self.config.success
+        result = super().step_chunk(actions)
+        key = self.config.success
         if not result.done or not key or key in self._info_keys:
             return result
         has = ", ".join(sorted(self._info_keys)) or "no keys"
@@ -148,7 +149,8 @@ class GymnasiumEnvironment(EpisodeEnvironment):
     def close(self) -> None:
         for env in self.environments.values():
             env.close()
-        self.environments, self._done = {}, True
+        self.environments = {}
+        self._done = True
 
 
 @EnvConfig.register_subclass("gym")
@@ -221,11 +223,13 @@ class GymEnvironment(GymnasiumEnvironment):
         super().__init__({config.id: env})
 
     def _look(self, observation: Observation) -> EnvironmentSpec:
-        config, metadata = self.config, self.environments[self.config.id].metadata
+        config = self.config
+        metadata = self.environments[self.config.id].metadata
         return self._spec(observation, config.fps or int(metadata.get("render_fps") or FPS), [config.task])
 
     def _observe(self) -> Observation:
-        raw, config = flattened(self._raw), self.config
+        raw = flattened(self._raw)
+        config = self.config
         state = self._vector("state", raw, config.state or ("",))
         observation: Observation = {TASK: config.task, _STATE: state}
         for camera, key in config.images.items():
@@ -319,7 +323,9 @@ class LeRobotEnvironment(GymnasiumEnvironment):
         for suite in self._vectors.values():
             for vector in suite.values():
                 vector.close()
-        self._vectors, self.environments, self._done = {}, {}, True
+        self._vectors = {}
+        self.environments = {}
+        self._done = True
 
     def _look(self, observation: Observation) -> EnvironmentSpec:
         if _STATE not in observation or not any(key.startswith(_IMAGE) for key in observation):

@@ -108,7 +108,8 @@ class Simulator:
         self._motors = np.array(robot._ref_joint_actuator_indexes)
         self._grip_motors = np.array(robot._ref_joint_gripper_actuator_indexes)
         low, high = self.model.actuator_ctrlrange[self._grip_motors].T
-        self._grip_centre, self._grip_half = 0.5 * (high + low), 0.5 * (high - low)
+        self._grip_centre = 0.5 * (high + low)
+        self._grip_half = 0.5 * (high - low)
         self._site = robot.eef_site_id
         self._hand = self.model.body(robot.robot_model.eef_name).id
         self._mass = np.zeros((self.model.nv, self.model.nv))
@@ -117,7 +118,8 @@ class Simulator:
         self._visible = self._mujoco.MjvOption()
         self._visible.geomgroup[:2] = 0, 1  # visual meshes, not what collides
         data = self.data
-        self._position, self._rotation = data.site_xpos[self._site], data.site_xmat[self._site].reshape(3, 3)
+        self._position = data.site_xpos[self._site]
+        self._rotation = data.site_xmat[self._site].reshape(3, 3)
         self._arm = Arm(
             self._jacobian, self._mass, data.qfrc_bias, data.qpos, data.qvel, self._position, self._rotation
         )  # fmt: skip
@@ -146,7 +148,9 @@ class Simulator:
     def step(self, action: np.ndarray) -> tuple[bool, bool]:
         """One env step with an action, float32 (7,) in [−1, 1]; True if the goal holds after it, and True if
         all numbers are finite."""
-        model, data, mujoco = self.model, self.data, self._mujoco
+        model = self.model
+        data = self.data
+        mujoco = self._mujoco
         self._closing = np.array([-0.01, 0.01]) * np.sign(action[6])
         for i in range(round(1 / FPS / TIMESTEP)):
             mujoco.mj_step1(model, data)
@@ -174,10 +178,12 @@ class Simulator:
         robot = self.env.robots[0]
         robot.control(action, policy_step=True)
         controller = robot.controller
-        self._rest, self._gains = controller.initial_joint, np.stack([controller.kp, controller.kd])
+        self._rest = controller.initial_joint
+        self._gains = np.stack([controller.kp, controller.kd])
         self._limits = controller.actuator_min, controller.actuator_max
         self._goal = np.array(controller.goal_pos), np.array(controller.goal_ori)
-        self._grip, self._fresh = robot.gripper.current_action, False
+        self._grip = robot.gripper.current_action
+        self._fresh = False
 
     def _control(self, action: np.ndarray, decided: bool) -> None:
         if decided:
@@ -206,12 +212,16 @@ class Simulator:
         An object has its position and its joint's; what there is not lies in the hand. Then come the vectors
         between all these, and again squashed. No turns: a bowl looks the same from all sides.
         """
-        data, joints, dofs = self.data, self._joints, self._dofs
+        data = self.data
+        joints = self._joints
+        dofs = self._dofs
         arm = data.qpos[joints], data.qvel[dofs], data.site_xpos[self._site], data.xquat[self._hand]
         fingers = data.qpos[self._fingers], data.qvel[self._finger_dofs]
-        points, openings = np.tile(self._position, (1 + MAX_OBJECTS, 1)), np.zeros(MAX_OBJECTS)
+        points = np.tile(self._position, (1 + MAX_OBJECTS, 1))
+        openings = np.zeros(MAX_OBJECTS)
         for i, name in enumerate(self.env.obj_of_interest):
-            points[1 + i], openings[i] = self.pose(name)[0], self.opening(name)
+            points[1 + i] = self.pose(name)[0]
+            openings[i] = self.opening(name)
         pairs = np.triu_indices(len(points), 1)
         vectors = (points[pairs[1]] - points[pairs[0]]).ravel()
         near = np.tanh(vectors / NEAR)
@@ -287,7 +297,8 @@ def operational_space_torques(arm: Arm, aim: Aim) -> np.ndarray:
     n = len(aim.rest)  # joints of the arm, which come first
     mass = np.ascontiguousarray(arm.mass[:n, :n])
     joined = np.ascontiguousarray(arm.jacobian.reshape(6, arm.jacobian.shape[2])[:, :n])
-    qpos, qvel = arm.qpos[:n], arm.qvel[:n]
+    qpos = arm.qpos[:n]
+    qvel = arm.qvel[:n]
     velocity = np.dot(joined, qvel)
     error = np.zeros(6)
     error[:3] = aim.position - arm.position
@@ -383,10 +394,12 @@ def _make_cheap(model: Any) -> None:
     """
     draw_fast(model)
     for mesh in range(model.nmesh):
-        at, count = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
+        at = int(model.mesh_faceadr[mesh])
+        count = int(model.mesh_facenum[mesh])
         if count <= MAX_FACES:
             continue
-        faces, first = model.mesh_face[at : at + count], int(model.mesh_vertadr[mesh])
+        faces = model.mesh_face[at : at + count]
+        first = int(model.mesh_vertadr[mesh])
         vertices = model.mesh_vert[first : first + int(model.mesh_vertnum[mesh])]
         kept, merged = _coarser_once(vertices.tobytes(), faces.tobytes())
         corners = model.mesh_facetexcoord[at : at + count][kept] + model.mesh_texcoordadr[mesh]

@@ -77,7 +77,8 @@ def environment_error(config: EnvConfig, error: Exception) -> InputError:
     drawing = drawing_error(error)
     if drawing is not None:
         return drawing
-    field, value = f"env.{config.named_by}", getattr(config, config.named_by)
+    field = f"env.{config.named_by}"
+    value = getattr(config, config.named_by)
     if isinstance(error, ModuleNotFoundError):
         missing = str(error.name or getattr(error.__cause__, "name", None)).partition(".")[0]
         hint = f"the package {missing} is not installed"

@@ -212,7 +212,8 @@ def touching_object(sim: Any, geom: int) -> bool:
 
     The rewards of 14 tasks ask for it at every env step, where loops took a quarter of the simulation.
     """
-    contact, force = sim.data.contact, sim.data.efc_force
+    contact = sim.data.contact
+    force = sim.data.efc_force
     pads = (sim.data.geom(name).id for name in ("leftpad_geom", "rightpad_geom"))
     of_object = (contact.geom == geom).any(1)
     pressing = (of_object & (contact.geom == pad).any(1) for pad in pads)

@@ -23,7 +23,8 @@ class Batcher[R: Sized]:
     """
 
     def __init__(self, max_batch: int, max_wait_s: float) -> None:
-        self.max_batch, self.max_wait_s = max_batch, max_wait_s
+        self.max_batch = max_batch
+        self.max_wait_s = max_wait_s
         self.counts = {"batches": 0.0, "requests": 0.0, "observations": 0.0, "waited_s": 0.0}
         """Served so far, and how long the requests had waited in sum."""
         self._waiting: deque[tuple[R, float]] = deque()
@@ -33,7 +34,8 @@ class Batcher[R: Sized]:
 
     def lock_step(self, environments: int) -> None:
         """From now on so many observations wait for each other; 0: none do."""
-        self._environments, self._of_round = environments, 0
+        self._environments = environments
+        self._of_round = 0
 
     def __len__(self) -> int:
         return len(self._waiting)

@@ -131,7 +131,8 @@ class InferenceWorker:
         try:
             await asyncio.to_thread(self._serve)
         finally:
-            self._over, self._iteration = True, None
+            self._over = True
+            self._iteration = None
             self._server.wake()
 
     async def metrics(self) -> dict[str, float]:
@@ -140,7 +141,8 @@ class InferenceWorker:
             await asyncio.sleep(0.1)
         self._clock.beat()
         since, busy_before = self._reported
-        now, busy = time.monotonic(), self._busy_s
+        now = time.monotonic()
+        busy = self._busy_s
         self._reported = now, busy
         share = (busy - busy_before) / max(1e-9, now - since)
         return self._batcher.counts | {"version": float(self._version), "busy_share": share}

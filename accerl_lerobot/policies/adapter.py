@@ -160,7 +160,9 @@ class PretrainedAdapter(PolicyAdapter):
 
     def __init__(self, policy: Any, processing: Processing, precision: str) -> None:
         super().__init__()
-        self.policy, self.processing, self.precision = policy.eval(), processing, precision
+        self.policy = policy.eval()
+        self.processing = processing
+        self.precision = precision
         self.device = next(policy.parameters()).device
         self.parts = {"policy": policy}
         self.own_files = {}
@@ -216,12 +218,14 @@ class PretrainedAdapter(PolicyAdapter):
         A policy that looks back gets as many env steps as it wants, unless it does not explore: then it keeps
         them itself.
         """
-        rng, config = np.random.default_rng(0), self.policy.config
+        rng = np.random.default_rng(0)
+        config = self.policy.config
         env_names = {policy: env for env, policy in self.processing.rename_map.items()}
         batch = (2,) if config.n_obs_steps == 1 or not self.explores else (2, config.n_obs_steps)
         arrays: dict[str, np.ndarray] = {}
         for key, feature in config.input_features.items():
-            name, shape = env_names.get(key, key), tuple(feature.shape)
+            name = env_names.get(key, key)
+            shape = tuple(feature.shape)
             if key.startswith(IMAGES) and ".empty_camera_" not in key:
                 arrays[name] = rng.integers(0, 256, (*batch, *shape[1:], shape[0]), dtype=np.uint8)
             elif key == OBS_STATE:
@@ -247,7 +251,8 @@ class LeRobotAdapter(PretrainedAdapter):
     ) -> None:
         super().__init__(policy, processing, precision)
         self.model = model
-        self.family, self.value_head = family.to(self.device), value_head.to(self.device)
+        self.family = family.to(self.device)
+        self.value_head = value_head.to(self.device)
         self.parts |= {"family": self.family, "value_head": self.value_head}
         self.own_files |= {VALUE_HEAD: self.value_head, FAMILY: self.family}
         self.feature_width = model.width

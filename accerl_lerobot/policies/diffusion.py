@@ -57,7 +57,8 @@ class Schedule:
 
         `eta` is DDIM's: 0 is LeRobot's own, 1 adds as much noise as DDPM.
         """
-        alpha, following = self.alphas[k], self.following[k]
+        alpha = self.alphas[k]
+        following = self.following[k]
         noise_share = 1 - alpha
         estimate = output
         if self.prediction == "epsilon":
@@ -160,7 +161,9 @@ class DiffusionFamily(Family):
 
     def __init__(self, model: Diffusion, sampler: DiffusionSamplerConfig) -> None:
         super().__init__(model, sampler)
-        self.size, self.rows, self.schedule = model.size, model.rows, model.schedule
+        self.size = model.size
+        self.rows = model.rows
+        self.schedule = model.schedule
         self._factors = self.rows if len(self.schedule) == 1 else slice(None)
         """L rows. Those without a density are left out: as constant factors they would dilute means."""
         zero = torch.zeros(1, 1, 1)

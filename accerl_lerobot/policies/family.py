@@ -90,7 +90,8 @@ class Family(nn.Module, ABC):
 
     def __init__(self, model: Any, sampler: Any) -> None:
         super().__init__()
-        self.model, self.sampler = model, sampler
+        self.model = model
+        self.sampler = sampler
 
     @abstractmethod
     def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:

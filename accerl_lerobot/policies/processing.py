@@ -60,7 +60,7 @@ class Processing:
         return self.postprocessor(chunk)
 
     def units(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Place of a normalised 0 in environment units, and the length of a normalised 1, like `rows` (K, A)."""
+        """Place of a normalised 0 in environment units, and length of a normalised 1, like `rows` (K, A)."""
         ends = torch.stack([torch.zeros_like(rows), torch.ones_like(rows)])
         zero, one = self.unnormalise(ends.to(self.device)).to(rows)
         return zero, one - zero

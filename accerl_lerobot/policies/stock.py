@@ -207,7 +207,8 @@ class StockAdapter(PretrainedAdapter):
         self, observations: dict[str, np.ndarray], tasks: Sequence[str], chunk: Tensor
     ) -> dict[str, Any]:
         """A batch as LeRobot's trainer makes it, in which the chunk is padded around the executed rows."""
-        config, count = self.policy.config, len(tasks)
+        config = self.policy.config
+        count = len(tasks)
         executed = self.processing.unnormalise(chunk)
         batch: dict[str, Any] = {"task": list(tasks), ACTION: executed[:, 0]}
         if config.action_delta_indices is not None:

@@ -63,7 +63,10 @@ class Teacher(nn.Module):
 
     def __init__(self, model: StateModel, chunk: tuple[int, int], share: float, noise: float = NOISE) -> None:
         super().__init__()
-        self.model, self.chunk, self.share, self.noise = model, chunk, share, noise
+        self.model = model
+        self.chunk = chunk
+        self.share = share
+        self.noise = noise
         state = model.size + TASK_BITS
         self.network = Ensemble(state, chunk[0] * chunk[1], 1)
         self.mean = nn.Parameter(torch.zeros(state), requires_grad=False)

@@ -146,7 +146,9 @@ class TokenFamily(Family):
         if stock is not None:
             difference += float((tokens != stock)[factors].sum())
         used = int(factors.any(0).sum())
-        tokens, acted, factors = tokens[:, :used], acted[:, :used], factors[:, :used]
+        tokens = tokens[:, :used]
+        acted = acted[:, :used]
+        factors = factors[:, :used]
         logits = encoded.context.logits(tokens)
         scored = token_log_prob(logits, tokens, self.sampler.temperature)
         gap = (scored - acted)[factors].abs().max()
@@ -156,7 +158,8 @@ class TokenFamily(Family):
     def _decide(self, encoded: Encoded, explore: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
         """Tokens and their log-probs, each (B, L), in one pass or position by position."""
         context: TokenContext = encoded.context
-        terminator, temperature = self.model.terminator, self.sampler.temperature
+        terminator = self.model.terminator
+        temperature = self.sampler.temperature
 
         def pick(logits: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
             chosen = explore.view(-1, *[1] * (uniform.dim() - 1))

@@ -117,7 +117,9 @@ def guarded(section: str, commit: str | None = None) -> Iterator[None]:
     """
     from transformers import dynamic_module_utils as dynamic
 
-    fetch, look, load = dynamic.get_cached_module_file, dynamic.check_imports, torch.load
+    fetch = dynamic.get_cached_module_file
+    look = dynamic.check_imports
+    load = torch.load
 
     def fetch_pinned(name: Any, *arguments: Any, **options: Any) -> Any:
         if commit is not None:

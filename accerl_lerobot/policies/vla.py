@@ -100,7 +100,8 @@ class SmolVLA(FlowModel):
             images, image_masks, batch[OBS_LANGUAGE_TOKENS], batch[OBS_LANGUAGE_ATTENTION_MASK],
             state=self.policy.prepare_state(batch),
         )  # fmt: skip
-        mask, places = make_att_2d_masks(pad, att), torch.cumsum(pad, dim=1) - 1
+        mask = make_att_2d_masks(pad, att)
+        places = torch.cumsum(pad, dim=1) - 1
         features, cache = _run(model.vlm_with_expert, embedded, mask, places)
         return Encoded(features=features, mask=pad, context=_velocity(model, pad, cache))
 
@@ -279,7 +280,8 @@ class Pi0Fast(TokenModel):
             return network.paligemma.lm_head(states)
 
         def generate(choose: Choose) -> None:
-            own, state = clone_past_key_values(cache), features[:, -1]
+            own = clone_past_key_values(cache)
+            state = features[:, -1]
             for position in range(self.length):
                 tokens = choose(network.paligemma.lm_head(state), position)
                 if position == self.length - 1 or bool((tokens == self.terminator).all()):

@@ -332,7 +332,8 @@ class Replay:
         self.stored_decisions -= entry.size
         if entry.available:
             self.available_decisions -= entry.size
-        entry.segment, entry.left = None, how
+        entry.segment = None
+        entry.left = how
         _count(self.counters, f"{how}_segments", 1)
         _count(self.counters, f"{how}_decisions", entry.size)
         _count(self.counters, f"{how}_unused", int(entry.uses == 0))

@@ -115,8 +115,11 @@ class EpisodePlans:
     def __init__(
         self, tasks: tuple[str, ...], seed: int, budget: int | None, worker: int = 0, incarnation: int = 0
     ) -> None:
-        self.worker, self.incarnation = worker, incarnation
-        self._tasks, self._seed, self._budget = tasks, seed, budget
+        self.worker = worker
+        self.incarnation = incarnation
+        self._tasks = tasks
+        self._seed = seed
+        self._budget = budget
         self.starts = incarnation * STARTS_PER_INCARNATION  # where it is in the worker's seeds
         self.imagined = self.starts  # the same, of imagined episodes
         # Filled and emptied on different threads: appending to and popping from a deque is atomic.
@@ -149,7 +152,8 @@ class EpisodePlans:
         """The same for an imagined environment, which begins at one of `starts`."""
         if not exploring or not starts:
             return None
-        number, self.imagined = self.imagined, self.imagined + 1
+        number = self.imagined
+        self.imagined = self.imagined + 1
         seed = train_seed(self._seed, self.worker, number)
         task, _ = start_of(starts, seed)
         return EpisodePlan(task=task, seed=seed, explore=True, source=IMAGINED)
@@ -252,7 +256,8 @@ class ActiveEpisode:
 
     def cut(self, key: str, terminated: bool = False, success: bool = False) -> Segment:
         """Hands out what was collected as one segment and goes on from its last observation."""
-        observations, self.observations = self.observations, self.observations[-1:]
+        observations = self.observations
+        self.observations = self.observations[-1:]
         decisions, actions, rewards, steps = zip(*self.taken, strict=True)
         self.taken = []
         names = [name for name in observations[0] if name != TASK]
@@ -388,7 +393,8 @@ class RolloutRunner:
 
     def restore(self, state: dict[str, Any]) -> None:
         """Resumes from `state`: environments without a state are brought back by doing it all again."""
-        self.counters, self._sequence = state["counters"], state["sequence"]
+        self.counters = state["counters"]
+        self._sequence = state["sequence"]
         self._episodes = state["episodes"]
         self.starts.extend(state["starts"])
         for environment, episode, kept in zip(
@@ -399,7 +405,8 @@ class RolloutRunner:
             if kept is not None:
                 environment.restore(kept)
                 continue
-            plan, latest = episode.plan, episode.observations[-1]
+            plan = episode.plan
+            latest = episode.observations[-1]
             observation = environment.reset(plan.seed, plan.task)
             for chunk in episode.chunks:
                 observation = environment.step_chunk(chunk).observation

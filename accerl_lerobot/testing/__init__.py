@@ -92,7 +92,8 @@ def check_alike(found: Sequence[Decision], expected: Sequence[Decision]) -> None
     mine, theirs = ({"chunk": _chunks(of)} | stored(of)[0] for of in (found, expected))
     for name, tensor in theirs.items():
         exact = not tensor.is_floating_point()
-        error, size = float((mine[name] - tensor).abs().max()), float(tensor.abs().max())
+        error = float((mine[name] - tensor).abs().max())
+        size = float(tensor.abs().max())
         where = f"{name} is off by {error:.2e} where the largest is {size:.2e}"
         assert error <= (0 if exact else TOLERANCE * size), f"of two decisions on one request, {where}"
 
@@ -101,7 +102,8 @@ def check_stock_sampler(adapter: LeRobotAdapter, asked: Sequence[Request]) -> No
     """Without exploration: LeRobot's own sampler on equal noise, and nothing that could be scored."""
     adapter.self_check(*stack_observations(asked))
     decisions = adapter.decide([replace(request, explore=False) for request in asked], 0)
-    rows, expected = len(decisions[0].chunk), adapter.policy.config.n_action_steps
+    rows = len(decisions[0].chunk)
+    expected = adapter.policy.config.n_action_steps
     assert rows == expected, f"the adapter executes {rows} rows, not n_action_steps={expected} of its policy"
     assert not any(d.log_prob.any() for d in decisions), "without exploration, log-probs must be 0"
 

@@ -91,7 +91,8 @@ class AccerlEnvConfig(EnvConfig):
     def __post_init__(self) -> None:
         with contextlib.closing(make_environment(self.environment_config)) as environment:
             spec = environment.spec
-        self.fps, self.tasks = spec.fps, spec.tasks
+        self.fps = spec.fps
+        self.tasks = spec.tasks
         self.features = {
             "action": PolicyFeature(type=FeatureType.ACTION, shape=(spec.action_dim,)),
             "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(spec.state_dim,)),
@@ -119,7 +120,8 @@ class AccerlEnvConfig(EnvConfig):
         self, n_envs: int, use_async_envs: bool = False
     ) -> dict[str, dict[int, gym.vector.VectorEnv]]:
         """One vector environment per task, as ``{task: {0: vector}}``."""
-        config, vectors = self.environment_config, {}
+        config = self.environment_config
+        vectors = {}
         for task in self.tasks:
             make = functools.partial(AccerlEnv, config, task)
             if use_async_envs and n_envs > 1:  # one task's processes at a time
