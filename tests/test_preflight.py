@@ -54,7 +54,7 @@ def test_an_environment_offers_what_a_policy_of_it_needs():
     check_features(with_shape(OFFERED, STATE, None), OFFERED, {}, "policy.path", "x")
     other_size = replace(with_shape(OFFERED, FRONT, (3, 64, 48)), any_size=True)
     check_features(other_size, OFFERED, {}, "policy.path", "x")
-    written = replace(OFFERED, tasks=("match  the TARGET.", "another"), fps=float(OFFERED.fps or 0))
+    written = replace(OFFERED, tasks=("another", *OFFERED.tasks), fps=float(OFFERED.fps or 0))
     check_features(written, OFFERED, {}, "dataset.repo_id", "x")
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import lerobot_policy_smolvla_bins  # noqa: F401 - registers its type
 import torch
 from torch import Tensor
 
