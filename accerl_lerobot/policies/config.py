@@ -290,6 +290,6 @@ def override(policy_config: Any, config: PolicyConfig) -> None:
     if config.n_action_steps is not None:
         rows = predicted_rows(policy_config) if hasattr(policy_config, "n_action_steps") else 0
         if config.n_action_steps > rows:
-            hint = f"a {policy_config.type} policy predicts a chunk of which up to {rows} can be executed"
+            hint = f"{policy_config.type}: at most {rows} rows of a predicted chunk can be executed"
             raise InputError("policy.n_action_steps", config.n_action_steps, hint)
         policy_config.n_action_steps = config.n_action_steps
