@@ -44,6 +44,9 @@ class Range:
         self.low = float(match[2])
         self.high = float(match[3])
 
+    def __repr__(self) -> str:
+        return f"Range({self.text!r})"
+
     def __contains__(self, value: Any) -> bool:
         if value == self.low:
             return not self._low_open
@@ -58,6 +61,9 @@ class Pattern:
     def __init__(self, pattern: str, words: str) -> None:
         self.pattern = re.compile(pattern)
         self.words = words
+
+    def __repr__(self) -> str:
+        return f"Pattern({self.pattern.pattern!r})"
 
     def __contains__(self, value: Any) -> bool:
         return self.pattern.fullmatch(value) is not None
