@@ -89,19 +89,19 @@ def write_smolvla(
 
 
 def write_multi_task_dit(directory: Path, **options: Any) -> Path:
-    """A multi-task DiT of 0.07 M parameters; its CLIP models are written beside it."""
+    """A multi-task DiT for images of 64 pixels; its tiny CLIP models are written beside it."""
     from transformers import CLIPTextConfig, CLIPTextModel, CLIPVisionConfig, CLIPVisionModel
 
     vision, text = (str(directory.parent / name) for name in ("clip-vision", "clip-text"))
     small = {"hidden_size": 16, "intermediate_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2}
-    CLIPVisionModel(CLIPVisionConfig(**small, image_size=224, patch_size=32)).save_pretrained(vision)
+    CLIPVisionModel(CLIPVisionConfig(**small, image_size=64, patch_size=16)).save_pretrained(vision)
     words = write_words(text, pad_token="[PAD]", cls_token="[CLS]", sep_token="[SEP]")
     ends = {"pad_token_id": 0, "bos_token_id": 1, "eos_token_id": 2}
     language = CLIPTextConfig(**small, vocab_size=words, max_position_embeddings=16, **ends)
     CLIPTextModel(language).save_pretrained(text)
     fields = {
         "n_obs_steps": 2, "horizon": 6, "n_action_steps": 3, "hidden_dim": 16, "num_layers": 1,
-        "num_heads": 2, "timestep_embed_dim": 16, "num_train_timesteps": 10, "image_resize_shape": (224, 224),
+        "num_heads": 2, "timestep_embed_dim": 16, "num_train_timesteps": 10, "image_crop_shape": None,
         "tokenizer_max_length": 16, "vision_encoder_name": vision, "text_encoder_name": text,
     }  # fmt: skip
     return write_policy(directory, "multi_task_dit", **(fields | options))

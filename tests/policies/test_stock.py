@@ -230,15 +230,17 @@ def write_pi05(folder: Path, image: int) -> Path:
     return write_pi(folder, "pi05")
 
 
-@pytest.mark.parametrize("algorithm", ["self_imitation", "chunk_critic"])
 @pytest.mark.parametrize(
-    "write",
+    ("write", "algorithm"),
     [
-        write_vqbet,
-        write_multi_task_dit,
+        (write_vqbet, "chunk_critic"),
+        (write_multi_task_dit, "self_imitation"),
+        pytest.param(write_vqbet, "self_imitation", marks=pytest.mark.slow),
+        pytest.param(write_multi_task_dit, "chunk_critic", marks=pytest.mark.slow),
         *(
-            pytest.param(write, marks=pytest.mark.slow)
+            pytest.param(write, algorithm, marks=pytest.mark.slow)
             for write in (write_xvla, write_act, write_diffusion, write_smolvla, write_pi0, write_pi05)
+            for algorithm in ("self_imitation", "chunk_critic")
         ),
     ],
 )

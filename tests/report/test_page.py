@@ -170,7 +170,7 @@ def test_a_run_that_is_going_on_and_one_that_has_died(tmp_path: Path) -> None:
         file.write('{"kind": "tr')
     going = page_of(folder)
     assert "The run is still going: there is no summary.json" in going.text
-    assert "success – task" in going.text and "updates 40" in going.text
+    assert "40 of 40 updates on door-open-v3" in going.text and "success – algorithm" in going.text
     assert "The last line of metrics.jsonl is incomplete" in going.text and len(going.named("img")) >= 9
     (folder / "error.log").write_text("Traceback …\nValueError: no film\n")
     assert "The run failed: ValueError: no film The traceback is in error.log." in page_of(folder).text
