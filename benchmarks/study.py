@@ -7,7 +7,8 @@
 
 Runs are in the single-process engine, each on one thread, where lag is what settings make it and not what
 else the machine is doing. Finished runs are kept: the same command continues a study that was stopped, and
-adds seeds, arms or settings to one that is finished. Another recipe needs another folder.
+adds seeds, arms or settings to one that is finished. Another recipe, `updates` or `episodes` needs another
+folder.
 """
 
 from __future__ import annotations
@@ -279,7 +280,8 @@ def draw(path: Path, result: dict[str, Any]) -> None:
                 rate = group["successes"] / group["n"]
                 error = [[max(0.0, rate - group["ci95"][0])], [max(0.0, group["ci95"][1] - rate)]]
                 axes.errorbar(place, rate, yerr=error, marker="o", capsize=3, color=f"C{number}")
-                axes.scatter([place] * len(group["by_policy"]), group["by_policy"], s=12, alpha=0.4)
+                dots = {"s": 12, "alpha": 0.4, "color": f"C{number}", "linewidths": 0}
+                axes.scatter([place] * len(group["by_policy"]), group["by_policy"], **dots)
             axes.plot([], [], marker="o", color=f"C{number}", label=arm or "success")
         axes.set_xticks(range(len(places)), [" ".join(place) for place in places], rotation=20, ha="right")
         axes.set(ylabel="success", ylim=(-0.02, 1.02))

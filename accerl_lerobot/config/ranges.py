@@ -132,7 +132,7 @@ class RunsConfig(Section):
     runs: tuple[str, ...] = ()
     """Folders of runs; several go into one file. Bare arguments are runs."""
     output: str | None = None
-    """The file. None: in the run's folder, or here if there are several."""
+    """The file. None: ``report.html`` or ``timeline.json`` in the run's folder, here if there are several."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

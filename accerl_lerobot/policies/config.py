@@ -11,7 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import draccus
 
 from accerl_lerobot.config.parsing import import_plugins, imported
-from accerl_lerobot.config.ranges import Commit, Device, Range, Section, registered_name
+from accerl_lerobot.config.ranges import Commit, Device, Range, Section, check, registered_name
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE
 from accerl_lerobot.policies.deferred import import_policies
@@ -173,6 +173,11 @@ POLICIES: dict[str, tuple[str, tuple[str, ...]]] = {
 ANY = "chunk_noise"  # the family of a type that has no other
 NOT_IMPORTED: dict[str, str] = {}  # installed ``lerobot_policy_*`` → words on why it cannot be imported
 PLUGINS: dict[str, str] = {}  # policy type that is not LeRobot's own → package that registers it with LeRobot
+SIZES = (
+    "chunk_size", "n_action_steps", "n_obs_steps", "horizon", "num_steps", "num_inference_steps",
+    "max_state_dim", "max_action_dim", "num_train_timesteps", "max_decoding_steps", "tokenizer_max_length",
+)  # fmt: skip
+"""Numbers of LeRobot's policy configs by which is divided or which are shapes: at least 1."""
 USES_HISTORY = ("diffusion",)  # types that read observations of ``n_obs_steps`` env steps; others read one
 
 
@@ -259,6 +264,13 @@ def executed_rows(policy_config: Any) -> int:
     return int(rows or 1)
 
 
+def check_size(name: str, value: Any, field: str) -> None:
+    """Refuses a whole number of a LeRobot policy config that no policy can be built or can act with."""
+    if isinstance(value, int):
+        span = Range("[1, 10000]" if name in SIZES else "[-1, 1000000]")
+        check(Annotated[int, span], int(value), field)
+
+
 def predicted_rows(policy_config: Any) -> int:
     """Rows of a predicted chunk that can be executed; 0 where LeRobot's config does not tell."""
     rows = getattr(policy_config, "chunk_size", 0) or getattr(policy_config, "horizon", 0)
@@ -289,6 +301,9 @@ def override(policy_config: Any, config: PolicyConfig) -> None:
         setattr(policy_config, names[0], config.num_steps)
     if config.n_action_steps is not None:
         rows = predicted_rows(policy_config) if hasattr(policy_config, "n_action_steps") else 0
+        if not rows:
+            hint = f"a {policy_config.type} policy has no such choice; leave the field out"
+            raise InputError("policy.n_action_steps", config.n_action_steps, hint)
         if config.n_action_steps > rows:
             hint = f"{policy_config.type}: at most {rows} rows of a predicted chunk can be executed"
             raise InputError("policy.n_action_steps", config.n_action_steps, hint)

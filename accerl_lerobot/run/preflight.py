@@ -332,6 +332,7 @@ def check_sft_policy(config: SFTConfig) -> Any:
     from lerobot.configs.policies import PreTrainedConfig
 
     from accerl_lerobot.demos.sft import policy_fields
+    from accerl_lerobot.policies.config import check_size
 
     kind = config.policy["type"]
     fields = {name: value for name, value in config.policy.items() if name != "type"}
@@ -343,6 +344,7 @@ def check_sft_policy(config: SFTConfig) -> Any:
         if name not in names:
             near = " or ".join(difflib.get_close_matches(name, names)) or "one of its own"
             raise InputError(f"sft.policy.{name}", value, f"LeRobot's {kind} has no such field; use {near}")
+        check_size(name, value, f"sft.policy.{name}")
     try:
         # Without a device LeRobot looks for one.
         return draccus.decode(PreTrainedConfig.get_choice_class(kind), {"device": "cpu"} | fields)

@@ -24,7 +24,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from accerl_lerobot.experience import Decision, Observation, Request, stack_observations
 from accerl_lerobot.policies.adapter import LeRobotAdapter, PolicyAdapter
@@ -167,16 +166,19 @@ def check_gradient(
     silent = [k for k, p in named.items() if p.grad is None or not p.grad.abs().max() > 0]
     assert not silent, f"the log-prob does not depend on {silent[:3]}; name them in the model's `idle`"
     for part in parts:
-        chosen = [p for k, p in named.items() if part in k]
-        gradient = parameters_to_vector([p.grad for p in chosen])
-        home = parameters_to_vector(chosen).detach()
-        norm = float(gradient.norm())
-        width = step / max(norm, 1)
+        gradients = {k: p.grad.clone() for k, p in named.items() if part in k}
+        norm = float(torch.cat([g.flatten() for g in gradients.values()]).norm())
+        home = {k: named[k].detach().clone() for k in gradients}
         scores = []
-        for moved in (home + width * gradient / norm, home - width * gradient / norm):
-            vector_to_parameters(moved, chosen)
+        width = step / max(norm, 1)
+        for sign in (1, -1):
+            with torch.no_grad():
+                for key, gradient in gradients.items():
+                    named[key].copy_(home[key] + sign * width * gradient / norm)
             scores.append(float(log_ratio(adapter, asked, decisions).double().sum()))
-        vector_to_parameters(home, chosen)
+        with torch.no_grad():
+            for key, value in home.items():
+                named[key].copy_(value)
         found = (scores[0] - scores[1]) / (2 * width)
         wrong = f"the log-prob rises by {found:.4g} along its gradient, whose norm is {norm:.4g}"
         assert math.isclose(found, norm, rel_tol=slack), f"{part or 'all parameters'}: {wrong}"

@@ -11,7 +11,6 @@ Shapes: F frames of an episode, T env steps; see `contract.py` for the others.
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -196,27 +195,8 @@ def check_dataset(dataset: DatasetConfig, spec: WorldModelSpec, section: str = "
     """The metadata of a dataset; one that a world model of `spec` cannot be trained on is refused."""
     with _named(section):
         meta = open_metadata(dataset)
-        sizes = {name: math.prod(feature["shape"]) for name, feature in meta.features.items()}
-        missing = [camera for camera in spec.cameras if camera not in sizes]
-        state_dim = sizes.get(STATE, 0) if spec.state_dim else 0
-        why = difference(spec, state_dim, sizes.get("action", 0), meta.fps)
-        if missing:
-            cameras = ", ".join(meta.camera_keys) or "no camera"
-            why = f"no {missing[0]!r}: the dataset has {cameras}; choose env.camera accordingly"
-        elif not {SUCCESS, REWARD} & sizes.keys():
-            why = f"no {SUCCESS}: record it, as accerl demos does, or add it to the dataset"
-        if why:
-            raise InputError("dataset.repo_id", dataset.repo_id, why)
+        _check_metadata(meta, dataset.repo_id, spec)
     return meta
-
-
-def difference(spec: WorldModelSpec, state_dim: int, action_dim: int, fps: int) -> str:
-    """The first size that differs from a world model's; empty: none does."""
-    for name, other in {"state_dim": state_dim, "action_dim": action_dim, "fps": fps}.items():
-        modelled = getattr(spec, name)
-        if other != modelled:
-            return f"its {name} is {other}, and the world model's is {modelled}"
-    return ""
 
 
 @contextmanager
@@ -229,3 +209,24 @@ def _named(section: str) -> Iterator[None]:
         if field.startswith("dataset."):
             field = f"{section}.{field.removeprefix('dataset.')}"
         raise InputError(field, error.value, error.hint) from error
+
+
+def _check_metadata(meta: Any, name: str | None, spec: WorldModelSpec) -> None:
+    shapes = {key: tuple(feature["shape"]) for key, feature in meta.features.items()}
+    missing = [camera for camera in spec.cameras if camera not in shapes]
+    if missing:
+        cameras = ", ".join(meta.camera_keys) or "no camera"
+        hint = f"no {missing[0]!r}: the dataset has {cameras}; choose env.camera accordingly"
+        raise InputError("dataset.repo_id", name, hint)
+    for key, size in {"action": spec.action_dim, STATE: spec.state_dim}.items():
+        if size and shapes.get(key) != (size,):
+            hint = (
+                f"{key} has shape {shapes.get(key)}, the environment's has ({size},): it is another robot's"
+            )
+            raise InputError("dataset.repo_id", name, hint)
+    if not {SUCCESS, REWARD} & shapes.keys():
+        hint = f"no {SUCCESS}: record it, as accerl demos does, or add it to the dataset"
+        raise InputError("dataset.repo_id", name, hint)
+    if meta.fps != spec.fps:
+        hint = f"{meta.fps} frames a second, and the environment makes {spec.fps} steps; record at its rate"
+        raise InputError("dataset.repo_id", name, hint)

@@ -49,7 +49,6 @@ from accerl_lerobot.world_model.data import (
     WindowStart,
     check_dataset,
     cut_windows,
-    difference,
     model_arrays,
     resize,
 )
@@ -280,7 +279,7 @@ def check_imagination(config: RunConfig) -> None:
                 make_expert(config.env, environment, spec.tasks[0])
             return
     world = world_of(imagination)
-    _check_fit(imagination.path, world.model.spec, spec, getattr(policy, "n_action_steps", 1))
+    _check_fit(world.model.spec, spec, getattr(policy, "n_action_steps", 1))
     if imagination.learns and imagination.learn.dataset.repo_id is not None:
         check_dataset(imagination.learn.dataset, world.model.spec, LEARN)
     failed = read_content(world_path(imagination), "imagination").get("failed_checks")
@@ -290,7 +289,7 @@ def check_imagination(config: RunConfig) -> None:
         logger.warning(text, imagination.path, why)
 
 
-def _check_fit(path: str | None, spec: WorldModelSpec, environment: EnvironmentSpec, executed: int) -> None:
+def _check_fit(spec: WorldModelSpec, environment: EnvironmentSpec, executed: int) -> None:
     """Refuses a world model that does not fit environment and policy, which executes so many actions per
     decision."""
     field = "imagination.path"
@@ -298,8 +297,11 @@ def _check_fit(path: str | None, spec: WorldModelSpec, environment: EnvironmentS
     if missing := [camera for camera in environment.images if camera not in spec.cameras]:
         hint = f"the environment shows this camera, the world model {spec.cameras!r}; {again}"
         raise InputError(field, missing[0], hint)
-    if why := difference(spec, environment.state_dim, environment.action_dim, environment.fps):
-        raise InputError(field, path, f"does not fit the environment: {why}; {again}")
+    for name in ("state_dim", "action_dim", "fps"):
+        modelled, real = getattr(spec, name), getattr(environment, name)
+        if modelled != real:
+            hint = f"is the world model's {name}, and the environment's is {real}; {again}"
+            raise InputError(field, modelled, hint)
     unknown = [text for text in environment.instructions if spec.tasks and text not in spec.tasks]
     if unknown:
         raise InputError(field, unknown[0], f"the world model was trained on {spec.tasks!r}; {again}")
