@@ -142,10 +142,10 @@ def test_every_frame_and_action_is_the_dataset_s_once(
     ("changes", "why"),
     [
         ({"observation.images.front": None}, "no 'observation.images.front': the dataset has no camera"),
-        ({"action": (7,)}, "its action_dim is 7, and the world model's is 2"),
-        ({"observation.state": None}, "its state_dim is 0, and the world model's is 4"),
+        ({"action": (7,)}, r"action has shape \(7,\), the environment's has \(2,\)"),
+        ({"observation.state": None}, "observation.state has shape None, the environment's has"),
         ({"next.success": None}, "no next.success: record it, as accerl demos does"),
-        ({"fps": 10}, "its fps is 10, and the world model's is 80"),
+        ({"fps": 10}, "10 frames a second, and the environment makes 80 steps"),
     ],
 )
 def test_what_cannot_be_learned_from(changes: dict[str, Any], why: str, monkeypatch: pytest.MonkeyPatch):
