@@ -17,7 +17,7 @@ import torch
 from safetensors.torch import save_file
 
 from accerl_lerobot import cli, load_policy
-from accerl_lerobot.algorithms import chunk_critic
+from accerl_lerobot.algorithms import chunk_critic, off_policy
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Request, stack_observations
 from accerl_lerobot.policies.config import ChunkNoiseConfig, PolicyConfig
@@ -255,6 +255,7 @@ def test_any_policy_learns_and_is_saved_for_stock_lerobot(
     from lerobot.policies.factory import get_policy_class
 
     monkeypatch.setattr(chunk_critic, "FIRST_STEPS", 50)
+    monkeypatch.setattr(off_policy, "POLICY_BATCH", 8)
     size = 32 if write in (write_pi0, write_pi05) else 64
     policy, root, out = write(tmp_path / "policy", image=size), tmp_path / "data", tmp_path / "run"
     data = ["--env.type=simulated", "--env.max_steps=12", f"--env.image_size={size}"]
@@ -275,8 +276,8 @@ def test_any_policy_learns_and_is_saved_for_stock_lerobot(
     before, after = (kind.from_pretrained(path).state_dict() for path in (policy, saved))
     changed = [name for name, tensor in before.items() if not torch.equal(tensor, after[name])]
     assert changed and all(bool(torch.isfinite(tensor).all()) for tensor in after.values())
-    evaluation = ["--evaluation.episodes=2", f"--output_dir={tmp_path / 'eval'}", f"--policy.path={saved}"]
-    assert cli.main(["eval", *data, *evaluation]) == 0
+    evaluation = ["--evaluation.episodes=2", "--launch.engine=local", f"--output_dir={tmp_path / 'eval'}"]
+    assert cli.main(["eval", *data, *evaluation, f"--policy.path={saved}", "--policy.device=cpu"]) == 0
 
 
 def test_in_python_an_episode_begins_with_reset(written: Any):
