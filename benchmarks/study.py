@@ -221,7 +221,7 @@ def together(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     Returns:
         ``successes`` and ``n`` of all, ``by_policy``, the success of each, and ``ci95`` of their mean. That
         is `mean_interval` over policies, where there are several, and never narrower than if one policy had
-        played all episodes: policies may be alike by chance.
+        played all episodes: policies may be equal by chance.
     """
     successes = sum(round(row["success"] * row["n"]) for row in rows)
     rate = Rate(successes=successes, n=sum(row["n"] for row in rows))

@@ -83,7 +83,7 @@ class AWRConfig(OffPolicyConfig):
     update = "accerl_lerobot.algorithms.off_policy:AWRUpdate"
 
     beta: Annotated[float, Range("(0, inf]")] = 1.0
-    """Temperature in standard deviations of the advantage; ``inf`` weighs all decisions alike."""
+    """Temperature in standard deviations of the advantage; ``inf`` weighs all decisions equally."""
 
 
 @AlgorithmConfig.register_subclass("chunk_critic")

@@ -153,7 +153,7 @@ class EpisodePlans:
         if not exploring or not starts:
             return None
         number = self.imagined
-        self.imagined = self.imagined + 1
+        self.imagined += 1
         seed = train_seed(self._seed, self.worker, number)
         task, _ = start_of(starts, seed)
         return EpisodePlan(task=task, seed=seed, explore=True, source=IMAGINED)

@@ -369,7 +369,7 @@ class ActingPolicy:
 
     def reset(self) -> None:
         """Begins another episode, for policies that remember former observations or actions."""
-        self._episode = self._episode + 1
+        self._episode += 1
         self._decisions = 0
 
     def act(self, observation: Observation) -> np.ndarray:

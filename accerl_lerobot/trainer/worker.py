@@ -158,7 +158,7 @@ class TrainerWorker:
 
     def write(self, directory: Path) -> None:
         """Writes what is kept: ``pretrained_model`` and its part of ``training_state``."""
-        (weights, trained, state) = self._kept
+        weights, trained, state = self._kept
         self._kept = None
         fault_point("trainer.write")
         self._update.adapter.save(directory / PRETRAINED, self._policy, weights)
