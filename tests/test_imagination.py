@@ -21,7 +21,6 @@ from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE, WORLD_MODEL
 from accerl_lerobot.console import Console
-from accerl_lerobot.demos.record import DemosConfig, record_demos
 from accerl_lerobot.engines.config import DatasetConfig, RunConfig
 from accerl_lerobot.engines.contract import Progress
 from accerl_lerobot.engines.local import LocalEngine
@@ -44,6 +43,7 @@ from accerl_lerobot.world_model.imagined import World, check_imagination, load_w
 from accerl_lerobot.world_model.online import ONLINE, make_learner
 from tests.policies.checkpoints import write_diffusion
 from tests.runs import drive, polls, tiny_run
+from tests.tiny_datasets import one_process, record_dataset
 
 # About half of all episodes succeed when it is acted at random.
 ENV = SimulatedConfig(max_steps=16, hold=8, tolerance=0.45)
@@ -246,8 +246,7 @@ def test_what_does_not_fit_is_refused_before_the_run_begins(
 def test_it_goes_on_with_what_it_has_learned_from_and_never_with_what_was_held_out(
     tiny_checkpoint: Path, tmp_path: Path
 ):
-    demos = record_demos(ENV, DemosConfig(episodes=6, failure_share=0.5), str(tmp_path / "demos"))
-    dataset = DatasetConfig(repo_id="a/b", root=str(demos))
+    dataset = record_dataset(tmp_path / "demos", ENV, episodes=6, failure_share=0.5)
     keys = [episode.key for episode in load_episodes(dataset, SPEC)]
     for learnt, expected in ((keys[1:4], keys[1:4]), (["elsewhere"], None)):
         path = new_world(tmp_path / str(len(learnt)), PixelModelConfig(channels=(8, 8)), learnt=learnt)
@@ -312,7 +311,7 @@ def test_one_command_records_play_trains_a_world_model_on_it_and_practises(
     launch = replace(config.launch, engine="local")
     config = replace(config, imagination=play, launch=launch, env=replace(ENV, image_size=32))
     stopped = mock.patch("accerl_lerobot.run.play.pretrain", side_effect=KeyboardInterrupt)
-    with stopped, pytest.raises(KeyboardInterrupt):
+    with one_process(), stopped, pytest.raises(KeyboardInterrupt):
         Run(config, tmp_path, Console()).execute()
     recorded = load_episodes(DatasetConfig(repo_id="a/b", root=str(tmp_path / "play")), SPEC)
     assert len(recorded) == 16 and {episode.success for episode in recorded} == {True, False}

@@ -16,20 +16,19 @@ from accerl_lerobot.algorithms import chunk_critic
 from accerl_lerobot.cli import main
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos.dataset_files import read_labels
-from accerl_lerobot.demos.record import DemosConfig, record_demos
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.metrics import METRICS
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.loading import load_adapter
 from accerl_lerobot.world_model.latent import LatentModel
+from tests.tiny_datasets import record_dataset
 
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Six successes and two failures."""
     root = tmp_path_factory.mktemp("recorded") / "dataset"
-    config = DemosConfig(episodes=8, failure_share=0.25)
-    record_demos(SimulatedConfig(max_steps=16), config, str(root))
+    record_dataset(root, SimulatedConfig(max_steps=16), episodes=8, failure_share=0.25)
     return root
 
 
@@ -133,7 +132,7 @@ def test_the_chunk_critic_learns_from_recorded_episodes(
     monkeypatch.setattr(chunk_critic, "FIRST_STEPS", 200)
     root = tmp_path / "recorded"
     environment = SimulatedConfig(max_steps=16, environment_state=model == "simulator")
-    record_demos(environment, DemosConfig(episodes=8, failure_share=0.25), str(root))
+    record_dataset(root, environment, episodes=8, failure_share=0.25)
     out = tmp_path / "out"
     run = [*arguments(tiny_checkpoint, root, out), "--algorithm.type=chunk_critic"]
     assert main(run) == 0  # the state is the simulator's where the dataset has it

@@ -1,18 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Small LeRobotDatasets, written by LeRobot, that fit ``env.type=simulated``, and changes of their files."""
+"""Small LeRobotDatasets that fit ``env.type=simulated``, and changes of their files."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from accerl_lerobot.config.ranges import DatasetConfig
+from accerl_lerobot.demos import record
+from accerl_lerobot.envs import EnvConfig
 
 FPS, STEPS, TASK = 80, 6, "Match the target"
 FRONT, STATE, ACTION = "observation.images.front", "observation.state", "action"
@@ -74,3 +79,28 @@ def rewrite(path: Path, change: Callable[[pa.Table], pa.Table]) -> None:
     with pq.ParquetFile(path) as file:
         table = file.read()
     pq.write_table(change(table), path)
+
+
+@contextmanager
+def one_process() -> Iterator[None]:
+    """Episodes are played in this process, not in new ones that first import everything."""
+
+    @contextmanager
+    def simulators(processes: int, start: Callable[..., None], *arguments: Any) -> Iterator[Any]:
+        start(*arguments)
+        yield SimpleNamespace(submit=lambda work, *given: SimpleNamespace(result=lambda: work(*given)))
+        record.this_environment().close()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(record, "simulators", simulators)
+        yield
+
+
+def record_dataset(
+    root: Path, env: EnvConfig, episodes: int, failure_share: float = 0.0, seed: int = 0
+) -> DatasetConfig:
+    """Demonstrations as ``accerl demos`` records them, but in this process."""
+    config = record.DemosConfig(episodes=episodes, failure_share=failure_share)
+    with one_process():
+        record.record_demos(env, config, str(root), seed=seed)
+    return DatasetConfig(repo_id="a/b", root=str(root))

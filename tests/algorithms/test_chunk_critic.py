@@ -50,6 +50,11 @@ GAMMA = 0.9
 ENV = SimulatedConfig(max_steps=16, environment_state=True)
 
 
+@pytest.fixture(autouse=True)
+def few_first_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(chunk_critic, "FIRST_STEPS", 20)
+
+
 def episode(rewards: list[float], *, first: float = 0.0, actions: np.ndarray | None = None) -> Segment:
     """An episode whose environment state counts its decisions from `first`."""
     t = len(rewards)

@@ -20,7 +20,6 @@ from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.algorithms.demonstrations import demonstrations, recorded
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos.dataset_files import open_metadata
-from accerl_lerobot.demos.record import DemosConfig, record_demos
 from accerl_lerobot.demos.sft import SFTConfig, run_sft
 from accerl_lerobot.envs import SimulatedConfig, make_environment
 from accerl_lerobot.errors import InputError
@@ -33,7 +32,7 @@ from accerl_lerobot.world_model.config import SimulatorStateConfig
 from tests.algorithms.test_chunk_critic import SECTIONS
 from tests.replay.segments import make_segment
 from tests.runs import tiny_run
-from tests.tiny_datasets import labels, write_dataset
+from tests.tiny_datasets import labels, record_dataset, write_dataset
 
 ENV = SimulatedConfig(max_steps=16, environment_state=True)
 K, COST = 4, 0.25
@@ -43,9 +42,7 @@ K, COST = 4, 0.25
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> DatasetConfig:
     """Three successes and a failure."""
     root = tmp_path_factory.mktemp("demos") / "dataset"
-    config = DemosConfig(episodes=4, failure_share=0.25)
-    record_demos(ENV, config, str(root))
-    return DatasetConfig(repo_id="a/b", root=str(root))
+    return record_dataset(root, ENV, episodes=4, failure_share=0.25)
 
 
 @pytest.fixture

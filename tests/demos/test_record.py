@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from accerl_lerobot.demos import record
 from accerl_lerobot.demos.record import (
     SIDECAR,
     DemosConfig,
@@ -25,6 +24,7 @@ from accerl_lerobot.envs import EnvConfig, MetaWorldConfig, SimulatedConfig, mak
 from accerl_lerobot.envs.gym_env import GymConfig
 from accerl_lerobot.errors import InputError
 from tests.rounding import assert_close
+from tests.tiny_datasets import record_dataset
 
 TINY = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
 TASKS = "handle-press-v3,reach-v3"
@@ -73,10 +73,8 @@ def test_the_expert_succeeds_at_the_last_frame_of_each_episode(recorded: Path):
         assert [i for i, row in enumerate(data) if row[name]] == last, name
 
 
-def test_the_content_does_not_depend_on_the_processes(recorded, tmp_path, monkeypatch):
-    monkeypatch.setattr(record, "MOST_PROCESSES", 1)
-    config = DemosConfig(episodes=2)
-    record_demos(MetaWorldConfig(task=TASKS, max_steps=100), config, str(tmp_path / "one"))
+def test_the_content_does_not_depend_on_the_processes(recorded: Path, tmp_path: Path):
+    record_dataset(tmp_path / "one", MetaWorldConfig(task=TASKS, max_steps=100), episodes=2)
     one, two = rows(tmp_path / "one"), rows(recorded)
     assert len(one) == len(two)
     assert all(np.array_equal(a[key], b[key]) for a, b in zip(one, two, strict=True) for key in a)
@@ -85,8 +83,7 @@ def test_the_content_does_not_depend_on_the_processes(recorded, tmp_path, monkey
 
 def test_failures_are_recorded_on_request_spread_over_tasks(tmp_path: Path):
     env = SimulatedConfig(task="match,mirror", max_steps=60, hold=25)
-    config = DemosConfig(episodes=8, failure_share=0.5)
-    record_demos(env, config, str(tmp_path / "mixed"), seed=3)
+    record_dataset(tmp_path / "mixed", env, episodes=8, failure_share=0.5, seed=3)
     data = rows(tmp_path / "mixed")
     outcome: dict[str, list[bool]] = {"Match the target": [], "Mirror the target": []}
     for row in data:

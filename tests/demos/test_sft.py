@@ -21,7 +21,6 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos import guarded_train, sft
 from accerl_lerobot.demos.backbone import BackboneConfig
-from accerl_lerobot.demos.record import DemosConfig, record_demos
 from accerl_lerobot.demos.sft import ANSWER, SFTConfig, picked, run_sft, sft_command
 from accerl_lerobot.engines.config import RunConfig
 from accerl_lerobot.envs import MetaWorldConfig, SimulatedConfig
@@ -33,6 +32,7 @@ from accerl_lerobot.run.preflight import check_start
 from tests.policies.checkpoints import edit_config, write_smolvla
 from tests.policies.tiny import adapter_at
 from tests.rounding import assert_close
+from tests.tiny_datasets import record_dataset
 
 ROOT = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
 HUB = DatasetConfig(repo_id="a/b")
@@ -128,10 +128,8 @@ class TestPick:
     @pytest.fixture(scope="class")
     def dataset(self, tmp_path_factory: pytest.TempPathFactory) -> DatasetConfig:
         """Every second episode fails."""
-        root = str(tmp_path_factory.mktemp("demos") / "dataset")
-        config = DemosConfig(episodes=4, failure_share=0.5)
-        record_demos(SimulatedConfig(max_steps=16), config, root)
-        return DatasetConfig(repo_id="a/b", root=root)
+        root = tmp_path_factory.mktemp("demos") / "dataset"
+        return record_dataset(root, SimulatedConfig(max_steps=16), episodes=4, failure_share=0.5)
 
     def test_episodes_by_their_label(self, dataset: DatasetConfig, tmp_path: Path):
         assert picked(dataset, "all") is None

@@ -8,6 +8,7 @@ import re
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from safetensors.torch import save_file
 
 from accerl_lerobot import cli, load_policy
 from accerl_lerobot.algorithms import chunk_critic, off_policy
+from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Request, stack_observations
 from accerl_lerobot.policies.config import ChunkNoiseConfig, PolicyConfig
@@ -34,6 +36,7 @@ from tests.policies.checkpoints import (
 )
 from tests.policies.tiny import requests
 from tests.policies.tiny_pi import small, write_pi
+from tests.tiny_datasets import record_dataset
 
 KINDS: dict[str, dict[str, Any]] = {
     "vqbet": {
@@ -230,23 +233,37 @@ def write_pi05(folder: Path, image: int) -> Path:
     return write_pi(folder, "pi05")
 
 
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int, bool], Path]:
+    """Three demonstrations with images of a size, with or without the simulator's state."""
+
+    @cache
+    def record(size: int, states: bool) -> Path:
+        env = SimulatedConfig(max_steps=12, image_size=size, environment_state=states)
+        return Path(str(record_dataset(tmp_path_factory.mktemp("demos") / "data", env, episodes=3).root))
+
+    return record
+
+
 @pytest.mark.parametrize(
     ("write", "algorithm"),
     [
         (write_vqbet, "chunk_critic"),
         (write_multi_task_dit, "self_imitation"),
-        pytest.param(write_vqbet, "self_imitation", marks=pytest.mark.slow),
-        pytest.param(write_multi_task_dit, "chunk_critic", marks=pytest.mark.slow),
         *(
             pytest.param(write, algorithm, marks=pytest.mark.slow)
-            for write in (write_xvla, write_act, write_diffusion, write_smolvla, write_pi0, write_pi05)
-            for algorithm in ("self_imitation", "chunk_critic")
+            for write, algorithm in (
+                (write_vqbet, "self_imitation"), (write_xvla, "chunk_critic"), (write_act, "self_imitation"),
+                (write_diffusion, "chunk_critic"), (write_smolvla, "self_imitation"),
+                (write_pi0, "chunk_critic"), (write_pi05, "self_imitation"),
+            )
         ),
     ],
-)
+)  # fmt: skip
 def test_any_policy_learns_and_is_saved_for_stock_lerobot(
     write: Callable[..., Path],
     algorithm: str,
+    recorded: Callable[[int, bool], Path],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     small_pi: None,
@@ -254,30 +271,34 @@ def test_any_policy_learns_and_is_saved_for_stock_lerobot(
     from lerobot.configs.policies import PreTrainedConfig
     from lerobot.policies.factory import get_policy_class
 
-    monkeypatch.setattr(chunk_critic, "FIRST_STEPS", 50)
+    monkeypatch.setattr(chunk_critic, "FIRST_STEPS", 5)
     monkeypatch.setattr(off_policy, "POLICY_BATCH", 8)
-    size = 32 if write in (write_pi0, write_pi05) else 64
-    policy, root, out = write(tmp_path / "policy", image=size), tmp_path / "data", tmp_path / "run"
-    data = ["--env.type=simulated", "--env.max_steps=12", f"--env.image_size={size}"]
-    data += [f"--env.environment_state={'true' if algorithm == 'chunk_critic' else 'false'}"]
-    assert cli.main(["demos", *data, "--demos.episodes=3", f"--root={root}"]) == 0
+    size = 64 if write in (write_vqbet, write_multi_task_dit, write_xvla) else 32
+    policy, states, out = (
+        write(tmp_path / "policy", image=size),
+        algorithm == "chunk_critic",
+        tmp_path / "run",
+    )
+    env = ["--env.type=simulated", "--env.max_steps=12", f"--env.image_size={size}"]
+    env += [f"--env.environment_state={str(states).lower()}"]
     fields = [
         f"--policy.path={policy}", "--policy.device=cpu", "--sft.steps=0", "--launch.engine=local",
         "--policy.sampler.type=chunk_noise", f"--algorithm.type={algorithm}",
-        "--dataset.repo_id=a/b", f"--dataset.root={root}",
-        "--algorithm.policy_steps=1", "--rollout.environments=2", "--rollout.segment_length=6",
-        "--trainer.updates=10", "--trainer.batch_decisions=8", "--trainer.value_warmup_updates=1",
+        "--dataset.repo_id=a/b", f"--dataset.root={recorded(size, states)}",
+        "--algorithm.policy_steps=0.5", "--rollout.environments=2", "--rollout.segment_length=6",
+        "--trainer.updates=3", "--trainer.batch_decisions=8", "--trainer.value_warmup_updates=1",
         "--replay.min_decisions=8", "--replay.max_unlearned_decisions=16", "--replay.samples_per_insert=1",
-        "--replay.max_lag=100", "--evaluation.episodes=2", "--evaluation.videos=0", f"--output_dir={out}",
+        "--replay.max_lag=100", "--evaluation.before=false", "--evaluation.episodes=2",
+        "--evaluation.videos=0", f"--output_dir={out}",
     ]  # fmt: skip
-    assert cli.main(["train", *data, *fields]) == 0
+    assert cli.main(["train", *env, *fields]) == 0
     saved = out / "checkpoints" / "last" / "pretrained_model"
     kind = get_policy_class(PreTrainedConfig.from_pretrained(saved).type)
     before, after = (kind.from_pretrained(path).state_dict() for path in (policy, saved))
     changed = [name for name, tensor in before.items() if not torch.equal(tensor, after[name])]
     assert changed and all(bool(torch.isfinite(tensor).all()) for tensor in after.values())
     evaluation = ["--evaluation.episodes=2", "--launch.engine=local", f"--output_dir={tmp_path / 'eval'}"]
-    assert cli.main(["eval", *data, *evaluation, f"--policy.path={saved}", "--policy.device=cpu"]) == 0
+    assert cli.main(["eval", *env, *evaluation, f"--policy.path={saved}", "--policy.device=cpu"]) == 0
 
 
 def test_in_python_an_episode_begins_with_reset(written: Any):

@@ -14,13 +14,13 @@ from lerobot.datasets.dataset_tools import merge_datasets
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch import Tensor
 
-from accerl_lerobot.demos.record import DemosConfig, record_demos
 from accerl_lerobot.engines.config import DatasetConfig
 from accerl_lerobot.envs import SimulatedConfig, make_environment
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model import data
 from accerl_lerobot.world_model.contract import Windows, WorldModelSpec
 from accerl_lerobot.world_model.data import Episode, WindowStart, cut_windows, load_episodes, split_episodes
+from tests.tiny_datasets import record_dataset
 
 K = 3
 SPEC = WorldModelSpec(
@@ -110,8 +110,8 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[DatasetConfig, W
     """Six episodes of the simulated environment, some of which fail."""
     root = tmp_path_factory.mktemp("demos") / "dataset"
     env = SimulatedConfig(max_steps=60, hold=25, image_size=16)
-    record_demos(env, DemosConfig(episodes=6, failure_share=0.5), str(root))
-    return DatasetConfig(repo_id="a/b", root=str(root)), replace(SPEC, fps=make_environment(env).spec.fps)
+    dataset = record_dataset(root, env, episodes=6, failure_share=0.5)
+    return dataset, replace(SPEC, fps=make_environment(env).spec.fps)
 
 
 def test_every_frame_and_action_is_the_dataset_s_once(

@@ -16,7 +16,6 @@ from torch import nn
 
 from accerl_lerobot import cli
 from accerl_lerobot.cli.configs import WorldModelRun
-from accerl_lerobot.demos.record import DemosConfig, record_demos
 from accerl_lerobot.engines.config import parse
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
@@ -24,6 +23,7 @@ from accerl_lerobot.world_model.config import LearnableModelConfig
 from accerl_lerobot.world_model.imagined import World, load_world, read_content, save_world
 from accerl_lerobot.world_model.training import Trainer, uniform
 from tests.runs import replacing
+from tests.tiny_datasets import record_dataset
 from tests.world_model.test_pixels import dots, model
 
 ENV = SimulatedConfig(max_steps=60, hold=25, image_size=16)
@@ -47,7 +47,8 @@ def forgotten() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def demos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("demos") / "dataset"
-    return record_demos(ENV, DemosConfig(episodes=12, failure_share=0.5), str(root))
+    record_dataset(root, ENV, episodes=12, failure_share=0.5)
+    return root
 
 
 def arguments(demos: Path, output_dir: Path, *more: str) -> list[str]:
@@ -88,8 +89,8 @@ def test_from_a_dataset_to_a_check_and_another_check(
 
 
 def test_what_cannot_be_held_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    demos = record_demos(ENV, DemosConfig(episodes=3, failure_share=0.5), str(tmp_path / "demos"))
-    assert cli.main(arguments(demos, tmp_path / "out")) == 2
+    record_dataset(tmp_path / "demos", ENV, episodes=3, failure_share=0.5)
+    assert cli.main(arguments(tmp_path / "demos", tmp_path / "out")) == 2
     assert "it needs at least two successes and two failures" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
