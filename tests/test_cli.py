@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +22,7 @@ from rich.table import Table
 from accerl_lerobot import cli
 from accerl_lerobot.cli import verbs
 from accerl_lerobot.console import Console
-from accerl_lerobot.engines.config import encode
+from accerl_lerobot.engines.config import LaunchConfig, encode
 from accerl_lerobot.engines.stopping import WorkerError
 from accerl_lerobot.errors import InputError, kept_traceback, one_line
 
@@ -155,7 +156,7 @@ class TestTrain:
     @pytest.fixture
     def arguments(self, tmp_path: Path, tiny_checkpoint: Path) -> list[str]:
         places = [f"--policy.path={tiny_checkpoint}", f"--output_dir={tmp_path / 'run'}"]
-        return ["train", "--env.type=simulated", *places]
+        return ["train", "--env.type=simulated", "--launch.engine=local", *places]
 
     def test_prints_the_summary(self, arguments, tmp_path, capsys, monkeypatch):
         seen: dict[str, Any] = {}
@@ -263,7 +264,8 @@ def test_a_run_that_cannot_go_on_ends_with_one_line(error, said, tmp_path, monke
 
     monkeypatch.setattr("accerl_lerobot.run.train.Run.execute", fails)
     recipe, folder = tmp_path / "light.yaml", tmp_path / "run"
-    recipe.write_text(yaml.safe_dump(encode(light_config(updates=1))))
+    config = replace(light_config(updates=1), launch=LaunchConfig(engine="local"))
+    recipe.write_text(yaml.safe_dump(encode(config)))
     assert verbs.train([f"--config_path={recipe}", f"--output_dir={folder}"], light_policy()) == 1
     how = f"accerl train --resume=true --config_path={folder}/config.yaml"
     assert said.format(run=folder, how=how) in capsys.readouterr().err.splitlines()[-1]

@@ -22,7 +22,7 @@ import torch
 from lerobot.configs.policies import PreTrainedConfig
 
 from accerl_lerobot import cli, load_policy
-from accerl_lerobot.algorithms import AlgorithmConfig
+from accerl_lerobot.algorithms import AlgorithmConfig, chunk_critic
 from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.algorithms.ratio_update import make_update
 from accerl_lerobot.config.parsing import parse
@@ -196,6 +196,7 @@ def test_the_world_model_of_the_page(tmp_path: Path, monkeypatch: Any, tiny_chec
     (code,) = (b for b in re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL) if "SmallPicture" in b)
     (tmp_path / "small_picture.py").write_text(code)
     monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(chunk_critic, "FIRST_STEPS", 5)
     flags = ["--world_model.discover_packages_path=small_picture", "--world_model.type=small_picture"]
     try:
         chosen = parse(RunConfig, ["--config_path=few_shot", "--env.environment_state=false", *flags])
@@ -206,6 +207,7 @@ def test_the_world_model_of_the_page(tmp_path: Path, monkeypatch: Any, tiny_chec
             "replay": ReplayConfig(
                 capacity=64, min_decisions=16, max_unlearned_decisions=32, samples_per_insert=1
             ),
+            "trainer": TrainerConfig(updates=4, batch_decisions=16, value_warmup_updates=2),
         }
         config = tiny_run(tiny_checkpoint, **sections)
         engine: Any = make_engine(replace(config, launch=LaunchConfig(engine="local")), ("match",), history=1)

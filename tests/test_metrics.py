@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
 
+from accerl_lerobot.algorithms import chunk_critic
 from accerl_lerobot.console import Console
 from accerl_lerobot.engines.config import RunConfig, parse
 from accerl_lerobot.inference.batcher import Batcher, merge_metrics
@@ -125,6 +126,7 @@ def explained(section: str) -> set[str]:
 def test_every_logged_number_is_explained(tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """And nothing is explained that is not logged."""
     monkeypatch.setattr(LatentModel, "first_steps", 1)
+    monkeypatch.setattr(chunk_critic, "FIRST_STEPS", 5)
     arguments = [
         "--env.type=simulated", f"--policy.path={tiny_checkpoint}", "--launch.engine=local",
         "--replay.min_decisions=32", "--trainer.batch_decisions=16", "--rollout.environments=4",

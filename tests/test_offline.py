@@ -127,9 +127,9 @@ def test_graded_rewards_without_a_success_are_enough_for_awr(
 def test_the_chunk_critic_learns_from_recorded_episodes(
     model, tiny_checkpoint, tmp_path, capsys, monkeypatch
 ):
-    monkeypatch.setattr(LatentModel, "first_steps", 20)
+    monkeypatch.setattr(LatentModel, "first_steps", 10)
     monkeypatch.setattr(chunk_critic, "LEAST_TRANSITIONS", 8)
-    monkeypatch.setattr(chunk_critic, "FIRST_STEPS", 200)
+    monkeypatch.setattr(chunk_critic, "FIRST_STEPS", 50)
     root = tmp_path / "recorded"
     environment = SimulatedConfig(max_steps=16, environment_state=model == "simulator")
     record_dataset(root, environment, episodes=8, failure_share=0.25)

@@ -145,7 +145,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 def test_checkpoints_of_another_image_size(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """A policy that does not resize: LeRobot takes any image, and nobody can tell what it does then."""
     path, out = write_act(tmp_path / "policy", image=48), tmp_path / "out"
-    told = [*SIMULATED, f"--policy.path={path}", f"--output_dir={out}"]
+    told = [*SIMULATED, f"--policy.path={path}", "--launch.engine=local", f"--output_dir={out}"]
     for verb, more in (("train", ["--sft.steps=0"]), ("eval", [])):
         line = refused(capsys, verb, *told, *more)
         assert line.startswith(

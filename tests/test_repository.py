@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -58,10 +59,17 @@ def sources() -> list[Path]:
     return sorted(PACKAGE.rglob("*.py"))
 
 
+@cache
+def parsed(path: Path) -> tuple[ast.Module, list[ast.AST]]:
+    """The syntax tree of a file, and all of its nodes."""
+    tree = ast.parse(path.read_text())
+    return tree, list(ast.walk(tree))
+
+
 def imports(path: Path, *, top_level: bool = False) -> Iterator[str]:
     """Names of imported modules; those at the top of the file only, if so asked."""
-    tree = ast.parse(path.read_text())
-    for node in tree.body if top_level else ast.walk(tree):
+    tree, nodes = parsed(path)
+    for node in tree.body if top_level else nodes:
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
@@ -84,7 +92,7 @@ def test_no_file_is_too_long() -> None:
 
 
 def test_every_module_says_what_it_is() -> None:
-    silent = [str(p.relative_to(ROOT)) for p in sources() if not ast.get_docstring(ast.parse(p.read_text()))]
+    silent = [str(p.relative_to(ROOT)) for p in sources() if not ast.get_docstring(parsed(p)[0])]
     assert silent == []
 
 
@@ -130,8 +138,8 @@ def test_the_package_does_not_grow() -> None:
         ast.Compare,
         ast.Subscript,
     )
-    nodes = [node for path in sources() for node in ast.walk(ast.parse(path.read_text()))]
-    assert sum(isinstance(node, kinds) for node in nodes) <= MOST_EXPRESSIONS
+    found = sum(isinstance(node, kinds) for path in sources() for node in parsed(path)[1])
+    assert found <= MOST_EXPRESSIONS
     assert len(sources()) <= MOST_FILES
 
 
@@ -140,7 +148,7 @@ def test_docstrings_begin_with_a_noun_or_a_verb() -> None:
         f"{path.relative_to(ROOT)}:{node.lineno}"
         for folder in (PACKAGE, ROOT / "tests", ROOT / "benchmarks")
         for path in sorted(folder.rglob("*.py"))
-        for node in ast.walk(ast.parse(path.read_text()))
+        for node in parsed(path)[1]
         if isinstance(node, ast.Expr)
         and isinstance(node.value, ast.Constant)
         and isinstance(node.value.value, str)

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from dataclasses import replace
 from functools import partial
@@ -20,7 +19,6 @@ from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.algorithms.demonstrations import demonstrations, recorded
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos.dataset_files import open_metadata
-from accerl_lerobot.demos.sft import SFTConfig, run_sft
 from accerl_lerobot.envs import SimulatedConfig, make_environment
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE, Segment, SegmentStart
@@ -148,16 +146,6 @@ def test_the_memory_begins_with_them_and_is_restored_without(
     again = ChunkCriticUpdate(adapter, ChunkCriticConfig(), config)
     again.restore(update.state())
     assert again.step([like])["memory_decisions"] == rows + 2
-
-
-def test_a_policy_of_images_does_not_read_the_simulators_state(dataset: DatasetConfig, tmp_path: Path):
-    policy = {"type": "act", "chunk_size": K, "n_action_steps": K, "dim_model": 8, "n_heads": 1}
-    small = {"n_encoder_layers": 1, "n_vae_encoder_layers": 1, "dim_feedforward": 8, "latent_dim": 2}
-    weights = {"pretrained_backbone_weights": None}
-    config = SFTConfig(steps=1, batch_size=2, policy=policy | small | weights)
-    path = run_sft(config, dataset, tmp_path / "sft", seed=0)
-    inputs = json.loads((path / "config.json").read_text())["input_features"]
-    assert "observation.state" in inputs and ENVIRONMENT_STATE not in inputs
 
 
 def test_they_are_looked_at_before_the_run_begins(

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import shutil
 import sys
 from collections.abc import Callable
@@ -11,25 +12,35 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from lerobot.configs import default
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.datasets.dataset_reader import DatasetReader
+from lerobot.policies.act.configuration_act import ACTConfig
+from lerobot.policies.factory import make_policy
+from lerobot.scripts import lerobot_train
 
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos import guarded_train, sft
 from accerl_lerobot.demos.sft import ANSWER, TRUST, SFTConfig, run_sft, sft_command
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.envs import SimulatedConfig
+from accerl_lerobot.errors import InputError, warn_once
+from accerl_lerobot.experience import ENVIRONMENT_STATE
 from tests.policies.checkpoints import write_act
 from tests.policies.test_loading import remote
 from tests.policies.tiny_pi import ACTIONS, COMMIT, PALIGEMMA, hub
+from tests.tiny_datasets import record_dataset
 
 HUB = DatasetConfig(repo_id="a/b")
+CHANGED = [(lerobot_train, "make_train_eval_datasets"), (DatasetReader, "_query_hf_dataset")]
 ROOT = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
 
 
 def run(monkeypatch: pytest.MonkeyPatch, work: Callable[[], Any], *arguments: str) -> Any:
     """`work` where LeRobot's trainer would be; gives what it returns."""
-    from lerobot.scripts import lerobot_train
-
     got: list[Any] = []
     monkeypatch.setattr(lerobot_train, "main", lambda: got.append(work()))
+    for owner, name in CHANGED:
+        monkeypatch.setattr(owner, name, getattr(owner, name))  # put back after the test
     monkeypatch.setattr(sys, "argv", ["lerobot-train", *arguments])
     guarded_train.main()
     return got[0]
@@ -74,6 +85,37 @@ def test_a_refusal_is_one_line_of_the_run(tmp_path: Path, monkeypatch: pytest.Mo
     with pytest.raises(InputError) as caught:
         run_sft(SFTConfig(steps=1), HUB, tmp_path / "sft", seed=0)
     assert str(caught.value) == "sft.trust_remote_code='x.py': read it"
+
+
+def test_a_failure_and_warnings_are_handed_over(tmp_path: Path, monkeypatch: Any, capsys: Any, caplog: Any):
+    def fails() -> None:
+        logging.getLogger("accerl_lerobot.x").warning("tasks differ")
+        raise KeyError("observation.state.joints")
+
+    warn_once.cache_clear()
+    with pytest.raises(SystemExit):
+        run(monkeypatch, fails)
+    out, err = capsys.readouterr()
+    caplog.clear()
+    program = f"print({err + out!r})\nraise SystemExit(1)"
+    monkeypatch.setattr(sft, "sft_command", lambda *_: [sys.executable, "-c", program])
+    with pytest.raises(RuntimeError, match="see .*sft.log: KeyError: 'observation.state.joints'$"):
+        run_sft(SFTConfig(steps=1), HUB, tmp_path / "sft", seed=0)
+    assert [record.getMessage() for record in caplog.records] == ["tasks differ"]
+
+
+def test_a_policy_of_images_does_not_read_the_simulators_state(tmp_path: Path, monkeypatch: Any):
+    env = SimulatedConfig(max_steps=16, environment_state=True)
+    dataset = record_dataset(tmp_path / "data", env, episodes=1)
+
+    def inputs() -> Any:
+        data = default.DatasetConfig(repo_id="a/b", root=dataset.root, video_backend="pyav")
+        policy = ACTConfig(device="cpu", push_to_hub=False, pretrained_backbone_weights=None)
+        made, _ = lerobot_train.make_train_eval_datasets(TrainPipelineConfig(dataset=data, policy=policy))
+        return make_policy(policy, ds_meta=made.meta).config.input_features
+
+    found = run(monkeypatch, inputs, "--dataset.repo_id=a/b", f"--dataset.root={dataset.root}")
+    assert "observation.state" in found and ENVIRONMENT_STATE not in found
 
 
 def test_a_hostile_dataset_ends_the_training_in_a_line(tmp_path: Path, monkeypatch: Any, capsys: Any):

@@ -172,18 +172,6 @@ def command_that(monkeypatch: pytest.MonkeyPatch, program: str) -> None:
 
 
 BAR = r"print('\rTraining:   0%|          | 0/8 [00:00<?, ?step/s]', end='', flush=True)"
-TRAINER = f"""
-import logging, sys
-from lerobot.scripts import lerobot_train
-from accerl_lerobot.demos import guarded_train
-def main():
-    {BAR}
-    logging.getLogger('accerl_lerobot.x').warning('tasks differ')
-    raise KeyError('observation.state.joints')
-lerobot_train.main = main
-sys.argv = ["lerobot-train"]
-guarded_train.main()
-"""
 
 
 @pytest.mark.parametrize(
@@ -192,18 +180,15 @@ guarded_train.main()
         (f"{BAR}\nraise SystemExit('out of disk')", "out of disk"),
         (f"{BAR}\nraise ValueError('no q01,\\nno q99')", "ValueError: no q01, no q99"),
         (f"{BAR}\nimport os; os.kill(os.getpid(), 9)", "was ended by SIGKILL"),
-        (TRAINER, "KeyError: 'observation.st"),
     ],
-    ids=["exit", "exception", "killed", "trainer"],
+    ids=["exit", "exception", "killed"],
 )
-def test_a_failing_trainer_s_last_exception_is_the_reason(program, reason, tmp_path, monkeypatch, caplog):
+def test_a_failing_trainer_s_last_exception_is_the_reason(program, reason, tmp_path, monkeypatch):
     command_that(monkeypatch, program)
     with pytest.raises(RuntimeError) as caught:
         run_sft(TINY, HUB, tmp_path / "sft", seed=0)
     assert str(caught.value).startswith(f"lerobot-train failed, see {tmp_path / 'sft.log'}: {reason}")
     assert not any(words in str(caught.value) for words in ("%|", "\n", ANSWER))
-    warned = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
-    assert warned == (["tasks differ"] if program == TRAINER else [])
 
 
 def test_progress_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
