@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import io
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -33,11 +34,12 @@ ALGORITHMS = [
 """Names of the algorithms with a likelihood ratio."""
 
 
-def pip_installed(source: Path, site: Path) -> dict[str, str]:
-    """Installs a package's source folder into `site`; the environment of processes that find it there."""
+def pip_installed(folder: Path, *packages: Path) -> dict[str, str]:
+    """Installs packages' source folders below `folder`; the environment of processes that find them there."""
     pip = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--no-index"]
-    subprocess.run([*pip, f"--target={site}", str(source)], check=True)
-    path = os.pathsep.join([str(site), *filter(None, [os.environ.get("PYTHONPATH")])])
+    sources = [shutil.copytree(path, folder / "sources" / path.name) for path in packages]  # pip builds there
+    subprocess.run([*pip, f"--target={folder / 'site'}", *map(str, sources)], check=True)
+    path = os.pathsep.join([str(folder / "site"), *filter(None, [os.environ.get("PYTHONPATH")])])
     return os.environ | {"PYTHONPATH": path}
 
 

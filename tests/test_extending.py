@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import importlib
 import re
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -39,6 +38,8 @@ from accerl_lerobot.run.train import make_engine
 from accerl_lerobot.testing import check_policy
 from accerl_lerobot.world_model.config import StateModelConfig
 from tests.algorithms.test_chunk_critic import episode
+from tests.envs.test_gym import GYM
+from tests.envs.test_gym import PACKAGE as PACKAGE_OF_GYM
 from tests.policies.checkpoints import write_policy
 from tests.runs import drive, pip_installed, tiny_run, trained
 
@@ -250,18 +251,21 @@ print(config.type, tuple(action.shape))
 """
 
 
+REACH = """
+from accerl_lerobot.envs import LeRobotEnvConfig, make_environment
+
+environment = make_environment(LeRobotEnvConfig(name="reach", task="Reach the goal"))
+print(environment.reset(0, "reach")["observation.state"].shape)
+"""
+
+
 @pytest.mark.slow
-def test_the_installed_package_is_found_by_every_process(checkpoint: Path, tmp_path: Path):
-    """In a run on Ray, by its name; by LeRobot and in an evaluation, as a plugin that pip has announced."""
-    source = shutil.copytree(SOURCE, tmp_path / "source")  # pip builds within it
-    environment = pip_installed(source, tmp_path / "site")
+def test_installed_packages_are_found_by_every_process(checkpoint: Path, tmp_path: Path):
+    """A policy, an algorithm and an environment by their names in a run on Ray; then policy and environment as
+    LeRobot's plugins, which only pip has announced."""
+    environment = pip_installed(tmp_path, SOURCE, PACKAGE_OF_GYM)
     accerl = [sys.executable, "-m", "accerl_lerobot.cli"]
-    common = [
-        "--env.type=simulated",
-        "--policy.device=cpu",
-        "--rollout.environments=4",
-        "--evaluation.episodes=4",
-    ]
+    common = [*GYM, "--policy.device=cpu", "--rollout.environments=4", "--evaluation.episodes=4"]
     run = [
         "train", *common, *NAMED, FLAG, f"--policy.path={checkpoint}", "--rollout.segment_length=3",
         "--replay.capacity=64", "--replay.min_decisions=16", "--replay.max_unlearned_decisions=32",
@@ -269,8 +273,9 @@ def test_the_installed_package_is_found_by_every_process(checkpoint: Path, tmp_p
     ]  # fmt: skip
     subprocess.run([*accerl, *run], check=True, env=environment, cwd=tmp_path)
     trained = tmp_path / "run" / "checkpoints" / "last" / "pretrained_model"
-    command = [sys.executable, "-c", STOCK, str(trained)]
-    shown = subprocess.run(command, check=True, env=environment, cwd=tmp_path, capture_output=True)
-    assert shown.stdout.decode().splitlines()[-1] == f"{POLICY} (1, 2)"
+    for code, last in ((STOCK, f"{POLICY} (1, 2)"), (REACH, "(2,)")):
+        command = [sys.executable, "-c", code, str(trained)]
+        shown = subprocess.run(command, check=True, env=environment, cwd=tmp_path, capture_output=True)
+        assert shown.stdout.decode().splitlines()[-1] == last
     evaluation = ["eval", *common, f"--policy.path={trained}", "--launch.engine=local"]
     subprocess.run([*accerl, *evaluation], check=True, env=environment, cwd=tmp_path)

@@ -151,7 +151,7 @@ def test_a_run_that_was_left_goes_on_as_if_it_had_not(
     steps: float, left_at: float, tiny_checkpoint: Path, world_model: Path, tmp_path: Path
 ):
     """Imagined episodes and the world model's training included."""
-    config = imagining(tiny_checkpoint, world_model, episodes=24, steps=steps)
+    config = imagining(tiny_checkpoint, world_model, episodes=12, steps=steps)
 
     def reported(history: list[Progress]) -> list[Any]:
         last = history[-1]

@@ -25,6 +25,7 @@ from accerl_lerobot.engines.stopping import WorkerError
 from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.inference import worker as inference_worker
 from accerl_lerobot.inference.worker import InferenceConfig
+from accerl_lerobot.replay.buffer import ReplayConfig
 from accerl_lerobot.rollout import worker as rollout_worker
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
 from benchmarks.simulated_environment import LatencyConfig
@@ -222,8 +223,14 @@ def test_a_world_that_does_not_return_is_no_reason_to_wait_for_ever(engine):
 
 @pytest.mark.slow
 def test_a_run_in_which_nothing_moves_ends_but_not_while_resets_are_slow(engine):
-    slow, launch = LatencyConfig(max_steps=4, frame_ms=600.0), LaunchConfig(stall_s=3.0, max_restarts=0)
-    one = engine(env=slow, rollout=RolloutConfig(environments=8), launch=launch, trainer=ENDLESS)
+    """A reset takes 0.6 s, and so does a decision, with which an episode ends: eight resets take 5 s."""
+    one = engine(
+        env=LatencyConfig(max_steps=4, frame_ms=600.0),
+        rollout=RolloutConfig(environments=8, segment_length=1),
+        replay=ReplayConfig(capacity=16, min_decisions=4, max_unlearned_decisions=4, samples_per_insert=1),
+        trainer=TrainerConfig(updates=1_000_000, batch_decisions=4),
+        launch=LaunchConfig(stall_s=3.0, max_restarts=0),
+    )
     one.plan(evaluation_plans(("match",), 8, "before"))
     assert len(collect(one, "before", 8)) == 8
     until_training(one)

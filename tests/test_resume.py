@@ -26,7 +26,7 @@ from accerl_lerobot.demos.record import DemosConfig
 from accerl_lerobot.engines.config import LaunchConfig, RunConfig, decode, encode
 from accerl_lerobot.engines.local import LocalEngine
 from accerl_lerobot.envs import SimulatedConfig
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.errors import InputError, check_absent
 from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.policies.config import GaussianSamplerConfig, PolicyConfig
 from accerl_lerobot.replay.buffer import ReplayConfig
@@ -34,7 +34,9 @@ from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.run import preflight, resuming
 from accerl_lerobot.run import train as run_module
 from accerl_lerobot.run.resuming import resume_command
+from tests.policies.checkpoints import write_policy
 from tests.runs import tiny_run
+from tests.tiny_datasets import one_process
 
 UPDATES = 14
 TIMES = ("wall_s", "wait_s", "update_s", "publish_s", "rl_s", "warm_start_s")
@@ -126,16 +128,16 @@ def test_a_run_that_another_process_has_resumed_is_left_alone(whole: Path, capsy
     assert "another process resumes it" in capsys.readouterr().err
 
 
-@pytest.mark.slow
 def test_a_run_that_fell_over_in_its_sft_keeps_its_demonstrations(tmp_path: Path, monkeypatch, capsys):
     """And they begin the memory of an off-policy algorithm."""
-    run, trainer = tmp_path / "run", sft.run_sft
+    run = tmp_path / "run"
     small = {"type": "act", "chunk_size": 4, "n_action_steps": 4, "dim_model": 8, "n_heads": 1}
     small |= {"n_encoder_layers": 1, "n_vae_encoder_layers": 1, "dim_feedforward": 8, "latent_dim": 2}
+    small |= {"pretrained_backbone_weights": None}
     sections: dict[str, Any] = {
         "env": SimulatedConfig(max_steps=16, tolerance=0.4, environment_state=True),
         "demos": DemosConfig(episodes=3),
-        "sft": sft.SFTConfig(steps=2, batch_size=2, policy=small | {"pretrained_backbone_weights": None}),
+        "sft": sft.SFTConfig(steps=2, batch_size=2, policy=small),
         "policy": PolicyConfig(device="cpu", sampler=GaussianSamplerConfig(std=0.3)),
         "algorithm": SelfImitationConfig(),
         "replay": ReplayConfig(
@@ -146,11 +148,17 @@ def test_a_run_that_fell_over_in_its_sft_keeps_its_demonstrations(tmp_path: Path
         "evaluation": EvaluationConfig(episodes=2, videos=0),
     }
 
+    def trained(config: sft.SFTConfig, dataset: Any, output_dir: Path, *rest: Any, **fields: Any) -> Path:
+        check_absent(output_dir)
+        options = dict(small)
+        return write_policy(output_dir / "pretrained_model", options.pop("type"), image=32, **options)
+
     def falls(*arguments: Any, **fields: Any) -> Path:
-        trainer(*arguments, **fields)
+        trained(*arguments, **fields)
         raise ArithmeticError("it fell over")
 
-    with monkeypatch.context() as context:
+    monkeypatch.setattr(sft, "run_sft", trained)
+    with monkeypatch.context() as context, one_process():
         context.setattr(sft, "run_sft", falls)
         assert main(["train", str(recipe(tmp_path, Path("x"), **sections)), f"--output_dir={run}"]) == 1
     assert "to resume: accerl train --resume=true" in " ".join(capsys.readouterr().err.split())
@@ -273,8 +281,8 @@ def test_an_asynchronous_run_that_was_killed_and_stopped_goes_on(tiny_checkpoint
         launch=LaunchConfig(stall_s=120),
         env=SimulatedConfig(max_steps=12, tolerance=0.4),
         rollout=RolloutConfig(workers=2, environments=2, segment_length=3),
-        trainer=TrainerConfig(updates=60, batch_decisions=16, lr=1e-3),
-        save_every_updates=4,
+        trainer=TrainerConfig(updates=36, batch_decisions=16, lr=1e-3),
+        save_every_updates=3,
     )
     command = [sys.executable, "-m", "accerl_lerobot.cli", "train"]
     log = tmp_path / "log"
@@ -291,17 +299,17 @@ def test_an_asynchronous_run_that_was_killed_and_stopped_goes_on(tiny_checkpoint
             process.send_signal(number)
             return process.wait(60)
 
-    assert until(12, [*command, str(path), f"--output_dir={run}"], signal.SIGKILL) == -signal.SIGKILL
+    assert until(6, [*command, str(path), f"--output_dir={run}"], signal.SIGKILL) == -signal.SIGKILL
     newest = max(int(p.name) for p in (run / "checkpoints").glob("0*"))
-    assert until(newest + 8, again, signal.SIGTERM) == 143, log.read_text()
+    assert until(newest + 5, again, signal.SIGTERM) == 143, log.read_text()
     assert "stopped by SIGTERM; to resume: accerl train --resume=true" in log.read_text()
     assert not (run / "summary.json").exists()
     ended = subprocess.run(again, capture_output=True, text=True, timeout=300)
     assert ended.returncode == 0, ended.stderr
     train = [r for r in records(run) if r["kind"] == "train"]
-    assert [r["update"] for r in train] == list(range(1, 61)), "none lost, none twice"
+    assert [r["update"] for r in train] == list(range(1, 37)), "none lost, none twice"
     found = summary(run)
-    assert found["updates"] == 60 and found["n_before"] == found["n_after"] == 6
+    assert found["updates"] == 36 and found["n_before"] == found["n_after"] == 6
     evaluations = [r["group"] for r in records(run) if r["kind"] == "evaluation"]
     assert len(set(evaluations)) == len(evaluations) and {"before", "after"} <= set(evaluations)
     assert max(r["lag_max"] for r in train) == found["lag_max"] < 40

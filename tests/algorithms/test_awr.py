@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot.algorithms import AWRConfig
+from accerl_lerobot.algorithms import AWRConfig, off_policy
 from accerl_lerobot.algorithms.off_policy import weights
 from tests.algorithms.test_chunk_critic import awr, episode, first_action, tried
 
@@ -57,8 +57,9 @@ def test_the_critic_learns_returns_and_leaves_the_policy_alone(tiny_checkpoint: 
 
 
 @pytest.mark.slow
-def test_it_goes_where_returns_are_high(tiny_checkpoint: Path):
+def test_it_goes_where_returns_are_high(tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch):
     """The return is how far the first action goes up; nothing counts as a success."""
+    monkeypatch.setattr(off_policy, "POLICY_BATCH", 32)
     update = awr(tiny_checkpoint, AWRConfig(policy_steps=0.5, beta=0.3), value_lr=1e-2)
     rng, before = np.random.default_rng(0), first_action(update)
     for _ in range(10):

@@ -3,9 +3,6 @@
 
 from __future__ import annotations
 
-import shutil
-import subprocess
-import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +19,7 @@ from accerl_lerobot.envs import GymConfig, make_environment
 from accerl_lerobot.envs.gym_env import GymEnvironment
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.run.preflight import check_environment
-from tests.runs import pip_installed, replacing
+from tests.runs import replacing
 
 PACKAGE = Path(__file__).parents[1] / "packages" / "lerobot_env_reach"
 GYM = [
@@ -236,27 +233,3 @@ def test_starts_that_do_not_follow_from_the_seed_are_told(
 def test_bad_values_name_field_and_remedy(changed: str, message: str):
     with pytest.raises(InputError, match=message):
         make_environment(config(changed))
-
-
-@pytest.mark.slow
-def test_the_installed_package_is_found_by_every_process(tiny_checkpoint: Path, tmp_path: Path):
-    """As `env.type=gym` in a run on Ray, and as LeRobot's plugin ``reach``, which only pip has announced."""
-    source = shutil.copytree(PACKAGE, tmp_path / "source")  # pip builds within it
-    environment = pip_installed(source, tmp_path / "site")
-    accerl = [sys.executable, "-m", "accerl_lerobot.cli"]
-    run = [
-        "train", *GYM, f"--policy.path={tiny_checkpoint}", "--policy.device=cpu", "--rollout.environments=4",
-        "--rollout.segment_length=3", "--replay.capacity=64", "--replay.min_decisions=16",
-        "--replay.max_unlearned_decisions=32",
-        "--trainer.updates=4", "--trainer.batch_decisions=16", "--evaluation.episodes=4",
-        f"--output_dir={tmp_path / 'run'}",
-    ]  # fmt: skip
-    subprocess.run([*accerl, *run], check=True, env=environment, cwd=tmp_path)
-    assert (tmp_path / "run" / "summary.json").is_file()
-    code = (
-        "from accerl_lerobot.envs import LeRobotEnvConfig, make_environment\n"
-        "environment = make_environment(LeRobotEnvConfig(name='reach', task='Reach the goal'))\n"
-        "print(environment.reset(0, 'reach')['observation.state'].shape)\n"
-    )
-    shown = subprocess.run([sys.executable, "-c", code], check=True, env=environment, capture_output=True)
-    assert shown.stdout.decode().splitlines()[-1] == "(2,)"

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 
-from accerl_lerobot.algorithms import ChunkCriticConfig
+from accerl_lerobot.algorithms import ChunkCriticConfig, chunk_critic
 from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE
@@ -19,6 +19,8 @@ from accerl_lerobot.engines.stopping import WorkerError
 from accerl_lerobot.replay.buffer import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.run.train import make_engine
+from accerl_lerobot.trainer import worker as trainer_worker
+from accerl_lerobot.trainer.worker import TrainerWorker
 from accerl_lerobot.world_model import worker as module
 from accerl_lerobot.world_model.state_learner import BATCH, StateLearner
 from accerl_lerobot.world_model.worker import RemoteStateLearner, WorldModelWorker
@@ -101,8 +103,19 @@ def test_nobody_waits_while_steps_are_under_way_but_each_call_has_a_timeout(
     assert len(there.collect()) == 1 and not there.busy
 
 
+class HastyTrainer(TrainerWorker):
+    """Its teacher soon acts."""
+
+    def __init__(self, *arguments: Any) -> None:
+        chunk_critic.FIRST_STEPS = 20
+        super().__init__(*arguments)
+
+
 @pytest.mark.slow
-def test_a_run_on_a_state_that_another_process_learns(tiny_checkpoint: Path, tmp_path: Path):
+def test_a_run_on_a_state_that_another_process_learns(
+    tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(trainer_worker, "TrainerWorker", HastyTrainer)
     config = tiny_run(
         tiny_checkpoint,
         output_dir=str(tmp_path),
