@@ -261,7 +261,7 @@ print(environment.reset(0, "reach")["observation.state"].shape)
 
 @pytest.mark.slow
 def test_installed_packages_are_found_by_every_process(checkpoint: Path, tmp_path: Path):
-    """A policy, an algorithm and an environment by their names in a run on Ray; then policy and environment as
+    """A policy, an algorithm and an environment, by their names, in a run on Ray; policy and environment also as
     LeRobot's plugins, which only pip has announced."""
     environment = pip_installed(tmp_path, SOURCE, PACKAGE_OF_GYM)
     accerl = [sys.executable, "-m", "accerl_lerobot.cli"]
