@@ -261,8 +261,8 @@ print(environment.reset(0, "reach")["observation.state"].shape)
 
 @pytest.mark.slow
 def test_installed_packages_are_found_by_every_process(checkpoint: Path, tmp_path: Path):
-    """A policy, an algorithm and an environment, by their names, in a run on Ray; policy and environment also as
-    LeRobot's plugins, which only pip has announced."""
+    """Policy, algorithm and environment by their names in a run on Ray; policy and environment as LeRobot's
+    plugins, which only pip has announced."""
     environment = pip_installed(tmp_path, SOURCE, PACKAGE_OF_GYM)
     accerl = [sys.executable, "-m", "accerl_lerobot.cli"]
     common = [*GYM, "--policy.device=cpu", "--rollout.environments=4", "--evaluation.episodes=4"]
