@@ -110,7 +110,7 @@ def test_a_client_without_the_token_is_refused_and_the_token_is_in_no_log(light_
     context = ray.get_runtime_context()
     code = f"import ray; ray.init(address={context.gcs_address!r}, log_to_driver=False); print('connected')"
     clean = {name: value for name, value in os.environ.items() if not name.startswith("RAY_AUTH")}
-    wrong = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "0" * 64}
+    wrong = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "0" * 64, "RAY_NUM_REDIS_GET_RETRIES": "2"}
     command = [sys.executable, "-c", code]
     done = subprocess.run(command, env=clean | wrong, capture_output=True, text=True, timeout=120)
     assert done.returncode != 0 and "connected" not in done.stdout and "InvalidAuthToken" in done.stderr
