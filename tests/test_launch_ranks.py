@@ -28,7 +28,7 @@ from tests.test_ray_session import LOOPBACK, listening
 
 pytestmark = pytest.mark.slow
 
-UPDATES = 12
+UPDATES = 6
 TWO = TrainerConfig(
     updates=1000, batch_decisions=16, warmup_updates=0, value_warmup_updates=1, probe_every=3,
     ranks=2, sharding="zero3",
@@ -54,7 +54,7 @@ def probes(updates: list[dict[str, float]]) -> list[float]:
 
 @pytest.fixture(scope="module")
 def story(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Story]:
-    config = tiny_run(tiny_checkpoint, trainer=TWO, launch=LaunchConfig(stall_s=40.0))
+    config = tiny_run(tiny_checkpoint, trainer=TWO, launch=LaunchConfig(stall_s=25.0))
     directory = tmp_path_factory.mktemp("saved")
     engine = RayEngine(config, ("match",))
     try:
