@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import io
 import os
-import shutil
 import subprocess
 import sys
 import time
@@ -34,12 +33,11 @@ ALGORITHMS = [
 """Names of the algorithms with a likelihood ratio."""
 
 
-def pip_installed(folder: Path, *packages: Path) -> dict[str, str]:
-    """Installs packages' source folders below `folder`; the environment of processes that find them there."""
+def pip_installed(site: Path, *sources: Path) -> dict[str, str]:
+    """Installs packages' source folders into `site`; the environment of processes that find them there."""
     pip = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--no-index"]
-    sources = [shutil.copytree(path, folder / "sources" / path.name) for path in packages]  # pip builds there
-    subprocess.run([*pip, f"--target={folder / 'site'}", *map(str, sources)], check=True)
-    path = os.pathsep.join([str(folder / "site"), *filter(None, [os.environ.get("PYTHONPATH")])])
+    subprocess.run([*pip, f"--target={site}", *map(str, sources)], check=True)
+    path = os.pathsep.join([str(site), *filter(None, [os.environ.get("PYTHONPATH")])])
     return os.environ | {"PYTHONPATH": path}
 
 

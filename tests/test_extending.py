@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -39,7 +40,7 @@ from accerl_lerobot.testing import check_policy
 from accerl_lerobot.world_model.config import StateModelConfig
 from tests.algorithms.test_chunk_critic import episode
 from tests.envs.test_gym import GYM
-from tests.envs.test_gym import PACKAGE as PACKAGE_OF_GYM
+from tests.envs.test_gym import PACKAGE as REACH
 from tests.policies.checkpoints import write_policy
 from tests.runs import drive, pip_installed, tiny_run, trained
 
@@ -251,7 +252,7 @@ print(config.type, tuple(action.shape))
 """
 
 
-REACH = """
+USE_REACH = """
 from accerl_lerobot.envs import LeRobotEnvConfig, make_environment
 
 environment = make_environment(LeRobotEnvConfig(name="reach", task="Reach the goal"))
@@ -263,7 +264,9 @@ print(environment.reset(0, "reach")["observation.state"].shape)
 def test_installed_packages_are_found_by_every_process(checkpoint: Path, tmp_path: Path):
     """Policy, algorithm and environment by their names in a run on Ray; policy and environment as LeRobot's
     plugins, which only pip has announced."""
-    environment = pip_installed(tmp_path, SOURCE, PACKAGE_OF_GYM)
+    copies = tmp_path / "sources"  # pip builds there
+    sources = [shutil.copytree(path, copies / path.name) for path in (SOURCE, REACH)]
+    environment = pip_installed(tmp_path / "site", *sources)
     accerl = [sys.executable, "-m", "accerl_lerobot.cli"]
     common = [*GYM, "--policy.device=cpu", "--rollout.environments=4", "--evaluation.episodes=4"]
     run = [
@@ -273,7 +276,7 @@ def test_installed_packages_are_found_by_every_process(checkpoint: Path, tmp_pat
     ]  # fmt: skip
     subprocess.run([*accerl, *run], check=True, env=environment, cwd=tmp_path)
     trained = tmp_path / "run" / "checkpoints" / "last" / "pretrained_model"
-    for code, last in ((STOCK, f"{POLICY} (1, 2)"), (REACH, "(2,)")):
+    for code, last in ((STOCK, f"{POLICY} (1, 2)"), (USE_REACH, "(2,)")):
         command = [sys.executable, "-c", code, str(trained)]
         shown = subprocess.run(command, check=True, env=environment, cwd=tmp_path, capture_output=True)
         assert shown.stdout.decode().splitlines()[-1] == last

@@ -19,7 +19,7 @@ ROOT = Path(__file__).parents[1]
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with nothing but what the wheel puts there."""
     site = tmp_path_factory.mktemp("site")
-    pip_installed(ROOT, site)
+    pip_installed(site, ROOT)
     return site
 
 
