@@ -102,7 +102,8 @@ def test_a_world_that_keeps_crashing_ends_the_run_with_its_own_traceback(engine)
     assert "simulated crash after 30 env steps" in text and "simulated_environment.py" in text
 
 
-@pytest.mark.parametrize("how", [signal.SIGKILL, pytest.param(signal.SIGSTOP, marks=pytest.mark.slow)])
+@pytest.mark.slow  # `test_launch` kills a rollout worker too
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
 def test_a_rollout_worker_that_is_lost_is_replaced_and_a_lost_replay_ends_the_run(
     engine, how: signal.Signals
 ):
@@ -179,6 +180,7 @@ def test_an_inference_replica_that_is_lost_is_replaced_alone(engine, lose: Any, 
         assert "the forward pass fell over" in text and "serve" in text
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_survived_and_a_trainer_that_hangs_while_it_is_saved_is_not(engine, tmp_path: Path):
     one = engine(trainer=ENDLESS, launch=LaunchConfig(stall_s=5.0))
     with pytest.raises(RuntimeError, match=r"trainer worker failed in write(.|\n)*no space left"):

@@ -114,7 +114,8 @@ def drive_counting(engine: Any) -> tuple[list[Progress], Counter[int]]:
     return history, sizes[-2]  # another look after it has found the run in training
 
 
-@pytest.mark.parametrize("schedule", [SYNCHRONOUS, pytest.param(OVERLAP, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("schedule", [SYNCHRONOUS, OVERLAP])
 def test_a_run_in_turn(counted: None, schedule: Any):
     """Episodes of one segment each, of all four environments: a batch is exactly what they do in one
     round."""

@@ -20,7 +20,7 @@ from accerl_lerobot.cli.verbs import CONFIGS
 from accerl_lerobot.config.parsing import dotted_fields
 from accerl_lerobot.run import preflight
 
-CASES = 120
+CASES = 80
 VALUES = [
     "-1", "0", "1e400", "99999999999999999999", ".nan", "-.inf", "0x_", "1:99:99", "2024-13-45", "null",
     "true", "[]", "{}", "[[1]]", "{a: 1}", "{[1]: 2}", "[" * 9000, "x" * 5000, "", " ", "*x",

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import itertools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -178,7 +177,8 @@ def environment() -> Iterator[LiberoEnvironment]:
 
 @needs_assets
 def test_same_seed_same_episode_whatever_went_before(environment: LiberoEnvironment):
-    for seed, task in itertools.product((eval_seed(0, 3), train_seed(0, 0, 1)), environment.spec.tasks):
+    seeds = eval_seed(0, 3), train_seed(0, 0, 1)
+    for seed, task in zip(seeds, environment.spec.tasks, strict=True):
         episodes = []
         for between in environment.spec.tasks:
             environment.reset(train_seed(1, 0, 4), between)

@@ -84,6 +84,7 @@ def run(tiny_checkpoint: Path, tmp_path: Path) -> Path:
     return tmp_path / "run"
 
 
+@pytest.mark.slow
 def test_policies_and_datasets_load_wherever_they_are(hub: HubServer, run: Path, tmp_path: Path):
     accerl("push", f"--path={run / LAST}", "--repo_id=alice/policy")
     commit = hub.repo("alice/policy").branches["main"]

@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from accerl_lerobot.policies.deferred import OURS
 
 CODE = """
@@ -26,6 +28,7 @@ assert "lerobot.policies.groot.processor_groot" in sys.modules
 """
 
 
+@pytest.mark.slow
 def test_one_policy_is_imported_without_the_others(tiny_checkpoint: Path):
     command = [sys.executable, "-c", CODE, str(tiny_checkpoint)]
     subprocess.run(command, check=True, timeout=300, env=os.environ | {OURS: "1"})
