@@ -15,10 +15,8 @@ import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot.algorithms import GIPOConfig
 from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.algorithms.ranks import prepare, split_rows
-from accerl_lerobot.algorithms.ratio_update import RatioUpdate
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.errors import InputError
 from tests.algorithms import sharded
@@ -166,22 +164,6 @@ def test_blocks_are_the_named_modules_and_none_is_within_another():
     ]
     assert [names[block] for block in adapter.blocks()] == found
     assert LinearAdapter().blocks() == []
-
-
-def test_blocks_that_forget_compute_again_and_learn_the_same():
-    counts, gradients = [], []
-    for forget in (False, True):
-        adapter = sharded.LayeredAdapter()
-        config = TrainerConfig(warmup_updates=0, value_warmup_updates=0, activation_checkpointing=forget)
-        update = RatioUpdate(adapter, GIPOConfig(), config)
-        calls: list[None] = []
-        adapter.layers[0].up.register_forward_hook(lambda *_, calls=calls: calls.append(None))
-        update.step(sharded.cases()["forgetful"].batches[0])
-        counts.append(len(calls))
-        gradients.append([p.grad for p in adapter.trainable().values() if p.grad is not None])
-    assert counts[1] == counts[0] + 1, "once more, for the gradient"
-    for mine, theirs in zip(*gradients, strict=True):
-        assert_close(mine, theirs)
 
 
 def test_a_policy_without_blocks_cannot_forget():
