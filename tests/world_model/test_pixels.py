@@ -234,9 +234,8 @@ def test_the_success_model_learns_how_replayed_episodes_end():
     trainer = Trainer(World(model(channels=(8, 8))), 2e-3, seed=0)
     episodes = ending_on_the_right(dots(80, steps=20, seed=1))
     trainer.fit_statistics(episodes)
-    for _ in range(120):
-        metrics = trainer.step(episodes, uniform(episodes))
-    assert metrics["success"] < 0.6
+    for _ in range(60):
+        trainer.step(episodes, uniform(episodes))
     batch = trainer._halves(trainer._labelled)  # type: ignore[arg-type]
     assert batch.success.tolist() == [True] * 16 + [False] * 16
     frames = torch.from_numpy(np.stack([episode.frames[-1] for episode in dots(200, seed=7)]))
@@ -244,7 +243,7 @@ def test_the_success_model_learns_how_replayed_episodes_end():
     codes = torch.from_numpy(task_codes(["go"] * 200))
     success = trainer.serving.success
     found = success.probabilities(frames, codes)
-    assert auroc(found.numpy(), right.numpy()) > 0.75
+    assert auroc(found.numpy(), right.numpy()) > 0.9
     assert not torch.allclose(found, success.probabilities(frames, -codes)), "it knows the task"
     torch.testing.assert_close(success.probabilities(frames.repeat(1, 2, 1, 1, 1), codes), found)
 
