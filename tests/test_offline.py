@@ -21,6 +21,7 @@ from accerl_lerobot.metrics import METRICS
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.loading import load_adapter
 from accerl_lerobot.world_model.latent import LatentModel
+from tests.runs import replacing
 from tests.tiny_datasets import record_dataset
 
 
@@ -85,11 +86,7 @@ def test_the_checkpoint_does_more_of_what_succeeded(algorithm, tiny_checkpoint, 
 def test_a_mistake_is_one_line_and_leaves_no_folder(
     wrong, message, tiny_checkpoint, recorded, tmp_path, capsys
 ):
-    names = {argument.partition("=")[0] for argument in wrong}
-    given = [
-        a for a in arguments(tiny_checkpoint, recorded, tmp_path / "out") if a.split("=")[0] not in names
-    ]
-    assert main([*given, *wrong]) == 2
+    assert main(replacing(arguments(tiny_checkpoint, recorded, tmp_path / "out"), *wrong)) == 2
     assert not (tmp_path / "out").exists()
     error = capsys.readouterr().err.strip().splitlines()[-1]
     assert re.search(message, error), error
@@ -134,7 +131,8 @@ def test_the_chunk_critic_learns_from_recorded_episodes(
     environment = SimulatedConfig(max_steps=16, environment_state=model == "simulator")
     record_dataset(root, environment, episodes=8, failure_share=0.25)
     out = tmp_path / "out"
-    run = [*arguments(tiny_checkpoint, root, out), "--algorithm.type=chunk_critic"]
+    given = arguments(tiny_checkpoint, root, out)
+    run = replacing(given, "--trainer.updates=15", "--algorithm.type=chunk_critic")
     assert main(run) == 0  # the state is the simulator's where the dataset has it
     summary = json.loads(capsys.readouterr().out)
     before, after = (summary["imitation_loss"][when]["successes"] for when in ("before", "after"))

@@ -126,6 +126,7 @@ def test_a_run_that_another_process_has_resumed_is_left_alone(whole: Path, capsy
     assert "another process resumes it" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_run_that_fell_over_in_its_sft_keeps_its_demonstrations(tmp_path: Path, monkeypatch, capsys):
     """And they begin the memory of an off-policy algorithm."""
     run = tmp_path / "run"
@@ -167,7 +168,8 @@ def test_a_run_that_fell_over_in_its_sft_keeps_its_demonstrations(tmp_path: Path
     begun = run / json.loads((run / "warm_start.json").read_text())["policy"]
     assert (begun / "model.safetensors").is_file()
     first, *_, last = [r for r in records(run) if r["kind"] == "train"]
-    assert first["memory_decisions"] > 16 + 3 * 4 and last["memory_decisions"] > first["memory_decisions"]
+    assert first["memory_decisions"] >= first["decisions"] + 3 * 4  # each is read from four steps on
+    assert last["memory_decisions"] > first["memory_decisions"]
     assert summary(run)["updates"] == 3
 
 
