@@ -423,7 +423,7 @@ def first_action(update: OffPolicyUpdate) -> float:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("precision", "updates"), [("fp32", 10), ("bf16", 4)])
+@pytest.mark.parametrize(("precision", "updates"), [("fp32", 6), ("bf16", 4)])
 def test_teacher_and_policy_go_where_the_critic_leads(
     precision: str, updates: int, tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -448,7 +448,7 @@ def test_teacher_and_policy_go_where_the_critic_leads(
     state = update.tensor("state", np.arange(1))
     assert update.adapter.processing.unnormalise(update.teacher(state).detach())[0, 0, 0] > 0.3
     assert first_action(update) > before + 0.2
-    assert metrics["explained_variance"] > 0.5 and metrics["memory_decisions"] == 10 * 32
+    assert metrics["explained_variance"] > 0.5 and metrics["memory_decisions"] == updates * 32
 
 
 def test_blocks_that_forget_compute_again_and_learn_the_same(tiny_checkpoint: Path):
@@ -497,7 +497,6 @@ def test_what_was_learnt_is_restored_to_the_last_bit(
     assert all(np.array_equal(left[name], right[name]) for name in left)
 
 
-@pytest.mark.slow
 def test_self_imitation_goes_where_successes_are(tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch):
     """Success is a chunk whose first action goes up; half of the chunks do, by chance."""
     torch.manual_seed(0)
