@@ -112,7 +112,10 @@ class PolicyAdapter(nn.Module, ABC):
 
     @abstractmethod
     def trainable(self) -> dict[str, nn.Parameter]:
-        """Parameters that the trainer updates and publishes; the critic's begin with ``value_head.``"""
+        """Parameters that the trainer updates and publishes, and the teacher's buffers.
+
+        The critic's begin with ``value_head.``, and the teacher's with ``teacher.``.
+        """
 
     @abstractmethod
     def copy_weights(self) -> Any:
@@ -202,8 +205,8 @@ class PretrainedAdapter(PolicyAdapter):
                 if parameter.requires_grad:
                     named[f"{part}.{name}"] = parameter
         if self.teacher is not None:
-            for name, parameter in self.teacher.named_parameters():
-                named[TEACHER_PREFIX + name] = parameter
+            for name, tensor in self.teacher.state_dict(keep_vars=True).items():
+                named[TEACHER_PREFIX + name] = tensor
         return named
 
     def copy_weights(self) -> saving.Weights:

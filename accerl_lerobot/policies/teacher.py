@@ -57,8 +57,8 @@ class Teacher(nn.Module):
 
     A state consists of the output of ``model.encode`` and the code of the task.
 
-    All its tensors are parameters, so that they are published with the policy's weights; those that no
-    gradient reaches are set by the trainer.
+    Its parameters and buffers are published with the policy's weights. The trainer sets the parameters that
+    no gradient reaches.
     """
 
     def __init__(self, model: StateModel, chunk: tuple[int, int], share: float, noise: float = NOISE) -> None:

@@ -20,7 +20,7 @@ from accerl_lerobot.errors import MAX_NONFINITE, NonFiniteError
 from accerl_lerobot.world_model.states import Observations, StateModel, Transitions
 
 BATCH = 64  # transitions of a step
-LEARNING_RATE, WEIGHT_DECAY, CLIP = 1e-3, 1e-4, 10.0
+WEIGHT_DECAY, CLIP = 1e-4, 10.0
 
 
 class StateLearner:
@@ -32,7 +32,9 @@ class StateLearner:
     def __init__(self, model: StateModel) -> None:
         self.model = copy.deepcopy(model).train()
         learned = [parameter for parameter in self.model.parameters() if parameter.requires_grad]
-        self.optimizer = torch.optim.AdamW(learned, lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY, fused=True)
+        self.optimizer = torch.optim.AdamW(
+            learned, lr=model.learning_rate, weight_decay=WEIGHT_DECAY, fused=True
+        )
         self.count = 0  # steps made
         self._skipped_in_a_row = 0
         self._made: list[dict[str, float]] = []

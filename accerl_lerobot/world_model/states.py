@@ -70,7 +70,7 @@ class Transitions(NamedTuple):
 class StateModel(nn.Module, ABC):
     """A model whose states critic and teacher see.
 
-    All its tensors are parameters, as they are published and saved with the policy's weights.
+    Its parameters and buffers are published and saved with the policy's weights.
     """
 
     size: int
@@ -79,6 +79,8 @@ class StateModel(nn.Module, ABC):
     """Gradient steps of a model that learns before critic and teacher begin."""
     steps_per_decision = 0.5
     """Gradient steps of a model that learns for each new decision."""
+    learning_rate = 1e-3
+    """Learning rate of these steps, which AdamW makes."""
 
     @abstractmethod
     def encode(self, observations: Observations, tasks: Sequence[str], elapsed: np.ndarray) -> Tensor:
@@ -124,13 +126,10 @@ def new_state_model(spec: StateSpec, config: StateModelConfig) -> StateModel:
     """The untrained model that `config` names, which does not learn by itself.
 
     Raises:
-        InputError: it is no `StateModel`, has buffers, or cannot read what the policy reads.
+        InputError: it is no `StateModel`, or cannot read what the policy reads.
     """
     model: Any = imported(config.make)(spec, config)
     if not isinstance(model, StateModel):
         hint = f"{config.make} is no accerl_lerobot.world_model.states.StateModel; derive it from that"
-        raise InputError("world_model.type", config.type, hint)
-    if buffers := [name for name, _ in model.named_buffers()]:
-        hint = f"{config.make} has the buffer {buffers[0]}; make it a parameter without gradient"
         raise InputError("world_model.type", config.type, hint)
     return model.eval()

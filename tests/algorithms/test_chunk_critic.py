@@ -208,6 +208,16 @@ def test_a_teacher_keeps_to_its_range_and_scales_what_it_sees():
 
 
 class TestActing:
+    def test_buffers_of_the_world_model_are_published(self, tiny_checkpoint: Path):
+        config = PolicyConfig(path=str(tiny_checkpoint), device="cpu")
+        trained, replica = (
+            with_teacher(load_adapter, LatentConfig(latents=4), 0, 0.5, config) for _ in range(2)
+        )
+        for adapter, value in ((trained, 7), (replica, 0)):
+            adapter.teacher.model.register_buffer("seen", torch.tensor(value))
+        replica.load_trainable(trained.export_trainable())
+        assert int(replica.teacher.model.seen) == 7
+
     def test_whole_episodes_are_the_teachers_once_it_is_ready(self, tiny_checkpoint: Path):
         config = PolicyConfig(path=str(tiny_checkpoint), device="cpu")
         model = SimulatorStateConfig()
