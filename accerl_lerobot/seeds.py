@@ -53,6 +53,10 @@ def episode_of(noise_seed: int) -> int:
     return noise_seed // _DECISIONS_PER_EPISODE
 
 
+def decision_of(noise_seed: int) -> int:
+    return noise_seed % _DECISIONS_PER_EPISODE
+
+
 def eval_seed(run_seed: int, index: int) -> int:
     """Seed of the `index`-th evaluation episode of a task.
 

@@ -31,7 +31,7 @@ from accerl_lerobot.policies.adapter import Evaluation, PretrainedAdapter
 from accerl_lerobot.policies.config import ChunkNoiseConfig, SamplerConfig, executed_rows
 from accerl_lerobot.policies.features import ACTION
 from accerl_lerobot.policies.processing import Processing
-from accerl_lerobot.seeds import episode_of
+from accerl_lerobot.seeds import decision_of, episode_of
 
 logger = logging.getLogger(__name__)
 
@@ -131,7 +131,7 @@ class StockAdapter(PretrainedAdapter):
 
     def _decide_step(self, request: Request, version: int) -> Decision:
         arrays, tasks = stack_observations([request])
-        policy = self._policy_of(episode_of(request.noise_seed), tasks[0])
+        policy = self._policy_of(request, tasks[0])
         # LeRobot's samplers draw from the global generator: here from the request's seed.
         with torch.random.fork_rng(), self.autocast():
             torch.manual_seed(request.noise_seed % 2**63)
@@ -139,19 +139,21 @@ class StockAdapter(PretrainedAdapter):
         chunk = self.processing.unnormalise(action.float()).cpu().numpy()
         return Decision(chunk=chunk, latent={}, log_prob=np.zeros(1, np.float32), version=version)
 
-    def _policy_of(self, episode: int, task: str) -> Any:
-        """The episode's policy object, which is new and reset if this is its first decision."""
-        policy = self._episodes.get((episode, task))
-        if policy is None:
-            shared = (self.policy.config, *self.policy.modules(), *self.policy.parameters())
-            memo = {id(part): part for part in (*shared, *self.policy.buffers()) if part is not self.policy}
-            policy = copy.deepcopy(self.policy, memo)
-            policy.reset()
-            self._episodes[episode, task] = policy
-        self._episodes.move_to_end((episode, task))
+    def _policy_of(self, request: Request, task: str) -> Any:
+        """The policy object of the request's episode; new, and reset, if this is its first decision."""
+        episode = episode_of(request.noise_seed), task
+        if decision_of(request.noise_seed) == 0:  # the episode of a lost worker begins once more
+            self._episodes.pop(episode, None)
+        if episode not in self._episodes:
+            policy = self.policy
+            shared = [policy.config, *policy.modules(), *policy.parameters(), *policy.buffers()]
+            memo = {id(part): part for part in shared if part is not policy}
+            self._episodes[episode] = copy.deepcopy(policy, memo)
+            self._episodes[episode].reset()
+        self._episodes.move_to_end(episode)
         if len(self._episodes) > EPISODES:
             self._episodes.popitem(last=False)
-        return policy
+        return self._episodes[episode]
 
     def _decide_chunks(self, requests: Sequence[Request], version: int) -> list[Decision]:
         """Exploring environments are decided for together, the others one by one, each with its own noise."""

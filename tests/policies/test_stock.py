@@ -111,6 +111,13 @@ def test_it_acts_as_in_lerobot_s_loop_whatever_other_episodes_do(written: Any, k
             assert decision.chunk.shape == (1, 2) and decision.version == 3 and not decision.log_prob.any()
 
 
+def test_an_episode_that_is_run_again_begins_anew(written: Any):
+    adapter = load_acting(config_of(written("vqbet"), "vqbet"))
+    chunks = [adapter.decide([request], 0)[0].chunk for request in steps_of(5, 2)]
+    again = adapter.decide(steps_of(5, 1), 0)[0].chunk
+    np.testing.assert_array_equal(again, chunks[0])
+
+
 def test_what_cannot_learn_is_evaluated_and_refused_in_one_line(written: Any, tmp_path: Path, capsys: Any):
     fields = ["--env.type=simulated", "--env.image_size=64", "--launch.engine=local"]
     renames = f"--policy.rename_map={json.dumps({FRONT: CAMERAS['tdmpc']})}"
