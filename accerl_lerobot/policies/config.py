@@ -178,6 +178,8 @@ SIZES = (
     "max_state_dim", "max_action_dim", "num_train_timesteps", "max_decoding_steps", "tokenizer_max_length",
 )  # fmt: skip
 """Numbers of LeRobot's policy configs by which is divided or which are shapes: at least 1."""
+STEPS = ("num_steps", "num_inference_steps", "num_integration_steps", "num_denoising_steps")
+"""Names of LeRobot's policy configs for the number of denoising steps."""
 USES_HISTORY = ("diffusion",)  # types that read observations of ``n_obs_steps`` env steps; others read one
 
 
@@ -272,10 +274,8 @@ def check_size(name: str, value: Any, field: str) -> None:
 
 
 def predicted_rows(policy_config: Any) -> int:
-    """Rows of a predicted chunk that can be executed; 0 where LeRobot's config does not tell."""
-    rows = getattr(policy_config, "chunk_size", 0) or getattr(policy_config, "horizon", 0)
-    past = policy_config.n_obs_steps - 1 if policy_config.type in USES_HISTORY else 0
-    return int(rows) - past
+    """Rows of a predicted chunk that can be executed: those that do not stand for the past."""
+    return sum(row >= 0 for row in policy_config.action_delta_indices or ())
 
 
 def override(policy_config: Any, config: PolicyConfig) -> None:
@@ -294,14 +294,15 @@ def override(policy_config: Any, config: PolicyConfig) -> None:
         if hasattr(policy_config, name):
             setattr(policy_config, name, value)
     if config.num_steps is not None:
-        names = [name for name in ("num_steps", "num_inference_steps") if hasattr(policy_config, name)]
+        names = [name for name in STEPS if hasattr(policy_config, name)]
         if not names:
-            hint = f"a {policy_config.type} policy does not denoise; leave the field out"
-            raise InputError("policy.num_steps", config.num_steps, hint)
-        setattr(policy_config, names[0], config.num_steps)
+            hint = f"LeRobot's config of a {policy_config.type} policy has no {' or '.join(STEPS)}"
+            raise InputError("policy.num_steps", config.num_steps, f"{hint}; leave the field out")
+        for name in names:
+            setattr(policy_config, name, config.num_steps)
     if config.n_action_steps is not None:
-        rows = predicted_rows(policy_config) if hasattr(policy_config, "n_action_steps") else 0
-        if not rows:
+        rows = predicted_rows(policy_config)
+        if not rows or not hasattr(policy_config, "n_action_steps"):
             hint = f"a {policy_config.type} policy has no such choice; leave the field out"
             raise InputError("policy.n_action_steps", config.n_action_steps, hint)
         if config.n_action_steps > rows:

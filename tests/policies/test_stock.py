@@ -20,7 +20,7 @@ from accerl_lerobot import cli, load_policy
 from accerl_lerobot.algorithms import chunk_critic, off_policy
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Request, stack_observations
-from accerl_lerobot.policies.config import ChunkNoiseConfig, PolicyConfig
+from accerl_lerobot.policies.config import ChunkNoiseConfig, PolicyConfig, override
 from accerl_lerobot.policies.loading import load_acting, load_adapter
 from accerl_lerobot.policies.stock import StockAdapter
 from accerl_lerobot.seeds import noise_seed
@@ -205,6 +205,16 @@ def test_a_policy_that_looks_back_is_shown_what_lerobot_s_loop_would_show_it(wri
     chunk = adapter.decide([asked], 0)[0].chunk
     np.testing.assert_allclose(chunk, np.stack(taken[6:9]), atol=1e-5)
     assert "predict_action_chunk" not in vars(adapter.policy)
+
+
+def test_steps_and_rows_of_a_run_are_set_by_the_names_of_lerobot_s_config():
+    from lerobot.policies.factory import make_policy_config
+
+    config = make_policy_config("multi_task_dit", device="cpu", n_obs_steps=2, horizon=6, n_action_steps=3)
+    override(config, PolicyConfig(num_steps=4, n_action_steps=5))
+    assert (config.num_inference_steps, config.num_integration_steps, config.n_action_steps) == (4, 4, 5)
+    with pytest.raises(InputError, match="policy.n_action_steps=6: multi_task_dit: at most 5 rows"):
+        override(config, PolicyConfig(n_action_steps=6))
 
 
 def test_exploring_is_the_chunk_and_noise_of_the_request(written: Any):
