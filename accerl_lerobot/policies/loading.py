@@ -199,7 +199,8 @@ def _stock_adapter(
         if sampler is None:
             adapter.decide(adapter.example_requests(), 0)
         else:
-            tune(policy, config.tuning)
+            backbone = None if model_class is None else model_class.backbone
+            tune(policy, config.tuning, backbone)
             adapter.self_check()
     return adapter
 

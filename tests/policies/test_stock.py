@@ -20,7 +20,7 @@ from accerl_lerobot import cli, load_policy
 from accerl_lerobot.algorithms import chunk_critic, off_policy
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Request, stack_observations
-from accerl_lerobot.policies.config import ChunkNoiseConfig, PolicyConfig, override
+from accerl_lerobot.policies.config import ChunkNoiseConfig, PolicyConfig, TuningConfig, override
 from accerl_lerobot.policies.loading import load_acting, load_adapter
 from accerl_lerobot.policies.stock import StockAdapter
 from accerl_lerobot.seeds import noise_seed
@@ -151,10 +151,11 @@ def test_what_cannot_learn_is_evaluated_and_refused_in_one_line(written: Any, tm
     assert not (tmp_path / "new").exists()
 
 
-def learning(path: Path, **fields: Any) -> StockAdapter:
+def learning(path: Path, mode: Any = "checkpoint", **fields: Any) -> StockAdapter:
     """A policy of any type, loaded to learn."""
     sampler = ChunkNoiseConfig(**fields)
-    adapter = load_adapter(PolicyConfig(path=str(path), device="cpu", sampler=sampler))
+    tuning = TuningConfig(mode=mode)
+    adapter = load_adapter(PolicyConfig(path=str(path), device="cpu", sampler=sampler, tuning=tuning))
     assert isinstance(adapter, StockAdapter)
     return adapter
 
@@ -185,6 +186,12 @@ def test_smolvla_s_training_loss_is_ours(tmp_path: Path):
         loss, _ = adapter.imitate(arrays, tasks, chunk)
         found.append(float(loss.mean().detach()))
     assert found[0] == pytest.approx(found[1], rel=1e-4)
+
+
+def test_of_a_smolvla_with_noise_on_its_chunk_the_expert_alone_can_be_trained(tmp_path: Path):
+    adapter = learning(write_smolvla(tmp_path / "smolvla"), mode="expert")
+    trained = adapter.trainable()
+    assert trained and not [name for name in trained if ".vlm_with_expert.vlm." in name]
 
 
 def test_a_policy_that_looks_back_is_shown_what_lerobot_s_loop_would_show_it(written: Any):
