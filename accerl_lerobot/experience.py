@@ -25,6 +25,9 @@ are raw: scaling and normalisation belong to the policy's own LeRobot processors
 (LeRobot's ``n_obs_steps`` above 1), arrays hold so many env steps, oldest first, in a dimension in front.
 """
 
+Observations = dict[str, np.ndarray]
+"""A batch of observations, arrays (B, ...) by the names of an `Observation`; the instructions are apart."""
+
 TASK = "task"
 ENVIRONMENT_STATE = "observation.environment_state"
 """LeRobot's name for what a simulator says of itself. Ours end it with the share of the time limit gone."""
@@ -104,7 +107,7 @@ class Segment:
         return ((ends - self.steps) / self.time_limit).astype(np.float32)
 
 
-def stack_observations(requests: Sequence[Request]) -> tuple[dict[str, np.ndarray], list[str]]:
+def stack_observations(requests: Sequence[Request]) -> tuple[Observations, list[str]]:
     """Batches raw observations: each array (B, ...), and the B task texts."""
     keys = [k for k in requests[0].observation if k != TASK]
     arrays = {k: np.stack([r.observation[k] for r in requests]) for k in keys}

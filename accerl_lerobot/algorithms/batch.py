@@ -13,28 +13,29 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from accerl_lerobot.experience import Segment
+from accerl_lerobot.experience import Observations, Segment
+from accerl_lerobot.policies.family import Latent
 
 
 @dataclass(frozen=True, kw_only=True)
 class Batch:
     """Segments laid end to end: N rows of decisions, plus one bootstrap observation per segment."""
 
-    observations: dict[str, np.ndarray]  # each (N, ...)
+    observations: Observations  # each (N, ...)
     tasks: list[str]  # N
-    latent: dict[str, Tensor]  # each (N, ...)
+    latent: Latent  # each (N, ...)
     log_prob: Tensor  # (N, L) of the behaviour policy
     reward: Tensor  # (N,)
     version: np.ndarray  # int64 (N,)
     lengths: Tensor  # int64 (S,)
     terminated: Tensor  # bool (S,)
-    last_observations: dict[str, np.ndarray]  # each (S, ...)
+    last_observations: Observations  # each (S, ...)
     segment_tasks: list[str]  # S
 
     def __len__(self) -> int:
         return len(self.tasks)
 
-    def part(self, rows: np.ndarray) -> tuple[dict[str, np.ndarray], list[str], dict[str, Tensor]]:
+    def part(self, rows: np.ndarray) -> tuple[Observations, list[str], Latent]:
         """Some of the decisions, as `PolicyAdapter.evaluate` takes them."""
         return *pick(self.observations, self.tasks, rows), {k: v[rows] for k, v in self.latent.items()}
 
@@ -57,6 +58,6 @@ def collate(segments: Sequence[Segment]) -> Batch:
 
 
 def pick(
-    observations: dict[str, np.ndarray], tasks: Sequence[str], rows: np.ndarray
-) -> tuple[dict[str, np.ndarray], list[str]]:
+    observations: Observations, tasks: Sequence[str], rows: np.ndarray
+) -> tuple[Observations, list[str]]:
     return {k: v[rows] for k, v in observations.items()}, [tasks[i] for i in rows]

@@ -22,7 +22,7 @@ from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.algorithms.objective import lag_metrics
 from accerl_lerobot.algorithms.ratio_update import BaseUpdate
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import ENVIRONMENT_STATE, Segment
+from accerl_lerobot.experience import ENVIRONMENT_STATE, Observations, Segment
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.family import Encoded
 from accerl_lerobot.policies.stock import StockAdapter
@@ -97,11 +97,11 @@ class Memory:
             column[rows] = values
         return rows
 
-    def seen(self) -> dict[str, np.ndarray]:
+    def seen(self) -> Observations:
         """The policy's observations of all rows, each (len, ...); not a copy."""
         return {name: self[name] for name in self._columns if name.startswith("observation.")}
 
-    def observations(self, rows: np.ndarray) -> tuple[dict[str, np.ndarray], list[str]]:
+    def observations(self, rows: np.ndarray) -> tuple[Observations, list[str]]:
         """The policy's observations, each (B, ...), and its instructions."""
         seen = {name: column[rows] for name, column in self.seen().items()}
         return seen, [self.tasks[i] for i in self._columns["task"][rows]]

@@ -31,7 +31,7 @@ from accerl_lerobot.algorithms.ranks import Part
 from accerl_lerobot.checkpoint.tensors import in_parts, optimizer_state, restore_optimizer
 from accerl_lerobot.config.parsing import imported
 from accerl_lerobot.errors import MAX_NONFINITE, NonFiniteError
-from accerl_lerobot.experience import Segment
+from accerl_lerobot.experience import Observations, Segment
 from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.policies.adapter import Evaluation, PolicyAdapter
 from accerl_lerobot.policies.teacher import TEACHER_PREFIX
@@ -143,7 +143,7 @@ class RatioUpdate(BaseUpdate):
         self._moments = state["moments"]
         self._probe.restore(state["probe"])
 
-    def _values(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Tensor:
+    def _values(self, observations: Observations, tasks: Sequence[str]) -> Tensor:
         """V of each row, (rows,), without gradient, at most `micro_batch` rows at a time."""
 
         def values(rows: np.ndarray) -> Tensor:

@@ -21,10 +21,10 @@ from torch import Tensor, nn
 
 from accerl_lerobot.checkpoint.tensors import in_parts, part_of, whole
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import TASK, Decision, Request, Segment, stack_observations
+from accerl_lerobot.experience import TASK, Decision, Observations, Request, Segment, stack_observations
 from accerl_lerobot.policies import saving
 from accerl_lerobot.policies.config import PLUGINS, PolicyConfig, SamplerConfig
-from accerl_lerobot.policies.family import Encoded, Family, Model, pooled
+from accerl_lerobot.policies.family import Encoded, Family, Latent, Model, pooled
 from accerl_lerobot.policies.processing import IMAGES, Processing
 from accerl_lerobot.policies.teacher import TEACHER_PREFIX, Teacher
 from accerl_lerobot.policies.untrusted import FAMILY, VALUE_HEAD
@@ -75,7 +75,7 @@ class PolicyAdapter(nn.Module, ABC):
 
     device: torch.device
 
-    def factors(self, latent: dict[str, Tensor]) -> Tensor | None:
+    def factors(self, latent: Latent) -> Tensor | None:
         """bool (B, L), False for log-prob factors that a latent does not have, such as tokens after the
         terminator; None if all latents have all of them."""
         return None
@@ -85,13 +85,11 @@ class PolicyAdapter(nn.Module, ABC):
         """Acts on a batch, without gradient. Answers in the order of the requests."""
 
     @abstractmethod
-    def evaluate(
-        self, observations: dict[str, np.ndarray], tasks: Sequence[str], latent: dict[str, Tensor]
-    ) -> Evaluation:
+    def evaluate(self, observations: Observations, tasks: Sequence[str], latent: Latent) -> Evaluation:
         """Re-scores stored latents, each (B, ...), differentiably; observations, each (B, ...), are raw."""
 
     @abstractmethod
-    def values(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Tensor:
+    def values(self, observations: Observations, tasks: Sequence[str]) -> Tensor:
         """V only, (B,), without gradient."""
 
     block_names = ""  # regular expression
@@ -178,7 +176,7 @@ class PretrainedAdapter(PolicyAdapter):
 
     @abstractmethod
     def imitate(
-        self, observations: dict[str, np.ndarray], tasks: Sequence[str], chunk: Tensor
+        self, observations: Observations, tasks: Sequence[str], chunk: Tensor
     ) -> tuple[Tensor, Encoded | None]:
         """LeRobot's training loss, (B,) or its mean, of chunks (B, K, A) in normalised units, and what it was
         read from, if that is known."""
@@ -262,17 +260,17 @@ class LeRobotAdapter(PretrainedAdapter):
     def sampler(self) -> SamplerConfig:
         return self.family.sampler
 
-    def encode(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Encoded:
+    def encode(self, observations: Observations, tasks: Sequence[str]) -> Encoded:
         """Reads raw observations, each (B, ...), and B instructions, for the family; differentiable."""
         return self.model.encode(self.processing.prepare(observations, tasks))
 
     def imitate(
-        self, observations: dict[str, np.ndarray], tasks: Sequence[str], chunk: Tensor
+        self, observations: Observations, tasks: Sequence[str], chunk: Tensor
     ) -> tuple[Tensor, Encoded]:
         encoded = self.encode(observations, tasks)
         return self.family.imitation_loss(encoded, chunk), encoded
 
-    def factors(self, latent: dict[str, Tensor]) -> Tensor | None:
+    def factors(self, latent: Latent) -> Tensor | None:
         return self.family.factors(latent)
 
     @torch.no_grad()
@@ -290,22 +288,20 @@ class LeRobotAdapter(PretrainedAdapter):
             decisions.append(Decision(chunk=chunk, latent=latent, log_prob=log_probs[i], version=version))
         return decisions
 
-    def evaluate(
-        self, observations: dict[str, np.ndarray], tasks: Sequence[str], latent: dict[str, Tensor]
-    ) -> Evaluation:
+    def evaluate(self, observations: Observations, tasks: Sequence[str], latent: Latent) -> Evaluation:
         with self.autocast():
             encoded = self.encode(observations, tasks)
             log_prob, entropy = self.family.score(encoded, {k: v.to(self.device) for k, v in latent.items()})
         return Evaluation(log_prob, entropy, self.value_head(encoded.features, encoded.mask))
 
     @torch.no_grad()
-    def values(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Tensor:
+    def values(self, observations: Observations, tasks: Sequence[str]) -> Tensor:
         with self.autocast():
             encoded = self.encode(observations, tasks)
         return self.value_head(encoded.features, encoded.mask)
 
     @torch.no_grad()
-    def self_check(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> float:
+    def self_check(self, observations: Observations, tasks: Sequence[str]) -> float:
         """Largest difference between our sampler without exploration and LeRobot's own on equal noise.
 
         Raises:

@@ -32,7 +32,15 @@ from torch import Tensor
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Request
 from accerl_lerobot.policies.config import DiffusionSamplerConfig
-from accerl_lerobot.policies.family import Action, Encoded, Family, Model, normal_entropy, normal_log_prob
+from accerl_lerobot.policies.family import (
+    Action,
+    Encoded,
+    Family,
+    Latent,
+    Model,
+    normal_entropy,
+    normal_log_prob,
+)
 
 Network = Callable[[Tensor, int], Tensor]
 """(x (B, H, A), timestep) → what the network predicts, fp32 (B, H, A), given the observations."""
@@ -196,7 +204,7 @@ class DiffusionFamily(Family):
             path.append(x)
         return Action(x[:, self.rows], {"path": torch.stack(path, 1)}, log_prob[:, self._factors])
 
-    def log_prob(self, network: Network, latent: dict[str, Tensor]) -> Tensor:
+    def log_prob(self, network: Network, latent: Latent) -> Tensor:
         """Log-density of stored chains under the current network, (B, L), differentiable."""
         path = latent["path"].unbind(1)
         log_prob = path[0].new_zeros(path[0].shape[:2])
@@ -205,7 +213,7 @@ class DiffusionFamily(Family):
             log_prob = log_prob + self._rows(k, path[k + 1], mean, std)
         return log_prob[:, self._factors]
 
-    def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+    def score(self, encoded: Encoded, latent: Latent) -> tuple[Tensor, Tensor]:
         log_prob = self.log_prob(encoded.context, latent)
         return log_prob, log_prob.new_full((len(log_prob),), self.entropy)
 

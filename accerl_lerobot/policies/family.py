@@ -24,6 +24,9 @@ from torch import Tensor, nn
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Request
 
+Latent = dict[str, Tensor]
+"""What a family sampled for B decisions: tensors (B, ...) by name."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Encoded:
@@ -38,8 +41,7 @@ class Action(NamedTuple):
     """A family's decisions for a batch."""
 
     chunk: Tensor  # (B, K, A), K executed actions in the policy's normalised units
-    latent: dict[str, Tensor]
-    """Each (B, ...): what was sampled, all that `Family.score` needs beside the observations."""
+    latent: Latent  # all that `Family.score` needs beside the observations
     log_prob: Tensor  # (B, L); zero where not exploring
 
 
@@ -98,7 +100,7 @@ class Family(nn.Module, ABC):
         """Samples; where a request does not explore, LeRobot's own sampler."""
 
     @abstractmethod
-    def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+    def score(self, encoded: Encoded, latent: Latent) -> tuple[Tensor, Tensor]:
         """Log-prob (B, L), differentiable, of what `act` stored, and entropy (B,)."""
 
     def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
@@ -117,7 +119,7 @@ class Family(nn.Module, ABC):
         """
         raise NotImplementedError
 
-    def factors(self, latent: dict[str, Tensor]) -> Tensor | None:
+    def factors(self, latent: Latent) -> Tensor | None:
         """See `PolicyAdapter.factors`."""
         return None
 

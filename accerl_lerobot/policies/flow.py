@@ -23,7 +23,15 @@ from torch import Tensor
 
 from accerl_lerobot.experience import Request
 from accerl_lerobot.policies.config import FlowSamplerConfig
-from accerl_lerobot.policies.family import Action, Encoded, Family, Model, normal_entropy, normal_log_prob
+from accerl_lerobot.policies.family import (
+    Action,
+    Encoded,
+    Family,
+    Latent,
+    Model,
+    normal_entropy,
+    normal_log_prob,
+)
 
 Velocity = Callable[[Tensor, Tensor], Tensor]
 """(x (B, K, D), t (B,)) → v (B, K, D), conditioned on the observations; output in fp32."""
@@ -95,12 +103,12 @@ class FlowFamily(Family):
             log_prob=torch.where(explore[:, None], self._rows(x, mean), 0.0),
         )
 
-    def log_prob(self, velocity: Velocity, latent: dict[str, Tensor]) -> Tensor:
+    def log_prob(self, velocity: Velocity, latent: Latent) -> Tensor:
         """Log-density of stored latents under the current velocity field, (B, L), differentiable."""
         x0, x = latent["path"].unbind(1)
         return self._rows(x, self.shape.integrate(velocity, x0))
 
-    def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+    def score(self, encoded: Encoded, latent: Latent) -> tuple[Tensor, Tensor]:
         log_prob = self.log_prob(encoded.context, latent)
         return log_prob, log_prob.new_full((len(log_prob),), self.entropy)
 

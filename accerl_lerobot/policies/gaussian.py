@@ -26,6 +26,7 @@ from accerl_lerobot.policies.family import (
     Action,
     Encoded,
     Family,
+    Latent,
     Model,
     NoDensityError,
     normal_entropy,
@@ -80,7 +81,7 @@ class GaussianFamily(Family):
         counted = normal_log_prob(u, mean, std).sum(-1)
         return Action(u, {"u": u}, torch.where(explore[:, None], counted, 0.0))
 
-    def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+    def score(self, encoded: Encoded, latent: Latent) -> tuple[Tensor, Tensor]:
         mean, std = self._gaussian(encoded)
         log_prob = normal_log_prob(latent["u"], mean, std).sum(-1)
         return log_prob, normal_entropy(std).sum((1, 2))

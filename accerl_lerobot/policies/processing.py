@@ -22,6 +22,7 @@ from torch import Tensor
 from accerl_lerobot.checkpoint.layout import CONFIG_FOLDERS, PREPROCESSOR, STEP_FOLDERS
 from accerl_lerobot.checkpoint.safety import FileSource, read_tensors, tensor_shapes
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.experience import Observations
 from accerl_lerobot.policies.features import ACTION, STATE, STATISTICS, pads, policy_features
 from accerl_lerobot.policies.untrusted import CONFIG, PROCESSORS
 
@@ -41,11 +42,11 @@ class Processing:
     device: torch.device
     rename_map: dict[str, str]
 
-    def prepare(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> dict[str, Tensor]:
+    def prepare(self, observations: Observations, tasks: Sequence[str]) -> dict[str, Tensor]:
         """Normalised and tokenised observations."""
         return self.preprocessor({"task": list(tasks), **self.tensors(observations)})
 
-    def tensors(self, observations: dict[str, np.ndarray]) -> dict[str, Tensor]:
+    def tensors(self, observations: Observations) -> dict[str, Tensor]:
         """By the policy's names; images go from uint8 (..., H, W, 3) to float (..., 3, H, W) in [0, 1]."""
         batch: dict[str, Tensor] = {}
         for key, array in observations.items():

@@ -26,9 +26,10 @@ from torch import Tensor, nn
 
 from accerl_lerobot.checkpoint.safety import brief
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import Decision, Request, stack_observations
+from accerl_lerobot.experience import Decision, Observations, Request, stack_observations
 from accerl_lerobot.policies.adapter import Evaluation, PretrainedAdapter
 from accerl_lerobot.policies.config import ChunkNoiseConfig, SamplerConfig, executed_rows
+from accerl_lerobot.policies.family import Latent
 from accerl_lerobot.policies.features import ACTION
 from accerl_lerobot.policies.processing import Processing
 from accerl_lerobot.seeds import decision_of, episode_of
@@ -69,9 +70,7 @@ class StockAdapter(PretrainedAdapter):
             self._refuse()
         return [self._decide_step(request, version) for request in requests]
 
-    def imitate(
-        self, observations: dict[str, np.ndarray], tasks: Sequence[str], chunk: Tensor
-    ) -> tuple[Tensor, None]:
+    def imitate(self, observations: Observations, tasks: Sequence[str], chunk: Tensor) -> tuple[Tensor, None]:
         batch = self._training_batch(observations, tasks, chunk)
         self.policy.train()
         for module in self.policy.modules():
@@ -115,12 +114,10 @@ class StockAdapter(PretrainedAdapter):
             for name, buffer in self.policy.named_buffers():  # such as a codebook that the loss moves
                 buffer.copy_(buffers[name])
 
-    def evaluate(
-        self, observations: dict[str, np.ndarray], tasks: Sequence[str], latent: dict[str, Tensor]
-    ) -> Evaluation:
+    def evaluate(self, observations: Observations, tasks: Sequence[str], latent: Latent) -> Evaluation:
         self._refuse()
 
-    def values(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Tensor:
+    def values(self, observations: Observations, tasks: Sequence[str]) -> Tensor:
         self._refuse()
 
     def _refuse(self) -> NoReturn:
@@ -193,7 +190,7 @@ class StockAdapter(PretrainedAdapter):
             policy.reset()
         return torch.stack(rows, 1).float()
 
-    def _frames(self, arrays: dict[str, np.ndarray]) -> list[dict[str, np.ndarray]]:
+    def _frames(self, arrays: Observations) -> list[Observations]:
         """The env steps of an observation, oldest first."""
         steps = self.policy.config.n_obs_steps
         if steps == 1:
@@ -206,7 +203,7 @@ class StockAdapter(PretrainedAdapter):
         return torch.zeros(count, 1, self.policy.config.action_feature.shape[0], device=self.device)
 
     def _training_batch(
-        self, observations: dict[str, np.ndarray], tasks: Sequence[str], chunk: Tensor
+        self, observations: Observations, tasks: Sequence[str], chunk: Tensor
     ) -> dict[str, Any]:
         """A batch as LeRobot's trainer makes it, in which the chunk is padded around the executed rows."""
         config = self.policy.config

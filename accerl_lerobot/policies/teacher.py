@@ -17,14 +17,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from accerl_lerobot.experience import TASK_BITS, Request, stack_observations, task_codes
+from accerl_lerobot.experience import TASK_BITS, Observations, Request, stack_observations, task_codes
 from accerl_lerobot.policies.config import Load, PolicyConfig, executed_rows
 from accerl_lerobot.policies.features import STATE, policy_features
 from accerl_lerobot.seeds import episode_of
 
 if TYPE_CHECKING:
     from accerl_lerobot.world_model.config import StateModelConfig
-    from accerl_lerobot.world_model.states import Observations, StateModel, StateSpec
+    from accerl_lerobot.world_model.states import StateModel, StateSpec
 
 WIDTH = 256
 NOISE = 0.25  # standard deviation of its exploration, in normalised action units

@@ -27,7 +27,7 @@ from torch import Tensor, nn
 
 from accerl_lerobot.experience import Request
 from accerl_lerobot.policies.config import TokenSamplerConfig
-from accerl_lerobot.policies.family import Action, Encoded, Family, Model
+from accerl_lerobot.policies.family import Action, Encoded, Family, Latent, Model
 
 Choose = Callable[[Tensor, int], Tensor]  # (logits (B, V), position) → tokens (B,), int64
 
@@ -112,7 +112,7 @@ class TokenFamily(Family):
         counted = explore[:, None] & existing(tokens, self.model.terminator)
         return Action(self.model.chunk(tokens), {"tokens": tokens}, torch.where(counted, log_prob, 0.0))
 
-    def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+    def score(self, encoded: Encoded, latent: Latent) -> tuple[Tensor, Tensor]:
         """Re-scores; the entropy is that of the distributions the factors were drawn from."""
         tokens = latent["tokens"]
         factors = existing(tokens, self.model.terminator)
@@ -126,7 +126,7 @@ class TokenFamily(Family):
         log_prob = torch.where(factors, nn.functional.pad(log_prob, missing), 0.0)
         return log_prob, torch.where(factors[:, :used], entropy, 0.0).sum(1)
 
-    def factors(self, latent: dict[str, Tensor]) -> Tensor | None:
+    def factors(self, latent: Latent) -> Tensor | None:
         terminator = self.model.terminator
         return None if terminator is None else existing(latent["tokens"], terminator)
 
