@@ -28,6 +28,9 @@ are raw: scaling and normalisation belong to the policy's own LeRobot processors
 Observations = dict[str, np.ndarray]
 """A batch of observations, arrays (B, ...) by the names of an `Observation`; the instructions are apart."""
 
+Metrics = dict[str, float]
+"""Numbers for the log, by name; docs/metrics.md explains them."""
+
 TASK = "task"
 ENVIRONMENT_STATE = "observation.environment_state"
 """LeRobot's name for what a simulator says of itself. Ours end it with the share of the time limit gone."""

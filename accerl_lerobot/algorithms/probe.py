@@ -20,6 +20,7 @@ from accerl_lerobot.algorithms import ranks
 from accerl_lerobot.algorithms.batch import Batch
 from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.checkpoint.tensors import copy_of, part_of
+from accerl_lerobot.experience import Metrics
 from accerl_lerobot.policies.adapter import PolicyAdapter
 
 CRITIC_PREFIX = "value_head."  # how names of the critic's weights begin
@@ -58,22 +59,23 @@ class Probe:
             self._version = version
             self._next = version + every
 
-    def read(self, batch: Batch) -> dict[str, float]:
+    def read(self, batch: Batch) -> Metrics:
         """The mismatch, if the batch holds decisions of the probed version; else nothing."""
         if self._version is None:
             return {}
         rows = np.flatnonzero(batch.version == self._version)
         skipped = np.median(batch.version) > self._version
-        metrics: dict[str, float] = {}
+        metrics: Metrics = {}
         if len(rows):
             self._exchange()
             try:
                 apart = ranks.over_rows(partial(self._apart, batch), rows, self._config.micro_batch)
             finally:
                 self._exchange()
+            clipped = apart.expm1().abs() > CLIP
             metrics["logprob/mismatch_mean"] = float(apart.abs().mean())
             metrics["logprob/mismatch_max"] = float(apart.abs().max())
-            metrics["logprob/mismatch_clip"] = float((apart.expm1().abs() > CLIP).double().mean())
+            metrics["logprob/mismatch_clip"] = float(clipped.double().mean())
         elif skipped:
             self._next = 0
         else:

@@ -21,16 +21,24 @@ from torch import Tensor, nn
 
 from accerl_lerobot.checkpoint.tensors import in_parts, part_of, whole
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import TASK, Decision, Observations, Request, Segment, stack_observations
+from accerl_lerobot.experience import (
+    TASK,
+    Decision,
+    Observation,
+    Observations,
+    Request,
+    Segment,
+    stack_observations,
+)
 from accerl_lerobot.policies import saving
 from accerl_lerobot.policies.config import PLUGINS, PolicyConfig, SamplerConfig
 from accerl_lerobot.policies.family import Encoded, Family, Latent, Model, pooled
+from accerl_lerobot.policies.features import STATE
 from accerl_lerobot.policies.processing import IMAGES, Processing
 from accerl_lerobot.policies.teacher import TEACHER_PREFIX, Teacher
 from accerl_lerobot.policies.untrusted import FAMILY, VALUE_HEAD
 
 HIDDEN = 128
-OBS_STATE = "observation.state"
 SELF_CHECK_TOLERANCE = 1e-5  # between our sampler and LeRobot's, in normalised actions; fp32 noise is 1e-6
 
 
@@ -58,8 +66,10 @@ class ValueHead(nn.Module):
         """V (B,) from features (B, P, width) and mask (B, P) bool, True where a token is real."""
         features = features.detach().float()  # the critic does not shape the backbone
         scores = (features @ self.query) / features.shape[-1] ** 0.5
-        weights = torch.softmax(scores.masked_fill(~mask, float("-inf")), -1)
-        return self.out(torch.relu(self.hidden(self.norm(pooled(features, weights))))).float()[:, 0]
+        scores = scores.masked_fill(~mask, -torch.inf)
+        x = self.norm(pooled(features, torch.softmax(scores, -1)))
+        x = torch.relu(self.hidden(x))
+        return self.out(x).float()[:, 0]
 
 
 class Evaluation(NamedTuple):
@@ -102,11 +112,13 @@ class PolicyAdapter(nn.Module, ABC):
         """
         found: dict[str, nn.Module] = {}
         for name, module in self.named_modules():
+            if not name or not re.fullmatch(self.block_names, name):
+                continue
             inside = any(name.startswith(f"{outer}.") for outer in found)
             has_weights = next(module.parameters(), None) is not None
-            if has_weights and not inside and re.fullmatch(self.block_names, name):
+            if has_weights and not inside:
                 found[name] = module
-        return list(found.values()) if self.block_names else []
+        return list(found.values())
 
     @abstractmethod
     def trainable(self) -> dict[str, nn.Parameter]:
@@ -134,8 +146,11 @@ class PolicyAdapter(nn.Module, ABC):
 
     def view_trainable(self) -> dict[str, np.ndarray]:
         """`trainable` as NumPy arrays; on a CPU the parameters' own memory, to be copied before an update."""
-        named = {name: whole(parameter.detach()) for name, parameter in self.trainable().items()}
-        return {name: tensor.to("cpu", torch.float32).numpy() for name, tensor in named.items()}
+        views: dict[str, np.ndarray] = {}
+        for name, parameter in self.trainable().items():
+            tensor = whole(parameter.detach())
+            views[name] = tensor.to("cpu", torch.float32).numpy()
+        return views
 
     def export_trainable(self) -> dict[str, np.ndarray]:
         """A copy of `trainable` as NumPy arrays, safe to hand to another thread."""
@@ -219,18 +234,21 @@ class PretrainedAdapter(PolicyAdapter):
         rng = np.random.default_rng(0)
         config = self.policy.config
         env_names = {policy: env for env, policy in self.processing.rename_map.items()}
-        batch = (2,) if config.n_obs_steps == 1 or not self.explores else (2, config.n_obs_steps)
-        arrays: dict[str, np.ndarray] = {}
+        batch = [2]
+        if self.explores and config.n_obs_steps > 1:
+            batch.append(config.n_obs_steps)
+        arrays: Observations = {}
         for key, feature in config.input_features.items():
             name = env_names.get(key, key)
-            shape = tuple(feature.shape)
             if key.startswith(IMAGES) and ".empty_camera_" not in key:
-                arrays[name] = rng.integers(0, 256, (*batch, *shape[1:], shape[0]), dtype=np.uint8)
-            elif key == OBS_STATE:
-                arrays[name] = rng.standard_normal((*batch, *shape), dtype=np.float32)
+                channels, height, width = feature.shape
+                arrays[name] = rng.integers(0, 256, (*batch, height, width, channels), dtype=np.uint8)
+            elif key == STATE:
+                arrays[name] = rng.standard_normal((*batch, *feature.shape), dtype=np.float32)
         requests: list[Request] = []
         for i, task in enumerate(("Go", "Put the red cube on the plate")):
-            observation = {name: array[i] for name, array in arrays.items()} | {TASK: task}
+            observation: Observation = {name: array[i] for name, array in arrays.items()}
+            observation[TASK] = task
             requests.append(Request(observation=observation, noise_seed=i, explore=self.explores))
         return requests
 
@@ -254,7 +272,8 @@ class LeRobotAdapter(PretrainedAdapter):
         self.parts |= {"family": self.family, "value_head": self.value_head}
         self.own_files |= {VALUE_HEAD: self.value_head, FAMILY: self.family}
         self.feature_width = model.width
-        self.block_names = model.blocks and rf"policy\.({model.blocks})"
+        if model.blocks:
+            self.block_names = rf"policy\.({model.blocks})"
 
     @property
     def sampler(self) -> SamplerConfig:
@@ -289,10 +308,12 @@ class LeRobotAdapter(PretrainedAdapter):
         return decisions
 
     def evaluate(self, observations: Observations, tasks: Sequence[str], latent: Latent) -> Evaluation:
+        latent = {name: values.to(self.device) for name, values in latent.items()}
         with self.autocast():
             encoded = self.encode(observations, tasks)
-            log_prob, entropy = self.family.score(encoded, {k: v.to(self.device) for k, v in latent.items()})
-        return Evaluation(log_prob, entropy, self.value_head(encoded.features, encoded.mask))
+            log_prob, entropy = self.family.score(encoded, latent)
+        value = self.value_head(encoded.features, encoded.mask)
+        return Evaluation(log_prob, entropy, value)
 
     @torch.no_grad()
     def values(self, observations: Observations, tasks: Sequence[str]) -> Tensor:

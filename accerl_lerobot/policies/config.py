@@ -198,7 +198,8 @@ def register_policies(wanted: str | None = None) -> None:
     """Fills LeRobot's registry of policy types; those of installed plugins too, if `wanted` is missing.
 
     Of LeRobot's own types, the code of `wanted` alone is imported; of all if it is None or another's."""
-    import_policies(wanted if wanted in POLICIES.keys() - PLUGINS.keys() else None)
+    ours = wanted in POLICIES and wanted not in PLUGINS
+    import_policies(wanted if ours else None)
     from lerobot.configs.policies import PreTrainedConfig
 
     if wanted is None or wanted in PreTrainedConfig.get_known_choices():
@@ -220,7 +221,9 @@ def check_registered(policy_type: Any, field: str, prefix: str = "") -> None:
 
 def discovery(policy_type: str | None) -> list[str]:
     """Arguments by which stock LeRobot commands find this type; none for LeRobot's own."""
-    return [f"--policy.discover_packages_path={PLUGINS[policy_type]}"] if policy_type in PLUGINS else []
+    if policy_type not in PLUGINS:
+        return []
+    return [f"--policy.discover_packages_path={PLUGINS[policy_type]}"]
 
 
 def check_observations(policy_config: Any, field: str) -> None:
@@ -235,7 +238,10 @@ def check_observations(policy_config: Any, field: str) -> None:
 
 def sampler_config(config: PolicyConfig, policy_type: str) -> SamplerConfig:
     """How a policy of this type explores in this run; refuses a sampler that does not suit it."""
-    families = (*POLICIES[policy_type][1], ANY) if policy_type in POLICIES else (ANY,)
+    families = [ANY]
+    if policy_type in POLICIES:
+        _, suitable = POLICIES[policy_type]
+        families = [*suitable, ANY]
     if config.sampler is None:
         return SamplerConfig.get_choice_class(families[0])()
     if config.sampler.type not in families:
@@ -257,13 +263,18 @@ def env_steps_seen(policy_config: Any, *, learns: bool = False) -> int:
 
     A policy of another type than `POLICIES` keeps former ones itself, unless it `learns`.
     """
-    return int(policy_config.n_obs_steps) if learns or policy_config.type in POLICIES else 1
+    if learns or policy_config.type in POLICIES:
+        return int(policy_config.n_obs_steps)
+    return 1
 
 
 def executed_rows(policy_config: Any) -> int:
     """Actions that a policy executes for each of its decisions, in LeRobot's loop and here."""
-    rows = getattr(policy_config, "n_action_steps", None) or getattr(policy_config, "action_chunk_size", None)
-    return int(rows or 1)
+    for name in ("n_action_steps", "action_chunk_size"):
+        rows = getattr(policy_config, name, None)
+        if rows:
+            return int(rows)
+    return 1
 
 
 def check_size(name: str, value: Any, field: str) -> None:

@@ -108,14 +108,17 @@ class Family(nn.Module, ABC):
         count = len(encoded.features)
         requests = [Request(observation={}, noise_seed=seed, explore=False) for seed in range(count)]
         ours, latent, _ = self.act(encoded, requests)
-        noise = {"noise": latent["path"][:, 0].clone()} if "path" in latent else {}
+        noise: dict[str, Tensor] = {}
+        if "path" in latent:
+            noise["noise"] = latent["path"][:, 0].clone()
         stock = self.model.stock(batch, **noise)
-        return float((ours - stock[:, : ours.shape[1]]).abs().max())
+        executed = stock[:, : ours.shape[1]]
+        return float((ours - executed).abs().max())
 
     def imitation_loss(self, encoded: Encoded, chunk: Tensor) -> Tensor:
         """LeRobot's training loss (B,) on chunks (B, K, A) of as many actions as are executed, normalised.
 
-        `engine.preflight` refuses off-policy algorithms for a family without it.
+        `run.preflight` refuses off-policy algorithms for a family without it.
         """
         raise NotImplementedError
 

@@ -82,12 +82,15 @@ _known_sizes: dict[tuple[str, bool, bool], Sizes] = {}  # of the dry runs of thi
 def resolve_device(name: str, field: str = "policy.device") -> torch.device:
     """The device of this name; ``auto`` is CUDA when there is one. The error names `field`."""
     available = torch.cuda.is_available()
-    automatic = "cuda" if available else "cpu"
-    device = torch.device(automatic if name == "auto" else name)
-    if device.type == "cuda" and not available:
+    if name == "auto":
+        return torch.device("cuda" if available else "cpu")
+    device = torch.device(name)
+    if device.type != "cuda":
+        return device
+    if not available:
         raise InputError(field, name, "no CUDA device here; use cpu or auto")
     count = torch.cuda.device_count()
-    if device.type == "cuda" and (device.index or 0) >= count:
+    if (device.index or 0) >= count:
         raise InputError(field, name, f"there are {count} such devices here, numbered from 0")
     return device
 
@@ -120,9 +123,11 @@ def policy_sizes(config: PolicyConfig, *, fine_tuned: bool = False, learns: bool
         InputError: see `open_checkpoint` and `load_adapter`.
     """
     text = repr(config)
-    for key in ((text, fine_tuned, learns), (text, fine_tuned, True)):  # a policy that can learn can act
-        if key in _known_sizes:
-            return _known_sizes[key]
+    known = _known_sizes.get((text, fine_tuned, learns))
+    if known is None:  # a policy that can learn can act
+        known = _known_sizes.get((text, fine_tuned, True))
+    if known is not None:
+        return known
     load = load_adapter if learns else load_acting
     precision = precision_on(resolve_device(config.device), config.precision)
     on_cpu = replace(config, device="cpu", precision=precision)
@@ -165,7 +170,8 @@ def load_adapter(
     sampler = sampler_config(config, checkpoint.config.type)
     if isinstance(sampler, ChunkNoiseConfig):
         return _stock_adapter(checkpoint, config, sampler, dry_run, fine_tuned)
-    model_class = imported(POLICIES[checkpoint.config.type][0])
+    model_class = _model_class(checkpoint)
+    assert model_class is not None
     policy, processing = _load_parts(checkpoint, config, model_class, dry_run, fine_tuned)
     with refusing(checkpoint.source, "it cannot act here"):
         model = model_class(policy)
@@ -191,18 +197,30 @@ def _stock_adapter(
     fine_tuned: bool,
 ) -> StockAdapter:
     """A policy of any type, which has acted once; with a `sampler` one that explores and learns."""
-    known = POLICIES.get(checkpoint.config.type)
-    model_class = None if known is None else imported(known[0])
+    model_class = _model_class(checkpoint)
     policy, processing = _load_parts(checkpoint, config, model_class, dry_run, fine_tuned)
-    adapter = StockAdapter(policy, processing, precision_on(processing.device, config.precision), sampler)
+    precision = precision_on(processing.device, config.precision)
+    adapter = StockAdapter(policy, processing, precision, sampler)
     with refusing(checkpoint.source, "it cannot act here"):
         if sampler is None:
             adapter.decide(adapter.example_requests(), 0)
         else:
-            backbone = None if model_class is None else model_class.backbone
+            backbone = None
+            if model_class is not None:
+                backbone = model_class.backbone
             tune(policy, config.tuning, backbone)
             adapter.self_check()
     return adapter
+
+
+def _model_class(checkpoint: Checkpoint) -> type[Model] | None:
+    """The model of a policy type that has a likelihood; None for any other type."""
+    policy_type = checkpoint.config.type
+    if policy_type not in POLICIES:
+        return None
+    path, _ = POLICIES[policy_type]
+    model_class: type[Model] = imported(path)
+    return model_class
 
 
 def load_network(config: PolicyConfig) -> tuple[Any, Processing]:
@@ -232,8 +250,8 @@ def open_checkpoint(config: PolicyConfig) -> Checkpoint:
     discover(config.discover_packages_path, "policy")
     kind = read_json(folder / untrusted.CONFIG, source).get("type")
     if kind is None:
-        known = ", ".join(sorted(PreTrainedConfig.get_known_choices()))
-        hint = f'{untrusted.CONFIG} of {config.path} names no type; add "type": one of {known}'
+        types = ", ".join(sorted(PreTrainedConfig.get_known_choices()))
+        hint = f'{untrusted.CONFIG} of {config.path} names no type; add "type": one of {types}'
         raise InputError("policy.type", None, hint)
     register_policies(str(kind))
     check_registered(kind, "policy.type", f"{config.path} is of this type: ")
@@ -266,12 +284,13 @@ def _load_parts(
             processing = load_processors(policy_config, folder, config.rename_map)
         with refusing(source, "its network cannot be built as its config.json says"), untrusted.Unfilled():
             policy = _build_network(policy_config)
+    unread: Sequence[str] = ()
     if model_class is not None:
+        unread = model_class.unread
         # LeRobot builds SmolVLA's backbone and expert in the backbone's bfloat16, in which small steps of a
         # gradient are lost.
         policy = policy.float()
     base = weights_folder(folder, source)
-    unread = () if model_class is None else model_class.unread
     load_weights(policy, unread, base / untrusted.WEIGHTS, source, read=not dry_run)
     if base != folder:
         with refusing(source, "its adapter did not load"), untrusted.guarded("policy"):
@@ -281,7 +300,8 @@ def _load_parts(
     if processing.device.type == "cuda" and precision_on(processing.device, config.precision) == "fp32":
         # torch convolves with 10 bits of mantissa there. For batches of different sizes cuDNN chooses other
         # algorithms; what they round differently is divided by the std of the noise in every log-prob.
-        torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = False
+        torch.backends.cudnn.allow_tf32 = False
+        torch.backends.cuda.matmul.allow_tf32 = False
     return policy, processing
 
 
@@ -311,16 +331,18 @@ def load_weights(
     stored = _renamed(stored, policy)
     expected = policy.state_dict()
     # Nor is a tensor missing that a policy holds under several names: savers keep one of them.
-    held = {expected[name].data_ptr() for name in stored.keys() & expected.keys()}
-    absent = expected.keys() - stored.keys() - set(unread)
+    both = stored.keys() & expected.keys()
+    held = {expected[name].data_ptr() for name in both}
+    absent = expected.keys() - both - set(unread)
     problems = {
         "missing": [name for name in absent if expected[name].data_ptr() not in held],
-        "unexpected": list(stored.keys() - expected.keys()),
-        "of another shape": [n for n, t in stored.items() if n in expected and t.shape != expected[n].shape],
+        "unexpected": list(stored.keys() - both),
+        "of another shape": [name for name in both if stored[name].shape != expected[name].shape],
     }
     if any(problems.values()):
-        counts = ", ".join(f"{len(names)} {what} {sorted(names)[:3]}" for what, names in problems.items())
-        hint = f"the weights did not load: tensors {counts}; config.json and {file.name} disagree"
+        counts = [f"{len(names)} {what} {sorted(names)[:3]}" for what, names in problems.items()]
+        listed = ", ".join(counts)
+        hint = f"the weights did not load: tensors {listed}; config.json and {file.name} disagree"
         raise InputError(source.field, source.value, hint)
     if read:
         policy.load_state_dict(stored, strict=False)
@@ -336,12 +358,15 @@ def _renamed(stored: dict[str, Tensor], policy: Any) -> dict[str, Tensor]:
     if rename is None:
         return stored
     renamed = _prefixed(rename(stored, policy.config))
-    # What a file has under its own name goes before what is taken for it.
-    return renamed | {name: t for name, t in _prefixed(stored).items() if name in renamed}
+    for name, tensor in _prefixed(stored).items():
+        if name in renamed:  # what a file has under its own name goes before what is taken for it
+            renamed[name] = tensor
+    return renamed
 
 
 def _prefixed(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    return {k if k.startswith("model.") else f"model.{k}": tensor for k, tensor in tensors.items()}
+    prefix = "model."
+    return {prefix + name.removeprefix(prefix): tensor for name, tensor in tensors.items()}
 
 
 def weights_folder(folder: Path, source: FileSource) -> Path:
@@ -380,7 +405,8 @@ def _merged(policy: Any, folder: Path, source: FileSource) -> Any:
 def _load_ours(adapter: LeRobotAdapter, checkpoint: Checkpoint) -> None:
     """Loads critic and family, where the checkpoint has them."""
     folder, source, _ = checkpoint
-    for file, module in ((untrusted.FAMILY, adapter.family), (untrusted.VALUE_HEAD, adapter.value_head)):
+    for file, module in adapter.own_files.items():
         if (folder / file).is_file():
             with refusing(source, f"{file}: not of this policy; remove it to start anew"):
-                module.load_state_dict(dict(read_tensors(folder / file, source)))
+                stored = dict(read_tensors(folder / file, source))
+                module.load_state_dict(stored)
