@@ -31,7 +31,13 @@ TEXT_FIELDS = ("tokenizer_", "text_encoder_", "text_tokenizer_", "vlm_", "qwen_"
 """Beginnings of the fields of LeRobot's policy configs that only policies with an instruction have."""
 OUTSIDE_SHARE, OUTSIDE_SLACK = 0.05, 0.01
 """Share of a dataset's actions to be warned of that lie outside the bounds by this part of their width."""
-RESIZERS = ("resize_imgs_with_padding", "image_resolution", "resize_shape")
+RESIZERS = (
+    "resize_imgs_with_padding",
+    "image_resolution",
+    "resize_shape",
+    "image_resize_shape",
+    "resize_images_to",
+)
 """Fields of LeRobot's policy configs: where one is set, the policy resizes its images by itself."""
 
 

@@ -21,6 +21,7 @@ from accerl_lerobot.algorithms import chunk_critic, off_policy
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Request, stack_observations
 from accerl_lerobot.policies.config import ChunkNoiseConfig, PolicyConfig, TuningConfig, override
+from accerl_lerobot.policies.features import policy_features
 from accerl_lerobot.policies.loading import load_acting, load_adapter
 from accerl_lerobot.policies.stock import StockAdapter
 from accerl_lerobot.seeds import noise_seed
@@ -222,6 +223,16 @@ def test_steps_and_rows_of_a_run_are_set_by_the_names_of_lerobot_s_config():
     assert (config.num_inference_steps, config.num_integration_steps, config.n_action_steps) == (4, 4, 5)
     with pytest.raises(InputError, match="policy.n_action_steps=6: multi_task_dit: at most 5 rows"):
         override(config, PolicyConfig(n_action_steps=6))
+
+
+def test_images_of_any_size_fit_a_policy_that_resizes_them():
+    from lerobot.policies.factory import make_policy_config
+
+    fields: dict[str, Any] = {"device": "cpu", "image_crop_shape": None}
+    assert not policy_features(make_policy_config("multi_task_dit", **fields)).any_size
+    assert policy_features(
+        make_policy_config("multi_task_dit", **fields, image_resize_shape=(64, 64))
+    ).any_size
 
 
 def test_exploring_is_the_chunk_and_noise_of_the_request(written: Any):
