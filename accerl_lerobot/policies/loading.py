@@ -27,7 +27,6 @@ from accerl_lerobot.config.machine import computes_bf16
 from accerl_lerobot.config.parsing import discover, imported
 from accerl_lerobot.errors import InputError, expanded
 from accerl_lerobot.experience import stack_observations
-from accerl_lerobot.policies import untrusted
 from accerl_lerobot.policies.adapter import LeRobotAdapter, ValueHead
 from accerl_lerobot.policies.config import (
     POLICIES,
@@ -51,7 +50,17 @@ from accerl_lerobot.policies.processing import (
 )
 from accerl_lerobot.policies.saving import tune
 from accerl_lerobot.policies.stock import StockAdapter
-from accerl_lerobot.policies.untrusted import ADAPTER, ADAPTER_CONFIG, fetched_checkpoint, refusing
+from accerl_lerobot.policies.untrusted import (
+    ADAPTER,
+    ADAPTER_CONFIG,
+    CONFIG,
+    WEIGHTS,
+    Unfilled,
+    fetched_checkpoint,
+    guarded,
+    is_adapter,
+    refusing,
+)
 
 ACTS_MOST = 10**9  # parameters of a policy that acts in a dry run; π0's four billion would take minutes
 
@@ -248,10 +257,10 @@ def open_checkpoint(config: PolicyConfig) -> Checkpoint:
     folder = fetched_checkpoint(config.path, config.revision, "policy.path")
     source = FileSource("policy.path", config.path)
     discover(config.discover_packages_path, "policy")
-    kind = read_json(folder / untrusted.CONFIG, source).get("type")
+    kind = read_json(folder / CONFIG, source).get("type")
     if kind is None:
         types = ", ".join(sorted(PreTrainedConfig.get_known_choices()))
-        hint = f'{untrusted.CONFIG} of {config.path} names no type; add "type": one of {types}'
+        hint = f'{CONFIG} of {config.path} names no type; add "type": one of {types}'
         raise InputError("policy.type", None, hint)
     register_policies(str(kind))
     check_registered(kind, "policy.type", f"{config.path} is of this type: ")
@@ -277,12 +286,12 @@ def _load_parts(
     folder, source, policy_config = checkpoint
     check_statistics(policy_config, folder, source, replaced=fine_tuned)
     with contextlib.ExitStack() as guards:
-        guards.enter_context(untrusted.guarded("policy", config.trust_remote_code))
+        guards.enter_context(guarded("policy", config.trust_remote_code))
         if model_class is not None:
             guards.enter_context(model_class.loading())
         with refusing(source, f"its LeRobot processors did not load; {PROCESSORS_HINT}"):
             processing = load_processors(policy_config, folder, config.rename_map)
-        with refusing(source, "its network cannot be built as its config.json says"), untrusted.Unfilled():
+        with refusing(source, "its network cannot be built as its config.json says"), Unfilled():
             policy = _build_network(policy_config)
     unread: Sequence[str] = ()
     if model_class is not None:
@@ -291,9 +300,9 @@ def _load_parts(
         # gradient are lost.
         policy = policy.float()
     base = weights_folder(folder, source)
-    load_weights(policy, unread, base / untrusted.WEIGHTS, source, read=not dry_run)
+    load_weights(policy, unread, base / WEIGHTS, source, read=not dry_run)
     if base != folder:
-        with refusing(source, "its adapter did not load"), untrusted.guarded("policy"):
+        with refusing(source, "its adapter did not load"), guarded("policy"):
             policy = _merged(policy, folder, source)
     keep_tokenizer_names(policy_config, folder)
     policy.to(processing.device).eval()
@@ -371,7 +380,7 @@ def _prefixed(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
 
 def weights_folder(folder: Path, source: FileSource) -> Path:
     """The folder with all of a policy's weights: `folder` itself, or, of an adapter, the policy it is for."""
-    if not untrusted.is_adapter(folder):
+    if not is_adapter(folder):
         return folder
     stored = read_json(folder / ADAPTER_CONFIG, source)
     base = stored.get("base_model_name_or_path")
