@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from accerl_lerobot.checkpoint.snapshot import State
 from accerl_lerobot.config.ranges import Section
 from accerl_lerobot.errors import for_viewing
 from accerl_lerobot.fault_points import fault_point
@@ -89,13 +90,13 @@ class MetricsLog:
             with for_viewing("record in Weights & Biases"):
                 self._wandb.log(named | {"update": update})
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> State:
         """All that `restore` needs: how far the file goes, and the seconds."""
         self._file.flush()
         os.fsync(self._file.fileno())
         return {"bytes": self._path.stat().st_size, "wall_s": self.wall_s}
 
-    def restore(self, state: dict[str, Any], update: int) -> None:
+    def restore(self, state: State, update: int) -> None:
         """Resumes from `state`, after `update` updates; records that were written later are removed."""
         cut_back(self._path, state["bytes"])
         # TensorBoard forgets what older files have of this step and later ones.

@@ -27,6 +27,7 @@ from torch import Tensor, nn
 from accerl_lerobot.algorithms import ChunkCriticConfig
 from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.algorithms.off_policy import OffPolicyUpdate, drawn, mean
+from accerl_lerobot.checkpoint.snapshot import State
 from accerl_lerobot.checkpoint.tensors import copied, optimizer_state, restore_optimizer
 from accerl_lerobot.experience import Metrics, Segment
 from accerl_lerobot.policies.adapter import LeRobotAdapter
@@ -69,10 +70,12 @@ class Critic(nn.Module):
 
     def __init__(self, teacher: Teacher) -> None:
         super().__init__()
-        self.network = Ensemble(len(teacher.mean) + math.prod(teacher.chunk), 1, MEMBERS)
+        inputs = len(teacher.mean) + math.prod(teacher.chunk)
+        self.network = Ensemble(inputs, 1, MEMBERS)
 
     def forward(self, state: Tensor, chunk: Tensor) -> Tensor:
-        return self.network(torch.cat([state, chunk.flatten(1)], -1))[..., 0].float()
+        inputs = torch.cat([state, chunk.flatten(1)], -1)
+        return self.network(inputs)[..., 0].float()
 
 
 class ChunkCriticUpdate(OffPolicyUpdate):
@@ -129,7 +132,8 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         t = len(segment)
         seen = {name: rows[:-1] for name, rows in segment.observations.items()}
         states = self.teacher.states(seen, [segment.task] * t, segment.elapsed)
-        return {"state": states.cpu().numpy(), "elapsed": segment.elapsed, "last": np.arange(t) == t - 1}
+        last = np.arange(t) == t - 1
+        return {"state": states.cpu().numpy(), "elapsed": segment.elapsed, "last": last}
 
     def learn_states_in(self, worker: Any, timeout_s: float) -> None:
         """Have a `WorldModelWorker`, of which `worker` is the handle, make the steps of the world model."""
@@ -239,19 +243,18 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         losses["perception_loss"] = PERCEPTION * error.square().mean()
         return losses
 
-    def state(self) -> dict[str, Any]:
-        state_learner = None
+    def state(self) -> State:
+        state = super().state()
+        state["networks"] = {name: copied(module) for name, module in self.networks.items()}
+        state["optimizers"] = {name: optimizer_state(each) for name, each in self.optimizers.items()}
+        state["outcomes"] = {name: list(last) for name, last in self._outcomes.items()}
+        state["unpublished"] = (self._unpublished, self._unsubmitted)
+        state["state_learner"] = None
         if self.state_learner is not None:
-            state_learner = self.state_learner.state()
-        return super().state() | {
-            "networks": {name: copied(module) for name, module in self.networks.items()},
-            "optimizers": {name: optimizer_state(optimizer) for name, optimizer in self.optimizers.items()},
-            "outcomes": {name: list(last) for name, last in self._outcomes.items()},
-            "unpublished": (self._unpublished, self._unsubmitted),
-            "state_learner": state_learner,
-        }
+            state["state_learner"] = self.state_learner.state()
+        return state
 
-    def restore(self, state: dict[str, Any]) -> None:
+    def restore(self, state: State) -> None:
         super().restore(state)
         for name, module in self.networks.items():
             module.load_state_dict(state["networks"][name])
@@ -281,7 +284,9 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         with torch.no_grad():
             self.teacher.low.copy_(low - margin)
             self.teacher.high.copy_(high + margin)
-        known = won if len(won) >= BATCH else np.arange(len(self.memory))
+        known = won
+        if len(won) < BATCH:
+            known = np.arange(len(self.memory))
         for _ in range(FIRST_STEPS):
             loss = self._gap(drawn(known, BATCH)).square().mean()
             self._descend("teacher", loss)
@@ -352,7 +357,8 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         optimizer = self.optimizers[name]
         parameters = optimizer.param_groups[0]["params"]
         # Of these alone: the teacher's loss runs through the critic, whose gradients nobody needs then.
-        for parameter, gradient in zip(parameters, torch.autograd.grad(loss, parameters), strict=True):
+        gradients = torch.autograd.grad(loss, parameters)
+        for parameter, gradient in zip(parameters, gradients, strict=True):
             parameter.grad = gradient
         norm = torch.nn.utils.clip_grad_norm_(parameters, clip)
         self.apply(optimizer, f"a step of the {name}", float(loss.detach()), float(norm))

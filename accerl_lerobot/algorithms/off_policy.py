@@ -21,6 +21,7 @@ from accerl_lerobot.algorithms.advantages import STD_EPSILON
 from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.algorithms.objective import lag_metrics
 from accerl_lerobot.algorithms.ratio_update import BaseUpdate
+from accerl_lerobot.checkpoint.snapshot import State
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE, Metrics, Observations, Segment
 from accerl_lerobot.policies.adapter import LeRobotAdapter
@@ -114,11 +115,11 @@ class Memory:
         tasks = self._columns["task"][rows]
         return seen, [self.tasks[task] for task in tasks]
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> State:
         columns = {name: self[name].copy() for name in self._columns}
         return {"total": self.total, "tasks": list(self.tasks), "columns": columns}
 
-    def restore(self, state: dict[str, Any]) -> None:
+    def restore(self, state: State) -> None:
         self.total = state["total"]
         self.tasks = list(state["tasks"])
         self._columns = dict(state["columns"])
@@ -187,10 +188,13 @@ class OffPolicyUpdate(BaseUpdate):
         """
         return {"imitation_loss": imitation.mean()}
 
-    def state(self) -> dict[str, Any]:
-        return super().state() | {"pending_steps": dict(self._pending_steps), "memory": self.memory.state()}
+    def state(self) -> State:
+        state = super().state()
+        state["pending_steps"] = dict(self._pending_steps)
+        state["memory"] = self.memory.state()
+        return state
 
-    def restore(self, state: dict[str, Any]) -> None:
+    def restore(self, state: State) -> None:
         super().restore(state)
         self._pending_steps = dict(state["pending_steps"])
         self.memory.restore(state["memory"])
@@ -263,12 +267,13 @@ class AWRUpdate(OffPolicyUpdate):
         self._variance = square
         std = max(math.sqrt(self._variance), STD_EPSILON)
         weight = weights(error.detach() / std, self.algorithm.beta)
-        return {"imitation_loss": (weight * imitation).mean(), "value_loss": error.square().mean()}
+        weighted = weight * imitation
+        return {"imitation_loss": weighted.mean(), "value_loss": error.square().mean()}
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> State:
         return super().state() | {"variance": self._variance}
 
-    def restore(self, state: dict[str, Any]) -> None:
+    def restore(self, state: State) -> None:
         super().restore(state)
         self._variance = state["variance"]
 

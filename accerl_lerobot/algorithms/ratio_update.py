@@ -28,6 +28,7 @@ from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.algorithms.objective import lag_metrics, present, sample_metrics
 from accerl_lerobot.algorithms.probe import CRITIC_PREFIX, Probe
 from accerl_lerobot.algorithms.ranks import Part
+from accerl_lerobot.checkpoint.snapshot import State
 from accerl_lerobot.checkpoint.tensors import in_parts, optimizer_state, restore_optimizer
 from accerl_lerobot.config.parsing import imported
 from accerl_lerobot.errors import MAX_NONFINITE, NonFiniteError
@@ -66,7 +67,7 @@ class BaseUpdate(ABC):
     def step(self, segments: Sequence[Segment]) -> Metrics:
         """Learns from new segments and returns metrics; the version rises by one."""
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> State:
         """A copy of all that `restore` needs, the policy's weights apart; see `snapshot`."""
         return {
             "version": self.version,
@@ -76,7 +77,7 @@ class BaseUpdate(ABC):
             "optimizer": optimizer_state(self.optimizer),
         }
 
-    def restore(self, state: dict[str, Any]) -> None:
+    def restore(self, state: State) -> None:
         """Resume from `state`; the adapter has its weights already."""
         self.version = state["version"]
         self.skipped = state["skipped"]
@@ -143,10 +144,13 @@ class RatioUpdate(BaseUpdate):
         self._probe.renew(self.version)
         return metrics
 
-    def state(self) -> dict[str, Any]:
-        return super().state() | {"moments": self._moments.clone(), "probe": self._probe.state()}
+    def state(self) -> State:
+        state = super().state()
+        state["moments"] = self._moments.clone()
+        state["probe"] = self._probe.state()
+        return state
 
-    def restore(self, state: dict[str, Any]) -> None:
+    def restore(self, state: State) -> None:
         super().restore(state)
         self._moments = state["moments"]
         self._probe.restore(state["probe"])

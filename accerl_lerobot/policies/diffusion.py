@@ -204,7 +204,8 @@ class DiffusionFamily(Family):
     def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
         """Samples; without exploration a DDPM policy still draws step noise, as LeRobot's does."""
         device = encoded.features.device
-        x, eps = self.noise(requests, self.size, (len(self.schedule), *self.size), device=device)
+        steps = len(self.schedule)
+        x, eps = self.noise(requests, self.size, (steps, *self.size), device=device)
         return self.sample(encoded.context, x, eps, self.exploring(requests, device))
 
     def sample(self, network: Network, x: Tensor, eps: Tensor, explore: Tensor) -> Action:

@@ -130,8 +130,11 @@ class Family(nn.Module, ABC):
     def noise(requests: Sequence[Request], *sizes: tuple[int, ...], device: torch.device) -> list[Tensor]:
         """Standard normal tensors, each (B, *size), row i from request i's own seed, whatever its batch."""
         generators = [np.random.default_rng(request.noise_seed) for request in requests]
-        draws = [[rng.standard_normal(size, dtype=np.float32) for size in sizes] for rng in generators]
-        return [torch.from_numpy(np.stack(column)).to(device) for column in zip(*draws, strict=True)]
+        tensors: list[Tensor] = []
+        for size in sizes:
+            draws = np.stack([rng.standard_normal(size, dtype=np.float32) for rng in generators])
+            tensors.append(torch.from_numpy(draws).to(device))
+        return tensors
 
     @staticmethod
     def exploring(requests: Sequence[Request], device: torch.device) -> Tensor:

@@ -53,10 +53,11 @@ class FlowShape:
 
     def integrate(self, velocity: Velocity, x: Tensor) -> Tensor:
         """LeRobot's Euler loop from noise (B, K, D) to actions (B, K, D), padding included."""
-        n = self.num_steps
-        for k in range(n):
-            t = 1.0 + k * (-1.0 / n)  # in double precision, as LeRobot counts it
-            x = x + (-1.0 / n) * velocity(x, x.new_full((len(x),), t))
+        step = -1.0 / self.num_steps
+        for k in range(self.num_steps):
+            t = 1.0 + k * step  # in double precision, as LeRobot counts it
+            times = x.new_full((len(x),), t)
+            x = x + step * velocity(x, times)
         return x
 
 
@@ -132,5 +133,6 @@ class FlowFamily(Family):
 
     def _rows(self, x: Tensor, mean: Tensor) -> Tensor:
         """Log-density (B, L) of the executed entries of x (B, K, D)."""
-        part = self.shape.executed_part
-        return normal_log_prob(part(x), part(mean), self._std(x)).sum(-1)
+        executed = self.shape.executed_part(x)
+        executed_mean = self.shape.executed_part(mean)
+        return normal_log_prob(executed, executed_mean, self._std(x)).sum(-1)

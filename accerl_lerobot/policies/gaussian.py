@@ -58,9 +58,10 @@ class StdHead(nn.Module):
         low, high = sampler.bounds
         self.low = math.log(low)
         self.high = math.log(high)
-        start = (math.log(sampler.std) - self.low) / (self.high - self.low)
+        share = (math.log(sampler.std) - self.low) / (self.high - self.low)
+        start = math.log(share / (1 - share))
         nn.init.zeros_(self.out.weight)
-        nn.init.constant_(self.out.bias, math.log(start / (1 - start)))
+        nn.init.constant_(self.out.bias, start)
 
     def forward(self, rows: Tensor) -> Tensor:
         """(B, K, W) to (B, K, A): between the bounds by a sigmoid between their logarithms."""

@@ -132,11 +132,9 @@ def policy_sizes(config: PolicyConfig, *, fine_tuned: bool = False, learns: bool
         InputError: see `open_checkpoint` and `load_adapter`.
     """
     text = repr(config)
-    known = _known_sizes.get((text, fine_tuned, learns))
-    if known is None:  # a policy that can learn can act
-        known = _known_sizes.get((text, fine_tuned, True))
-    if known is not None:
-        return known
+    for key in ((text, fine_tuned, learns), (text, fine_tuned, True)):  # a policy that can learn can act
+        if key in _known_sizes:
+            return _known_sizes[key]
     load = load_adapter if learns else load_acting
     precision = precision_on(resolve_device(config.device), config.precision)
     on_cpu = replace(config, device="cpu", precision=precision)
@@ -349,7 +347,9 @@ def load_weights(
         "of another shape": [name for name in both if stored[name].shape != expected[name].shape],
     }
     if any(problems.values()):
-        counts = [f"{len(names)} {what} {sorted(names)[:3]}" for what, names in problems.items()]
+        counts: list[str] = []
+        for what, names in problems.items():
+            counts.append(f"{len(names)} {what} {sorted(names)[:3]}")
         listed = ", ".join(counts)
         hint = f"the weights did not load: tensors {listed}; config.json and {file.name} disagree"
         raise InputError(source.field, source.value, hint)

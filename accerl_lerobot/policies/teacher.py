@@ -49,7 +49,8 @@ class Ensemble(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, inputs) to (M, B, outputs)."""
-        x = x.expand(len(self.weights[0]), -1, -1)
+        members = len(self.weights[0])
+        x = x.expand(members, -1, -1)
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
             x = torch.baddbmm(bias, x, weight)
             x = functional.layer_norm(x, x.shape[-1:])
@@ -106,11 +107,14 @@ class Teacher(nn.Module):
         middle = (self.low + self.high) / 2
         half = (self.high - self.low) / 2
         raw = self.network(self.scaled(state))[0]
-        return middle + half * torch.tanh(raw.unflatten(-1, self.chunk))
+        share = torch.tanh(raw.unflatten(-1, self.chunk))
+        return middle + half * share
 
     def acts(self, request: Request) -> bool:
         """True if this decision is the teacher's."""
-        return request.explore and bool(self.ready) and self.plays(episode_of(request.noise_seed))
+        if not request.explore or not self.ready:
+            return False
+        return self.plays(episode_of(request.noise_seed))
 
     def plays(self, episode: int) -> bool:
         """True if, once ready, it makes all decisions of this exploring episode; see `seeds.episode_of`."""
@@ -129,7 +133,8 @@ class Teacher(nn.Module):
         observations, tasks = stack_observations(asked)
         elapsed = np.array([request.elapsed for request in asked], np.float32)
         own = self(self.states(observations, tasks, elapsed)).cpu()
-        own = own + self.noise * torch.from_numpy(noise.astype(np.float32))
+        noise = noise.astype(np.float32)
+        own = own + self.noise * torch.from_numpy(noise)
         chunk = chunk.clone()
         chunk[rows] = own.to(chunk)
         return chunk

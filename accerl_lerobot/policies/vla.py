@@ -289,7 +289,8 @@ class Pi0Fast(TokenModel):
             asked = positions[first:]
             seen = positions <= asked[:, None]
             whole = pad[:, None].expand(-1, len(asked), -1)
-            attends = torch.cat([whole, seen.expand(len(pad), -1, -1)], 2)
+            generated = seen.expand(len(pad), -1, -1)
+            attends = torch.cat([whole, generated], 2)
             embedded = network.embed_language_tokens(tokens)
             mask = prepare_attention_masks_4d(attends, dtype=embedded.dtype)
             places = pad.sum(1, keepdim=True) + asked

@@ -28,7 +28,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from accerl_lerobot.checkpoint.snapshot import kind
+from accerl_lerobot.checkpoint.snapshot import State, kind
 from accerl_lerobot.config.ranges import Range, Section, Steps
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import REAL, Metrics, Segment
@@ -277,7 +277,7 @@ class Replay:
         counts["available_decisions"] = self.available_decisions
         return {name: float(count) for name, count in counts.items()}
 
-    def state(self, version: int | None = None) -> dict[str, Any]:
+    def state(self, version: int | None = None) -> State:
         """All that `restore` needs; see `snapshot`. Shares the segments, which nobody changes.
 
         Batches drawn for updates after `version` count as not drawn. None: the trainer has learned from all.
@@ -308,7 +308,7 @@ class Replay:
             "journal": journal,
         }
 
-    def restore(self, state: dict[str, Any]) -> None:
+    def restore(self, state: State) -> None:
         """Resumes from `state`, before the first insert."""
         self.counters = state["counters"]
         self.ended = state["ended"]
