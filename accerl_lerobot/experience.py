@@ -56,7 +56,7 @@ class Request:
 @kind
 @dataclass(frozen=True, kw_only=True)
 class Decision:
-    """One policy call, as the inference service answers it."""
+    """The result of one policy call."""
 
     chunk: np.ndarray  # float32 (K, A), in the environment's action units (un-normalised); not clipped
     latent: dict[str, np.ndarray]  # what the policy sampled; `log_prob` is its density in normalised units

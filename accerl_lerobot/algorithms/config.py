@@ -139,7 +139,7 @@ class TrainerConfig(Section, section="trainer"):
     """
 
     updates: Steps = 1000
-    """Optimiser steps of the run; the trainer is the run's clock. 0: the warm start, and what it is worth."""
+    """Updates of the run, by which its progress is measured. 0: the run evaluates its warm start alone."""
     batch_decisions: Annotated[int, Range("[1, 1000000]")] = 128
     """Decisions of one update; whole segments are drawn until there are at least as many."""
     micro_batch: Annotated[int, Range("[1, 1000000]")] = 1024
@@ -160,7 +160,7 @@ class TrainerConfig(Section, section="trainer"):
     advantage_memory: Annotated[float, Range("[0, 1)")] = 0.0
     """Advantages are normalised by the moments of this batch and of those before it, of which each earlier
     one is weighted by this factor once more; 0: this batch alone. A small batch may hold nothing but
-    failures; its advantages are then the critic's noise, which their own deviation would make loud."""
+    failures. Its advantages are then the critic's noise, and their own deviation would amplify it."""
     grad_clip: Positive = 1.0
     """Largest gradient norm of the policy, and of the critic head, each by itself."""
     betas: tuple[Annotated[float, Range("[0, 1)")], Annotated[float, Range("[0, 1)")]] = (0.9, 0.95)

@@ -63,9 +63,9 @@ class ReplayConfig(Section, section="replay"):
     off-policy algorithm keeps in a memory of its own may be older.
     """
     max_unlearned_decisions: Annotated[int, Range("[1, 100000000]")] = 512
-    """Decisions to learn from, each counted as often as it will be, that the rollouts may be ahead of the
-    trainer; from one batch to `capacity`. Where environments end their segments together, room for all of
-    them keeps both sides busy. It costs lag."""
+    """Rollouts wait while at least so many stored decisions have draws left; from one batch to `capacity`.
+    Where environments end their segments together, room for all of them keeps both sides busy. It costs
+    lag."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
