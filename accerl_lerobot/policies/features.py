@@ -177,8 +177,7 @@ def check_features(
         if name in offered.unusable:
             raise InputError(field, value, f"no {name} in the {offerer}: {offered.unusable[name]}")
         if name not in shapes:
-            alike = [key for key, other in shapes.items() if len(other) == len(shape)]
-            same = [key for key in alike if key != ACTION]
+            same = [key for key, other in shapes.items() if len(other) == len(shape) and key != ACTION]
             why = f"no {name} in the {offerer}, which offers {', '.join(same) or 'none'}"
             if image:
                 why += "; choose env.camera (env.images of gym), or map names with policy.rename_map" + hint
