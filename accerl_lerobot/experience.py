@@ -25,6 +25,12 @@ are raw: scaling and normalisation belong to the policy's own LeRobot processors
 (LeRobot's ``n_obs_steps`` above 1), arrays hold so many env steps, oldest first, in a dimension in front.
 """
 
+Observations = dict[str, np.ndarray]
+"""A batch of observations, arrays (B, ...) by the names of an `Observation`; the instructions are apart."""
+
+Metrics = dict[str, float]
+"""Numbers for the log, by name; docs/metrics.md explains them."""
+
 TASK = "task"
 ENVIRONMENT_STATE = "observation.environment_state"
 """LeRobot's name for what a simulator says of itself. Ours end it with the share of the time limit gone."""
@@ -50,7 +56,7 @@ class Request:
 @kind
 @dataclass(frozen=True, kw_only=True)
 class Decision:
-    """One policy call, as the inference service answers it."""
+    """The result of one policy call."""
 
     chunk: np.ndarray  # float32 (K, A), in the environment's action units (un-normalised); not clipped
     latent: dict[str, np.ndarray]  # what the policy sampled; `log_prob` is its density in normalised units
@@ -104,7 +110,7 @@ class Segment:
         return ((ends - self.steps) / self.time_limit).astype(np.float32)
 
 
-def stack_observations(requests: Sequence[Request]) -> tuple[dict[str, np.ndarray], list[str]]:
+def stack_observations(requests: Sequence[Request]) -> tuple[Observations, list[str]]:
     """Batches raw observations: each array (B, ...), and the B task texts."""
     keys = [k for k in requests[0].observation if k != TASK]
     arrays = {k: np.stack([r.observation[k] for r in requests]) for k in keys}
@@ -113,6 +119,9 @@ def stack_observations(requests: Sequence[Request]) -> tuple[dict[str, np.ndarra
 
 def task_codes(tasks: Sequence[str]) -> np.ndarray:
     """float32 (B, 16): ±1 for each of 16 bits of an instruction's hash, known without a list of all tasks."""
-    hashes = b"".join(hashlib.sha256(task.encode()).digest()[:TASK_BITS] for task in tasks)
-    bits = np.frombuffer(hashes, np.uint8).reshape(len(tasks), TASK_BITS) & 1
-    return np.where(bits, 1.0, -1.0).astype(np.float32)
+    codes = np.empty((len(tasks), TASK_BITS), np.float32)
+    for code, task in zip(codes, tasks, strict=True):
+        digest = hashlib.sha256(task.encode()).digest()
+        bits = np.frombuffer(digest, np.uint8, TASK_BITS) & 1
+        code[:] = np.where(bits, 1.0, -1.0)
+    return codes

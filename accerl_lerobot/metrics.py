@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from accerl_lerobot.checkpoint.snapshot import State
 from accerl_lerobot.config.ranges import Section
 from accerl_lerobot.errors import for_viewing
 from accerl_lerobot.fault_points import fault_point
@@ -49,7 +50,7 @@ class MetricsLog:
         if wandb.enable:
             import wandb as client
 
-            # A run that is gone on with is the same one there.
+            # A resumed run adds to the wandb run that it began.
             note = directory / ".wandb-id"
             if not note.is_file():
                 note.write_text(secrets.token_hex(8))
@@ -77,22 +78,26 @@ class MetricsLog:
         record = {"kind": kind, "wall_s": round(self.wall_s, 3), "update": update, **finite}
         fault_point("driver.metrics")
         self._file.write(json.dumps(record) + "\n")
-        scalars = {k: float(v) for k, v in finite.items() if isinstance(v, (int, float))}
+        scalars: dict[str, float] = {}
+        for name, value in finite.items():
+            if isinstance(value, (int, float)):
+                scalars[name] = float(value)
         with for_viewing("record in TensorBoard"):
             for name, value in scalars.items():
                 self._board.add_scalar(f"{kind}/{name}", value, update)
         if self._wandb is not None:
+            named = {f"{kind}/{name}": value for name, value in scalars.items()}
             with for_viewing("record in Weights & Biases"):
-                self._wandb.log({f"{kind}/{k}": v for k, v in scalars.items()} | {"update": update})
+                self._wandb.log(named | {"update": update})
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> State:
         """All that `restore` needs: how far the file goes, and the seconds."""
         self._file.flush()
         os.fsync(self._file.fileno())
         return {"bytes": self._path.stat().st_size, "wall_s": self.wall_s}
 
-    def restore(self, state: dict[str, Any], update: int) -> None:
-        """Goes on from what `state` gave, after `update` updates: what was written since is about others."""
+    def restore(self, state: State, update: int) -> None:
+        """Resumes from `state`, after `update` updates; records that were written later are removed."""
         cut_back(self._path, state["bytes"])
         # TensorBoard forgets what older files have of this step and later ones.
         self._board.close()
@@ -119,13 +124,17 @@ def plain(value: Any) -> Any:
     """JSON types: NumPy numbers become Python's, numbers that are not finite become None."""
     if isinstance(value, np.generic):
         value = value.item()
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
     if isinstance(value, dict):
         return {k: plain(v) for k, v in value.items()}
-    return [plain(v) for v in value] if isinstance(value, (list, tuple)) else value
+    if isinstance(value, (list, tuple)):
+        return [plain(v) for v in value]
+    return value
 
 
 def numbered(name: str, count: int) -> list[str]:
-    """Names of so many workers of a kind; of a single one, its kind's."""
-    return [name] if count == 1 else [f"{name} {i}" for i in range(count)]
+    """Names of `count` workers of one kind; a single worker has the name of the kind."""
+    if count == 1:
+        return [name]
+    return [f"{name} {i}" for i in range(count)]

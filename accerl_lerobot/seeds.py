@@ -40,8 +40,10 @@ def _permuted(seeds: range, run_seed: int, index: int) -> int:
     Indices below the prime p have different seeds, as i → a·i + b mod p is a permutation; a and b are drawn
     from a hash of the use and the run's seed, so that the orders of different runs have nothing in common.
     """
-    a, b = np.random.SeedSequence((seeds.start, run_seed)).generate_state(2, np.uint64)
-    return seeds.start + ((1 + int(a) % (_PRIME - 1)) * index + int(b)) % _PRIME
+    drawn = np.random.SeedSequence((seeds.start, run_seed)).generate_state(2, np.uint64)
+    a = 1 + int(drawn[0]) % (_PRIME - 1)
+    b = int(drawn[1])
+    return seeds.start + (a * index + b) % _PRIME
 
 
 def noise_seed(episode_seed: int, decision: int) -> int:
@@ -53,6 +55,10 @@ def episode_of(noise_seed: int) -> int:
     return noise_seed // _DECISIONS_PER_EPISODE
 
 
+def decision_of(noise_seed: int) -> int:
+    return noise_seed % _DECISIONS_PER_EPISODE
+
+
 def eval_seed(run_seed: int, index: int) -> int:
     """Seed of the `index`-th evaluation episode of a task.
 
@@ -61,7 +67,8 @@ def eval_seed(run_seed: int, index: int) -> int:
     """
     if not 0 <= index < _EVALUATIONS_PER_RUN:
         raise ValueError(f"evaluation episode {index}: use 0 to {_EVALUATIONS_PER_RUN - 1}")
-    return EVAL_SEEDS.start + (run_seed * _EVALUATIONS_PER_RUN + index) % len(EVAL_SEEDS)
+    place = run_seed * _EVALUATIONS_PER_RUN + index
+    return EVAL_SEEDS.start + place % len(EVAL_SEEDS)
 
 
 def global_generators() -> dict[str, Any]:
@@ -71,7 +78,9 @@ def global_generators() -> dict[str, Any]:
         import torch
 
         states["torch"] = torch.get_rng_state()
-        states["cuda"] = torch.cuda.get_rng_state_all() if torch.cuda.is_available() else []
+        states["cuda"] = []
+        if torch.cuda.is_available():
+            states["cuda"] = torch.cuda.get_rng_state_all()
     return states
 
 

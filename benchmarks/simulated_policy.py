@@ -21,9 +21,10 @@ from torch import Tensor, nn
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.config.ranges import NonNegative, Range, Section
 from accerl_lerobot.experience import Decision, Request
-from accerl_lerobot.policies.adapter import OBS_STATE, Evaluation, PolicyAdapter
+from accerl_lerobot.policies.adapter import Evaluation, PolicyAdapter
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.family import normal_entropy, normal_log_prob
+from accerl_lerobot.policies.features import STATE
 
 STD = 0.3
 
@@ -61,7 +62,7 @@ class SimulatedAdapter(PolicyAdapter):
         gain = float(self.gain)
         decisions = []
         for request in requests:
-            target = np.asarray(request.observation[OBS_STATE])[: c.action_dim]
+            target = np.asarray(request.observation[STATE])[: c.action_dim]
             noise = np.random.default_rng(request.noise_seed).standard_normal((c.chunk, c.action_dim))
             u = (gain * target + STD * noise * request.explore).astype(np.float32)
             log_prob = -0.5 * np.square(noise).sum(1) - c.action_dim * np.log(STD * np.sqrt(2 * np.pi))
@@ -74,7 +75,7 @@ class SimulatedAdapter(PolicyAdapter):
         self, observations: dict[str, np.ndarray], tasks: Sequence[str], latent: dict[str, Tensor]
     ) -> Evaluation:
         time.sleep(self.config.update_ms / 1000)
-        target = torch.from_numpy(observations[OBS_STATE][:, : self.config.action_dim])
+        target = torch.from_numpy(observations[STATE][:, : self.config.action_dim])
         mean = (self.gain * target)[:, None, :].expand_as(latent["u"])
         std = torch.full_like(mean, STD)
         return Evaluation(

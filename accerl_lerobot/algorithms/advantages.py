@@ -49,13 +49,15 @@ def gae(
     rewards = rewards.detach().masked_fill(padding, 0.0)
     values = values.detach().masked_fill(padding, 0.0)
     after = bootstrap_value.detach().masked_fill(terminated, 0.0)
-    next_values = values.roll(-1, dims=1).scatter(1, lengths[:, None] - 1, after[:, None])
-    delta = (rewards + gamma * next_values - values).masked_fill(padding, 0.0)
+    last = lengths[:, None] - 1
+    next_values = values.roll(-1, dims=1).scatter(1, last, after[:, None])
+    delta = rewards + gamma * next_values - values
 
-    advantages = delta.clone()
+    advantages = delta.masked_fill(padding, 0.0)
     for i in reversed(range(t - 1)):
         advantages[:, i] += gamma * lam * advantages[:, i + 1]
-    return advantages, (advantages + values).masked_fill(padding, 0.0)
+    returns = advantages + values
+    return advantages, returns.masked_fill(padding, 0.0)
 
 
 def moments(x: Tensor, mask: Tensor) -> Tensor:
@@ -64,7 +66,8 @@ def moments(x: Tensor, mask: Tensor) -> Tensor:
     In float64, because the variance is the difference of two nearly equal numbers when the mean is large.
     """
     wide = x.detach().double().masked_fill(~mask, 0.0)
-    return torch.stack([wide.sum(), wide.square().sum(), mask.sum().double()])
+    count = mask.sum().double()
+    return torch.stack([wide.sum(), wide.square().sum(), count])
 
 
 def normalise(x: Tensor, moments: Tensor, mask: Tensor) -> Tensor:
@@ -73,7 +76,9 @@ def normalise(x: Tensor, moments: Tensor, mask: Tensor) -> Tensor:
     `moments` (3,) is of everything that is compared with each other.
     """
     total, squares, count = moments.unbind()
-    mean = total / count.clamp(min=1.0)
-    std = (squares / count.clamp(min=1.0) - mean.square()).clamp(min=0.0).sqrt()
-    scaled = ((x.detach().double() - mean) / (std + STD_EPSILON)).to(x.dtype)
-    return scaled.masked_fill(~mask, 0.0)
+    count = count.clamp(min=1.0)
+    mean = total / count
+    variance = squares / count - mean.square()
+    std = variance.clamp(min=0.0).sqrt()
+    scaled = (x.detach().double() - mean) / (std + STD_EPSILON)
+    return scaled.to(x.dtype).masked_fill(~mask, 0.0)

@@ -27,8 +27,9 @@ from torch import Tensor, nn
 from accerl_lerobot.algorithms import ChunkCriticConfig
 from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.algorithms.off_policy import OffPolicyUpdate, drawn, mean
+from accerl_lerobot.checkpoint.snapshot import State
 from accerl_lerobot.checkpoint.tensors import copied, optimizer_state, restore_optimizer
-from accerl_lerobot.experience import Segment
+from accerl_lerobot.experience import Metrics, Segment
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.family import Encoded, pooled
 from accerl_lerobot.policies.stock import StockAdapter
@@ -69,10 +70,12 @@ class Critic(nn.Module):
 
     def __init__(self, teacher: Teacher) -> None:
         super().__init__()
-        self.network = Ensemble(len(teacher.mean) + math.prod(teacher.chunk), 1, MEMBERS)
+        inputs = len(teacher.mean) + math.prod(teacher.chunk)
+        self.network = Ensemble(inputs, 1, MEMBERS)
 
     def forward(self, state: Tensor, chunk: Tensor) -> Tensor:
-        return self.network(torch.cat([state, chunk.flatten(1)], -1))[..., 0].float()
+        inputs = torch.cat([state, chunk.flatten(1)], -1)
+        return self.network(inputs)[..., 0].float()
 
 
 class ChunkCriticUpdate(OffPolicyUpdate):
@@ -85,7 +88,8 @@ class ChunkCriticUpdate(OffPolicyUpdate):
     ) -> None:
         super().__init__(adapter, algorithm, config)
         assert adapter.teacher is not None
-        self.algorithm, self.teacher = algorithm, adapter.teacher
+        self.algorithm = algorithm
+        self.teacher = adapter.teacher
         device = adapter.device
         self.critic = Critic(self.teacher).to(device)
         self.slow = copy.deepcopy(self.critic).requires_grad_(False)
@@ -95,32 +99,40 @@ class ChunkCriticUpdate(OffPolicyUpdate):
             self.state_learner = StateLearner(model)
         self._unpublished = 0  # new decisions since the model that acts was replaced
         self._unsubmitted = 0  # new decisions for which the world model has no steps yet
-        # Reads the scaled state off the policy's features.
-        width = adapter.feature_width
-        self.reader = None if width is None else nn.Linear(width, len(self.teacher.mean)).to(device)
         # The teacher lies beside the policy's weights.
         self.networks: dict[str, nn.Module] = {"critic": self.critic, "slow": self.slow}
+        teacher = self.teacher.network
         self.optimizers = {
             "critic": torch.optim.AdamW(self.critic.parameters(), lr=config.value_lr, weight_decay=1e-3),
-            "teacher": torch.optim.AdamW(self.teacher.network.parameters(), lr=TEACHER_LR, weight_decay=1e-4),
+            "teacher": torch.optim.AdamW(teacher.parameters(), lr=TEACHER_LR, weight_decay=1e-4),
         }
-        # Success of the last exploring episodes, by who acted in them.
-        self._outcomes = {name: deque[bool](maxlen=LAST) for name in ("policy_success", "teacher_success")}
-        if self.reader is not None:
+        # Success of the last exploring episodes, by the network that acted in them.
+        self._outcomes = {
+            "policy_success": deque[bool](maxlen=LAST),
+            "teacher_success": deque[bool](maxlen=LAST),
+        }
+        # Reads the scaled state off the policy's features.
+        self.reader: nn.Linear | None = None
+        if adapter.feature_width is not None:
+            self.reader = nn.Linear(adapter.feature_width, len(self.teacher.mean)).to(device)
             self.networks["reader"] = self.reader
             self.optimizer.add_param_group({"params": list(self.reader.parameters()), "lr": READER_LR})
 
-    def step(self, segments: Sequence[Segment]) -> dict[str, float]:
+    def step(self, segments: Sequence[Segment]) -> Metrics:
         for segment in segments:
             taught = bool(self.teacher.ready) and self.teacher.plays(segment.origin.seed)
-            self._outcomes["teacher_success" if taught else "policy_success"].append(segment.success)
-        outcomes = {name: sum(last) / max(1, len(last)) for name, last in self._outcomes.items()}
-        return super().step(segments) | outcomes
+            name = "teacher_success" if taught else "policy_success"
+            self._outcomes[name].append(segment.success)
+        metrics: Metrics = {}
+        for name, last in self._outcomes.items():
+            metrics[name] = sum(last) / max(1, len(last))
+        return super().step(segments) | metrics
 
     def columns(self, segment: Segment) -> dict[str, np.ndarray]:
+        t = len(segment)
         seen = {name: rows[:-1] for name, rows in segment.observations.items()}
-        states = self.teacher.states(seen, [segment.task] * len(segment), segment.elapsed)
-        last = np.arange(len(segment)) == len(segment) - 1
+        states = self.teacher.states(seen, [segment.task] * t, segment.elapsed)
+        last = np.arange(t) == t - 1
         return {"state": states.cpu().numpy(), "elapsed": segment.elapsed, "last": last}
 
     def learn_states_in(self, worker: Any, timeout_s: float) -> None:
@@ -130,13 +142,13 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         if isinstance(self.state_learner, StateLearner):
             self.state_learner = RemoteStateLearner(worker, self.state_learner, timeout_s)
 
-    def learn(self, new: int) -> dict[str, float]:
+    def learn(self, new: int) -> Metrics:
         metrics = self._learn_states(new)
         if self.state_learner is not None and not self.state_learner.ready:
             return metrics  # critic and teacher would learn on states that mean nothing yet
         return metrics | self._learn_to_act(new)
 
-    def _learn_states(self, new: int) -> dict[str, float]:
+    def _learn_states(self, new: int) -> Metrics:
         """Steps of the world model, where it learns; now and then the one that acts takes them over."""
         transitions = np.flatnonzero(~self.memory["last"])
         if self.state_learner is None or len(transitions) < LEAST_TRANSITIONS:
@@ -146,12 +158,13 @@ class ChunkCriticUpdate(OffPolicyUpdate):
             self.state_learner.wait()  # or episodes would be spent before anything is learned from them
         steps = self.state_learner.collect()
         self._unpublished += new
-        due = not self.teacher.ready or self._unpublished >= max(REFRESH, len(self.memory) // REENCODED)
+        interval = max(REFRESH, len(self.memory) // REENCODED)
+        due = not self.teacher.ready or self._unpublished >= interval
         if steps and due:
             self._unpublished = 0
             self.state_learner.publish(self.teacher.model)
             self._encode_memory()
-        return {f"world_model_{name}": value for name, value in mean(iter(steps)).items()}
+        return {f"world_model_{name}": value for name, value in mean(steps).items()}
 
     def _submit_steps(self, transitions: np.ndarray, new: int) -> None:
         """Give the world model the steps that are due, unless it has not made the last ones yet."""
@@ -164,11 +177,13 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         # A part of the first steps at a time, so that no update takes minutes.
         due = min(learner.behind, MOST_STATE_STEPS)
         if not due:
-            due = len(self.steps("world_model", self.teacher.model.steps_per_decision, self._unsubmitted))
+            each = self.teacher.model.steps_per_decision
+            due = len(self.steps("world_model", each, self._unsubmitted))
         self._unsubmitted = 0
         for first in range(0, due, STEPS_AT_ONCE):
             count = min(STEPS_AT_ONCE, due - first)
-            learner.submit(self._transitions(drawn(transitions, count * TRANSITIONS)), numbers)
+            rows = drawn(transitions, count * TRANSITIONS)
+            learner.submit(self._transitions(rows), numbers)
 
     def _transitions(self, rows: np.ndarray) -> Transitions:
         observations, tasks = self.memory.observations(rows)
@@ -185,12 +200,14 @@ class ChunkCriticUpdate(OffPolicyUpdate):
 
     def _encode_memory(self) -> None:
         states = self.memory["state"]
-        for rows in np.array_split(np.arange(len(states)), -(-len(states) // REENCODED_AT_ONCE)):
+        parts = math.ceil(len(states) / REENCODED_AT_ONCE)
+        for rows in np.array_split(np.arange(len(states)), parts):
             observations, tasks = self.memory.observations(rows)
             elapsed = self.memory["elapsed"][rows]
-            states[rows] = self.teacher.states(observations, tasks, elapsed).cpu().numpy()
+            computed = self.teacher.states(observations, tasks, elapsed)
+            states[rows] = computed.cpu().numpy()
 
-    def _learn_to_act(self, new: int) -> dict[str, float]:
+    def _learn_to_act(self, new: int) -> Metrics:
         won = np.flatnonzero(self.memory["success"])
         # Without a success there is nothing to learn: the teacher would follow the critic's noise.
         if self.version < self.config.value_warmup_updates or not len(won):
@@ -200,9 +217,13 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         bounds = float(returns.min()), float(returns.max())
         if not self.teacher.ready:
             self._begin(won, bounds)
-        each = self.algorithm.critic_steps or (1.0 if self.state_learner is None else LATENT_CRITIC_STEPS)
-        metrics = mean(self._critic_step(bounds) for _ in self.steps("critic", each, new))
-        metrics |= mean(self._teacher_step(won) for _ in self.steps("teacher", each / 2, new))
+        each = self.algorithm.critic_steps
+        if each is None:
+            each = 1.0 if self.state_learner is None else LATENT_CRITIC_STEPS
+        critic_steps = self.steps("critic", each, new)
+        metrics = mean(self._critic_step(bounds) for _ in critic_steps)
+        teacher_steps = self.steps("teacher", each / 2, new)
+        metrics |= mean(self._teacher_step(won) for _ in teacher_steps)
         return metrics | super().learn(new)
 
     def imitable(self) -> np.ndarray:  # the teacher labels every observation
@@ -217,19 +238,23 @@ class ChunkCriticUpdate(OffPolicyUpdate):
             return super().losses(rows, encoded, imitation)
         features = pooled(encoded.features, encoded.mask)
         state = self.teacher.scaled(self.tensor("state", rows))
-        perception = PERCEPTION * (self.reader(features) - state).square().mean()
-        return super().losses(rows, encoded, imitation) | {"perception_loss": perception}
+        error = self.reader(features) - state
+        losses = super().losses(rows, encoded, imitation)
+        losses["perception_loss"] = PERCEPTION * error.square().mean()
+        return losses
 
-    def state(self) -> dict[str, Any]:
-        return super().state() | {
-            "networks": {name: copied(module) for name, module in self.networks.items()},
-            "optimizers": {name: optimizer_state(optimizer) for name, optimizer in self.optimizers.items()},
-            "outcomes": {name: list(last) for name, last in self._outcomes.items()},
-            "unpublished": (self._unpublished, self._unsubmitted),
-            "state_learner": None if self.state_learner is None else self.state_learner.state(),
-        }
+    def state(self) -> State:
+        state = super().state()
+        state["networks"] = {name: copied(module) for name, module in self.networks.items()}
+        state["optimizers"] = {name: optimizer_state(each) for name, each in self.optimizers.items()}
+        state["outcomes"] = {name: list(last) for name, last in self._outcomes.items()}
+        state["unpublished"] = (self._unpublished, self._unsubmitted)
+        state["state_learner"] = None
+        if self.state_learner is not None:
+            state["state_learner"] = self.state_learner.state()
+        return state
 
-    def restore(self, state: dict[str, Any]) -> None:
+    def restore(self, state: State) -> None:
         super().restore(state)
         for name, module in self.networks.items():
             module.load_state_dict(state["networks"][name])
@@ -245,21 +270,25 @@ class ChunkCriticUpdate(OffPolicyUpdate):
     def _scale_states(self) -> None:
         states = self.memory["state"]
         # In float64, or the rounding of a long sum would look like a spread.
-        self.teacher.mean.copy_(torch.from_numpy(states.mean(0, dtype=np.float64)))
-        self.teacher.std.copy_(torch.from_numpy(states.std(0, dtype=np.float64).clip(1e-3)))
+        mean_state = states.mean(0, dtype=np.float64)
+        std = states.std(0, dtype=np.float64).clip(1e-3)
+        self.teacher.mean.copy_(torch.from_numpy(mean_state))
+        self.teacher.std.copy_(torch.from_numpy(std))
 
     def _begin(self, won: np.ndarray, bounds: tuple[float, float]) -> None:
         """The teacher learns to do what succeeded so far, or all that was done if that is little."""
         chunks = self.memory["chunk"]
-        low, high = (torch.from_numpy(end) for end in (chunks.min((0, 1)), chunks.max((0, 1))))
+        low = torch.from_numpy(chunks.min((0, 1)))
+        high = torch.from_numpy(chunks.max((0, 1)))
         margin = MARGIN * (high - low) + MARGIN
         with torch.no_grad():
             self.teacher.low.copy_(low - margin)
             self.teacher.high.copy_(high + margin)
-        known = won if len(won) >= BATCH else np.arange(len(self.memory))
+        known = won
+        if len(won) < BATCH:
+            known = np.arange(len(self.memory))
         for _ in range(FIRST_STEPS):
-            rows = drawn(known, BATCH)
-            loss = (self.teacher(self.tensor("state", rows)) - self.tensor("chunk", rows)).square().mean()
+            loss = self._gap(drawn(known, BATCH)).square().mean()
             self._descend("teacher", loss)
         # Or the teacher would at once climb a critic that knows nothing.
         for _ in range(min(len(self.memory), MOST_FIRST)):
@@ -267,17 +296,25 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         with torch.no_grad():
             self.teacher.ready.fill_(1)
 
-    def _critic_step(self, bounds: tuple[float, float]) -> dict[str, float]:
+    def _gap(self, rows: np.ndarray) -> Tensor:
+        """Difference (B, K, A) of the teacher's chunks from those that were executed."""
+        return self.teacher(self.tensor("state", rows)) - self.tensor("chunk", rows)
+
+    def _critic_step(self, bounds: tuple[float, float]) -> Metrics:
         """One gradient step of the ensemble; ``bounds`` of the returns seen, which no target leaves."""
         rows = drawn(self.imitable(), BATCH)
-        names = ("state", "chunk", "reward", "discount", "return")
-        state, chunk, reward, discount, returns = (self.tensor(name, rows) for name in names)
+        state = self.tensor("state", rows)
+        chunk = self.tensor("chunk", rows)
+        reward = self.tensor("reward", rows)
+        discount = self.tensor("discount", rows)
+        returns = self.tensor("return", rows)
         following = self.tensor("state", self.memory["following"][rows])
         with torch.no_grad(), self.adapter.autocast():
             planned = self.teacher(following)
             planned = planned + SMOOTHING * torch.randn_like(planned)
-            bootstrap = pessimistic(self.slow(self.teacher.scaled(following), planned))
-            predicted = reward + discount * bootstrap.clamp(*bounds)
+            following_q = self.slow(self.teacher.scaled(following), planned)
+            bootstrap = pessimistic(following_q).clamp(*bounds)
+            predicted = reward + discount * bootstrap
             target = (1 - MONTE_CARLO) * predicted + MONTE_CARLO * returns
         with self.adapter.autocast():
             q = self.critic(self.teacher.scaled(state), chunk)
@@ -287,7 +324,8 @@ class ChunkCriticUpdate(OffPolicyUpdate):
             for slow, fast in zip(self.slow.parameters(), self.critic.parameters(), strict=True):
                 slow.lerp_(fast, TAU)
             q = q.mean(0)
-            unexplained = (returns - q).var() / returns.var().clamp(min=1e-8)
+            spread = returns.var().clamp(min=1e-8)
+            unexplained = (returns - q).var() / spread
         return {
             "value_loss": float(loss.detach()) / MEMBERS,
             "value_grad_norm": norm,
@@ -296,29 +334,35 @@ class ChunkCriticUpdate(OffPolicyUpdate):
             "explained_variance": float(1 - unexplained),
         }
 
-    def _teacher_step(self, won: np.ndarray) -> dict[str, float]:
+    def _teacher_step(self, won: np.ndarray) -> Metrics:
         """One gradient step of the teacher; `won` are the rows of successful episodes."""
         state = self.tensor("state", drawn(self.imitable(), BATCH))
         rows = drawn(won, BATCH)
         with self.adapter.autocast():
             q = self.critic(self.teacher.scaled(state), self.teacher(state))
-            gap = self.teacher(self.tensor("state", rows)) - self.tensor("chunk", rows)
-        loss = -pessimistic(q).mean() / q.detach().abs().mean().clamp(min=SMALLEST_SCALE)
+            gap = self._gap(rows)
+        scale = q.detach().abs().mean().clamp(min=SMALLEST_SCALE)
+        loss = -pessimistic(q).mean() / scale
         distance = gap.square().mean() / DISTANCE**2
         self._descend("teacher", loss + IMITATION * distance)
-        metrics = {"teacher_value": q.mean(), "disagreement": q.std(0).mean(), "distance": distance}
-        return {name: float(value.detach()) for name, value in metrics.items()}
+        q = q.detach()
+        return {
+            "teacher_value": float(q.mean()),
+            "disagreement": float(q.std(0).mean()),
+            "distance": float(distance.detach()),
+        }
 
     def _descend(self, name: str, loss: Tensor, clip: float = 1.0) -> float:
         """A step of one optimiser, left out where it is not finite; the gradient's norm."""
         optimizer = self.optimizers[name]
         parameters = optimizer.param_groups[0]["params"]
         # Of these alone: the teacher's loss runs through the critic, whose gradients nobody needs then.
-        for parameter, gradient in zip(parameters, torch.autograd.grad(loss, parameters), strict=True):
+        gradients = torch.autograd.grad(loss, parameters)
+        for parameter, gradient in zip(parameters, gradients, strict=True):
             parameter.grad = gradient
-        norm = float(torch.nn.utils.clip_grad_norm_(parameters, clip))
-        self.apply(optimizer, f"a step of the {name}", float(loss.detach()), norm)
-        return norm
+        norm = torch.nn.utils.clip_grad_norm_(parameters, clip)
+        self.apply(optimizer, f"a step of the {name}", float(loss.detach()), float(norm))
+        return float(norm)
 
 
 def pessimistic(q: Tensor) -> Tensor:

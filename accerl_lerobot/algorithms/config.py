@@ -139,7 +139,7 @@ class TrainerConfig(Section, section="trainer"):
     """
 
     updates: Steps = 1000
-    """Optimiser steps of the run; the trainer is the run's clock. 0: the warm start, and what it is worth."""
+    """Updates of the run, by which its progress is measured. 0: the run evaluates its warm start alone."""
     batch_decisions: Annotated[int, Range("[1, 1000000]")] = 128
     """Decisions of one update; whole segments are drawn until there are at least as many."""
     micro_batch: Annotated[int, Range("[1, 1000000]")] = 1024
@@ -148,7 +148,7 @@ class TrainerConfig(Section, section="trainer"):
     lr: Annotated[float, Range("[0, 1)")] = 3e-5
     """Peak learning rate of the policy; 0 freezes it."""
     value_lr: Annotated[float, Range("[0, 1)")] = 1e-3
-    """Peak learning rate of the critic head."""
+    """Peak learning rate of the critic head; with ``chunk_critic`` the constant rate of its critics."""
     warmup_updates: Steps = 20
     """Updates over which each rate rises linearly from 0: the critic's from the first update on, the policy's
     once `value_warmup_updates` are over."""
@@ -160,9 +160,10 @@ class TrainerConfig(Section, section="trainer"):
     advantage_memory: Annotated[float, Range("[0, 1)")] = 0.0
     """Advantages are normalised by the moments of this batch and of those before it, of which each earlier
     one is weighted by this factor once more; 0: this batch alone. A small batch may hold nothing but
-    failures; its advantages are then the critic's noise, which their own deviation would make loud."""
+    failures. Its advantages are then the critic's noise, and their own deviation would amplify it."""
     grad_clip: Positive = 1.0
-    """Largest gradient norm of the policy, and of the critic head, each by itself."""
+    """Largest gradient norm of the policy and, in algorithms with a likelihood ratio, of the critic head,
+    each by itself."""
     betas: tuple[Annotated[float, Range("[0, 1)")], Annotated[float, Range("[0, 1)")]] = (0.9, 0.95)
     hold_back: Steps = 0
     """Updates by which the acting policy's weights are held back: lag on purpose, to study it with

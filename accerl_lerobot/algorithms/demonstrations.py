@@ -13,7 +13,7 @@ import numpy as np
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos.dataset_files import numbers, observations, open_metadata, opened, read_labels
 from accerl_lerobot.experience import Segment, SegmentStart
-from accerl_lerobot.policies.features import dataset_shapes
+from accerl_lerobot.policies.features import Shapes, dataset_shapes
 
 logger = logging.getLogger(__name__)
 
@@ -21,12 +21,14 @@ ROWS, FRAMES = 5000, 20_000
 """Decisions, and env steps, that are read at most; of short datasets, decisions that begin at every step."""
 
 
-def unlike(meta: Any, wanted: dict[str, tuple[int, ...]]) -> str | None:
+def unlike(meta: Any, wanted: Shapes) -> str | None:
     """How a dataset's features differ from an environment's names and shapes; None: they do not."""
     shapes = dataset_shapes(meta)
     for name, shape in wanted.items():
-        offered = shapes.get(name)
-        if offered is not None and len(offered) == 3:
+        if name not in shapes:
+            return f"the dataset has no {name}"
+        offered = shapes[name]
+        if len(offered) == 3:
             offered = offered[1:] + offered[:1]  # environments have (height, width, channels)
         if offered != shape:
             return f"the dataset's {name} has shape {offered}, the environment's {shape}"
@@ -54,7 +56,7 @@ def demonstrations(dataset: DatasetConfig, decision_cost: float, like: Segment) 
 def recorded(
     dataset: DatasetConfig,
     meta: Any,
-    wanted: dict[str, tuple[int, ...]],
+    wanted: Shapes,
     chunk: int,
     most: int,
     enough: int,
@@ -70,32 +72,37 @@ def recorded(
     share = min(1.0, most * chunk / meta.total_frames)
     episodes = range(math.ceil(share * meta.total_episodes))
     with opened(dataset, meta, episodes) as data:
-        images = [name for name, shape in wanted.items() if len(shape) > 2]
-        vectors = {
-            name: numbers(data, name, dataset).astype(np.float32).reshape(-1, *shape)
-            for name, shape in wanted.items()
-            if name not in images
-        }
+        images: list[str] = []
+        vectors: dict[str, np.ndarray] = {}
+        for name, shape in wanted.items():
+            if len(shape) > 2:
+                images.append(name)
+            else:
+                column = numbers(data, name, dataset).astype(np.float32)
+                vectors[name] = column.reshape(-1, *shape)
         for episode in read_labels(data, dataset):
             success = episode.success or episode.success_at is None
             end = len(episode.rows)
             if episode.success_at is not None and episode.success_at >= 0:
                 end = episode.success_at + 1
-            only_success = np.zeros(end, np.float32)
-            only_success[-1] = success
-            rewards = only_success if episode.rewards is None else episode.rewards[:end]
+            rewards = episode.rewards
+            if rewards is None:
+                rewards = np.zeros(end, np.float32)
+                rewards[-1] = success
             columns = observations(data, episode.rows[:end], vectors, images)
             actions = columns.pop("action")
             for phase in range(min(phases, end)):
                 starts = np.arange(phase, end, chunk)
+                seen = [*starts, end - 1]
+                executed = starts[:, None] + np.arange(chunk)
                 t = len(starts)
-                reward = np.add.reduceat(rewards, starts)
+                reward = np.add.reduceat(rewards[:end], starts)
                 yield Segment(
-                    observations={name: rows[[*starts, end - 1]] for name, rows in columns.items()},
+                    observations={name: rows[seen] for name, rows in columns.items()},
                     task=episode.tasks[0],
                     latent={},
                     log_prob=np.zeros((t, 0), np.float32),
-                    actions=actions[np.minimum(starts[:, None] + np.arange(chunk), end - 1)],
+                    actions=actions[np.minimum(executed, end - 1)],
                     reward=reward - np.float32(decision_cost),
                     version=np.zeros(t, np.int64),
                     steps=np.minimum(chunk, end - starts),

@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from accerl_lerobot.algorithms.config import AlgorithmConfig, Level, LossInputs
 from accerl_lerobot.config.ranges import NonNegative, Range, Share
+from accerl_lerobot.experience import Metrics
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -49,12 +50,16 @@ def at_level(x: Tensor, inputs: LossInputs, level: Level) -> Tensor:
     """
     if inputs.factors is not None:
         x = x.masked_fill(~inputs.factors, 0.0)
-    return x.sum(dim=-1, keepdim=True) if level == "chunk" else x
+    if level == "token":
+        return x
+    return x.sum(dim=-1, keepdim=True)
 
 
 def present(factors: Tensor, level: Level) -> Tensor:
     """bool (N, F), the ratios that cover at least one existing factor; `factors` is bool (N, L)."""
-    return factors.any(dim=-1, keepdim=True) if level == "chunk" else factors
+    if level == "token":
+        return factors
+    return factors.any(dim=-1, keepdim=True)
 
 
 def ratio(log_ratio: Tensor) -> Tensor:
@@ -70,12 +75,14 @@ def kl_from_behaviour(log_ratio: Tensor) -> Tensor:
     Deviation: linear in log ρ above `KL_LINEAR_ABOVE`.
     """
     x = log_ratio.clamp(max=KL_LINEAR_ABOVE)
-    return x.expm1() - x + math.expm1(KL_LINEAR_ABOVE) * (log_ratio - x)
+    slope = math.expm1(KL_LINEAR_ABOVE)
+    return x.expm1() - x + slope * (log_ratio - x)
 
 
 def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
     """Mean over the entries where `mask`, bool and of the same shape, is True; a scalar, 0 if none is."""
-    return x.masked_fill(~mask, 0.0).sum() / mask.sum().clamp(min=1)
+    total = x.masked_fill(~mask, 0.0).sum()
+    return total / mask.sum().clamp(min=1)
 
 
 def mean_over_ratios(x: Tensor, inputs: LossInputs, level: Level) -> Tensor:
@@ -88,7 +95,8 @@ def mean_over_ratios(x: Tensor, inputs: LossInputs, level: Level) -> Tensor:
     counts = present(inputs.factors, level)
     if inputs.ratios_per_decision is None:
         return masked_mean(x, counts)
-    return x.masked_fill(~counts, 0.0).sum() / (len(x) * inputs.ratios_per_decision)
+    total = x.masked_fill(~counts, 0.0).sum()
+    return total / (len(x) * inputs.ratios_per_decision)
 
 
 def advantage_column(inputs: LossInputs) -> Tensor:
@@ -103,25 +111,29 @@ def sample_metrics(samples: Tensor, clip: tuple[float, float]) -> dict[str, Tens
     keep = exists.bool()
     rho = ratio(log_ratio)
     low, high = clip
+    clipped = (rho < 1.0 - low) | (rho > 1.0 + high)
     weighted = weight * rho
-    squares = masked_mean(weighted.square(), keep).clamp(min=TINY)
+    mean_weight = masked_mean(weighted, keep)
+    mean_square = masked_mean(weighted.square(), keep)
+    lost = weight < LOW_WEIGHT
     logs = log_ratio.masked_fill(~keep, math.nan).flatten()
     spread = returns.var(correction=0)
-    left = (returns - value).var(correction=0) / spread.clamp(min=VARIANCE_FLOOR)
+    left = (returns - value).var(correction=0)
+    explained = 1.0 - left / spread.clamp(min=VARIANCE_FLOOR)
     return {
         "approx_kl": masked_mean(rho - 1.0 - log_ratio, keep),
-        "ess": masked_mean(weighted, keep).square() / squares,  # Kish's
-        "low_weight": masked_mean((weight < LOW_WEIGHT).float(), keep),
-        "clip_fraction": masked_mean(((rho < 1.0 - low) | (rho > 1.0 + high)).float(), keep),
+        "ess": mean_weight.square() / mean_square.clamp(min=TINY),  # Kish's
+        "low_weight": masked_mean(lost.float(), keep),
+        "clip_fraction": masked_mean(clipped.float(), keep),
         "ratio_max_dev": (rho - 1.0).abs().max(),
         "log_ratio_p05": logs.nanquantile(0.05),
         "log_ratio_p50": logs.nanquantile(0.5),
         "log_ratio_p95": logs.nanquantile(0.95),
-        "explained_variance": (1.0 - left).masked_fill(spread <= VARIANCE_FLOOR, 0.0),
+        "explained_variance": explained.masked_fill(spread <= VARIANCE_FLOOR, 0.0),
     }
 
 
-def lag_metrics(version: Tensor, trainer_version: int) -> dict[str, float]:
+def lag_metrics(version: Tensor, trainer_version: int) -> Metrics:
     """How stale a batch is, in updates; `version`, int (N,), is of the weights behind each decision."""
     lag = (trainer_version - version).float()
     return {"lag_mean": float(lag.mean()), "lag_p95": float(lag.quantile(0.95)), "lag_max": float(lag.max())}
@@ -175,10 +187,12 @@ def assemble(
         "kl": kl,
         "entropy": mean_entropy,
     }
-    exists = torch.ones_like(log_ratio) if inputs.factors is None else present(inputs.factors, config.level)
+    means = {name: mean.detach() for name, mean in means.items()}
+    exists = torch.ones_like(log_ratio)
+    if inputs.factors is not None:
+        exists = present(inputs.factors, config.level)
     columns = (log_ratio, weight, exists, inputs.value[:, None], inputs.returns[:, None])
     samples = torch.cat([column.detach().double() for column in columns], 1)
-    means = {name: mean.detach() for name, mean in means.items()}
     return LossOutput(loss=loss, means=means, samples=samples, clip=clip)
 
 
@@ -224,7 +238,8 @@ class GIPOConfig(RatioConfig):
 
     def loss(self, inputs: LossInputs) -> LossOutput:
         logs = at_level(inputs.log_prob_new - inputs.log_prob_old, inputs, self.level)
-        weight = (-0.5 * (logs.detach() / self.sigma).square()).exp()
+        distance = logs.detach() / self.sigma
+        weight = (-0.5 * distance.square()).exp()
         weighted = weight * ratio(logs) * advantage_column(inputs)
         policy_loss = -mean_over_ratios(weighted, inputs, self.level)
         return assemble(inputs, self, policy_loss=policy_loss, log_ratio=logs, weight=weight)
@@ -252,8 +267,11 @@ class PPOConfig(RatioConfig):
         advantage = advantage_column(inputs)
         low = 1.0 - self.clip_low
         high = 1.0 + self.clip_high
-        surrogate = (rho * advantage).minimum(rho.clamp(low, high) * advantage)
-        dropped = ((advantage > 0.0) & (rho > high)) | ((advantage < 0.0) & (rho < low))
+        clipped = rho.clamp(low, high) * advantage
+        surrogate = (rho * advantage).minimum(clipped)
+        above = (advantage > 0.0) & (rho > high)
+        below = (advantage < 0.0) & (rho < low)
+        dropped = above | below
         return assemble(
             inputs,
             self,

@@ -9,7 +9,7 @@ Shapes: B rows, K executed actions of A dims.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,8 +21,9 @@ from accerl_lerobot.algorithms.advantages import STD_EPSILON
 from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.algorithms.objective import lag_metrics
 from accerl_lerobot.algorithms.ratio_update import BaseUpdate
+from accerl_lerobot.checkpoint.snapshot import State
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import ENVIRONMENT_STATE, Segment
+from accerl_lerobot.experience import ENVIRONMENT_STATE, Metrics, Observations, Segment
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.family import Encoded
 from accerl_lerobot.policies.stock import StockAdapter
@@ -57,8 +58,8 @@ class Memory:
         """
         return self._columns[name][: len(self)]
 
-    def add(self, segment: Segment, chunk: np.ndarray, **more: np.ndarray) -> np.ndarray:
-        """Add a whole episode, with `more` columns (T, ...); returns its T rows.
+    def add(self, segment: Segment, chunk: np.ndarray, **more: np.ndarray) -> None:
+        """Adds an episode of T decisions, with `more` columns (T, ...).
 
         `chunk`, (T, K, A), was executed, normalised.
         """
@@ -66,51 +67,59 @@ class Memory:
         if segment.origin.decision or not segment.terminated or t > self.capacity:
             hint = f"the memory holds whole episodes of at most algorithm.memory={self.capacity} decisions"
             raise InputError("rollout.segment_length", t, hint)
-        rows = (self.total + np.arange(t)) % self.capacity
+        decisions = np.arange(t)
+        rows = (self.total + decisions) % self.capacity
         returns = np.zeros(t + 1)
         for i in reversed(range(t)):
             returns[i] = segment.reward[i] + self.gamma * returns[i + 1]
-        ahead = np.minimum(self.n_step, t - np.arange(t))
-        ends = np.arange(t) + ahead == t
-        discount = self.gamma**ahead
-        seen = {name: values[:-1] for name, values in segment.observations.items()}
-        seen.pop(ENVIRONMENT_STATE, None)  # no policy reads it
+        bootstrap = np.minimum(decisions + self.n_step, t)
+        ends = bootstrap == t
+        discount = self.gamma ** (bootstrap - decisions)
+        reward = returns[:-1] - discount * returns[bootstrap]
         if segment.task not in self.tasks:
             self.tasks.append(segment.task)
         columns: dict[str, Any] = {
             "chunk": chunk,
-            "reward": (returns[:-1] - discount * returns[np.arange(t) + ahead]).astype(np.float32),
+            "reward": reward.astype(np.float32),
             "discount": np.where(ends, 0.0, discount).astype(np.float32),
-            "following": np.where(ends, rows, rows[0] + np.arange(t) + ahead) % self.capacity,
+            "following": rows[np.where(ends, decisions, bootstrap)],
             "return": returns[:-1].astype(np.float32),
             "success": np.full(t, segment.success),
             "task": np.full(t, self.tasks.index(segment.task)),
         }
+        for name, values in segment.observations.items():
+            if name != ENVIRONMENT_STATE:  # no policy reads it
+                columns[name] = values[:-1]
         self.total += t
-        for name, values in (columns | seen | more).items():
-            column = self._columns.get(name, values[:0])
-            if len(column) < len(self):
-                size = min(max(FIRST, len(self), 2 * len(column)), self.capacity)
-                space = np.zeros((size - len(column), *values.shape[1:]), values.dtype)
-                column = np.concatenate([column, space])
-                self._columns[name] = column
-            column[rows] = values
-        return rows
+        for name, values in (columns | more).items():
+            self._write(name, rows, values)
 
-    def seen(self) -> dict[str, np.ndarray]:
+    def _write(self, name: str, rows: np.ndarray, values: np.ndarray) -> None:
+        """Sets rows of a column, after making space in it for all rows so far."""
+        column = self._columns.get(name, values[:0])
+        if len(column) < len(self):
+            size = max(FIRST, len(self), 2 * len(column))
+            missing = min(size, self.capacity) - len(column)
+            space = np.zeros((missing, *values.shape[1:]), values.dtype)
+            column = np.concatenate([column, space])
+            self._columns[name] = column
+        column[rows] = values
+
+    def seen(self) -> Observations:
         """The policy's observations of all rows, each (len, ...); not a copy."""
         return {name: self[name] for name in self._columns if name.startswith("observation.")}
 
-    def observations(self, rows: np.ndarray) -> tuple[dict[str, np.ndarray], list[str]]:
+    def observations(self, rows: np.ndarray) -> tuple[Observations, list[str]]:
         """The policy's observations, each (B, ...), and its instructions."""
         seen = {name: column[rows] for name, column in self.seen().items()}
-        return seen, [self.tasks[i] for i in self._columns["task"][rows]]
+        tasks = self._columns["task"][rows]
+        return seen, [self.tasks[task] for task in tasks]
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> State:
         columns = {name: self[name].copy() for name in self._columns}
         return {"total": self.total, "tasks": list(self.tasks), "columns": columns}
 
-    def restore(self, state: dict[str, Any]) -> None:
+    def restore(self, state: State) -> None:
         self.total = state["total"]
         self.tasks = list(state["tasks"])
         self._columns = dict(state["columns"])
@@ -131,24 +140,27 @@ class OffPolicyUpdate(BaseUpdate):
         self.memory = Memory(algorithm.memory, algorithm.gamma, self.n_step)
         self._pending_steps: dict[str, float] = {}
 
-    def step(self, segments: Sequence[Segment]) -> dict[str, float]:
+    def step(self, segments: Sequence[Segment]) -> Metrics:
         if not self.memory.total and self.adapter.demonstrations is not None:
             for demonstration in self.adapter.demonstrations(segments[0]):
                 self.remember(demonstration)
         for segment in segments:
             self.remember(segment)
         rewards = np.concatenate([segment.reward for segment in segments])
-        metrics = {"decisions": float(len(rewards)), "memory_decisions": float(len(self.memory))}
-        metrics["reward_mean"] = float(rewards.mean())
-        if len(self.memory):
-            metrics |= self.learn(len(rewards))
+        metrics = {
+            "decisions": float(len(rewards)),
+            "memory_decisions": float(len(self.memory)),
+            "reward_mean": float(rewards.mean()),
+        }
+        metrics |= self.learn(len(rewards))
         # Lag is that of the new decisions only: those that the steps draw from the memory may be much older.
-        versions = torch.from_numpy(np.concatenate([segment.version for segment in segments]))
-        metrics |= lag_metrics(versions, self.version)
+        versions = np.concatenate([segment.version for segment in segments])
+        metrics |= lag_metrics(torch.from_numpy(versions), self.version)
         self.version += 1
-        return metrics | {"skipped": float(self.skipped)}
+        metrics["skipped"] = float(self.skipped)
+        return metrics
 
-    def learn(self, new: int) -> dict[str, float]:
+    def learn(self, new: int) -> Metrics:
         """Makes the steps that so many new decisions allow; none before ``value_warmup_updates``."""
         start = self.config.value_warmup_updates
         lr = self.config.lr * self.lr_share(start)
@@ -156,7 +168,8 @@ class OffPolicyUpdate(BaseUpdate):
         metrics = {"lr": lr}
         rows = self.imitable()
         if self.version >= start and len(rows):
-            metrics |= mean(self._policy_step(rows) for _ in self.steps("policy", self.policy_steps, new))
+            steps = self.steps("policy", self.policy_steps, new)
+            metrics |= mean(self._policy_step(rows) for _ in steps)
         return metrics
 
     def imitable(self) -> np.ndarray:
@@ -175,10 +188,13 @@ class OffPolicyUpdate(BaseUpdate):
         """
         return {"imitation_loss": imitation.mean()}
 
-    def state(self) -> dict[str, Any]:
-        return super().state() | {"pending_steps": dict(self._pending_steps), "memory": self.memory.state()}
+    def state(self) -> State:
+        state = super().state()
+        state["pending_steps"] = dict(self._pending_steps)
+        state["memory"] = self.memory.state()
+        return state
 
-    def restore(self, state: dict[str, Any]) -> None:
+    def restore(self, state: State) -> None:
         super().restore(state)
         self._pending_steps = dict(state["pending_steps"])
         self.memory.restore(state["memory"])
@@ -202,22 +218,27 @@ class OffPolicyUpdate(BaseUpdate):
         """Rows of a column, where the policy lives."""
         return torch.from_numpy(self.memory[name][rows]).to(self.adapter.device)
 
-    def _policy_step(self, imitable: np.ndarray) -> dict[str, float]:
+    def _policy_step(self, imitable: np.ndarray) -> Metrics:
         rows = drawn(imitable, POLICY_BATCH)
-        metrics: dict[str, float] = {}
+        metrics: Metrics = {}
         self.optimizer.zero_grad(set_to_none=True)
-        for part in np.array_split(rows, math.ceil(len(rows) / self.config.micro_batch)):
+        micro_batches = math.ceil(len(rows) / self.config.micro_batch)
+        for part in np.array_split(rows, micro_batches):
+            observations, tasks = self.memory.observations(part)
             with self.adapter.autocast():
-                imitation, encoded = self.adapter.imitate(*self.memory.observations(part), self.target(part))
+                imitation, encoded = self.adapter.imitate(observations, tasks, self.target(part))
+            share = len(part) / len(rows)
             losses = self.losses(part, encoded, imitation.float())
-            losses = {name: len(part) / len(rows) * value for name, value in losses.items()}
+            losses = {name: share * value for name, value in losses.items()}
             torch.stack(list(losses.values())).sum().backward()
             for name, value in losses.items():
                 metrics[name] = metrics.get(name, 0.0) + float(value.detach())
         loss = sum(metrics.values())
-        norm = float(torch.nn.utils.clip_grad_norm_(self._policy, self.config.grad_clip))
-        self.apply(self.optimizer, "a step of the policy", loss, norm)
-        return metrics | {"policy_loss": loss, "grad_norm": norm}
+        norm = torch.nn.utils.clip_grad_norm_(self._policy, self.config.grad_clip)
+        self.apply(self.optimizer, "a step of the policy", loss, float(norm))
+        metrics["policy_loss"] = loss
+        metrics["grad_norm"] = float(norm)
+        return metrics
 
 
 class AWRUpdate(OffPolicyUpdate):
@@ -229,7 +250,7 @@ class AWRUpdate(OffPolicyUpdate):
         self._variance = 0.0  # mean square of R − V, over some hundred steps
         self.optimizer.add_param_group({"params": self._value, "lr": config.value_lr})
 
-    def learn(self, new: int) -> dict[str, float]:
+    def learn(self, new: int) -> Metrics:
         self.optimizer.param_groups[1]["lr"] = self.config.value_lr * self.lr_share()
         return super().learn(new)
 
@@ -238,24 +259,29 @@ class AWRUpdate(OffPolicyUpdate):
 
     def losses(self, rows: np.ndarray, encoded: Encoded | None, imitation: Tensor) -> dict[str, Tensor]:
         assert encoded is not None and isinstance(self.adapter, LeRobotAdapter)
-        error = self.tensor("return", rows) - self.adapter.value_head(encoded.features, encoded.mask)
+        value = self.adapter.value_head(encoded.features, encoded.mask)
+        error = self.tensor("return", rows) - value
         square = float(error.detach().square().mean())
-        self._variance = FORGET * self._variance + (1 - FORGET) * square if self._variance else square
-        advantage = error.detach() / max(math.sqrt(self._variance), STD_EPSILON)
-        weight = weights(advantage, self.algorithm.beta)
-        return {"imitation_loss": (weight * imitation).mean(), "value_loss": error.square().mean()}
+        if self._variance:
+            square = FORGET * self._variance + (1 - FORGET) * square
+        self._variance = square
+        std = max(math.sqrt(self._variance), STD_EPSILON)
+        weight = weights(error.detach() / std, self.algorithm.beta)
+        weighted = weight * imitation
+        return {"imitation_loss": weighted.mean(), "value_loss": error.square().mean()}
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> State:
         return super().state() | {"variance": self._variance}
 
-    def restore(self, state: dict[str, Any]) -> None:
+    def restore(self, state: State) -> None:
         super().restore(state)
         self._variance = state["variance"]
 
 
 def drawn(rows: np.ndarray, count: int) -> np.ndarray:
     """So many of the rows, with repetition, by torch's global generator."""
-    return rows[torch.randint(len(rows), (count,)).numpy()]
+    chosen = torch.randint(len(rows), (count,))
+    return rows[chosen.numpy()]
 
 
 def weights(advantage: Tensor, beta: float) -> Tensor:
@@ -263,7 +289,12 @@ def weights(advantage: Tensor, beta: float) -> Tensor:
     return (advantage / beta).clamp(max=math.log(CAP)).exp()
 
 
-def mean(steps: Iterator[dict[str, float]]) -> dict[str, float]:
+def mean(steps: Iterable[Metrics]) -> Metrics:
     """Means over steps; empty without any."""
     made = list(steps)
-    return {name: sum(step[name] for step in made) / len(made) for name in (made[0] if made else ())}
+    if not made:
+        return {}
+    means: Metrics = {}
+    for name in made[0]:
+        means[name] = sum(step[name] for step in made) / len(made)
+    return means

@@ -10,16 +10,17 @@ skipped it for a newer one: once most of a batch is newer, another one is taken.
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from accerl_lerobot.algorithms import ranks
 from accerl_lerobot.algorithms.batch import Batch
 from accerl_lerobot.algorithms.config import TrainerConfig
+from accerl_lerobot.checkpoint.snapshot import State
 from accerl_lerobot.checkpoint.tensors import copy_of, part_of
+from accerl_lerobot.experience import Metrics
 from accerl_lerobot.policies.adapter import PolicyAdapter
 
 CRITIC_PREFIX = "value_head."  # how names of the critic's weights begin
@@ -32,17 +33,20 @@ class Probe:
     def __init__(self, adapter: PolicyAdapter, config: TrainerConfig) -> None:
         self.adapter = adapter
         self._config = config
-        self._live = [p for name, p in adapter.trainable().items() if not name.startswith(CRITIC_PREFIX)]
+        self._live: list[nn.Parameter] = []
+        for name, parameter in adapter.trainable().items():
+            if not name.startswith(CRITIC_PREFIX):
+                self._live.append(parameter)
         self._copy: list[Tensor] = []
         self._version: int | None = None  # version of the copy; None: there is none
         self._next = 0  # version from which on a copy is taken
         self.renew(0)
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> State:
         weights = [copy_of(tensor) for tensor in self._copy]
         return {"version": self._version, "next": self._next, "weights": weights}
 
-    def restore(self, state: dict[str, Any]) -> None:
+    def restore(self, state: State) -> None:
         self._version = state["version"]
         self._next = state["next"]
         # There are no weights in the state where there was no copy.
@@ -58,22 +62,23 @@ class Probe:
             self._version = version
             self._next = version + every
 
-    def read(self, batch: Batch) -> dict[str, float]:
+    def read(self, batch: Batch) -> Metrics:
         """The mismatch, if the batch holds decisions of the probed version; else nothing."""
         if self._version is None:
             return {}
         rows = np.flatnonzero(batch.version == self._version)
         skipped = np.median(batch.version) > self._version
-        metrics: dict[str, float] = {}
+        metrics: Metrics = {}
         if len(rows):
             self._exchange()
             try:
                 apart = ranks.over_rows(partial(self._apart, batch), rows, self._config.micro_batch)
             finally:
                 self._exchange()
+            clipped = apart.expm1().abs() > CLIP
             metrics["logprob/mismatch_mean"] = float(apart.abs().mean())
             metrics["logprob/mismatch_max"] = float(apart.abs().max())
-            metrics["logprob/mismatch_clip"] = float((apart.expm1().abs() > CLIP).double().mean())
+            metrics["logprob/mismatch_clip"] = float(clipped.double().mean())
         elif skipped:
             self._next = 0
         else:

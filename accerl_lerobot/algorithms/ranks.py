@@ -53,7 +53,9 @@ class Part(NamedTuple):
 
     def counted(self, result: Tensor) -> Tensor:
         """The result of these rows, (rows, ...), without rows that are not counted."""
-        return result if self.own else result[:0]
+        if self.own:
+            return result
+        return result[:0]
 
 
 def split_rows(rows: np.ndarray, at_once: int, this_rank: int, ranks: int) -> list[Part]:
@@ -64,9 +66,13 @@ def split_rows(rows: np.ndarray, at_once: int, this_rank: int, ranks: int) -> li
     """
     shares = np.array_split(rows, ranks)
     share = shares[this_rank]
-    parts = [Part(share[start : start + at_once], True) for start in range(0, len(share), at_once)]
+    parts: list[Part] = []
+    for start in range(0, len(share), at_once):
+        parts.append(Part(share[start : start + at_once], own=True))
     turns = math.ceil(len(shares[0]) / at_once)
-    return parts + [Part(rows[:1], False)] * (turns - len(parts))
+    while len(parts) < turns:
+        parts.append(Part(rows[:1], own=False))
+    return parts
 
 
 def gather(local: Tensor, total: int) -> Tensor:
@@ -78,7 +84,8 @@ def gather(local: Tensor, total: int) -> Tensor:
     padded[: len(local)] = local
     parts = [torch.empty_like(padded) for _ in counts]
     dist.all_gather(parts, padded)
-    return torch.cat([part[:count] for part, count in zip(parts, counts, strict=True)])
+    own = [part[:count] for part, count in zip(parts, counts, strict=True)]
+    return torch.cat(own)
 
 
 def over_rows(score: Callable[[np.ndarray], Tensor], rows: np.ndarray, at_once: int) -> Tensor:
@@ -114,8 +121,9 @@ def prepare(adapter: PolicyAdapter, config: TrainerConfig) -> None:
     from torch.distributed.fsdp import fully_shard, register_fsdp_forward_method
 
     mesh = init_device_mesh(adapter.device.type, (size(),))
+    reshard = config.sharding == "zero3"
     for module in (*adapter.blocks(), adapter):
-        fully_shard(module, mesh=mesh, reshard_after_forward=config.sharding == "zero3")
+        fully_shard(module, mesh=mesh, reshard_after_forward=reshard)
     for name in ("evaluate", "values"):
         register_fsdp_forward_method(adapter, name)
 
@@ -149,7 +157,9 @@ def store_at(address: str, port: int, ranks: int, timeout_s: float, **options: b
 def join(store: dist.Store, this_rank: int, ranks: int, device: torch.device, timeout_s: float) -> None:
     """Become one of several ranks, once all of them have come."""
     # Gathered tensors are on the CPU.
-    backend = "gloo" if device.type == "cpu" else f"cpu:gloo,{device.type}:nccl"
+    backend = "gloo"
+    if device.type != "cpu":
+        backend = f"cpu:gloo,{device.type}:nccl"
     timeout = timedelta(seconds=timeout_s)
     dist.init_process_group(backend, store=store, rank=this_rank, world_size=ranks, timeout=timeout)
 

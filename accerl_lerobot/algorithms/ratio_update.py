@@ -28,10 +28,11 @@ from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.algorithms.objective import lag_metrics, present, sample_metrics
 from accerl_lerobot.algorithms.probe import CRITIC_PREFIX, Probe
 from accerl_lerobot.algorithms.ranks import Part
+from accerl_lerobot.checkpoint.snapshot import State
 from accerl_lerobot.checkpoint.tensors import in_parts, optimizer_state, restore_optimizer
 from accerl_lerobot.config.parsing import imported
 from accerl_lerobot.errors import MAX_NONFINITE, NonFiniteError
-from accerl_lerobot.experience import Segment
+from accerl_lerobot.experience import Metrics, Observations, Segment
 from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.policies.adapter import Evaluation, PolicyAdapter
 from accerl_lerobot.policies.teacher import TEACHER_PREFIX
@@ -50,18 +51,23 @@ class BaseUpdate(ABC):
         self.adapter = adapter
         self.config = config
         self.version = 0  # updates made
-        self.skipped = self._skipped_in_a_row = 0
+        self.skipped = 0
+        self._skipped_in_a_row = 0
         self._schedule_updates = config.updates
-        named = adapter.trainable().items()
-        self._policy = [p for k, p in named if not k.startswith((CRITIC_PREFIX, TEACHER_PREFIX))]
-        self._value = [p for k, p in named if k.startswith(CRITIC_PREFIX)]
+        self._policy: list[nn.Parameter] = []
+        self._value: list[nn.Parameter] = []
+        for name, parameter in adapter.trainable().items():
+            if name.startswith(CRITIC_PREFIX):
+                self._value.append(parameter)
+            elif not name.startswith(TEACHER_PREFIX):
+                self._policy.append(parameter)
         self.optimizer = torch.optim.AdamW(self._policy, lr=config.lr, betas=config.betas, weight_decay=0.0)
 
     @abstractmethod
-    def step(self, segments: Sequence[Segment]) -> dict[str, float]:
+    def step(self, segments: Sequence[Segment]) -> Metrics:
         """Learns from new segments and returns metrics; the version rises by one."""
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> State:
         """A copy of all that `restore` needs, the policy's weights apart; see `snapshot`."""
         return {
             "version": self.version,
@@ -71,7 +77,7 @@ class BaseUpdate(ABC):
             "optimizer": optimizer_state(self.optimizer),
         }
 
-    def restore(self, state: dict[str, Any]) -> None:
+    def restore(self, state: State) -> None:
         """Resume from `state`; the adapter has its weights already."""
         self.version = state["version"]
         self.skipped = state["skipped"]
@@ -114,42 +120,49 @@ class RatioUpdate(BaseUpdate):
         self._moments = torch.zeros(3, dtype=torch.float64)  # of the advantages so far
         self._probe = Probe(adapter, config)
 
-    def step(self, segments: Sequence[Segment]) -> dict[str, float]:
+    def step(self, segments: Sequence[Segment]) -> Metrics:
         batch = collate(segments)
         mismatch = self._probe.read(batch)
         self.optimizer.zero_grad(set_to_none=True)
-        parts = ranks.split_rows(np.arange(len(batch)), self.config.micro_batch, ranks.rank(), ranks.size())
+        rows = np.arange(len(batch))
+        parts = ranks.split_rows(rows, self.config.micro_batch, ranks.rank(), ranks.size())
         following = self._values(batch.last_observations, batch.segment_tasks)
         evaluation: Evaluation | None = None
         if len(parts) == 1:  # the forward pass of a single micro-batch has the values
             evaluation = self.adapter.evaluate(*batch.part(parts[0].rows))
-            values = ranks.gather(parts[0].counted(evaluation.value.detach().cpu().float()), len(batch))
+            local_values = evaluation.value.detach().cpu().float()
+            values = ranks.gather(parts[0].counted(local_values), len(batch))
         else:
             values = self._values(batch.observations, batch.tasks)
         advantages, returns = self._targets(batch, values, following)
         metrics = self._backward(batch, parts, evaluation, advantages, returns)
         fault_point("trainer.backward")
         metrics |= self._step(metrics["loss"])
-        metrics |= mismatch | lag_metrics(torch.from_numpy(batch.version), self.version)
+        metrics |= mismatch
+        metrics |= lag_metrics(torch.from_numpy(batch.version), self.version)
         self.version += 1
         self._probe.renew(self.version)
         return metrics
 
-    def state(self) -> dict[str, Any]:
-        return super().state() | {"moments": self._moments.clone(), "probe": self._probe.state()}
+    def state(self) -> State:
+        state = super().state()
+        state["moments"] = self._moments.clone()
+        state["probe"] = self._probe.state()
+        return state
 
-    def restore(self, state: dict[str, Any]) -> None:
+    def restore(self, state: State) -> None:
         super().restore(state)
         self._moments = state["moments"]
         self._probe.restore(state["probe"])
 
-    def _values(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Tensor:
+    def _values(self, observations: Observations, tasks: Sequence[str]) -> Tensor:
         """V of each row, (rows,), without gradient, at most `micro_batch` rows at a time."""
 
         def values(rows: np.ndarray) -> Tensor:
             return self.adapter.values(*pick(observations, tasks, rows)).float()
 
-        return ranks.over_rows(values, np.arange(len(tasks)), self.config.micro_batch)
+        all_rows = np.arange(len(tasks))
+        return ranks.over_rows(values, all_rows, self.config.micro_batch)
 
     def _targets(self, batch: Batch, values: Tensor, following: Tensor) -> tuple[Tensor, Tensor]:
         """Normalised advantages, and returns, each (N,), from V before each decision and V after the last."""
@@ -176,7 +189,7 @@ class RatioUpdate(BaseUpdate):
         only: Evaluation | None,
         advantages: Tensor,
         returns: Tensor,
-    ) -> dict[str, float]:
+    ) -> Metrics:
         """Accumulates the gradient of the loss over micro-batches; returns metrics of the whole batch.
 
         `only` is the evaluation of a single micro-batch.
@@ -184,13 +197,19 @@ class RatioUpdate(BaseUpdate):
         factors = self.adapter.factors(batch.latent)
         ratios = None
         if factors is not None:
-            ratios = float(present(factors, self.algorithm.level).sum()) / len(factors)
-        means: dict[str, float] = {}
+            count = present(factors, self.algorithm.level).sum()
+            ratios = float(count) / len(factors)
+        means: Metrics = {}
         samples: list[Tensor] = []
         for part in parts:
             rows = part.rows
-            evaluation = self.adapter.evaluate(*batch.part(rows)) if only is None else only
+            evaluation = only
+            if evaluation is None:
+                evaluation = self.adapter.evaluate(*batch.part(rows))
             device = evaluation.log_prob.device
+            part_factors = None
+            if factors is not None:
+                part_factors = factors[rows].to(device)
             inputs = LossInputs(
                 log_prob_new=evaluation.log_prob,
                 log_prob_old=batch.log_prob[rows].to(device),
@@ -198,11 +217,13 @@ class RatioUpdate(BaseUpdate):
                 value=evaluation.value,
                 returns=returns[rows].to(device),
                 entropy=evaluation.entropy,
-                factors=None if factors is None else factors[rows].to(device),
+                factors=part_factors,
                 ratios_per_decision=ratios,
             )
             output = self.algorithm.loss(inputs)
-            share = len(rows) / len(batch) if part.own else 0.0
+            share = 0.0
+            if part.own:
+                share = len(rows) / len(batch)
             loss = output.loss * share * ranks.size()  # a gradient is the mean over ranks
             if fault_point("trainer.loss"):
                 loss = loss * math.nan
@@ -212,9 +233,7 @@ class RatioUpdate(BaseUpdate):
             samples.append(part.counted(output.samples.cpu()))
         if not self.config.zero:  # FSDP averages by itself
             ranks.average_gradients(self._policy + self._value)
-        local_means = torch.tensor([list(means.values())], dtype=torch.float64)
-        totals = ranks.gather(local_means, ranks.size()).sum(0).tolist()
-        metrics = dict(zip(means, totals, strict=True))
+        metrics = self._whole_means(means)
         all_samples = ranks.gather(torch.cat(samples), len(batch))
         for name, value in sample_metrics(all_samples, output.clip).items():
             metrics[name] = float(value)
@@ -223,7 +242,13 @@ class RatioUpdate(BaseUpdate):
         metrics["reward_mean"] = float(batch.reward.mean())
         return metrics
 
-    def _step(self, loss: float) -> dict[str, float]:
+    def _whole_means(self, means: Metrics) -> Metrics:
+        """Means over the batch from this rank's shares of them."""
+        local_means = torch.tensor([list(means.values())], dtype=torch.float64)
+        totals = ranks.gather(local_means, ranks.size()).sum(0)
+        return dict(zip(means, totals.tolist(), strict=True))
+
+    def _step(self, loss: float) -> Metrics:
         """A step of the optimiser along the gradient, whose loss it was, if both are finite."""
         warmup = self.config.value_warmup_updates
         lr = self.config.lr * self.lr_share(warmup)
@@ -248,4 +273,6 @@ class RatioUpdate(BaseUpdate):
     def _clip(self, parameters: list[nn.Parameter]) -> float:
         """Scales gradients down to ``trainer.grad_clip``; returns their norm before."""
         norm: Any = torch.nn.utils.clip_grad_norm_(parameters, self.config.grad_clip)
-        return float(norm.full_tensor() if in_parts(norm) else norm)
+        if in_parts(norm):
+            norm = norm.full_tensor()
+        return float(norm)

@@ -24,6 +24,9 @@ from accerl_lerobot.errors import InputError
 MARK = "$"  # key of a JSON object that stands for something JSON does not know
 _KINDS: dict[str, type[Any]] = {}
 
+State = dict[str, Any]
+"""All that an object needs to go on from where it is: a tree that `save` writes."""
+
 
 def kind[T](cls: type[T]) -> type[T]:
     """Class decorator: instances of this dataclass or named tuple, which has no base, may be in a tree."""

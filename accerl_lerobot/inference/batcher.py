@@ -15,6 +15,8 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence, Sized
 
+from accerl_lerobot.experience import Metrics
+
 
 class Batcher[R: Sized]:
     """Gathers requests into batches; ``len(request)`` is the number of observations it carries.
@@ -54,11 +56,13 @@ class Batcher[R: Sized]:
         or in lock step with others that are not here yet."""
         if not self._waiting:
             return None
-        oldest = self._waiting[0][1]
-        if self._environments and not self._of_round:
-            return oldest if self._observations >= self._environments else None
-        full = self._of_round or self._observations >= self.max_batch
-        return oldest if full else oldest + self.max_wait_s
+        _, oldest = self._waiting[0]
+        full = self._environments or self.max_batch
+        if self._of_round or self._observations >= full:
+            return oldest
+        if self._environments:
+            return None
+        return oldest + self.max_wait_s
 
     def take(self, now: float) -> list[R]:
         """Remove the next batch, due or not: the oldest requests, as many as fit, at least one."""
@@ -67,8 +71,11 @@ class Batcher[R: Sized]:
         most = min(self.max_batch, self._of_round or self.max_batch)
         batch: list[R] = []
         size = 0
-        while self._waiting and (not batch or size + len(self._waiting[0][0]) <= most):
-            request, since = self._waiting.popleft()
+        while self._waiting:
+            request, since = self._waiting[0]
+            if batch and size + len(request) > most:
+                break
+            self._waiting.popleft()
             batch.append(request)
             size += len(request)
             self.counts["waited_s"] += now - since
@@ -80,7 +87,7 @@ class Batcher[R: Sized]:
         return batch
 
 
-def merge_metrics(replicas: Sequence[dict[str, float]]) -> dict[str, float]:
+def merge_metrics(replicas: Sequence[Metrics]) -> Metrics:
     """Metrics for the log from those of each replica: `Batcher.counts`, its version and busy share.
 
     Means are over all batches and requests, 0 before the first; the version is the oldest. {} for no replica.

@@ -29,7 +29,7 @@ from accerl_lerobot import errors
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import WEIGHTS
 from accerl_lerobot.config.ranges import Range, Section, Threads
-from accerl_lerobot.experience import Request
+from accerl_lerobot.experience import Decision, Metrics, Request
 from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.inference.batcher import Batcher
 from accerl_lerobot.policies.config import Load, PolicyConfig, loader
@@ -55,7 +55,7 @@ class InferenceConfig(Section, section="inference"):
 
 
 class InferenceWorker:
-    """Becomes an asynchronous Ray actor in `launch`."""
+    """Becomes an asynchronous Ray actor in `engines.ray_engine`."""
 
     def __init__(
         self,
@@ -135,7 +135,7 @@ class InferenceWorker:
             self._iteration = None
             self._server.wake()
 
-    async def metrics(self) -> dict[str, float]:
+    async def metrics(self) -> Metrics:
         """Numbers for `merge_metrics`; does not answer while the serving thread hangs."""
         while self._iteration is not None and time.monotonic() - self._iteration > 2 * LOOK_S:
             await asyncio.sleep(0.1)
@@ -154,7 +154,9 @@ class InferenceWorker:
                 self._iteration = time.monotonic()
                 self._clock.enter(WAIT_IN)
                 deadline = self._batcher.next_deadline()
-                wait = LOOK_S if deadline is None else max(0.0, deadline - time.monotonic())
+                wait = LOOK_S
+                if deadline is not None:
+                    wait = max(0.0, deadline - time.monotonic())
                 self._server.poll(wait)
                 if self._lock_step:
                     self._batcher.lock_step(self._lock_step.popleft())
@@ -196,7 +198,9 @@ class InferenceWorker:
         started = time.monotonic()
         self._clock.enter(COMPUTE)
         broken = fault_point("inference.batch")
-        decisions = self._adapter.decide(requests, self._version) if requests else []
+        decisions: list[Decision] = []
+        if requests:
+            decisions = self._adapter.decide(requests, self._version)
         if broken:
             for decision in decisions:
                 decision.log_prob.fill(np.nan)

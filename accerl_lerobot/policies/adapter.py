@@ -21,16 +21,24 @@ from torch import Tensor, nn
 
 from accerl_lerobot.checkpoint.tensors import in_parts, part_of, whole
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import TASK, Decision, Request, Segment, stack_observations
+from accerl_lerobot.experience import (
+    TASK,
+    Decision,
+    Observation,
+    Observations,
+    Request,
+    Segment,
+    stack_observations,
+)
 from accerl_lerobot.policies import saving
 from accerl_lerobot.policies.config import PLUGINS, PolicyConfig, SamplerConfig
-from accerl_lerobot.policies.family import Encoded, Family, Model, pooled
+from accerl_lerobot.policies.family import Encoded, Family, Latent, Model, pooled
+from accerl_lerobot.policies.features import STATE
 from accerl_lerobot.policies.processing import IMAGES, Processing
 from accerl_lerobot.policies.teacher import TEACHER_PREFIX, Teacher
 from accerl_lerobot.policies.untrusted import FAMILY, VALUE_HEAD
 
 HIDDEN = 128
-OBS_STATE = "observation.state"
 SELF_CHECK_TOLERANCE = 1e-5  # between our sampler and LeRobot's, in normalised actions; fp32 noise is 1e-6
 
 
@@ -58,8 +66,10 @@ class ValueHead(nn.Module):
         """V (B,) from features (B, P, width) and mask (B, P) bool, True where a token is real."""
         features = features.detach().float()  # the critic does not shape the backbone
         scores = (features @ self.query) / features.shape[-1] ** 0.5
-        weights = torch.softmax(scores.masked_fill(~mask, float("-inf")), -1)
-        return self.out(torch.relu(self.hidden(self.norm(pooled(features, weights))))).float()[:, 0]
+        scores = scores.masked_fill(~mask, -torch.inf)
+        x = self.norm(pooled(features, torch.softmax(scores, -1)))
+        x = torch.relu(self.hidden(x))
+        return self.out(x).float()[:, 0]
 
 
 class Evaluation(NamedTuple):
@@ -75,7 +85,7 @@ class PolicyAdapter(nn.Module, ABC):
 
     device: torch.device
 
-    def factors(self, latent: dict[str, Tensor]) -> Tensor | None:
+    def factors(self, latent: Latent) -> Tensor | None:
         """bool (B, L), False for log-prob factors that a latent does not have, such as tokens after the
         terminator; None if all latents have all of them."""
         return None
@@ -85,13 +95,11 @@ class PolicyAdapter(nn.Module, ABC):
         """Acts on a batch, without gradient. Answers in the order of the requests."""
 
     @abstractmethod
-    def evaluate(
-        self, observations: dict[str, np.ndarray], tasks: Sequence[str], latent: dict[str, Tensor]
-    ) -> Evaluation:
+    def evaluate(self, observations: Observations, tasks: Sequence[str], latent: Latent) -> Evaluation:
         """Re-scores stored latents, each (B, ...), differentiably; observations, each (B, ...), are raw."""
 
     @abstractmethod
-    def values(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Tensor:
+    def values(self, observations: Observations, tasks: Sequence[str]) -> Tensor:
         """V only, (B,), without gradient."""
 
     block_names = ""  # regular expression
@@ -104,11 +112,13 @@ class PolicyAdapter(nn.Module, ABC):
         """
         found: dict[str, nn.Module] = {}
         for name, module in self.named_modules():
+            if not name or not re.fullmatch(self.block_names, name):
+                continue
             inside = any(name.startswith(f"{outer}.") for outer in found)
             has_weights = next(module.parameters(), None) is not None
-            if has_weights and not inside and re.fullmatch(self.block_names, name):
+            if has_weights and not inside:
                 found[name] = module
-        return list(found.values()) if self.block_names else []
+        return list(found.values())
 
     @abstractmethod
     def trainable(self) -> dict[str, nn.Parameter]:
@@ -139,8 +149,11 @@ class PolicyAdapter(nn.Module, ABC):
 
     def view_trainable(self) -> dict[str, np.ndarray]:
         """`trainable` as NumPy arrays; on a CPU the parameters' own memory, to be copied before an update."""
-        named = {name: whole(parameter.detach()) for name, parameter in self.trainable().items()}
-        return {name: tensor.to("cpu", torch.float32).numpy() for name, tensor in named.items()}
+        views: dict[str, np.ndarray] = {}
+        for name, parameter in self.trainable().items():
+            tensor = whole(parameter.detach())
+            views[name] = tensor.to("cpu", torch.float32).numpy()
+        return views
 
     def export_trainable(self) -> dict[str, np.ndarray]:
         """A copy of `trainable` as NumPy arrays, safe to hand to another thread."""
@@ -181,7 +194,7 @@ class PretrainedAdapter(PolicyAdapter):
 
     @abstractmethod
     def imitate(
-        self, observations: dict[str, np.ndarray], tasks: Sequence[str], chunk: Tensor
+        self, observations: Observations, tasks: Sequence[str], chunk: Tensor
     ) -> tuple[Tensor, Encoded | None]:
         """LeRobot's training loss, (B,) or its mean, of chunks (B, K, A) in normalised units, and what it was
         read from, if that is known."""
@@ -224,18 +237,21 @@ class PretrainedAdapter(PolicyAdapter):
         rng = np.random.default_rng(0)
         config = self.policy.config
         env_names = {policy: env for env, policy in self.processing.rename_map.items()}
-        batch = (2,) if config.n_obs_steps == 1 or not self.explores else (2, config.n_obs_steps)
-        arrays: dict[str, np.ndarray] = {}
+        batch = [2]
+        if self.explores and config.n_obs_steps > 1:
+            batch.append(config.n_obs_steps)
+        arrays: Observations = {}
         for key, feature in config.input_features.items():
             name = env_names.get(key, key)
-            shape = tuple(feature.shape)
             if key.startswith(IMAGES) and ".empty_camera_" not in key:
-                arrays[name] = rng.integers(0, 256, (*batch, *shape[1:], shape[0]), dtype=np.uint8)
-            elif key == OBS_STATE:
-                arrays[name] = rng.standard_normal((*batch, *shape), dtype=np.float32)
+                channels, height, width = feature.shape
+                arrays[name] = rng.integers(0, 256, (*batch, height, width, channels), dtype=np.uint8)
+            elif key == STATE:
+                arrays[name] = rng.standard_normal((*batch, *feature.shape), dtype=np.float32)
         requests: list[Request] = []
         for i, task in enumerate(("Go", "Put the red cube on the plate")):
-            observation = {name: array[i] for name, array in arrays.items()} | {TASK: task}
+            observation: Observation = {name: array[i] for name, array in arrays.items()}
+            observation[TASK] = task
             requests.append(Request(observation=observation, noise_seed=i, explore=self.explores))
         return requests
 
@@ -259,23 +275,24 @@ class LeRobotAdapter(PretrainedAdapter):
         self.parts |= {"family": self.family, "value_head": self.value_head}
         self.own_files |= {VALUE_HEAD: self.value_head, FAMILY: self.family}
         self.feature_width = model.width
-        self.block_names = model.blocks and rf"policy\.({model.blocks})"
+        if model.blocks:
+            self.block_names = rf"policy\.({model.blocks})"
 
     @property
     def sampler(self) -> SamplerConfig:
         return self.family.sampler
 
-    def encode(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Encoded:
+    def encode(self, observations: Observations, tasks: Sequence[str]) -> Encoded:
         """Reads raw observations, each (B, ...), and B instructions, for the family; differentiable."""
         return self.model.encode(self.processing.prepare(observations, tasks))
 
     def imitate(
-        self, observations: dict[str, np.ndarray], tasks: Sequence[str], chunk: Tensor
+        self, observations: Observations, tasks: Sequence[str], chunk: Tensor
     ) -> tuple[Tensor, Encoded]:
         encoded = self.encode(observations, tasks)
         return self.family.imitation_loss(encoded, chunk), encoded
 
-    def factors(self, latent: dict[str, Tensor]) -> Tensor | None:
+    def factors(self, latent: Latent) -> Tensor | None:
         return self.family.factors(latent)
 
     @torch.no_grad()
@@ -293,22 +310,22 @@ class LeRobotAdapter(PretrainedAdapter):
             decisions.append(Decision(chunk=chunk, latent=latent, log_prob=log_probs[i], version=version))
         return decisions
 
-    def evaluate(
-        self, observations: dict[str, np.ndarray], tasks: Sequence[str], latent: dict[str, Tensor]
-    ) -> Evaluation:
+    def evaluate(self, observations: Observations, tasks: Sequence[str], latent: Latent) -> Evaluation:
+        latent = {name: values.to(self.device) for name, values in latent.items()}
         with self.autocast():
             encoded = self.encode(observations, tasks)
-            log_prob, entropy = self.family.score(encoded, {k: v.to(self.device) for k, v in latent.items()})
-        return Evaluation(log_prob, entropy, self.value_head(encoded.features, encoded.mask))
+            log_prob, entropy = self.family.score(encoded, latent)
+        value = self.value_head(encoded.features, encoded.mask)
+        return Evaluation(log_prob, entropy, value)
 
     @torch.no_grad()
-    def values(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Tensor:
+    def values(self, observations: Observations, tasks: Sequence[str]) -> Tensor:
         with self.autocast():
             encoded = self.encode(observations, tasks)
         return self.value_head(encoded.features, encoded.mask)
 
     @torch.no_grad()
-    def self_check(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> float:
+    def self_check(self, observations: Observations, tasks: Sequence[str]) -> float:
         """Largest difference between our sampler without exploration and LeRobot's own on equal noise.
 
         Raises:

@@ -178,6 +178,8 @@ SIZES = (
     "max_state_dim", "max_action_dim", "num_train_timesteps", "max_decoding_steps", "tokenizer_max_length",
 )  # fmt: skip
 """Numbers of LeRobot's policy configs by which is divided or which are shapes: at least 1."""
+STEPS = ("num_steps", "num_inference_steps", "num_integration_steps", "num_denoising_steps")
+"""Names of LeRobot's policy configs for the number of denoising steps."""
 USES_HISTORY = ("diffusion",)  # types that read observations of ``n_obs_steps`` env steps; others read one
 
 
@@ -196,7 +198,8 @@ def register_policies(wanted: str | None = None) -> None:
     """Fills LeRobot's registry of policy types; those of installed plugins too, if `wanted` is missing.
 
     Of LeRobot's own types, the code of `wanted` alone is imported; of all if it is None or another's."""
-    import_policies(wanted if wanted in POLICIES.keys() - PLUGINS.keys() else None)
+    ours = wanted in POLICIES and wanted not in PLUGINS
+    import_policies(wanted if ours else None)
     from lerobot.configs.policies import PreTrainedConfig
 
     if wanted is None or wanted in PreTrainedConfig.get_known_choices():
@@ -218,7 +221,9 @@ def check_registered(policy_type: Any, field: str, prefix: str = "") -> None:
 
 def discovery(policy_type: str | None) -> list[str]:
     """Arguments by which stock LeRobot commands find this type; none for LeRobot's own."""
-    return [f"--policy.discover_packages_path={PLUGINS[policy_type]}"] if policy_type in PLUGINS else []
+    if policy_type not in PLUGINS:
+        return []
+    return [f"--policy.discover_packages_path={PLUGINS[policy_type]}"]
 
 
 def check_observations(policy_config: Any, field: str) -> None:
@@ -233,7 +238,10 @@ def check_observations(policy_config: Any, field: str) -> None:
 
 def sampler_config(config: PolicyConfig, policy_type: str) -> SamplerConfig:
     """How a policy of this type explores in this run; refuses a sampler that does not suit it."""
-    families = (*POLICIES[policy_type][1], ANY) if policy_type in POLICIES else (ANY,)
+    families = [ANY]
+    if policy_type in POLICIES:
+        _, suitable = POLICIES[policy_type]
+        families = [*suitable, ANY]
     if config.sampler is None:
         return SamplerConfig.get_choice_class(families[0])()
     if config.sampler.type not in families:
@@ -255,13 +263,18 @@ def env_steps_seen(policy_config: Any, *, learns: bool = False) -> int:
 
     A policy of another type than `POLICIES` keeps former ones itself, unless it `learns`.
     """
-    return int(policy_config.n_obs_steps) if learns or policy_config.type in POLICIES else 1
+    if learns or policy_config.type in POLICIES:
+        return int(policy_config.n_obs_steps)
+    return 1
 
 
 def executed_rows(policy_config: Any) -> int:
     """Actions that a policy executes for each of its decisions, in LeRobot's loop and here."""
-    rows = getattr(policy_config, "n_action_steps", None) or getattr(policy_config, "action_chunk_size", None)
-    return int(rows or 1)
+    for name in ("n_action_steps", "action_chunk_size"):
+        rows = getattr(policy_config, name, None)
+        if rows:
+            return int(rows)
+    return 1
 
 
 def check_size(name: str, value: Any, field: str) -> None:
@@ -272,10 +285,8 @@ def check_size(name: str, value: Any, field: str) -> None:
 
 
 def predicted_rows(policy_config: Any) -> int:
-    """Rows of a predicted chunk that can be executed; 0 where LeRobot's config does not tell."""
-    rows = getattr(policy_config, "chunk_size", 0) or getattr(policy_config, "horizon", 0)
-    past = policy_config.n_obs_steps - 1 if policy_config.type in USES_HISTORY else 0
-    return int(rows) - past
+    """Rows of a predicted chunk that can be executed: those that do not stand for the past."""
+    return sum(row >= 0 for row in policy_config.action_delta_indices or ())
 
 
 def override(policy_config: Any, config: PolicyConfig) -> None:
@@ -294,14 +305,15 @@ def override(policy_config: Any, config: PolicyConfig) -> None:
         if hasattr(policy_config, name):
             setattr(policy_config, name, value)
     if config.num_steps is not None:
-        names = [name for name in ("num_steps", "num_inference_steps") if hasattr(policy_config, name)]
+        names = [name for name in STEPS if hasattr(policy_config, name)]
         if not names:
-            hint = f"a {policy_config.type} policy does not denoise; leave the field out"
-            raise InputError("policy.num_steps", config.num_steps, hint)
-        setattr(policy_config, names[0], config.num_steps)
+            hint = f"LeRobot's config of a {policy_config.type} policy has no {' or '.join(STEPS)}"
+            raise InputError("policy.num_steps", config.num_steps, f"{hint}; leave the field out")
+        for name in names:
+            setattr(policy_config, name, config.num_steps)
     if config.n_action_steps is not None:
-        rows = predicted_rows(policy_config) if hasattr(policy_config, "n_action_steps") else 0
-        if not rows:
+        rows = predicted_rows(policy_config)
+        if not rows or not hasattr(policy_config, "n_action_steps"):
             hint = f"a {policy_config.type} policy has no such choice; leave the field out"
             raise InputError("policy.n_action_steps", config.n_action_steps, hint)
         if config.n_action_steps > rows:

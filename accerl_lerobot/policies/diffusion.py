@@ -32,7 +32,15 @@ from torch import Tensor
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Request
 from accerl_lerobot.policies.config import DiffusionSamplerConfig
-from accerl_lerobot.policies.family import Action, Encoded, Family, Model, normal_entropy, normal_log_prob
+from accerl_lerobot.policies.family import (
+    Action,
+    Encoded,
+    Family,
+    Latent,
+    Model,
+    normal_entropy,
+    normal_log_prob,
+)
 
 Network = Callable[[Tensor, int], Tensor]
 """(x (B, H, A), timestep) → what the network predicts, fp32 (B, H, A), given the observations."""
@@ -60,10 +68,11 @@ class Schedule:
         alpha = self.alphas[k]
         following = self.following[k]
         noise_share = 1 - alpha
-        estimate = output
+        clean = output
         if self.prediction == "epsilon":
-            estimate = (x - noise_share**0.5 * output) / alpha**0.5
-        clean = estimate if self.clip is None else estimate.clamp(-self.clip, self.clip)
+            clean = (x - noise_share**0.5 * output) / alpha**0.5
+        if self.clip is not None:
+            clean = clean.clamp(-self.clip, self.clip)
         remaining = alpha / following
         beta = 1 - remaining
         variance = (1 - following) / noise_share * beta
@@ -72,10 +81,13 @@ class Schedule:
             if self.prediction == "sample":
                 noise = (x - alpha**0.5 * output) / noise_share**0.5
             std = eta * variance**0.5
-            return following**0.5 * clean + (1 - following - std**2) ** 0.5 * noise, std
+            of_noise = (1 - following - std**2) ** 0.5
+            mean = following**0.5 * clean + of_noise * noise
+            return mean, std
         of_clean = (following**0.5 * beta) / noise_share
         of_noisy = remaining**0.5 * (1 - following) / noise_share
-        return of_clean * clean + of_noisy * x, variance**0.5
+        mean = of_clean * clean + of_noisy * x
+        return mean, variance**0.5
 
 
 class Diffusion(Model):
@@ -96,24 +108,30 @@ class Diffusion(Model):
         steps = policy.diffusion.num_inference_steps
         most = config.num_train_timesteps
         if steps > most:
-            raise InputError("policy.num_steps", steps, f"use at most {most}, as many as it was trained with")
+            hint = f"use at most {most}, as many as it was trained with"
+            raise InputError("policy.num_steps", steps, hint)
         self.size = (config.horizon, config.action_feature.shape[0])
         first = config.n_obs_steps - 1  # rows before it stand for the past
-        self.rows = slice(first, min(first + config.n_action_steps, config.horizon))
+        end = first + config.n_action_steps
+        self.rows = slice(first, min(end, config.horizon))
         scheduler = policy.diffusion.noise_scheduler
         scheduler.set_timesteps(steps)
-        timesteps = tuple(int(t) for t in scheduler.timesteps)
-        alphas = scheduler.alphas_cumprod.float().cpu()[list(timesteps)]
+        timesteps = scheduler.timesteps.tolist()
+        alphas = scheduler.alphas_cumprod.float().cpu()[timesteps]
+        clip = None
+        if config.clip_sample:
+            clip = config.clip_sample_range
         self.schedule = Schedule(
-            timesteps=timesteps,
+            timesteps=tuple(timesteps),
             alphas=alphas,
             following=torch.cat([alphas[1:], torch.ones(1)]),
             scheduler=config.noise_scheduler_type,
             prediction=config.prediction_type,
-            clip=config.clip_sample_range if config.clip_sample else None,
+            clip=clip,
         )
+        of_state = config.robot_state_feature.shape[0]
         of_images = 2 * config.spatial_softmax_num_keypoints * len(config.image_features)
-        self.width = config.n_obs_steps * (config.robot_state_feature.shape[0] + of_images)
+        self.width = config.n_obs_steps * (of_state + of_images)
 
     def encode(self, batch: dict[str, Tensor]) -> Encoded:
         """The features, one token, are the U-Net's condition: state, image keypoints."""
@@ -124,24 +142,25 @@ class Diffusion(Model):
             t = torch.full(x.shape[:1], timestep, dtype=torch.long, device=x.device)
             return diffusion.unet(x, t, global_cond=condition).float()
 
-        return Encoded(
-            features=condition[:, None], mask=condition.new_ones(len(condition), 1).bool(), context=network
-        )
+        mask = condition.new_ones(len(condition), 1).bool()
+        return Encoded(features=condition[:, None], mask=mask, context=network)
 
     def stock_and_noise(self, batch: dict[str, Tensor], noise: Tensor) -> tuple[Tensor, Tensor]:
         """LeRobot's own chunk from noise (B, H, A), and the step noise (B, N, H, A) that it drew.
 
         It draws from the global generator, which is put back.
         """
-        eps = torch.zeros(len(self.schedule), *noise.shape, device=noise.device)
+        device = noise.device
+        eps = torch.zeros(len(self.schedule), *noise.shape, device=device)
         self.policy.reset()
-        with torch.random.fork_rng([noise.device] if noise.device.type == "cuda" else []):
+        gpus = [device] if device.type == "cuda" else []
+        with torch.random.fork_rng(gpus):
             torch.manual_seed(0)
             chunk = self.stock(self._with_time(batch), noise=noise)
             torch.manual_seed(0)
             for k, timestep in enumerate(self.schedule.timesteps):
                 if self.schedule.scheduler == "DDPM" and timestep > 0:
-                    eps[k] = torch.randn(noise.shape, device=noise.device)
+                    eps[k] = torch.randn(noise.shape, device=device)
         return chunk, eps.transpose(0, 1)
 
     def _with_time(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -164,22 +183,29 @@ class DiffusionFamily(Family):
         self.size = model.size
         self.rows = model.rows
         self.schedule = model.schedule
-        self._factors = self.rows if len(self.schedule) == 1 else slice(None)
+        self._factors = slice(None)
         """L rows. Those without a density are left out: as constant factors they would dilute means."""
-        zero = torch.zeros(1, 1, 1)
-        stds = [self._exploring_step(k, zero, zero)[1] for k in range(len(self.schedule))]
-        counted = torch.ones(len(stds), self.size[0], 1, dtype=torch.bool)
+        steps = len(self.schedule)
+        if steps == 1:
+            self._factors = self.rows
+        horizon, action_dim = self.size
+        counted = torch.ones(steps, horizon, 1, dtype=torch.bool)
         counted[-1] = False
         counted[-1, self.rows] = True
         self.register_buffer("counted", counted, persistent=False)
-        entries = (counted.sum((1, 2)) * self.size[1]).tolist()
-        self.entropy = sum(n * float(normal_entropy(std)) for n, std in zip(entries, stds, strict=True))
+        zero = torch.zeros(1, 1, 1)
+        self.entropy = 0.0
         """Differential entropy of the steps; no weight changes it."""
+        for k in range(steps):
+            _, std = self._exploring_step(k, zero, zero)
+            entries = int(counted[k].sum()) * action_dim
+            self.entropy += entries * float(normal_entropy(std))
 
     def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
         """Samples; without exploration a DDPM policy still draws step noise, as LeRobot's does."""
         device = encoded.features.device
-        x, eps = self.noise(requests, self.size, (len(self.schedule), *self.size), device=device)
+        steps = len(self.schedule)
+        x, eps = self.noise(requests, self.size, (steps, *self.size), device=device)
         return self.sample(encoded.context, x, eps, self.exploring(requests, device))
 
     def sample(self, network: Network, x: Tensor, eps: Tensor, explore: Tensor) -> Action:
@@ -191,36 +217,44 @@ class DiffusionFamily(Family):
             mean, std = self.schedule.step(k, x, output)
             stock = mean + std * eps[:, k]
             mean, std = self._exploring_step(k, x, output)
-            x = torch.where(explore[:, None, None], mean + std * eps[:, k], stock)
-            log_prob = log_prob + torch.where(explore[:, None], self._rows(k, x, mean, std), 0.0)
+            noisy = mean + std * eps[:, k]
+            x = torch.where(explore[:, None, None], noisy, stock)
+            rows = self._rows(k, x, mean, std)
+            log_prob = log_prob + torch.where(explore[:, None], rows, 0.0)
             path.append(x)
-        return Action(x[:, self.rows], {"path": torch.stack(path, 1)}, log_prob[:, self._factors])
+        latent = {"path": torch.stack(path, 1)}
+        return Action(x[:, self.rows], latent, log_prob[:, self._factors])
 
-    def log_prob(self, network: Network, latent: dict[str, Tensor]) -> Tensor:
+    def log_prob(self, network: Network, latent: Latent) -> Tensor:
         """Log-density of stored chains under the current network, (B, L), differentiable."""
         path = latent["path"].unbind(1)
         log_prob = path[0].new_zeros(path[0].shape[:2])
         for k, timestep in enumerate(self.schedule.timesteps):
-            mean, std = self._exploring_step(k, path[k], network(path[k], timestep))
+            output = network(path[k], timestep)
+            mean, std = self._exploring_step(k, path[k], output)
             log_prob = log_prob + self._rows(k, path[k + 1], mean, std)
         return log_prob[:, self._factors]
 
-    def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+    def score(self, encoded: Encoded, latent: Latent) -> tuple[Tensor, Tensor]:
         log_prob = self.log_prob(encoded.context, latent)
         return log_prob, log_prob.new_full((len(log_prob),), self.entropy)
 
     def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
-        size = (len(encoded.features), *self.size)
-        noise = torch.randn(size, generator=torch.Generator().manual_seed(0)).to(encoded.features.device)
+        count = len(encoded.features)
+        generator = torch.Generator().manual_seed(0)
+        noise = torch.randn(count, *self.size, generator=generator).to(encoded.features.device)
         stock, eps = self.model.stock_and_noise(batch, noise)
-        ours = self.sample(encoded.context, noise, eps, torch.zeros_like(noise[:, 0, 0], dtype=torch.bool))
+        explore = torch.zeros(count, dtype=torch.bool, device=noise.device)
+        ours = self.sample(encoded.context, noise, eps, explore)
         return float((ours.chunk - stock).abs().max())
 
     def _exploring_step(self, k: int, x: Tensor, output: Tensor) -> tuple[Tensor, Tensor]:
         """Mean (B, H, A) and std (1, 1, 1) of step k while exploring."""
         mean, std = self.schedule.step(k, x, output, eta=1.0)
-        return mean, std.clamp(min=self.sampler.std_min).to(x).view(1, 1, 1)
+        std = std.clamp(min=self.sampler.std_min)
+        return mean, std.to(x).view(1, 1, 1)
 
     def _rows(self, k: int, x: Tensor, mean: Tensor, std: Tensor) -> Tensor:
         """Log-density of each row (B, H) of step k's outcome x."""
-        return torch.where(self.counted[k], normal_log_prob(x, mean, std), 0.0).sum(-1)
+        entries = normal_log_prob(x, mean, std)
+        return torch.where(self.counted[k], entries, 0.0).sum(-1)

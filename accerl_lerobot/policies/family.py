@@ -24,6 +24,9 @@ from torch import Tensor, nn
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Request
 
+Latent = dict[str, Tensor]
+"""What a family sampled for B decisions: tensors (B, ...) by name."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Encoded:
@@ -38,8 +41,7 @@ class Action(NamedTuple):
     """A family's decisions for a batch."""
 
     chunk: Tensor  # (B, K, A), K executed actions in the policy's normalised units
-    latent: dict[str, Tensor]
-    """Each (B, ...): what was sampled, all that `Family.score` needs beside the observations."""
+    latent: Latent  # all that `Family.score` needs beside the observations
     log_prob: Tensor  # (B, L); zero where not exploring
 
 
@@ -98,7 +100,7 @@ class Family(nn.Module, ABC):
         """Samples; where a request does not explore, LeRobot's own sampler."""
 
     @abstractmethod
-    def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+    def score(self, encoded: Encoded, latent: Latent) -> tuple[Tensor, Tensor]:
         """Log-prob (B, L), differentiable, of what `act` stored, and entropy (B,)."""
 
     def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
@@ -106,18 +108,21 @@ class Family(nn.Module, ABC):
         count = len(encoded.features)
         requests = [Request(observation={}, noise_seed=seed, explore=False) for seed in range(count)]
         ours, latent, _ = self.act(encoded, requests)
-        noise = {"noise": latent["path"][:, 0].clone()} if "path" in latent else {}
+        noise: dict[str, Tensor] = {}
+        if "path" in latent:
+            noise["noise"] = latent["path"][:, 0].clone()
         stock = self.model.stock(batch, **noise)
-        return float((ours - stock[:, : ours.shape[1]]).abs().max())
+        executed = stock[:, : ours.shape[1]]
+        return float((ours - executed).abs().max())
 
     def imitation_loss(self, encoded: Encoded, chunk: Tensor) -> Tensor:
         """LeRobot's training loss (B,) on chunks (B, K, A) of as many actions as are executed, normalised.
 
-        `engine.preflight` refuses off-policy algorithms for a family without it.
+        `run.preflight` refuses off-policy algorithms for a family without it.
         """
         raise NotImplementedError
 
-    def factors(self, latent: dict[str, Tensor]) -> Tensor | None:
+    def factors(self, latent: Latent) -> Tensor | None:
         """See `PolicyAdapter.factors`."""
         return None
 
@@ -125,8 +130,11 @@ class Family(nn.Module, ABC):
     def noise(requests: Sequence[Request], *sizes: tuple[int, ...], device: torch.device) -> list[Tensor]:
         """Standard normal tensors, each (B, *size), row i from request i's own seed, whatever its batch."""
         generators = [np.random.default_rng(request.noise_seed) for request in requests]
-        draws = [[rng.standard_normal(size, dtype=np.float32) for size in sizes] for rng in generators]
-        return [torch.from_numpy(np.stack(column)).to(device) for column in zip(*draws, strict=True)]
+        tensors: list[Tensor] = []
+        for size in sizes:
+            draws = np.stack([rng.standard_normal(size, dtype=np.float32) for rng in generators])
+            tensors.append(torch.from_numpy(draws).to(device))
+        return tensors
 
     @staticmethod
     def exploring(requests: Sequence[Request], device: torch.device) -> Tensor:

@@ -31,15 +31,25 @@ TEXT_FIELDS = ("tokenizer_", "text_encoder_", "text_tokenizer_", "vlm_", "qwen_"
 """Beginnings of the fields of LeRobot's policy configs that only policies with an instruction have."""
 OUTSIDE_SHARE, OUTSIDE_SLACK = 0.05, 0.01
 """Share of a dataset's actions to be warned of that lie outside the bounds by this part of their width."""
-RESIZERS = ("resize_imgs_with_padding", "image_resolution", "resize_shape")
+RESIZERS = (
+    "resize_imgs_with_padding",
+    "image_resolution",
+    "resize_shape",
+    "image_resize_shape",
+    "resize_images_to",
+)
 """Fields of LeRobot's policy configs: where one is set, the policy resizes its images by itself."""
+
+
+Shapes = dict[str, tuple[int, ...]]
+"""Shapes of features by LeRobot's names; images are (channels, height, width)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Features:
     """Inputs and outputs of an environment, a dataset or a policy, by LeRobot's names."""
 
-    shapes: dict[str, tuple[int, ...]]  # name → shape; images are (channels, height, width)
+    shapes: Shapes
     any_size: bool = False  # images of any height and width fit
     fps: float | None = None  # control rate in Hz; None: not known
     labelled_fps: tuple[float, ...] = ()  # see `EnvironmentSpec.labelled_fps`
@@ -50,8 +60,11 @@ class Features:
 
 def env_features(spec: EnvironmentSpec) -> Features:
     """Features that an environment offers."""
-    shapes: dict[str, tuple[int, ...]] = {name: (c, h, w) for name, (h, w, c) in spec.images.items()}
-    shapes |= {STATE: (spec.state_dim,), ACTION: (spec.action_dim,)}
+    shapes: Shapes = {}
+    for name, (height, width, channels) in spec.images.items():
+        shapes[name] = (channels, height, width)
+    shapes[STATE] = (spec.state_dim,)
+    shapes[ACTION] = (spec.action_dim,)
     labels = spec.labelled_fps
     return Features(shapes=shapes, fps=spec.fps, labelled_fps=labels, tasks=spec.instructions)
 
@@ -81,12 +94,18 @@ def fine_tuned_features(policy: Any, dataset: Features, renames: dict[str, str])
     """
     needed = policy_features(policy)
     offered = {renames.get(name, name): shape for name, shape in dataset.shapes.items()}
-    read = {name for name, shape in needed.shapes.items() if len(shape) == 3}
-    recorded = {name for name, shape in offered.items() if len(shape) == 3}
+    read = cameras(needed.shapes)
+    recorded = cameras(offered)
     matching = bool(renames) or read <= recorded or recorded <= read
     if not (pads(policy) and read & recorded and matching):
         return needed
-    return replace(needed, shapes={name: offered[name] for name in needed.shapes if name in offered})
+    shapes = {name: offered[name] for name in needed.shapes if name in offered}
+    return replace(needed, shapes=shapes)
+
+
+def cameras(shapes: Shapes) -> set[str]:
+    """Names of the images among some features."""
+    return {name for name, shape in shapes.items() if len(shape) == 3}
 
 
 def dataset_features(meta: Any) -> Features:
@@ -102,26 +121,29 @@ def dataset_features(meta: Any) -> Features:
                 unusable[name] = f"it is {kind}, and policies read numbers; record it as float32"
                 del shapes[name]
             continue
-        parts = ", ".join(key for key in meta.features if key.startswith(f"{name}."))
+        parts = [key for key in meta.features if key.startswith(f"{name}.")]
         if parts:
-            unusable[name] = (
-                f"it is in parts ({parts}); join them into one {name} with LeRobot's add_features"
-            )
+            hint = f"join them into one {name} with LeRobot's add_features"
+            unusable[name] = f"it is in parts ({', '.join(parts)}); {hint}"
     tasks = tuple(map(str, meta.tasks.index))
     return Features(shapes=shapes, fps=meta.fps, tasks=tasks, unusable=unusable)
 
 
-def dataset_shapes(meta: Any) -> dict[str, tuple[int, ...]]:
+def dataset_shapes(meta: Any) -> Shapes:
     """Shapes of a LeRobotDataset's features; images are (channels, height, width)."""
     from lerobot.utils.feature_utils import dataset_to_policy_features
 
     return _shapes(dataset_to_policy_features(meta.features))
 
 
-def _shapes(features: dict[str, Any]) -> dict[str, tuple[int, ...]]:
+def _shapes(features: dict[str, Any]) -> Shapes:
     """Shapes of the features that policies read or write."""
-    named = {k: f for k, f in features.items() if f.type.name == "VISUAL" or k in (STATE, ENV_STATE, ACTION)}
-    return {k: tuple(f.shape) for k, f in named.items() if ".empty_camera_" not in k}
+    shapes: Shapes = {}
+    for name, feature in features.items():
+        camera = feature.type.name == "VISUAL" and ".empty_camera_" not in name
+        if camera or name in (STATE, ENV_STATE, ACTION):
+            shapes[name] = tuple(feature.shape)
+    return shapes
 
 
 def check_features(
@@ -140,10 +162,11 @@ def check_features(
     """
     renames = "policy.rename_map"
     sources = {name for name in offered.shapes if name != ACTION}
-    if unknown := sorted(rename_map.keys() - sources):
+    unknown = sorted(rename_map.keys() - sources)
+    if unknown:
         names = ", ".join(sorted(sources))
         raise InputError(renames, unknown[0], f"the {offerer} has no such feature; it offers {names}")
-    shapes: dict[str, tuple[int, ...]] = {}
+    shapes: Shapes = {}
     for name, shape in offered.shapes.items():
         new = rename_map.get(name, name)
         if new in shapes:
@@ -154,21 +177,24 @@ def check_features(
         if name in offered.unusable:
             raise InputError(field, value, f"no {name} in the {offerer}: {offered.unusable[name]}")
         if name not in shapes:
-            same = [k for k, other in shapes.items() if len(other) == len(shape) and k != ACTION]
+            same = [key for key, other in shapes.items() if len(other) == len(shape) and key != ACTION]
             why = f"no {name} in the {offerer}, which offers {', '.join(same) or 'none'}"
             if image:
                 why += "; choose env.camera (env.images of gym), or map names with policy.rename_map" + hint
             raise InputError(field, value, why)
-        compared = 1 if image and needed.any_size else len(shape)
+        compared = len(shape)
+        if image and needed.any_size:
+            compared = 1  # the channels
         if shapes[name][:compared] != shape[:compared]:
             advice = "give both one image size" if image else "choose parties that were made for each other"
             sizes = f"its {name} is {shape}, but {shapes[name]} in the {offerer}"
             raise InputError(field, value, f"{sizes}; {advice}")
-    rates = (offered.fps, *offered.labelled_fps) if offered.fps else ()
-    if needed.fps and rates and not any(math.isclose(needed.fps, rate) for rate in rates):
-        why = f"recorded at {needed.fps:g} Hz, but the environment runs at {offered.fps:g} Hz"
-        advice = "its actions would be executed at another rate; use a dataset of this rate"
-        raise InputError(field, value, f"{why}: {advice}, or with env.type=gym set env.fps")
+    if needed.fps and offered.fps:
+        rates = (offered.fps, *offered.labelled_fps)
+        if not any(math.isclose(needed.fps, rate) for rate in rates):
+            why = f"recorded at {needed.fps:g} Hz, but the environment runs at {offered.fps:g} Hz"
+            advice = "its actions would be executed at another rate; use a dataset of this rate"
+            raise InputError(field, value, f"{why}: {advice}, or with env.type=gym set env.fps")
     if needed.reads_text and offerer == "environment" and not offered.tasks:
         why = "the policy reads an instruction, and the environment gives none; name it in env.task"
         logger.warning("%s=%r: %s", field, value, why)
@@ -185,23 +211,28 @@ def _check_tasks(needed: tuple[str, ...], offered: tuple[str, ...], field: str, 
         raise InputError(field, value, f"{why}; set it with {tool}, --repo_id and --root")
     spelled = {_plain(text): text for text in needed}
     missing = [text for text in offered if _plain(text) not in spelled]
-    has = ", ".join(map(repr, needed[:4])) + (" …" if len(needed) > 4 else "")
-    message = f"no episode of {', '.join(map(repr, missing[:4]))}, the environment's task: it has {has}"
+    has = ", ".join(map(repr, needed[:4]))
+    if len(needed) > 4:
+        has += " …"
+    lacks = ", ".join(map(repr, missing[:4]))
+    message = f"no episode of {lacks}, the environment's task: it has {has}"
     if len(missing) == len(offered):
         raise InputError(field, value, f"{message}; choose env.task accordingly")
     if missing:
         logger.warning("%s=%r: %s", field, value, message)
     for text in offered:
         if text not in needed and text not in missing:
-            why = f"the environment's instruction is {text!r}, and the dataset's {spelled[_plain(text)]!r}"
+            other = spelled[_plain(text)]
+            why = f"the environment's instruction is {text!r}, and the dataset's {other!r}"
             logger.warning("%s=%r: %s; policies tell them apart", field, value, why)
 
 
 def check_actions(actions: np.ndarray, spec: EnvironmentSpec, field: str, value: object) -> None:
     """Warns where many of a dataset's actions (N, A) lie outside the range that the environment executes."""
     slack = OUTSIDE_SLACK * (spec.action_high - spec.action_low)
-    outside = (actions < spec.action_low - slack) | (actions > spec.action_high + slack)
-    share = outside.mean(0)
+    below = actions < spec.action_low - slack
+    above = actions > spec.action_high + slack
+    share = (below | above).mean(0)
     worst = int(share.argmax())
     if share[worst] < OUTSIDE_SHARE:
         return
@@ -217,4 +248,5 @@ def check_actions(actions: np.ndarray, spec: EnvironmentSpec, field: str, value:
 
 def _plain(text: str) -> str:
     """An instruction without what does not count: letter case, spaces and a full stop."""
-    return " ".join(text.lower().split()).rstrip(".")
+    words = text.lower().split()
+    return " ".join(words).rstrip(".")

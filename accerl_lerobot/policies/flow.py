@@ -23,7 +23,15 @@ from torch import Tensor
 
 from accerl_lerobot.experience import Request
 from accerl_lerobot.policies.config import FlowSamplerConfig
-from accerl_lerobot.policies.family import Action, Encoded, Family, Model, normal_entropy, normal_log_prob
+from accerl_lerobot.policies.family import (
+    Action,
+    Encoded,
+    Family,
+    Latent,
+    Model,
+    normal_entropy,
+    normal_log_prob,
+)
 
 Velocity = Callable[[Tensor, Tensor], Tensor]
 """(x (B, K, D), t (B,)) → v (B, K, D), conditioned on the observations; output in fp32."""
@@ -45,10 +53,11 @@ class FlowShape:
 
     def integrate(self, velocity: Velocity, x: Tensor) -> Tensor:
         """LeRobot's Euler loop from noise (B, K, D) to actions (B, K, D), padding included."""
-        n = self.num_steps
-        for k in range(n):
-            t = 1.0 + k * (-1.0 / n)  # in double precision, as LeRobot counts it
-            x = x + (-1.0 / n) * velocity(x, x.new_full((len(x),), t))
+        step = -1.0 / self.num_steps
+        for k in range(self.num_steps):
+            t = 1.0 + k * step  # in double precision, as LeRobot counts it
+            times = x.new_full((len(x),), t)
+            x = x + step * velocity(x, times)
         return x
 
 
@@ -80,27 +89,30 @@ class FlowFamily(Family):
         """Differential entropy of the executed entries; no weight changes it."""
 
     def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
-        n, size = self.shape.num_steps, (self.shape.chunk_size, self.shape.padded_dim)
+        device = encoded.features.device
+        size = (self.shape.chunk_size, self.shape.padded_dim)
         # As many as steps are drawn, though one is used: recorded runs used these numbers.
-        x0, eps = self.noise(requests, size, (n, *size), device=encoded.features.device)
-        return self.sample(encoded.context, x0, eps[:, -1], self.exploring(requests, x0.device))
+        x0, eps = self.noise(requests, size, (self.shape.num_steps, *size), device=device)
+        return self.sample(encoded.context, x0, eps[:, -1], self.exploring(requests, device))
 
     def sample(self, velocity: Velocity, x0: Tensor, eps: Tensor, explore: Tensor) -> Action:
         """Denoises `x0` (B, K, D), and adds noise `eps` (B, K, D) where `explore` (B,), else as LeRobot."""
         mean = self.shape.integrate(velocity, x0)
-        x = torch.where(explore[:, None, None], mean + self._std(x0) * eps, mean)
+        noisy = mean + self._std(x0) * eps
+        x = torch.where(explore[:, None, None], noisy, mean)
+        log_prob = self._rows(x, mean)
         return Action(
             chunk=self.shape.executed_part(x),
             latent={"path": torch.stack([x0, x], 1)},
-            log_prob=torch.where(explore[:, None], self._rows(x, mean), 0.0),
+            log_prob=torch.where(explore[:, None], log_prob, 0.0),
         )
 
-    def log_prob(self, velocity: Velocity, latent: dict[str, Tensor]) -> Tensor:
+    def log_prob(self, velocity: Velocity, latent: Latent) -> Tensor:
         """Log-density of stored latents under the current velocity field, (B, L), differentiable."""
         x0, x = latent["path"].unbind(1)
         return self._rows(x, self.shape.integrate(velocity, x0))
 
-    def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+    def score(self, encoded: Encoded, latent: Latent) -> tuple[Tensor, Tensor]:
         log_prob = self.log_prob(encoded.context, latent)
         return log_prob, log_prob.new_full((len(log_prob),), self.entropy)
 
@@ -109,17 +121,18 @@ class FlowFamily(Family):
         target = chunk.new_zeros(len(chunk), self.shape.chunk_size, self.shape.padded_dim)
         self.shape.executed_part(target).copy_(chunk)
         noise = torch.randn_like(target)
-        # Its checks would read values, which fake tensors do not have.
-        times = torch.distributions.Beta(1.5, 1.0, validate_args=False).sample((len(chunk),))
+        times = torch.distributions.Beta(1.5, 1.0).sample((len(chunk),))
         t = times.to(chunk) * 0.999 + 0.001
-        mixed = t[:, None, None] * noise + (1 - t[:, None, None]) * target
-        error = (encoded.context(mixed, t) - (noise - target)).square()
-        return self.shape.executed_part(error).mean((1, 2))
+        share = t[:, None, None]
+        mixed = share * noise + (1 - share) * target
+        error = encoded.context(mixed, t) - (noise - target)
+        return self.shape.executed_part(error).square().mean((1, 2))
 
     def _std(self, like: Tensor) -> Tensor:
         return like.new_full((), self.sampler.noise_level)
 
     def _rows(self, x: Tensor, mean: Tensor) -> Tensor:
         """Log-density (B, L) of the executed entries of x (B, K, D)."""
-        part = self.shape.executed_part
-        return normal_log_prob(part(x), part(mean), self._std(x)).sum(-1)
+        executed = self.shape.executed_part(x)
+        executed_mean = self.shape.executed_part(mean)
+        return normal_log_prob(executed, executed_mean, self._std(x)).sum(-1)

@@ -26,6 +26,7 @@ from accerl_lerobot.policies.family import (
     Action,
     Encoded,
     Family,
+    Latent,
     Model,
     NoDensityError,
     normal_entropy,
@@ -54,15 +55,19 @@ class StdHead(nn.Module):
         super().__init__()
         self.norm = nn.LayerNorm(width)
         self.out = nn.Linear(width, action_dim)
-        self.low, self.high = (math.log(bound) for bound in sampler.bounds)
-        start = (math.log(sampler.std) - self.low) / (self.high - self.low)
+        low, high = sampler.bounds
+        self.low = math.log(low)
+        self.high = math.log(high)
+        share = (math.log(sampler.std) - self.low) / (self.high - self.low)
+        start = math.log(share / (1 - share))
         nn.init.zeros_(self.out.weight)
-        nn.init.constant_(self.out.bias, math.log(start / (1 - start)))
+        nn.init.constant_(self.out.bias, start)
 
     def forward(self, rows: Tensor) -> Tensor:
         """(B, K, W) to (B, K, A): between the bounds by a sigmoid between their logarithms."""
         raw = self.out(self.norm(rows.detach().float())).float()
-        return torch.exp(self.low + (self.high - self.low) * torch.sigmoid(raw))
+        share = torch.sigmoid(raw)
+        return torch.exp(self.low + (self.high - self.low) * share)
 
 
 class GaussianFamily(Family):
@@ -77,22 +82,25 @@ class GaussianFamily(Family):
         (eps,) = self.noise(requests, tuple(mean.shape[1:]), device=mean.device)
         explore = self.exploring(requests, mean.device)
         u = torch.where(explore[:, None, None], mean + std * eps, mean)
-        counted = normal_log_prob(u, mean, std).sum(-1)
-        return Action(u, {"u": u}, torch.where(explore[:, None], counted, 0.0))
+        log_prob = normal_log_prob(u, mean, std).sum(-1)
+        log_prob = torch.where(explore[:, None], log_prob, 0.0)
+        return Action(u, {"u": u}, log_prob)
 
-    def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+    def score(self, encoded: Encoded, latent: Latent) -> tuple[Tensor, Tensor]:
         mean, std = self._gaussian(encoded)
         log_prob = normal_log_prob(latent["u"], mean, std).sum(-1)
         return log_prob, normal_entropy(std).sum((1, 2))
 
     def imitation_loss(self, encoded: Encoded, chunk: Tensor) -> Tensor:
         """Mean absolute error, ACT's reconstruction loss."""
-        return (self._gaussian(encoded)[0] - chunk).abs().mean((1, 2))
+        mean, _ = self._gaussian(encoded)
+        return (mean - chunk).abs().mean((1, 2))
 
     def _gaussian(self, encoded: Encoded) -> tuple[Tensor, Tensor]:
         """Mean and std of the executed rows, each (B, L, A)."""
-        mean, rows = (part[:, : self.model.executed] for part in encoded.context)
-        return mean, self.std(rows)
+        mean, rows = encoded.context
+        executed = self.model.executed
+        return mean[:, :executed], self.std(rows[:, :executed])
 
 
 class ACT(GaussianModel):
@@ -109,24 +117,29 @@ class ACT(GaussianModel):
             raise NoDensityError("policy.temporal_ensemble_coeff", config.temporal_ensemble_coeff, hint)
         self.executed = config.n_action_steps
         self.action_dim = config.action_feature.shape[0]
-        self.width = self.row_width = config.dim_model
+        self.width = config.dim_model
+        self.row_width = config.dim_model
 
     def encode(self, batch: dict[str, Tensor]) -> Encoded:
         """The features are the encoder's output: latent, state, image positions."""
         model = self.policy.model
         inputs: dict[str, Any] = dict(batch)
-        if self.policy.config.image_features:
-            inputs[OBS_IMAGES] = [batch[key] for key in self.policy.config.image_features]
+        cameras = self.policy.config.image_features
+        if cameras:
+            inputs[OBS_IMAGES] = [batch[camera] for camera in cameras]
         seen: dict[str, Tensor] = {}
 
+        def note_features(module: nn.Module, given: Any, made: Tensor) -> None:
+            seen["features"] = made
+
+        def note_rows(module: nn.Module, given: Any) -> None:
+            seen["rows"] = given[0]
+
         with (
-            model.encoder.register_forward_hook(lambda module, given, made: seen.update(features=made)),
-            model.action_head.register_forward_pre_hook(lambda module, given: seen.update(rows=given[0])),
+            model.encoder.register_forward_hook(note_features),
+            model.action_head.register_forward_pre_hook(note_rows),
         ):
             mean, _ = model(inputs)
         features = seen["features"].transpose(0, 1)
-        return Encoded(
-            features=features,
-            mask=features.new_ones(features.shape[:2]).bool(),
-            context=(mean.float(), seen["rows"]),
-        )
+        mask = features.new_ones(features.shape[:2]).bool()
+        return Encoded(features=features, mask=mask, context=(mean.float(), seen["rows"]))

@@ -27,7 +27,6 @@ from accerl_lerobot.config.machine import computes_bf16
 from accerl_lerobot.config.parsing import discover, imported
 from accerl_lerobot.errors import InputError, expanded
 from accerl_lerobot.experience import stack_observations
-from accerl_lerobot.policies import untrusted
 from accerl_lerobot.policies.adapter import LeRobotAdapter, ValueHead
 from accerl_lerobot.policies.config import (
     POLICIES,
@@ -51,7 +50,17 @@ from accerl_lerobot.policies.processing import (
 )
 from accerl_lerobot.policies.saving import tune
 from accerl_lerobot.policies.stock import StockAdapter
-from accerl_lerobot.policies.untrusted import ADAPTER, ADAPTER_CONFIG, fetched_checkpoint, refusing
+from accerl_lerobot.policies.untrusted import (
+    ADAPTER,
+    ADAPTER_CONFIG,
+    CONFIG,
+    WEIGHTS,
+    Unfilled,
+    fetched_checkpoint,
+    guarded,
+    is_adapter,
+    refusing,
+)
 
 ACTS_MOST = 10**9  # parameters of a policy that acts in a dry run; π0's four billion would take minutes
 
@@ -82,12 +91,15 @@ _known_sizes: dict[tuple[str, bool, bool], Sizes] = {}  # of the dry runs of thi
 def resolve_device(name: str, field: str = "policy.device") -> torch.device:
     """The device of this name; ``auto`` is CUDA when there is one. The error names `field`."""
     available = torch.cuda.is_available()
-    automatic = "cuda" if available else "cpu"
-    device = torch.device(automatic if name == "auto" else name)
-    if device.type == "cuda" and not available:
+    if name == "auto":
+        return torch.device("cuda" if available else "cpu")
+    device = torch.device(name)
+    if device.type != "cuda":
+        return device
+    if not available:
         raise InputError(field, name, "no CUDA device here; use cpu or auto")
     count = torch.cuda.device_count()
-    if device.type == "cuda" and (device.index or 0) >= count:
+    if (device.index or 0) >= count:
         raise InputError(field, name, f"there are {count} such devices here, numbered from 0")
     return device
 
@@ -165,7 +177,8 @@ def load_adapter(
     sampler = sampler_config(config, checkpoint.config.type)
     if isinstance(sampler, ChunkNoiseConfig):
         return _stock_adapter(checkpoint, config, sampler, dry_run, fine_tuned)
-    model_class = imported(POLICIES[checkpoint.config.type][0])
+    model_class = _model_class(checkpoint)
+    assert model_class is not None
     policy, processing = _load_parts(checkpoint, config, model_class, dry_run, fine_tuned)
     with refusing(checkpoint.source, "it cannot act here"):
         model = model_class(policy)
@@ -191,17 +204,30 @@ def _stock_adapter(
     fine_tuned: bool,
 ) -> StockAdapter:
     """A policy of any type, which has acted once; with a `sampler` one that explores and learns."""
-    known = POLICIES.get(checkpoint.config.type)
-    model_class = None if known is None else imported(known[0])
+    model_class = _model_class(checkpoint)
     policy, processing = _load_parts(checkpoint, config, model_class, dry_run, fine_tuned)
-    adapter = StockAdapter(policy, processing, precision_on(processing.device, config.precision), sampler)
+    precision = precision_on(processing.device, config.precision)
+    adapter = StockAdapter(policy, processing, precision, sampler)
     with refusing(checkpoint.source, "it cannot act here"):
         if sampler is None:
             adapter.decide(adapter.example_requests(), 0)
         else:
-            tune(policy, config.tuning)
+            backbone = None
+            if model_class is not None:
+                backbone = model_class.backbone
+            tune(policy, config.tuning, backbone)
             adapter.self_check()
     return adapter
+
+
+def _model_class(checkpoint: Checkpoint) -> type[Model] | None:
+    """The model of a policy type that has a likelihood; None for any other type."""
+    policy_type = checkpoint.config.type
+    if policy_type not in POLICIES:
+        return None
+    path, _ = POLICIES[policy_type]
+    model_class: type[Model] = imported(path)
+    return model_class
 
 
 def load_network(config: PolicyConfig) -> tuple[Any, Processing]:
@@ -229,10 +255,10 @@ def open_checkpoint(config: PolicyConfig) -> Checkpoint:
     folder = fetched_checkpoint(config.path, config.revision, "policy.path")
     source = FileSource("policy.path", config.path)
     discover(config.discover_packages_path, "policy")
-    kind = read_json(folder / untrusted.CONFIG, source).get("type")
+    kind = read_json(folder / CONFIG, source).get("type")
     if kind is None:
-        known = ", ".join(sorted(PreTrainedConfig.get_known_choices()))
-        hint = f'{untrusted.CONFIG} of {config.path} names no type; add "type": one of {known}'
+        types = ", ".join(sorted(PreTrainedConfig.get_known_choices()))
+        hint = f'{CONFIG} of {config.path} names no type; add "type": one of {types}'
         raise InputError("policy.type", None, hint)
     register_policies(str(kind))
     check_registered(kind, "policy.type", f"{config.path} is of this type: ")
@@ -258,29 +284,31 @@ def _load_parts(
     folder, source, policy_config = checkpoint
     check_statistics(policy_config, folder, source, replaced=fine_tuned)
     with contextlib.ExitStack() as guards:
-        guards.enter_context(untrusted.guarded("policy", config.trust_remote_code))
+        guards.enter_context(guarded("policy", config.trust_remote_code))
         if model_class is not None:
             guards.enter_context(model_class.loading())
         with refusing(source, f"its LeRobot processors did not load; {PROCESSORS_HINT}"):
             processing = load_processors(policy_config, folder, config.rename_map)
-        with refusing(source, "its network cannot be built as its config.json says"), untrusted.Unfilled():
+        with refusing(source, "its network cannot be built as its config.json says"), Unfilled():
             policy = _build_network(policy_config)
+    unread: Sequence[str] = ()
     if model_class is not None:
+        unread = model_class.unread
         # LeRobot builds SmolVLA's backbone and expert in the backbone's bfloat16, in which small steps of a
         # gradient are lost.
         policy = policy.float()
     base = weights_folder(folder, source)
-    unread = () if model_class is None else model_class.unread
-    load_weights(policy, unread, base / untrusted.WEIGHTS, source, read=not dry_run)
+    load_weights(policy, unread, base / WEIGHTS, source, read=not dry_run)
     if base != folder:
-        with refusing(source, "its adapter did not load"), untrusted.guarded("policy"):
+        with refusing(source, "its adapter did not load"), guarded("policy"):
             policy = _merged(policy, folder, source)
     keep_tokenizer_names(policy_config, folder)
     policy.to(processing.device).eval()
     if processing.device.type == "cuda" and precision_on(processing.device, config.precision) == "fp32":
         # torch convolves with 10 bits of mantissa there. For batches of different sizes cuDNN chooses other
         # algorithms; what they round differently is divided by the std of the noise in every log-prob.
-        torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = False
+        torch.backends.cudnn.allow_tf32 = False
+        torch.backends.cuda.matmul.allow_tf32 = False
     return policy, processing
 
 
@@ -310,16 +338,20 @@ def load_weights(
     stored = _renamed(stored, policy)
     expected = policy.state_dict()
     # Nor is a tensor missing that a policy holds under several names: savers keep one of them.
-    held = {expected[name].data_ptr() for name in stored.keys() & expected.keys()}
-    absent = expected.keys() - stored.keys() - set(unread)
+    both = stored.keys() & expected.keys()
+    held = {expected[name].data_ptr() for name in both}
+    absent = expected.keys() - both - set(unread)
     problems = {
         "missing": [name for name in absent if expected[name].data_ptr() not in held],
-        "unexpected": list(stored.keys() - expected.keys()),
-        "of another shape": [n for n, t in stored.items() if n in expected and t.shape != expected[n].shape],
+        "unexpected": list(stored.keys() - both),
+        "of another shape": [name for name in both if stored[name].shape != expected[name].shape],
     }
     if any(problems.values()):
-        counts = ", ".join(f"{len(names)} {what} {sorted(names)[:3]}" for what, names in problems.items())
-        hint = f"the weights did not load: tensors {counts}; config.json and {file.name} disagree"
+        counts: list[str] = []
+        for what, names in problems.items():
+            counts.append(f"{len(names)} {what} {sorted(names)[:3]}")
+        listed = ", ".join(counts)
+        hint = f"the weights did not load: tensors {listed}; config.json and {file.name} disagree"
         raise InputError(source.field, source.value, hint)
     if read:
         policy.load_state_dict(stored, strict=False)
@@ -335,17 +367,20 @@ def _renamed(stored: dict[str, Tensor], policy: Any) -> dict[str, Tensor]:
     if rename is None:
         return stored
     renamed = _prefixed(rename(stored, policy.config))
-    # What a file has under its own name goes before what is taken for it.
-    return renamed | {name: t for name, t in _prefixed(stored).items() if name in renamed}
+    for name, tensor in _prefixed(stored).items():
+        if name in renamed:  # what a file has under its own name goes before what is taken for it
+            renamed[name] = tensor
+    return renamed
 
 
 def _prefixed(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    return {k if k.startswith("model.") else f"model.{k}": tensor for k, tensor in tensors.items()}
+    prefix = "model."
+    return {prefix + name.removeprefix(prefix): tensor for name, tensor in tensors.items()}
 
 
 def weights_folder(folder: Path, source: FileSource) -> Path:
     """The folder with all of a policy's weights: `folder` itself, or, of an adapter, the policy it is for."""
-    if not untrusted.is_adapter(folder):
+    if not is_adapter(folder):
         return folder
     stored = read_json(folder / ADAPTER_CONFIG, source)
     base = stored.get("base_model_name_or_path")
@@ -379,7 +414,8 @@ def _merged(policy: Any, folder: Path, source: FileSource) -> Any:
 def _load_ours(adapter: LeRobotAdapter, checkpoint: Checkpoint) -> None:
     """Loads critic and family, where the checkpoint has them."""
     folder, source, _ = checkpoint
-    for file, module in ((untrusted.FAMILY, adapter.family), (untrusted.VALUE_HEAD, adapter.value_head)):
+    for file, module in adapter.own_files.items():
         if (folder / file).is_file():
             with refusing(source, f"{file}: not of this policy; remove it to start anew"):
-                module.load_state_dict(dict(read_tensors(folder / file, source)))
+                stored = dict(read_tensors(folder / file, source))
+                module.load_state_dict(stored)

@@ -22,7 +22,8 @@ from torch import Tensor
 from accerl_lerobot.checkpoint.layout import CONFIG_FOLDERS, PREPROCESSOR, STEP_FOLDERS
 from accerl_lerobot.checkpoint.safety import FileSource, read_tensors, tensor_shapes
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.policies.features import ACTION, STATE, STATISTICS, pads, policy_features
+from accerl_lerobot.experience import Observations
+from accerl_lerobot.policies.features import ACTION, STATE, STATISTICS, Shapes, cameras, pads, policy_features
 from accerl_lerobot.policies.untrusted import CONFIG, PROCESSORS
 
 logger = logging.getLogger(__name__)
@@ -41,11 +42,11 @@ class Processing:
     device: torch.device
     rename_map: dict[str, str]
 
-    def prepare(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> dict[str, Tensor]:
+    def prepare(self, observations: Observations, tasks: Sequence[str]) -> dict[str, Tensor]:
         """Normalised and tokenised observations."""
         return self.preprocessor({"task": list(tasks), **self.tensors(observations)})
 
-    def tensors(self, observations: dict[str, np.ndarray]) -> dict[str, Tensor]:
+    def tensors(self, observations: Observations) -> dict[str, Tensor]:
         """By the policy's names; images go from uint8 (..., H, W, 3) to float (..., 3, H, W) in [0, 1]."""
         batch: dict[str, Tensor] = {}
         for key, array in observations.items():
@@ -72,7 +73,8 @@ class Processing:
         """
         zero, scale = self.units(chunk[0])
         varies = scale.abs() > CONSTANT
-        return torch.where(varies, (chunk - zero) / torch.where(varies, scale, 1), 0)
+        divisor = torch.where(varies, scale, 1)
+        return torch.where(varies, (chunk - zero) / divisor, 0)
 
 
 def load_processors(policy_config: Any, folder: Path, rename_map: dict[str, str]) -> Processing:
@@ -82,20 +84,23 @@ def load_processors(policy_config: Any, folder: Path, rename_map: dict[str, str]
     steps = stored_steps(folder, PREPROCESSOR)
     for step in steps:
         kind = step["registry_name"]
-        option, own = STEP_FOLDERS.get(kind, ("", ""))
-        if own and (folder / own).is_dir():
-            overrides[kind] = {option: str((folder / own).resolve())}
+        options: dict[str, Any] = {}
         if kind == "action_tokenizer_processor":  # LeRobot does not save these two of its options
-            overrides.setdefault(kind, {}).update(
-                paligemma_tokenizer_name=policy_config.text_tokenizer_name,
-                fast_skip_tokens=policy_config.fast_skip_tokens,
-            )
+            options["paligemma_tokenizer_name"] = policy_config.text_tokenizer_name
+            options["fast_skip_tokens"] = policy_config.fast_skip_tokens
+        if kind in STEP_FOLDERS:
+            option, own = STEP_FOLDERS[kind]
+            if (folder / own).is_dir():
+                options[option] = str((folder / own).resolve())
+        if options:
+            overrides[kind] = options
     pre, post = make_pre_post_processors(
         policy_config, pretrained_path=str(folder), preprocessor_overrides=overrides
     )
     for loaded, step in zip(pre.steps, steps, strict=True):
-        option, _ = STEP_FOLDERS.get(step["registry_name"], ("", ""))
-        if option:  # what is saved has the names that the checkpoint has
+        kind = step["registry_name"]
+        if kind in STEP_FOLDERS:  # what is saved has the names that the checkpoint has
+            option, _ = STEP_FOLDERS[kind]
             setattr(loaded, option, step["config"].get(option))
     return Processing(pre, post, torch.device(device), rename_map)
 
@@ -124,7 +129,9 @@ def keep_tokenizer_names(policy_config: Any, folder: Path) -> None:
 def stored_steps(folder: Path, processor: str) -> list[dict[str, Any]]:
     """Steps of a processor that has been checked; none if the file is missing."""
     file = folder / processor
-    return json.loads(file.read_text())["steps"] if file.is_file() else []
+    if not file.is_file():
+        return []
+    return json.loads(file.read_text())["steps"]
 
 
 def correct_inputs(policy_config: Any, folder: Path, source: FileSource) -> None:
@@ -135,18 +142,19 @@ def correct_inputs(policy_config: Any, folder: Path, source: FileSource) -> None
     """
     if not pads(policy_config):
         return
-    seen: dict[str, tuple[int, ...]] = {}
+    seen: Shapes = {}
     renames: dict[str, str] = {}
     for step in stored_steps(folder, PREPROCESSOR):
         renames |= step.get("config", {}).get("rename_map", {})
         if step["registry_name"] in NORMALISERS and "state_file" in step:
-            for key, (_, shape) in tensor_shapes(folder / step["state_file"], source).items():
+            shapes = tensor_shapes(folder / step["state_file"], source)
+            for key, (_, shape) in shapes.items():
                 name = key.removesuffix(".mean")
                 seen[renames.get(name, name)] = shape
     inputs = policy_config.input_features
-    cameras = {name for name, shape in policy_features(policy_config).shapes.items() if len(shape) == 3}
-    if cameras & seen.keys():
-        for name in cameras - seen.keys():
+    needed = cameras(policy_features(policy_config).shapes)
+    if needed & seen.keys():
+        for name in needed - seen.keys():
             del inputs[name]
     if STATE in inputs and STATE in seen:
         inputs[STATE] = replace(inputs[STATE], shape=seen[STATE])
@@ -157,17 +165,21 @@ def check_statistics(policy_config: Any, folder: Path, source: FileSource, *, re
 
     None are needed if they are `replaced` by those of a training to come.
     """
-    features = {**(policy_config.input_features or {}), **(policy_config.output_features or {})}
+    features = (policy_config.input_features or {}) | (policy_config.output_features or {})
     for processor in PROCESSORS:
         for step in stored_steps(folder, processor):
-            file = step.get("state_file")
-            state = {} if file is None else dict(read_tensors(folder / file, source))
+            file = processor
+            state: dict[str, Tensor] = {}
+            if "state_file" in step:
+                file = step["state_file"]
+                state = dict(read_tensors(folder / file, source))
             if step["registry_name"] not in NORMALISERS or replaced:
                 continue
             options = step.get("config", {})
+            modes = options.get("norm_map", {})
             for name in _normalised(step["registry_name"], options, features):
                 kind = features[name].type.value
-                needed = STATISTICS.get(options.get("norm_map", {}).get(kind), ())
+                needed = STATISTICS.get(modes.get(kind), ())
                 if all(f"{name}.{statistic}" in state for statistic in needed):
                     continue
                 has = sorted({key.rpartition(".")[0] for key in state})
@@ -175,8 +187,8 @@ def check_statistics(policy_config: Any, folder: Path, source: FileSource, *, re
                 why += f"; it has {', '.join(has[:6]) or 'none'}"
                 if kind != "VISUAL":
                     hint = "fine-tuning it on a dataset (sft.init_path) computes new ones"
-                    raise source.refuse(file or processor, f"{why}; {hint}")
-                logger.warning("%s; pictures go in as they are", source.refuse(file or processor, why))
+                    raise source.refuse(file, f"{why}; {hint}")
+                logger.warning("%s; pictures go in as they are", source.refuse(file, why))
 
 
 def _normalised(step: str, options: dict[str, Any], features: dict[str, Any]) -> list[str]:
@@ -184,4 +196,5 @@ def _normalised(step: str, options: dict[str, Any], features: dict[str, Any]) ->
     if step == "unnormalizer_processor":
         return [ACTION] if ACTION in features else []
     chosen = options.get("normalize_observation_keys") or options.get("features", {})
-    return [key for key in features if key in chosen and key != ACTION and ".empty_camera_" not in key]
+    read = [name for name in features if name in chosen and name != ACTION]
+    return [name for name in read if ".empty_camera_" not in name]

@@ -54,7 +54,8 @@ def tune(policy: Any, config: TuningConfig, backbone: str | None = None, idle: t
 def _inject(policy: Any, config: TuningConfig) -> None:
     from peft import LoraConfig, inject_adapter_in_model
 
-    targets = config.targets or (policy._get_default_peft_targets() or {}).get("target_modules")
+    defaults = policy._get_default_peft_targets() or {}
+    targets = config.targets or defaults.get("target_modules")
     if targets is None:
         hint = f"LeRobot names no default for {policy.name}; give a regular expression of module names"
         raise InputError("policy.tuning.targets", None, hint)
@@ -62,7 +63,8 @@ def _inject(policy: Any, config: TuningConfig) -> None:
     linear = [name for name, module in policy.named_modules() if type(module) is nn.Linear]
     matching = [name for name in linear if re.fullmatch(targets, name)]
     if not matching:
-        some = ", ".join(linear[:: max(1, len(linear) // 3)][:3])
+        step = max(1, len(linear) // 3)
+        some = ", ".join(linear[::step][:3])
         hint = f"matches none of the policy's {len(linear)} linear layers, such as {some}"
         raise InputError("policy.tuning.targets", targets, hint)
     policy.requires_grad_(False)
@@ -76,8 +78,9 @@ def merged_state_dict(policy: nn.Module) -> dict[str, Tensor]:
     # Under every name: a module that a policy holds twice is in its state twice.
     for name, layer in policy.named_modules(remove_duplicate=False):
         if hasattr(layer, "get_delta_weight"):  # a low-rank adapter of peft's
-            weight = state[f"{name}.base_layer.weight"]
-            state[f"{name}.base_layer.weight"] = weight + layer.get_delta_weight("default").to(weight)
+            base = f"{name}.base_layer.weight"
+            delta = layer.get_delta_weight("default")
+            state[base] = state[base] + delta.to(state[base])
     return {name.replace(".base_layer.", "."): tensor.detach() for name, tensor in state.items()}
 
 
@@ -109,30 +112,39 @@ def save_pretrained(
         if tensors:
             save_file(tensors, directory / file)
     ours = {"sampler": draccus.encode(adapter.sampler, SamplerConfig), "rename_map": config.rename_map}
-    (directory / OURS).write_text(json.dumps(ours, indent=2) + "\n")
+    text = json.dumps(ours, indent=2)
+    (directory / OURS).write_text(text + "\n")
 
 
 def _save_backbone(lerobot_config: Any, preprocessor: Any, directory: Path) -> None:
     """Writes the backbone folder of a checkpoint in `directory`, unless its backbone is on the Hub."""
     if not hasattr(lerobot_config, "vlm_model_name"):
+        folders = {"input_tokenizer": BACKBONE, "action_tokenizer": FAST}
         for step in preprocessor.steps:
-            for name, folder in (("input_tokenizer", BACKBONE), ("action_tokenizer", FAST)):
+            for name, folder in folders.items():
                 tokenizer = getattr(step, name, None)
                 if tokenizer is not None:
                     tokenizer.save_pretrained(directory / folder)
         return
     source = Path(lerobot_config.vlm_model_name)
-    if source.is_absolute() and source.resolve() != (directory / BACKBONE).resolve():
-        # The policy's own file holds the backbone's weights, unless LeRobot builds it from the backbone's.
-        wanted = BACKBONE_FILES + (BACKBONE_WEIGHTS if lerobot_config.load_vlm_weights else ())
-        (directory / BACKBONE).mkdir(exist_ok=True)
-        for name, file in matching_files(source, wanted, FileSource("policy.path", str(source))).items():
-            shutil.copyfile(file, directory / BACKBONE / name)
+    target = directory / BACKBONE
+    if source.is_absolute() and source.resolve() != target.resolve():
+        wanted: tuple[str, ...] = BACKBONE_FILES
+        if lerobot_config.load_vlm_weights:  # otherwise the policy's own file holds them
+            wanted += BACKBONE_WEIGHTS
+        target.mkdir(exist_ok=True)
+        files = matching_files(source, wanted, FileSource("policy.path", str(source)))
+        for name, file in files.items():
+            shutil.copyfile(file, target / name)
 
 
 def _copied(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     """Copies on the CPU; what shared its memory shares it again, so that it is written once."""
-    places = {name: place(t) for name, t in tensors.items()}
-    kept = {places[name]: t for name, t in tensors.items()}
-    copies = {at: copy_of(t).contiguous() for at, t in kept.items()}
-    return {name: copies[at] for name, at in places.items()}
+    copies: dict[tuple[object, ...], Tensor] = {}  # by the place of the tensor that is copied
+    named: dict[str, Tensor] = {}
+    for name, tensor in tensors.items():
+        at = place(tensor)
+        if at not in copies:
+            copies[at] = copy_of(tensor).contiguous()
+        named[name] = copies[at]
+    return named

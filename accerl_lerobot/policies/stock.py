@@ -26,12 +26,13 @@ from torch import Tensor, nn
 
 from accerl_lerobot.checkpoint.safety import brief
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import Decision, Request, stack_observations
+from accerl_lerobot.experience import Decision, Observations, Request, stack_observations
 from accerl_lerobot.policies.adapter import Evaluation, PretrainedAdapter
 from accerl_lerobot.policies.config import ChunkNoiseConfig, SamplerConfig, executed_rows
+from accerl_lerobot.policies.family import Latent
 from accerl_lerobot.policies.features import ACTION
 from accerl_lerobot.policies.processing import Processing
-from accerl_lerobot.seeds import episode_of
+from accerl_lerobot.seeds import decision_of, episode_of
 
 logger = logging.getLogger(__name__)
 
@@ -69,9 +70,7 @@ class StockAdapter(PretrainedAdapter):
             self._refuse()
         return [self._decide_step(request, version) for request in requests]
 
-    def imitate(
-        self, observations: dict[str, np.ndarray], tasks: Sequence[str], chunk: Tensor
-    ) -> tuple[Tensor, None]:
+    def imitate(self, observations: Observations, tasks: Sequence[str], chunk: Tensor) -> tuple[Tensor, None]:
         batch = self._training_batch(observations, tasks, chunk)
         self.policy.train()
         for module in self.policy.modules():
@@ -94,7 +93,8 @@ class StockAdapter(PretrainedAdapter):
             hint = "LeRobot trains it on what follows a chunk, rewards or observations, and not on chunks"
             raise InputError("policy.type", config.type, f"{hint} alone; it can be evaluated (accerl eval)")
         requests = self.example_requests()
-        first, second = (self.decide(requests[:1], 0)[0].chunk for _ in range(2))
+        first = self.decide(requests[:1], 0)[0].chunk
+        second = self.decide(requests[:1], 0)[0].chunk
         if not np.array_equal(first, second):
             hint = "asked twice with the same noise, it gives two chunks: it changes while it acts"
             raise InputError("policy.type", config.type, f"{hint}; it can be evaluated (accerl eval)")
@@ -106,8 +106,10 @@ class StockAdapter(PretrainedAdapter):
             reason = f"{type(error).__name__}: {brief(error)}"
             logger.warning(
                 "%s policies decide for one environment at a time, which takes as many calls as there are "
-                "environments: a batch of two fails (%s)", config.type, reason,
-            )  # fmt: skip
+                "environments: a batch of two fails (%s)",
+                config.type,
+                reason,
+            )
         chunk = torch.zeros(len(requests), *first.shape, device=self.device)
         buffers = {name: buffer.clone() for name, buffer in self.policy.named_buffers()}
         with torch.no_grad(), torch.random.fork_rng(), self.autocast():
@@ -115,43 +117,41 @@ class StockAdapter(PretrainedAdapter):
             for name, buffer in self.policy.named_buffers():  # such as a codebook that the loss moves
                 buffer.copy_(buffers[name])
 
-    def evaluate(
-        self, observations: dict[str, np.ndarray], tasks: Sequence[str], latent: dict[str, Tensor]
-    ) -> Evaluation:
+    def evaluate(self, observations: Observations, tasks: Sequence[str], latent: Latent) -> Evaluation:
         self._refuse()
 
-    def values(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Tensor:
+    def values(self, observations: Observations, tasks: Sequence[str]) -> Tensor:
         self._refuse()
 
     def _refuse(self) -> NoReturn:
-        kind = self.policy.config.type
-        raise InputError(
-            "policy.type", kind, "it has no likelihood here, and was loaded to be evaluated only"
-        )
+        hint = "it has no likelihood here, and was loaded to be evaluated only"
+        raise InputError("policy.type", self.policy.config.type, hint)
 
     def _decide_step(self, request: Request, version: int) -> Decision:
         arrays, tasks = stack_observations([request])
-        policy = self._policy_of(episode_of(request.noise_seed), tasks[0])
+        policy = self._policy_of(request, tasks[0])
         # LeRobot's samplers draw from the global generator: here from the request's seed.
         with torch.random.fork_rng(), self.autocast():
             torch.manual_seed(request.noise_seed % 2**63)
             action = policy.select_action(self.processing.prepare(arrays, tasks))
         chunk = self.processing.unnormalise(action.float()).cpu().numpy()
-        return Decision(chunk=chunk, latent={}, log_prob=np.zeros(1, np.float32), version=version)
+        return _decision(chunk, version)
 
-    def _policy_of(self, episode: int, task: str) -> Any:
-        """The episode's policy object, which is new and reset if this is its first decision."""
-        policy = self._episodes.get((episode, task))
-        if policy is None:
-            shared = (self.policy.config, *self.policy.modules(), *self.policy.parameters())
-            memo = {id(part): part for part in (*shared, *self.policy.buffers()) if part is not self.policy}
-            policy = copy.deepcopy(self.policy, memo)
-            policy.reset()
-            self._episodes[episode, task] = policy
-        self._episodes.move_to_end((episode, task))
+    def _policy_of(self, request: Request, task: str) -> Any:
+        """The policy object of the request's episode; new, and reset, if this is its first decision."""
+        episode = episode_of(request.noise_seed), task
+        if decision_of(request.noise_seed) == 0:  # the episode of a lost worker begins once more
+            self._episodes.pop(episode, None)
+        if episode not in self._episodes:
+            policy = self.policy
+            shared = [policy.config, *policy.modules(), *policy.parameters(), *policy.buffers()]
+            memo = {id(part): part for part in shared if part is not policy}
+            self._episodes[episode] = copy.deepcopy(policy, memo)
+            self._episodes[episode].reset()
+        self._episodes.move_to_end(episode)
         if len(self._episodes) > EPISODES:
             self._episodes.popitem(last=False)
-        return policy
+        return self._episodes[episode]
 
     def _decide_chunks(self, requests: Sequence[Request], version: int) -> list[Decision]:
         """Exploring environments are decided for together, the others one by one, each with its own noise."""
@@ -167,13 +167,10 @@ class StockAdapter(PretrainedAdapter):
             chunks |= dict(zip(rows, chunk, strict=True))
         executed = torch.stack([chunks[i] for i in range(len(requests))])
         for i in exploring:
-            noise = np.random.default_rng((requests[i].noise_seed, NOISE)).standard_normal(executed[i].shape)
-            executed[i] += self._sampler.noise_level * torch.from_numpy(noise).to(executed)
-        nothing = np.zeros(1, np.float32)
-        return [
-            Decision(chunk=chunk, latent={}, log_prob=nothing, version=version)
-            for chunk in self.execute(executed, requests)
-        ]
+            generator = np.random.default_rng((requests[i].noise_seed, NOISE))
+            noise = torch.from_numpy(generator.standard_normal(executed[i].shape))
+            executed[i] += self._sampler.noise_level * noise.to(executed)
+        return [_decision(chunk, version) for chunk in self.execute(executed, requests)]
 
     def _chunk(self, requests: Sequence[Request]) -> Tensor:
         """(B, K, A) by LeRobot's sampler, in normalised units; its noise follows from the first request."""
@@ -182,7 +179,8 @@ class StockAdapter(PretrainedAdapter):
         with torch.random.fork_rng(), self.autocast():
             torch.manual_seed(requests[0].noise_seed % 2**63)
             policy.reset()
-            *earlier, newest = [self.processing.prepare(frame, tasks) for frame in self._frames(arrays)]
+            batches = [self.processing.prepare(frame, tasks) for frame in self._frames(arrays)]
+            *earlier, newest = batches
             with patch.object(policy, "predict_action_chunk", self._no_prediction):
                 for batch in earlier:
                     policy.select_action(batch)
@@ -191,20 +189,24 @@ class StockAdapter(PretrainedAdapter):
             policy.reset()
         return torch.stack(rows, 1).float()
 
-    def _frames(self, arrays: dict[str, np.ndarray]) -> list[dict[str, np.ndarray]]:
+    def _frames(self, arrays: Observations) -> list[Observations]:
         """The env steps of an observation, oldest first."""
         steps = self.policy.config.n_obs_steps
         if steps == 1:
             return [arrays]
-        return [{name: values[:, step] for name, values in arrays.items()} for step in range(steps)]
+        frames: list[Observations] = []
+        for step in range(steps):
+            frames.append({name: values[:, step] for name, values in arrays.items()})
+        return frames
 
     def _no_prediction(self, batch: dict[str, Tensor], *args: Any, **fields: Any) -> Tensor:
         """Zeros in the place of a predicted chunk, so that `select_action` only notes the observation."""
         count = next(len(value) for value in batch.values() if isinstance(value, Tensor))
-        return torch.zeros(count, 1, self.policy.config.action_feature.shape[0], device=self.device)
+        action_dim = self.policy.config.action_feature.shape[0]
+        return torch.zeros(count, 1, action_dim, device=self.device)
 
     def _training_batch(
-        self, observations: dict[str, np.ndarray], tasks: Sequence[str], chunk: Tensor
+        self, observations: Observations, tasks: Sequence[str], chunk: Tensor
     ) -> dict[str, Any]:
         """A batch as LeRobot's trainer makes it, in which the chunk is padded around the executed rows."""
         config = self.policy.config
@@ -213,14 +215,21 @@ class StockAdapter(PretrainedAdapter):
         batch: dict[str, Any] = {"task": list(tasks), ACTION: executed[:, 0]}
         if config.action_delta_indices is not None:
             rows = torch.tensor(list(config.action_delta_indices), device=executed.device)
-            batch[ACTION] = executed[:, rows.clamp(0, chunk.shape[1] - 1)]
-            outside = (rows < 0) | (rows >= chunk.shape[1])
-            batch[f"{ACTION}_is_pad"] = outside.expand(count, -1)
+            inside = rows.clamp(0, chunk.shape[1] - 1)
+            batch[ACTION] = executed[:, inside]
+            batch[f"{ACTION}_is_pad"] = (rows != inside).expand(count, -1)
         steps = config.observation_delta_indices
         for key, tensor in self.processing.tensors(observations).items():
             batch[key] = tensor
             if steps is not None:
-                batch[f"{key}_is_pad"] = torch.zeros(count, len(steps), dtype=torch.bool, device=self.device)
-                batch[key] = tensor if config.n_obs_steps > 1 else tensor[:, None]
+                if config.n_obs_steps == 1:
+                    batch[key] = tensor[:, None]
+                no_pad = torch.zeros(count, len(steps), dtype=torch.bool, device=self.device)
+                batch[f"{key}_is_pad"] = no_pad
         prepared: dict[str, Any] = self.processing.preprocessor(batch)
         return prepared
+
+
+def _decision(chunk: np.ndarray, version: int) -> Decision:
+    """A decision without a likelihood."""
+    return Decision(chunk=chunk, latent={}, log_prob=np.zeros(1, np.float32), version=version)

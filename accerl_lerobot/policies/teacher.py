@@ -9,6 +9,7 @@ Shapes: M networks side by side, B rows, S numbers of a state, K actions of A di
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -17,14 +18,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from accerl_lerobot.experience import TASK_BITS, Request, stack_observations, task_codes
+from accerl_lerobot.experience import TASK_BITS, Observations, Request, stack_observations, task_codes
 from accerl_lerobot.policies.config import Load, PolicyConfig, executed_rows
 from accerl_lerobot.policies.features import STATE, policy_features
 from accerl_lerobot.seeds import episode_of
 
 if TYPE_CHECKING:
     from accerl_lerobot.world_model.config import StateModelConfig
-    from accerl_lerobot.world_model.states import Observations, StateModel, StateSpec
+    from accerl_lerobot.world_model.states import StateModel, StateSpec
 
 WIDTH = 256
 NOISE = 0.25  # standard deviation of its exploration, in normalised action units
@@ -37,18 +38,23 @@ class Ensemble(nn.Module):
 
     def __init__(self, inputs: int, outputs: int, members: int) -> None:
         super().__init__()
-        sizes = ((inputs, WIDTH), (WIDTH, WIDTH), (WIDTH, outputs))
-        self.weights = nn.ParameterList((torch.rand(members, i, o) * 2 - 1) / i**0.5 for i, o in sizes)
-        self.biases = nn.ParameterList(torch.zeros(members, 1, o) for _, o in sizes)
+        self.weights = nn.ParameterList()
+        self.biases = nn.ParameterList()
+        for i, o in ((inputs, WIDTH), (WIDTH, WIDTH), (WIDTH, outputs)):
+            uniform = torch.rand(members, i, o) * 2 - 1
+            self.weights.append(uniform / i**0.5)
+            self.biases.append(torch.zeros(members, 1, o))
         with torch.no_grad():
             self.weights[-1].mul_(0.1)
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, inputs) to (M, B, outputs)."""
-        x = x.expand(len(self.weights[0]), -1, -1)
+        members = len(self.weights[0])
+        x = x.expand(members, -1, -1)
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
             x = torch.baddbmm(bias, x, weight)
-            x = functional.silu(functional.layer_norm(x, x.shape[-1:]))
+            x = functional.layer_norm(x, x.shape[-1:])
+            x = functional.silu(x)
         return torch.baddbmm(self.biases[-1], x, self.weights[-1])
 
 
@@ -68,43 +74,52 @@ class Teacher(nn.Module):
         self.share = share
         self.noise = noise
         state = model.size + TASK_BITS
-        self.network = Ensemble(state, chunk[0] * chunk[1], 1)
+        rows, action_dim = chunk
+        self.network = Ensemble(state, rows * action_dim, 1)
         self.mean = nn.Parameter(torch.zeros(state), requires_grad=False)
         self.std = nn.Parameter(torch.ones(state), requires_grad=False)
-        self.low = nn.Parameter(-torch.ones(chunk[1]), requires_grad=False)
+        self.low = nn.Parameter(-torch.ones(action_dim), requires_grad=False)
         """(A,), smallest action that it gives, in normalised units; with `high`, the range that was explored:
         beyond it the critic knows nothing."""
-        self.high = nn.Parameter(torch.ones(chunk[1]), requires_grad=False)
+        self.high = nn.Parameter(torch.ones(action_dim), requires_grad=False)
         self.ready = nn.Parameter(torch.zeros(()), requires_grad=False)  # 1 once it may act
 
     @torch.no_grad()
     def states(self, observations: Observations, tasks: Sequence[str], elapsed: np.ndarray) -> Tensor:
         """States (B, S) of observations, each (B, ...), at shares `elapsed` (B,) of the time limit."""
-        states = []
-        for rows in np.array_split(np.arange(len(tasks)), -(-len(tasks) // ENCODED)):
+        states: list[Tensor] = []
+        parts = math.ceil(len(tasks) / ENCODED)
+        for rows in np.array_split(np.arange(len(tasks)), parts):
             some = {name: values[rows] for name, values in observations.items()}
             texts = [tasks[row] for row in rows]
             seen = self.model.encode(some, texts, elapsed[rows]).to(self.mean)
-            states.append(torch.cat([seen, torch.from_numpy(task_codes(texts)).to(seen)], 1))
+            codes = torch.from_numpy(task_codes(texts))
+            states.append(torch.cat([seen, codes.to(seen)], 1))
         return torch.cat(states)
 
     def scaled(self, state: Tensor) -> Tensor:
         """States (B, S) in units of what has been seen."""
-        return ((state - self.mean) / self.std).clamp(-10, 10)
+        scaled = (state - self.mean) / self.std
+        return scaled.clamp(-10, 10)
 
     def forward(self, state: Tensor) -> Tensor:
         """(B, S) to chunks (B, K, A) in the policy's normalised units."""
-        middle, half = (self.low + self.high) / 2, (self.high - self.low) / 2
-        raw = self.network(self.scaled(state))[0].unflatten(-1, self.chunk)
-        return middle + half * torch.tanh(raw)
+        middle = (self.low + self.high) / 2
+        half = (self.high - self.low) / 2
+        raw = self.network(self.scaled(state))[0]
+        share = torch.tanh(raw.unflatten(-1, self.chunk))
+        return middle + half * share
 
     def acts(self, request: Request) -> bool:
         """True if this decision is the teacher's."""
-        return request.explore and bool(self.ready) and self.plays(episode_of(request.noise_seed))
+        if not request.explore or not self.ready:
+            return False
+        return self.plays(episode_of(request.noise_seed))
 
     def plays(self, episode: int) -> bool:
         """True if, once ready, it makes all decisions of this exploring episode; see `seeds.episode_of`."""
-        return float(np.random.default_rng((episode, 4)).random()) < self.share
+        generator = np.random.default_rng((episode, 4))
+        return generator.random() < self.share
 
     @torch.no_grad()
     def replace(self, chunk: Tensor, requests: Sequence[Request]) -> Tensor:
@@ -113,13 +128,13 @@ class Teacher(nn.Module):
         if not rows:
             return chunk
         asked = [requests[i] for i in rows]
-        noise = [
-            np.random.default_rng((request.noise_seed, 5)).standard_normal(self.chunk) for request in asked
-        ]
+        generators = [np.random.default_rng((request.noise_seed, 5)) for request in asked]
+        noise = np.stack([generator.standard_normal(self.chunk) for generator in generators])
         observations, tasks = stack_observations(asked)
         elapsed = np.array([request.elapsed for request in asked], np.float32)
         own = self(self.states(observations, tasks, elapsed)).cpu()
-        own = own + self.noise * torch.from_numpy(np.stack(noise).astype(np.float32))
+        noise = noise.astype(np.float32)
+        own = own + self.noise * torch.from_numpy(noise)
         chunk = chunk.clone()
         chunk[rows] = own.to(chunk)
         return chunk
@@ -143,7 +158,8 @@ def with_teacher(
     spec = state_spec(adapter.policy.config, config.rename_map, environment_state)
     zero, scale = adapter.processing.units(torch.zeros(1, spec.chunk[1]))
     spec = spec._replace(units=(zero[0].numpy(), scale[0].numpy()))
-    adapter.teacher = Teacher(new_state_model(spec, model), spec.chunk, share, noise).to(adapter.device)
+    teacher = Teacher(new_state_model(spec, model), spec.chunk, share, noise)
+    adapter.teacher = teacher.to(adapter.device)
     return adapter
 
 
@@ -152,11 +168,16 @@ def state_spec(policy: Any, rename_map: dict[str, str], environment_state: int) 
     from accerl_lerobot.world_model.states import StateSpec
 
     env_names = {new: name for name, new in rename_map.items()}
-    shapes = policy_features(policy).shapes
-    images = {name: shape[0] for name, shape in shapes.items() if len(shape) == 3}
+    cameras: dict[str, int] = {}
+    state = 0
+    for name, shape in policy_features(policy).shapes.items():
+        if len(shape) == 3:
+            cameras[env_names.get(name, name)] = shape[0]
+        elif name == STATE:
+            state = policy.n_obs_steps * shape[0]
     return StateSpec(
-        cameras={env_names.get(name, name): channels for name, channels in images.items()},
-        state=policy.n_obs_steps * shapes.get(STATE, (0,))[0],
+        cameras=cameras,
+        state=state,
         environment_state=environment_state,
         chunk=(executed_rows(policy), policy.action_feature.shape[0]),
     )

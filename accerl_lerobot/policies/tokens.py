@@ -27,7 +27,7 @@ from torch import Tensor, nn
 
 from accerl_lerobot.experience import Request
 from accerl_lerobot.policies.config import TokenSamplerConfig
-from accerl_lerobot.policies.family import Action, Encoded, Family, Model
+from accerl_lerobot.policies.family import Action, Encoded, Family, Latent, Model
 
 Choose = Callable[[Tensor, int], Tensor]  # (logits (B, V), position) → tokens (B,), int64
 
@@ -66,8 +66,10 @@ class TokenModel(Model):
 def draw(logits: Tensor, uniform: Tensor, temperature: float) -> Tensor:
     """Tokens (...) from logits (..., V): the distribution function inverted at `uniform` (...) in [0, 1)."""
     # In double precision: in single the sum is off by more than many a token's probability.
-    cumulative = torch.softmax(logits.float() / temperature, -1).double().cumsum(-1)
-    place = uniform.to(cumulative)[..., None] * cumulative[..., -1:]
+    probabilities = torch.softmax(logits.float() / temperature, -1)
+    cumulative = probabilities.double().cumsum(-1)
+    total = cumulative[..., -1:]
+    place = uniform.to(cumulative)[..., None] * total
     tokens = torch.searchsorted(cumulative, place, right=True)[..., 0]
     return tokens.clamp(max=logits.shape[-1] - 1)  # only where logits are NaN, which the log-prob shows
 
@@ -81,7 +83,8 @@ def token_log_prob(logits: Tensor, tokens: Tensor, temperature: float) -> Tensor
 def token_entropy(logits: Tensor, temperature: float) -> Tensor:
     """Entropy (...) in nats of the distribution over the V tokens, exact."""
     log_probs = torch.log_softmax(logits.float() / temperature, -1)
-    finite = log_probs.masked_fill(log_probs == -torch.inf, 0.0)  # 0·log 0 is 0, and so is its gradient
+    impossible = log_probs == -torch.inf
+    finite = log_probs.masked_fill(impossible, 0.0)  # 0·log 0 is 0, and so is its gradient
     return -(log_probs.exp() * finite).sum(-1)
 
 
@@ -90,7 +93,8 @@ def existing(tokens: Tensor, terminator: int | None) -> Tensor:
     if terminator is None:
         return torch.ones_like(tokens, dtype=torch.bool)
     ends = (tokens == terminator).long()
-    return ends.cumsum(1) - ends == 0
+    ends_before = ends.cumsum(1) - ends
+    return ends_before == 0
 
 
 class TokenFamily(Family):
@@ -110,25 +114,30 @@ class TokenFamily(Family):
         uniform = torch.from_numpy(draws).to(device)
         tokens, log_prob = self._decide(encoded, explore, uniform)
         counted = explore[:, None] & existing(tokens, self.model.terminator)
-        return Action(self.model.chunk(tokens), {"tokens": tokens}, torch.where(counted, log_prob, 0.0))
+        log_prob = torch.where(counted, log_prob, 0.0)
+        return Action(self.model.chunk(tokens), {"tokens": tokens}, log_prob)
 
-    def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+    def score(self, encoded: Encoded, latent: Latent) -> tuple[Tensor, Tensor]:
         """Re-scores; the entropy is that of the distributions the factors were drawn from."""
         tokens = latent["tokens"]
         factors = existing(tokens, self.model.terminator)
         # Positions at which every row has ended are not computed: a logit for each of V tokens is a lot.
         used = int(factors.any(0).sum())
+        used_tokens = tokens[:, :used]
         temperature = self.sampler.temperature
-        logits = encoded.context.logits(tokens[:, :used])
-        log_prob = token_log_prob(logits, tokens[:, :used], temperature)
+        logits = encoded.context.logits(used_tokens)
+        log_prob = token_log_prob(logits, used_tokens, temperature)
+        log_prob = nn.functional.pad(log_prob, (0, tokens.shape[1] - used))
+        log_prob = torch.where(factors, log_prob, 0.0)
         entropy = token_entropy(logits, temperature)
-        missing = (0, tokens.shape[1] - used)
-        log_prob = torch.where(factors, nn.functional.pad(log_prob, missing), 0.0)
-        return log_prob, torch.where(factors[:, :used], entropy, 0.0).sum(1)
+        entropy = torch.where(factors[:, :used], entropy, 0.0)
+        return log_prob, entropy.sum(1)
 
-    def factors(self, latent: dict[str, Tensor]) -> Tensor | None:
+    def factors(self, latent: Latent) -> Tensor | None:
         terminator = self.model.terminator
-        return None if terminator is None else existing(latent["tokens"], terminator)
+        if terminator is None:
+            return None
+        return existing(latent["tokens"], terminator)
 
     def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
         """Compares greedy chunks and tokens, then the log-probs of the two passes.
@@ -136,24 +145,23 @@ class TokenFamily(Family):
         An autoregressive model has two ways to its logits, and a policy may be trained in another layout than
         it acts in. That changes log-probs by far more than rounding does, which is what is let pass here.
         """
-        size = (len(encoded.features), self.model.length)
+        count = len(encoded.features)
         device = encoded.features.device
-        greedy = torch.zeros(size[0], dtype=torch.bool, device=device)
-        tokens, acted = self._decide(encoded, greedy, torch.zeros(size, device=device))
-        difference = float((self.model.chunk(tokens) - self.model.stock(batch)).abs().max())
+        explore = torch.zeros(count, dtype=torch.bool, device=device)
+        uniform = torch.zeros(count, self.model.length, device=device)
+        tokens, acted = self._decide(encoded, explore, uniform)
+        apart = self.model.chunk(tokens) - self.model.stock(batch)
+        difference = float(apart.abs().max())
         factors = existing(tokens, self.model.terminator)
         stock = self.model.stock_tokens(batch)
         if stock is not None:
             difference += float((tokens != stock)[factors].sum())
-        used = int(factors.any(0).sum())
-        tokens = tokens[:, :used]
-        acted = acted[:, :used]
-        factors = factors[:, :used]
-        logits = encoded.context.logits(tokens)
-        scored = token_log_prob(logits, tokens, self.sampler.temperature)
+        scored, _ = self.score(encoded, {"tokens": tokens})
         gap = (scored - acted)[factors].abs().max()
-        # A NaN is not below: argmax finds a token among NaNs too.
-        return difference if gap <= torch.finfo(logits.dtype).eps ** 0.5 else difference + float(gap)
+        rounding = torch.finfo(encoded.features.dtype).eps ** 0.5
+        if not gap <= rounding:  # a NaN is not below: argmax finds a token among NaNs too
+            difference += float(gap)
+        return difference
 
     def _decide(self, encoded: Encoded, explore: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
         """Tokens and their log-probs, each (B, L), in one pass or position by position."""
@@ -161,20 +169,21 @@ class TokenFamily(Family):
         terminator = self.model.terminator
         temperature = self.sampler.temperature
 
-        def pick(logits: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
-            chosen = explore.view(-1, *[1] * (uniform.dim() - 1))
-            tokens = torch.where(chosen, draw(logits, uniform, temperature), logits.argmax(-1))
+        def pick(logits: Tensor, uniform: Tensor, explore: Tensor) -> tuple[Tensor, Tensor]:
+            drawn = draw(logits, uniform, temperature)
+            tokens = torch.where(explore, drawn, logits.argmax(-1))
             return tokens, token_log_prob(logits, tokens, temperature)
 
         if context.generate is None:
-            return pick(context.logits(torch.zeros_like(uniform, dtype=torch.long)), uniform)
+            logits = context.logits(torch.zeros_like(uniform, dtype=torch.long))
+            return pick(logits, uniform, explore[:, None])
         fill = 0 if terminator is None else terminator
         tokens = torch.full_like(uniform, fill, dtype=torch.long)
         log_prob = torch.zeros_like(uniform, dtype=torch.float32)
         running = torch.ones_like(explore)
 
         def choose(logits: Tensor, position: int) -> Tensor:
-            picked, each = pick(logits, uniform[:, position])
+            picked, each = pick(logits, uniform[:, position], explore)
             tokens[:, position] = torch.where(running, picked, fill)
             log_prob[:, position] = each
             if terminator is not None:

@@ -33,10 +33,10 @@ FILES = ("*.json", WEIGHTS, ADAPTER, "*processor_step_*.safetensors", VALUE_HEAD
 """Files that are fetched of a checkpoint on the Hub."""
 PROCESSORS = (PREPROCESSOR, "policy_postprocessor.json")
 LARGE = 2**16  # numbers of a tensor that is not filled, see `Unfilled`
-FILLS = frozenset((
+FILLS = {
     "normal_", "uniform_", "zero_", "fill_", "erfinv_", "trunc_normal_", "constant_", "ones_", "zeros_",
     "kaiming_uniform_", "kaiming_normal_", "xavier_uniform_", "xavier_normal_", "orthogonal_",
-))  # fmt: skip
+}  # fmt: skip
 
 
 def fetched_checkpoint(path: str, revision: str | None, field: str) -> Path:
@@ -47,7 +47,8 @@ def fetched_checkpoint(path: str, revision: str | None, field: str) -> Path:
     local = folder.exists()
     if not local and not path.startswith((".", "/", "~")):
         try:
-            folder = Path(snapshot_download(path, revision=revision, allow_patterns=list(FILES)))
+            fetched = snapshot_download(path, revision=revision, allow_patterns=list(FILES))
+            folder = Path(fetched)
         except (OSError, ValueError) as error:
             hint = f"not a directory here and not loadable from the Hub ({brief(error)})"
             raise InputError(field, path, hint) from error
@@ -89,8 +90,9 @@ def check_processor(folder: Path, name: str, source: FileSource) -> None:
     """Checks a processor file: only LeRobot's registered steps, with state files in this folder."""
     for step in read_json(folder / name, source).get("steps", []):
         if not isinstance(step.get("registry_name"), str) or "class" in step:
+            named = str(step.get("class"))[:60]
             hint = "only steps with a registry_name are loaded: LeRobot would import and call this class"
-            raise source.refuse(f"{name}: {str(step.get('class'))[:60]}", hint)
+            raise source.refuse(f"{name}: {named}", hint)
         if "state_file" in step:
             safe_join(folder, step["state_file"], source)
 
@@ -138,7 +140,8 @@ def guarded(section: str, commit: str | None = None) -> Iterator[None]:
         # torchvision's weights are fetched into this folder by PyTorch, and compared with their hash.
         home = Path(torch.hub.get_dir()).resolve()
         if isinstance(file, (str, Path)) and Path(file).resolve().is_relative_to(home):
-            return load(file, *arguments, **options | {"weights_only": True})
+            options["weights_only"] = True
+            return load(file, *arguments, **options)
         hint = "a pickle, which may run code when it is loaded; convert it to safetensors where you trust it"
         raise InputError(f"{section}.path", str(file)[:200], hint)
 
@@ -177,5 +180,6 @@ def input_error(error: BaseException) -> InputError | None:
 
 def reason(error: BaseException) -> str:
     """An error's words; of one that draccus wraps, those of the error itself."""
-    wrapped = isinstance(error, draccus.utils.DraccusException)
-    return brief(list(causes(error))[-1] if wrapped else error, 400)
+    if isinstance(error, draccus.utils.DraccusException):
+        error = list(causes(error))[-1]
+    return brief(error, 400)

@@ -38,7 +38,7 @@ from lerobot.policies.common.vla_utils import (
     clone_past_key_values,
     make_att_2d_masks,
     prepare_attention_masks_4d,
-)  # fmt: skip
+)
 from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
 from scipy.fft import dct
 from torch import Tensor
@@ -55,8 +55,13 @@ def _run(
     network: Any, embedded: Tensor, mask: Tensor, places: Tensor, cache: Any = None
 ) -> tuple[Tensor, Any]:
     """Hidden states of a language model on tokens at these places, and its key-value cache."""
-    given = {"position_ids": places, "past_key_values": cache, "inputs_embeds": [embedded, None]}
-    (hidden, _), cache = network.forward(attention_mask=mask, use_cache=True, **given)
+    (hidden, _), cache = network.forward(
+        attention_mask=mask,
+        position_ids=places,
+        past_key_values=cache,
+        inputs_embeds=[embedded, None],
+        use_cache=True,
+    )
     return hidden, cache
 
 
@@ -86,9 +91,8 @@ class SmolVLA(FlowModel):
     def __init__(self, policy: Any) -> None:
         super().__init__(policy)
         if policy.config.adapt_to_pi_aloha:
-            raise NoDensityError(
-                "policy.adapt_to_pi_aloha", True, "not supported in RL; train one without it"
-            )
+            hint = "not supported in RL; train one without it"
+            raise NoDensityError("policy.adapt_to_pi_aloha", True, hint)
         self.shape = flow_shape(policy.config, policy.config.num_steps)
         self.width = policy.model.vlm_with_expert.config.text_config.hidden_size
 
@@ -97,9 +101,12 @@ class SmolVLA(FlowModel):
         model = self.policy.model
         images, image_masks = self.policy.prepare_images(batch)
         embedded, pad, att = model.embed_prefix(
-            images, image_masks, batch[OBS_LANGUAGE_TOKENS], batch[OBS_LANGUAGE_ATTENTION_MASK],
+            images,
+            image_masks,
+            batch[OBS_LANGUAGE_TOKENS],
+            batch[OBS_LANGUAGE_ATTENTION_MASK],
             state=self.policy.prepare_state(batch),
-        )  # fmt: skip
+        )
         mask = make_att_2d_masks(pad, att)
         places = torch.cumsum(pad, dim=1) - 1
         features, cache = _run(model.vlm_with_expert, embedded, mask, places)
@@ -125,9 +132,15 @@ class Pi05(FlowModel):
         language_model.config._attn_implementation = "eager"
         self.width = language_model.config.hidden_size
         # The expert reads the last layer's keys and values; what that layer makes of them is for the critic.
-        last = f"{LANGUAGE_MODEL}layers.{len(language_model.layers) - 1}."
-        parts = ("self_attn.q_proj.", "self_attn.o_proj.", "mlp.", "post_attention_layernorm.")
-        self.idle = (*self.unread, f"{LANGUAGE_MODEL}norm.", *(last + part for part in parts))
+        last = f"{LANGUAGE_MODEL}layers.{len(language_model.layers) - 1}"
+        self.idle = (
+            *self.unread,
+            f"{LANGUAGE_MODEL}norm.",
+            f"{last}.self_attn.q_proj.",
+            f"{last}.self_attn.o_proj.",
+            f"{last}.mlp.",
+            f"{last}.post_attention_layernorm.",
+        )
 
     def encode(self, batch: dict[str, Tensor]) -> Encoded:
         """The features are the prefix's: images and prompt."""
@@ -137,11 +150,13 @@ class Pi05(FlowModel):
             images, image_masks, batch[OBS_LANGUAGE_TOKENS], batch[OBS_LANGUAGE_ATTENTION_MASK]
         )
         mask = prepare_attention_masks_4d(make_att_2d_masks(pad, att))
-        features, cache = _run(model.paligemma_with_expert, embedded, mask, torch.cumsum(pad, dim=1) - 1)
+        places = torch.cumsum(pad, dim=1) - 1
+        features, cache = _run(model.paligemma_with_expert, embedded, mask, places)
         shown = self._shown_to_expert(batch)
         # The critic reads the prefix: what is not in it stands beside every token, so their mean keeps it.
         for tensor in shown.values():
-            features = torch.cat([features, tensor[:, None].expand(-1, features.shape[1], -1)], -1)
+            beside = tensor[:, None].expand(-1, features.shape[1], -1)
+            features = torch.cat([features, beside], -1)
         return Encoded(features=features, mask=pad, context=_velocity(model, pad, cache, **shown))
 
     def _shown_to_expert(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -194,8 +209,9 @@ class FastTokenizer:
     def __call__(self, chunks: Any) -> list[list[int]]:
         """Tokens of each of the chunks (B, K, A)."""
         chunks = np.asarray(chunks, dtype=np.float64)
-        coefficients = np.around(dct(chunks, axis=-2, norm="ortho") * self.scale)
-        characters = np.maximum(coefficients - self.min_token, 0).astype(int)
+        coefficients = dct(chunks, axis=-2, norm="ortho")
+        rounded = np.around(coefficients * self.scale)
+        characters = np.maximum(rounded - self.min_token, 0).astype(int)
         texts = ["".join(map(chr, each.flatten())) for each in characters]
         return [self.bpe_tokenizer(text)["input_ids"] for text in texts]
 
@@ -216,8 +232,12 @@ def data_only() -> Iterator[None]:
     from transformers import AutoTokenizer
 
     load = AutoTokenizer.from_pretrained
-    never = {"trust_remote_code": False}
-    text = SimpleNamespace(from_pretrained=lambda name, **options: load(name, **options | never))
+
+    def load_data(name: str, **options: Any) -> Any:
+        options["trust_remote_code"] = False
+        return load(name, **options)
+
+    text = SimpleNamespace(from_pretrained=load_data)
     ours: dict[str, Any] = {"AutoProcessor": FastTokenizer, "AutoTokenizer": text}
     with patch.multiple(modeling_pi0_fast, **ours), patch.multiple(tokenizer_processor, **ours):
         yield
@@ -260,23 +280,28 @@ class Pi0Fast(TokenModel):
         known = torch.cat([known, torch.ones_like(known[:, :1])], 1)
         embedded, pad, att, _, _ = model.embed_prefix_fast(images, image_masks, prompt, known)
         mask = prepare_attention_masks_4d(att, dtype=embedded.dtype)
-        features, cache = _run(network, embedded, mask, torch.cumsum(pad, dim=1) - 1)
+        places = torch.cumsum(pad, dim=1) - 1
+        features, cache = _run(network, embedded, mask, places)
 
         def follow(tokens: Tensor, cache: Any, first: int) -> Tensor:
             """Hidden states (B, n, width) at the n positions from `first` on, whose tokens are (B, n)."""
-            last = first + tokens.shape[1]
-            places = torch.arange(first, last, device=tokens.device)
-            seen = torch.arange(last, device=tokens.device) <= places[:, None]
-            whole = pad[:, None].expand(-1, len(places), -1)
-            attends = torch.cat([whole, seen.expand(len(pad), -1, -1)], 2)
+            positions = torch.arange(first + tokens.shape[1], device=tokens.device)
+            asked = positions[first:]
+            seen = positions <= asked[:, None]
+            whole = pad[:, None].expand(-1, len(asked), -1)
+            generated = seen.expand(len(pad), -1, -1)
+            attends = torch.cat([whole, generated], 2)
             embedded = network.embed_language_tokens(tokens)
             mask = prepare_attention_masks_4d(attends, dtype=embedded.dtype)
-            return _run(network, embedded, mask, pad.sum(1, keepdim=True) + places, cache)[0]
+            places = pad.sum(1, keepdim=True) + asked
+            states, _ = _run(network, embedded, mask, places, cache)
+            return states
 
         def logits(tokens: Tensor) -> Tensor:
             states = features[:, -1:]
             if tokens.shape[1] > 1:
-                states = torch.cat([states, follow(tokens[:, :-1], clone_past_key_values(cache), 0)], 1)
+                following = follow(tokens[:, :-1], clone_past_key_values(cache), 0)
+                states = torch.cat([states, following], 1)
             return network.paligemma.lm_head(states)
 
         def generate(choose: Choose) -> None:
@@ -291,8 +316,11 @@ class Pi0Fast(TokenModel):
         return Encoded(features=features, mask=pad, context=TokenContext(logits=logits, generate=generate))
 
     def chunk(self, tokens: Tensor) -> Tensor:
-        rows, dims = self.policy.config.n_action_steps, self.policy.config.action_feature.shape[0]
-        return self.policy.detokenize_actions(tokens, action_horizon=rows, action_dim=dims)
+        config = self.policy.config
+        (action_dim,) = config.action_feature.shape
+        return self.policy.detokenize_actions(
+            tokens, action_horizon=config.n_action_steps, action_dim=action_dim
+        )
 
     def stock_tokens(self, batch: dict[str, Tensor]) -> Tensor:
         return self.policy.model.sample_actions_fast_kv_cache(

@@ -28,10 +28,10 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from accerl_lerobot.checkpoint.snapshot import kind
+from accerl_lerobot.checkpoint.snapshot import State, kind
 from accerl_lerobot.config.ranges import Range, Section, Steps
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import REAL, Segment
+from accerl_lerobot.experience import REAL, Metrics, Segment
 from accerl_lerobot.replay.journal import Journal
 
 DRAWS = 1024
@@ -63,9 +63,9 @@ class ReplayConfig(Section, section="replay"):
     off-policy algorithm keeps in a memory of its own may be older.
     """
     max_unlearned_decisions: Annotated[int, Range("[1, 100000000]")] = 512
-    """Decisions to learn from, each counted as often as it will be, that the rollouts may be ahead of the
-    trainer; from one batch to `capacity`. Where environments end their segments together, room for all of
-    them keeps both sides busy. It costs lag."""
+    """Rollouts wait while at least so many stored decisions have draws left; from one batch to `capacity`.
+    Where environments end their segments together, room for all of them keeps both sides busy. It costs
+    lag."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -266,17 +266,18 @@ class Replay:
     def retire(self, trainer_version: int) -> None:
         """Removes segments that are too old for a trainer that has made so many updates."""
         cutoff = trainer_version - self.config.max_lag
-        for entry in [entry for entry in self._entries if entry.oldest < cutoff]:
+        old = [entry for entry in self._entries if entry.oldest < cutoff]
+        for entry in old:
             self._remove(entry, "retired")
 
-    def metrics(self) -> dict[str, float]:
+    def metrics(self) -> Metrics:
         counts = asdict(self.counters)
         counts["stored_segments"] = len(self._entries)
         counts["stored_decisions"] = self.stored_decisions
         counts["available_decisions"] = self.available_decisions
         return {name: float(count) for name, count in counts.items()}
 
-    def state(self, version: int | None = None) -> dict[str, Any]:
+    def state(self, version: int | None = None) -> State:
         """All that `restore` needs; see `snapshot`. Shares the segments, which nobody changes.
 
         Batches drawn for updates after `version` count as not drawn. None: the trainer has learned from all.
@@ -292,18 +293,22 @@ class Replay:
                 counters.unique_decisions -= entry.size
                 if entry.left:
                     _count(counters, f"{entry.left}_unused", 1)
-        entries = [
-            {"segment": e.segment, "draws": e.draws, "uses": e.uses - unlearned[e]} for e in self._entries
-        ]
+        entries: list[dict[str, Any]] = []
+        for entry in self._entries:
+            uses = entry.uses - unlearned[entry]
+            entries.append({"segment": entry.segment, "draws": entry.draws, "uses": uses})
+        journal = None
+        if self._journal is not None:
+            journal = self._journal.save()
         return {
             "counters": counters,
             "entries": entries,
             "remainder": self._remainder,
             "ended": self.ended,
-            "journal": None if self._journal is None else self._journal.save(),
+            "journal": journal,
         }
 
-    def restore(self, state: dict[str, Any]) -> None:
+    def restore(self, state: State) -> None:
         """Resumes from `state`, before the first insert."""
         self.counters = state["counters"]
         self.ended = state["ended"]
@@ -346,4 +351,5 @@ def _count(counters: ReplayCounters, name: str, amount: int) -> None:
 def is_finite(segment: Segment) -> bool:
     """True if no floating-point number of the segment is a NaN or an infinity."""
     arrays = [segment.log_prob, segment.reward, *segment.latent.values(), *segment.observations.values()]
-    return all(bool(np.isfinite(a).all()) for a in arrays if np.issubdtype(a.dtype, np.inexact))
+    floating = [array for array in arrays if np.issubdtype(array.dtype, np.inexact)]
+    return all(np.isfinite(array).all() for array in floating)

@@ -54,6 +54,7 @@ class Journal:
     def write(self, segment: Segment) -> None:
         chunks = zip(segment.actions, segment.steps, strict=True)
         actions = np.concatenate([chunk[:steps] for chunk, steps in chunks])
+        encoded = base64.b64encode(actions.astype("<f4").tobytes())
         line = {
             "key": segment.key,
             **segment.origin._asdict(),  # task, seed, decision
@@ -63,10 +64,11 @@ class Journal:
             "ended": segment.terminated,
             "success": segment.success,
             "action_dim": segment.actions.shape[-1],
-            "actions": base64.b64encode(actions.astype("<f4").tobytes()).decode(),
+            "actions": encoded.decode(),
         }
         fault_point("replay.journal")
-        self._file.write((json.dumps(line) + "\n").encode())
+        text = json.dumps(line) + "\n"
+        self._file.write(text.encode())
         self._file.flush()
 
     def cut(self, position: int) -> None:
@@ -88,7 +90,8 @@ def read_journal(path: Path) -> Iterator[JournalEntry]:
 
 
 def _entry(line: dict[str, Any]) -> JournalEntry:
-    actions = np.frombuffer(base64.b64decode(line["actions"], validate=True), "<f4")
+    encoded = base64.b64decode(line["actions"], validate=True)
+    actions = np.frombuffer(encoded, "<f4")
     steps = tuple(line["steps"])
     return JournalEntry(
         key=line["key"],

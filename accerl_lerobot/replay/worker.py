@@ -21,7 +21,7 @@ import numpy as np
 
 from accerl_lerobot import errors
 from accerl_lerobot.checkpoint import snapshot
-from accerl_lerobot.experience import Segment
+from accerl_lerobot.experience import Metrics, Segment
 from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.replay.buffer import ASYNCHRONOUS, SYNCHRONOUS, Replay, ReplayConfig, Schedule
 from accerl_lerobot.replay.journal import EPISODES, Journal
@@ -30,7 +30,7 @@ from accerl_lerobot.transport.connection import Address, Server, node_address, s
 
 
 class ReplayWorker:
-    """Becomes an asynchronous Ray actor in `launch`."""
+    """Becomes an asynchronous Ray actor in `engines.ray_engine`."""
 
     def __init__(
         self,
@@ -43,7 +43,9 @@ class ReplayWorker:
     ) -> None:
         errors.collect_warnings()
         self._clock = open_clock(timeline, "replay")
-        journal = None if directory is None else Journal(directory / EPISODES)
+        journal = None
+        if directory is not None:
+            journal = Journal(directory / EPISODES)
         self._replay = Replay(config, journal)
         self._rng = np.random.default_rng(seed)
         self._changed = asyncio.Condition()
@@ -140,7 +142,7 @@ class ReplayWorker:
         self._clock.enter(WAIT_IN)
         await asyncio.to_thread(snapshot.save, directory / "replay", state)
 
-    async def metrics(self) -> dict[str, float]:
+    async def metrics(self) -> Metrics:
         self._clock.beat()
         return self._replay.metrics()
 

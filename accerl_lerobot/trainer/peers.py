@@ -23,7 +23,7 @@ from accerl_lerobot.algorithms import AlgorithmConfig
 from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import WEIGHTS
-from accerl_lerobot.experience import Segment
+from accerl_lerobot.experience import Metrics, Segment
 from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.policies.config import Load, PolicyConfig, loader
 
@@ -80,7 +80,7 @@ class TrainerRank:
     def node(self) -> str:
         return str(ray.get_runtime_context().get_node_id())
 
-    def metrics(self) -> dict[str, float]:
+    def metrics(self) -> Metrics:
         """Nothing: the first rank reports for all. Answering shows that it is not stuck."""
         return {}
 
@@ -89,7 +89,10 @@ class TrainerRank:
 
         size = self._settings.trainer.ranks
         timeout_s = self._settings.timeout_s
-        ranks.use_only(address if address == ranks.LOOPBACK else ray.util.get_node_ip_address())
+        own_address = address
+        if address != ranks.LOOPBACK:
+            own_address = ray.util.get_node_ip_address()
+        ranks.use_only(own_address)
         store = ranks.store_at(address, port, size, timeout_s)
         ranks.join(store, self._rank, size, self._adapter.device, timeout_s)
         self._update = self._settings.begin(self._adapter)
@@ -127,7 +130,9 @@ class Peers:
         # Actors of one thread: by then they have loaded their policies.
         nodes = ray.get([actor.node.remote() for actor in self._actors], timeout=LOAD_S)
         this_node = str(ray.get_runtime_context().get_node_id())
-        address = ranks.LOOPBACK if set(nodes) == {this_node} else ray.util.get_node_ip_address()
+        address = ranks.LOOPBACK
+        if set(nodes) != {this_node}:
+            address = ray.util.get_node_ip_address()
         ranks.use_only(address)
         size = self._config.ranks
         store, port = ranks.open_store(address, size, self._timeout_s)
@@ -145,4 +150,6 @@ class Peers:
 
     def gathering(self, method: str) -> AbstractContextManager[None]:
         """As `joining`, for work of all ranks only where each keeps a part of the weights."""
-        return self.joining(method) if self._config.zero else nullcontext()
+        if self._config.zero:
+            return self.joining(method)
+        return nullcontext()

@@ -22,7 +22,7 @@ import ray
 from accerl_lerobot import errors
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import PRETRAINED, TRAINING_STATE, WEIGHTS
-from accerl_lerobot.experience import Segment
+from accerl_lerobot.experience import Metrics, Segment
 from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.replay.buffer import ASYNCHRONOUS, Schedule
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
@@ -31,7 +31,7 @@ from accerl_lerobot.transport.weights import WeightPublisher
 
 
 class TrainerWorker:
-    """Becomes a threaded Ray actor in `launch`: `run` on one thread, everything else beside it.
+    """Becomes a threaded Ray actor in `engines.ray_engine`: `run` on one thread, everything else beside it.
 
     `world_model` is the handle of a `WorldModelWorker`, where the algorithm learns on its states; `readers`
     are the inference replicas; `online` is the handle of an `OnlineLearningWorker`, which gets the batches
@@ -63,7 +63,7 @@ class TrainerWorker:
         self._kept: Any = None
         self._in_turn = False
         self._publisher = WeightPublisher(readers, ray.put)
-        self._history: deque[dict[str, float]] = deque()  # filled on one thread, emptied on another
+        self._history: deque[Metrics] = deque()  # filled on one thread, emptied on another
         self._clock.enter(WAIT_IN)
 
     def ready(self) -> int:
@@ -136,7 +136,7 @@ class TrainerWorker:
         fault_point("trainer.publish")
         self._publisher.publish(self._update.version, weights)
 
-    def metrics(self) -> list[dict[str, float]]:
+    def metrics(self) -> list[Metrics]:
         """One record per update since the last call."""
         self._clock.beat()
         return [self._history.popleft() for _ in range(len(self._history))]
@@ -145,7 +145,7 @@ class TrainerWorker:
         """From now on, turns are taken with those who collect like this."""
         self._in_turn = schedule != ASYNCHRONOUS
 
-    def hold(self) -> tuple[int, list[dict[str, float]]]:
+    def hold(self) -> tuple[int, list[Metrics]]:
         """Keeps a copy of all that is to be saved, as it is between two updates, for `write`.
 
         Returns its version, and the records up to it that `metrics` has not given.

@@ -17,7 +17,8 @@ import torch
 
 from accerl_lerobot.checkpoint.tensors import copied, optimizer_state, restore_optimizer
 from accerl_lerobot.errors import MAX_NONFINITE, NonFiniteError
-from accerl_lerobot.world_model.states import Observations, StateModel, Transitions
+from accerl_lerobot.experience import Observations
+from accerl_lerobot.world_model.states import StateModel, Transitions
 
 BATCH = 64  # transitions of a step
 WEIGHT_DECAY, CLIP = 1e-4, 10.0

@@ -23,12 +23,8 @@ from torch import Tensor, nn
 
 from accerl_lerobot.config.parsing import imported
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import ENVIRONMENT_STATE
+from accerl_lerobot.experience import ENVIRONMENT_STATE, Observations
 from accerl_lerobot.world_model.config import StateModelConfig
-
-Observations = dict[str, np.ndarray]
-"""Arrays (B, ...) by LeRobot's names, as `experience.Observation` has them, without the instruction. Where a
-policy looks back, so many env steps stand in a dimension after the first, oldest first."""
 
 
 class StateSpec(NamedTuple):

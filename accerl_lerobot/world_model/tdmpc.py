@@ -21,13 +21,14 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.experience import Observations
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.features import STATE
 from accerl_lerobot.policies.loading import load_network
 from accerl_lerobot.policies.processing import IMAGES, Processing
 from accerl_lerobot.world_model.config import TDMPCStateConfig
 from accerl_lerobot.world_model.latent import shifted
-from accerl_lerobot.world_model.states import Observations, StateModel, StateSpec, Transitions
+from accerl_lerobot.world_model.states import StateModel, StateSpec, Transitions
 
 RETURN = 0.5  # weight of the return's squared error; consistency's is in the policy's own config
 SMALLEST_SCALE = 1e-6

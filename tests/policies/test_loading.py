@@ -104,7 +104,7 @@ def test_a_config_of_something_else(damaged: Any, text: str | None, why: str):
         ("smolvla", {"adapt_to_pi_aloha": True}, {}, "policy.adapt_to_pi_aloha=True: "),
         ("pi0_fast", {"temperature": 0.7}, {}, "policy.temperature=0.7: LeRobot's sampler has to be greedy"),
         ("pi0_fast", {"n_action_steps": 3}, {}, "policy.n_action_steps=3: LeRobot decodes so many rows from"),
-        ("pi0_fast", {}, {"num_steps": 3}, "policy.num_steps=3: a pi0_fast policy does not denoise"),
+        ("pi0_fast", {}, {"num_steps": 3}, "policy.num_steps=3: LeRobot's config of a pi0_fast policy"),
         ("smolvla", {}, {"n_action_steps": 6}, "policy.n_action_steps=6: smolvla: at most 5 rows of"),
         ("diffusion", {}, {"n_action_steps": 8}, "policy.n_action_steps=8: diffusion: at most 7 rows of"),
         ("diffusion", {}, {"num_steps": 21}, "policy.num_steps=21: use at most 20, as many as it was"),

@@ -22,7 +22,8 @@ from accerl_lerobot.algorithms import chunk_critic, off_policy
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Request, stack_observations
-from accerl_lerobot.policies.config import ChunkNoiseConfig, PolicyConfig
+from accerl_lerobot.policies.config import ChunkNoiseConfig, PolicyConfig, TuningConfig, override
+from accerl_lerobot.policies.features import policy_features
 from accerl_lerobot.policies.loading import load_acting, load_adapter
 from accerl_lerobot.policies.stock import StockAdapter
 from accerl_lerobot.seeds import noise_seed
@@ -114,6 +115,13 @@ def test_it_acts_as_in_lerobot_s_loop_whatever_other_episodes_do(written: Any, k
             assert decision.chunk.shape == (1, 2) and decision.version == 3 and not decision.log_prob.any()
 
 
+def test_an_episode_that_is_run_again_begins_anew(written: Any):
+    adapter = load_acting(config_of(written("vqbet"), "vqbet"))
+    chunks = [adapter.decide([request], 0)[0].chunk for request in steps_of(5, 2)]
+    again = adapter.decide(steps_of(5, 1), 0)[0].chunk
+    np.testing.assert_array_equal(again, chunks[0])
+
+
 def test_what_cannot_learn_is_evaluated_and_refused_in_one_line(written: Any, tmp_path: Path, capsys: Any):
     fields = ["--env.type=simulated", "--env.image_size=64", "--launch.engine=local"]
     renames = f"--policy.rename_map={json.dumps({FRONT: CAMERAS['tdmpc']})}"
@@ -147,10 +155,11 @@ def test_what_cannot_learn_is_evaluated_and_refused_in_one_line(written: Any, tm
     assert not (tmp_path / "new").exists()
 
 
-def learning(path: Path, **fields: Any) -> StockAdapter:
+def learning(path: Path, mode: Any = "checkpoint", **fields: Any) -> StockAdapter:
     """A policy of any type, loaded to learn."""
     sampler = ChunkNoiseConfig(**fields)
-    adapter = load_adapter(PolicyConfig(path=str(path), device="cpu", sampler=sampler))
+    tuning = TuningConfig(mode=mode)
+    adapter = load_adapter(PolicyConfig(path=str(path), device="cpu", sampler=sampler, tuning=tuning))
     assert isinstance(adapter, StockAdapter)
     return adapter
 
@@ -183,6 +192,12 @@ def test_smolvla_s_training_loss_is_ours(tmp_path: Path):
     assert found[0] == pytest.approx(found[1], rel=1e-4)
 
 
+def test_of_a_smolvla_with_noise_on_its_chunk_the_expert_alone_can_be_trained(tmp_path: Path):
+    adapter = learning(write_smolvla(tmp_path / "smolvla"), mode="expert")
+    trained = adapter.trainable()
+    assert trained and not [name for name in trained if ".vlm_with_expert.vlm." in name]
+
+
 def test_a_policy_that_looks_back_is_shown_what_lerobot_s_loop_would_show_it(written: Any):
     from lerobot.policies.factory import get_policy_class
 
@@ -201,6 +216,26 @@ def test_a_policy_that_looks_back_is_shown_what_lerobot_s_loop_would_show_it(wri
     chunk = adapter.decide([asked], 0)[0].chunk
     np.testing.assert_allclose(chunk, np.stack(taken[6:9]), atol=1e-5)
     assert "predict_action_chunk" not in vars(adapter.policy)
+
+
+def test_steps_and_rows_of_a_run_are_set_by_the_names_of_lerobot_s_config():
+    from lerobot.policies.factory import make_policy_config
+
+    config = make_policy_config("multi_task_dit", device="cpu", n_obs_steps=2, horizon=6, n_action_steps=3)
+    override(config, PolicyConfig(num_steps=4, n_action_steps=5))
+    assert (config.num_inference_steps, config.num_integration_steps, config.n_action_steps) == (4, 4, 5)
+    with pytest.raises(InputError, match="policy.n_action_steps=6: multi_task_dit: at most 5 rows"):
+        override(config, PolicyConfig(n_action_steps=6))
+
+
+def test_images_of_any_size_fit_a_policy_that_resizes_them():
+    from lerobot.policies.factory import make_policy_config
+
+    fields: dict[str, Any] = {"device": "cpu", "image_crop_shape": None}
+    assert not policy_features(make_policy_config("multi_task_dit", **fields)).any_size
+    assert policy_features(
+        make_policy_config("multi_task_dit", **fields, image_resize_shape=(64, 64))
+    ).any_size
 
 
 def test_exploring_is_the_chunk_and_noise_of_the_request(written: Any):
