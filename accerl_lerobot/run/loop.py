@@ -205,8 +205,8 @@ class Recorder:
         return f"exploring success {success} · lag {lag} · {decisions:.0f} decisions"
 
     def warn_if_hopeless(self) -> None:
-        """Tell if no exploring episode has succeeded."""
-        if not self.state.won:
+        """Tell if there were exploring episodes and none has succeeded."""
+        if self.state.explored and not self.state.won:
             logger.warning(
                 "none of %d exploring episodes succeeded%s; where success is the only reward there is "
                 "nothing to learn from: see env.success, and docs/troubleshooting.md",
