@@ -431,6 +431,7 @@ def evaluate(
     """
     if policy is not None:
         config = resuming.improving(config, policy)
+    if policy is not None or revision is not None:
         config = replace(config, policy=replace(config.policy, revision=revision))
     if episodes is not None:
         config = replace(config, evaluation=replace(config.evaluation, episodes=episodes))
