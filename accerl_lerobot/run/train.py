@@ -413,7 +413,7 @@ def train(config: RunConfig) -> TrainResult:
 
 def resume(directory: str | Path, changes: Mapping[str, Any] | None = None) -> TrainResult:
     """Resumes a run that was stopped, from its last complete checkpoint."""
-    recipe = Path(directory) / layout.CONFIG
+    recipe = expanded(str(directory), "directory") / layout.CONFIG
     config = load_config(recipe, {**(changes or {}), "resume": True})
     return _result(*start(config, Console(), recipe))
 
