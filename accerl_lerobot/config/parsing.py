@@ -351,10 +351,18 @@ def _overridden(config_class: type[Any], tree: dict[str, Any], given: dict[str, 
         chosen = over.get(TYPE, former)
         kind = choices_of(sections[name]).get(str(chosen), sections[name])
         if chosen != former:
-            annotations = annotations_of(kind)
-            under = {k: v for k, v in under.items() if k in annotations and fits(annotations[k], v)}
+            under = _fitting(kind, under)
         merged[name] = _overridden(kind, under, over)
     return merged
+
+
+def _fitting(section: type[Any], tree: dict[str, Any]) -> dict[str, Any]:
+    """The part of `tree` that a section of this type has fields for, and whose values fit them."""
+    fitting = {}
+    for name, annotation in annotations_of(section).items():
+        if name in tree and fits(annotation, _converted(annotation, tree[name])):
+            fitting[name] = tree[name]
+    return fitting
 
 
 def decode(config_class: type[Any], tree: dict[str, Any]) -> Any:
