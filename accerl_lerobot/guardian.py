@@ -66,7 +66,7 @@ def remove(folder: Path) -> None:
 
 
 def explain(hint: str) -> None:
-    """Set the line that is printed if this process is killed; without a hint there is none."""
+    """Set the hint that is printed if this process is killed; with an empty one nothing is printed."""
     _tell(hint=hint)
 
 

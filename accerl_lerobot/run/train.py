@@ -214,7 +214,7 @@ class Run:
 
     def do(self) -> dict[str, Any]:
         """`execute`, in a folder that is locked meanwhile; says how to resume whatever ends the run."""
-        guardian.explain(hint=printable(f"to resume: {self.how}"))
+        guardian.explain(printable(f"to resume: {self.how}"))
         try:
             with (
                 redirect_stdout(sys.stderr),
@@ -236,6 +236,8 @@ class Run:
                 reason = str(error)
             self.console.say(f"{reason}; to resume: {self.how}")
             raise
+        finally:
+            guardian.explain("")
 
     def begin(self) -> Path | None:
         """Check the run and write its config; returns the checkpoint that it goes on from."""
