@@ -237,7 +237,8 @@ class RolloutSlot(RestartedWorker):
             if plan.explore:
                 results.append(episode)
                 if plan.source == REAL:
-                    self.begun = [*self.begun, (plan.task, plan.seed)][-MOST_BEGUN:]
+                    self.begun.append((plan.task, plan.seed))
+                    del self.begun[:-MOST_BEGUN]
                     if self.budget is not None:
                         self.budget -= 1
             elif self.outstanding.pop((plan.group, plan.index), None) is not None:
@@ -245,7 +246,9 @@ class RolloutSlot(RestartedWorker):
         return results
 
     def assign(self, plans: list[EpisodePlan]) -> None:
-        self.outstanding |= {(plan.group, plan.index): plan for plan in plans}
+        """Queue planned episodes for the next report."""
+        for plan in plans:
+            self.outstanding[plan.group, plan.index] = plan
         self._unsent += plans
 
     def ask_report(self, training: bool, in_turn: bool) -> None:
@@ -277,15 +280,15 @@ def has_died(error: Exception) -> bool:
 
 def save_rollouts(directory: Path, workers: Sequence[RolloutSlot]) -> None:
     """Write the rollout workers' part of ``training_state``."""
-    slots = [
-        {
+    slots = []
+    for worker in workers:
+        slot = {
             "incarnation": worker.next_incarnation - 1,
             "budget": worker.budget,
             "outstanding": list(worker.outstanding.values()),
             "begun": worker.begun,
         }
-        for worker in workers
-    ]
+        slots.append(slot)
     snapshot.save(directory / ROLLOUT, {"past": dict(total_counters(workers)), "slots": slots})
 
 
@@ -317,7 +320,7 @@ def total_counters(workers: Iterable[RolloutSlot]) -> Counter[str]:
 def show_new_warnings(workers: Sequence[Worker], timeout: float = 0.0) -> None:
     """Show each warning that workers have handed over, once."""
     asked = [reference for worker in workers for reference in worker.warnings]
-    ready, waiting = ray.wait(asked, num_returns=len(asked), timeout=timeout) if asked else ([], [])
+    ready, waiting = ray.wait(asked, num_returns=len(asked), timeout=timeout)
     for reference in ready:
         with contextlib.suppress(RayError):  # the process has died, which others find out
             show_warnings(ray.get(reference))
@@ -339,6 +342,7 @@ def end_all(workers: Sequence[Worker]) -> None:
 
 
 def _runs(pid: int) -> bool:
+    """True while a process of this id is alive."""
     try:
         return bool(psutil.Process(pid).status() != psutil.STATUS_ZOMBIE)
     except psutil.NoSuchProcess:
