@@ -62,11 +62,14 @@ def train(arguments: list[str], load: Load | None = None) -> int:
         if is_full(error) or (isinstance(error, WorkerError) and error.brief):
             return 1  # `start` has said it
         raise
-    ends = ["after"] if summary["success_before"] is None else ["before", "after"]
-    success = " → ".join(rate(summary[f"success_{end}"], summary[f"ci95_{end}"]) for end in ends)
+    success = rate(summary["success_after"], summary["ci95_after"])
+    if summary["success_before"] is not None:
+        before = rate(summary["success_before"], summary["ci95_before"])
+        success = f"{before} → {success}"
     practice = f"{count(summary['episodes'], 'episode')}, {count(summary['env_steps'], 'env step')}"
     console.say(f"success {success} of {summary['n_after']}; {practice}; {duration(summary['wall_s'])}")
-    return tell({name: summary[name] for name in OUTCOME} | _say_places(directory, console))
+    outcome = {name: summary[name] for name in OUTCOME}
+    return tell(outcome | _say_places(directory, console))
 
 
 def demos(arguments: list[str]) -> int:
@@ -114,12 +117,12 @@ def offline(arguments: list[str]) -> int:
     from accerl_lerobot.run.offline import learn_offline
 
     summary, directory, console = _in_new_folder(config, lambda *place: learn_offline(config, *place))
-    losses = {
-        outcome: f"{number(summary['imitation_loss']['before'][outcome])} → {number(loss)}"
-        for outcome, loss in summary["imitation_loss"]["after"].items()
-    }
+    losses = summary["imitation_loss"]
+    changes = {}
+    for outcome, loss in losses["before"].items():
+        changes[outcome] = f"{number(loss)} → {number(losses['after'][outcome])}"
     console.say(
-        f"imitation loss of successes {losses['successes']}, of failures {losses['failures']}; "
+        f"imitation loss of successes {changes['successes']}, of failures {changes['failures']}; "
         f"{count(summary['episodes'], 'episode')}; {duration(summary['wall_s'])}"
     )
     _say_places(directory, console)
@@ -129,9 +132,10 @@ def offline(arguments: list[str]) -> int:
 def _say_places(directory: Path, console: Console) -> dict[str, str]:
     """Says where a run's policy and everything else is; both as values."""
     policy = directory / CHECKPOINTS / LAST / PRETRAINED
+    summary = directory / SUMMARY
     console.say(f"policy {policy}")
-    console.say(f"the rest {directory / SUMMARY}; accerl report {shlex.quote(str(directory))} makes a page")
-    return {"policy": str(policy), "summary": str(directory / SUMMARY)}
+    console.say(f"the rest {summary}; accerl report {shlex.quote(str(directory))} makes a page")
+    return {"policy": str(policy), "summary": str(summary)}
 
 
 def _in_new_folder[Result](
@@ -155,8 +159,9 @@ def _in_new_folder[Result](
 def evaluate(arguments: list[str]) -> int:
     """``accerl eval``."""
     config: EvalRun = parse(EvalRun, arguments, recipe_class=RunConfig)
-    out = expanded(config.output_dir, "output_dir") if config.output_dir else None
-    if out is not None:
+    out = None
+    if config.output_dir:
+        out = expanded(config.output_dir, "output_dir")
         check_absent(out)
     from accerl_lerobot.evaluation import summarise, table, write_video
     from accerl_lerobot.run import train as run
@@ -171,13 +176,15 @@ def evaluate(arguments: list[str]) -> int:
     console.rich.print(table(summary, "evaluation"))
     if out is not None:
         make_folder(out, "output_dir")
-        (out / "evaluation.json").write_text(json.dumps(summary, indent=2) + "\n")
+        text = json.dumps(summary, indent=2)
+        (out / "evaluation.json").write_text(f"{text}\n")
         for result in results:
             if not result.frames:
                 continue
             outcome = "success" if result.success else "failure"
-            name = f"{result.plan.task.replace('/', '-')}_{result.plan.seed}_{outcome}.mp4"
-            write_video(out / name, [[result.frames]], fps=20)
+            task = result.plan.task.replace("/", "-")
+            video = out / f"{task}_{result.plan.seed}_{outcome}.mp4"
+            write_video(video, [[result.frames]], fps=20)
     for rates in summary["tasks"].values():  # seeds are in the file alone
         rates.pop("seeds", None)
         rates.pop("failed_seeds", None)

@@ -94,7 +94,8 @@ def budgets(config: RolloutConfig) -> list[int | None]:
     """How many exploring episodes each worker plays; None: no end."""
     if not config.episodes:
         return [None] * config.workers
-    return [len(range(w, config.episodes, config.workers)) for w in range(config.workers)]
+    each, more = divmod(config.episodes, config.workers)
+    return [each + int(worker < more) for worker in range(config.workers)]
 
 
 def incarnation_after(incarnation: int, starts: int) -> int:
@@ -102,7 +103,8 @@ def incarnation_after(incarnation: int, starts: int) -> int:
 
     `starts` is where the one before was in its seeds when it last said so; it may have gone on since.
     """
-    return max(incarnation, (starts + STARTS_PER_INCARNATION // 2) // STARTS_PER_INCARNATION) + 1
+    reached = (starts + STARTS_PER_INCARNATION // 2) // STARTS_PER_INCARNATION
+    return max(incarnation, reached) + 1
 
 
 class EpisodePlans:
@@ -125,8 +127,11 @@ class EpisodePlans:
         # Filled and emptied on different threads: appending to and popping from a deque is atomic.
         self._queued: deque[EpisodePlan] = deque()
         self._failing = dict.fromkeys(tasks, 1.0)
-        # Episodes that each task is still to get. The first one's is the worker's own; equals take turns.
-        self._owed = {task: -1e-6 * ((place - worker) % len(tasks)) for place, task in enumerate(tasks)}
+        # Episodes that each task is still to get. Each worker begins with another task; equals take turns.
+        self._owed: dict[str, float] = {}
+        for place, task in enumerate(tasks):
+            turn = (place - worker) % len(tasks)
+            self._owed[task] = -1e-6 * turn
 
     def queue(self, plans: Iterable[EpisodePlan]) -> None:
         self._queued.extend(plans)
@@ -142,8 +147,9 @@ class EpisodePlans:
         seed = train_seed(self._seed, self.worker, self.starts)
         self.starts += 1
         shares = {task: max(failing, LEAST_SHARE) for task, failing in self._failing.items()}
+        total = sum(shares.values())
         for task, share in shares.items():
-            self._owed[task] += share / sum(shares.values())
+            self._owed[task] += share / total
         task = max(self._tasks, key=self._owed.__getitem__)
         self._owed[task] -= 1
         return EpisodePlan(task=task, seed=seed, explore=True)
@@ -162,7 +168,8 @@ class EpisodePlans:
         """Tasks that fail more are explored more."""
         if result.plan.explore and result.plan.source == REAL:
             task = result.plan.task
-            self._failing[task] += ((not result.success) - self._failing[task]) / RECENT
+            failed = not result.success
+            self._failing[task] += (failed - self._failing[task]) / RECENT
 
     @property
     def spent(self) -> bool:
@@ -260,9 +267,12 @@ class ActiveEpisode:
         self.observations = self.observations[-1:]
         decisions, actions, rewards, steps = zip(*self.taken, strict=True)
         self.taken = []
-        names = [name for name in observations[0] if name != TASK]
+        arrays = {}
+        for name in observations[0]:
+            if name != TASK:
+                arrays[name] = np.stack([np.asarray(each[name]) for each in observations])
         return Segment(
-            observations={name: np.stack([np.asarray(o[name]) for o in observations]) for name in names},
+            observations=arrays,
             task=str(observations[0][TASK]),
             latent={name: np.stack([d.latent[name] for d in decisions]) for name in decisions[0].latent},
             log_prob=np.stack([d.log_prob for d in decisions]).astype(np.float32),
@@ -310,8 +320,10 @@ class RolloutRunner:
     @property
     def exploring(self) -> bool:
         """True while a real exploring episode is under way."""
-        plans = [episode.plan for episode in self._episodes if episode is not None]
-        return any(plan.explore and plan.source == REAL for plan in plans)
+        for episode in self._episodes:
+            if episode is not None and episode.plan.explore and episode.plan.source == REAL:
+                return True
+        return False
 
     def start(self, slot: int) -> Request | None:
         """Begins the next planned episode in `slot`; None when nothing is planned."""
@@ -397,9 +409,8 @@ class RolloutRunner:
         self._sequence = state["sequence"]
         self._episodes = state["episodes"]
         self.starts.extend(state["starts"])
-        for environment, episode, kept in zip(
-            self.environments, self._episodes, state["environments"], strict=True
-        ):
+        slots = zip(self.environments, self._episodes, state["environments"], strict=True)
+        for environment, episode, kept in slots:
             if episode is None:
                 continue
             if kept is not None:
@@ -458,5 +469,9 @@ def _execute(environment: Environment, episode: ActiveEpisode, actions: np.ndarr
 
 def nonfinite(observation: Observation) -> str:
     """The first name in an observation whose numbers are not finite; empty: there is none."""
-    arrays = {k: v for k, v in observation.items() if isinstance(v, np.ndarray) and v.dtype.kind == "f"}
-    return next((name for name, array in arrays.items() if not np.isfinite(array).all()), "")
+    for name, value in observation.items():
+        if isinstance(value, str) or value.dtype.kind != "f":
+            continue
+        if not np.isfinite(value).all():
+            return name
+    return ""
