@@ -131,5 +131,4 @@ def duration(seconds: float | None) -> str:
 
 def count(n: int, thing: str) -> str:
     """``1 run``, ``2 runs``."""
-    ending = "" if n == 1 else "s"
-    return f"{n:,} {thing}{ending}"
+    return f"{n:,} {thing}{'' if n == 1 else 's'}"

@@ -137,6 +137,12 @@ def write_atomically(path: Path, text: str) -> None:
     _sync(path.parent)
 
 
+def write_json(path: Path, values: Any) -> None:
+    """Replaces a JSON file as `write_atomically` does."""
+    text = json.dumps(values, indent=2)
+    write_atomically(path, f"{text}\n")
+
+
 def write_manifest(directory: Path) -> None:
     """Writes the size and SHA-256 of every file in a new checkpoint."""
     files = {}
@@ -263,11 +269,12 @@ def displaced(directory: Path) -> bool:
     """True if a checkpoint has a backbone folder of its own and its files name one that does not exist."""
     if not (directory / BACKBONE).is_dir():
         return False
-    named: list[str] = []
     for file in NAMING_BACKBONE:
         content = json.loads((directory / file).read_text())
-        named += [fields[key] for fields, key, _ in _local_names(content)]
-    return not all(Path(name).is_dir() for name in named)
+        for fields, key, _ in _local_names(content):
+            if not Path(fields[key]).is_dir():
+                return True
+    return False
 
 
 Place = tuple[dict[str, Any], str, str]  # mapping, its key that may name a folder, and our folder for that

@@ -10,7 +10,6 @@ journal is left out and counted.
 
 from __future__ import annotations
 
-import json
 from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
@@ -19,7 +18,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from accerl_lerobot.checkpoint.layout import CONFIG
+from accerl_lerobot.checkpoint.layout import CONFIG, write_json
 from accerl_lerobot.checkpoint.safety import FileSource, check_folder
 from accerl_lerobot.config.parsing import parse, read_arguments, read_recipe
 from accerl_lerobot.config.ranges import DatasetName, NewFolder, Section
@@ -110,8 +109,7 @@ def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
             hint = "none of its episodes could be repeated: this environment is not deterministic"
             raise InputError("path", str(run), hint)
         origin = {"path": run.name, "pick": config.pick}
-        text = json.dumps({"export": origin, **tally}, indent=2)
-        (folder / SIDECAR).write_text(f"{text}\n")
+        write_json(folder / SIDECAR, {"export": origin, **tally})
     left_out = tally["left_out"]
     if left_out:
         console.say(f"{left_out} of {len(episodes)} episodes differed from the run and are left out")

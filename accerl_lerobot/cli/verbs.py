@@ -18,7 +18,15 @@ from typing import Any
 
 import yaml
 
-from accerl_lerobot.checkpoint.layout import CHECKPOINTS, CONFIG, LAST, PRETRAINED, SUMMARY, write_atomically
+from accerl_lerobot.checkpoint.layout import (
+    CHECKPOINTS,
+    CONFIG,
+    LAST,
+    PRETRAINED,
+    SUMMARY,
+    write_atomically,
+    write_json,
+)
 from accerl_lerobot.cli.configs import (
     NO_DATASET,
     DemosRun,
@@ -176,8 +184,7 @@ def evaluate(arguments: list[str]) -> int:
     console.rich.print(table(summary, "evaluation"))
     if out is not None:
         make_folder(out, "output_dir")
-        text = json.dumps(summary, indent=2)
-        (out / "evaluation.json").write_text(f"{text}\n")
+        write_json(out / "evaluation.json", summary)
         for result in results:
             if not result.frames:
                 continue

@@ -181,16 +181,15 @@ class RunConfig(Section):
         if self.inference.workers > self.rollout.workers:
             hint = f"use at most rollout.workers, {self.rollout.workers}, or some have nobody to answer"
             raise InputError("inference.workers", self.inference.workers, hint)
-        batch = self.trainer.batch_decisions
-        length = self.rollout.segment_length
+        rollout = self.rollout
         if self.trainer.updates:
-            self.replay.check(batch_decisions=batch, segment_decisions=length)
+            batch = self.trainer.batch_decisions
+            self.replay.check(batch_decisions=batch, segment_decisions=rollout.segment_length)
         imagined = self.imagination.environments
-        workers = self.rollout.workers
-        if imagined and 0 < self.rollout.episodes < workers:
-            hint = f"use at least {workers}: each rollout worker needs a real episode to imagine from"
-            raise InputError("rollout.episodes", self.rollout.episodes, hint)
-        if self.launch.schedule != ASYNCHRONOUS and (imagined or self.rollout.episodes):
+        if imagined and 0 < rollout.episodes < rollout.workers:
+            hint = f"use at least {rollout.workers}: each rollout worker needs a real episode to imagine from"
+            raise InputError("rollout.episodes", rollout.episodes, hint)
+        if self.launch.schedule != ASYNCHRONOUS and (imagined or rollout.episodes):
             hint = "use asynchronous, or leave out imagination.environments and rollout.episodes"
             raise InputError("launch.schedule", self.launch.schedule, hint)
 

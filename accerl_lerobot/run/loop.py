@@ -21,7 +21,6 @@ in the run, it has a process too: `world_model.worker` for the state of critic a
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 import shutil
@@ -289,8 +288,7 @@ class Loop:
             self.recorder.warn_if_hopeless()
         after, results = self._evaluate("after", self.state.steps)
         summary: dict[str, Any] = plain(self._summary(after, progress))
-        text = json.dumps(summary, indent=2)
-        layout.write_atomically(self.directory / layout.SUMMARY, f"{text}\n")
+        layout.write_json(self.directory / layout.SUMMARY, summary)
         self._draw(filmed, results)
         layout.prune(self._checkpoints)  # it has ended
         return summary

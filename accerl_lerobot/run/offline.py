@@ -7,7 +7,6 @@ LeRobotDataset with `next.success` or `next.reward` → the trainer's memory →
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
 import math
 import shutil
@@ -78,8 +77,7 @@ def learn_offline(config: OfflineRun, directory: Path, console: Console) -> dict
         "policy": str(checkpoints / layout.LAST / layout.PRETRAINED),
     }
     summary = plain(summary)
-    text = json.dumps(summary, indent=2)
-    layout.write_atomically(directory / layout.SUMMARY, f"{text}\n")
+    layout.write_json(directory / layout.SUMMARY, summary)
     return summary
 
 

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import datetime
 import functools
-import json
 import logging
 import shutil
 import sys
@@ -96,12 +95,13 @@ def start(
 ) -> tuple[Path, dict[str, Any]]:
     """Do a new run, or with ``config.resume`` the rest of the one whose config is `recipe`."""
     with ray_session.opened(config.launch, now=config.resume or config.policy.path is not None):
+        resume_from = None
         if config.resume:
             directory, resume_from = resuming.resumed_run(recipe, config)
-            run = Run(config, directory, console, resume_from, load)
         else:
-            run = Run(config, make_output_dir(config), console, load=load)
-        return run.directory, run.do()
+            directory = make_output_dir(config)
+        run = Run(config, directory, console, resume_from, load)
+        return directory, run.do()
 
 
 def play_evaluation(config: RunConfig, console: Console, filmed: int = 0) -> list[EpisodeResult]:
@@ -182,7 +182,7 @@ def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfi
     device = str(resolve_device(config.policy.device))
     path = fine_tune(config.sft, dataset, directory, config.seed, device, console)
     relative = Path(path).absolute().relative_to(directory.absolute())
-    layout.write_atomically(note, json.dumps({"policy": str(relative)}) + "\n")
+    layout.write_json(note, {"policy": str(relative)})
     return resuming.improving(config, path)
 
 
