@@ -29,7 +29,7 @@ class Stage:
         self._said = time.monotonic()
 
     def update(self, done: int, status: str = "") -> None:
-        """Moves the bar, and shows `status` beside it."""
+        """Move the bar, and show `status` beside it."""
         self._progress.update(self._task.id, completed=done)
         total = self._task.total
         parts = [f"{done}/{total:.0f} ({done / total:.0%})" if total else str(done)]

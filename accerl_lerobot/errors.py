@@ -93,7 +93,7 @@ def check_absent(path: Path, field: str = "output_dir") -> None:
 
 @contextmanager
 def reading(field: str, value: str, files: str) -> Iterator[None]:
-    """Refuses files of a run whose content is not what a run writes: damaged, half written or changed."""
+    """Turns errors of reading a run's files into an `InputError`: the files are damaged or changed."""
     try:
         yield
     except InputError:
@@ -153,7 +153,7 @@ def warn_once(text: str, name: str = __name__) -> None:
 
 @contextmanager
 def for_viewing(what: str) -> Iterator[None]:
-    """Goes on without something that people only look at, such as a film, if it cannot be made."""
+    """Turns an error into one warning where the result, such as a film, is only for people to look at."""
     try:
         yield
     except Exception as error:

@@ -118,7 +118,7 @@ def check_folder(folder: Path, origin: FileSource) -> None:
 
 
 def check_name(name: object, what: str, origin: FileSource) -> None:
-    """Refuses a name that will become one part of a path, such as a camera's, and may not."""
+    """Refuses a name, such as a camera's, that cannot be one part of a path."""
     if unsafe_name(name) or "/" in str(name):
         raise origin.refuse(what, f"the name {_shown(str(name))!r} cannot be part of a path")
 
@@ -141,7 +141,7 @@ def read_json(path: Path, origin: FileSource) -> dict[str, Any]:
 
 @contextmanager
 def opened(path: Path, origin: FileSource, framework: str = "np") -> Iterator[Any]:
-    """A safetensors file, whose header safetensors itself compares with the file."""
+    """An open safetensors file. The library compares its header with its size."""
     try:
         with safe_open(path, framework) as file:
             yield file
@@ -150,7 +150,7 @@ def opened(path: Path, origin: FileSource, framework: str = "np") -> Iterator[An
 
 
 def tensor_shapes(path: Path, origin: FileSource) -> dict[str, tuple[str, tuple[int, ...]]]:
-    """Dtype and shape by name of what a safetensors file holds; no tensor is read."""
+    """Dtype and shape of each tensor of a safetensors file, by name; no tensor is read."""
     shapes = {}
     with opened(path, origin) as file:
         for name in file.keys():  # noqa: SIM118

@@ -2,8 +2,8 @@
 """The verbs of ``accerl``.
 
 Results go to the standard output, as a path or one JSON object for programs; everything else goes to the
-standard error, since LeRobot prints while it loads. On a terminal there is no JSON: what people want of it is
-among the lines before.
+standard error, since LeRobot prints while it loads. On a terminal there is no JSON, because the lines before
+say the same.
 """
 
 from __future__ import annotations
@@ -138,7 +138,7 @@ def offline(arguments: list[str]) -> int:
 
 
 def _say_places(directory: Path, console: Console) -> dict[str, str]:
-    """Says where a run's policy and everything else is; both as values."""
+    """Say where the policy and the summary of a run are; returns both paths by name."""
     policy = directory / CHECKPOINTS / LAST / PRETRAINED
     summary = directory / SUMMARY
     console.say(f"policy {policy}")
@@ -149,7 +149,11 @@ def _say_places(directory: Path, console: Console) -> dict[str, str]:
 def _in_new_folder[Result](
     config: Any, work: Callable[[Path, Console], Result]
 ) -> tuple[Result, Path, Console]:
-    """Does work in the folder that a config names, which goes if the input turns out to be bad."""
+    """Do `work` in a new folder, which is removed again if the input is refused.
+
+    Returns:
+        The result of `work`, the folder, and the console.
+    """
     from accerl_lerobot.run.train import discard_unused, make_output_dir
 
     directory = make_output_dir(config)
@@ -221,7 +225,7 @@ def world_model_eval(arguments: list[str]) -> int:
 def _checked(
     config: WorldModelRun | WorldModelEvalRun, work: Callable[[Path, Console], dict[str, Any]]
 ) -> int:
-    """Does the work in a new folder; the exit status tells if the world model passed its check."""
+    """Do `work` in a new folder; returns 0 if the world model has passed its check, otherwise 1."""
     if config.dataset.repo_id is None:
         raise InputError("dataset.repo_id", None, NO_DATASET)
     from accerl_lerobot.world_model.pretrain import show
@@ -286,7 +290,7 @@ def export(arguments: list[str]) -> int:
 
 
 def tell(result: dict[str, Any], code: int = 0) -> int:
-    """Gives a result to programs: as JSON, unless people see what has been said of it on a terminal."""
+    """Print a result as JSON for programs, unless the output is a terminal; returns `code`."""
     if not sys.stdout.isatty():
         sys.stdout.write(json.dumps(plain(result), indent=2) + "\n")
     return code

@@ -75,7 +75,7 @@ OF_LEROBOT = {
 
 
 def imported(path: str) -> Any:
-    """Object behind a table's ``module:name``."""
+    """The object that ``module:name`` names."""
     module, _, name = path.partition(":")
     collects = gc.isenabled()
     new = module not in sys.modules
@@ -90,7 +90,7 @@ def imported(path: str) -> Any:
 
 
 def discover(package: str | None, section: str = "") -> None:
-    """Imports a package that registers types; None does nothing. `section` is that of the field."""
+    """Imports a package that registers types, if there is one. Errors name the field in `section`."""
     if package is None:
         return
     try:
@@ -103,7 +103,7 @@ def discover(package: str | None, section: str = "") -> None:
 
 
 def import_plugins(*prefixes: str) -> dict[str, str]:
-    """Imports the installed packages whose names begin so; words on each one that cannot be imported.
+    """Imports the installed packages whose names begin with a prefix; returns package → reason of a failure.
 
     LeRobot's `register_third_party_plugins` logs the traceback of each that is broken, wanted or not.
     """
@@ -457,9 +457,9 @@ def _section(section: type[Any], value: Any, default: Any, path: tuple[str, ...]
 
 
 def _converted(kind: Any, value: Any) -> Any:
-    """A value of YAML's as its annotation has it, or as it is if nothing but its type would have to change.
+    """A value from YAML, converted to the type of its annotation where that is possible.
 
-    ``a,b`` and a lone value are the list that a field holds.
+    Text such as ``a,b``, and a single value, become a list where the field is a list.
     """
     origin = typing.get_origin(kind)
     arguments = typing.get_args(kind)
@@ -506,7 +506,7 @@ def dotted_fields(cls: type[Any], path: str = "") -> Iterator[str]:
 
 
 def _unknown(place: tuple[str, ...], value: Any, names: list[str], whole: type[Any]) -> InputError:
-    """The error for a field that a config does not have: what it resembles, or where it belongs."""
+    """The error for a field that a config does not have. It names similar fields, or all of the section."""
     *path, key = place
     name = ".".join(place)
     for flag, leaf in _leaves(value, name):

@@ -60,7 +60,7 @@ class Placement:
         return options
 
     def rows(self) -> list[str]:
-        """The plan in words, one line a role."""
+        """One line for each role: its workers, their share of a GPU, and their nodes."""
         rows = []
         for role, count in (self._workers | {"replay": 1}).items():
             selector = self._selectors.get(role)
@@ -90,8 +90,7 @@ class Placement:
         return nodes
 
     def _gpu_shares(self, config: RunConfig, on_gpu: Sequence[str]) -> dict[str, float]:
-        """Share of a GPU for each process of a role; roles that are sent to the same nodes share what these
-        have."""
+        """Share of a GPU for each process of a role. Roles on the same nodes share their GPUs."""
         shares: dict[str, float] = {}
         for selector in {self._selectors.get(role) for role in on_gpu}:
             roles = [role for role in on_gpu if self._selectors.get(role) == selector]
@@ -127,7 +126,7 @@ def place_workers(config: RunConfig) -> Placement:
 
 
 def check_placement(config: RunConfig) -> list[str]:
-    """Plan where the workers will be, so that what does not fit is refused before anything long; as lines."""
+    """Refuse a placement that does not fit before any long work; returns the placement as lines."""
     if config.launch.engine == "local":
         return []
     if config.launch.address is not None:

@@ -79,7 +79,7 @@ class Worker:
         self.warnings.append(self.actor.__ray_call__.remote(collected_warnings))
 
     def answer(self, timeout: float = 0.0) -> Any:
-        """The answer to the last question, once; None if there is none yet."""
+        """The answer to the last question; None if it has not come, or has been taken."""
         if self._question is None or not ray.wait([self._question], timeout=timeout)[0]:
             return None
         question = self._question
@@ -88,7 +88,7 @@ class Worker:
         return self.last_answer
 
     def hung(self) -> str:
-        """Reason to give the worker up; empty: none."""
+        """The reason to give the worker up; empty if there is none."""
         if self._question is None or ray.wait([self._question], timeout=0)[0]:
             return ""
         silent = time.monotonic() - self._asked
@@ -257,7 +257,7 @@ class RolloutSlot(RestartedWorker):
             self._unsent = []
 
     def hung(self) -> str:
-        """Also an environment that does not return."""
+        """The reason to give the worker up, which may be an environment that does not return."""
         why = super().hung()
         report: Report | None = self.last_answer
         if why or report is None or report.busy_s <= self._launch.stall_s:

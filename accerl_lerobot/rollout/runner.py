@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Several environments, each somewhere between a decision and the next: the rollout worker without its
-process.
+"""Steps several environments at once, each at its own decision: the rollout worker without its process.
 
 A slot is one environment. `start` resets it and `advance` executes a decision in it; both return the request
 for the next decision. The Ray worker goes on with other slots meanwhile, the local engine answers at once.
@@ -165,7 +164,7 @@ class EpisodePlans:
         return EpisodePlan(task=task, seed=seed, explore=True, source=IMAGINED)
 
     def ended(self, result: EpisodeResult) -> None:
-        """Tasks that fail more are explored more."""
+        """Note the outcome of an episode: tasks that fail more often are explored more often."""
         if result.plan.explore and result.plan.source == REAL:
             task = result.plan.task
             failed = not result.success
@@ -198,7 +197,7 @@ class EpisodePlans:
 @kind
 @dataclass(frozen=True, kw_only=True)
 class EpisodeResult:
-    """How an episode went."""
+    """Outcome of an episode."""
 
     plan: EpisodePlan
     success: bool
@@ -262,7 +261,7 @@ class ActiveEpisode:
         self.versions.append(decision.version)
 
     def cut(self, key: str, terminated: bool = False, success: bool = False) -> Segment:
-        """Hands out what was collected as one segment and goes on from its last observation."""
+        """Returns the decisions so far as one segment; the next segment begins at its last observation."""
         observations = self.observations
         self.observations = self.observations[-1:]
         decisions, actions, rewards, steps = zip(*self.taken, strict=True)
@@ -375,7 +374,7 @@ class RolloutRunner:
         return episode.request()
 
     def _drop(self, slot: int, episode: ActiveEpisode, bad: str) -> Request | None:
-        """Throws away the rest of an episode; the request of the next one."""
+        """Throws away the rest of an episode; returns the request of the next episode."""
         plan = episode.plan
         note = f"an episode is dropped: {bad} is not finite"
         self.counters.dropped_episodes += 1
@@ -404,7 +403,7 @@ class RolloutRunner:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Resumes from `state`: environments without a state are brought back by doing it all again."""
+        """Resumes from `state`. Environments without a state of their own repeat their episode so far."""
         self.counters = state["counters"]
         self._sequence = state["sequence"]
         self._episodes = state["episodes"]

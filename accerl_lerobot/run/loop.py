@@ -135,7 +135,7 @@ class RunState:
 
 
 class Recorder:
-    """Counts and logs what an engine reports."""
+    """Counts and logs the reports of an engine."""
 
     def __init__(self, config: RunConfig, log: MetricsLog, console: Console, times: Times) -> None:
         self.config = config
@@ -187,7 +187,7 @@ class Recorder:
             self.times.furthest = max(self.times.furthest, version)
 
     def report(self, group: str, results: list[EpisodeResult], steps: float, version: int) -> dict[str, Any]:
-        """Log an evaluation and say it; returns its summary."""
+        """Log an evaluation and print its success; returns its summary."""
         summary = summarise(results) | {"env_steps": steps, "group": group}
         self.state.evaluations.append(summary)
         self.log.write("evaluation", version, summary)
@@ -214,7 +214,7 @@ class Recorder:
         return f"exploring success {success} · lag {lag} · {decisions:.0f} decisions"
 
     def warn_if_hopeless(self) -> None:
-        """Tell if there were exploring episodes and none has succeeded."""
+        """Warn if there were exploring episodes and none has succeeded."""
         state = self.state
         if state.explored and not state.won:
             note = f" ({state.note})" if state.note else ""
@@ -250,7 +250,7 @@ class Recorder:
 
 
 def _mean(values: Sequence[float]) -> float:
-    """The mean; NaN of nothing."""
+    """The mean; NaN for an empty sequence."""
     return float(np.mean(values)) if values else math.nan
 
 
@@ -435,5 +435,5 @@ class Loop:
 
 
 def _multiples(number: int, every: int) -> int:
-    """How many multiples of `every` have been reached; 0 if that is 0."""
+    """How many multiples of `every` are not above `number`; 0 if `every` is 0."""
     return number // every if every else 0

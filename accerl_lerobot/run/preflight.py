@@ -62,7 +62,7 @@ VISIBLE = 25  # levels of a pixel that rendering alone does not change
 
 
 def check_environment(env: EnvConfig, reward_model: RewardModelConfig | None = None) -> EnvironmentSpec:
-    """Build and reset an environment, so that what is wrong with it shows before anything long."""
+    """Build and reset an environment, so that its errors show before any long work; returns its spec."""
     with contextlib.closing(make_environment(env, reward_model=reward_model)) as environment:
         task = environment.spec.tasks[0]
         began = time.monotonic()
@@ -135,8 +135,11 @@ def check_device(config: RunConfig) -> None:
 
 
 def check_start(config: RunConfig, say: Callable[[str], object] = str) -> tuple[EnvironmentSpec, int]:
-    """Refuse a run that could not begin, or whose outcome could not be used, as far as can be told; returns
-    what the environment offers, and the policy's ``n_obs_steps``."""
+    """Refuse a run that cannot begin, or whose policy could not be used, as far as this is known before it.
+
+    Returns:
+        The spec of the environment, and the policy's ``n_obs_steps``.
+    """
     from accerl_lerobot.demos.dataset_files import open_metadata
     from accerl_lerobot.policies.config import check_likelihood, sampler_config
 
