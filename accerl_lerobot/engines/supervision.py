@@ -320,6 +320,8 @@ def total_counters(workers: Iterable[RolloutSlot]) -> Counter[str]:
 def show_new_warnings(workers: Sequence[Worker], timeout: float = 0.0) -> None:
     """Show each warning that workers have handed over, once."""
     asked = [reference for worker in workers for reference in worker.warnings]
+    if not asked:
+        return
     ready, waiting = ray.wait(asked, num_returns=len(asked), timeout=timeout)
     for reference in ready:
         with contextlib.suppress(RayError):  # the process has died, which others find out

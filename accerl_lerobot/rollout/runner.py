@@ -469,7 +469,7 @@ def _execute(environment: Environment, episode: ActiveEpisode, actions: np.ndarr
 def nonfinite(observation: Observation) -> str:
     """The first name in an observation whose numbers are not finite; empty: there is none."""
     for name, value in observation.items():
-        if isinstance(value, str) or value.dtype.kind != "f":
+        if not isinstance(value, np.ndarray) or value.dtype.kind != "f":
             continue
         if not np.isfinite(value).all():
             return name
