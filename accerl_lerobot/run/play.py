@@ -24,7 +24,7 @@ from accerl_lerobot.engines.config import RunConfig
 from accerl_lerobot.envs import make_environment
 from accerl_lerobot.envs.base import ChunkResult, Environment, WrappedEnvironment
 from accerl_lerobot.experience import Observation
-from accerl_lerobot.policies.config import Load, loader
+from accerl_lerobot.policies.config import Load, executed_rows, loader
 from accerl_lerobot.rollout.runner import EpisodePlans, RolloutRunner
 from accerl_lerobot.run.preflight import policy_to_be
 from accerl_lerobot.world_model.config import WorldModelConfig
@@ -48,8 +48,7 @@ def prepared(config: RunConfig, directory: Path, console: Console, load: Load | 
     if not play.exists():
         record_play(config, play, console, load)
     if not pretraining.exists():
-        policy = policy_to_be(config)
-        chunk = getattr(policy, "n_action_steps", 1)
+        chunk = executed_rows(policy_to_be(config))
         model = WorldModelConfig(steps=imagination.steps, chunk=chunk)
         with record.appearing(pretraining) as folder:
             folder.mkdir()
