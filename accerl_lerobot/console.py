@@ -29,7 +29,7 @@ class Stage:
         self._said = time.monotonic()
 
     def update(self, done: int, status: str = "") -> None:
-        """Moves the bar, and shows `status` beside it."""
+        """Move the bar, and show `status` beside it."""
         self._progress.update(self._task.id, completed=done)
         total = self._task.total
         parts = [f"{done}/{total:.0f} ({done / total:.0%})" if total else str(done)]
@@ -41,8 +41,9 @@ class Stage:
             parts.append(status)
         text = " · ".join(parts)
         self._progress.update(self._task.id, text=text)
-        if not self._console.is_terminal and time.monotonic() - self._said > PLAIN_EVERY_S:
-            self._said = time.monotonic()
+        now = time.monotonic()
+        if not self._console.is_terminal and now - self._said > PLAIN_EVERY_S:
+            self._said = now
             self._console.print(f"  {self._task.description} {text}", highlight=False, soft_wrap=True)
 
 
@@ -62,7 +63,8 @@ class Console:
 
     def say(self, text: str) -> None:
         """One line, with the seconds since the start."""
-        line = f"[{time.monotonic() - self._started:6.1f} s] {text}"
+        seconds = time.monotonic() - self._started
+        line = f"[{seconds:6.1f} s] {text}"
         # Not wrapped: commands and paths in it are there to be copied.
         self.rich.print(line, highlight=False, markup=False, soft_wrap=True)
 
@@ -120,10 +122,11 @@ def duration(seconds: float | None) -> str:
         return ABSENT
     if seconds < 60:
         return f"{seconds:.3g} s"
-    whole = round(seconds)
-    if whole < 3600:
-        return f"{whole // 60} min {whole % 60:02} s"
-    return f"{whole // 3600} h {whole % 3600 // 60:02} min"
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes < 60:
+        return f"{minutes} min {rest:02} s"
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes:02} min"
 
 
 def count(n: int, thing: str) -> str:

@@ -47,14 +47,17 @@ class InputError(ValueError):
     """
 
     def __init__(self, field: str, value: object, hint: str) -> None:
-        self.field, self.value, self.hint = field, value, hint
+        self.field = field
+        self.value = value
+        self.hint = hint
         super().__init__(field, value, hint)
 
     def __str__(self) -> str:
         value = repr(self.value)
         if len(value) > LONGEST:
             value = f"{value[: LONGEST - 1]}…"
-        line = " ".join(f"{self.field}={value}: {self.hint}".split())
+        text = f"{self.field}={value}: {self.hint}"
+        line = " ".join(text.split())
         return TOKEN.sub("<token>", printable(line))
 
 
@@ -65,10 +68,15 @@ def printable(text: str, keep: str = "") -> str:
     """
     if text.isprintable():
         return text
-    return "".join(c if c in keep or not _controls(c) else repr(c)[1:-1] for c in text)
+    characters = []
+    for character in text:
+        escapes = _controls(character) and character not in keep
+        characters.append(repr(character)[1:-1] if escapes else character)
+    return "".join(characters)
 
 
 def _controls(character: str) -> bool:
+    """True for a control character, and for a line separator."""
     category = unicodedata.category(character)
     return category.startswith("C") or category in ("Zl", "Zp")
 
@@ -85,7 +93,7 @@ def check_absent(path: Path, field: str = "output_dir") -> None:
 
 @contextmanager
 def reading(field: str, value: str, files: str) -> Iterator[None]:
-    """Refuses files of a run whose content is not what a run writes: damaged, half written or changed."""
+    """Turns errors of reading a run's files into an `InputError`: the files are damaged or changed."""
     try:
         yield
     except InputError:
@@ -107,10 +115,11 @@ def causes(error: BaseException | None) -> Iterator[BaseException]:
 
 def is_full(error: BaseException | None) -> bool:
     """True if an error is that of a full disk, here or in a worker whose error carries the text."""
-    return any(
-        getattr(link, "errno", None) in (errno.ENOSPC, errno.EDQUOT) or os.strerror(errno.ENOSPC) in str(link)
-        for link in causes(error)
-    )
+    words = os.strerror(errno.ENOSPC)
+    for link in causes(error):
+        if getattr(link, "errno", None) in (errno.ENOSPC, errno.EDQUOT) or words in str(link):
+            return True
+    return False
 
 
 def expanded(path: str, field: str) -> Path:
@@ -144,7 +153,7 @@ def warn_once(text: str, name: str = __name__) -> None:
 
 @contextmanager
 def for_viewing(what: str) -> Iterator[None]:
-    """Goes on without something that people only look at, such as a film, if it cannot be made."""
+    """Turns an error into one warning where the result, such as a film, is only for people to look at."""
     try:
         yield
     except Exception as error:
@@ -173,23 +182,31 @@ def last_exception(text: str) -> str:
     lines = [line for line in BAR.sub("", text).splitlines() if line.strip()]
     inside = [number for number, line in enumerate(lines) if line.startswith(("  ", "Traceback"))]
     end = lines[inside[-1] + 1 :] if inside else []
-    return " ".join(" ".join(end or lines[-1:]).split())
+    words = " ".join(end or lines[-1:])
+    return " ".join(words.split())
 
 
 def in_one_line(error: BaseException) -> str:
     """Type and text of an error in one line: of a long text its beginning, and the exception at its end."""
     cause = getattr(error, "cause", error)  # Ray's errors carry a traceback as their text
-    cause = cause if isinstance(cause, BaseException) else error
-    lines = [line.strip() for line in str(cause).splitlines() if line.strip()]
-    words = " … ".join(lines if len(lines) < 2 else [lines[0], last_exception(str(cause))])
-    return f"{type(cause).__name__}: {words}" if words else type(cause).__name__
+    if not isinstance(cause, BaseException):
+        cause = error
+    name = type(cause).__name__
+    text = str(cause)
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    if not lines:
+        return name
+    if len(lines) == 1:
+        return f"{name}: {lines[0]}"
+    return f"{name}: {lines[0]} … {last_exception(text)}"
 
 
 def one_line(error: BaseException) -> str:
     """An unexpected error in one line, with its traceback's place or how to see it."""
-    text = in_one_line(error)
+    text = in_one_line(error)[:MOST_SHOWN]
     notes = getattr(error, "__notes__", ()) or ("ACCERL_LOG=DEBUG shows the traceback",)
-    line = " ".join("; ".join([TOKEN.sub("<token>", text[:MOST_SHOWN]), *notes]).split())
+    words = "; ".join([TOKEN.sub("<token>", text), *notes])
+    line = " ".join(words.split())
     return printable(line)
 
 
@@ -257,8 +274,11 @@ def error_as_json(error: BaseException) -> dict[str, Any]:
     refused = next((link for link in causes(error) if isinstance(link, InputError)), None)
     if refused is None:
         return {"error": in_one_line(error)[:LONGEST_HANDED]}
-    value = None if refused.value is None else str(refused.value)[:LONGEST_HANDED]
-    return {"field": refused.field, "value": value, "why": refused.hint[:LONGEST_HANDED]}
+    value = None
+    if refused.value is not None:
+        value = str(refused.value)[:LONGEST_HANDED]
+    why = refused.hint[:LONGEST_HANDED]
+    return {"field": refused.field, "value": value, "why": why}
 
 
 def raise_refusal(answer: dict[str, Any]) -> None:

@@ -66,7 +66,7 @@ def remove(folder: Path) -> None:
 
 
 def explain(hint: str) -> None:
-    """Set the line that is printed if this process is killed; without a hint there is none."""
+    """Set the hint that is printed if this process is killed; with an empty one nothing is printed."""
     _tell(hint=hint)
 
 
@@ -131,8 +131,9 @@ def main(identity: str) -> None:
     """Wait for the end of the parent, then end and remove what it has left."""
     folders, hint = _listen(os.getppid())
     if hint:
-        sys.stderr.write(f"accerl: the process was killed; {hint}\n")
-        sys.stderr.flush()
+        with contextlib.suppress(OSError):  # its terminal may have been closed, which ended the parent
+            sys.stderr.write(f"accerl: the process was killed; {hint}\n")
+            sys.stderr.flush()
     deadline = time.monotonic() + END_S
     while time.monotonic() < deadline:
         left = left_behind(identity)

@@ -13,9 +13,12 @@ import pytest
 import yaml
 
 import accerl_lerobot
-from accerl_lerobot import RunConfig, evaluate, load_config, load_policy, resume, train
+from accerl_lerobot import RunConfig, evaluate, guardian, load_config, load_policy, resume, train
 from accerl_lerobot.envs import make_environment
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.rollout.runner import EpisodeResult
+from accerl_lerobot.run import train as run
 from tests.test_run import local_run
 
 EXAMPLES = Path(__file__).parents[1] / "docs" / "examples"
@@ -47,9 +50,28 @@ def test_settings_are_those_of_the_command_line():
         load_config(changes={"trainer.update": 3})
 
 
-def test_train_evaluate_resume_act(tiny_checkpoint: Path, tmp_path: Path):
+def test_a_revision_counts_with_any_policy(monkeypatch: pytest.MonkeyPatch):
+    measured: list[str | None] = []
+
+    def play(config: RunConfig, console: object) -> list[EpisodeResult]:
+        measured.append(config.policy.revision)
+        return []
+
+    monkeypatch.setattr(run, "play_evaluation", play)
+    config = RunConfig(policy=PolicyConfig(path="me/policy", revision="v1"))
+    evaluate(config)
+    evaluate(config, revision="v2")
+    evaluate(config, policy="me/other", revision="v3")
+    evaluate(config, policy="me/other")
+    assert measured == ["v1", "v2", "v3", None]
+
+
+def test_train_evaluate_resume_act(tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    hints: list[str] = []
+    monkeypatch.setattr(guardian, "explain", hints.append)
     config = local_run(tiny_checkpoint, tmp_path / "run")
     result = train(config)
+    assert hints[0].startswith("to resume: accerl train --resume=true") and hints[1:] == [""]
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert result.summary == summary and result.directory == tmp_path / "run"
     assert result.before is not None and result.before.n == result.after.n == 8
@@ -59,7 +81,8 @@ def test_train_evaluate_resume_act(tiny_checkpoint: Path, tmp_path: Path):
     assert found.success == result.after, "the same policy on the same starts"
     assert list(found.tasks) == ["match"] and len(found.episodes) == 8
 
-    further = resume(tmp_path / "run", {"trainer.updates": 14})
+    monkeypatch.setenv("HOME", str(tmp_path))
+    further = resume("~/run", {"trainer.updates": 14})
     assert further.summary["updates"] == 14 and further.directory == result.directory
 
     policy, environment = load_policy(further.policy), make_environment(config.env)

@@ -62,6 +62,12 @@ class TestOverrides:
         config = parse(RunConfig, [recipe, "--env.type=metaworld", "--env.task=door-open-v3"])
         assert config.env == MetaWorldConfig(task="door-open-v3", image_size=64)
 
+    def test_also_what_is_text_in_yaml(self, tmp_path: Path) -> None:
+        """YAML 1.1 takes 9e-1 for text."""
+        path = tmp_path / "recipe.yaml"
+        path.write_text("algorithm: {type: gipo, gamma: 9e-1}\n")
+        assert parse(RunConfig, [str(path), "--algorithm.type=ppo"]).algorithm == PPOConfig(gamma=0.9)
+
     def test_but_a_field_of_another_type_is_refused(self, recipe: str) -> None:
         with pytest.raises(InputError, match=r"algorithm.sigma=1: no such field"):
             parse(RunConfig, [recipe, "--algorithm.type=ppo", "--algorithm.sigma=1"])

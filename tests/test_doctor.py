@@ -141,6 +141,11 @@ class TestResources:
         ("sections", "name", "words"),
         [
             ({"rollout": {"workers": 4}}, "cores", ""),
+            (
+                {"rollout": {"workers": 5}, "inference": {"workers": 3}, "trainer": {"ranks": 2}},
+                "cores",
+                "4 for 5 rollout workers, 3 inference, 2 trainer: lower",
+            ),
             ({"rollout": {"workers": 4}}, "needs", ""),
             ({"rollout": {"workers": 5}}, "cores", "lower rollout.workers"),
             ({"trainer": {"num_threads": 8}}, "cores", "trainer.num_threads"),

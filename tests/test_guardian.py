@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import json
+import os
 import signal
 import subprocess
 import sys
@@ -13,6 +15,7 @@ from pathlib import Path
 import psutil
 import pytest
 
+from accerl_lerobot import guardian
 from accerl_lerobot.demos.record import simulators
 
 PARENT = """
@@ -74,6 +77,19 @@ def test_nothing_is_left_however_a_process_ends(how: str, tmp_path: Path):
     assert until(lambda: not Path(f"/dev/shm/sem.{semaphore.strip('/')}").exists())
     said = "accerl: the process was killed; begin again"
     assert done.stderr.splitlines().count(said) == (how != "return")
+
+
+def test_it_cleans_up_where_nobody_can_read_its_hint(tmp_path: Path):
+    """The end of a terminal ends the process and the reader of its standard error together."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    command = [sys.executable, "-P", guardian.__file__, "of-nobody"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=writer) as process:
+        os.close(writer)
+        process.communicate(json.dumps({"folder": str(folder), "hint": "begin again"}).encode() + b"\n", 60)
+    assert not folder.exists()
 
 
 def test_simulators_end_at_once_when_their_parent_is_interrupted():

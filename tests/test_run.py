@@ -96,6 +96,16 @@ def test_the_evaluation_before_can_be_left_out_and_a_run_without_success_says_so
     assert (directory / "success_curve.png").is_file() and not (directory / "before_after.mp4").exists()
 
 
+def test_a_run_without_updates_measures_its_start(
+    tiny_checkpoint: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
+    config = local_run(tiny_checkpoint, tmp_path / "run", trainer=TrainerConfig(updates=0))
+    _, summary = executed(config)
+    assert summary["updates"] == summary["episodes_explored"] == 0
+    assert summary["success_before"] == summary["success_after"]
+    assert not [message for message in caplog.messages if "exploring episodes succeeded" in message]
+
+
 def test_the_run_directory_is_complete(finished: Finished):
     assert {path.name for path in finished.directory.iterdir()} == {
         "config.yaml", "metrics.jsonl", "tensorboard", "checkpoints", "success_curve.png", "summary.json",

@@ -82,8 +82,9 @@ def save_checkpoint(checkpoints: Path, write: Callable[[Path], int]) -> Path:
         (temporary / TRAINING_STATE).mkdir(exist_ok=True)
         (temporary / TRAINING_STATE / STEP).write_text(json.dumps({"step": version}, indent=2) + "\n")
         write_manifest(temporary)
-        for path in [*sorted(temporary.rglob("*"), reverse=True), temporary]:
+        for path in sorted(temporary.rglob("*"), reverse=True):
             _sync(path)
+        _sync(temporary)
         if final.exists():
             final.rename(checkpoints / f"{WRITING}{final.name}")
         temporary.rename(final)
@@ -96,7 +97,7 @@ def save_checkpoint(checkpoints: Path, write: Callable[[Path], int]) -> Path:
 
 
 def _tidy(checkpoints: Path) -> None:
-    """Removes what a killed process has left half written."""
+    """Removes the incomplete folders that a killed process has left."""
     for partial in checkpoints.glob(f"{WRITING}*"):
         shutil.rmtree(partial)
 
@@ -110,9 +111,10 @@ def _point_at(checkpoint: Path) -> None:
 
 
 def go_back_to(checkpoint: Path) -> None:
-    """Makes a checkpoint the last one; of later ones the policy is kept, as ``abandoned-NNNNNN``."""
+    """Makes a checkpoint the last one. The policies of later checkpoints are kept as ``abandoned-NNNNNN``."""
+    version = int(checkpoint.name)
     for later in _numbered(checkpoint.parent):
-        if int(later.name) > int(checkpoint.name):
+        if int(later.name) > version:
             aside = later.with_name(f"abandoned-{later.name}")
             shutil.rmtree(aside, ignore_errors=True)
             later.rename(aside)
@@ -135,14 +137,21 @@ def write_atomically(path: Path, text: str) -> None:
     _sync(path.parent)
 
 
+def write_json(path: Path, values: Any) -> None:
+    """Replaces a JSON file as `write_atomically` does."""
+    text = json.dumps(values, indent=2)
+    write_atomically(path, f"{text}\n")
+
+
 def write_manifest(directory: Path) -> None:
     """Writes the size and SHA-256 of every file in a new checkpoint."""
-    files = {
-        str(path.relative_to(directory)): {"size": path.stat().st_size, "sha256": digest(path)}
-        for path in sorted(directory.rglob("*"))
-        if path.is_file()
-    }
-    (directory / MANIFEST).write_text(json.dumps({"format": FORMAT, "files": files}, indent=2) + "\n")
+    files = {}
+    for path in sorted(directory.rglob("*")):
+        if path.is_file():
+            name = str(path.relative_to(directory))
+            files[name] = {"size": path.stat().st_size, "sha256": digest(path)}
+    manifest = {"format": FORMAT, "files": files}
+    (directory / MANIFEST).write_text(json.dumps(manifest, indent=2) + "\n")
 
 
 def resumable(directory: Path) -> bool:
@@ -151,7 +160,7 @@ def resumable(directory: Path) -> bool:
 
 
 def defect(directory: Path) -> str | None:
-    """The first difference between a checkpoint and its manifest; None if every byte is as it was written.
+    """The first difference between a checkpoint and its manifest; None if there is no difference.
 
     The training state does not count where it was removed.
     """
@@ -184,11 +193,11 @@ def newest_whole(checkpoints: Path, wanted: str = LAST) -> tuple[Path, list[str]
     _tidy(checkpoints)
     numbers = _numbered(checkpoints)
     if wanted != LAST:
-        if checkpoints / wanted not in numbers:
-            names = ", ".join(p.name for p in numbers) or "none"
-            hint = f"no such checkpoint; there are {names}"
-            raise InputError("config_path", str(checkpoints / wanted), hint)
-        numbers = numbers[: numbers.index(checkpoints / wanted) + 1]
+        asked = checkpoints / wanted
+        if asked not in numbers:
+            names = ", ".join(path.name for path in numbers) or "none"
+            raise InputError("config_path", str(asked), f"no such checkpoint; there are {names}")
+        numbers = numbers[: numbers.index(asked) + 1]
     skipped: list[str] = []
     for path in reversed(numbers):
         why = defect(path)
@@ -202,7 +211,9 @@ def newest_whole(checkpoints: Path, wanted: str = LAST) -> tuple[Path, list[str]
 
 
 def saved_version(state: Path) -> int:
-    return int(json.loads((state / STEP).read_text())["step"])
+    """Number of updates behind a ``training_state``."""
+    record = json.loads((state / STEP).read_text())
+    return int(record["step"])
 
 
 def prune(checkpoints: Path, *, needed: str | None = None) -> None:
@@ -211,17 +222,19 @@ def prune(checkpoints: Path, *, needed: str | None = None) -> None:
     The files of the one named `needed` stay too, although it cannot be resumed from any more: an inference
     replica that is lost starts again where all workers did.
     """
-    states = [path / TRAINING_STATE for path in _numbered(checkpoints)]
-    for state in [state for state in states if state.is_dir()][:-KEEP]:
+    with_state = [path for path in _numbered(checkpoints) if (path / TRAINING_STATE).is_dir()]
+    for checkpoint in with_state[:-KEEP]:
+        state = checkpoint / TRAINING_STATE
         # Without this file the others do not count, even where their removal is interrupted.
         (state / f"{RUN_STATE}.json").unlink(missing_ok=True)
-        if state.parent.name != needed:
+        if checkpoint.name != needed:
             shutil.rmtree(state)
 
 
 def _numbered(checkpoints: Path) -> list[Path]:
     """All checkpoints, the oldest first."""
-    return sorted((p for p in checkpoints.glob("*") if p.name.isdigit()), key=lambda p: int(p.name))
+    numbered = [path for path in checkpoints.glob("*") if path.name.isdigit()]
+    return sorted(numbered, key=lambda path: int(path.name))
 
 
 def digest(path: Path) -> str:
@@ -256,20 +269,25 @@ def displaced(directory: Path) -> bool:
     """True if a checkpoint has a backbone folder of its own and its files name one that does not exist."""
     if not (directory / BACKBONE).is_dir():
         return False
-    named: list[str] = []
     for file in NAMING_BACKBONE:
         content = json.loads((directory / file).read_text())
-        named += [fields[key] for fields, key, _ in _local_names(content)]
-    return not all(Path(name).is_dir() for name in named)
+        for fields, key, _ in _local_names(content):
+            if not Path(fields[key]).is_dir():
+                return True
+    return False
 
 
 Place = tuple[dict[str, Any], str, str]  # mapping, its key that may name a folder, and our folder for that
 
 
 def _local_names(content: dict[str, Any]) -> list[Place]:
-    """Places in a policy's file that name a folder here, or by its bare name one beside the file."""
-    places = [place for place in places_of_names(content, content) if place[0].get(place[1])]
-    return [at for at in places if at[0][at[1]] == at[2] or Path(at[0][at[1]]).is_absolute()]
+    """Places in a policy's file that name a folder by its absolute path, or a folder beside the file."""
+    places = []
+    for fields, key, folder in places_of_names(content, content):
+        name = fields.get(key)
+        if name and (name == folder or Path(name).is_absolute()):
+            places.append((fields, key, folder))
+    return places
 
 
 def check_names(folder: Path, origin: FileSource) -> None:
@@ -278,7 +296,8 @@ def check_names(folder: Path, origin: FileSource) -> None:
     The name of a backbone or tokeniser that lies in the folder is accepted: it is not read.
     """
     for path in sorted(folder.rglob("*")):
-        if path.name == NOT_READ or not path.is_file() or not any(map(path.match, NAMING)):
+        names_files = path.name != NOT_READ and any(map(path.match, NAMING))
+        if not names_files or not path.is_file():
             continue
         content = read_json(path, origin)
         for fields, key, own in places_of_names(content, content):

@@ -49,22 +49,24 @@ def safe_join(root: Path, name: object, origin: FileSource) -> Path:
 
     Links may point within `root`, and in the Hub's cache to its blobs.
     """
+    text = str(name)
     why = unsafe_name(name)
     if why:
-        raise origin.refuse(str(name), f"{why}; only files inside the folder are read")
-    path = root / str(name)
-    _check_link(path, root, str(name), origin)
+        raise origin.refuse(text, f"{why}; only files inside the folder are read")
+    path = root / text
+    _check_link(path, root, text, origin)
     return path
 
 
 def _check_link(path: Path, root: Path, name: str, origin: FileSource) -> None:
     """Refuses a link that leads out of `root`; the Hub's cache keeps the content of files beside it."""
     home = Path(os.path.realpath(root))
-    homes = [home]
-    if home.parent.name == "snapshots":
-        homes.append(home.parents[1] / "blobs")
     real = Path(os.path.realpath(path))
-    if not any(real.is_relative_to(home) for home in homes):
+    inside = real.is_relative_to(home)
+    if home.parent.name == "snapshots":
+        blobs = home.parents[1] / "blobs"
+        inside = inside or real.is_relative_to(blobs)
+    if not inside:
         raise origin.refuse(name, "a link that leads out of the folder; put the file itself there")
 
 
@@ -116,7 +118,7 @@ def check_folder(folder: Path, origin: FileSource) -> None:
 
 
 def check_name(name: object, what: str, origin: FileSource) -> None:
-    """Refuses a name that will become one part of a path, such as a camera's, and may not."""
+    """Refuses a name, such as a camera's, that cannot be one part of a path."""
     if unsafe_name(name) or "/" in str(name):
         raise origin.refuse(what, f"the name {_shown(str(name))!r} cannot be part of a path")
 
@@ -139,7 +141,7 @@ def read_json(path: Path, origin: FileSource) -> dict[str, Any]:
 
 @contextmanager
 def opened(path: Path, origin: FileSource, framework: str = "np") -> Iterator[Any]:
-    """A safetensors file, whose header safetensors itself compares with the file."""
+    """An open safetensors file. The library compares its header with its size."""
     try:
         with safe_open(path, framework) as file:
             yield file
@@ -148,10 +150,13 @@ def opened(path: Path, origin: FileSource, framework: str = "np") -> Iterator[An
 
 
 def tensor_shapes(path: Path, origin: FileSource) -> dict[str, tuple[str, tuple[int, ...]]]:
-    """Dtype and shape by name of what a safetensors file holds; no tensor is read."""
+    """Dtype and shape of each tensor of a safetensors file, by name; no tensor is read."""
+    shapes = {}
     with opened(path, origin) as file:
-        slices = {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118
-        return {name: (one.get_dtype(), tuple(one.get_shape())) for name, one in slices.items()}
+        for name in file.keys():  # noqa: SIM118
+            tensor = file.get_slice(name)
+            shapes[name] = (tensor.get_dtype(), tuple(tensor.get_shape()))
+    return shapes
 
 
 def read_tensors(path: Path, origin: FileSource) -> Iterator[tuple[str, Any]]:
@@ -168,9 +173,12 @@ def read_tensors(path: Path, origin: FileSource) -> Iterator[tuple[str, Any]]:
 
 
 def _finite(tensor: Any) -> bool:
+    """True if a tensor holds neither NaN nor infinity."""
     if not tensor.is_floating_point() or not tensor.numel():
         return True
-    least, most = (tensor.float() if tensor.itemsize == 1 else tensor).aminmax()
+    if tensor.itemsize == 1:
+        tensor = tensor.float()
+    least, most = tensor.aminmax()
     return math.isfinite(least) and math.isfinite(most)
 
 
@@ -185,8 +193,11 @@ def unsafe_name(name: object) -> str:
     if not isinstance(name, str) or not _INSIDE.fullmatch(name):
         return "not the name of a file inside a folder"
     parts = PurePosixPath(name).parts
-    return "it leads out of the folder" if ".." in parts or not parts else ""
+    if ".." in parts or not parts:
+        return "it leads out of the folder"
+    return ""
 
 
 def _shown(text: str, length: int = 80) -> str:
+    """A text cut off after so many characters."""
     return text if len(text) <= length else f"{text[: length - 1]}…"

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The state of things on disk: a JSON file that says how they are put together, beside their arrays.
+"""A tree of values on disk: a JSON file with its structure, and a safetensors file with its arrays.
 
     NAME.json           the tree: dicts, lists, tuples, numbers, texts, known kinds of things
     NAME.safetensors    its arrays and tensors, by number
 
-Nothing in it is ever executed: at worst it is refused. A tree may hold, beside plain values, NumPy arrays,
-torch tensors, NumPy's default generator, and dataclasses and named tuples that were registered with `kind`.
+Reading executes nothing. A tree may hold, beside plain values, NumPy arrays, torch tensors, NumPy's default
+generator, and dataclasses and named tuples that were registered with `kind`.
 """
 
 from __future__ import annotations
@@ -52,8 +52,9 @@ def load(path: Path) -> Any:
     """Reads a file of `save`; arrays are writable and owned by the caller."""
     file = path.with_suffix(".json")
     try:
-        text, arrays = file.read_text(), load_file(path.with_suffix(".safetensors"))
-        return from_json(json.loads(text), arrays)
+        tree = json.loads(file.read_text())
+        arrays = load_file(path.with_suffix(".safetensors"))
+        return from_json(tree, arrays)
     except (OSError, ValueError, KeyError, TypeError, RecursionError, SafetensorError) as error:
         hint = f"not a state that accerl has saved ({brief(error)}); resume from another checkpoint"
         raise InputError("checkpoint", str(file), hint) from error
@@ -70,24 +71,30 @@ def to_json(value: Any, place: str, arrays: dict[str, np.ndarray]) -> Any:
         items = [to_json(part, f"{place}.{i}", arrays) for i, part in enumerate(value)]
         return items if cls is list else {MARK: "tuple", "items": items}
     if cls is dict:
-        parts = {key: to_json(part, f"{place}.{key}", arrays) for key, part in value.items()}
+        parts = {}
+        for key, part in value.items():
+            parts[key] = to_json(part, f"{place}.{key}", arrays)
         if MARK not in parts and all(isinstance(key, str) for key in parts):
             return parts
         keys = [to_json(key, f"{place}.key", arrays) for key in parts]
         return {MARK: "map", "items": list(zip(keys, parts.values(), strict=True))}
     if cls in _KINDS.values():
-        fields = {f: to_json(getattr(value, f), f"{place}.{f}", arrays) for f in cls.__annotations__}
+        fields = {}
+        for name in cls.__annotations__:
+            fields[name] = to_json(getattr(value, name), f"{place}.{name}", arrays)
         return {MARK: cls.__name__, "fields": fields}
     if isinstance(value, np.generic):
         return value.item()
     if cls.__module__ == "torch":
-        return _stored(value.detach().cpu().numpy(), "tensor", place, arrays)
+        array = value.detach().cpu().numpy()
+        return _stored(array, "tensor", place, arrays)
     if cls is np.random.Generator:
         return {MARK: "generator", "state": value.bit_generator.state}
     raise TypeError(f"{place}: a {cls.__name__} cannot be saved")
 
 
 def _stored(array: np.ndarray, mark: str, place: str, arrays: dict[str, np.ndarray]) -> dict[str, str]:
+    """Put an array into `arrays`; returns the JSON object that stands for it."""
     if array.dtype.kind not in "biuf":
         raise TypeError(f"{place}: an array of {array.dtype} cannot be saved")
     name = str(len(arrays))
@@ -113,11 +120,14 @@ def from_json(value: Any, arrays: dict[str, np.ndarray]) -> Any:
         case "tuple":
             return tuple(from_json(part, arrays) for part in value["items"])
         case "map":
-            return {from_json(key, arrays): from_json(part, arrays) for key, part in value["items"]}
+            tree = {}
+            for key, part in value["items"]:
+                tree[from_json(key, arrays)] = from_json(part, arrays)
+            return tree
         case "generator":
             generator = np.random.default_rng()
             generator.bit_generator.state = value["state"]
             return generator
         case name:
-            fields = {key: from_json(part, arrays) for key, part in value["fields"].items()}
+            fields = from_json(value["fields"], arrays)
             return _KINDS[name](**fields)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The state of torch's modules and optimisers as trees of whole tensors, see `snapshot`.
 
-Every process of a group may hold a part of a tensor, a DTensor of `torch.distributed`. Those are told apart
-by what they can do: the class itself costs an import that nobody needs who trains alone.
+Every process of a group may hold a part of a tensor, a DTensor of `torch.distributed`. It is recognised by
+its methods: importing its class takes time, and a single process does not need it.
 """
 
 from __future__ import annotations
@@ -14,26 +14,30 @@ from torch import Tensor
 
 
 def in_parts(tensor: Tensor) -> bool:
-    """True if this process holds a part of it only."""
+    """True if this process holds only a part of the tensor."""
     return hasattr(tensor, "full_tensor")
 
 
 def whole(tensor: Tensor) -> Tensor:
-    """All of it, on the CPU if it was in parts: then every process of the group asks for it at the same time,
-    and the first one gets it, the others nothing."""
+    """The whole tensor. One in parts is gathered on the CPU of the first process of the group.
+
+    All processes of the group call this at the same time for a tensor in parts. The others get an empty one.
+    """
     if not in_parts(tensor):
         return tensor
     full: Tensor = tensor.full_tensor()
-    return full.cpu() if torch.distributed.get_rank() == 0 else torch.empty(0)
+    if torch.distributed.get_rank() == 0:
+        return full.cpu()
+    return torch.empty(0)
 
 
 def copy_of(tensor: Tensor) -> Tensor:
-    """A copy of all of it on the CPU; see `whole`."""
+    """A copy of the whole tensor on the CPU, see `whole`."""
     return whole(tensor.detach()).to("cpu", copy=True)
 
 
 def part_of(tensor: Tensor, like: Tensor) -> Tensor:
-    """A whole tensor as `like` is: on its device, and the same part of it."""
+    """The part of a whole `tensor` that corresponds to the part `like`, on the device of `like`."""
     tensor = tensor.to(like.device)
     if not in_parts(like):
         return tensor
@@ -45,22 +49,25 @@ def part_of(tensor: Tensor, like: Tensor) -> Tensor:
 
 def place(tensor: Tensor) -> tuple[object, ...]:
     """Equal for tensors that are the same memory, seen in the same way."""
-    mine = tensor.to_local() if in_parts(tensor) else tensor
+    local = tensor.to_local() if in_parts(tensor) else tensor
     # Not its address, which is 0 for every part without a row: ranks would ask for different tensors.
-    return mine.untyped_storage()._cdata, mine.storage_offset(), tensor.shape, tensor.stride()
+    storage = local.untyped_storage()._cdata
+    return storage, local.storage_offset(), tensor.shape, tensor.stride()
 
 
 def optimizer_state(optimizer: torch.optim.Optimizer) -> dict[int, dict[str, torch.Tensor]]:
-    """A copy on the CPU of what it knows of each parameter, in order; rates are not its own."""
+    """A copy on the CPU of an optimiser's state, by the number of the parameter; without learning rates."""
     known: dict[int, dict[str, Any]] = optimizer.state_dict()["state"]
-    copies = {}
+    copies: dict[int, dict[str, Tensor]] = {}
     for number, values in known.items():
-        copies[number] = {name: copy_of(torch.as_tensor(value)) for name, value in values.items()}
+        copies[number] = {}
+        for name, value in values.items():
+            copies[number][name] = copy_of(torch.as_tensor(value))
     return copies
 
 
 def restore_optimizer(optimizer: torch.optim.Optimizer, state: dict[int, dict[str, torch.Tensor]]) -> None:
-    """Sets it to what `optimizer_state` gave of one for the same parameters."""
+    """Restore what `optimizer_state` has returned for the same parameters."""
     parameters: list[Tensor] = []
     for group in optimizer.param_groups:
         parameters += group["params"]
@@ -70,8 +77,13 @@ def restore_optimizer(optimizer: torch.optim.Optimizer, state: dict[int, dict[st
         for name, value in values.items():
             if value.dim():  # the number of steps has no dimension and is the same for every process
                 parts[number][name] = part_of(value, parameters[number])
-    optimizer.load_state_dict({"state": parts, "param_groups": optimizer.state_dict()["param_groups"]})
+    groups = optimizer.state_dict()["param_groups"]
+    optimizer.load_state_dict({"state": parts, "param_groups": groups})
 
 
 def copied(module: torch.nn.Module) -> dict[str, torch.Tensor]:
-    return {name: copy_of(tensor) for name, tensor in module.state_dict().items()}
+    """A copy on the CPU of a module's state, by name."""
+    copies = {}
+    for name, tensor in module.state_dict().items():
+        copies[name] = copy_of(tensor)
+    return copies

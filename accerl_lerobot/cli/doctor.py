@@ -168,9 +168,9 @@ def recipe(arguments: list[str]) -> Iterator[Check]:
     yield rendering(needed=config.env.type in ("metaworld", "libero"))
     yield from resources(config, history)
     yield from pace(config)
-    if config.imagination.environments:
+    count = config.imagination.environments
+    if count:
         check_imagination(config)
-        count = config.imagination.environments
         yield Check("imagination", OK, f"{count} imagined environments per rollout process")
     for row in check_placement(config):  # a cluster is asked if one is to be joined
         yield Check("placement", OK, row)
@@ -181,14 +181,14 @@ def resources(config: RunConfig, history: int = 1) -> Iterator[Check]:
     cores = len(os.sched_getaffinity(0))
     workers = config.rollout.workers
     threads = max(config.trainer.num_threads, config.inference.num_threads)
-    text = f"{cores} for {workers} rollout workers, 1 inference, 1 trainer"
+    networks = f"{config.inference.workers} inference, {config.trainer.ranks} trainer"
+    text = f"{cores} for {workers} rollout workers, {networks}"
     hint = "lower rollout.workers, trainer.num_threads or inference.num_threads"
     yield compared("cores", text, max(workers, threads) <= cores, hint)
     need = sizes.policy_gib(config) + sum(sizes.memory_parts_gib(config, history).values())
+    text = f"about {need:.1f} GiB of memory needed"
     hint = "lower rollout.workers, rollout.environments or replay.capacity, or use a smaller policy"
-    yield compared(
-        "needs", f"about {need:.1f} GiB of memory needed", need <= memory_gib("MemAvailable"), hint
-    )
+    yield compared("needs", text, need <= memory_gib("MemAvailable"), hint)
     yield from gpu_memory(config)
 
 
@@ -202,9 +202,10 @@ def gpu_memory(config: RunConfig) -> Iterator[Check]:
         return
     policy = policy_sizes(config.policy)
     need = 4 * (policy.policy + policy.trained * sizes.trained_copies(config)) / GIB
+    memory = torch.cuda.get_device_properties(0).total_memory / GIB
     text = f"weights, gradients and AdamW take {need:.1f} GiB of GPU memory"
     hint = "use policy.tuning.mode=lora, or several GPUs and trainer.sharding=zero3"
-    yield compared("needs", text, need <= torch.cuda.get_device_properties(0).total_memory / GIB, hint)
+    yield compared("needs", text, need <= memory, hint)
 
 
 def pace(config: RunConfig) -> Iterator[Check]:

@@ -10,7 +10,6 @@ journal is left out and counted.
 
 from __future__ import annotations
 
-import json
 from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
@@ -19,7 +18,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from accerl_lerobot.checkpoint.layout import CONFIG
+from accerl_lerobot.checkpoint.layout import CONFIG, write_json
 from accerl_lerobot.checkpoint.safety import FileSource, check_folder
 from accerl_lerobot.config.parsing import parse, read_arguments, read_recipe
 from accerl_lerobot.config.ranges import DatasetName, NewFolder, Section
@@ -77,8 +76,8 @@ def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
     root = record.check_free(config.root)
     episodes = list(whole_episodes(read_journal(run / EPISODES)))
     if config.pick != "all":
-        picks_successes = config.pick == "successes"
-        episodes = [parts for parts in episodes if parts[-1].success is picks_successes]
+        outcome = config.pick == "successes"
+        episodes = [parts for parts in episodes if parts[-1].success is outcome]
     if not episodes:
         hint = f"no whole episode in its {EPISODES} of those asked for ({config.pick})"
         raise InputError("path", str(run), hint)
@@ -109,17 +108,19 @@ def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
         if not tally["episodes"]:
             hint = "none of its episodes could be repeated: this environment is not deterministic"
             raise InputError("path", str(run), hint)
-        about = {"export": {"path": run.name, "pick": config.pick}, **tally}
-        (folder / SIDECAR).write_text(json.dumps(about, indent=2) + "\n")
-    if tally["left_out"]:
-        console.say(f"{tally['left_out']} of {len(episodes)} episodes differed from the run and are left out")
+        origin = {"path": run.name, "pick": config.pick}
+        write_json(folder / SIDECAR, {"export": origin, **tally})
+    left_out = tally["left_out"]
+    if left_out:
+        console.say(f"{left_out} of {len(episodes)} episodes differed from the run and are left out")
     return tally
 
 
 def _decision_cost(run: Path) -> float:
     """The cost of a decision in a run, which the rewards of its journal have in them."""
     rollout = read_recipe(run / CONFIG).get("rollout") or {}
-    if (rollout.get("reward_model") or {}).get("path"):
+    reward_model = rollout.get("reward_model") or {}
+    if reward_model.get("path"):
         hint = "rollout.reward_model told its successes, which a repeated episode does not have"
         raise InputError("path", str(run), hint)
     return float(rollout.get("decision_cost", RolloutConfig().decision_cost))
@@ -136,4 +137,6 @@ def _replay(cost: float, parts: list[JournalEntry]) -> record.Episode | None:
     first = np.cumsum(steps) - steps  # env step with which each decision begins
     rewards = np.add.reduceat(episode.rewards, first) - cost
     expected = np.concatenate([part.rewards for part in parts])
-    return episode if np.allclose(rewards, expected, rtol=0, atol=TOLERANCE) else None
+    if not np.allclose(rewards, expected, rtol=0, atol=TOLERANCE):
+        return None
+    return episode

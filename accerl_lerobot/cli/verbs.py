@@ -2,8 +2,8 @@
 """The verbs of ``accerl``.
 
 Results go to the standard output, as a path or one JSON object for programs; everything else goes to the
-standard error, since LeRobot prints while it loads. On a terminal there is no JSON: what people want of it is
-among the lines before.
+standard error, since LeRobot prints while it loads. On a terminal there is no JSON, because the lines before
+say the same.
 """
 
 from __future__ import annotations
@@ -18,7 +18,15 @@ from typing import Any
 
 import yaml
 
-from accerl_lerobot.checkpoint.layout import CHECKPOINTS, CONFIG, LAST, PRETRAINED, SUMMARY, write_atomically
+from accerl_lerobot.checkpoint.layout import (
+    CHECKPOINTS,
+    CONFIG,
+    LAST,
+    PRETRAINED,
+    SUMMARY,
+    write_atomically,
+    write_json,
+)
 from accerl_lerobot.cli.configs import (
     NO_DATASET,
     DemosRun,
@@ -62,11 +70,14 @@ def train(arguments: list[str], load: Load | None = None) -> int:
         if is_full(error) or (isinstance(error, WorkerError) and error.brief):
             return 1  # `start` has said it
         raise
-    ends = ["after"] if summary["success_before"] is None else ["before", "after"]
-    success = " → ".join(rate(summary[f"success_{end}"], summary[f"ci95_{end}"]) for end in ends)
+    success = rate(summary["success_after"], summary["ci95_after"])
+    if summary["success_before"] is not None:
+        before = rate(summary["success_before"], summary["ci95_before"])
+        success = f"{before} → {success}"
     practice = f"{count(summary['episodes'], 'episode')}, {count(summary['env_steps'], 'env step')}"
     console.say(f"success {success} of {summary['n_after']}; {practice}; {duration(summary['wall_s'])}")
-    return tell({name: summary[name] for name in OUTCOME} | _say_places(directory, console))
+    outcome = {name: summary[name] for name in OUTCOME}
+    return tell(outcome | _say_places(directory, console))
 
 
 def demos(arguments: list[str]) -> int:
@@ -114,12 +125,12 @@ def offline(arguments: list[str]) -> int:
     from accerl_lerobot.run.offline import learn_offline
 
     summary, directory, console = _in_new_folder(config, lambda *place: learn_offline(config, *place))
-    losses = {
-        outcome: f"{number(summary['imitation_loss']['before'][outcome])} → {number(loss)}"
-        for outcome, loss in summary["imitation_loss"]["after"].items()
-    }
+    losses = summary["imitation_loss"]
+    changes = {}
+    for outcome, loss in losses["before"].items():
+        changes[outcome] = f"{number(loss)} → {number(losses['after'][outcome])}"
     console.say(
-        f"imitation loss of successes {losses['successes']}, of failures {losses['failures']}; "
+        f"imitation loss of successes {changes['successes']}, of failures {changes['failures']}; "
         f"{count(summary['episodes'], 'episode')}; {duration(summary['wall_s'])}"
     )
     _say_places(directory, console)
@@ -127,17 +138,22 @@ def offline(arguments: list[str]) -> int:
 
 
 def _say_places(directory: Path, console: Console) -> dict[str, str]:
-    """Says where a run's policy and everything else is; both as values."""
+    """Say where the policy and the summary of a run are; returns both paths by name."""
     policy = directory / CHECKPOINTS / LAST / PRETRAINED
+    summary = directory / SUMMARY
     console.say(f"policy {policy}")
-    console.say(f"the rest {directory / SUMMARY}; accerl report {shlex.quote(str(directory))} makes a page")
-    return {"policy": str(policy), "summary": str(directory / SUMMARY)}
+    console.say(f"the rest {summary}; accerl report {shlex.quote(str(directory))} makes a page")
+    return {"policy": str(policy), "summary": str(summary)}
 
 
 def _in_new_folder[Result](
     config: Any, work: Callable[[Path, Console], Result]
 ) -> tuple[Result, Path, Console]:
-    """Does work in the folder that a config names, which goes if the input turns out to be bad."""
+    """Do `work` in a new folder, which is removed again if the input is refused.
+
+    Returns:
+        The result of `work`, the folder, and the console.
+    """
     from accerl_lerobot.run.train import discard_unused, make_output_dir
 
     directory = make_output_dir(config)
@@ -155,8 +171,9 @@ def _in_new_folder[Result](
 def evaluate(arguments: list[str]) -> int:
     """``accerl eval``."""
     config: EvalRun = parse(EvalRun, arguments, recipe_class=RunConfig)
-    out = expanded(config.output_dir, "output_dir") if config.output_dir else None
-    if out is not None:
+    out = None
+    if config.output_dir:
+        out = expanded(config.output_dir, "output_dir")
         check_absent(out)
     from accerl_lerobot.evaluation import summarise, table, write_video
     from accerl_lerobot.run import train as run
@@ -171,13 +188,14 @@ def evaluate(arguments: list[str]) -> int:
     console.rich.print(table(summary, "evaluation"))
     if out is not None:
         make_folder(out, "output_dir")
-        (out / "evaluation.json").write_text(json.dumps(summary, indent=2) + "\n")
+        write_json(out / "evaluation.json", summary)
         for result in results:
             if not result.frames:
                 continue
             outcome = "success" if result.success else "failure"
-            name = f"{result.plan.task.replace('/', '-')}_{result.plan.seed}_{outcome}.mp4"
-            write_video(out / name, [[result.frames]], fps=20)
+            task = result.plan.task.replace("/", "-")
+            video = out / f"{task}_{result.plan.seed}_{outcome}.mp4"
+            write_video(video, [[result.frames]], fps=20)
     for rates in summary["tasks"].values():  # seeds are in the file alone
         rates.pop("seeds", None)
         rates.pop("failed_seeds", None)
@@ -207,7 +225,7 @@ def world_model_eval(arguments: list[str]) -> int:
 def _checked(
     config: WorldModelRun | WorldModelEvalRun, work: Callable[[Path, Console], dict[str, Any]]
 ) -> int:
-    """Does the work in a new folder; the exit status tells if the world model passed its check."""
+    """Do `work` in a new folder; returns 0 if the world model has passed its check, otherwise 1."""
     if config.dataset.repo_id is None:
         raise InputError("dataset.repo_id", None, NO_DATASET)
     from accerl_lerobot.world_model.pretrain import show
@@ -272,7 +290,7 @@ def export(arguments: list[str]) -> int:
 
 
 def tell(result: dict[str, Any], code: int = 0) -> int:
-    """Gives a result to programs: as JSON, unless people see what has been said of it on a terminal."""
+    """Print a result as JSON for programs, unless the output is a terminal; returns `code`."""
     if not sys.stdout.isatty():
         sys.stdout.write(json.dumps(plain(result), indent=2) + "\n")
     return code

@@ -55,16 +55,24 @@ def help_text(command: str, config_class: type[Any], what: str, section: str = "
         return "\n".join(map(_in_full, inside))
     bare: str = getattr(config_class, "BARE", "")
     recipe = f"{bare.upper()} …" if bare else "[recipe.yaml | --config_path=recipe.yaml]"
-    about = f"{what[0].upper()}{what[1:]}. Shown are defaults; a recipe counts more."
-    head = [f"usage: {command} {recipe} [--section.field=value …]", "", textwrap.fill(about, WIDTH), ""]
+    usage = f"usage: {command} {recipe} [--section.field=value …]"
+    about = f"{_capital(what)}. Shown are defaults; a recipe counts more."
+    head = [usage, "", textwrap.fill(about, WIDTH), ""]
     full = "\n".join([*head, *map(_in_full, lines)])
     if section == "all" or full.count("\n") < PAGE:
         return full
-    head += [_in_brief(line) for line in lines if line.name in COMMON and line.usual]
-    head += ["", f"more: {command} --help=all, or --help=SECTION:"]
+    common = [_in_brief(line) for line in lines if line.name in COMMON and line.usual]
+    more = ["", f"more: {command} --help=all, or --help=SECTION:"]
     for name, kind in sections.items():
-        head.append(f"  {name:12}{' | '.join(choices_of(kind)) or _summary(kind)}"[:WIDTH])
-    return "\n".join(head)
+        content = " | ".join(choices_of(kind)) or _summary(kind)
+        line = f"  {name:12}{content}"
+        more.append(line[:WIDTH])
+    return "\n".join(head + common + more)
+
+
+def _capital(text: str) -> str:
+    """The text with a capital letter at its beginning."""
+    return f"{text[0].upper()}{text[1:]}"
 
 
 def docstrings(cls: type[Any]) -> dict[str, str]:
@@ -85,9 +93,9 @@ def docstrings(cls: type[Any]) -> dict[str, str]:
 
 
 def _lines(cls: type[Any], prefix: str = "", default: Any = None, usual: bool = True) -> Iterator[Line]:
-    """Fields of a config and of its sections, with the defaults of `default`, which is one of it, or its own.
+    """Fields of a config and of its sections, of a choice those of all types.
 
-    Of a choice, the fields of all types follow.
+    `default` is an instance with the defaults to show; None: those of the class.
     """
     texts = docstrings(cls)
     defaults = defaults_of(cls)
@@ -95,7 +103,8 @@ def _lines(cls: type[Any], prefix: str = "", default: Any = None, usual: bool = 
     for name, annotation in annotations_of(cls).items():
         if name not in sections:
             value = getattr(default, name, defaults[name])
-            yield Line(f"{prefix}{name}", shown(value), f"{texts[name]} {in_words(annotation)}", usual)
+            text = f"{texts[name]} {in_words(annotation)}"
+            yield Line(f"{prefix}{name}", shown(value), text, usual)
     for name, section in sections.items():
         dotted = f"{prefix}{name}"
         inner = getattr(default, name, defaults[name])
@@ -108,17 +117,21 @@ def _lines(cls: type[Any], prefix: str = "", default: Any = None, usual: bool = 
         if chosen is not None:
             yield Line(f"{dotted}.{TYPE}", chosen, " | ".join(types), usual)
         for kind, subclass in types.items():
-            is_default = kind == chosen
-            note = " (default)" if is_default else ""
-            yield Line(dotted, None, f"{dotted}.{TYPE}={kind}{note}: {_summary(subclass)}", usual)
-            yield from _lines(subclass, f"{dotted}.", inner if is_default else None, usual and is_default)
+            heading = f"{dotted}.{TYPE}={kind}"
+            if kind == chosen:
+                yield Line(dotted, None, f"{heading} (default): {_summary(subclass)}", usual)
+                yield from _lines(subclass, f"{dotted}.", inner, usual)
+            else:
+                yield Line(dotted, None, f"{heading}: {_summary(subclass)}", usual)
+                yield from _lines(subclass, f"{dotted}.", usual=False)
 
 
 def in_words(annotation: Any) -> str:
     """The values of a field as a sentence; empty for any text."""
     words = wanted(annotation)
-    plain = words.startswith(("text", "true", "the ", "a list", "a mapping"))
-    return "" if plain else f"{words[0].upper()}{words[1:]}."
+    if words.startswith(("text", "true", "the ", "a list", "a mapping")):
+        return ""
+    return f"{_capital(words)}."
 
 
 def _in_full(line: Line) -> str:
@@ -130,17 +143,18 @@ def _in_full(line: Line) -> str:
     if len(start) >= COLUMN:
         above = f"{start}\n"
         start = ""
-    indent = " " * COLUMN
-    return above + textwrap.fill(
-        line.text or " ", WIDTH, initial_indent=start.ljust(COLUMN), subsequent_indent=indent
-    )
+    first = start.ljust(COLUMN)
+    others = " " * COLUMN
+    text = textwrap.fill(line.text or " ", WIDTH, initial_indent=first, subsequent_indent=others)
+    return above + text
 
 
 def _in_brief(line: Line) -> str:
     """A field in one line: the first sentence about it."""
     start = f"  --{line.name}={line.default}".ljust(COLUMN - 1)
-    text = line.text.partition(". ")[0].strip().removesuffix(".")
-    return f"{start} {textwrap.shorten(text, WIDTH - COLUMN, placeholder=' …')}"
+    sentence = line.text.partition(". ")[0].strip().removesuffix(".")
+    text = textwrap.shorten(sentence, WIDTH - COLUMN, placeholder=" …")
+    return f"{start} {text}"
 
 
 def shown(value: Any) -> str:
@@ -153,5 +167,9 @@ def shown(value: Any) -> str:
 
 
 def _summary(cls: type[Any]) -> str:
-    text = inspect.getdoc(cls) or ""  # a dataclass without one shows its signature
-    return "" if text.startswith(f"{cls.__name__}(") else text.split("\n\n")[0].replace("\n", " ")
+    """The first paragraph of a class's docstring."""
+    text = inspect.getdoc(cls) or ""
+    if text.startswith(f"{cls.__name__}("):  # a dataclass without a docstring shows its signature
+        return ""
+    paragraph = text.split("\n\n")[0]
+    return paragraph.replace("\n", " ")

@@ -29,8 +29,9 @@ def memory_gib(entry: str) -> float:
     group = Path("/sys/fs/cgroup")
     with contextlib.suppress(OSError, ValueError):  # no such file, or no limit
         limit = int((group / "memory.max").read_text())
-        used = int((group / "memory.current").read_text())
-        found = min(found, limit - used if free else limit)
+        if free:
+            limit -= int((group / "memory.current").read_text())
+        found = min(found, limit)
     return found / GIB
 
 

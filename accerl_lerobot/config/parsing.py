@@ -75,7 +75,7 @@ OF_LEROBOT = {
 
 
 def imported(path: str) -> Any:
-    """Object behind a table's ``module:name``."""
+    """The object that ``module:name`` names."""
     module, _, name = path.partition(":")
     collects = gc.isenabled()
     new = module not in sys.modules
@@ -90,7 +90,7 @@ def imported(path: str) -> Any:
 
 
 def discover(package: str | None, section: str = "") -> None:
-    """Imports a package that registers types; None does nothing. `section` is that of the field."""
+    """Imports a package that registers types, if there is one. Errors name the field in `section`."""
     if package is None:
         return
     try:
@@ -103,7 +103,7 @@ def discover(package: str | None, section: str = "") -> None:
 
 
 def import_plugins(*prefixes: str) -> dict[str, str]:
-    """Imports the installed packages whose names begin so; words on each one that cannot be imported.
+    """Imports the installed packages whose names begin with a prefix; returns package → reason of a failure.
 
     LeRobot's `register_third_party_plugins` logs the traceback of each that is broken, wanted or not.
     """
@@ -148,11 +148,12 @@ def _for_verb(tree: dict[str, Any], config_class: type[Any], recipe_class: type[
     taken = annotations_of(config_class)
     left = {}
     for key, value in tree.items():
-        if key in known and (key not in taken or key == "output_dir"):
-            continue  # a run's own config is a recipe too, and its folder is taken
-        typed = isinstance(value, dict) and TYPE in value
-        if typed and key in known and section_of(known[key]) is not section_of(taken[key]):
-            continue  # a section that has types in a run and none here is another one of the same name
+        if key in known:
+            if key not in taken or key == "output_dir":
+                continue  # a run's own config is a recipe too, and its folder is taken
+            typed = isinstance(value, dict) and TYPE in value
+            if typed and section_of(known[key]) is not section_of(taken[key]):
+                continue  # a section that has types in a run and none here is another one of the same name
         left[key] = value
     return left
 
@@ -165,14 +166,16 @@ def consents(tree: Any, given: Any = None) -> dict[str, Any]:
     allowed = dict(_leaves(given))
     found = {}
     for name, value in _leaves(tree):
-        if name.rpartition(".")[2] in CONSENT and value not in UNSET and name not in allowed:
+        key = name.rpartition(".")[2]
+        if key in CONSENT and value not in UNSET and name not in allowed:
             found[name] = value
     return found
 
 
 def consent_flags(consented: dict[str, Any]) -> str:
     """Arguments of the command line that give these `consents`."""
-    return " ".join(shlex.quote(f"--{name}={as_text(value)}") for name, value in consented.items())
+    flags = [f"--{name}={as_text(value)}" for name, value in consented.items()]
+    return shlex.join(flags)
 
 
 def _leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any]]:
@@ -187,7 +190,9 @@ def _leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 def as_text(value: Any) -> str:
     """A value as it can be typed on a command line; control characters are escaped."""
-    return value if isinstance(value, str) and value.isprintable() else json.dumps(value, default=str)
+    if isinstance(value, str) and value.isprintable():
+        return value
+    return json.dumps(value, default=str)
 
 
 def read_arguments(arguments: list[str], bare: str | None = None) -> tuple[Path | None, dict[str, Any]]:
@@ -217,13 +222,16 @@ def read_arguments(arguments: list[str], bare: str | None = None) -> tuple[Path 
         recipes += entries
     elif entries:
         _set(given, bare, entries)
+    if not recipes:
+        return None, given
     if len(recipes) > 1:
         raise InputError("config_path", recipes[1], "there is another one already; give one recipe")
-    return (_recipe_path(expanded(recipes[0], "config_path")) if recipes else None), given
+    path = expanded(recipes[0], "config_path")
+    return _recipe_path(path), given
 
 
 def _set(tree: dict[str, Any], dotted: str, value: Any) -> None:
-    """Adds a value of the command line to a tree, once."""
+    """Add a value of the command line to a tree; a second value of a field is refused."""
     *sections, name = dotted.split(".")
     for section in sections:
         tree = tree.setdefault(section, {})
@@ -235,7 +243,7 @@ def _set(tree: dict[str, Any], dotted: str, value: Any) -> None:
 
 
 def _recipe_path(path: Path) -> Path:
-    """A recipe, that of a run for its folder, or that of a checkpoint for its folder or its policy's."""
+    """The recipe that a path names: a file, or the config of a run, a checkpoint or a policy in a run."""
     for place in (path / CONFIG, path.parent / CONFIG):
         if path.is_dir() and place.is_file():
             return place
@@ -256,14 +264,17 @@ def read_recipe(path: Path) -> dict[str, Any]:
     shipped = shipped_recipes()
     if not path.is_file():
         in_repository = str(path.parent) == RECIPES
-        path = shipped.get(path.stem if in_repository else str(path), path)
+        name = path.stem if in_repository else str(path)
+        path = shipped.get(name, path)
     if path.is_dir():
         hint = f"a folder without {CONFIG}, so no run or checkpoint; name a recipe"
         raise InputError("config_path", str(path), hint)
     if not path.is_file():
         names = [*map(str, path.parent.glob("*.y*ml")), *shipped]
         near = difflib.get_close_matches(str(path), names, n=3)
-        hint = f"did you mean {' or '.join(near)}" if near else f"this package has {', '.join(shipped)}"
+        hint = f"this package has {', '.join(shipped)}"
+        if near:
+            hint = f"did you mean {' or '.join(near)}"
         raise InputError("config_path", str(path), f"no such file; {hint}")
     if path.name in LEROBOTS_FILES:
         hint = "resume a run with RUN/config.yaml, and name a policy's folder by policy.path"
@@ -302,29 +313,38 @@ def _value(text: str) -> Any:
 def section_of(annotation: Any) -> type[Any] | None:
     """The config class behind a field's annotation, ``X`` or ``X | None``; None for a plain value."""
     kinds = typing.get_args(annotation) if is_union(annotation) else (annotation,)
-    sections = [kind for kind in kinds if isinstance(kind, type) and dataclasses.is_dataclass(kind)]
-    return sections[0] if sections else None
+    for kind in kinds:
+        if isinstance(kind, type) and dataclasses.is_dataclass(kind):
+            return kind
+    return None
 
 
 def sections_of(cls: type[Any]) -> dict[str, type[Any]]:
     """Field → config class, of the fields that are sections."""
-    found = {name: section_of(annotation) for name, annotation in annotations_of(cls).items()}
-    return {name: section for name, section in found.items() if section is not None}
+    sections = {}
+    for name, annotation in annotations_of(cls).items():
+        section = section_of(annotation)
+        if section is not None:
+            sections[name] = section
+    return sections
 
 
 def choices_of(section: type[Any]) -> dict[str, type[Any]]:
     """Registered name → config class, where `section` is the root of a choice; otherwise empty."""
-    return dict(section.get_known_choices()) if draccus.ChoiceRegistry in section.__bases__ else {}
+    if draccus.ChoiceRegistry in section.__bases__:
+        return dict(section.get_known_choices())
+    return {}
 
 
 def register_types(cls: type[Any], tree: dict[str, Any], path: tuple[str, ...] = ()) -> None:
     """Imports the packages that register types of what is to be decoded, as LeRobot's parser does."""
     for field in dataclasses.fields(cls):
-        if field.metadata.get(REGISTERS) and tree.get(field.name) is not None:
+        package = tree.get(field.name)
+        if field.metadata.get(REGISTERS) and package is not None:
             prepare = field.metadata.get(PREPARES)
             if prepare is not None:
                 prepare()
-            discover(str(tree[field.name]), ".".join(path))
+            discover(str(package), ".".join(path))
     for name, section in sections_of(cls).items():
         if isinstance(tree.get(name), dict):
             register_types(section, tree[name], (*path, name))
@@ -347,14 +367,23 @@ def _overridden(config_class: type[Any], tree: dict[str, Any], given: dict[str, 
         if name not in sections:
             merged[name] = under | over
             continue
+        section = sections[name]
         former = under.get(TYPE, getattr(defaults[name], TYPE, None))
         chosen = over.get(TYPE, former)
-        kind = choices_of(sections[name]).get(str(chosen), sections[name])
+        kind = choices_of(section).get(str(chosen), section)
         if chosen != former:
-            annotations = annotations_of(kind)
-            under = {k: v for k, v in under.items() if k in annotations and fits(annotations[k], v)}
+            under = _fitting(kind, under)
         merged[name] = _overridden(kind, under, over)
     return merged
+
+
+def _fitting(section: type[Any], tree: dict[str, Any]) -> dict[str, Any]:
+    """The part of `tree` that a section of this type has fields for, and whose values fit them."""
+    fitting = {}
+    for name, annotation in annotations_of(section).items():
+        if name in tree and fits(annotation, _converted(annotation, tree[name])):
+            fitting[name] = tree[name]
+    return fitting
 
 
 def decode(config_class: type[Any], tree: dict[str, Any]) -> Any:
@@ -388,8 +417,9 @@ def _decoded(
         place = (*path, str(key))
         if key not in annotations:
             raise _unknown(place, value, list(annotations), whole)
-        if key not in sections or (value is None and is_optional(annotations[key])):
-            values[key] = _converted(annotations[key], value)
+        annotation = annotations[key]
+        if key not in sections or (value is None and is_optional(annotation)):
+            values[key] = _converted(annotation, value)
         else:
             usual = defaults_of(cls)[key] if base is None else getattr(base, key)
             values[key] = _section(sections[key], value, usual, place, whole)
@@ -404,13 +434,15 @@ def _decoded(
             raise
         value = tree.get(key, error.value)  # as it was typed
         hint = error.hint.replace(f"{own}.", f"{actual}.") if own else error.hint
-        raise InputError(".".join(filter(None, (actual, key))), value, hint) from error
+        field = f"{actual}.{key}" if actual else key
+        raise InputError(field, value, hint) from error
 
 
 def _section(section: type[Any], value: Any, default: Any, path: tuple[str, ...], whole: type[Any]) -> Any:
     """A section of the type that `value` names, or of its default's."""
+    dotted = ".".join(path)
     if not isinstance(value, dict | None):
-        raise InputError(".".join(path), value, f"a config section; use --{path[-1]}.field=value")
+        raise InputError(dotted, value, f"a config section; use --{path[-1]}.field=value")
     value = value or {}
     choices = choices_of(section)
     if choices:
@@ -418,16 +450,16 @@ def _section(section: type[Any], value: Any, default: Any, path: tuple[str, ...]
         if not isinstance(kind, str) or kind not in choices:
             near = difflib.get_close_matches(str(kind), choices, n=1)
             hint = f"did you mean {near[0]}? Otherwise use" if near else "use"
-            raise InputError(".".join((*path, TYPE)), kind, f"{hint} one of {', '.join(sorted(choices))}")
+            raise InputError(f"{dotted}.{TYPE}", kind, f"{hint} one of {', '.join(sorted(choices))}")
         section = choices[kind]
         value = {name: entry for name, entry in value.items() if name != TYPE}
     return _decoded(section, value, default, path, whole)
 
 
 def _converted(kind: Any, value: Any) -> Any:
-    """A value of YAML's as its annotation has it, or as it is if nothing but its type would have to change.
+    """A value from YAML, converted to the type of its annotation where that is possible.
 
-    ``a,b`` and a lone value are the list that a field holds.
+    Text such as ``a,b``, and a single value, become a list where the field is a list.
     """
     origin = typing.get_origin(kind)
     arguments = typing.get_args(kind)
@@ -445,10 +477,15 @@ def _converted(kind: Any, value: Any) -> Any:
         entries = value if isinstance(value, (list, tuple)) else [value]
         return origin(_converted(arguments[0], entry) for entry in entries)
     if origin is dict and isinstance(value, dict):
-        return {str(key): _converted(arguments[1], entry) for key, entry in value.items()}
-    if kind is str and isinstance(value, (int, float, datetime.date)) and not isinstance(value, bool):
+        converted = {}
+        for key, entry in value.items():
+            converted[str(key)] = _converted(arguments[1], entry)
+        return converted
+    if isinstance(value, bool):
+        return value
+    if kind is str and isinstance(value, (int, float, datetime.date)):
         return str(value)
-    if kind in (int, float) and isinstance(value, (str, int)) and not isinstance(value, bool):
+    if kind in (int, float) and isinstance(value, (str, int)):
         try:
             return kind(value)  # YAML takes 1e-5 for text
         except (OverflowError, ValueError):
@@ -463,20 +500,23 @@ def dotted_fields(cls: type[Any], path: str = "") -> Iterator[str]:
         if name not in sections:
             yield f"{path}{name}"
             continue
-        for kind in choices_of(sections[name]).values() or (sections[name],):
+        section = sections[name]
+        for kind in choices_of(section).values() or (section,):
             yield from dotted_fields(kind, f"{path}{name}.")
 
 
 def _unknown(place: tuple[str, ...], value: Any, names: list[str], whole: type[Any]) -> InputError:
-    """The error for a field that a config does not have: what it resembles, or where it belongs."""
+    """The error for a field that a config does not have. It names similar fields, or all of the section."""
     *path, key = place
     name = ".".join(place)
     for flag, leaf in _leaves(value, name):
         if flag in OF_LEROBOT:
             return InputError(flag, leaf, f"the name is LeRobot's; {OF_LEROBOT[flag]}")
     near = [".".join((*path, other)) for other in difflib.get_close_matches(key, names, n=3)]
-    near += [other for other in dotted_fields(whole) if other.rpartition(".")[2] == key and other != name]
+    for other in dotted_fields(whole):
+        if other.rpartition(".")[2] == key and other not in (name, *near):
+            near.append(other)
     if near:
-        return InputError(name, value, f"no such field; did you mean {' or '.join(dict.fromkeys(near))}?")
+        return InputError(name, value, f"no such field; did you mean {' or '.join(near)}?")
     where = f"{'.'.join(path)} has" if path else "there are"
     return InputError(name, value, f"no such field; {where} {', '.join(names)}")

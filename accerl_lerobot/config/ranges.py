@@ -38,11 +38,12 @@ class Range:
         match = re.fullmatch(r"([\[(])(\S+), (\S+)([\])])", text)
         if match is None:
             raise ValueError(f"{text}: write an interval such as [0, 1)")
+        opening, low, high, closing = match.groups()
         self.text = text
-        self._low_open = match[1] == "("
-        self._high_open = match[4] == ")"
-        self.low = float(match[2])
-        self.high = float(match[3])
+        self._low_open = opening == "("
+        self._high_open = closing == ")"
+        self.low = float(low)
+        self.high = float(high)
 
     def __repr__(self) -> str:
         return f"Range({self.text!r})"
@@ -102,7 +103,8 @@ class Section:
 
     def __post_init__(self) -> None:
         for name, annotation in annotations_of(type(self)).items():
-            check(annotation, getattr(self, name), f"{self.SECTION}.{name}" if self.SECTION else name)
+            dotted = f"{self.SECTION}.{name}" if self.SECTION else name
+            check(annotation, getattr(self, name), dotted)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,12 +143,14 @@ class RunsConfig(Section):
 
     def file(self, name: str) -> Path:
         """The file to write, which is called `name` by default; refused if it is a folder, or in none."""
-        path = Path(name)
         if self.output is not None:
             path = expanded(self.output, "output")
         elif len(self.runs) == 1:
             path = expanded(self.runs[0], "runs") / name
-        if path.is_dir() or (self.output is not None and not path.parent.is_dir()):
+        else:
+            path = Path(name)
+        missing = self.output is not None and not path.parent.is_dir()
+        if missing or path.is_dir():
             raise InputError("output", str(path), "name a file in a folder that exists")
         return path
 
@@ -177,8 +181,10 @@ def defaults_of(cls: type[Any]) -> dict[str, Any]:
     for field in dataclasses.fields(cls):
         if field.default_factory is not dataclasses.MISSING:
             defaults[field.name] = field.default_factory()
+        elif field.default is not dataclasses.MISSING:
+            defaults[field.name] = field.default
         else:
-            defaults[field.name] = None if field.default is dataclasses.MISSING else field.default
+            defaults[field.name] = None
     return defaults
 
 
@@ -201,7 +207,9 @@ def fits(annotation: Any, value: Any) -> bool:
     if origin is typing.Literal:
         return value in arguments
     if origin is dict:
-        return isinstance(value, dict) and all(fits(arguments[1], entry) for entry in value.values())
+        if not isinstance(value, dict):
+            return False
+        return all(fits(arguments[1], entry) for entry in value.values())
     if origin in (list, tuple):
         if not isinstance(value, (list, tuple)):
             return False
@@ -231,7 +239,9 @@ def wanted(annotation: Any) -> str:
     arguments = typing.get_args(annotation)
     if origin is Annotated:
         kind, mark = arguments
-        return mark.words if isinstance(mark, Pattern) else f"{wanted(kind)} in {mark.text}"
+        if isinstance(mark, Pattern):
+            return mark.words
+        return f"{wanted(kind)} in {mark.text}"
     if is_union(annotation):
         return " or ".join(wanted(kind) for kind in arguments)
     if origin is typing.Literal:

@@ -173,37 +173,32 @@ class RunConfig(Section):
         if held_back >= self.replay.max_lag:
             hint = f"use more than trainer.hold_back, {held_back}, or all is thrown away as too old"
             raise InputError("replay.max_lag", self.replay.max_lag, hint)
-        for name, count in (
-            ("inference.workers", self.inference.workers),
-            ("trainer.ranks", self.trainer.ranks),
-        ):
+        counts = {"inference.workers": self.inference.workers, "trainer.ranks": self.trainer.ranks}
+        for name, count in counts.items():
             if count > 1 and self.launch.engine == "local":
-                raise InputError(
-                    name, count, "launch.engine=local is one process; use launch.engine=ray, or 1"
-                )
+                hint = "launch.engine=local is one process; use launch.engine=ray, or 1"
+                raise InputError(name, count, hint)
         if self.inference.workers > self.rollout.workers:
             hint = f"use at most rollout.workers, {self.rollout.workers}, or some have nobody to answer"
             raise InputError("inference.workers", self.inference.workers, hint)
-        batch = self.trainer.batch_decisions
-        length = self.rollout.segment_length
+        rollout = self.rollout
         if self.trainer.updates:
-            self.replay.check(batch_decisions=batch, segment_decisions=length)
+            batch = self.trainer.batch_decisions
+            self.replay.check(batch_decisions=batch, segment_decisions=rollout.segment_length)
         imagined = self.imagination.environments
-        workers = self.rollout.workers
-        if imagined and 0 < self.rollout.episodes < workers:
-            hint = f"use at least {workers}: each rollout worker needs a real episode to imagine from"
-            raise InputError("rollout.episodes", self.rollout.episodes, hint)
-        if self.launch.schedule != ASYNCHRONOUS and (imagined or self.rollout.episodes):
+        if imagined and 0 < rollout.episodes < rollout.workers:
+            hint = f"use at least {rollout.workers}: each rollout worker needs a real episode to imagine from"
+            raise InputError("rollout.episodes", rollout.episodes, hint)
+        if self.launch.schedule != ASYNCHRONOUS and (imagined or rollout.episodes):
             hint = "use asynchronous, or leave out imagination.environments and rollout.episodes"
             raise InputError("launch.schedule", self.launch.schedule, hint)
 
     def _check_off_policy(self) -> None:
         """A memory of its own stands for replay's reuse, and holds whole real episodes."""
         if isinstance(self.world_model, SimulatorStateConfig) and not self.env.tells_state:
-            hint = "add env.environment_state, if the environment has it, or use latent"
-            raise InputError(
-                "world_model.type", "simulator", f"env.type={self.env.type} tells no state; {hint}"
-            )
+            hint = f"env.type={self.env.type} tells no state; "
+            hint += "add env.environment_state, if the environment has it, or use latent"
+            raise InputError("world_model.type", "simulator", hint)
         only = f"algorithm.type={self.algorithm.type}"
         for name, value, wanted, why in (
             ("replay.samples_per_insert", self.replay.samples_per_insert, 1.0, "draws from its own memory"),
@@ -217,11 +212,13 @@ class RunConfig(Section):
 def lag_limits(config: RunConfig) -> tuple[int, int]:
     """The largest lag under this recipe, and what its pace alone would allow; in updates."""
     early = 1 if config.launch.engine == "ray" else 0  # publications under way, and batches drawn early
-    batch = config.trainer.batch_decisions
     rollout = config.rollout
     environments = rollout.environments + config.imagination.environments
-    in_flight = replace(rollout, environments=environments).in_flight
-    counts = {"batch_decisions": batch, "in_flight": in_flight, "prefetch": early}
-    counts["pickup"] = early + config.trainer.hold_back
-    of_pace = lag_bound(replace(config.replay, max_lag=10**9), **counts)
-    return lag_bound(config.replay, **counts), of_pace
+    counts = {
+        "batch_decisions": config.trainer.batch_decisions,
+        "in_flight": rollout.workers * environments * rollout.segment_length,
+        "pickup": early + config.trainer.hold_back,
+        "prefetch": early,
+    }
+    unlimited = replace(config.replay, max_lag=10**9)
+    return lag_bound(config.replay, **counts), lag_bound(unlimited, **counts)

@@ -117,11 +117,13 @@ class LocalEngine(Engine):
         if self._exploring and self._replay.may_sample(n):
             segments = self._replay.sample(n, self._update.version, self._rng)
             if segments:
-                updates.append(self._update.step(segments) | {"update": float(self._update.version)})
+                metrics = self._update.step(segments)
+                metrics["update"] = float(self._update.version)
+                updates.append(metrics)
                 self._publish()
         self._clock.enter(WAIT_IN)
-        episodes = list(self._episodes)
-        self._episodes[:] = []
+        episodes = self._episodes
+        self._episodes = []
         learner = self._world_learner
         return Progress(
             version=self._update.version,
@@ -241,9 +243,11 @@ class LocalEngine(Engine):
             self._acting_version = version
             return
         self._clock.enter(WEIGHT_SYNC)
-        last = version == updates or not self._exploring
         self._held_back.append((version, self._adapter.export_trainable()))
-        while self._held_back and (last or self._held_back[0][0] <= version - self._config.trainer.hold_back):
+        due = version - self._config.trainer.hold_back
+        if version == updates or not self._exploring:
+            due = version
+        while self._held_back and self._held_back[0][0] <= due:
             self._acting_version, weights = self._held_back.popleft()
             self._acting.load_trainable(weights)
 

@@ -60,14 +60,15 @@ class Placement:
         return options
 
     def rows(self) -> list[str]:
-        """The plan in words, one line a role."""
+        """One line for each role: its workers, their share of a GPU, and their nodes."""
         rows = []
         for role, count in (self._workers | {"replay": 1}).items():
-            selector = self._selectors.get(role, "this node")
+            selector = self._selectors.get(role)
+            if selector is None:
+                where = "this node"
+            else:
+                where = "all nodes" if selector == ALL else f"nodes with {selector}"
             share = self._shares.get(role, 0.0)
-            where = "all nodes" if selector == ALL else selector
-            if role in self._selectors and selector != ALL:
-                where = f"nodes with {selector}"
             gpus = f" × {share:g} GPU" if share else ""
             if count:
                 rows.append(f"{count} {role}{gpus} on {where}")
@@ -78,16 +79,18 @@ class Placement:
         selector = self._selectors.get(role)
         if selector is None:
             return self._nodes[:1]
-        nodes = [node for node in self._nodes if selector in (ALL, *node)]
+        if selector == ALL:
+            return self._nodes
+        nodes = [node for node in self._nodes if selector in node]
         if not nodes:
-            known = ", ".join(sorted(set().union(*self._nodes) - {"CPU", "GPU", "memory"}))
-            hint = f"no node of the cluster has this resource; there are {known}, or use all"
+            known = set().union(*self._nodes) - {"CPU", "GPU", "memory"}
+            names = ", ".join(sorted(known))
+            hint = f"no node of the cluster has this resource; there are {names}, or use all"
             raise InputError(f"launch.placement.{role}", selector, hint)
         return nodes
 
     def _gpu_shares(self, config: RunConfig, on_gpu: Sequence[str]) -> dict[str, float]:
-        """Share of a GPU for each process of a role; roles that are sent to the same nodes share what these
-        have."""
+        """Share of a GPU for each process of a role. Roles on the same nodes share their GPUs."""
         shares: dict[str, float] = {}
         for selector in {self._selectors.get(role) for role in on_gpu}:
             roles = [role for role in on_gpu if self._selectors.get(role) == selector]
@@ -97,9 +100,11 @@ class Placement:
                 raise InputError("policy.device", config.policy.device, hint)
             others = sum(self._workers[role] for role in roles if role != "trainer")
             share = 1 / math.ceil(others / gpus) if gpus and others else 0.0
+            of_trainer = 0.0
             if "trainer" in roles:
-                shares["trainer"], share = config.trainer.gpu_shares(gpus, max(1, others))
-            shares |= {role: share for role in roles if role != "trainer"}
+                of_trainer, share = config.trainer.gpu_shares(gpus, max(1, others))
+            for role in roles:
+                shares[role] = of_trainer if role == "trainer" else share
         return shares
 
 
@@ -121,7 +126,7 @@ def place_workers(config: RunConfig) -> Placement:
 
 
 def check_placement(config: RunConfig) -> list[str]:
-    """Plan where the workers will be, so that what does not fit is refused before anything long; as lines."""
+    """Refuse a placement that does not fit before any long work; returns the placement as lines."""
     if config.launch.engine == "local":
         return []
     if config.launch.address is not None:

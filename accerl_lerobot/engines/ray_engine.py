@@ -146,7 +146,9 @@ class RayEngine(Engine):
         if updates:
             self._version = int(updates[-1]["update"])
         served = [replica.last_answer for replica in self._inference if replica.last_answer]
-        restarts = sum(replica.all_restarts for replica in self._inference)
+        inference = merge_metrics(served)
+        inference["restarts"] = float(sum(replica.all_restarts for replica in self._inference))
+        world_model = None if self._world_learner is None else self._world_learner.last_answer
         progress = Progress(
             version=self._version,
             done=self._done,
@@ -154,8 +156,8 @@ class RayEngine(Engine):
             episodes=episodes,
             rollout=dict(total_counters(self._rollouts)),
             replay=self._replay.last_answer or {},
-            inference=merge_metrics(served) | {"restarts": float(restarts)},
-            world_model=(self._world_learner.last_answer or {}) if self._world_learner else {},
+            inference=inference,
+            world_model=world_model or {},
         )
         self._check_moving(progress)
         return progress
@@ -334,8 +336,8 @@ class RayEngine(Engine):
             answer = self._hear(worker)
             if answer is not None and isinstance(worker, RolloutSlot):
                 episodes += worker.take(answer)
-        imagining = self._config.imagination.environments > 0
-        if not self._collected and not imagining and all(slot.spent for slot in self._rollouts):
+        may_end = not self._collected and not self._config.imagination.environments
+        if may_end and all(slot.spent for slot in self._rollouts):
             self._collected = True
             self._replay.call("end")
         return episodes
@@ -356,10 +358,12 @@ class RayEngine(Engine):
     def _hand_over_world(self) -> None:
         """Give a new version of the world model to the rollout workers."""
         learner = self._world_learner
-        answer = None if learner is None else learner.last_answer
-        if learner is None or not answer or answer["version"] <= self._world_version:
+        if learner is None or not learner.last_answer:
             return
-        self._world_version = int(answer["version"])
+        version = int(learner.last_answer["version"])
+        if version <= self._world_version:
+            return
+        self._world_version = version
         newest = learner.actor.weights.remote()
         for slot in self._rollouts:
             slot.world = newest
@@ -388,7 +392,6 @@ class RayEngine(Engine):
             self._last_state = state
             self._last_change = now
         elif now - self._last_change > 2 * self._limit:  # a single worker that hangs is found earlier
+            counters = f"{progress.rollout}, {progress.replay}"
             hint = "raise launch.stall_s if a single step takes that long"
-            raise WorkerError(
-                f"nothing moved for {2 * self._limit:.0f} s: {progress.rollout}, {progress.replay}; {hint}"
-            )
+            raise WorkerError(f"nothing moved for {2 * self._limit:.0f} s: {counters}; {hint}")

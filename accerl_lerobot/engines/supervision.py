@@ -79,7 +79,7 @@ class Worker:
         self.warnings.append(self.actor.__ray_call__.remote(collected_warnings))
 
     def answer(self, timeout: float = 0.0) -> Any:
-        """The answer to the last question, once; None if there is none yet."""
+        """The answer to the last question; None if it has not come, or has been taken."""
         if self._question is None or not ray.wait([self._question], timeout=timeout)[0]:
             return None
         question = self._question
@@ -88,7 +88,7 @@ class Worker:
         return self.last_answer
 
     def hung(self) -> str:
-        """Reason to give the worker up; empty: none."""
+        """The reason to give the worker up; empty if there is none."""
         if self._question is None or ray.wait([self._question], timeout=0)[0]:
             return ""
         silent = time.monotonic() - self._asked
@@ -237,7 +237,8 @@ class RolloutSlot(RestartedWorker):
             if plan.explore:
                 results.append(episode)
                 if plan.source == REAL:
-                    self.begun = [*self.begun, (plan.task, plan.seed)][-MOST_BEGUN:]
+                    self.begun.append((plan.task, plan.seed))
+                    del self.begun[:-MOST_BEGUN]
                     if self.budget is not None:
                         self.budget -= 1
             elif self.outstanding.pop((plan.group, plan.index), None) is not None:
@@ -245,7 +246,9 @@ class RolloutSlot(RestartedWorker):
         return results
 
     def assign(self, plans: list[EpisodePlan]) -> None:
-        self.outstanding |= {(plan.group, plan.index): plan for plan in plans}
+        """Queue planned episodes for the next report."""
+        for plan in plans:
+            self.outstanding[plan.group, plan.index] = plan
         self._unsent += plans
 
     def ask_report(self, training: bool, in_turn: bool) -> None:
@@ -254,7 +257,7 @@ class RolloutSlot(RestartedWorker):
             self._unsent = []
 
     def hung(self) -> str:
-        """Also an environment that does not return."""
+        """The reason to give the worker up, which may be an environment that does not return."""
         why = super().hung()
         report: Report | None = self.last_answer
         if why or report is None or report.busy_s <= self._launch.stall_s:
@@ -277,15 +280,15 @@ def has_died(error: Exception) -> bool:
 
 def save_rollouts(directory: Path, workers: Sequence[RolloutSlot]) -> None:
     """Write the rollout workers' part of ``training_state``."""
-    slots = [
-        {
+    slots = []
+    for worker in workers:
+        slot = {
             "incarnation": worker.next_incarnation - 1,
             "budget": worker.budget,
             "outstanding": list(worker.outstanding.values()),
             "begun": worker.begun,
         }
-        for worker in workers
-    ]
+        slots.append(slot)
     snapshot.save(directory / ROLLOUT, {"past": dict(total_counters(workers)), "slots": slots})
 
 
@@ -317,7 +320,9 @@ def total_counters(workers: Iterable[RolloutSlot]) -> Counter[str]:
 def show_new_warnings(workers: Sequence[Worker], timeout: float = 0.0) -> None:
     """Show each warning that workers have handed over, once."""
     asked = [reference for worker in workers for reference in worker.warnings]
-    ready, waiting = ray.wait(asked, num_returns=len(asked), timeout=timeout) if asked else ([], [])
+    if not asked:
+        return
+    ready, waiting = ray.wait(asked, num_returns=len(asked), timeout=timeout)
     for reference in ready:
         with contextlib.suppress(RayError):  # the process has died, which others find out
             show_warnings(ray.get(reference))
@@ -339,6 +344,7 @@ def end_all(workers: Sequence[Worker]) -> None:
 
 
 def _runs(pid: int) -> bool:
+    """True while a process of this id is alive."""
     try:
         return bool(psutil.Process(pid).status() != psutil.STATUS_ZOMBIE)
     except psutil.NoSuchProcess:

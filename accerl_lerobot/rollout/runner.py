@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Several environments, each somewhere between a decision and the next: the rollout worker without its
-process.
+"""Steps several environments at once, each at its own decision: the rollout worker without its process.
 
 A slot is one environment. `start` resets it and `advance` executes a decision in it; both return the request
 for the next decision. The Ray worker goes on with other slots meanwhile, the local engine answers at once.
@@ -94,7 +93,8 @@ def budgets(config: RolloutConfig) -> list[int | None]:
     """How many exploring episodes each worker plays; None: no end."""
     if not config.episodes:
         return [None] * config.workers
-    return [len(range(w, config.episodes, config.workers)) for w in range(config.workers)]
+    each, more = divmod(config.episodes, config.workers)
+    return [each + int(worker < more) for worker in range(config.workers)]
 
 
 def incarnation_after(incarnation: int, starts: int) -> int:
@@ -102,7 +102,8 @@ def incarnation_after(incarnation: int, starts: int) -> int:
 
     `starts` is where the one before was in its seeds when it last said so; it may have gone on since.
     """
-    return max(incarnation, (starts + STARTS_PER_INCARNATION // 2) // STARTS_PER_INCARNATION) + 1
+    reached = (starts + STARTS_PER_INCARNATION // 2) // STARTS_PER_INCARNATION
+    return max(incarnation, reached) + 1
 
 
 class EpisodePlans:
@@ -125,8 +126,11 @@ class EpisodePlans:
         # Filled and emptied on different threads: appending to and popping from a deque is atomic.
         self._queued: deque[EpisodePlan] = deque()
         self._failing = dict.fromkeys(tasks, 1.0)
-        # Episodes that each task is still to get. The first one's is the worker's own; equals take turns.
-        self._owed = {task: -1e-6 * ((place - worker) % len(tasks)) for place, task in enumerate(tasks)}
+        # Episodes that each task is still to get. Each worker begins with another task; equals take turns.
+        self._owed: dict[str, float] = {}
+        for place, task in enumerate(tasks):
+            turn = (place - worker) % len(tasks)
+            self._owed[task] = -1e-6 * turn
 
     def queue(self, plans: Iterable[EpisodePlan]) -> None:
         self._queued.extend(plans)
@@ -142,8 +146,9 @@ class EpisodePlans:
         seed = train_seed(self._seed, self.worker, self.starts)
         self.starts += 1
         shares = {task: max(failing, LEAST_SHARE) for task, failing in self._failing.items()}
+        total = sum(shares.values())
         for task, share in shares.items():
-            self._owed[task] += share / sum(shares.values())
+            self._owed[task] += share / total
         task = max(self._tasks, key=self._owed.__getitem__)
         self._owed[task] -= 1
         return EpisodePlan(task=task, seed=seed, explore=True)
@@ -159,10 +164,11 @@ class EpisodePlans:
         return EpisodePlan(task=task, seed=seed, explore=True, source=IMAGINED)
 
     def ended(self, result: EpisodeResult) -> None:
-        """Tasks that fail more are explored more."""
+        """Note the outcome of an episode: tasks that fail more often are explored more often."""
         if result.plan.explore and result.plan.source == REAL:
             task = result.plan.task
-            self._failing[task] += ((not result.success) - self._failing[task]) / RECENT
+            failed = not result.success
+            self._failing[task] += (failed - self._failing[task]) / RECENT
 
     @property
     def spent(self) -> bool:
@@ -191,7 +197,7 @@ class EpisodePlans:
 @kind
 @dataclass(frozen=True, kw_only=True)
 class EpisodeResult:
-    """How an episode went."""
+    """Outcome of an episode."""
 
     plan: EpisodePlan
     success: bool
@@ -255,14 +261,17 @@ class ActiveEpisode:
         self.versions.append(decision.version)
 
     def cut(self, key: str, terminated: bool = False, success: bool = False) -> Segment:
-        """Hands out what was collected as one segment and goes on from its last observation."""
+        """Returns the decisions so far as one segment; the next segment begins at its last observation."""
         observations = self.observations
         self.observations = self.observations[-1:]
         decisions, actions, rewards, steps = zip(*self.taken, strict=True)
         self.taken = []
-        names = [name for name in observations[0] if name != TASK]
+        arrays = {}
+        for name in observations[0]:
+            if name != TASK:
+                arrays[name] = np.stack([np.asarray(each[name]) for each in observations])
         return Segment(
-            observations={name: np.stack([np.asarray(o[name]) for o in observations]) for name in names},
+            observations=arrays,
             task=str(observations[0][TASK]),
             latent={name: np.stack([d.latent[name] for d in decisions]) for name in decisions[0].latent},
             log_prob=np.stack([d.log_prob for d in decisions]).astype(np.float32),
@@ -310,8 +319,10 @@ class RolloutRunner:
     @property
     def exploring(self) -> bool:
         """True while a real exploring episode is under way."""
-        plans = [episode.plan for episode in self._episodes if episode is not None]
-        return any(plan.explore and plan.source == REAL for plan in plans)
+        for episode in self._episodes:
+            if episode is not None and episode.plan.explore and episode.plan.source == REAL:
+                return True
+        return False
 
     def start(self, slot: int) -> Request | None:
         """Begins the next planned episode in `slot`; None when nothing is planned."""
@@ -363,7 +374,7 @@ class RolloutRunner:
         return episode.request()
 
     def _drop(self, slot: int, episode: ActiveEpisode, bad: str) -> Request | None:
-        """Throws away the rest of an episode; the request of the next one."""
+        """Throws away the rest of an episode; returns the request of the next episode."""
         plan = episode.plan
         note = f"an episode is dropped: {bad} is not finite"
         self.counters.dropped_episodes += 1
@@ -392,14 +403,13 @@ class RolloutRunner:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Resumes from `state`: environments without a state are brought back by doing it all again."""
+        """Resumes from `state`. Environments without a state of their own repeat their episode so far."""
         self.counters = state["counters"]
         self._sequence = state["sequence"]
         self._episodes = state["episodes"]
         self.starts.extend(state["starts"])
-        for environment, episode, kept in zip(
-            self.environments, self._episodes, state["environments"], strict=True
-        ):
+        slots = zip(self.environments, self._episodes, state["environments"], strict=True)
+        for environment, episode, kept in slots:
             if episode is None:
                 continue
             if kept is not None:
@@ -458,5 +468,9 @@ def _execute(environment: Environment, episode: ActiveEpisode, actions: np.ndarr
 
 def nonfinite(observation: Observation) -> str:
     """The first name in an observation whose numbers are not finite; empty: there is none."""
-    arrays = {k: v for k, v in observation.items() if isinstance(v, np.ndarray) and v.dtype.kind == "f"}
-    return next((name for name, array in arrays.items() if not np.isfinite(array).all()), "")
+    for name, value in observation.items():
+        if not isinstance(value, np.ndarray) or value.dtype.kind != "f":
+            continue
+        if not np.isfinite(value).all():
+            return name
+    return ""

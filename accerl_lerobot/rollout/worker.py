@@ -116,7 +116,8 @@ class RolloutWorker:
             self._starts.clear()
             if self._world is not None:
                 for task, seed in begun:
-                    self._starts.append((task, self._environments[0].reset(seed, task)))
+                    observation = self._environments[0].reset(seed, task)
+                    self._starts.append((task, observation))
             self._runner = RolloutRunner(
                 self._environments,
                 self._next,
@@ -141,7 +142,10 @@ class RolloutWorker:
         self._clock.beat()
         self._plans.queue(plans)
         self._max_pending = 1 if in_turn else MAX_PENDING
-        (self._training.set if training else self._training.clear)()
+        if training:
+            self._training.set()
+        else:
+            self._training.clear()
         now = time.monotonic()
         since, in_environment = self._active or (now, False)
         return Report(
@@ -180,8 +184,8 @@ class RolloutWorker:
             segments = self._outbox[: self._together]
             if fault_point("rollout.send"):
                 segments[0].reward = segments[0].reward * np.float32(np.nan)
-            is_real = any(segment.source == REAL for segment in segments)
-            self._pending[storing.send(segments)] = is_real
+            ticket = storing.send(segments)
+            self._pending[ticket] = any(segment.source == REAL for segment in segments)
             del self._outbox[: self._together]
         unstored = any(self._pending.values())
         self._spent = self._plans.spent and not self._runner.exploring and not unstored
@@ -202,7 +206,8 @@ class RolloutWorker:
         for start in range(0, len(slots), self._together):
             self._clock.enter(TRANSPORT)
             part = slots[start : start + self._together]
-            ticket = deciding.send([self._due.pop(slot) for slot in part])
+            requests = [self._due.pop(slot) for slot in part]
+            ticket = deciding.send(requests)
             self._asked[ticket] = part
 
     def _execute_decisions(self, deciding: ReconnectingClient) -> None:

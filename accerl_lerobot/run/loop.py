@@ -21,7 +21,6 @@ in the run, it has a process too: `world_model.worker` for the state of critic a
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 import shutil
@@ -40,7 +39,7 @@ from accerl_lerobot.engines.contract import Engine, Progress
 from accerl_lerobot.engines.stopping import Stopping
 from accerl_lerobot.errors import warn_once
 from accerl_lerobot.evaluation import before_after, evaluation_plans, success_curve, summarise
-from accerl_lerobot.experience import IMAGINED, REAL
+from accerl_lerobot.experience import IMAGINED
 from accerl_lerobot.metrics import MetricsLog, plain
 from accerl_lerobot.rollout.runner import EpisodeResult
 from accerl_lerobot.timeline import CHECKPOINT, EVALUATION, TRAINING, Clock, NoClock
@@ -72,7 +71,8 @@ def run_plans(
             _warn_of_notes(progress.episodes)
             results += [episode for episode in progress.episodes if episode.plan.group == group]
             on_progress(progress)
-            stage.update(len(results), f"{np.mean([r.success for r in results]):.0%}" if results else "")
+            successes = [result.success for result in results]
+            stage.update(len(results), f"{_mean(successes):.0%}" if successes else "")
     return sorted(results, key=lambda result: result.plan.index)
 
 
@@ -98,8 +98,10 @@ class Times:
         """Seconds until now, as a checkpoint holds them."""
         now = time.monotonic()
         wall_s = (self.before_s or 0.0) + now - self.started
-        training_s = 0.0 if self.training_since is None else now - self.training_since
-        return {"rl_s": self.rl_s + training_s, "wall_s": wall_s, "warm_s": self.warm_s}
+        rl_s = self.rl_s
+        if self.training_since is not None:
+            rl_s += now - self.training_since
+        return {"rl_s": rl_s, "wall_s": wall_s, "warm_s": self.warm_s}
 
     def restore(self, state: dict[str, float]) -> None:
         self.rl_s = state["rl_s"]
@@ -133,7 +135,7 @@ class RunState:
 
 
 class Recorder:
-    """Counts and logs what an engine reports."""
+    """Counts and logs the reports of an engine."""
 
     def __init__(self, config: RunConfig, log: MetricsLog, console: Console, times: Times) -> None:
         self.config = config
@@ -147,24 +149,32 @@ class Recorder:
         self.times.clock.beat()
         self.record_updates(progress.updates)
         _warn_of_notes(progress.episodes)
-        explored = [e for e in progress.episodes if e.plan.explore and e.plan.source == REAL]
-        imagined = [e.success for e in progress.episodes if e.plan.source == IMAGINED]
-        state.imagined = (state.imagined + imagined)[-RECENT:]
-        state.recent = (state.recent + [episode.success for episode in explored])[-RECENT:]
+        explored: list[EpisodeResult] = []
+        for episode in progress.episodes:
+            if episode.plan.source == IMAGINED:
+                state.imagined.append(episode.success)
+            elif episode.plan.explore:
+                state.recent.append(episode.success)
+                explored.append(episode)
+        del state.imagined[:-RECENT]
+        del state.recent[:-RECENT]
         self._count(explored)
         # The first episodes to end are the short ones, which are successes.
         training = math.isinf(state.steps)
         if explored and training and len(state.recent) >= RECENT // 4:
-            state.curve.append((self.env_steps(progress), _mean(state.recent)))
+            point = (self.env_steps(progress), _mean(state.recent))
+            state.curve.append(point)
         # Imagined episodes and learning go on once all real episodes have been played.
-        if explored or any(metrics["update"] % RECORD_EVERY == 0 for metrics in progress.updates):
+        due = any(metrics["update"] % RECORD_EVERY == 0 for metrics in progress.updates)
+        if explored or due:
             self._log_counters(progress, explored)
         for episode in progress.episodes:
-            results = state.during.get(episode.plan.group)
+            group = episode.plan.group
+            results = state.during.get(group)
             if results is not None:
                 results.append(episode)
                 if len(results) == self.config.evaluation.episodes_during:
-                    self.report(episode.plan.group, results, self.env_steps(progress), progress.version)
+                    self.report(group, results, self.env_steps(progress), progress.version)
 
     def record_updates(self, updates: list[dict[str, float]]) -> None:
         state = self.state
@@ -177,15 +187,14 @@ class Recorder:
             self.times.furthest = max(self.times.furthest, version)
 
     def report(self, group: str, results: list[EpisodeResult], steps: float, version: int) -> dict[str, Any]:
-        """Log an evaluation and say it; returns its summary."""
+        """Log an evaluation and print its success; returns its summary."""
         summary = summarise(results) | {"env_steps": steps, "group": group}
         self.state.evaluations.append(summary)
         self.log.write("evaluation", version, summary)
         low, high = summary["ci95"]
-        self.console.say(
-            f"{group}: success {summary['success']:.1%} [{low:.1%}, {high:.1%}] n={summary['n']} "
-            f"weights {summary['version_min']}–{summary['version_max']}"
-        )
+        success = f"success {summary['success']:.1%} [{low:.1%}, {high:.1%}] n={summary['n']}"
+        weights = f"weights {summary['version_min']}–{summary['version_max']}"
+        self.console.say(f"{group}: {success} {weights}")
         return summary
 
     def since(self, progress: Progress, key: str) -> float:
@@ -199,25 +208,27 @@ class Recorder:
         """The words beside the bar of training."""
         recent = self.state.recent
         lags = self.state.lags
-        success = f"{np.mean(recent):.0%} of {len(recent)}" if recent else "…"
+        success = f"{_mean(recent):.0%} of {len(recent)}" if recent else "…"
         lag = f"{lags[-1]:.0f}" if lags else "…"
         decisions = self.since(progress, "decisions")
         return f"exploring success {success} · lag {lag} · {decisions:.0f} decisions"
 
     def warn_if_hopeless(self) -> None:
-        """Tell if no exploring episode has succeeded."""
-        if not self.state.won:
+        """Warn if there were exploring episodes and none has succeeded."""
+        state = self.state
+        if state.explored and not state.won:
+            note = f" ({state.note})" if state.note else ""
             logger.warning(
                 "none of %d exploring episodes succeeded%s; where success is the only reward there is "
                 "nothing to learn from: see env.success, and docs/troubleshooting.md",
-                self.state.explored, f" ({self.state.note})" if self.state.note else "",
+                state.explored, note,
             )  # fmt: skip
 
     def _count(self, explored: list[EpisodeResult]) -> None:
         state = self.state
-        before = self.state.explored
+        before = state.explored
+        state.explored += len(explored)
         for episode in explored:
-            state.explored += 1
             state.won += episode.success
             state.note = episode.note or state.note
         if before < HOPELESS <= state.explored:
@@ -233,13 +244,13 @@ class Recorder:
             values["episode_steps"] = _mean([episode.steps for episode in explored])
             values["episode_decisions"] = _mean([episode.decisions for episode in explored])
         for part in ("replay", "inference", "world_model"):
-            numbers = getattr(progress, part)
-            values |= {f"{part}_{name}": value for name, value in numbers.items()}
+            for name, value in getattr(progress, part).items():
+                values[f"{part}_{name}"] = value
         self.log.write("rollout", progress.version, values)
 
 
 def _mean(values: Sequence[float]) -> float:
-    """The mean; NaN of nothing."""
+    """The mean; NaN for an empty sequence."""
     return float(np.mean(values)) if values else math.nan
 
 
@@ -277,17 +288,18 @@ class Loop:
             self.recorder.warn_if_hopeless()
         after, results = self._evaluate("after", self.state.steps)
         summary: dict[str, Any] = plain(self._summary(after, progress))
-        layout.write_atomically(self.directory / layout.SUMMARY, json.dumps(summary, indent=2) + "\n")
+        layout.write_json(self.directory / layout.SUMMARY, summary)
         self._draw(filmed, results)
         layout.prune(self._checkpoints)  # it has ended
         return summary
 
     def _begin(self) -> list[EpisodeResult]:
-        """Evaluate before training, and save; returns the episodes of the evaluation."""
+        """Evaluate before training, and save; returns the filmed episodes of the evaluation."""
         filmed: list[EpisodeResult] = []
         if self.config.evaluation.before:
-            self.state.before, filmed = self._evaluate("before", 0.0)
-            snapshot.save(self.directory / FILMED, [result for result in filmed if result.frames])
+            self.state.before, results = self._evaluate("before", 0.0)
+            filmed = [result for result in results if result.frames]
+            snapshot.save(self.directory / FILMED, filmed)
             self.state.base = self.engine.poll().rollout
         if self.config.save_every_updates or self.config.save_every_s:
             self._save()
@@ -305,8 +317,10 @@ class Loop:
         self.times.restore(saved["times"])
         if version < self.config.trainer.updates:  # more are asked for than were when it ended
             state.steps = math.inf
-        state.evaluated = min(state.evaluated, _multiples(version, self.config.evaluation.every_updates))
-        state.saved = min(state.saved, _multiples(version, self.config.save_every_updates))
+        evaluations = _multiples(version, self.config.evaluation.every_updates)
+        checkpoints = _multiples(version, self.config.save_every_updates)
+        state.evaluated = min(state.evaluated, evaluations)
+        state.saved = min(state.saved, checkpoints)
         if not (self.directory / f"{FILMED}.json").is_file():
             return []
         filmed: list[EpisodeResult] = snapshot.load(self.directory / FILMED)
@@ -326,8 +340,9 @@ class Loop:
                 stage.update(progress.version, self.recorder.status(progress))
                 if progress.done:
                     break
-                if _multiples(progress.version, config.evaluation.every_updates) > self.state.evaluated:
-                    self._evaluate_meanwhile(progress.version)
+                evaluations = _multiples(progress.version, config.evaluation.every_updates)
+                if evaluations > self.state.evaluated:
+                    self._evaluate_meanwhile(evaluations)
                 if self._save_is_due(progress) or self.stop.asked is not None:
                     self._save()
                 self.stop.check()
@@ -337,8 +352,9 @@ class Loop:
         return progress
 
     def _plan(self, episodes: int, group: str, filmed: int = 0) -> None:
-        seed = self.config.seed
-        self.engine.plan(evaluation_plans(self.tasks, episodes, group, seed=seed, filmed=filmed))
+        """Queue the episodes of an evaluation."""
+        plans = evaluation_plans(self.tasks, episodes, group, seed=self.config.seed, filmed=filmed)
+        self.engine.plan(plans)
 
     def _evaluate(self, group: str, steps: float) -> tuple[dict[str, Any], list[EpisodeResult]]:
         """Wait for an evaluation; its summary and episodes."""
@@ -353,10 +369,10 @@ class Loop:
         self.recorder.record(progress)
         self.stop.check()
 
-    def _evaluate_meanwhile(self, version: int) -> None:
-        """Queue an evaluation that rollout workers play beside exploring."""
-        self.state.evaluated = _multiples(version, self.config.evaluation.every_updates)
-        group = f"during-{self.state.evaluated}"
+    def _evaluate_meanwhile(self, number: int) -> None:
+        """Queue the evaluation of this number, which rollout workers play beside exploring."""
+        self.state.evaluated = number
+        group = f"during-{number}"
         self.state.during[group] = []
         self._plan(self.config.evaluation.episodes_during, group)
 
@@ -379,7 +395,8 @@ class Loop:
         self.recorder.record_updates(saved.updates)
         self.state.saved = _multiples(saved.version, self.config.save_every_updates)
         shutil.copyfile(self.directory / layout.CONFIG, folder / layout.CONFIG)
-        state = vars(self.state) | {"log": self.recorder.log.state(), "times": self.times.state()}
+        log = self.recorder.log.state()
+        state = vars(self.state) | {"log": log, "times": self.times.state()}
         snapshot.save(folder / layout.TRAINING_STATE / layout.RUN_STATE, state)
         return saved.version
 
@@ -418,5 +435,5 @@ class Loop:
 
 
 def _multiples(number: int, every: int) -> int:
-    """How many multiples of `every` have been reached; 0 if that is 0."""
+    """How many multiples of `every` are not above `number`; 0 if `every` is 0."""
     return number // every if every else 0

@@ -7,7 +7,6 @@ LeRobotDataset with `next.success` or `next.reward` → the trainer's memory →
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
 import math
 import shutil
@@ -39,7 +38,7 @@ COMPARED = 64  # decisions of successes, and of failures, whose imitation loss i
 
 
 def learn_offline(config: OfflineRun, directory: Path, console: Console) -> dict[str, Any]:
-    """Learns, writes ``checkpoints/NNNNNN`` and ``summary.json`` into `directory`; returns the summary."""
+    """Learn, and write ``checkpoints/NNNNNN`` and ``summary.json`` into `directory`; returns the summary."""
     from accerl_lerobot.algorithms.ratio_update import make_update
     from accerl_lerobot.demos.dataset_files import open_metadata
     from accerl_lerobot.policies.loading import dry_run_config
@@ -57,12 +56,14 @@ def learn_offline(config: OfflineRun, directory: Path, console: Console) -> dict
         algorithm = replace(algorithm, critic_steps=algorithm.critic_steps or 1.0)
     update: Any = make_update(_adapter(config, shapes), algorithm, config.trainer)
     counts = _remember(config, update, meta, shapes, console)
-    before = _imitation(update)
+    losses = {"before": _imitation(update)}
     _learn(config, update, directory, console)
+    losses["after"] = _imitation(update)
 
     def write(folder: Path) -> int:
         adapter = update.adapter
-        adapter.save(folder / layout.PRETRAINED, config.policy, adapter.copy_weights())
+        weights = adapter.copy_weights()
+        adapter.save(folder / layout.PRETRAINED, config.policy, weights)
         shutil.copyfile(directory / layout.CONFIG, folder / layout.CONFIG)
         return int(update.version)
 
@@ -71,12 +72,12 @@ def learn_offline(config: OfflineRun, directory: Path, console: Console) -> dict
     summary: dict[str, Any] = counts | {
         "algorithm": algorithm.type,
         "updates": update.version,
-        "imitation_loss": {"before": before, "after": _imitation(update)},
+        "imitation_loss": losses,
         "wall_s": time.monotonic() - started,
         "policy": str(checkpoints / layout.LAST / layout.PRETRAINED),
     }
     summary = plain(summary)
-    layout.write_atomically(directory / layout.SUMMARY, json.dumps(summary, indent=2) + "\n")
+    layout.write_json(directory / layout.SUMMARY, summary)
     return summary
 
 
@@ -95,7 +96,8 @@ def _learn(config: OfflineRun, update: Any, directory: Path, console: Console) -
             if update.version % LOG_EVERY == 0 or update.version == last:
                 means = {name: float(np.mean(values)) for name, values in recent.items()}
                 log.write("train", update.version, means)
-                stage.update(update.version, f"imitation loss {means.get('imitation_loss', math.nan):.4f}")
+                loss = means.get("imitation_loss", math.nan)
+                stage.update(update.version, f"imitation loss {loss:.4f}")
                 recent = {}
 
 
@@ -146,13 +148,16 @@ def _check(config: OfflineRun, policy: Any, meta: Any) -> dict[str, tuple[int, .
 def _remember(
     config: OfflineRun, update: Any, meta: Any, shapes: dict[str, tuple[int, ...]], console: Console
 ) -> dict[str, Any]:
-    """Fills the memory; counts of what is in it."""
+    """Fill the memory from the dataset; returns the numbers of its episodes, successes and decisions."""
     from accerl_lerobot.algorithms.demonstrations import recorded
     from accerl_lerobot.policies.config import executed_rows
 
     algorithm: Any = config.algorithm
     chunk = executed_rows(update.adapter.policy.config)
-    size = sum(math.prod(shape) * (1 if len(shape) == 3 else 4) for shape in shapes.values())
+    size = 0  # bytes of a decision
+    for shape in shapes.values():
+        is_picture = len(shape) == 3
+        size += math.prod(shape) * (1 if is_picture else 4)
     most = max(1, min(algorithm.memory, BYTES // size))
     longest = int(max(meta.episodes["length"]))
     outcomes: dict[int, bool] = {}  # episode → success
@@ -169,9 +174,10 @@ def _remember(
     if len(outcomes) < meta.total_episodes:
         left = f"{len(outcomes)} of {meta.total_episodes} episodes fit into {most} decisions"
         logger.warning("%s, the others are left out", left)
-    counts = {"episodes": len(outcomes), "successes": sum(outcomes.values()), "decisions": len(update.memory)}
+    successes = sum(outcomes.values())
+    counts = {"episodes": len(outcomes), "successes": successes, "decisions": len(update.memory)}
     graded = len(set(totals.values())) > 1 and not isinstance(algorithm, ChunkCriticConfig)
-    if not len(update.imitable()) or not (counts["successes"] or graded):
+    if not len(update.imitable()) or not (successes or graded):
         hint = "none of its episodes is a success, or better than another; there is nothing to imitate"
         raise InputError("dataset.repo_id", config.dataset.repo_id, hint)
     console.say(", ".join(f"{number} {name}" for name, number in counts.items()))
@@ -190,6 +196,7 @@ def _imitation(update: Any) -> dict[str, float | None]:
             with torch.random.fork_rng(), update.adapter.autocast():
                 torch.manual_seed(0)
                 observations = update.memory.observations(rows)
-                loss, _ = update.adapter.imitate(*observations, update.tensor("chunk", rows))
+                chunks = update.tensor("chunk", rows)
+                loss, _ = update.adapter.imitate(*observations, chunks)
             losses[name] = float(loss.float().mean())
     return losses

@@ -24,7 +24,7 @@ from accerl_lerobot.engines.config import RunConfig
 from accerl_lerobot.envs import make_environment
 from accerl_lerobot.envs.base import ChunkResult, Environment, WrappedEnvironment
 from accerl_lerobot.experience import Observation
-from accerl_lerobot.policies.config import Load, loader
+from accerl_lerobot.policies.config import Load, executed_rows, loader
 from accerl_lerobot.rollout.runner import EpisodePlans, RolloutRunner
 from accerl_lerobot.run.preflight import policy_to_be
 from accerl_lerobot.world_model.config import WorldModelConfig
@@ -48,7 +48,7 @@ def prepared(config: RunConfig, directory: Path, console: Console, load: Load | 
     if not play.exists():
         record_play(config, play, console, load)
     if not pretraining.exists():
-        chunk = getattr(policy_to_be(config), "n_action_steps", 1)
+        chunk = executed_rows(policy_to_be(config))
         model = WorldModelConfig(steps=imagination.steps, chunk=chunk)
         with record.appearing(pretraining) as folder:
             folder.mkdir()
@@ -75,7 +75,8 @@ def record_play(config: RunConfig, root: Path, console: Console, load: Load | No
         dataset = stack.enter_context(record.new_dataset(folder, "accerl/play", spec, config.env))
         disturbed = stack.enter_context(record.simulated(config.env, expert, range(expert_episodes)))
         by_expert = (episode for episode, _ in disturbed)
-        for episode in itertools.chain(policy_play(config, policy_episodes, load), by_expert):
+        by_policy = policy_play(config, policy_episodes, load)
+        for episode in itertools.chain(by_policy, by_expert):
             record.save_episode(dataset, episode, tally)
             stage.update(tally["episodes"], f"{tally['successes']} successes")
     console.say("{episodes} episodes of play, {successes} successes".format(**tally))
@@ -85,10 +86,10 @@ def policy_play(config: RunConfig, count: int, load: Load | None) -> Iterator[re
     """Exploring episodes of a run's policy, with an observation at every env step."""
     adapter = loader(load)(config.policy)
     ended: list[record.Episode] = []
-    environments = [
-        RecordingEnvironment(make_environment(config.env, 1, config.rollout.reward_model), ended)
-        for _ in range(min(count, config.rollout.environments))
-    ]
+    environments = []
+    for _ in range(min(count, config.rollout.environments)):
+        environment = make_environment(config.env, 1, config.rollout.reward_model)
+        environments.append(RecordingEnvironment(environment, ended))
     if not environments:
         return
     plans = EpisodePlans(environments[0].spec.tasks, config.seed, count, PLAY_WORKER)
@@ -98,7 +99,10 @@ def policy_play(config: RunConfig, count: int, load: Load | None) -> Iterator[re
     )  # fmt: skip
     with closing(runner):
         requests = {slot: runner.start(slot) for slot in range(len(runner))}
-        while due := {slot: request for slot, request in requests.items() if request is not None}:
+        while True:
+            due = {slot: request for slot, request in requests.items() if request is not None}
+            if not due:
+                return
             decisions = adapter.decide(list(due.values()), 0)
             for slot, decision in zip(due, decisions, strict=True):
                 requests[slot] = runner.advance(slot, decision)
@@ -119,12 +123,14 @@ class RecordingEnvironment(WrappedEnvironment):
         return self._observation
 
     def step_chunk(self, actions: np.ndarray) -> ChunkResult:
-        results: list[ChunkResult] = []
-        for action in np.clip(actions, self.spec.action_low, self.spec.action_high).astype(np.float32):
-            results.append(self._environment.step_chunk(action[None]))
-            self._steps.append((self._observation, action, results[-1]))
-            self._observation = results[-1].observation
-            if results[-1].done:
+        rewards = []
+        actions = np.clip(actions, self.spec.action_low, self.spec.action_high).astype(np.float32)
+        for action in actions:
+            result = self._environment.step_chunk(action[None])
+            rewards.append(result.rewards)
+            self._steps.append((self._observation, action, result))
+            self._observation = result.observation
+            if result.done:
                 self._ended.append(record.episode_of(self._steps))
                 break
-        return replace(results[-1], rewards=np.concatenate([result.rewards for result in results]))
+        return replace(result, rewards=np.concatenate(rewards))

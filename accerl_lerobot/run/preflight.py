@@ -62,16 +62,16 @@ VISIBLE = 25  # levels of a pixel that rendering alone does not change
 
 
 def check_environment(env: EnvConfig, reward_model: RewardModelConfig | None = None) -> EnvironmentSpec:
-    """Build and reset an environment, so that what is wrong with it shows before anything long."""
+    """Build and reset an environment, so that its errors show before any long work; returns its spec."""
     with contextlib.closing(make_environment(env, reward_model=reward_model)) as environment:
         task = environment.spec.tasks[0]
         began = time.monotonic()
         try:
             first = environment.reset(0, task)
             slow = time.monotonic() - began > SLOW_S
-            other, again = (
-                (first, first) if slow else (environment.reset(1, task), environment.reset(0, task))
-            )
+            if not slow:
+                other = environment.reset(1, task)
+                again = environment.reset(0, task)
         except Exception as error:
             raise environment_error(env, error) from error
         if bad := nonfinite(first):
@@ -113,12 +113,16 @@ def check_policy(config: RunConfig, spec: EnvironmentSpec, *, own: bool = False)
     from accerl_lerobot.policies.config import env_steps_seen
     from accerl_lerobot.policies.loading import dry_run_config, load_lerobot_config
 
-    policy = (load_lerobot_config if own else dry_run_config)(config.policy)
-    needed = policy_features(policy)
-    offered = env_features(spec)
-    renames = config.policy.rename_map
-    check_features(needed, offered, renames, "policy.path", config.policy.path)
+    load = load_lerobot_config if own else dry_run_config
+    policy = load(config.policy)
+    _check_reads(policy, config.policy, spec)
     return env_steps_seen(policy, learns=isinstance(config.algorithm, OffPolicyConfig))
+
+
+def _check_reads(policy: Any, config: PolicyConfig, spec: EnvironmentSpec) -> None:
+    """Refuse a checkpoint that reads what the environment does not offer; `policy` is LeRobot's config."""
+    needed = policy_features(policy)
+    check_features(needed, env_features(spec), config.rename_map, "policy.path", config.path)
 
 
 def check_device(config: RunConfig) -> None:
@@ -131,8 +135,11 @@ def check_device(config: RunConfig) -> None:
 
 
 def check_start(config: RunConfig, say: Callable[[str], object] = str) -> tuple[EnvironmentSpec, int]:
-    """Refuse a run that could not begin, or whose outcome could not be used, as far as can be told; returns
-    what the environment offers, and the policy's ``n_obs_steps``."""
+    """Refuse a run that cannot begin, or whose policy could not be used, as far as this is known before it.
+
+    Returns:
+        The spec of the environment, and the policy's ``n_obs_steps``.
+    """
     from accerl_lerobot.demos.dataset_files import open_metadata
     from accerl_lerobot.policies.config import check_likelihood, sampler_config
 
@@ -158,15 +165,13 @@ def check_start(config: RunConfig, say: Callable[[str], object] = str) -> tuple[
         check_likelihood(algorithm.type, sampler_config(config.policy, policy.type), policy.type, field)
     check_memory(config)
     spec = check_environment(config.env, config.rollout.reward_model)
-    renames = config.policy.rename_map
     history = int(policy.n_obs_steps)
     meta = None
     if config.policy.path is None:
         trained = policy if config.sft.init_path is None else sft_policy(config.sft)
-        meta = check_training_data(config.sft, config.dataset, trained, spec, renames)
+        meta = check_training_data(config.sft, config.dataset, trained, spec, config.policy.rename_map)
     else:
-        needed = policy_features(policy)
-        check_features(needed, env_features(spec), renames, "policy.path", config.policy.path)
+        _check_reads(policy, config.policy, spec)
     if isinstance(algorithm, OffPolicyConfig):
         check_off_policy(config, policy, spec)
         if meta is None and config.dataset.repo_id is not None:
@@ -196,7 +201,7 @@ def check_state_model(config: RunConfig, policy: Any, decisions: int) -> None:
     from accerl_lerobot.world_model.states import new_state_model
 
     model = config.state_model
-    learns = not isinstance(config.state_model, SimulatorStateConfig)
+    learns = not isinstance(model, SimulatorStateConfig)
     if policy.input_features and policy.output_features:  # a new policy reads the features that are offered
         spec = state_spec(policy, config.policy.rename_map, config.env.state_size * policy.n_obs_steps)
         learns = new_state_model(spec, model).learns
@@ -211,7 +216,7 @@ def _check_remembered(config: RunConfig, spec: EnvironmentSpec, meta: Any, histo
     from accerl_lerobot.demos.dataset_files import numbers, opened, read_labels
 
     dataset = config.dataset
-    about = ("dataset.repo_id", config.dataset.repo_id)
+    about = ("dataset.repo_id", dataset.repo_id)
     shapes: dict[str, tuple[int, ...]] = {STATE: (spec.state_dim,), **spec.images}
     if config.env.state_size:
         shapes[ENV_STATE] = (config.env.state_size,)
@@ -247,19 +252,20 @@ def check_training_data(
         return meta  # with names of its own, LeRobot compares dataset and policy
     if sft.init_path is None:
         needs = _new_policy_features(policy, source, about)
+        if offered is not None:
+            hint = "; or name fewer in sft.policy.input_features"
+            check_features(needs, offered, rename_map, *about, hint=hint)
     else:
         needs = fine_tuned_features(policy, source, {})
-    if sft.init_path is not None and data is not None:
-        check_features(replace(needs, tasks=()), data, {}, "sft.init_path", sft.init_path, "dataset")
-    if offered is not None:
-        new = sft.init_path is None
-        field, value = about if new else ("sft.init_path", sft.init_path)
-        hint = "; or name fewer in sft.policy.input_features" if new else ""
-        check_features(needs, offered, rename_map, field, value, hint=hint)
-    if offered is not None and data is not None and sft.init_path is not None:
-        # Its cameras may have names of their own.
-        vectors = {name: shape for name, shape in data.shapes.items() if name in (STATE, ACTION)}
-        check_features(replace(data, shapes=vectors), offered, {}, *about)
+        start = ("sft.init_path", sft.init_path)
+        if data is not None:
+            check_features(replace(needs, tasks=()), data, {}, *start, "dataset")
+        if offered is not None:
+            check_features(needs, offered, rename_map, *start)
+        if offered is not None and data is not None:
+            # Its cameras may have names of their own.
+            vectors = {name: shape for name, shape in data.shapes.items() if name in (STATE, ACTION)}
+            check_features(replace(data, shapes=vectors), offered, {}, *about)
     if meta is not None and spec is not None:
         with opened(dataset, meta, picked(dataset, sft.pick)) as read:
             check_actions(numbers(read, ACTION, dataset), spec, *about)
@@ -318,8 +324,11 @@ def policy_to_be(config: RunConfig) -> Any:
         except InputError as error:
             if error.field not in ("policy.path", "policy.type", "policy.n_obs_steps"):
                 raise
-            what = "" if error.field == "policy.path" else f"{error.field.partition('.')[2]}={error.value}: "
-            raise InputError("sft.init_path", start.path, what + error.hint) from error
+            hint = error.hint
+            if error.field != "policy.path":
+                name = error.field.removeprefix("policy.")
+                hint = f"{name}={error.value}: {hint}"
+            raise InputError("sft.init_path", start.path, hint) from error
     policy_config = check_sft_policy(config.sft)
     sampler_config(config.policy, config.sft.policy["type"])
     override(policy_config, config.policy)
@@ -350,10 +359,12 @@ def check_sft_policy(config: SFTConfig) -> Any:
         return draccus.decode(PreTrainedConfig.get_choice_class(kind), {"device": "cpu"} | fields)
     except draccus.utils.DraccusException as error:
         chain: list[Any] = list(causes(error))
-        keys = [link.key_path[0] for link in chain if getattr(link, "key_path", ())]
-        field = f"sft.policy.{keys[0]}" if keys else "sft.policy"
-        value = fields.get(keys[0]) if keys else fields
-        raise InputError(field, value, f"LeRobot says: {brief(chain[-1])}") from error
+        hint = f"LeRobot says: {brief(chain[-1])}"
+        for link in chain:
+            if getattr(link, "key_path", ()):
+                name = link.key_path[0]
+                raise InputError(f"sft.policy.{name}", fields.get(name), hint) from error
+        raise InputError("sft.policy", fields, hint) from error
 
 
 def sft_policy(config: SFTConfig) -> Any:

@@ -40,11 +40,14 @@ def warm_started(directory: Path) -> Path | None:
     if not note.is_file():
         return None
     with reading("config_path", str(directory), WARM_START):
-        return directory / str(json.loads(note.read_text())["policy"])
+        content = json.loads(note.read_text())
+        return directory / str(content["policy"])
 
 
 def resume_command(directory: Path, config: RunConfig) -> str:
-    command = f"accerl train --resume=true --config_path={shlex.quote(str(directory / layout.CONFIG))}"
+    """The command line that resumes a run."""
+    recipe = shlex.quote(str(directory / layout.CONFIG))
+    command = f"accerl train --resume=true --config_path={recipe}"
     flags = consent_flags(consents(encode(config)))
     return f"{command} {flags}" if flags else command
 
@@ -63,19 +66,21 @@ def resumed_run(path: Path | None, config: RunConfig) -> tuple[Path, str]:
     directory = path.absolute().parent
     checkpoint = layout.LAST
     if directory.parent.name == layout.CHECKPOINTS:
-        directory, checkpoint = directory.parent.parent, directory.name
-    if not (directory / layout.CONFIG).is_file() or not (directory / LOCK).is_file():
+        checkpoint = directory.name
+        directory = directory.parent.parent
+    if not all((directory / name).is_file() for name in (layout.CONFIG, LOCK)):
         raise InputError("config_path", str(path), f"no run has been begun there; {how}")
     source = FileSource("config_path", str(path))
     check_folder(directory, source)
-    before = encode(decode(type(config), read_recipe(directory / layout.CONFIG)))
-    _check_unchanged(before, encode(config))
+    former = decode(type(config), read_recipe(directory / layout.CONFIG))
+    _check_unchanged(encode(former), encode(config))
     checkpoints = directory / layout.CHECKPOINTS
     newest = (checkpoints / checkpoint).resolve() == (checkpoints / layout.LAST).resolve()
+    summary = directory / layout.SUMMARY
     # From an earlier checkpoint there are updates left to make.
-    if newest and (directory / layout.SUMMARY).is_file():
-        made: Any = read_json(directory / layout.SUMMARY, source).get("updates")
-        check(Steps, made, f"{directory / layout.SUMMARY}: updates")
+    if newest and summary.is_file():
+        made: Any = read_json(summary, source).get("updates")
+        check(Steps, made, f"{summary}: updates")
         if made >= config.trainer.updates:
             hint = f"the run {directory} has made them, and has ended; ask for more"
             raise InputError("trainer.updates", config.trainer.updates, hint)
@@ -107,17 +112,24 @@ def continued(config: RunConfig, directory: Path, checkpoint: Path) -> RunConfig
         return improving(config, checkpoint / layout.PRETRAINED)
     # A checkpoint has low-rank adapters merged; apart from what they adapt they are in the training state.
     path = config.policy.path or warm_started(directory)
-    on_the_hub = isinstance(path, str) and path.count("/") <= 1 and not path.startswith((".", "/", "~"))
-    if path is None or not (on_the_hub or Path(path).expanduser().is_dir()):
+    if path is None or not _may_exist(str(path)):
         hint = "the policy that this run began from is gone, and its low-rank adapters are of no other; "
         hint += f"put it back, or begin a new run with --policy.path={checkpoint / layout.PRETRAINED}"
         raise InputError("policy.path", path, hint)
     return improving(config, path)
 
 
+def _may_exist(path: str) -> bool:
+    """True for a folder, and for a name that a repository of the Hub can have."""
+    if Path(path).expanduser().is_dir():
+        return True
+    return path.count("/") <= 1 and not path.startswith((".", "/", "~"))
+
+
 def improving(config: RunConfig, path: Path | str) -> RunConfig:
     """The run as one that improves a checkpoint."""
-    return replace(config, policy=replace(config.policy, path=str(path)), sft=replace(config.sft, steps=0))
+    policy = replace(config.policy, path=str(path))
+    return replace(config, policy=policy, sft=replace(config.sft, steps=0))
 
 
 def _check_unchanged(before: Any, now: Any, name: str = "") -> None:
@@ -128,7 +140,8 @@ def _check_unchanged(before: Any, now: Any, name: str = "") -> None:
         hint = f"the run was begun with {before!r}; leave it so, or begin a new run with --policy.path"
         raise InputError(name, now, hint)
     for key in sorted(before.keys() | now.keys()):
-        _check_unchanged(before.get(key), now.get(key), f"{name}.{key}" if name else key)
+        inner = f"{name}.{key}" if name else key
+        _check_unchanged(before.get(key), now.get(key), inner)
 
 
 @contextmanager

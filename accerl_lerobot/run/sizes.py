@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import operator
 from typing import TYPE_CHECKING, Any
 
 from accerl_lerobot.config.machine import GIB, SIMULATOR_GIB, memory_gib
@@ -19,22 +20,23 @@ ABSURD = 2  # times this machine's memory that a rough estimate may be; ``accerl
 
 def check_memory(config: RunConfig) -> None:
     """Refuse sizes far beyond this machine, and weights that it cannot hold; a cluster may have more."""
-    total = memory_gib("MemTotal")
-    if total is None or config.launch.address is not None:
+    if config.launch.address is not None:
         return
+    total = memory_gib("MemTotal")
     parts = memory_parts_gib(config)
     needed = sum(parts.values())
     largest = max(parts, key=lambda name: parts[name])
     if needed > ABSURD * total:
         hint = f"the run needs about {needed:,.0f} GiB of memory, this machine has {total:.0f}; lower it"
-        section, _, name = largest.partition(".")
-        raise InputError(largest, getattr(getattr(config, section), name), hint)
+        value = operator.attrgetter(largest)(config)
+        raise InputError(largest, value, hint)
     weights = policy_gib(config)
     if weights > total:
-        text = f"its weights take {weights:.1f} GiB in the processes of this run"
-        text += f", this machine has {total:.1f}"
-        hint = "use a smaller policy, a GPU, launch.engine=local or policy.tuning.mode=lora"
-        raise InputError("policy.path", config.policy.path, f"{text}; {hint}")
+        hint = (
+            f"its weights take {weights:.1f} GiB in the processes of this run, this machine has {total:.1f}; "
+        )
+        hint += "use a smaller policy, a GPU, launch.engine=local or policy.tuning.mode=lora"
+        raise InputError("policy.path", config.policy.path, hint)
 
 
 def memory_parts_gib(config: RunConfig, history: int = 1) -> dict[str, float]:
@@ -43,6 +45,7 @@ def memory_parts_gib(config: RunConfig, history: int = 1) -> dict[str, float]:
     tasks = len(getattr(config.env, "tasks", ("one",)))
     # The environments of a process share its simulators.
     simulators = min(rollout.environments * tasks, tasks + 2 * rollout.environments)
+    simulator = SIMULATOR_GIB.get(config.env.type, 0.0)
     pictures = history * observation_bytes(config) / GIB
     processes = POLICY_PROCESS_GIB
     if config.launch.engine == "ray":  # the driver, and workers
@@ -50,7 +53,7 @@ def memory_parts_gib(config: RunConfig, history: int = 1) -> dict[str, float]:
         processes = loaded * POLICY_PROCESS_GIB + rollout.workers * ROLLOUT_PROCESS_GIB
     return {
         "rollout.workers": processes,
-        "rollout.environments": rollout.workers * simulators * SIMULATOR_GIB.get(config.env.type, 0.0),
+        "rollout.environments": rollout.workers * simulators * simulator,
         "rollout.segment_length": rollout.in_flight * pictures,
         "replay.capacity": config.replay.capacity * pictures,
         "algorithm.memory": config.remembered * pictures,
@@ -61,7 +64,8 @@ def observation_bytes(config: RunConfig) -> int:
     """Bytes of one env step's images; what else a decision holds is small beside them."""
     env: Any = config.env
     side = getattr(env, "image_size", 96)  # LeRobot's own environments differ; PushT's have 96 pixels
-    return 3 * side * side * len(getattr(env, "cameras", ("one",)))
+    cameras = len(getattr(env, "cameras", ("one",)))
+    return 3 * side * side * cameras
 
 
 def policy_gib(config: RunConfig) -> float:
@@ -79,7 +83,8 @@ def policy_gib(config: RunConfig) -> float:
     if config.launch.engine == "ray":
         processes = config.trainer.ranks + config.inference.workers
         copies += 2 * config.inference.workers  # sets under way
-    return 4 * (sizes.policy * processes + sizes.trained * copies) / GIB
+    numbers = sizes.policy * processes + sizes.trained * copies
+    return 4 * numbers / GIB
 
 
 def trained_copies(config: RunConfig) -> int:

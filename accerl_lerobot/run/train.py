@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import datetime
 import functools
-import json
 import logging
 import shutil
 import sys
@@ -96,12 +95,13 @@ def start(
 ) -> tuple[Path, dict[str, Any]]:
     """Do a new run, or with ``config.resume`` the rest of the one whose config is `recipe`."""
     with ray_session.opened(config.launch, now=config.resume or config.policy.path is not None):
+        resume_from = None
         if config.resume:
             directory, resume_from = resuming.resumed_run(recipe, config)
-            run = Run(config, directory, console, resume_from, load)
         else:
-            run = Run(config, make_output_dir(config), console, load=load)
-        return run.directory, run.do()
+            directory = make_output_dir(config)
+        run = Run(config, directory, console, resume_from, load)
+        return directory, run.do()
 
 
 def play_evaluation(config: RunConfig, console: Console, filmed: int = 0) -> list[EpisodeResult]:
@@ -182,7 +182,7 @@ def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfi
     device = str(resolve_device(config.policy.device))
     path = fine_tune(config.sft, dataset, directory, config.seed, device, console)
     relative = Path(path).absolute().relative_to(directory.absolute())
-    layout.write_atomically(note, json.dumps({"policy": str(relative)}) + "\n")
+    layout.write_json(note, {"policy": str(relative)})
     return resuming.improving(config, path)
 
 
@@ -214,7 +214,7 @@ class Run:
 
     def do(self) -> dict[str, Any]:
         """`execute`, in a folder that is locked meanwhile; says how to resume whatever ends the run."""
-        guardian.explain(hint=printable(f"to resume: {self.how}"))
+        guardian.explain(printable(f"to resume: {self.how}"))
         try:
             with (
                 redirect_stdout(sys.stderr),
@@ -236,6 +236,8 @@ class Run:
                 reason = str(error)
             self.console.say(f"{reason}; to resume: {self.how}")
             raise
+        finally:
+            guardian.explain("")
 
     def begin(self) -> Path | None:
         """Check the run and write its config; returns the checkpoint that it goes on from."""
@@ -413,7 +415,7 @@ def train(config: RunConfig) -> TrainResult:
 
 def resume(directory: str | Path, changes: Mapping[str, Any] | None = None) -> TrainResult:
     """Resumes a run that was stopped, from its last complete checkpoint."""
-    recipe = Path(directory) / layout.CONFIG
+    recipe = expanded(str(directory), "directory") / layout.CONFIG
     config = load_config(recipe, {**(changes or {}), "resume": True})
     return _result(*start(config, Console(), recipe))
 
@@ -431,6 +433,7 @@ def evaluate(
     """
     if policy is not None:
         config = resuming.improving(config, policy)
+    if policy is not None or revision is not None:
         config = replace(config, policy=replace(config.policy, revision=revision))
     if episodes is not None:
         config = replace(config, evaluation=replace(config.evaluation, episodes=episodes))

@@ -126,7 +126,8 @@ class Stream:
 
         head = pickle.dumps(message, protocol=5, buffer_callback=is_small)
         sizes = struct.pack(f"<{len(pieces)}Q", *(piece.nbytes for piece in pieces))
-        self.unsent.append(memoryview(_HEAD.pack(len(head), len(pieces)) + sizes + head))
+        start = _HEAD.pack(len(head), len(pieces))
+        self.unsent.append(memoryview(start + sizes + head))
         self.unsent.extend(pieces)
         self.flush()
 
@@ -175,7 +176,8 @@ class Stream:
             pieces = [np.empty(size, np.uint8) for size in struct.unpack_from(f"<{count}Q", head)]
             for piece in pieces:
                 yield memoryview(piece)
-            self._received.append(pickle.loads(head[8 * count :], buffers=pieces))
+            message = pickle.loads(head[8 * count :], buffers=pieces)
+            self._received.append(message)
 
 
 class Client:
@@ -232,7 +234,9 @@ class Client:
 
     def _exchange(self, timeout: float) -> None:
         """Wait until the socket can be read or, with something unsent, written; read and write."""
-        events = select.POLLIN | (select.POLLOUT if self._stream.unsent else 0)
+        events = select.POLLIN
+        if self._stream.unsent:
+            events |= select.POLLOUT
         try:
             self._poll.register(self._stream, events)
             if not self._poll.poll(1000 * timeout):
