@@ -181,7 +181,8 @@ def check(world: World, episodes: Sequence[Episode], seed: int = 0) -> dict[str,
     if len(chosen):
         windows = cut_windows(episodes, [at[i] for i in chosen], world.model.spec, 1)
         values = skill_and_sensitivity(world, windows)
-    scores, achieved = replay_scores(world, episodes[:MOST_REPLAYS])
+    replayed = sorted(rng.permutation(len(episodes))[:MOST_REPLAYS])  # of a merged dataset not its first part
+    scores, achieved = replay_scores(world, [episodes[i] for i in replayed])
     values["auroc"] = auroc(scores, achieved)
     checks = {
         name: {"value": value, "above": BOUNDS[name], "holds": value > BOUNDS[name]}  # NaN passes nothing
