@@ -275,8 +275,8 @@ def check_imagination(config: RunConfig) -> None:
     with closing(make_environment(config.env)) as environment:
         spec = environment.spec
         if imagination.path is None:
-            if imagination.expert_episodes:
-                make_expert(config.env, environment, spec.tasks[0])
+            for task in spec.tasks[: imagination.expert_episodes]:
+                make_expert(config.env, environment, task)
             return
     world = world_of(imagination)
     _check_fit(world.model.spec, spec, getattr(policy, "n_action_steps", 1))
