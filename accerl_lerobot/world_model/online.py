@@ -221,6 +221,7 @@ class OnlineLearningWorker:
         while self._learner.pending_steps >= 1:
             fault_point("learning.step")
             with self._lock:
+                self._clock.enter(COMPUTE)  # a checkpoint may have been saved since the last step
                 self._learner.step()
         if self._learner.version > self._newest[0]:
             self._newest = self._learner.version, copied(self._learner.world)

@@ -74,20 +74,16 @@ class WorldModelWorker:
         with self._lock:
             learner = self._learner
             assert learner is not None  # the trainer begins before it submits
-            self._clock.enter(COMPUTE)
-            fault_point("world_model.learn")
-            learner.submit(transitions, numbers)
-            self._clock.enter(WAIT_IN)
+            with self._clock.during(COMPUTE):
+                fault_point("world_model.learn")
+                learner.submit(transitions, numbers)
             return Learned(learner.collect(), learner.count, copied(learner.model))
 
     def state(self) -> dict[str, Any]:
         """The learner's `state`, between two calls of `learn`."""
-        with self._lock:
+        with self._lock, self._clock.during(CHECKPOINT):
             assert self._learner is not None
-            self._clock.enter(CHECKPOINT)
-            state = self._learner.state()
-            self._clock.enter(WAIT_IN)
-            return state
+            return self._learner.state()
 
 
 class RemoteStateLearner:
