@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.experience import ENVIRONMENT_STATE
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.features import STATE
 from accerl_lerobot.policies.loading import load_network
@@ -41,6 +42,7 @@ class TDMPCModel(StateModel):
         policy, processing = _loaded(config)
         self.config = policy.config
         self.keeps_learning = config.learn
+        self.path = config.path
         self.image = next(iter(self.config.image_features), None)
         self.camera = _camera(spec, self.image, config)
         self.numbers = spec.state
@@ -102,11 +104,20 @@ class TDMPCModel(StateModel):
         if self.image is not None:
             pixels = torch.from_numpy(np.ascontiguousarray(observations[self.camera])).to(device)
             images = pixels.permute(0, 3, 1, 2).float() / 255
+            self._check_images(images)
             batch[self.image] = shifted(images) if shift else images
         if self.numbers:
             numbers = torch.from_numpy(observations[STATE]).to(device)
             batch[STATE] = self.state_zero + self.state_scale * numbers
         return batch
+
+    def _check_images(self, images: Tensor) -> None:
+        """Refuses images (B, C, H, W) of another size, which its encoder has no weights for."""
+        here = tuple(images.shape[1:])
+        there = self.config.image_features[self.image].shape
+        if here != there:
+            hint = f"its images have the shape {there}, the run's {here}; train it on these, or change env"
+            raise InputError("world_model.path", self.path, hint)
 
     def _blank(self, count: int) -> Observations:
         """Black images of TD-MPC's own name and size."""
@@ -142,13 +153,15 @@ def _camera(spec: StateSpec, image: str | None, config: TDMPCStateConfig) -> str
 
 
 def _check_sizes(spec: StateSpec, lerobot_config: Any, config: TDMPCStateConfig) -> None:
-    state = lerobot_config.robot_state_feature
-    for what, its, ours in (
-        (STATE, state.shape[0] if state else 0, spec.state),
-        ("action", lerobot_config.action_feature.shape[0], spec.chunk[1]),
-    ):
+    """Refuses a TD-MPC of other numbers than the run's, or that reads the simulator's."""
+    numbers = {STATE: spec.state, "action": spec.chunk[1], ENVIRONMENT_STATE: 0}
+    features = lerobot_config.input_features | lerobot_config.output_features
+    for name, ours in numbers.items():
+        its = features[name].shape[0] if name in features else 0
         if its != ours:
-            hint = f"{what} has {its} numbers there and {ours} here; train it on this robot's data"
+            hint = f"{name} has {its} numbers there and {ours} here; train it on this robot's data"
+            if name == ENVIRONMENT_STATE:
+                hint = f"it reads {name}; train it on demonstrations with env.environment_state=false"
             raise InputError("world_model.path", config.path, hint)
 
 
