@@ -375,14 +375,21 @@ class SuiteEnvironment(EpisodeEnvironment):
         return observation
 
 
-def lerobot_eval_arguments(env: Mapping[str, Any]) -> list[str]:
-    """``--env.…`` and seed of stock ``lerobot-eval`` for an environment; none if LeRobot cannot have it."""
+def lerobot_eval_arguments(env: Mapping[str, Any], renames: Mapping[str, str]) -> list[str]:
+    """``--env.…``, names and seed of stock ``lerobot-eval``; none if LeRobot cannot have the environment.
+
+    `renames` is the run's ``policy.rename_map``.
+    """
     kind = env.get("type")
     fields = dict[str, Any]()
     if kind == "lerobot" and env.get("success", IS_SUCCESS) == IS_SUCCESS:  # the only key that LeRobot reads
         fields = {"type": env.get("name"), **(env.get("kwargs") or {})}
         if env.get("max_steps"):
             fields["episode_length"] = env["max_steps"]
+        camera = env.get("camera")
+        if camera:  # the name that we give to LeRobot's lone image
+            image = f"observation.images.{camera}"
+            renames = {**renames, "observation.image": renames.get(image, image)}
     elif kind != "lerobot" and kind in EnvConfig.get_known_choices():
         # Only what differs from the defaults, as the run wrote them.
         usual = encoded_defaults(EnvConfig.get_choice_class(kind))
@@ -393,8 +400,11 @@ def lerobot_eval_arguments(env: Mapping[str, Any]) -> list[str]:
             fields["environment.discover_packages_path"] = given["discover_packages_path"]
     if not fields:
         return []
-    seed = f"--seed={EVAL_SEEDS.start}"  # the starts of our evaluation of a run with seed 0
-    return [*(f"--env.{name}={shlex.quote(str(value))}" for name, value in fields.items()), seed]
+    arguments = [f"--env.{name}={shlex.quote(str(value))}" for name, value in fields.items()]
+    if renames:
+        arguments.append(f"--rename_map={shlex.quote(json.dumps(renames))}")
+    arguments.append(f"--seed={EVAL_SEEDS.start}")  # the starts of our evaluation of a run with seed 0
+    return arguments
 
 
 class WrappedEnvironment(Environment):

@@ -191,6 +191,7 @@ def model_card(repo_id: str, artifact: str, folder: Path, files: Files) -> str:
     if summary:
         tags += ["reinforcement-learning", summary.get("algorithm")]
     local = repo_id.split("/")[1]
+    renames = (recipe.get("policy") or {}).get("rename_map") or {}
     card = ModelCard.from_template(
         ModelCardData(
             library_name="lerobot",
@@ -213,16 +214,21 @@ def model_card(repo_id: str, artifact: str, folder: Path, files: Files) -> str:
         recipe=texts[RECIPE],
         recipe_path=f"{local}/{FOLDER}/{RECIPE}",
         learns_online=bool(env),  # only runs of `accerl offline` have no environment
-        stock=lerobot_eval_command(local, config, env),
+        stock=lerobot_eval_command(local, config, env, renames),
         # With one of its own, LeRobot finds the backbone only once a pull has set its place.
         has_backbone=str(config.get("vlm_model_name") or "").startswith(("/", BACKBONE)),
     )
     return f"{card}\n"
 
 
-def lerobot_eval_command(policy: str, config: Mapping[str, Any], env: Mapping[str, Any]) -> str | None:
-    """Stock LeRobot's evaluation of a policy with this config.json in this environment of a recipe."""
-    stock = lerobot_eval_arguments(env)
+def lerobot_eval_command(
+    policy: str, config: Mapping[str, Any], env: Mapping[str, Any], renames: Mapping[str, str]
+) -> str | None:
+    """Stock LeRobot's evaluation of a policy with this config.json in this environment of a recipe.
+
+    `renames` is the recipe's ``policy.rename_map``.
+    """
+    stock = lerobot_eval_arguments(env, renames)
     if not stock:
         return None
     flags = [f"--policy.path={policy}", *discovery(config.get("type")), *stock]
