@@ -257,7 +257,10 @@ def _datasets(recipe: Mapping[str, Any]) -> list[str]:
 
 
 def _base_model(recipe: Mapping[str, Any]) -> str | None:
-    policy = (recipe.get("policy") or {}).get("path")
-    name = str(policy or (recipe.get("sft") or {}).get("init_path"))
-    is_on_hub = re.fullmatch(REPO_ID, name) and not name.startswith(f"{AWAY}/")
-    return name if is_on_hub else None
+    """The policy on the Hub that a run began with; a folder may look like one, such as ``outputs/door``."""
+    policy = recipe.get("policy") or {}
+    sft = recipe.get("sft") or {}
+    name = str(policy.get("path") or sft.get("init_path"))
+    if name.startswith(f"{AWAY}/") or Path(name).is_dir():
+        return None
+    return name if re.fullmatch(REPO_ID, name) else None

@@ -25,6 +25,13 @@ def card_of(folder: Path, kind: str, **fields: str) -> str:
     return bytes(files["README.md"]).decode()
 
 
+def test_a_folder_is_no_base_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    run = write_run_folder(tmp_path / "run")
+    monkeypatch.chdir(tmp_path)
+    Path("lerobot/smolvla_base").mkdir(parents=True)
+    assert ModelCard(card_of(run / "checkpoints/last/pretrained_model", "policy")).data.base_model is None
+
+
 def test_metadata(tmp_path: Path):
     run = write_run_folder(tmp_path / "run")
     data = ModelCard(card_of(run / "checkpoints/last/pretrained_model", "policy")).data
