@@ -20,7 +20,8 @@ from accerl_lerobot.errors import MAX_NONFINITE, NonFiniteError
 from accerl_lerobot.world_model.states import Observations, StateModel, Transitions
 
 BATCH = 64  # transitions of a step
-WEIGHT_DECAY, CLIP = 1e-4, 10.0
+WEIGHT_DECAY = 1e-4
+CLIP = 10.0  # largest norm of a gradient
 
 
 class StateLearner:
@@ -52,15 +53,16 @@ class StateLearner:
     def submit(self, transitions: Transitions, numbers: Observations) -> None:
         """Make a step on each `BATCH` of transitions; `numbers` are all that is remembered without images."""
         self.model.fit(numbers)
-        for part in np.split(np.arange(len(transitions.tasks)), len(transitions.tasks) // BATCH):
-            self._made.append(self._step(transitions.rows(part)))
+        for rows in np.arange(len(transitions.tasks)).reshape(-1, BATCH):
+            self._made.append(self._step(transitions.rows(rows)))
 
     def wait(self) -> None:
         """Wait until all that was submitted is made."""
 
     def collect(self) -> list[dict[str, float]]:
         """Parts of the loss in each step since the last call."""
-        made, self._made = self._made, []
+        made = self._made
+        self._made = []
         return made
 
     def publish(self, model: StateModel) -> None:

@@ -56,16 +56,17 @@ class TDMPCModel(StateModel):
         self.slow.requires_grad_(False)
         # What it normalises by, measured: LeRobot's normalisations are all affine.
         with torch.no_grad():
-            zero, one = (processing.normalise(torch.full((1, 1, spec.chunk[1]), x))[0, 0] for x in (0.0, 1.0))
-            scale = one - zero
+            one = torch.ones(1, 1, spec.chunk[1])
+            zero = processing.normalise(torch.zeros_like(one))[0, 0]
+            scale = processing.normalise(one)[0, 0] - zero
             if spec.units is not None:  # of the policy's normalised actions
-                first, each = (torch.from_numpy(part) for part in spec.units)
+                first, each = map(torch.from_numpy, spec.units)
                 zero = zero + scale * first
                 scale = scale * each
             self.action_zero = _fixed(zero)
             self.action_scale = _fixed(scale)
             if self.numbers:
-                ends = np.stack([np.zeros(self.numbers, np.float32), np.ones(self.numbers, np.float32)])
+                ends = np.repeat(np.array([[0], [1]], np.float32), self.numbers, 1)
                 seen = {STATE: ends} | self._blank(2)
                 low, high = processing.prepare(seen, ["", ""])[STATE]
                 self.state_zero = _fixed(low)
@@ -90,12 +91,13 @@ class TDMPCModel(StateModel):
             target = self.slow(self._read(transitions.following, shift=True))
         latent = self.encoder(self._read(transitions.observations, shift=True))
         value = self.value(latent)[:, 0]
-        for action in (self.action_zero + self.action_scale * transitions.chunk).unbind(1):
+        actions = self.action_zero + self.action_scale * transitions.chunk
+        for action in actions.unbind(1):
             latent = self.dynamics(torch.cat([latent, action], 1))
         consistency = functional.mse_loss(latent, target)
         returns = functional.mse_loss(value, transitions.returns)
-        metrics = {"consistency": float(consistency.detach()), "return": float(returns.detach())}
-        return self.config.consistency_coeff * consistency + RETURN * returns, metrics
+        loss = self.config.consistency_coeff * consistency + RETURN * returns
+        return loss, {"consistency": float(consistency.detach()), "return": float(returns.detach())}
 
     def _read(self, observations: Observations, shift: bool = False) -> dict[str, Tensor]:
         """Inputs of TD-MPC's encoder."""
@@ -105,7 +107,9 @@ class TDMPCModel(StateModel):
             pixels = torch.from_numpy(np.ascontiguousarray(observations[self.camera])).to(device)
             images = pixels.permute(0, 3, 1, 2).float() / 255
             self._check_images(images)
-            batch[self.image] = shifted(images) if shift else images
+            if shift:
+                images = shifted(images)
+            batch[self.image] = images
         if self.numbers:
             numbers = torch.from_numpy(observations[STATE]).to(device)
             batch[STATE] = self.state_zero + self.state_scale * numbers
@@ -136,20 +140,24 @@ def _loaded(config: TDMPCStateConfig) -> tuple[Any, Processing]:
     except InputError as error:
         field = error.field.replace("policy.", "world_model.", 1)
         raise InputError(field, error.value, error.hint) from error
-    if (kind := policy.config.type) != "tdmpc":
+    kind = policy.config.type
+    if kind != "tdmpc":
         raise InputError("world_model.path", config.path, f"its type is {kind}; give one of type tdmpc")
     return policy, processing
 
 
 def _camera(spec: StateSpec, image: str | None, config: TDMPCStateConfig) -> str:
     """The run's camera that TD-MPC sees: the one of its image's name, or the only one."""
-    if image is None or image in spec.cameras:
-        return image or ""
-    if len(spec.cameras) != 1:
-        has = ", ".join(name.removeprefix(IMAGES) for name in spec.cameras) or "none"
-        hint = f"it sees {image}, and the policy's cameras are {has}; train it on one of these names"
-        raise InputError("world_model.path", config.path, hint)
-    return next(iter(spec.cameras))
+    cameras = list(spec.cameras)
+    if image is None:
+        return ""
+    if image in cameras:
+        return image
+    if len(cameras) == 1:
+        return cameras[0]
+    has = ", ".join(name.removeprefix(IMAGES) for name in cameras) or "none"
+    hint = f"it sees {image}, and the policy's cameras are {has}; train it on one of these names"
+    raise InputError("world_model.path", config.path, hint)
 
 
 def _check_sizes(spec: StateSpec, lerobot_config: Any, config: TDMPCStateConfig) -> None:

@@ -99,7 +99,8 @@ class RemoteStateLearner:
         self._actor = actor
         self._timeout_s = timeout_s
         self._first_steps = learner.model.first_steps
-        self._submitted = self._count = learner.count
+        self._submitted = learner.count
+        self._count = learner.count
         self._pending: deque[Any] = deque()  # calls without an answer, in their order
         self._since = 0.0  # when the worker began with the first of them, at the latest
         self._made: list[dict[str, float]] = []
