@@ -124,18 +124,23 @@ def disturbed(
     """
     rng = np.random.default_rng((seed, 1))
     push_rng = np.random.default_rng((seed, 2))
-    low, high = spec.action_low, spec.action_high
+    low = spec.action_low
+    high = spec.action_high
     direction = push_rng.standard_normal(spec.action_dim)
     pushed = push * push_rng.random() * direction / np.linalg.norm(direction)
-    drift_from = int(rng.integers(0, _DRIFT_FROM)) if fail else spec.max_steps
+    drift_from = spec.max_steps
+    if fail:
+        drift_from = int(rng.integers(0, _DRIFT_FROM))
     drift: np.ndarray = np.zeros(spec.action_dim)
     for step in itertools.count():
         if step < drift_from:
-            wanted = np.clip(np.asarray(expert(), np.float64), low, high) + pushed
+            action = np.asarray(expert(), np.float64)
+            wanted = np.clip(action, low, high) + pushed
         else:
             drift = _DRIFT_MEMORY * drift + _DRIFT_SCALE * rng.standard_normal(len(drift))
             wanted = np.clip(drift, low, high)
-        yield np.clip(wanted + noise * rng.standard_normal(len(wanted)), low, high).astype(np.float32)
+        wanted = wanted + noise * rng.standard_normal(len(wanted))
+        yield np.clip(wanted, low, high).astype(np.float32)
 
 
 def metaworld_expert(environment: Environment, task: str) -> Expert:
@@ -221,7 +226,8 @@ def simulated[Item, Result](
     Few finished ones wait in memory.
     """
     # Each process comes to hold a simulator of every task.
-    each = len(getattr(env_config, "tasks", ("one",))) * SIMULATOR_GIB.get(env_config.type, 0.1)
+    tasks = getattr(env_config, "tasks", ("one",))
+    each = len(tasks) * SIMULATOR_GIB.get(env_config.type, 0.1)
     fitting = (memory_gib("MemAvailable") or math.inf) / each
     cores = len(os.sched_getaffinity(0))
     processes = max(1, int(min(cores, MOST_PROCESSES, len(items), fitting)))

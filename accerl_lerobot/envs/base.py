@@ -163,8 +163,10 @@ class EpisodeEnvironment(Environment):
             step = self._step(action)
             self._steps += 1
             succeeded = step.success and step.finite
-            first = succeeded and not self._success
-            rewards.append(float(first) if step.reward is None else step.reward)
+            reward = step.reward
+            if reward is None:
+                reward = float(succeeded and not self._success)
+            rewards.append(reward)
             self._success |= succeeded
             terminated = step.ended and step.finite
             limit = self._steps >= self.spec.max_steps
@@ -202,8 +204,7 @@ class EnvConfig(Section, draccus.ChoiceRegistry, section="env"):
     """The field that names the environment."""
     expert: ClassVar[str | None] = None
     """``module:function`` of the scripted expert for demonstrations: given an environment and a task, it
-    returns a
-    function whose every call is the action (A,) for the state that the environment is in."""
+    returns a function whose every call is the action (A,) for the state that the environment is in."""
 
     discover_packages_path: str | None = field(
         default=None, metadata={"registers": True, "prepares": start_graphics}
@@ -240,15 +241,20 @@ def names(text: str) -> tuple[str, ...]:
 
 def expand_tasks(text: str, groups: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
     """Expands names of tasks and groups, separated by commas; keeps the order, drops repetitions."""
-    known = dict(groups) | {task: (task,) for group in groups.values() for task in group}
+    known = dict(groups)
+    for group in groups.values():
+        known |= {task: (task,) for task in group}
     found: dict[str, None] = {}
-    for name in (part.strip() for part in text.split(",")):
+    for part in text.split(","):
+        name = part.strip()
         if name not in known:
+            hint = f"{name!r} is no task; "
             close = difflib.get_close_matches(name, known, cutoff=0.4)
-            near = f"did you mean {' or '.join(close)}? " if close else ""
+            if close:
+                hint += f"did you mean {' or '.join(close)}? "
             example = next(iter(groups.values()))[0]
-            hint = f"{near}use names such as {example}, separated by commas, or of {', '.join(groups)}"
-            raise InputError("env.task", text, f"{name!r} is no task; {hint}")
+            hint += f"use names such as {example}, separated by commas, or of {', '.join(groups)}"
+            raise InputError("env.task", text, hint)
         found |= dict.fromkeys(known[name])
     return tuple(found)
 

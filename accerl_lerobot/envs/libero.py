@@ -58,7 +58,11 @@ def _names() -> dict[str, list[str]]:
 @functools.cache
 def suites() -> dict[str, tuple[str, ...]]:
     """Tasks of each suite, ``suite/number``."""
-    return {suite: tuple(f"{suite}/{i}" for i in range(len(_names()[suite]))) for suite in LIMITS}
+    tasks = {}
+    for suite in LIMITS:
+        numbers = range(len(_names()[suite]))
+        tasks[suite] = tuple(f"{suite}/{number}" for number in numbers)
+    return tasks
 
 
 def task_file(task: str, folder: str, suffix: str) -> Path:
@@ -90,7 +94,9 @@ def recorded_states(task: str) -> np.ndarray:
         opcodes = pickletools.genops(archive.read("archive/data.pkl"))
         texts = [argument for _, argument, _ in opcodes if isinstance(argument, str | bytes)]
     numbers = max(texts, key=len)
-    return np.frombuffer(numbers.encode("latin-1") if isinstance(numbers, str) else numbers, "<f8")
+    if isinstance(numbers, str):
+        numbers = numbers.encode("latin-1")
+    return np.frombuffer(numbers, "<f8")
 
 
 def assets_folder(given: str) -> Path:

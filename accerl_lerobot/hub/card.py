@@ -36,12 +36,18 @@ from accerl_lerobot.envs.base import lerobot_eval_arguments
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import discovery
 
-POLICY, WORLD_MODEL, DATASET = "policy", "world model", "dataset"
+POLICY = "policy"
+WORLD_MODEL = "world model"
+DATASET = "dataset"
 
-CONFIG, WEIGHTS = "config.json", "model.safetensors"
-ADAPTER_CONFIG, ADAPTER = "adapter_config.json", "adapter_model.safetensors"
-INFO, CARD = "meta/info.json", "README.md"
-EVALUATION, VALIDATION = "evaluation.json", "validation.json"
+CONFIG = "config.json"
+WEIGHTS = "model.safetensors"
+ADAPTER_CONFIG = "adapter_config.json"
+ADAPTER = "adapter_model.safetensors"
+INFO = "meta/info.json"
+CARD = "README.md"
+EVALUATION = "evaluation.json"
+VALIDATION = "validation.json"
 RECORD = "accerl_pulled.json"  # file that a pull adds: the commit that the others are from
 FOLDER = "accerl_run"  # folder in which a policy or world model carries files of its run
 NEEDED = {
@@ -120,9 +126,8 @@ def recognise(folder: Path, field: str = "path") -> str:
     else:
         raise InputError(field, str(folder), _hint(folder))
     needed = list(NEEDED[artifact])
-    if (
-        artifact == POLICY and (folder / ADAPTER_CONFIG).is_file()
-    ):  # of LeRobot's PEFT training, whose policy is elsewhere
+    # LeRobot's PEFT training writes an adapter, whose policy is elsewhere.
+    if artifact == POLICY and (folder / ADAPTER_CONFIG).is_file():
         needed[needed.index(WEIGHTS)] = ADAPTER
     missing = [name for name in needed if not (folder / name).exists()]
     if missing:
@@ -164,11 +169,13 @@ def run_files(folder: Path, artifact: str, evaluation: str | None) -> dict[str, 
         names = KEPT[POLICY] if is_last else (RECIPE,)
     elif not carried and artifact == WORLD_MODEL and (run / VALIDATION).is_file():
         names = KEPT[WORLD_MODEL]
-    for name, path in safety.matching_files(run, names, safety.FileSource("path", str(folder))).items():
+    source = safety.FileSource("path", str(folder))
+    for name, path in safety.matching_files(run, names, source).items():
         files[f"{FOLDER}/{name}"] = path
     if evaluation is not None:
         path = Path(evaluation).expanduser()
-        path = path / EVALUATION if path.is_dir() else path
+        if path.is_dir():
+            path = path / EVALUATION
         policy = read_json(path).get("policy")
         if policy is None or Path(policy).expanduser().resolve() != place:
             hint = f"not an evaluation of {folder}; name the output_dir of accerl eval"
@@ -182,7 +189,9 @@ def model_card(repo_id: str, artifact: str, folder: Path, files: Files) -> str:
     texts = {}
     for name in (RECIPE, SUMMARY, EVALUATION, VALIDATION):
         content = files.get(f"{FOLDER}/{name}", b"")
-        texts[name] = content.read_text() if isinstance(content, Path) else content.decode()
+        if isinstance(content, Path):
+            content = content.read_bytes()
+        texts[name] = content.decode()
     recipe = yaml.safe_load(texts[RECIPE]) or {}
     summary = json.loads(texts[SUMMARY] or "{}")
     config = read_json(folder / CONFIG)
@@ -252,8 +261,12 @@ def dataset_card(repo_id: str, folder: Path) -> str:
 
 def _datasets(recipe: Mapping[str, Any]) -> list[str]:
     """Datasets on the Hub; beside a folder the name is a label."""
-    sections = [recipe.get(name) or {} for name in ("dataset", "online")]
-    return [section["repo_id"] for section in sections if section.get("repo_id") and not section.get("root")]
+    names = []
+    for name in ("dataset", "online"):
+        section = recipe.get(name) or {}
+        if section.get("repo_id") and not section.get("root"):
+            names.append(section["repo_id"])
+    return names
 
 
 def _base_model(recipe: Mapping[str, Any]) -> str | None:

@@ -138,12 +138,16 @@ def without_paths(name: str, content: Path | bytes) -> Path | bytes:
     path = PurePosixPath(name)
     if path.suffix not in (".json", ".yaml") or path.name in VOCABULARIES:
         return content
-    data = content if isinstance(content, bytes) else content.read_bytes()
-    tree = yaml.safe_load(data) if path.suffix == ".yaml" else json.loads(data)
+    if isinstance(content, Path):
+        content = content.read_bytes()
+    is_yaml = path.suffix == ".yaml"
+    tree = yaml.safe_load(content) if is_yaml else json.loads(content)
     changed = _without_paths(tree)
     if changed == tree:
-        return data
-    return yaml.safe_dump(changed, sort_keys=False).encode() if path.suffix == ".yaml" else _as_json(changed)
+        return content
+    if is_yaml:
+        return yaml.safe_dump(changed, sort_keys=False).encode()
+    return _as_json(changed)
 
 
 def _without_paths(value: Any) -> Any:
@@ -154,7 +158,9 @@ def _without_paths(value: Any) -> Any:
         return tree
     if isinstance(value, list):
         return [_without_paths(below) for below in value]
-    match = PATH.fullmatch(value) if isinstance(value, str) else None
+    if not isinstance(value, str):
+        return value
+    match = PATH.fullmatch(value)
     if match is None:
         return value
     return f"{match[1] or ''}{layout.AWAY}/{PurePosixPath(value).name}"
@@ -184,9 +190,9 @@ def _upload(config: card.PushConfig, artifact: str, files: card.Files) -> dict[s
         raise InputError("private", True, hint)
     listed = api.list_repo_files(revision=before.sha, **where)
     if card.CARD in listed:
-        there = Path(hf_hub_download(filename=card.CARD, revision=before.sha, **where)).read_text()
+        fetched = hf_hub_download(filename=card.CARD, revision=before.sha, **where)
         ours = files[card.CARD]
-        if isinstance(ours, bytes) and not _is_ours(there):
+        if isinstance(ours, bytes) and not _is_ours(Path(fetched).read_text()):
             logger.warning("the README.md on the Hub is left as it is, somebody wrote it")
             del files[card.CARD]
     known = filter_repo_objects(sorted(listed), allow_patterns=list(card.CONTENTS[artifact]))

@@ -144,7 +144,12 @@ def one_run(run: Run, now: float) -> dict[str, Any]:
         if not run.offline:
             bound = lag_limits(decode(RunConfig, run.config))[0]
     success = {"while exploring": exploring(run), "evaluation": evaluated(run)}
-    imagined = over_updates(run.rollout, ("success_imagined", "success_exploring"), share=True)
+    imagined = []
+    if len(finite(run.rollout, "success_imagined")):
+        imagined = [over_updates(run.rollout, ("success_imagined", "success_exploring"), share=True)]
+    facts = _facts(run)
+    if bound is not None:
+        facts["bound of the lag"] = f"{bound} updates"
     changed = changed_fields(run.config)
     blocks = [
         Block(
@@ -157,7 +162,7 @@ def one_run(run: Run, now: float) -> dict[str, Any]:
         ),
         Block("Evaluations", columns=("", "env steps", "task", "success", "n"), rows=_evaluations(run)),
         Block("Videos", videos=run.videos),
-        Block("Imagined rollouts", charts=[imagined] if len(finite(run.rollout, "success_imagined")) else []),
+        Block("Imagined rollouts", charts=imagined),
         Block("Time of each role while training", shares=_time_shares(run)),
         Block("Learning", charts=[over_updates(run.train, names) for names in LEARNING]),
         Block(
@@ -170,7 +175,7 @@ def one_run(run: Run, now: float) -> dict[str, Any]:
     return {
         "about": f"accerl {'offline' if run.offline else 'train'} · {run.name} · {status(run, now)}",
         "title": _headline(run),
-        "facts": _facts(run) | ({} if bound is None else {"bound of the lag": f"{bound} updates"}),
+        "facts": facts,
         "warnings": list(warnings(run, now)),
         "blocks": blocks,
     }
@@ -180,8 +185,11 @@ def comparison(runs: Sequence[Run], now: float) -> dict[str, Any]:
     """Values of a page about several runs. No winner is named."""
     names = [run.name for run in runs]
     each = {}
-    for name, run in zip(names, runs, strict=True):
-        each[name if names.count(name) == 1 else str(run.path)] = run
+    for run in runs:
+        name = run.name
+        if names.count(name) > 1:
+            name = str(run.path)
+        each[name] = run
     rows = []
     notes = []
     for name, run in each.items():
@@ -307,7 +315,9 @@ def _headline(run: Run) -> str:
     made = int(newest(run.train, "update") or 0)
     if run.offline:
         losses = finite(run.train, "imitation_loss")
-        ends = " → ".join(number(loss) for loss in losses[[0, -1]]) if len(losses) else ABSENT
+        ends = ABSENT
+        if len(losses):
+            ends = f"{number(losses[0])} → {number(losses[-1])}"
         return f"{count(made, 'update')} on recorded episodes: imitation loss {ends}"
     if run.result is None:
         return f"{made} of {run.section('trainer').get('updates')} updates on {_tasks(run)}"
@@ -317,11 +327,12 @@ def _headline(run: Run) -> str:
 
 def _tasks(run: Run) -> str:
     """The run's task, or how many it has."""
-    names = list(run.evaluations[-1].get("tasks") or ()) if run.evaluations else []
-    if len(names) > 1:
-        return count(len(names), "task")
+    for evaluation in run.evaluations[-1:]:
+        names = list(evaluation.get("tasks") or ())
+        if names:
+            return str(names[0]) if len(names) == 1 else count(len(names), "task")
     env = run.section("env")
-    return str(names[0] if names else env.get("task") or env.get("name") or env.get("type"))
+    return str(env.get("task") or env.get("name") or env.get("type"))
 
 
 def _facts(run: Run) -> dict[str, str]:
@@ -329,9 +340,13 @@ def _facts(run: Run) -> dict[str, str]:
     result = run.result or {}
     success = {}
     for name, ends in (("success before", run.before), ("success", run.newest)):
-        success[name] = rate(ends[0]["success"], ends[0]["ci95"]) if ends else ABSENT
+        success[name] = ABSENT
+        if ends:
+            success[name] = rate(ends[0]["success"], ends[0]["ci95"])
+    steps = result.get("env_steps")
     seen = exploring(run).x
-    steps = result.get("env_steps", seen[-1] if len(seen) else None)
+    if steps is None and len(seen):
+        steps = seen[-1]
     lags = finite(run.train, "lag_mean")
     return {
         **success,

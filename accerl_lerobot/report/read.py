@@ -80,8 +80,13 @@ def read_run(path: Path) -> Run:
     if not {"algorithm", "trainer"} <= config.keys():
         raise InputError("runs", str(path), f"no run in it: there is no {CONFIG} of accerl train")
     records, truncated = _records(path / METRICS)
+    result = None
+    if summary.is_file():
+        result = read_json(summary, source)
     written = max(file.stat().st_mtime for file in path.iterdir() if file.suffix != ".html")
-    failed = log.is_file() and log.stat().st_mtime >= written
+    error = ""
+    if log.is_file() and log.stat().st_mtime >= written:
+        error = log.read_text(errors="replace").strip().rpartition("\n")[2]
     return Run(
         path=path,
         config=config,
@@ -89,10 +94,10 @@ def read_run(path: Path) -> Run:
         train=records.get("train", []),
         rollout=records.get("rollout", []),
         evaluations=sorted(records.get("evaluation", []), key=lambda e: float(e["env_steps"])),
-        result=read_json(summary, source) if summary.is_file() else None,
+        result=result,
         truncated=truncated,
         written=written,
-        error=log.read_text(errors="replace").strip().rpartition("\n")[2] if failed else "",
+        error=error,
         videos=tuple(sorted(path.glob("*.mp4"))),
     )
 
@@ -128,7 +133,9 @@ def finite(records: Sequence[Record], name: str) -> np.ndarray:
 def newest(records: Sequence[Record], name: str) -> float | None:
     """The last finite value of this number."""
     values = finite(records, name)
-    return float(values[-1]) if len(values) else None
+    if not len(values):
+        return None
+    return float(values[-1])
 
 
 def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -136,7 +143,10 @@ def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     fields: dict[str, Any] = {}
     for key, value in tree.items():
         name = f"{prefix}{key}"
-        fields |= flat(value, f"{name}.") if isinstance(value, dict) and value else {name: value}
+        if isinstance(value, dict) and value:
+            fields |= flat(value, f"{name}.")
+        else:
+            fields[name] = value
     return fields
 
 

@@ -38,12 +38,14 @@ class AccerlEnv(gym.Env):
         self._environment = make_environment(config)  # its simulator is built at the first reset
         spec = self._environment.spec
         self.task = task
-        self.task_description = dict(zip(spec.tasks, spec.instructions, strict=False)).get(task, "")
+        instructions = dict(zip(spec.tasks, spec.instructions, strict=False))
+        self.task_description = instructions.get(task, "")
         self.metadata = self.metadata | {"render_fps": spec.fps}
         self._max_episode_steps = spec.max_steps  # LeRobot's rollout asks for it under this name
         images = {_camera(key): gym.spaces.Box(0, 255, size, np.uint8) for key, size in spec.images.items()}
         state = gym.spaces.Box(-np.inf, np.inf, (spec.state_dim,), np.float32)
-        self.observation_space = gym.spaces.Dict({"pixels": gym.spaces.Dict(images), "agent_pos": state})
+        pixels = gym.spaces.Dict(images)
+        self.observation_space = gym.spaces.Dict({"pixels": pixels, "agent_pos": state})
         self.action_space = gym.spaces.Box(spec.action_low, spec.action_high, dtype=np.float32)
 
     def reset(
@@ -52,7 +54,8 @@ class AccerlEnv(gym.Env):
         super().reset(seed=seed)
         if seed is None:
             seed = int(self.np_random.integers(2**32))
-        return self._format(self._environment.reset(seed, self.task)), {"is_success": False}
+        observation = self._environment.reset(seed, self.task)
+        return self._format(observation), {"is_success": False}
 
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         result = self._environment.step_chunk(np.asarray(action, np.float32)[None])
