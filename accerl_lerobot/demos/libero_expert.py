@@ -150,7 +150,7 @@ class Scene:
         chooses among grasps of similar cost.
         """
         corners = self.corners(name)
-        position = self.simulator.pose(name)[0]
+        position = self.simulator.position(name)
         heights = corners[..., 2]
         bottom = heights.min(1)
         top = heights.max(1)
@@ -209,9 +209,14 @@ class Hand:
         self.turn: Callable[[np.ndarray], np.ndarray] = lambda at: DOWN
         """Maps the hand's position to its wanted orientation (3, 3)."""
 
+    @property
+    def position(self) -> np.ndarray:
+        """Position (3,) of the point between the fingertips, as it is now."""
+        return self.simulator.hand[0]
+
     def toward(self, goal: np.ndarray) -> np.ndarray:
         """Action toward a position and the wanted orientation."""
-        delta = (goal - self.simulator.hand[0]) / REACH
+        delta = (goal - self.position) / REACH
         turn = self.rotation_error().as_rotvec() / TURN
         return np.concatenate([self._limited(delta), self._limited(turn), [self.grip]])
 
@@ -237,7 +242,7 @@ class Hand:
         for _ in range(steps):
             if not given():
                 return False
-            error = goal() - self.simulator.hand[0]
+            error = goal() - self.position
             distance = np.linalg.norm(error)
             if distance < within and self.rotation_error().magnitude() < 0.2:
                 return True
@@ -255,7 +260,7 @@ class Hand:
 
     def rise(self, height: float, steps: int) -> Script:
         """Moves straight up."""
-        up = self.simulator.hand[0] + [0, 0, height]
+        up = self.position + [0, 0, height]
         return (yield from self.move(lambda: up, steps=steps))
 
     def over(
@@ -264,7 +269,7 @@ class Hand:
         """Moves to `height` above a goal: up first, then sideways."""
 
         def waypoint() -> np.ndarray:
-            position = self.simulator.hand[0]
+            position = self.position
             aim = goal()
             below = height - position[2]
             late = np.clip(below / 0.03 - 0.3, 0, 1)  # 1: stay above the current place
@@ -279,28 +284,28 @@ class Hand:
         simulator = self.simulator
         while True:
             if self.grip > 0:  # the object was lost
-                yield from self.set_grip(-1.0, simulator.hand[0], 5)
+                yield from self.set_grip(-1.0, self.position, 5)
                 yield from self.rise(0.08, 12)
             grasp = known or scene.grasp(name, place(), self.rng)
             self.turn = functools.partial(scene.turn, grasp)
-            hand = simulator.hand[0]
+            start = self.position
 
             def goal(offset: np.ndarray = grasp.offset) -> np.ndarray:
-                return simulator.pose(name)[0] + offset
+                return simulator.position(name) + offset
 
-            above_others = scene.height(name, hand, goal()) + 0.03
+            above_others = scene.height(name, start, goal()) + 0.03
             above_goal = goal()[2] + self.rng.uniform(0.04, 0.08)
             yield from self.over(goal, max(above_others, above_goal))
             yield from self.move(goal, within=0.008, steps=25)
             yield from self.set_grip(1.0, goal())
-            self.held = simulator.pose(name)[0] - simulator.hand[0]
+            self.held = simulator.position(name) - self.position
             yield from self.rise(0.06, 8)
             if self.holds(name):
                 return True
 
     def holds(self, name: str) -> bool:
         """True if the object has hardly moved relative to the hand since the grasp."""
-        offset = self.simulator.pose(name)[0] - self.simulator.hand[0]
+        offset = self.simulator.position(name) - self.position
         return bool(np.linalg.norm(offset - self.held) < 0.05)
 
 
@@ -308,7 +313,7 @@ def pick_and_place(hand: Hand, name: str, region: str) -> Script:
     """Carries an object to a region or another object and releases it there."""
     scene = hand.scene
     simulator = hand.simulator
-    heights = scene.corners(name)[..., 2] - simulator.pose(name)[0][2]
+    heights = scene.corners(name)[..., 2] - simulator.position(name)[2]
     known = (offset for part, offset in OFFSETS.items() if part == name or part in region)
     x, y, up = next(known, (0, 0, 0.01))
     up = up - heights.min()
@@ -316,11 +321,10 @@ def pick_and_place(hand: Hand, name: str, region: str) -> Script:
         up = max(up, 0.045 - heights.max())
 
     def place() -> np.ndarray:
-        return simulator.pose(region)[0] + [x, y, up]
+        return simulator.position(region) + [x, y, up]
 
     def goal() -> np.ndarray:
-        position = simulator.hand[0]
-        return place() + position - simulator.pose(name)[0]
+        return place() + hand.position - simulator.position(name)
 
     def held() -> bool:
         return hand.holds(name)
@@ -329,14 +333,14 @@ def pick_and_place(hand: Hand, name: str, region: str) -> Script:
     if "moka_pot" in name:
         grasp = Grasp(np.array(LID), 0.0, 0.0)
     yield from hand.pick(name, place, grasp)
-    position = simulator.hand[0]
+    position = hand.position
     below = position[2] - scene.corners(name)[..., 2].min()
     clear = scene.height(name, position, goal()) + below + hand.rng.uniform(0.02, 0.04)
     if not (yield from hand.over(goal, clear, held)):
         return False
     if not (yield from hand.move(goal, given=held)):
         return False
-    yield from hand.set_grip(-1.0, simulator.hand[0])
+    yield from hand.set_grip(-1.0, hand.position)
     return (yield from hand.rise(0.1, 15))
 
 
@@ -345,13 +349,13 @@ def slide(hand: Hand, name: str, region: str) -> Script:
     simulator = hand.simulator
 
     def ahead(distance: float, height: float) -> np.ndarray:
-        position = simulator.pose(name)[0]
-        way = (simulator.pose(region)[0] - position)[:2]
+        position = simulator.position(name)
+        way = (simulator.position(region) - position)[:2]
         x, y = distance * way / max(np.linalg.norm(way), 1e-6)
         return position + [x, y, height]
 
     def follows() -> bool:
-        offset = simulator.hand[0] - simulator.pose(name)[0]
+        offset = hand.position - simulator.position(name)
         return bool(np.linalg.norm(offset) < 0.075)
 
     hand.grip = 1.0
@@ -368,10 +372,10 @@ def put_in_microwave(hand: Hand, name: str, region: str) -> Script:
     grasp = Grasp(turn.apply(MUG_HANDLE), np.pi / 2, 1.4, np.array([0.0, 1]))
 
     def place() -> np.ndarray:
-        return simulator.pose(region)[0] + OFFSETS["heating_region"]
+        return simulator.position(region) + OFFSETS["heating_region"]
 
     def goal(ahead: float = 0.0) -> np.ndarray:
-        return place() + simulator.hand[0] - simulator.pose(name)[0] - [0, ahead, 0]
+        return place() + hand.position - simulator.position(name) - [0, ahead, 0]
 
     def held() -> bool:
         return hand.holds(name)
@@ -380,8 +384,8 @@ def put_in_microwave(hand: Hand, name: str, region: str) -> Script:
     yield from hand.move(lambda: goal(0.2), within=0.02, given=held)
     if not (yield from hand.move(goal, given=held)):
         return False
-    yield from hand.set_grip(-1.0, simulator.hand[0])
-    back = simulator.hand[0] - [0, 0.12, 0]
+    yield from hand.set_grip(-1.0, hand.position)
+    back = hand.position - [0, 0.12, 0]
     return (yield from hand.move(lambda: back, within=0.02))
 
 
@@ -418,11 +422,10 @@ def in_front(hand: Hand, region: str, yaw: float, lean: float) -> Callable[..., 
 
 def open_drawer(hand: Hand, region: str) -> Script:
     """Opens the drawer with this region: grasps the handle from the front, pulls, and lets it go."""
-    simulator = hand.simulator
     handle = in_front(hand, region, 0.0, 1.4)
 
     def holds() -> bool:
-        offset = handle() - simulator.hand[0]
+        offset = handle() - hand.position
         return bool(np.linalg.norm(offset) < 0.03)
 
     yield from hand.move(lambda: handle(0.1), within=0.02)
@@ -430,7 +433,7 @@ def open_drawer(hand: Hand, region: str) -> Script:
     yield from hand.set_grip(1.0, handle())
     pulled = handle(0.2)
     yield from hand.move(lambda: pulled, steps=40, given=holds)
-    yield from hand.set_grip(-1.0, simulator.hand[0], 5)
+    yield from hand.set_grip(-1.0, hand.position, 5)
     return (yield from hand.move(lambda: handle(0.1), within=0.02))
 
 

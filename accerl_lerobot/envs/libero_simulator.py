@@ -96,11 +96,13 @@ class Simulator:
     def __init__(self, task: str, rendering: Literal["stock", "fast"], assets: str) -> None:
         self._mujoco = import_mujoco()
         self.env, self._bodies = _build(task, assets)
-        self.model = self.env.sim.model._model
-        self.data = self.env.sim.data._data
-        self._recorded = recorded_states(task).reshape(-1, 1 + self.model.nq + self.model.nv)
+        model = self.env.sim.model._model
+        data = self.env.sim.data._data
+        self.model = model
+        self.data = data
+        self._recorded = recorded_states(task).reshape(-1, 1 + model.nq + model.nv)
         if rendering == "fast":
-            _make_cheap(self.model)
+            _make_cheap(model)
         robot = self.env.robots[0]
         self._dofs = np.array(robot._ref_joint_vel_indexes)
         self._joints = np.array(robot._ref_joint_pos_indexes)
@@ -108,24 +110,23 @@ class Simulator:
         self._finger_dofs = np.array(robot._ref_gripper_joint_vel_indexes)
         self._motors = np.array(robot._ref_joint_actuator_indexes)
         self._grip_motors = np.array(robot._ref_joint_gripper_actuator_indexes)
-        low, high = self.model.actuator_ctrlrange[self._grip_motors].T
+        low, high = model.actuator_ctrlrange[self._grip_motors].T
         self._grip_centre = 0.5 * (high + low)
         self._grip_half = 0.5 * (high - low)
         self._site = robot.eef_site_id
-        self._hand = self.model.body(robot.robot_model.eef_name).id
-        self._mass = np.zeros((self.model.nv, self.model.nv))
-        self._jacobian = np.zeros((2, 3, self.model.nv))
+        self._hand = model.body(robot.robot_model.eef_name).id
+        self._mass = np.zeros((model.nv, model.nv))
+        self._jacobian = np.zeros((2, 3, model.nv))
         self._renderers: dict[tuple[int, int], Any] = {}
         self._visible = self._mujoco.MjvOption()
         self._visible.geomgroup[:2] = 0, 1  # visual meshes, not what collides
-        data = self.data
         self._position = data.site_xpos[self._site]
         self._rotation = data.site_xmat[self._site].reshape(3, 3)
         self._arm = Arm(
             self._jacobian, self._mass, data.qfrc_bias, data.qpos, data.qvel, self._position, self._rotation
         )  # fmt: skip
         # What is looked at: the data of the last reading of the sensors, without its velocities.
-        self._seen = self._mujoco.MjData(self.model)
+        self._seen = self._mujoco.MjData(model)
         self._fingers_seen = np.zeros(len(self._fingers))
 
     def reset(self, seed: int) -> None:
@@ -224,7 +225,7 @@ class Simulator:
         points = np.tile(self._position, (1 + MAX_OBJECTS, 1))
         openings = np.zeros(MAX_OBJECTS)
         for i, name in enumerate(self.env.obj_of_interest):
-            points[1 + i] = self.pose(name)[0]
+            points[1 + i] = self.position(name)
             openings[i] = self.opening(name)
         first, second = np.triu_indices(len(points), 1)
         vectors = (points[second] - points[first]).ravel()
@@ -241,6 +242,10 @@ class Simulator:
         quaternion = np.zeros(4)
         self._mujoco.mju_mat2Quat(quaternion, self.data.site_xmat[site])
         return self.data.site_xpos[site].copy(), quaternion
+
+    def position(self, name: str) -> np.ndarray:
+        """Position (3,) of an object, a fixture or a region in the environment."""
+        return self.pose(name)[0]
 
     @property
     def hand(self) -> tuple[np.ndarray, np.ndarray]:

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -209,10 +209,8 @@ def stored(decisions: Sequence[Decision]) -> tuple[dict[str, Tensor], Tensor]:
     """(latents, log-probs (B, L)) of decisions, as a batch."""
     latent = {}
     for name in decisions[0].latent:
-        rows = [decision.latent[name] for decision in decisions]
-        latent[name] = torch.from_numpy(np.stack(rows))
-    log_probs = [decision.log_prob for decision in decisions]
-    return latent, torch.from_numpy(np.stack(log_probs))
+        latent[name] = _stacked(decision.latent[name] for decision in decisions)
+    return latent, _stacked(decision.log_prob for decision in decisions)
 
 
 def log_ratio(adapter: PolicyAdapter, asked: Sequence[Request], decisions: Sequence[Decision]) -> Tensor:
@@ -225,4 +223,8 @@ def log_ratio(adapter: PolicyAdapter, asked: Sequence[Request], decisions: Seque
 
 
 def _chunks(decisions: Sequence[Decision]) -> Tensor:
-    return torch.from_numpy(np.stack([d.chunk for d in decisions]))
+    return _stacked(decision.chunk for decision in decisions)
+
+
+def _stacked(rows: Iterable[np.ndarray]) -> Tensor:
+    return torch.from_numpy(np.stack(list(rows)))

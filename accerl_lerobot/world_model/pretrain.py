@@ -181,7 +181,7 @@ def check(world: World, episodes: Sequence[Episode], seed: int = 0) -> dict[str,
         followed = np.flatnonzero(episode.times + chunk <= episode.times[-1])
         at += [WindowStart(e, int(frame)) for frame in followed]
     chosen = rng.permutation(len(at))[:MOST_WINDOWS]
-    values = {"skill": float("nan"), "sensitivity": float("nan")}
+    values = {"skill": np.nan, "sensitivity": np.nan}
     if len(chosen):
         windows = cut_windows(episodes, [at[i] for i in chosen], world.model.spec, 1)
         values = skill_and_sensitivity(world, windows)
@@ -275,7 +275,7 @@ def auroc(scores: np.ndarray, labels: np.ndarray) -> float:
     """Chance that a success scores above a failure, ties counting half; NaN without both."""
     difference = scores[labels][:, None] - scores[~labels]
     if not difference.size:
-        return float("nan")
+        return np.nan
     in_order = (difference > 0) + 0.5 * (difference == 0)
     return float(in_order.mean())
 
