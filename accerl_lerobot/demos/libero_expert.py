@@ -19,6 +19,8 @@ from accerl_lerobot.envs.base import Environment
 from accerl_lerobot.envs.libero_simulator import LiberoEnvironment, Simulator
 from accerl_lerobot.errors import InputError
 
+Goal = Callable[[], np.ndarray]  # a position (3,), which may move
+Condition = Callable[[], bool]
 Script = Generator[np.ndarray, None, bool]
 """Yields actions, float64 (7,); returns True if the movement was completed."""
 
@@ -231,11 +233,7 @@ class Hand:
         return Rotation.from_matrix(self.turn(position) @ rotation.T)
 
     def move(
-        self,
-        goal: Callable[[], np.ndarray],
-        within: float = 0.012,
-        steps: int = 60,
-        given: Callable[[], bool] = lambda: True,
+        self, goal: Goal, within: float = 0.012, steps: int = 60, given: Condition = lambda: True
     ) -> Script:
         """Moves straight to a goal that may itself move, for at most `steps` and while `given` is true."""
         lag: np.ndarray = np.zeros(3)
@@ -263,9 +261,7 @@ class Hand:
         up = self.position + [0, 0, height]
         return (yield from self.move(lambda: up, steps=steps))
 
-    def over(
-        self, goal: Callable[[], np.ndarray], height: float, given: Callable[[], bool] = lambda: True
-    ) -> Script:
+    def over(self, goal: Goal, height: float, given: Condition = lambda: True) -> Script:
         """Moves to `height` above a goal: up first, then sideways."""
 
         def waypoint() -> np.ndarray:
@@ -278,7 +274,7 @@ class Hand:
 
         return (yield from self.move(waypoint, within=0.02, given=given))
 
-    def pick(self, name: str, place: Callable[[], np.ndarray], known: Grasp | None = None) -> Script:
+    def pick(self, name: str, place: Goal, known: Grasp | None = None) -> Script:
         """Grasps an object and lifts it a little; repeats until it holds the object."""
         scene = self.scene
         simulator = self.simulator

@@ -28,7 +28,7 @@ from typing import Annotated, Any
 import draccus
 import numpy as np
 
-from accerl_lerobot import errors, guardian
+from accerl_lerobot import guardian
 from accerl_lerobot.config.machine import SIMULATOR_GIB, memory_gib
 from accerl_lerobot.config.parsing import imported
 from accerl_lerobot.config.ranges import Range, Section, Share
@@ -37,7 +37,15 @@ from accerl_lerobot.envs import make_environment
 from accerl_lerobot.envs.base import ChunkResult, EnvConfig, Environment, EnvironmentSpec
 from accerl_lerobot.envs.metaworld import MetaWorld, expert_name
 from accerl_lerobot.envs.simulated import SimulatedEnvironment
-from accerl_lerobot.errors import InputError, check_absent, expanded
+from accerl_lerobot.errors import (
+    ChildWarning,
+    InputError,
+    check_absent,
+    collect_warnings,
+    collected_warnings,
+    expanded,
+    show_warnings,
+)
 from accerl_lerobot.experience import ENVIRONMENT_STATE, REWARD, SUCCESS, Observation
 from accerl_lerobot.seeds import demo_seed
 
@@ -207,14 +215,14 @@ def simulators(
 def _ready(start: Callable[..., None], *arguments: Any) -> None:
     """Makes a process ready; Ctrl-C on the terminal is for its parent, which ends it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    errors.collect_warnings()
+    collect_warnings()
     start(*arguments)
 
 
 def _with_warnings[Item, Result](
     work: Callable[[Item], Result], item: Item
-) -> tuple[Result, list[errors.ChildWarning]]:
-    return work(item), errors.collected_warnings()
+) -> tuple[Result, list[ChildWarning]]:
+    return work(item), collected_warnings()
 
 
 @contextmanager
@@ -235,7 +243,7 @@ def simulated[Item, Result](
 
         def finished(work: Any) -> Result:
             result, warned = work.result()
-            errors.show_warnings(warned)
+            show_warnings(warned)
             return result
 
         def results() -> Iterator[Result]:

@@ -458,15 +458,16 @@ class HistoryEnvironment(WrappedEnvironment):
         parts = [actions[:unseen], *actions[unseen:, None]]
         results: list[ChunkResult] = []
         for part in parts:
-            results.append(self._environment.step_chunk(part))
-            self._seen.append(results[-1].observation)
-            if results[-1].done:
+            result = self._environment.step_chunk(part)
+            results.append(result)
+            self._seen.append(result.observation)
+            if result.done:
                 break
         if results[0].steps > 1:  # some were passed unseen; `length` follow, unless it was cut
             self._seen.extend([self._seen[-1]] * (self._length - len(results)))
-        rewards = np.concatenate([result.rewards for result in results])
+        rewards = np.concatenate([each.rewards for each in results])
         self._left -= len(rewards)
-        return replace(results[-1], observation=self._observation(), rewards=rewards)
+        return replace(result, observation=self._observation(), rewards=rewards)
 
     def _observation(self) -> Observation:
         observation = dict(self._seen[-1])

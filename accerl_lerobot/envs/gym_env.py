@@ -255,10 +255,13 @@ class GymEnvironment(GymnasiumEnvironment):
         return observation
 
     def _vector(self, name: str, raw: dict[str, Any], keys: tuple[str, ...]) -> np.ndarray:
-        parts = [_part(raw, key, name) for key in keys]
-        if any(part.dtype.kind not in "fiub" for part in parts):
-            raise InputError(f"env.{name}", list(keys), "name keys with numbers")
-        return np.concatenate([part.astype(np.float32).ravel() for part in parts])
+        parts = []
+        for key in keys:
+            part = _part(raw, key, name)
+            if part.dtype.kind not in "fiub":
+                raise InputError(f"env.{name}", list(keys), "name keys with numbers")
+            parts.append(part.astype(np.float32).ravel())
+        return np.concatenate(parts)
 
 
 @EnvConfig.register_subclass("lerobot")

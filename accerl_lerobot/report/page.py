@@ -91,7 +91,7 @@ class Chart(NamedTuple):
             for name, (x, y, interval) in self.series.items():
                 axes.plot(x, y, label=name, marker="o" if len(x) < 20 else "")
                 if interval is not None:
-                    axes.fill_between(x, interval[0], interval[1], alpha=0.2)
+                    axes.fill_between(x, *interval, alpha=0.2)
             if self.limit is not None:
                 axes.axhline(self.limit, color="grey", linestyle="--")
             if self.share:
@@ -271,9 +271,14 @@ def _evaluations(run: Run) -> list[tuple[str, ...]]:
         if len(tasks) != 1:
             tasks["all"] = e
         for task, one in tasks.items():
-            success = rate(one["success"], one["ci95"])
-            rows.append((str(e.get("group")), number(e["env_steps"]), task, success, number(one["n"])))
+            steps = number(e["env_steps"])
+            rows.append((str(e.get("group")), steps, task, success_of(one), number(one["n"])))
     return rows
+
+
+def success_of(evaluation: Record) -> str:
+    """Success of an evaluation, or of a task in it, with its interval."""
+    return rate(evaluation["success"], evaluation["ci95"])
 
 
 def exploring(run: Run) -> Series:
@@ -321,7 +326,7 @@ def _headline(run: Run) -> str:
         return f"{count(made, 'update')} on recorded episodes: imitation loss {ends}"
     if run.result is None:
         return f"{made} of {run.section('trainer').get('updates')} updates on {_tasks(run)}"
-    rates = [rate(e["success"], e["ci95"]) for e in (*run.before, *run.newest)]
+    rates = [success_of(evaluation) for evaluation in (*run.before, *run.newest)]
     return f"Success on {_tasks(run)}: {' → '.join(rates)}"
 
 
@@ -342,7 +347,7 @@ def _facts(run: Run) -> dict[str, str]:
     for name, ends in (("success before", run.before), ("success", run.newest)):
         success[name] = ABSENT
         if ends:
-            success[name] = rate(ends[0]["success"], ends[0]["ci95"])
+            success[name] = success_of(ends[0])
     steps = result.get("env_steps")
     seen = exploring(run).x
     if steps is None and len(seen):

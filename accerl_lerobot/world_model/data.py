@@ -203,7 +203,9 @@ def check_dataset(dataset: DatasetConfig, spec: WorldModelSpec, section: str = "
     """The metadata of a dataset; one that a world model of `spec` cannot be trained on is refused."""
     with _named(section):
         meta = open_metadata(dataset)
-        _check_metadata(meta, dataset.repo_id, spec)
+        why = _misfit(meta, spec)
+        if why is not None:
+            raise InputError("dataset.repo_id", dataset.repo_id, why)
     return meta
 
 
@@ -219,21 +221,19 @@ def _named(section: str) -> Iterator[None]:
         raise InputError(field, error.value, error.hint) from error
 
 
-def _check_metadata(meta: Any, name: str | None, spec: WorldModelSpec) -> None:
+def _misfit(meta: Any, spec: WorldModelSpec) -> str | None:
+    """Why a world model of `spec` cannot be trained on a dataset; None: it can."""
     shapes = {key: tuple(feature["shape"]) for key, feature in meta.features.items()}
-    missing = [camera for camera in spec.cameras if camera not in shapes]
-    if missing:
-        cameras = ", ".join(meta.camera_keys) or "no camera"
-        hint = f"no {missing[0]!r}: the dataset has {cameras}; choose env.camera accordingly"
-        raise InputError("dataset.repo_id", name, hint)
+    for camera in spec.cameras:
+        if camera not in shapes:
+            cameras = ", ".join(meta.camera_keys) or "no camera"
+            return f"no {camera!r}: the dataset has {cameras}; choose env.camera accordingly"
     for key, size in {"action": spec.action_dim, STATE: spec.state_dim}.items():
         shape = shapes.get(key)
         if size and shape != (size,):
-            hint = f"{key} has shape {shape}, the environment's has ({size},): it is another robot's"
-            raise InputError("dataset.repo_id", name, hint)
+            return f"{key} has shape {shape}, the environment's has ({size},): it is another robot's"
     if not {SUCCESS, REWARD} & shapes.keys():
-        hint = f"no {SUCCESS}: record it, as accerl demos does, or add it to the dataset"
-        raise InputError("dataset.repo_id", name, hint)
+        return f"no {SUCCESS}: record it, as accerl demos does, or add it to the dataset"
     if meta.fps != spec.fps:
-        hint = f"{meta.fps} frames a second, and the environment makes {spec.fps} steps; record at its rate"
-        raise InputError("dataset.repo_id", name, hint)
+        return f"{meta.fps} frames a second, and the environment makes {spec.fps} steps; record at its rate"
+    return None

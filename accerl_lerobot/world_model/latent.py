@@ -29,7 +29,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK_BITS, task_codes
 from accerl_lerobot.policies.features import STATE
 from accerl_lerobot.world_model.config import LatentConfig
-from accerl_lerobot.world_model.states import Observations, StateModel, StateSpec, Transitions
+from accerl_lerobot.world_model.states import Observations, StateModel, StateSpec, Transitions, fixed
 
 SIDE = 64  # pixels of the square that every image is resized to
 SHIFT = 3  # pixels of the random shift at most, in each direction
@@ -97,11 +97,11 @@ class LatentModel(StateModel):
         self.inverse = network(2 * seen, chunk, hidden=1)
         self.cloned = network(seen + TASK_BITS, chunk, hidden=1)
         pixels = channels, SIDE, SIDE
-        self.pixel_mean = nn.Parameter(torch.zeros(pixels), requires_grad=False)
-        self.pixel_square = nn.Parameter(torch.ones(pixels), requires_grad=False)
-        self.batches = nn.Parameter(torch.zeros(()), requires_grad=False)  # that the two above are means of
-        self.mean = nn.Parameter(torch.zeros(spec.state), requires_grad=False)
-        self.std = nn.Parameter(torch.ones(spec.state), requires_grad=False)
+        self.pixel_mean = fixed(torch.zeros(pixels))
+        self.pixel_square = fixed(torch.ones(pixels))
+        self.batches = fixed(torch.zeros(()))  # that the two above are means of
+        self.mean = fixed(torch.zeros(spec.state))
+        self.std = fixed(torch.ones(spec.state))
 
     def encode(self, observations: Observations, tasks: Sequence[str], elapsed: np.ndarray) -> Tensor:
         images = self._scaled(self._images(observations))

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional
 
 from accerl_lerobot.errors import InputError
@@ -28,7 +28,7 @@ from accerl_lerobot.policies.loading import load_network
 from accerl_lerobot.policies.processing import IMAGES, Processing
 from accerl_lerobot.world_model.config import TDMPCStateConfig
 from accerl_lerobot.world_model.latent import shifted
-from accerl_lerobot.world_model.states import Observations, StateModel, StateSpec, Transitions
+from accerl_lerobot.world_model.states import Observations, StateModel, StateSpec, Transitions, fixed
 
 RETURN = 0.5  # weight of the return's squared error; consistency's is in the policy's own config
 SMALLEST_SCALE = 1e-6
@@ -63,14 +63,14 @@ class TDMPCModel(StateModel):
                 first, each = map(torch.from_numpy, spec.units)
                 zero = zero + scale * first
                 scale = scale * each
-            self.action_zero = _fixed(zero)
-            self.action_scale = _fixed(scale)
+            self.action_zero = fixed(zero)
+            self.action_scale = fixed(scale)
             if self.numbers:
                 ends = np.repeat(np.array([[0], [1]], np.float32), self.numbers, 1)
                 seen = {STATE: ends} | self._blank(2)
                 low, high = processing.prepare(seen, ["", ""])[STATE]
-                self.state_zero = _fixed(low)
-                self.state_scale = _fixed(high - low)
+                self.state_zero = fixed(low)
+                self.state_scale = fixed(high - low)
 
     @property
     def learns(self) -> bool:
@@ -167,11 +167,5 @@ def _check_sizes(spec: StateSpec, lerobot_config: Any, config: TDMPCStateConfig)
     for name, ours in numbers.items():
         its = features[name].shape[0] if name in features else 0
         if its != ours:
-            hint = f"{name} has {its} numbers there and {ours} here; train it on this robot's data"
-            if name == ENVIRONMENT_STATE:
-                hint = f"it reads {name}; train it on demonstrations with env.environment_state=false"
+            hint = f"{name} has {its} numbers there and {ours} here; train it on what this run's policy sees"
             raise InputError("world_model.path", config.path, hint)
-
-
-def _fixed(values: Tensor) -> nn.Parameter:
-    return nn.Parameter(values.detach().clone().float(), requires_grad=False)

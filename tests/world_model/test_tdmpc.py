@@ -141,5 +141,5 @@ def test_one_that_reads_the_simulators_state_is_refused(tmp_path: Path):
     path = write_policy(
         tmp_path / "told", "tdmpc", **sizes, stats=stats, input_features=inputs, **KINDS["tdmpc"]
     )
-    with pytest.raises(InputError, match="it reads observation.environment_state; train it on"):
+    with pytest.raises(InputError, match="observation.environment_state has 5 numbers there and 0 here"):
         new_state_model(spec_of(path), TDMPCStateConfig(path=str(path)))
