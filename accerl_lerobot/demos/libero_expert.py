@@ -7,12 +7,13 @@ again. Positions are in metres in the world's frame, rotations in radians.
 
 from __future__ import annotations
 
-import functools
-import itertools
 from collections.abc import Callable, Generator
+from functools import partial
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
+from numpy.linalg import norm
 from scipy.spatial.transform import Rotation
 
 from accerl_lerobot.envs.base import Environment
@@ -59,10 +60,8 @@ EASY_REACH = 0.72  # distance from the robot's base that a hand pointing straigh
 DOWN = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
 """Rotation of a hand that points down; its fingers close along the world's y axis."""
 _CORNERS = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
-_FINGERS = itertools.product((-0.053, -0.043, 0.043, 0.053), (-0.01, 0.01), (0.008, -0.02))
-_PALM = itertools.product(
-    np.linspace(-0.1, 0.1, 11), np.linspace(-0.034, 0.034, 5), np.arange(-0.026, -0.11, -0.016)
-)
+_FINGERS = product((-0.053, -0.043, 0.043, 0.053), (-0.01, 0.01), (0.008, -0.02))
+_PALM = product(np.linspace(-0.1, 0.1, 11), np.linspace(-0.034, 0.034, 5), np.arange(-0.026, -0.11, -0.016))
 HAND = np.array([*_FINGERS, *_PALM])
 """Points of the open hand in its own frame, (P, 3): along the fingers' axis, across it, and ahead."""
 
@@ -110,13 +109,13 @@ class Scene:
         model = self.simulator.model
         data = self.simulator.data
         centre = points.reshape(-1, 3).mean(0)
-        spread = np.linalg.norm(points - centre, axis=-1).max() + margin
+        spread = norm(points - centre, axis=-1).max() + margin
         inside = np.zeros(points.shape[:-1], bool)
         for geom in self._geoms(name, others=True):
             position = data.geom_xpos[geom]
             middle, half = model.geom_aabb[geom].reshape(2, 3)
-            reach = spread + np.linalg.norm(middle) + np.linalg.norm(half)
-            if np.linalg.norm(position - centre) >= reach:
+            reach = spread + norm(middle) + norm(half)
+            if norm(position - centre) >= reach:
                 continue
             turn = data.geom_xmat[geom].reshape(3, 3)
             local = (points - position) @ turn - middle
@@ -140,7 +139,7 @@ class Scene:
         ahead = grasp.ahead
         if ahead is None:
             ahead = at[:2] - self.base
-        x, y = ahead / np.linalg.norm(ahead)
+        x, y = ahead / norm(ahead)
         lean = Rotation.from_rotvec(grasp.lean * np.array([y, -x, 0]))
         yaw = Rotation.from_euler("z", grasp.yaw)
         return (lean * yaw).as_matrix() @ DOWN
@@ -184,8 +183,8 @@ class Scene:
         yaws = np.tile(yaws, len(points) // len(yaws))
         hands = np.column_stack([points, np.full(len(points), height)])
         moved = hands + goal - position
-        reach = np.linalg.norm(hands[:, :2] - self.base, axis=-1)
-        reach_moved = np.linalg.norm(moved[:, :2] - self.base, axis=-1)
+        reach = norm(hands[:, :2] - self.base, axis=-1)
+        reach_moved = norm(moved[:, :2] - self.base, axis=-1)
         far = np.maximum(np.maximum(reach, reach_moved) - EASY_REACH, 0)
         leans = np.minimum(3 * far, 0.35)
         grasps = [Grasp(*each) for each in zip(hands - position, yaws, leans, strict=True)]
@@ -241,7 +240,7 @@ class Hand:
             if not given():
                 return False
             error = goal() - self.position
-            distance = np.linalg.norm(error)
+            distance = norm(error)
             if distance < within and self.rotation_error().magnitude() < 0.2:
                 return True
             if distance < 0.03:  # the controller has no integral part, and a stretched arm lags behind
@@ -283,7 +282,7 @@ class Hand:
                 yield from self.set_grip(-1.0, self.position, 5)
                 yield from self.rise(0.08, 12)
             grasp = known or scene.grasp(name, place(), self.rng)
-            self.turn = functools.partial(scene.turn, grasp)
+            self.turn = partial(scene.turn, grasp)
             start = self.position
 
             def goal(offset: np.ndarray = grasp.offset) -> np.ndarray:
@@ -302,7 +301,7 @@ class Hand:
     def holds(self, name: str) -> bool:
         """True if the object has hardly moved relative to the hand since the grasp."""
         offset = self.simulator.position(name) - self.position
-        return bool(np.linalg.norm(offset - self.held) < 0.05)
+        return bool(norm(offset - self.held) < 0.05)
 
 
 def pick_and_place(hand: Hand, name: str, region: str) -> Script:
@@ -347,12 +346,12 @@ def slide(hand: Hand, name: str, region: str) -> Script:
     def ahead(distance: float, height: float) -> np.ndarray:
         position = simulator.position(name)
         way = (simulator.position(region) - position)[:2]
-        x, y = distance * way / max(np.linalg.norm(way), 1e-6)
+        x, y = distance * way / max(norm(way), 1e-6)
         return position + [x, y, height]
 
     def follows() -> bool:
         offset = hand.position - simulator.position(name)
-        return bool(np.linalg.norm(offset) < 0.075)
+        return bool(norm(offset) < 0.075)
 
     hand.grip = 1.0
     yield from hand.move(lambda: ahead(0.02, 0.08), within=0.02)
@@ -408,7 +407,7 @@ def in_front(hand: Hand, region: str, yaw: float, lean: float) -> Callable[..., 
     turn = Rotation.from_quat(simulator.pose(cabinet)[1], scalar_first=True)
     front = turn.apply([0, -1.0, 0])
     grasp = Grasp(np.zeros(3), yaw, lean, -front[:2])
-    hand.turn = functools.partial(hand.scene.turn, grasp)
+    hand.turn = partial(hand.scene.turn, grasp)
 
     def handle(ahead: float = 0.0) -> np.ndarray:
         return drawer.xpos + turn.apply(HANDLES[level]) + ahead * front
@@ -422,7 +421,7 @@ def open_drawer(hand: Hand, region: str) -> Script:
 
     def holds() -> bool:
         offset = handle() - hand.position
-        return bool(np.linalg.norm(offset) < 0.03)
+        return bool(norm(offset) < 0.03)
 
     yield from hand.move(lambda: handle(0.1), within=0.02)
     yield from hand.move(handle, steps=30)
@@ -452,7 +451,7 @@ def turn_knob(hand: Hand, name: str) -> Script:
     def turn_by(angle: float) -> None:
         yaw = simulator.opening(name) + angle
         grasp = Grasp(np.zeros(3), yaw, 0.0)
-        hand.turn = functools.partial(hand.scene.turn, grasp)
+        hand.turn = partial(hand.scene.turn, grasp)
 
     turn_by(0.0)
     yield from hand.move(lambda: knob + [0, 0, 0.08])

@@ -7,8 +7,6 @@ dataset, so the content does not depend on how many processes worked on it.
 
 from __future__ import annotations
 
-import collections
-import concurrent.futures
 import importlib.metadata
 import itertools
 import json
@@ -18,7 +16,9 @@ import os
 import shutil
 import signal
 import warnings
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -195,15 +195,11 @@ def appearing(root: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def simulators(
-    processes: int, start: Callable[..., None], *arguments: Any
-) -> Iterator[concurrent.futures.ProcessPoolExecutor]:
+def simulators(processes: int, start: Callable[..., None], *arguments: Any) -> Iterator[ProcessPoolExecutor]:
     """So many processes, each made ready by `start`; an error inside ends them at once."""
     context = multiprocessing.get_context("spawn")
     before = set(multiprocessing.active_children())
-    with concurrent.futures.ProcessPoolExecutor(
-        processes, context, initializer=_ready, initargs=(start, *arguments)
-    ) as pool:
+    with ProcessPoolExecutor(processes, context, initializer=_ready, initargs=(start, *arguments)) as pool:
         try:
             yield pool
         except BaseException:
@@ -247,7 +243,7 @@ def simulated[Item, Result](
             return result
 
         def results() -> Iterator[Result]:
-            waiting: collections.deque[Any] = collections.deque()
+            waiting: deque[Any] = deque()
             for item in items:
                 waiting.append(pool.submit(_with_warnings, work, item))
                 if len(waiting) > 2 * processes:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-import collections
+from collections import deque
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -75,7 +75,7 @@ class SimulatedEnvironment(EpisodeEnvironment):
         image = f"observation.images.{CAMERA}"
         self.spec = unit_spec(config, [image], INSTRUCTIONS.__getitem__, STATE_DIM, ACTION_DIM, fps=80)
         self._target: np.ndarray = np.zeros(ACTION_DIM, np.float32)
-        self._recent: collections.deque[np.ndarray] = collections.deque(maxlen=config.hold)
+        self._recent: deque[np.ndarray] = deque(maxlen=config.hold)
 
     @property
     def solution(self) -> np.ndarray:

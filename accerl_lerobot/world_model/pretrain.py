@@ -39,7 +39,6 @@ from accerl_lerobot.console import Console
 from accerl_lerobot.envs import EnvConfig, make_environment
 from accerl_lerobot.errors import InputError, expanded
 from accerl_lerobot.evaluation import write_video
-from accerl_lerobot.experience import task_codes
 from accerl_lerobot.metrics import plain
 from accerl_lerobot.policies.loading import resolve_device
 from accerl_lerobot.world_model.config import WorldModelConfig
@@ -238,10 +237,8 @@ def replay_scores(world: World, episodes: Sequence[Episode]) -> tuple[np.ndarray
     windows = whole_windows(episodes, at, world)
     known = windows.known
     frames = replay(world.model, windows)
-    codes = torch.from_numpy(task_codes(windows.tasks))
-    codes = codes[:, None].expand(-1, known.shape[1], -1)
     probabilities = torch.zeros(known.shape)
-    probabilities[known] = world.success.probabilities(frames[known], codes[known])
+    probabilities[known] = world.success.probabilities(frames[known], windows.known_tasks)
     return probabilities.amax(1).numpy(), windows.success.any(1).numpy()
 
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch.nn.utils import clip_grad_norm_
 
 from accerl_lerobot.checkpoint.tensors import copied, optimizer_state, restore_optimizer
 from accerl_lerobot.errors import MAX_NONFINITE, NonFiniteError
@@ -84,7 +85,7 @@ class StateLearner:
         loss, metrics = self.model.loss(transitions)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        norm = torch.nn.utils.clip_grad_norm_(self.optimizer.param_groups[0]["params"], CLIP)
+        norm = clip_grad_norm_(self.optimizer.param_groups[0]["params"], CLIP)
         self.count += 1
         if math.isfinite(float(loss.detach()) + float(norm)):
             self.optimizer.step()

@@ -21,7 +21,6 @@ from torch.nn.utils import clip_grad_norm_
 
 from accerl_lerobot.checkpoint.snapshot import kind
 from accerl_lerobot.checkpoint.tensors import copied, optimizer_state, restore_optimizer
-from accerl_lerobot.experience import task_codes
 from accerl_lerobot.world_model.contract import Windows, replay
 from accerl_lerobot.world_model.data import Episode, WindowStart, cut_windows
 from accerl_lerobot.world_model.imagined import World
@@ -147,13 +146,11 @@ class Trainer:
                 at.append(WindowStart(e, frame))
         windows = whole_windows(episodes, at, self.world)
         known = windows.known
-        codes = torch.from_numpy(task_codes(windows.tasks))
-        tasks = codes[:, None].expand(-1, known.shape[1], -1)[known]
         recorded = windows.frames[known]
         imagined = replay(self.serving.model, windows)[known]
         success = windows.success[known]
         frames = torch.cat([recorded, imagined])
-        return Labelled(frames, tasks.repeat(2, 1), success.repeat(2))
+        return Labelled(frames, windows.known_tasks.repeat(2, 1), success.repeat(2))
 
     def _halves(self, labelled: Labelled) -> Labelled:
         """A batch of as many successes as failures."""
