@@ -299,7 +299,9 @@ def step_of_reward(rewards: np.ndarray) -> int | None:
     if len(positive) == 1:
         return first
     stays = (rewards[first:] == rewards[first]).all()
-    return first if first > 0 and stays else None
+    if first == 0 or not stays:
+        return None
+    return first
 
 
 def numbers(data: Any, name: str, dataset: DatasetConfig) -> np.ndarray:

@@ -414,7 +414,8 @@ def record_one(env_config: EnvConfig, config: DemosConfig, seed: int, slot: int)
         episode = played(environment, task, own_seed, actions)
         if episode.success != fail or (config.push and not fail):
             return episode, attempt
-    hint = f"{_MAX_TRIES} tries of {task} in a row did not {'fail' if fail else 'succeed'}; lower it"
+    outcome = "fail" if fail else "succeed"
+    hint = f"{_MAX_TRIES} tries of {task} in a row did not {outcome}; lower it"
     hint += ", or allow more env steps (env.max_steps)"
     if fail:
         raise InputError("demos.failure_share", share, hint)

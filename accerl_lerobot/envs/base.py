@@ -140,7 +140,9 @@ class EpisodeEnvironment(Environment):
     @property
     def late(self) -> float:
         """Share of the time limit gone."""
-        return self._steps / self.spec.max_steps if self._steps else 0.0
+        if self._steps == 0:
+            return 0.0
+        return self._steps / self.spec.max_steps
 
     def reset(self, seed: int, task: str) -> Observation:
         if task not in self.spec.tasks:
@@ -295,7 +297,9 @@ class SuiteConfig(EnvConfig):
 
     @property
     def state_size(self) -> int:
-        return self.STATE_NUMBERS + 1 if self.environment_state else 0
+        if not self.environment_state:
+            return 0
+        return self.STATE_NUMBERS + 1
 
 
 def unit_spec(

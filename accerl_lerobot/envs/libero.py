@@ -80,8 +80,9 @@ def instruction(task: str) -> str:
     """Text of a task, as LeRobot's environment and datasets have it."""
     name = bddl_file(task).stem
     _, scene, rest = name.partition("SCENE")
-    words = rest.partition("_")[2] if scene else name  # the scene has a number
-    return words.replace("_", " ")
+    if scene:  # it has a number
+        _, _, name = rest.partition("_")
+    return name.replace("_", " ")
 
 
 def recorded_states(task: str) -> np.ndarray:

@@ -52,7 +52,9 @@ class SimulatedConfig(EnvConfig):
 
     @property
     def state_size(self) -> int:
-        return STATE_DIM + 1 if self.environment_state else 0
+        if not self.environment_state:
+            return 0
+        return STATE_DIM + 1
 
     def __post_init__(self) -> None:
         super().__post_init__()

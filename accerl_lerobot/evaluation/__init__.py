@@ -76,8 +76,10 @@ def rate_of(results: Sequence[EpisodeResult]) -> Rate:
 
 def by_task(results: Sequence[EpisodeResult]) -> dict[str, list[EpisodeResult]]:
     """Task → its episodes, sorted by task."""
-    tasks = sorted({result.plan.task for result in results})
-    return {task: [result for result in results if result.plan.task == task] for task in tasks}
+    episodes: dict[str, list[EpisodeResult]] = {}
+    for result in sorted(results, key=lambda result: result.plan.task):
+        episodes.setdefault(result.plan.task, []).append(result)
+    return episodes
 
 
 def summarise(results: Sequence[EpisodeResult]) -> dict[str, Any]:
@@ -216,7 +218,10 @@ def write_video(path: Path, rows: Sequence[Sequence[Sequence[np.ndarray]]], fps:
     )
     with writer:
         for i in range(length + fps):
-            lines = [_joined([clip[min(i, len(clip) - 1)] for clip in row], axis=1) for row in rows]
+            lines = []
+            for row in rows:
+                pictures = [clip[min(i, len(clip) - 1)] for clip in row]
+                lines.append(_joined(pictures, axis=1))
             picture = _joined(lines, axis=0)
             height, width = picture.shape[:2]
             writer.append_data(picture[: height // 2 * 2, : width // 2 * 2])

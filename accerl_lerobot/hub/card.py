@@ -158,30 +158,41 @@ def run_files(folder: Path, artifact: str, evaluation: str | None) -> dict[str, 
     `evaluation` is a folder or file of ``accerl eval``; one of another policy is refused.
     """
     files: dict[str, Path] = {}
-    place = folder.resolve()
-    carried = (folder / FOLDER).is_dir()
-    names: Collection[str] = ()
-    run = place.parent
-    if not carried and artifact == POLICY and run.parent.name == CHECKPOINTS:
-        step = run.name
-        run = run.parents[1]
-        is_last = step.isdigit() and int(step) == read_json(run / SUMMARY).get("updates")
-        names = KEPT[POLICY] if is_last else (RECIPE,)
-    elif not carried and artifact == WORLD_MODEL and (run / VALIDATION).is_file():
-        names = KEPT[WORLD_MODEL]
+    run, names = _kept(folder, artifact)
     source = safety.FileSource("path", str(folder))
     for name, path in safety.matching_files(run, names, source).items():
         files[f"{FOLDER}/{name}"] = path
     if evaluation is not None:
-        path = Path(evaluation).expanduser()
-        if path.is_dir():
-            path = path / EVALUATION
-        policy = read_json(path).get("policy")
-        if policy is None or Path(policy).expanduser().resolve() != place:
-            hint = f"not an evaluation of {folder}; name the output_dir of accerl eval"
-            raise InputError("evaluation", str(path), hint)
-        files[f"{FOLDER}/{EVALUATION}"] = path
+        files[f"{FOLDER}/{EVALUATION}"] = _evaluation(folder, evaluation)
     return files
+
+
+def _kept(folder: Path, artifact: str) -> tuple[Path, Collection[str]]:
+    """Folder of the run that a folder lies in, and the names of the run's files that go with it."""
+    run = folder.resolve().parent
+    if (folder / FOLDER).is_dir():  # it carries files of its run already
+        return run, ()
+    if artifact == WORLD_MODEL and (run / VALIDATION).is_file():
+        return run, KEPT[WORLD_MODEL]
+    if artifact == POLICY and run.parent.name == CHECKPOINTS:
+        step = run.name
+        run = run.parents[1]
+        if step.isdigit() and int(step) == read_json(run / SUMMARY).get("updates"):
+            return run, KEPT[POLICY]
+        return run, (RECIPE,)
+    return run, ()
+
+
+def _evaluation(folder: Path, given: str) -> Path:
+    """The file that ``accerl eval`` wrote about the policy in a folder."""
+    path = Path(given).expanduser()
+    if path.is_dir():
+        path = path / EVALUATION
+    policy = read_json(path).get("policy")
+    if policy is None or Path(policy).expanduser().resolve() != folder.resolve():
+        hint = f"not an evaluation of {folder}; name the output_dir of accerl eval"
+        raise InputError("evaluation", str(path), hint)
+    return path
 
 
 def model_card(repo_id: str, artifact: str, folder: Path, files: Files) -> str:
@@ -276,4 +287,6 @@ def _base_model(recipe: Mapping[str, Any]) -> str | None:
     name = str(policy.get("path") or sft.get("init_path"))
     if name.startswith(f"{AWAY}/") or Path(name).is_dir():
         return None
-    return name if re.fullmatch(REPO_ID, name) else None
+    if not re.fullmatch(REPO_ID, name):
+        return None
+    return name

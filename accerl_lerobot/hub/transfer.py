@@ -88,7 +88,9 @@ def hub_errors(repo_id: str, revision: str | None) -> Iterator[None]:
         hint = f"{repo_id} has no such commit, tag or branch"
         raise InputError("revision", revision, hint) from None
     except Exception as error:
-        code = error.response.status_code if isinstance(error, HfHubHTTPError) else 0
+        code = 0
+        if isinstance(error, HfHubHTTPError):
+            code = error.response.status_code
         if code == 401 and get_token() is None:  # so the Hub answers where there is nothing, or it is private
             code = 404
         lines = str(error).replace(get_token() or "<token>", "<token>").strip().splitlines()
@@ -222,7 +224,9 @@ def _upload(config: PushConfig, artifact: str, files: Files) -> dict[str, Any]:
         parent_commit=before.sha,
         **where,
     ).oid
+    url = f"{api.endpoint}/{repo_id}"
     if artifact == DATASET:
+        url = f"{api.endpoint}/datasets/{repo_id}"
         with contextlib.suppress(RevisionNotFoundError):
             api.delete_tag(tag=DATASET_TAG, **where)
         api.create_tag(tag=DATASET_TAG, revision=commit, **where)
@@ -233,7 +237,7 @@ def _upload(config: PushConfig, artifact: str, files: Files) -> dict[str, Any]:
         "unchanged": commit == before.sha,
         "private": bool(before.private),
         "files": len(files),
-        "url": f"{api.endpoint}/{'datasets/' if artifact == DATASET else ''}{repo_id}",
+        "url": url,
     }
 
 

@@ -151,6 +151,7 @@ def one_run(run: Run, now: float) -> dict[str, Any]:
     if bound is not None:
         facts["bound of the lag"] = f"{bound} updates"
     changed = changed_fields(run.config)
+    verb = "offline" if run.offline else "train"
     blocks = [
         Block(
             "Success and staleness",
@@ -173,7 +174,7 @@ def one_run(run: Run, now: float) -> dict[str, Any]:
         ),
     ]
     return {
-        "about": f"accerl {'offline' if run.offline else 'train'} · {run.name} · {status(run, now)}",
+        "about": f"accerl {verb} · {run.name} · {status(run, now)}",
         "title": _headline(run),
         "facts": facts,
         "warnings": list(warnings(run, now)),
@@ -227,9 +228,11 @@ def comparison(runs: Sequence[Run], now: float) -> dict[str, Any]:
 def status(run: Run, now: float) -> str:
     if run.error:
         return "failed"
-    if run.result is None:
-        return "still going" if now - run.written < RECENT_S else "not finished"
-    return "finished"
+    if run.result is not None:
+        return "finished"
+    if now - run.written < RECENT_S:
+        return "still going"
+    return "not finished"
 
 
 def warnings(run: Run, now: float) -> Iterator[str]:
@@ -352,7 +355,10 @@ def _facts(run: Run) -> dict[str, str]:
     seen = exploring(run).x
     if steps is None and len(seen):
         steps = seen[-1]
+    mean_lag = None
     lags = finite(run.train, "lag_mean")
+    if len(lags):
+        mean_lag = float(lags.mean())
     return {
         **success,
         "algorithm": str(run.section("algorithm").get("type")),
@@ -360,6 +366,6 @@ def _facts(run: Run) -> dict[str, str]:
         "updates": number(result.get("updates", newest(run.train, "update"))),
         "episodes": number(result.get("episodes", newest(run.rollout, "episodes"))),
         "env steps": number(steps),
-        "mean lag": number(float(lags.mean()) if len(lags) else None, 2),
+        "mean lag": number(mean_lag, 2),
         "wall time": duration(result.get("wall_s", newest(run.train, "wall_s"))),
     }

@@ -67,7 +67,9 @@ class Run:
     def section(self, name: str) -> Record:
         """Section of its config; empty if another version wrote it without."""
         section = self.config.get(name)
-        return section if isinstance(section, dict) else {}
+        if not isinstance(section, dict):
+            return {}
+        return section
 
 
 def read_run(path: Path) -> Run:
@@ -105,7 +107,9 @@ def read_run(path: Path) -> Run:
 def _records(path: Path) -> tuple[dict[str, list[Record]], bool]:
     """Records by their kind, and whether the last line is incomplete."""
     records: dict[str, list[Record]] = {}
-    lines = path.read_bytes().splitlines() if path.is_file() else []
+    if not path.is_file():
+        return records, False
+    lines = path.read_bytes().splitlines()
     for number, text in enumerate(lines, 1):
         try:
             record = json.loads(text)

@@ -137,7 +137,9 @@ class NoClock(Clock):
 
 def open_clock(folder: Path | None, worker: str) -> Clock:
     """The clock of a worker; one that records nothing where there is no folder of the timeline."""
-    return NoClock() if folder is None else Clock(folder, worker)
+    if folder is None:
+        return NoClock()
+    return Clock(folder, worker)
 
 
 Window = tuple[float, float]  # first and last second, since the timeline began
@@ -186,7 +188,9 @@ class Timeline:
             follows = False  # an interval of training, or a checkpoint after it
             for start, end, state in zip(row.starts / 1e9, row.ends / 1e9, row.states, strict=True):
                 if state == TRAINING:
-                    first = windows.pop()[0] if follows else float(start)
+                    first = float(start)
+                    if follows:
+                        first, _ = windows.pop()
                     windows.append((first, float(end)))
                 follows = state == TRAINING or (follows and state == CHECKPOINT)
         return windows or [(0.0, self.seconds)]

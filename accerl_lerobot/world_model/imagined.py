@@ -162,7 +162,8 @@ def load_world(directory: Path, package: str | None = None, *, section: str = ""
 
 
 def _origin(directory: Path, section: str) -> FileSource:
-    return FileSource(f"{section}.path" if section else "path", str(directory))
+    field = f"{section}.path" if section else "path"
+    return FileSource(field, str(directory))
 
 
 class ImaginedEnvironment(Environment):
