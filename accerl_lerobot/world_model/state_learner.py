@@ -38,6 +38,7 @@ class StateLearner:
             learned, lr=model.learning_rate, weight_decay=WEIGHT_DECAY, fused=True
         )
         self.count = 0  # steps made
+        self._learned = learned
         self._skipped_in_a_row = 0
         self._made: list[dict[str, float]] = []
 
@@ -54,6 +55,7 @@ class StateLearner:
     def submit(self, transitions: Transitions, numbers: Observations) -> None:
         """Make a step on each `BATCH` of transitions; `numbers` are all that is remembered without images."""
         self.model.fit(numbers)
+        transitions = transitions.to(self._learned[0].device)
         for rows in np.arange(len(transitions.tasks)).reshape(-1, BATCH):
             self._made.append(self._step(transitions.rows(rows)))
 
@@ -85,7 +87,7 @@ class StateLearner:
         loss, metrics = self.model.loss(transitions)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        norm = clip_grad_norm_(self.optimizer.param_groups[0]["params"], CLIP)
+        norm = clip_grad_norm_(self._learned, CLIP)
         self.count += 1
         if math.isfinite(float(loss.detach()) + float(norm)):
             self.optimizer.step()

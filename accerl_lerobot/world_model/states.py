@@ -66,6 +66,12 @@ class Transitions(NamedTuple):
             success=self.success[chosen],
         )
 
+    def to(self, device: torch.device | str) -> Transitions:
+        """The same, with the tensors on a device."""
+        fields = self._asdict()
+        tensors = {name: value.to(device) for name, value in fields.items() if isinstance(value, Tensor)}
+        return self._replace(**tensors)
+
 
 class StateModel(nn.Module, ABC):
     """A model whose states critic and teacher see.

@@ -125,6 +125,7 @@ class RemoteStateLearner:
         if not self._pending:
             self._since = time.monotonic()
         self._submitted += len(transitions.tasks) // BATCH
+        transitions = transitions.to("cpu")  # the worker may have no GPU, or another one
         self._pending.append(self._actor.learn.remote(transitions, numbers))
 
     def wait(self) -> None:
