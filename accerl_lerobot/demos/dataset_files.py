@@ -326,9 +326,10 @@ def observations(
     found = {name: values[rows] for name, values in vectors.items()}
     if not cameras:
         return found
-    frames = [data[int(row)] for row in rows]
-    for camera in cameras:
-        # LeRobot gives float (3, h, w) in [0, 1].
-        images = [(frame[camera] * 255).round().byte().permute(1, 2, 0).numpy() for frame in frames]
-        found[camera] = np.stack(images)
-    return found
+    images: dict[str, list[np.ndarray]] = {camera: [] for camera in cameras}
+    for row in rows:
+        frame = data[int(row)]
+        for camera in cameras:
+            pixels = (frame[camera] * 255).round().byte()  # LeRobot gives float (3, h, w) in [0, 1]
+            images[camera].append(pixels.permute(1, 2, 0).numpy())
+    return found | {camera: np.stack(frames) for camera, frames in images.items()}

@@ -432,8 +432,7 @@ def resized(frame: np.ndarray, height: int, width: int) -> np.ndarray:
     """An image, uint8 (height, width, 3), by bilinear interpolation."""
     from PIL import Image
 
-    image = Image.fromarray(frame)
-    return np.asarray(image.resize((width, height), Image.Resampling.BILINEAR))
+    return np.asarray(Image.fromarray(frame).resize((width, height), Image.Resampling.BILINEAR))
 
 
 def flattened(raw: Any, prefix: str = "") -> dict[str, Any]:

@@ -117,8 +117,7 @@ def table(summary: dict[str, Any], title: str) -> Table:
         rows["all"] = summary
     for name, entry in rows.items():
         n = entry["n"]
-        rate = Rate(successes=round(entry["success"] * n), n=n)
-        out.add_row(name, str(rate))
+        out.add_row(name, str(Rate(successes=round(entry["success"] * n), n=n)))
     return out
 
 

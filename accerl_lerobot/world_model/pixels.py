@@ -126,8 +126,7 @@ class PixelWorldModel(LearnableWorldModel):
         robot = state["robot"][:, -1] + motion
         following = state | {"commanded_sum": state["commanded_sum"] + actions.sum(1)}
         for name, newest in {"frames": frames, "robot": robot, "actions": actions}.items():
-            seen = torch.cat([state[name], newest[:, None]], 1)
-            following[name] = seen[:, 1:]
+            following[name] = torch.cat([state[name], newest[:, None]], 1)[:, 1:]
         return Prediction(state=following, frames=frames, robot=robot)
 
     def _executed(self, steps: Tensor) -> Tensor:
@@ -217,8 +216,7 @@ class SuccessModel(nn.Module):
         # One shift for a batch is enough: there are many batches.
         y, x = torch.randint(2 * SHIFT + 1, (2,), generator=generator).tolist()
         padded = functional.pad(images.flatten(0, 1), (SHIFT,) * 4, mode="replicate")
-        shifted = padded[..., y : y + height, x : x + width]
-        shifted = shifted.unflatten(0, images.shape[:2])
+        shifted = padded[..., y : y + height, x : x + width].unflatten(0, images.shape[:2])
         each = (len(images), 1, 1, 1, 1)
         light = 1 + 0.1 * torch.randn(each, generator=generator)
         level = NOISE * torch.rand(each, generator=generator)

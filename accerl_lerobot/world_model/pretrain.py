@@ -273,8 +273,7 @@ def auroc(scores: np.ndarray, labels: np.ndarray) -> float:
     difference = scores[labels][:, None] - scores[~labels]
     if not difference.size:
         return np.nan
-    in_order = (difference > 0) + 0.5 * (difference == 0)
-    return float(in_order.mean())
+    return float(((difference > 0) + 0.5 * (difference == 0)).mean())
 
 
 def preview(video: Path, world: World, episodes: Sequence[Episode]) -> None:

@@ -80,8 +80,7 @@ class Trainer:
         if self._labelled is None or self.count % REFRESH_EVERY == 0:
             self._labelled = self._replayed(episodes, weights)
         if self._labelled is not None:
-            batch = self._halves(self._labelled)
-            success_loss = self.world.success.loss(*batch, self._generator)
+            success_loss = self.world.success.loss(*self._halves(self._labelled), self._generator)
             metrics["success"] = success_loss.item()
             loss = loss + success_loss
         self._optimizer.zero_grad(set_to_none=True)
@@ -149,8 +148,7 @@ class Trainer:
         recorded = windows.frames[known]
         imagined = replay(self.serving.model, windows)[known]
         success = windows.success[known]
-        frames = torch.cat([recorded, imagined])
-        return Labelled(frames, windows.known_tasks.repeat(2, 1), success.repeat(2))
+        return Labelled(torch.cat([recorded, imagined]), windows.known_tasks.repeat(2, 1), success.repeat(2))
 
     def _halves(self, labelled: Labelled) -> Labelled:
         """A batch of as many successes as failures."""

@@ -55,8 +55,7 @@ class AccerlEnv(gym.Env):
         super().reset(seed=seed)
         if seed is None:
             seed = int(self.np_random.integers(2**32))
-        observation = self._environment.reset(seed, self.task)
-        return self._format(observation), {"is_success": False}
+        return self._format(self._environment.reset(seed, self.task)), {"is_success": False}
 
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         result = self._environment.step_chunk(np.asarray(action, np.float32)[None])
