@@ -21,7 +21,6 @@ from torch import Tensor
 from torch.nn import functional
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import ENVIRONMENT_STATE
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.features import STATE
 from accerl_lerobot.policies.loading import load_network
@@ -161,11 +160,11 @@ def _camera(spec: StateSpec, image: str | None, config: TDMPCStateConfig) -> str
 
 
 def _check_sizes(spec: StateSpec, lerobot_config: Any, config: TDMPCStateConfig) -> None:
-    """Refuses a TD-MPC of other numbers than the run's, or that reads the simulator's."""
-    numbers = {STATE: spec.state, "action": spec.chunk[1], ENVIRONMENT_STATE: 0}
+    """Refuses a TD-MPC of another robot."""
+    numbers = {STATE: spec.state, "action": spec.chunk[1]}
     features = lerobot_config.input_features | lerobot_config.output_features
     for name, ours in numbers.items():
         its = features[name].shape[0] if name in features else 0
         if its != ours:
-            hint = f"{name} has {its} numbers there and {ours} here; train it on what this run's policy sees"
+            hint = f"{name} has {its} numbers there and {ours} here; train it on this robot's data"
             raise InputError("world_model.path", config.path, hint)

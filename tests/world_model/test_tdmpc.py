@@ -9,11 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import ENVIRONMENT_STATE
 from accerl_lerobot.world_model import tdmpc
 from accerl_lerobot.world_model.config import TDMPCStateConfig
 from accerl_lerobot.world_model.state_learner import StateLearner
@@ -128,18 +126,3 @@ def test_images_of_another_size_are_one_line(written: Path):
     small = {CAMERA: np.zeros((1, 32, 32, 3), np.uint8), ROBOT: np.zeros((1, spec.state), np.float32)}
     with pytest.raises(InputError, match=r"world_model.path=.*\(3, 64, 64\), the run's \(3, 32, 32\)"):
         made.encode(small, ["a"], np.zeros(1))
-
-
-def test_one_that_reads_the_simulators_state_is_refused(tmp_path: Path):
-    inputs = {
-        IMAGE: PolicyFeature(type=FeatureType.VISUAL, shape=(3, 64, 64)),
-        ROBOT: PolicyFeature(type=FeatureType.STATE, shape=(4,)),
-        ENVIRONMENT_STATE: PolicyFeature(type=FeatureType.ENV, shape=(5,)),
-    }
-    stats = {ENVIRONMENT_STATE: {"min": torch.zeros(5), "max": torch.ones(5)}}
-    sizes = {"image": 64, "camera": IMAGE, "state_dim": 4}
-    path = write_policy(
-        tmp_path / "told", "tdmpc", **sizes, stats=stats, input_features=inputs, **KINDS["tdmpc"]
-    )
-    with pytest.raises(InputError, match="observation.environment_state has 5 numbers there and 0 here"):
-        new_state_model(spec_of(path), TDMPCStateConfig(path=str(path)))
