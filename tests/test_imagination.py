@@ -21,16 +21,19 @@ from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE, WORLD_MODEL
 from accerl_lerobot.console import Console
+from accerl_lerobot.demos import record
+from accerl_lerobot.demos.record import Expert, simulated_expert
 from accerl_lerobot.engines.config import DatasetConfig, RunConfig
 from accerl_lerobot.engines.contract import Progress
 from accerl_lerobot.engines.local import LocalEngine
-from accerl_lerobot.envs import SimulatedConfig, make_environment
+from accerl_lerobot.envs import Environment, SimulatedConfig, make_environment
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, REAL, Segment
 from accerl_lerobot.rollout.runner import EpisodePlans, RolloutConfig
 from accerl_lerobot.rollout.worker import RolloutWorker
 from accerl_lerobot.run.train import Run
-from accerl_lerobot.timeline import read_timeline
+from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TIMELINE, read_timeline
+from accerl_lerobot.world_model import online
 from accerl_lerobot.world_model.config import (
     ImaginationConfig,
     LearnableModelConfig,
@@ -40,10 +43,11 @@ from accerl_lerobot.world_model.config import (
 from accerl_lerobot.world_model.contract import WorldModelSpec, new_model
 from accerl_lerobot.world_model.data import load_episodes
 from accerl_lerobot.world_model.imagined import World, check_imagination, load_world, read_content, save_world
-from accerl_lerobot.world_model.online import ONLINE, make_learner
+from accerl_lerobot.world_model.online import ONLINE, OnlineLearningWorker, make_learner
 from tests.policies.checkpoints import write_diffusion
 from tests.runs import drive, polls, tiny_run
 from tests.tiny_datasets import one_process, record_dataset
+from tests.world_model.real_segments import real_episode
 
 # About half of all episodes succeed when it is acted at random.
 ENV = SimulatedConfig(max_steps=16, hold=8, tolerance=0.45)
@@ -243,6 +247,22 @@ def test_what_does_not_fit_is_refused_before_the_run_begins(
         replace(config, rollout=replace(config.rollout, workers=4, episodes=2))
 
 
+def test_each_task_that_play_records_has_an_expert(
+    tiny_checkpoint: Path, world_model: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def only_match(environment: Environment, task: str) -> Expert:
+        if task != "match":
+            raise InputError("env.task", task, "no expert")
+        return simulated_expert(environment, task)
+
+    monkeypatch.setattr(record, "simulated_expert", only_match)
+    config = imagining(tiny_checkpoint, world_model)
+    config = replace(config, env=replace(ENV, task="match,mirror"))
+    check_imagination(replace(config, imagination=ImaginationConfig(environments=1, expert_episodes=1)))
+    with pytest.raises(InputError, match="env.task='mirror': no expert"):
+        check_imagination(replace(config, imagination=ImaginationConfig(environments=1)))
+
+
 def test_it_goes_on_with_what_it_has_learned_from_and_never_with_what_was_held_out(
     tiny_checkpoint: Path, tmp_path: Path
 ):
@@ -262,6 +282,20 @@ def test_it_goes_on_with_what_it_has_learned_from_and_never_with_what_was_held_o
     config = replace(config, imagination=replace(config.imagination, learn=nowhere))
     with pytest.raises(InputError, match=r"^imagination\.learn\.dataset\.root='nowhere': no meta/info.json"):
         check_imagination(config)
+
+
+def test_a_checkpoint_between_two_steps_does_not_end_the_time_of_learning(
+    tiny_checkpoint: Path, world_model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    config = imagining(tiny_checkpoint, world_model, steps=2.0)
+    worker = OnlineLearningWorker(config, timeline=tmp_path / TIMELINE)
+    checkpoints = iter([tmp_path / "checkpoint"])
+    monkeypatch.setattr(online, "fault_point", lambda name: [worker.save(path) for path in checkpoints])
+    worker.learn(real_episode(1))
+    worker.metrics()
+    [row] = read_timeline(tmp_path).rows
+    states = row.states.tolist()
+    assert COMPUTE in states[states.index(CHECKPOINT) :]
 
 
 @pytest.mark.parametrize(

@@ -31,7 +31,8 @@ from accerl_lerobot.experience import REWARD, SUCCESS
 if TYPE_CHECKING:
     from accerl_lerobot.config.ranges import DatasetConfig
 
-INFO, DATA = "meta/info.json", "data"
+INFO = "meta/info.json"
+DATA = "data"
 IMAGES = ("PNG", "JPEG", "TIFF")
 """Pillow's names of the formats that are decoded; LeRobot stores depth as TIFF."""
 PLACE = re.compile(r"\{(video_key|(chunk_index|file_index)(:0?[1-9]?d)?)\}")
@@ -71,12 +72,13 @@ def opened(dataset: DatasetConfig, meta: Any, episodes: Sequence[int] | None = N
     """
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    chosen = None if episodes is None else list(episodes)
+    if episodes is not None:
+        episodes = list(episodes)
     with checked(origin_of(dataset), whole=dataset.root is not None):
         with _one_line_errors(dataset):
             # The default backend probes for FFmpeg's libraries, and prints tracebacks where there are none.
             data = LeRobotDataset(
-                meta.repo_id, root=meta.root, revision=meta.revision, episodes=chosen, video_backend="pyav"
+                meta.repo_id, root=meta.root, revision=meta.revision, episodes=episodes, video_backend="pyav"
             )
             _check_rows(data, origin_of(dataset))
         yield data
@@ -214,7 +216,8 @@ def check_metadata(root: Path, origin: FileSource) -> None:
     for path in (root / "meta").rglob("*.parquet"):
         described = (pq.read_schema(path).metadata or {}).get(b"huggingface", b"{}")
         kinds = re.findall(r'"_type": "(\w+)"', json.dumps(json.loads(described)))
-        if other := set(kinds) - PLAIN:  # `datasets` would open the files that they name
+        other = set(kinds) - PLAIN
+        if other:  # `datasets` would open the files that they name
             hint = f"columns of kind {', '.join(other)[:80]}; numbers and texts are wanted"
             raise origin.refuse(path.name, hint)
 
@@ -279,7 +282,9 @@ def step_of_success(flags: np.ndarray) -> int:
     """
     if flags.all():
         return len(flags) - 1
-    return int(flags.argmax()) if flags.any() else -1
+    if not flags.any():
+        return -1
+    return int(flags.argmax())
 
 
 def step_of_reward(rewards: np.ndarray) -> int | None:
@@ -291,19 +296,25 @@ def step_of_reward(rewards: np.ndarray) -> int | None:
     if len(positive) == 0:
         return -1
     first = int(positive[0])
-    stays = first > 0 and bool((rewards[first:] == rewards[first]).all())
-    return first if len(positive) == 1 or stays else None
+    if len(positive) == 1:
+        return first
+    stays = (rewards[first:] == rewards[first]).all()
+    if first == 0 or not stays:
+        return None
+    return first
 
 
 def numbers(data: Any, name: str, dataset: DatasetConfig) -> np.ndarray:
     """A column of finite numbers, one row per frame."""
-    values = np.asarray(data.hf_dataset.with_format("numpy", columns=[name])[:][name])
+    rows = data.hf_dataset.with_format("numpy", columns=[name])[:]
+    values = np.asarray(rows[name])
     origin = origin_of(dataset)
     if values.dtype.kind not in "biuf":
         raise origin.refuse(name, "numbers are wanted, of the same shape in all rows; record it again")
     finite = np.isfinite(values).reshape(len(values), -1).all(1)
     if not finite.all():
-        where = int(data.hf_dataset[int(finite.argmin())]["episode_index"])
+        row = data.hf_dataset[int(finite.argmin())]
+        where = int(row["episode_index"])
         raise origin.refuse(name, f"a number that is not finite in episode {where}; leave the episode out")
     return values
 
@@ -313,9 +324,12 @@ def observations(
 ) -> dict[str, np.ndarray]:
     """Contents of some rows: of `vectors`, columns of the dataset, and images uint8 (T, h, w, 3)."""
     found = {name: values[rows] for name, values in vectors.items()}
-    frames = [data[int(row)] for row in rows] if cameras else []
-    for camera in cameras:
-        # LeRobot gives float (3, h, w) in [0, 1].
-        images = [(frame[camera] * 255).round().byte().permute(1, 2, 0).numpy() for frame in frames]
-        found[camera] = np.stack(images)
-    return found
+    if not cameras:
+        return found
+    images: dict[str, list[np.ndarray]] = {camera: [] for camera in cameras}
+    for row in rows:
+        frame = data[int(row)]
+        for camera in cameras:
+            pixels = (frame[camera] * 255).round().byte()  # LeRobot gives float (3, h, w) in [0, 1]
+            images[camera].append(pixels.permute(1, 2, 0).numpy())
+    return found | {camera: np.stack(frames) for camera, frames in images.items()}

@@ -48,7 +48,9 @@ def query_rows(reader: Any, wanted: dict[str, list[int]]) -> dict[str, torch.Ten
     row_of = reader._absolute_to_relative_idx
     found = {}
     for key in wanted.keys() - set(reader._meta.video_keys):
-        rows = wanted[key] if row_of is None else [row_of[index] for index in wanted[key]]
+        rows = wanted[key]
+        if row_of is not None:
+            rows = [row_of[index] for index in rows]
         found[key] = torch.stack(_column(reader.hf_dataset, key)[rows][key])
     return found
 
@@ -84,11 +86,12 @@ def _adapted(stock: Any) -> Any:
 
     def make(cfg: Any) -> tuple[Any, Any]:
         train, evaluation = stock(cfg)
-        if train.meta.camera_keys:
-            train.meta.features.pop(ENVIRONMENT_STATE, None)
+        meta = train.meta
+        if meta.camera_keys:
+            meta.features.pop(ENVIRONMENT_STATE, None)
         # LeRobot 0.6.1 renames the dataset's features and not their statistics.
-        train.meta.stats = rename_stats(train.meta.stats, cfg.rename_map)
-        pixels = [math.prod(train.meta.features[camera]["shape"]) for camera in train.meta.camera_keys]
+        meta.stats = rename_stats(meta.stats, cfg.rename_map)
+        pixels = [math.prod(meta.features[camera]["shape"]) for camera in meta.camera_keys]
         fits = 4 * sum(pixels) * cfg.policy.n_obs_steps * len(train) <= MAX_BYTES
         if fits and not cfg.dataset.image_transforms.enable and not cfg.dataset.streaming:
             train = CachedDataset(train)

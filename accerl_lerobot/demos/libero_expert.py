@@ -7,24 +7,28 @@ again. Positions are in metres in the world's frame, rotations in radians.
 
 from __future__ import annotations
 
-import functools
-import itertools
 from collections.abc import Callable, Generator
+from functools import partial
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
+from numpy.linalg import norm
 from scipy.spatial.transform import Rotation
 
 from accerl_lerobot.envs.base import Environment
 from accerl_lerobot.envs.libero_simulator import LiberoEnvironment, Simulator
 from accerl_lerobot.errors import InputError
 
+Goal = Callable[[], np.ndarray]  # a position (3,), which may move
+Condition = Callable[[], bool]
 Script = Generator[np.ndarray, None, bool]
 """Yields actions, float64 (7,); returns True if the movement was completed."""
 
 SUITES = ("libero_object", "libero_spatial", "libero_goal", "libero_10")
 UNSOLVED = "libero_goal/3"  # the task without an expert: open the top drawer and put the bowl inside
-REACH, TURN = 0.05, 0.5  # movement in m and rad for an action of 1
+REACH = 0.05  # movement in m for an action of 1
+TURN = 0.5  # turn in rad for an action of 1
 GRIP_STEPS = 10  # env steps in which the fingers open or close
 OFFSETS = {
     "basket": (0, 0, -0.055),
@@ -50,18 +54,14 @@ MUG_HANDLE = (0.062, 0, 0.068)  # centre of the yellow and white mug's handle in
 DOOR = (0.2, 0.06)  # point on a microwave's door: distance from its hinge, and height above its middle
 KNOB = 0.038  # height of the grasp above the origin of the stove's knob
 PRESS = 0.008  # height of the fingers above a plate's origin while they push it
-
-
 WIDEST = 0.068  # widest object that fits between the open fingers with some room, in m
 DEPTH = 0.015  # distance of the grip site below an object's top; the palm is 2.4 cm above the grip site
 EASY_REACH = 0.72  # distance from the robot's base that a hand pointing straight down reaches easily, in m
 DOWN = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
 """Rotation of a hand that points down; its fingers close along the world's y axis."""
 _CORNERS = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
-_FINGERS = itertools.product((-0.053, -0.043, 0.043, 0.053), (-0.01, 0.01), (0.008, -0.02))
-_PALM = itertools.product(
-    np.linspace(-0.1, 0.1, 11), np.linspace(-0.034, 0.034, 5), np.arange(-0.026, -0.11, -0.016)
-)
+_FINGERS = product((-0.053, -0.043, 0.043, 0.053), (-0.01, 0.01), (0.008, -0.02))
+_PALM = product(np.linspace(-0.1, 0.1, 11), np.linspace(-0.034, 0.034, 5), np.arange(-0.026, -0.11, -0.016))
 HAND = np.array([*_FINGERS, *_PALM])
 """Points of the open hand in its own frame, (P, 3): along the fingers' axis, across it, and ahead."""
 
@@ -98,38 +98,51 @@ class Scene:
         """Corners (G, 8, 3) of the boxes of one object, or of all others."""
         geoms = self._geoms(name, others)
         data = self.simulator.data
-        middle, half = np.split(self.simulator.model.geom_aabb[geoms][:, None], 2, axis=-1)
+        boxes = self.simulator.model.geom_aabb[geoms][:, None]
+        middle, half = np.split(boxes, 2, axis=-1)
+        corners = middle + _CORNERS * half
         turn = data.geom_xmat[geoms].reshape(-1, 3, 3)
-        return (middle + _CORNERS * half) @ turn.transpose(0, 2, 1) + data.geom_xpos[geoms][:, None]
+        return corners @ turn.transpose(0, 2, 1) + data.geom_xpos[geoms][:, None]
 
     def collisions(self, name: str, points: np.ndarray, margin: float = 0.004) -> np.ndarray:
         """Number of points (..., P, 3) that are inside an object other than `name`, int (...)."""
         model = self.simulator.model
         data = self.simulator.data
         centre = points.reshape(-1, 3).mean(0)
-        spread = np.linalg.norm(points - centre, axis=-1).max() + margin
+        spread = norm(points - centre, axis=-1).max() + margin
         inside = np.zeros(points.shape[:-1], bool)
         for geom in self._geoms(name, others=True):
-            position, (middle, half) = data.geom_xpos[geom], model.geom_aabb[geom].reshape(2, 3)
-            if np.linalg.norm(position - centre) < spread + np.linalg.norm(middle) + np.linalg.norm(half):
-                local = (points - position) @ data.geom_xmat[geom].reshape(3, 3) - middle
-                inside |= (np.abs(local) < half + margin).all(-1)
+            position = data.geom_xpos[geom]
+            middle, half = model.geom_aabb[geom].reshape(2, 3)
+            reach = spread + norm(middle) + norm(half)
+            if norm(position - centre) >= reach:
+                continue
+            turn = data.geom_xmat[geom].reshape(3, 3)
+            local = (points - position) @ turn - middle
+            inside |= (np.abs(local) < half + margin).all(-1)
         return inside.sum(-1)
 
     def height(self, name: str, start: np.ndarray, goal: np.ndarray, margin: float = 0.08) -> float:
         """Highest point of the objects that are, seen from above, within `margin` of a line."""
         corners = self.corners(name, others=True)
-        low, high = corners.min(1), corners.max(1)
-        way = start[:2] + np.linspace(0, 1, 12)[:, None] * (goal - start)[:2]
-        gap = np.maximum(low[:, :2] - way[:, None], way[:, None] - high[:, :2]).max(-1)
-        return float(high[(gap < margin).any(0), 2].max(initial=self.corners(name)[..., 2].min()))
+        low = corners.min(1)
+        high = corners.max(1)
+        shares = np.linspace(0, 1, 12)[:, None, None]
+        line = start[:2] + shares * (goal - start)[:2]
+        gap = np.maximum(low[:, :2] - line, line - high[:, :2]).max(-1)
+        near = (gap < margin).any(0)
+        lowest = self.corners(name)[..., 2].min()
+        return float(high[near, 2].max(initial=lowest))
 
     def turn(self, grasp: Grasp, at: np.ndarray) -> np.ndarray:
         """Rotation (3, 3) of a hand at position `at` that holds a grasp."""
-        ahead = at[:2] - self.base if grasp.ahead is None else grasp.ahead
-        x, y = ahead / np.linalg.norm(ahead)
+        ahead = grasp.ahead
+        if ahead is None:
+            ahead = at[:2] - self.base
+        x, y = ahead / norm(ahead)
         lean = Rotation.from_rotvec(grasp.lean * np.array([y, -x, 0]))
-        return (lean * Rotation.from_euler("z", grasp.yaw)).as_matrix() @ DOWN
+        yaw = Rotation.from_euler("z", grasp.yaw)
+        return (lean * yaw).as_matrix() @ DOWN
 
     def grasp(self, name: str, goal: np.ndarray, rng: np.random.Generator) -> Grasp:
         """Choose a grasp from above: across the narrow side, or at the rim of an object that is too wide.
@@ -138,38 +151,48 @@ class Scene:
         chooses among grasps of similar cost.
         """
         corners = self.corners(name)
-        position = self.simulator.pose(name)[0]
-        bottom = corners[..., 2].min(1)
-        top = corners[..., 2].max(1)
-        height = max(top.max() - DEPTH, (top.max() + bottom.min()) / 2)
+        position = self.simulator.position(name)
+        heights = corners[..., 2]
+        bottom = heights.min(1)
+        top = heights.max(1)
+        middle = (top.max() + bottom.min()) / 2
+        height = max(top.max() - DEPTH, middle)
         yaws = np.radians(np.arange(-90, 90, 7.5))
-        across = np.stack([-np.sin(yaws), np.cos(yaws)], -1)  # axes of the fingers
-        along = np.stack([np.cos(yaws), np.sin(yaws)], -1)
+        sine = np.sin(yaws)
+        cosine = np.cos(yaws)
+        across = np.stack([-sine, cosine], -1)  # axes of the fingers
+        along = np.stack([cosine, sine], -1)
         flat = corners[..., :2].reshape(-1, 2)
-        if np.ptp(flat @ across.T, axis=0).min() < WIDEST:  # across it, in the middle or toward an end
-            level = (bottom < height) & (top > height) | (np.abs(corners[..., 2] - height).min(1) < 0.005)
+        width = np.ptp(flat @ across.T, axis=0)
+        if width.min() < WIDEST:  # across it, in the middle or toward an end
+            level = (bottom < height) & (top > height)
+            level |= np.abs(heights - height).min(1) < 0.005
             flat = corners[level, :, :2].reshape(-1, 2)
             width = np.ptp(flat @ across.T, axis=0)
             length = np.ptp(flat @ along.T, axis=0)
             to_end = along * np.maximum(length / 2 - 0.022, 0)[:, None]
             offsets = np.concatenate([0 * along, to_end, -to_end])
             cost = np.where(width < WIDEST, 40 * (width - width.min()), np.inf)
-            cost = np.concatenate([cost, cost + 0.5, cost + 0.5])
+            at_end = cost + 0.5
+            cost = np.concatenate([cost, at_end, at_end])
         else:
-            to_rim = across * (np.ptp(flat @ across.T, axis=0) / 2 - 0.012)[:, None]
+            to_rim = across * (width / 2 - 0.012)[:, None]
             offsets = np.concatenate([to_rim, -to_rim])
             cost = np.repeat([1.0, 0.0], len(across))  # the side of −y, if it is free
         points = (flat.min(0) + flat.max(0)) / 2 + offsets
         yaws = np.tile(yaws, len(points) // len(yaws))
         hands = np.column_stack([points, np.full(len(points), height)])
         moved = hands + goal - position
-        reach = np.maximum(*(np.linalg.norm(at[:, :2] - self.base, axis=-1) for at in (hands, moved)))
-        far = np.maximum(reach - EASY_REACH, 0)
+        reach = norm(hands[:, :2] - self.base, axis=-1)
+        reach_moved = norm(moved[:, :2] - self.base, axis=-1)
+        far = np.maximum(np.maximum(reach, reach_moved) - EASY_REACH, 0)
         leans = np.minimum(3 * far, 0.35)
         grasps = [Grasp(*each) for each in zip(hands - position, yaws, leans, strict=True)]
         turns = np.stack([self.turn(grasp, position) for grasp in grasps])
         spread = hands[:, None] + HAND @ turns.transpose(0, 2, 1)
-        cost += self.collisions(name, spread) + self.collisions(name, spread + goal - position)
+        collisions = self.collisions(name, spread)
+        collisions += self.collisions(name, spread + goal - position)
+        cost += collisions
         cost += 30 * far + 0.7 * np.abs(yaws) + rng.normal(0, 0.3, len(yaws))
         return grasps[np.argmin(cost)]
 
@@ -187,12 +210,21 @@ class Hand:
         self.turn: Callable[[np.ndarray], np.ndarray] = lambda at: DOWN
         """Maps the hand's position to its wanted orientation (3, 3)."""
 
+    @property
+    def position(self) -> np.ndarray:
+        """Position (3,) of the point between the fingertips, as it is now."""
+        return self.simulator.hand[0]
+
     def toward(self, goal: np.ndarray) -> np.ndarray:
         """Action toward a position and the wanted orientation."""
-        delta = (goal - self.simulator.hand[0]) / REACH
+        delta = (goal - self.position) / REACH
         turn = self.rotation_error().as_rotvec() / TURN
-        action = [part * min(1.0, self.speed / max(np.abs(part).max(), 1e-9)) for part in (delta, turn)]
-        return np.concatenate([*action, [self.grip]])
+        return np.concatenate([self._limited(delta), self._limited(turn), [self.grip]])
+
+    def _limited(self, movement: np.ndarray) -> np.ndarray:
+        """A movement in the same direction that is no faster than this hand."""
+        largest = max(np.abs(movement).max(), 1e-9)
+        return movement * min(1.0, self.speed / largest)
 
     def rotation_error(self) -> Rotation:
         """Rotation from the hand's current orientation to the wanted one."""
@@ -200,19 +232,15 @@ class Hand:
         return Rotation.from_matrix(self.turn(position) @ rotation.T)
 
     def move(
-        self,
-        goal: Callable[[], np.ndarray],
-        within: float = 0.012,
-        steps: int = 60,
-        given: Callable[[], bool] = lambda: True,
+        self, goal: Goal, within: float = 0.012, steps: int = 60, given: Condition = lambda: True
     ) -> Script:
         """Moves straight to a goal that may itself move, for at most `steps` and while `given` is true."""
         lag: np.ndarray = np.zeros(3)
         for _ in range(steps):
             if not given():
                 return False
-            error = goal() - self.simulator.hand[0]
-            distance = np.linalg.norm(error)
+            error = goal() - self.position
+            distance = norm(error)
             if distance < within and self.rotation_error().magnitude() < 0.2:
                 return True
             if distance < 0.03:  # the controller has no integral part, and a stretched arm lags behind
@@ -229,56 +257,58 @@ class Hand:
 
     def rise(self, height: float, steps: int) -> Script:
         """Moves straight up."""
-        up = self.simulator.hand[0] + [0, 0, height]
+        up = self.position + [0, 0, height]
         return (yield from self.move(lambda: up, steps=steps))
 
-    def over(self, goal: Callable[[], np.ndarray], height: float, given: Callable[[], bool]) -> Script:
+    def over(self, goal: Goal, height: float, given: Condition = lambda: True) -> Script:
         """Moves to `height` above a goal: up first, then sideways."""
 
         def waypoint() -> np.ndarray:
-            position = self.simulator.hand[0]
+            position = self.position
             aim = goal()
-            late = np.clip((height - position[2]) / 0.03 - 0.3, 0, 1)  # 1: stay above the current place
+            below = height - position[2]
+            late = np.clip(below / 0.03 - 0.3, 0, 1)  # 1: stay above the current place
             aim = aim + late * (position - aim)
             return np.array([*aim[:2], height])
 
         return (yield from self.move(waypoint, within=0.02, given=given))
 
-    def pick(self, name: str, place: Callable[[], np.ndarray], known: Grasp | None = None) -> Script:
+    def pick(self, name: str, place: Goal, known: Grasp | None = None) -> Script:
         """Grasps an object and lifts it a little; repeats until it holds the object."""
         scene = self.scene
         simulator = self.simulator
         while True:
             if self.grip > 0:  # the object was lost
-                yield from self.set_grip(-1.0, simulator.hand[0], 5)
+                yield from self.set_grip(-1.0, self.position, 5)
                 yield from self.rise(0.08, 12)
             grasp = known or scene.grasp(name, place(), self.rng)
-            self.turn = functools.partial(scene.turn, grasp)
-            hand = simulator.hand[0]
+            self.turn = partial(scene.turn, grasp)
+            start = self.position
 
             def goal(offset: np.ndarray = grasp.offset) -> np.ndarray:
-                return simulator.pose(name)[0] + offset
+                return simulator.position(name) + offset
 
-            clear = max(scene.height(name, hand, goal()) + 0.03, goal()[2] + self.rng.uniform(0.04, 0.08))
-            yield from self.over(goal, clear, lambda: True)
+            above_others = scene.height(name, start, goal()) + 0.03
+            above_goal = goal()[2] + self.rng.uniform(0.04, 0.08)
+            yield from self.over(goal, max(above_others, above_goal))
             yield from self.move(goal, within=0.008, steps=25)
             yield from self.set_grip(1.0, goal())
-            self.held = simulator.pose(name)[0] - simulator.hand[0]
+            self.held = simulator.position(name) - self.position
             yield from self.rise(0.06, 8)
             if self.holds(name):
                 return True
 
     def holds(self, name: str) -> bool:
         """True if the object has hardly moved relative to the hand since the grasp."""
-        offset = self.simulator.pose(name)[0] - self.simulator.hand[0]
-        return bool(np.linalg.norm(offset - self.held) < 0.05)
+        offset = self.simulator.position(name) - self.position
+        return bool(norm(offset - self.held) < 0.05)
 
 
 def pick_and_place(hand: Hand, name: str, region: str) -> Script:
     """Carries an object to a region or another object and releases it there."""
     scene = hand.scene
     simulator = hand.simulator
-    heights = scene.corners(name)[..., 2] - simulator.pose(name)[0][2]
+    heights = scene.corners(name)[..., 2] - simulator.position(name)[2]
     known = (offset for part, offset in OFFSETS.items() if part == name or part in region)
     x, y, up = next(known, (0, 0, 0.01))
     up = up - heights.min()
@@ -286,25 +316,26 @@ def pick_and_place(hand: Hand, name: str, region: str) -> Script:
         up = max(up, 0.045 - heights.max())
 
     def place() -> np.ndarray:
-        return simulator.pose(region)[0] + [x, y, up]
+        return simulator.position(region) + [x, y, up]
 
     def goal() -> np.ndarray:
-        position = simulator.hand[0]
-        return place() + position - simulator.pose(name)[0]
+        return place() + hand.position - simulator.position(name)
 
     def held() -> bool:
         return hand.holds(name)
 
-    lid = Grasp(np.array(LID), 0.0, 0.0)
-    yield from hand.pick(name, place, lid if "moka_pot" in name else None)
-    position = simulator.hand[0]
+    grasp = None
+    if "moka_pot" in name:
+        grasp = Grasp(np.array(LID), 0.0, 0.0)
+    yield from hand.pick(name, place, grasp)
+    position = hand.position
     below = position[2] - scene.corners(name)[..., 2].min()
     clear = scene.height(name, position, goal()) + below + hand.rng.uniform(0.02, 0.04)
     if not (yield from hand.over(goal, clear, held)):
         return False
     if not (yield from hand.move(goal, given=held)):
         return False
-    yield from hand.set_grip(-1.0, simulator.hand[0])
+    yield from hand.set_grip(-1.0, hand.position)
     return (yield from hand.rise(0.1, 15))
 
 
@@ -313,12 +344,14 @@ def slide(hand: Hand, name: str, region: str) -> Script:
     simulator = hand.simulator
 
     def ahead(distance: float, height: float) -> np.ndarray:
-        position = simulator.pose(name)[0]
-        way = (simulator.pose(region)[0] - position)[:2]
-        return position + [*(distance * way / max(np.linalg.norm(way), 1e-6)), height]
+        position = simulator.position(name)
+        way = (simulator.position(region) - position)[:2]
+        x, y = distance * way / max(norm(way), 1e-6)
+        return position + [x, y, height]
 
     def follows() -> bool:
-        return bool(np.linalg.norm(simulator.hand[0] - simulator.pose(name)[0]) < 0.075)
+        offset = hand.position - simulator.position(name)
+        return bool(norm(offset) < 0.075)
 
     hand.grip = 1.0
     yield from hand.move(lambda: ahead(0.02, 0.08), within=0.02)
@@ -334,10 +367,10 @@ def put_in_microwave(hand: Hand, name: str, region: str) -> Script:
     grasp = Grasp(turn.apply(MUG_HANDLE), np.pi / 2, 1.4, np.array([0.0, 1]))
 
     def place() -> np.ndarray:
-        return simulator.pose(region)[0] + OFFSETS["heating_region"]
+        return simulator.position(region) + OFFSETS["heating_region"]
 
     def goal(ahead: float = 0.0) -> np.ndarray:
-        return place() + simulator.hand[0] - simulator.pose(name)[0] - [0, ahead, 0]
+        return place() + hand.position - simulator.position(name) - [0, ahead, 0]
 
     def held() -> bool:
         return hand.holds(name)
@@ -346,8 +379,8 @@ def put_in_microwave(hand: Hand, name: str, region: str) -> Script:
     yield from hand.move(lambda: goal(0.2), within=0.02, given=held)
     if not (yield from hand.move(goal, given=held)):
         return False
-    yield from hand.set_grip(-1.0, simulator.hand[0])
-    back = simulator.hand[0] - [0, 0.12, 0]
+    yield from hand.set_grip(-1.0, hand.position)
+    back = hand.position - [0, 0.12, 0]
     return (yield from hand.move(lambda: back, within=0.02))
 
 
@@ -356,11 +389,12 @@ def close_microwave(hand: Hand, name: str) -> Script:
     door = hand.simulator.data.body(f"{name}_microdoorroot")
 
     def outside(distance: float, height: float = 0.0) -> np.ndarray:
-        return door.xpos + door.xmat.reshape(3, 3) @ [DOOR[0], -distance, DOOR[1] + height]
+        point = [DOOR[0], -distance, DOOR[1] + height]
+        return door.xpos + door.xmat.reshape(3, 3) @ point
 
     hand.grip = 1.0
     hand.turn = lambda at: DOWN
-    yield from hand.over(lambda: outside(0.1), outside(0, 0.15)[2], lambda: True)
+    yield from hand.over(lambda: outside(0.1), outside(0, 0.15)[2])
     yield from hand.move(lambda: outside(0.1), within=0.02)
     return (yield from hand.move(lambda: outside(-0.06), steps=150))
 
@@ -372,33 +406,39 @@ def in_front(hand: Hand, region: str, yaw: float, lean: float) -> Callable[..., 
     drawer = simulator.data.body(f"{cabinet}_cabinet_{level}")
     turn = Rotation.from_quat(simulator.pose(cabinet)[1], scalar_first=True)
     front = turn.apply([0, -1.0, 0])
-    hand.turn = functools.partial(hand.scene.turn, Grasp(np.zeros(3), yaw, lean, -front[:2]))
-    return lambda ahead=0.0: drawer.xpos + turn.apply(HANDLES[level]) + ahead * front
+    grasp = Grasp(np.zeros(3), yaw, lean, -front[:2])
+    hand.turn = partial(hand.scene.turn, grasp)
+
+    def handle(ahead: float = 0.0) -> np.ndarray:
+        return drawer.xpos + turn.apply(HANDLES[level]) + ahead * front
+
+    return handle
 
 
 def open_drawer(hand: Hand, region: str) -> Script:
     """Opens the drawer with this region: grasps the handle from the front, pulls, and lets it go."""
-    simulator = hand.simulator
     handle = in_front(hand, region, 0.0, 1.4)
 
     def holds() -> bool:
-        return bool(np.linalg.norm(handle() - simulator.hand[0]) < 0.03)
+        offset = handle() - hand.position
+        return bool(norm(offset) < 0.03)
 
     yield from hand.move(lambda: handle(0.1), within=0.02)
     yield from hand.move(handle, steps=30)
     yield from hand.set_grip(1.0, handle())
     pulled = handle(0.2)
     yield from hand.move(lambda: pulled, steps=40, given=holds)
-    yield from hand.set_grip(-1.0, simulator.hand[0], 5)
+    yield from hand.set_grip(-1.0, hand.position, 5)
     return (yield from hand.move(lambda: handle(0.1), within=0.02))
 
 
 def close_drawer(hand: Hand, region: str) -> Script:
     """Closes the drawer with this region: pushes its handle with closed fingers."""
-    yaw = np.copysign(np.pi / 2, -hand.simulator.hand[1][0, 0])  # the one that needs the smaller turn
+    _, rotation = hand.simulator.hand
+    yaw = np.copysign(np.pi / 2, -rotation[0, 0])  # the one that needs the smaller turn
     handle = in_front(hand, region, yaw, 0.8)
     hand.grip = 1.0
-    yield from hand.over(lambda: handle(0.06), handle()[2] + 0.15, lambda: True)
+    yield from hand.over(lambda: handle(0.06), handle()[2] + 0.15)
     yield from hand.move(lambda: handle(0.06), within=0.02)
     return (yield from hand.move(lambda: handle(-0.05), steps=80))
 
@@ -409,8 +449,9 @@ def turn_knob(hand: Hand, name: str) -> Script:
     knob = simulator.data.body(f"{name}_button").xpos + [0, 0, KNOB]
 
     def turn_by(angle: float) -> None:
-        grasp = Grasp(np.zeros(3), simulator.opening(name) + angle, 0.0)
-        hand.turn = functools.partial(hand.scene.turn, grasp)
+        yaw = simulator.opening(name) + angle
+        grasp = Grasp(np.zeros(3), yaw, 0.0)
+        hand.turn = partial(hand.scene.turn, grasp)
 
     turn_by(0.0)
     yield from hand.move(lambda: knob + [0, 0, 0.08])

@@ -7,8 +7,6 @@ dataset, so the content does not depend on how many processes worked on it.
 
 from __future__ import annotations
 
-import collections
-import concurrent.futures
 import importlib.metadata
 import itertools
 import json
@@ -18,7 +16,9 @@ import os
 import shutil
 import signal
 import warnings
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -28,7 +28,7 @@ from typing import Annotated, Any
 import draccus
 import numpy as np
 
-from accerl_lerobot import errors, guardian
+from accerl_lerobot import guardian
 from accerl_lerobot.config.machine import SIMULATOR_GIB, memory_gib
 from accerl_lerobot.config.parsing import imported
 from accerl_lerobot.config.ranges import Range, Section, Share
@@ -37,7 +37,15 @@ from accerl_lerobot.envs import make_environment
 from accerl_lerobot.envs.base import ChunkResult, EnvConfig, Environment, EnvironmentSpec
 from accerl_lerobot.envs.metaworld import MetaWorld, expert_name
 from accerl_lerobot.envs.simulated import SimulatedEnvironment
-from accerl_lerobot.errors import InputError, check_absent, expanded
+from accerl_lerobot.errors import (
+    ChildWarning,
+    InputError,
+    check_absent,
+    collect_warnings,
+    collected_warnings,
+    expanded,
+    show_warnings,
+)
 from accerl_lerobot.experience import ENVIRONMENT_STATE, REWARD, SUCCESS, Observation
 from accerl_lerobot.seeds import demo_seed
 
@@ -124,18 +132,23 @@ def disturbed(
     """
     rng = np.random.default_rng((seed, 1))
     push_rng = np.random.default_rng((seed, 2))
-    low, high = spec.action_low, spec.action_high
+    low = spec.action_low
+    high = spec.action_high
     direction = push_rng.standard_normal(spec.action_dim)
     pushed = push * push_rng.random() * direction / np.linalg.norm(direction)
-    drift_from = int(rng.integers(0, _DRIFT_FROM)) if fail else spec.max_steps
+    drift_from = spec.max_steps
+    if fail:
+        drift_from = int(rng.integers(0, _DRIFT_FROM))
     drift: np.ndarray = np.zeros(spec.action_dim)
     for step in itertools.count():
         if step < drift_from:
-            wanted = np.clip(np.asarray(expert(), np.float64), low, high) + pushed
+            action = np.asarray(expert(), np.float64)
+            wanted = np.clip(action, low, high) + pushed
         else:
             drift = _DRIFT_MEMORY * drift + _DRIFT_SCALE * rng.standard_normal(len(drift))
             wanted = np.clip(drift, low, high)
-        yield np.clip(wanted + noise * rng.standard_normal(len(wanted)), low, high).astype(np.float32)
+        wanted = wanted + noise * rng.standard_normal(len(wanted))
+        yield np.clip(wanted, low, high).astype(np.float32)
 
 
 def metaworld_expert(environment: Environment, task: str) -> Expert:
@@ -182,15 +195,11 @@ def appearing(root: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def simulators(
-    processes: int, start: Callable[..., None], *arguments: Any
-) -> Iterator[concurrent.futures.ProcessPoolExecutor]:
+def simulators(processes: int, start: Callable[..., None], *arguments: Any) -> Iterator[ProcessPoolExecutor]:
     """So many processes, each made ready by `start`; an error inside ends them at once."""
     context = multiprocessing.get_context("spawn")
     before = set(multiprocessing.active_children())
-    with concurrent.futures.ProcessPoolExecutor(
-        processes, context, initializer=_ready, initargs=(start, *arguments)
-    ) as pool:
+    with ProcessPoolExecutor(processes, context, initializer=_ready, initargs=(start, *arguments)) as pool:
         try:
             yield pool
         except BaseException:
@@ -202,14 +211,14 @@ def simulators(
 def _ready(start: Callable[..., None], *arguments: Any) -> None:
     """Makes a process ready; Ctrl-C on the terminal is for its parent, which ends it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    errors.collect_warnings()
+    collect_warnings()
     start(*arguments)
 
 
 def _with_warnings[Item, Result](
     work: Callable[[Item], Result], item: Item
-) -> tuple[Result, list[errors.ChildWarning]]:
-    return work(item), errors.collected_warnings()
+) -> tuple[Result, list[ChildWarning]]:
+    return work(item), collected_warnings()
 
 
 @contextmanager
@@ -221,7 +230,8 @@ def simulated[Item, Result](
     Few finished ones wait in memory.
     """
     # Each process comes to hold a simulator of every task.
-    each = len(getattr(env_config, "tasks", ("one",))) * SIMULATOR_GIB.get(env_config.type, 0.1)
+    tasks = getattr(env_config, "tasks", ("one",))
+    each = len(tasks) * SIMULATOR_GIB.get(env_config.type, 0.1)
     fitting = (memory_gib("MemAvailable") or math.inf) / each
     cores = len(os.sched_getaffinity(0))
     processes = max(1, int(min(cores, MOST_PROCESSES, len(items), fitting)))
@@ -229,11 +239,11 @@ def simulated[Item, Result](
 
         def finished(work: Any) -> Result:
             result, warned = work.result()
-            errors.show_warnings(warned)
+            show_warnings(warned)
             return result
 
         def results() -> Iterator[Result]:
-            waiting: collections.deque[Any] = collections.deque()
+            waiting: deque[Any] = deque()
             for item in items:
                 waiting.append(pool.submit(_with_warnings, work, item))
                 if len(waiting) > 2 * processes:
@@ -404,7 +414,8 @@ def record_one(env_config: EnvConfig, config: DemosConfig, seed: int, slot: int)
         episode = played(environment, task, own_seed, actions)
         if episode.success != fail or (config.push and not fail):
             return episode, attempt
-    hint = f"{_MAX_TRIES} tries of {task} in a row did not {'fail' if fail else 'succeed'}; lower it"
+    outcome = "fail" if fail else "succeed"
+    hint = f"{_MAX_TRIES} tries of {task} in a row did not {outcome}; lower it"
     hint += ", or allow more env steps (env.max_steps)"
     if fail:
         raise InputError("demos.failure_share", share, hint)

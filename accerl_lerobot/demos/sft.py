@@ -41,7 +41,8 @@ PROGRESS = re.compile(
 """LeRobot's lines such as ``Training: 4%| | 1200/30000 [01:02<…]INFO … step:1K … loss:0.512 …``."""
 ANSWER = "accerl hands over: "
 """Begins the last line of a trainer; warnings and the last exception follow, as JSON."""
-LOG_EVERY, WARMUP_STEPS = 25, 20
+LOG_EVERY = 25  # steps
+WARMUP_STEPS = 20
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,7 +116,9 @@ def sft_command(
     }
     policy |= {"device": device, "push_to_hub": False}
     policy |= {name: value for name, value in preset.items() if name in known}
-    root = None if dataset.root is None else str(expanded(dataset.root, "dataset.root"))
+    root = dataset.root
+    if root is not None:
+        root = str(expanded(root, "dataset.root"))
     data = {"repo_id": dataset.repo_id, "root": root, "revision": dataset.revision, "episodes": episodes}
     flags = {f"policy.{name}": value for name, value in policy.items()}
     flags |= {f"dataset.{name}": value for name, value in data.items() if value is not None}

@@ -140,7 +140,9 @@ class EpisodeEnvironment(Environment):
     @property
     def late(self) -> float:
         """Share of the time limit gone."""
-        return self._steps / self.spec.max_steps if self._steps else 0.0
+        if self._steps == 0:
+            return 0.0
+        return self._steps / self.spec.max_steps
 
     def reset(self, seed: int, task: str) -> Observation:
         if task not in self.spec.tasks:
@@ -163,8 +165,10 @@ class EpisodeEnvironment(Environment):
             step = self._step(action)
             self._steps += 1
             succeeded = step.success and step.finite
-            first = succeeded and not self._success
-            rewards.append(float(first) if step.reward is None else step.reward)
+            reward = step.reward
+            if reward is None:
+                reward = float(succeeded and not self._success)
+            rewards.append(reward)
             self._success |= succeeded
             terminated = step.ended and step.finite
             limit = self._steps >= self.spec.max_steps
@@ -202,8 +206,7 @@ class EnvConfig(Section, draccus.ChoiceRegistry, section="env"):
     """The field that names the environment."""
     expert: ClassVar[str | None] = None
     """``module:function`` of the scripted expert for demonstrations: given an environment and a task, it
-    returns a
-    function whose every call is the action (A,) for the state that the environment is in."""
+    returns a function whose every call is the action (A,) for the state that the environment is in."""
 
     discover_packages_path: str | None = field(
         default=None, metadata={"registers": True, "prepares": start_graphics}
@@ -240,15 +243,20 @@ def names(text: str) -> tuple[str, ...]:
 
 def expand_tasks(text: str, groups: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
     """Expands names of tasks and groups, separated by commas; keeps the order, drops repetitions."""
-    known = dict(groups) | {task: (task,) for group in groups.values() for task in group}
+    known = dict(groups)
+    for group in groups.values():
+        known |= {task: (task,) for task in group}
     found: dict[str, None] = {}
-    for name in (part.strip() for part in text.split(",")):
+    for part in text.split(","):
+        name = part.strip()
         if name not in known:
+            hint = f"{name!r} is no task; "
             close = difflib.get_close_matches(name, known, cutoff=0.4)
-            near = f"did you mean {' or '.join(close)}? " if close else ""
+            if close:
+                hint += f"did you mean {' or '.join(close)}? "
             example = next(iter(groups.values()))[0]
-            hint = f"{near}use names such as {example}, separated by commas, or of {', '.join(groups)}"
-            raise InputError("env.task", text, f"{name!r} is no task; {hint}")
+            hint += f"use names such as {example}, separated by commas, or of {', '.join(groups)}"
+            raise InputError("env.task", text, hint)
         found |= dict.fromkeys(known[name])
     return tuple(found)
 
@@ -289,7 +297,9 @@ class SuiteConfig(EnvConfig):
 
     @property
     def state_size(self) -> int:
-        return self.STATE_NUMBERS + 1 if self.environment_state else 0
+        if not self.environment_state:
+            return 0
+        return self.STATE_NUMBERS + 1
 
 
 def unit_spec(
@@ -375,14 +385,21 @@ class SuiteEnvironment(EpisodeEnvironment):
         return observation
 
 
-def lerobot_eval_arguments(env: Mapping[str, Any]) -> list[str]:
-    """``--env.…`` and seed of stock ``lerobot-eval`` for an environment; none if LeRobot cannot have it."""
+def lerobot_eval_arguments(env: Mapping[str, Any], renames: Mapping[str, str]) -> list[str]:
+    """``--env.…``, names and seed of stock ``lerobot-eval``; none if LeRobot cannot have the environment.
+
+    `renames` is the run's ``policy.rename_map``.
+    """
     kind = env.get("type")
     fields = dict[str, Any]()
     if kind == "lerobot" and env.get("success", IS_SUCCESS) == IS_SUCCESS:  # the only key that LeRobot reads
         fields = {"type": env.get("name"), **(env.get("kwargs") or {})}
         if env.get("max_steps"):
             fields["episode_length"] = env["max_steps"]
+        camera = env.get("camera")
+        if camera:  # the name that we give to LeRobot's lone image
+            image = f"observation.images.{camera}"
+            renames = {**renames, "observation.image": renames.get(image, image)}
     elif kind != "lerobot" and kind in EnvConfig.get_known_choices():
         # Only what differs from the defaults, as the run wrote them.
         usual = encoded_defaults(EnvConfig.get_choice_class(kind))
@@ -393,8 +410,11 @@ def lerobot_eval_arguments(env: Mapping[str, Any]) -> list[str]:
             fields["environment.discover_packages_path"] = given["discover_packages_path"]
     if not fields:
         return []
-    seed = f"--seed={EVAL_SEEDS.start}"  # the starts of our evaluation of a run with seed 0
-    return [*(f"--env.{name}={shlex.quote(str(value))}" for name, value in fields.items()), seed]
+    arguments = [f"--env.{name}={shlex.quote(str(value))}" for name, value in fields.items()]
+    if renames:
+        arguments.append(f"--rename_map={shlex.quote(json.dumps(renames))}")
+    arguments.append(f"--seed={EVAL_SEEDS.start}")  # the starts of our evaluation of a run with seed 0
+    return arguments
 
 
 class WrappedEnvironment(Environment):
@@ -442,15 +462,16 @@ class HistoryEnvironment(WrappedEnvironment):
         parts = [actions[:unseen], *actions[unseen:, None]]
         results: list[ChunkResult] = []
         for part in parts:
-            results.append(self._environment.step_chunk(part))
-            self._seen.append(results[-1].observation)
-            if results[-1].done:
+            result = self._environment.step_chunk(part)
+            results.append(result)
+            self._seen.append(result.observation)
+            if result.done:
                 break
         if results[0].steps > 1:  # some were passed unseen; `length` follow, unless it was cut
             self._seen.extend([self._seen[-1]] * (self._length - len(results)))
-        rewards = np.concatenate([result.rewards for result in results])
+        rewards = np.concatenate([each.rewards for each in results])
         self._left -= len(rewards)
-        return replace(results[-1], observation=self._observation(), rewards=rewards)
+        return replace(result, observation=self._observation(), rewards=rewards)
 
     def _observation(self) -> Observation:
         observation = dict(self._seen[-1])

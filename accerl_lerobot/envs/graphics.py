@@ -42,7 +42,9 @@ def choose_backend() -> str | None:
     """
     if not _headless():
         return None
-    order = ("egl", "osmesa") if any(Path(node).exists() for node in _GPU_NODES) else ("osmesa", "egl")
+    order = ["osmesa", "egl"]
+    if any(Path(node).exists() for node in _GPU_NODES):
+        order.reverse()
     for backend in order:
         for library in _LIBRARIES[backend]:
             with contextlib.suppress(OSError):

@@ -42,7 +42,8 @@ RETURNS = {
     "step": ("observation", "reward", "terminated", "truncated", "info"),
 }
 """Values that Gymnasium's methods return."""
-_STATE, _IMAGE = "observation.state", "observation.image"
+_STATE = "observation.state"
+_IMAGE = "observation.image"
 _PINNED = re.compile(r"[\w.-]+/[\w.-]+@[0-9a-f]{40}(:\w[\w./-]*\.py)?", re.ASCII)
 
 
@@ -224,8 +225,9 @@ class GymEnvironment(GymnasiumEnvironment):
 
     def _look(self, observation: Observation) -> EnvironmentSpec:
         config = self.config
-        metadata = self.environments[self.config.id].metadata
-        return self._spec(observation, config.fps or int(metadata.get("render_fps") or FPS), [config.task])
+        metadata = self.environments[config.id].metadata
+        fps = config.fps or int(metadata.get("render_fps") or FPS)
+        return self._spec(observation, fps, [config.task])
 
     def _observe(self) -> Observation:
         raw = flattened(self._raw)
@@ -233,24 +235,33 @@ class GymEnvironment(GymnasiumEnvironment):
         state = self._vector("state", raw, config.state or ("",))
         observation: Observation = {TASK: config.task, _STATE: state}
         for camera, key in config.images.items():
-            rendered = self.environments[config.id].render() if key == RENDER else _part(raw, key, "images")
-            picture = np.array(rendered)
+            if key == RENDER:
+                picture = np.array(self.environments[config.id].render())
+            else:
+                picture = np.array(_part(raw, key, "images"))
             if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8:
                 hint = f"{key} is {picture.dtype} {picture.shape}; an image is uint8 (H, W, 3)"
                 raise InputError("env.images", config.images, hint)
             size = config.image_size
-            observation[f"{_IMAGE}s.{camera}"] = resized(picture, size, size) if size else picture
-        if config.environment_state:
-            keys = config.environment_state
-            numbers = state if keys == ("state",) else self._vector("environment_state", raw, keys)
+            if size:
+                picture = resized(picture, size, size)
+            observation[f"{_IMAGE}s.{camera}"] = picture
+        keys = config.environment_state
+        if keys:
+            numbers = state
+            if keys != ("state",):
+                numbers = self._vector("environment_state", raw, keys)
             observation[ENVIRONMENT_STATE] = np.append(numbers, np.float32(self.late))
         return observation
 
     def _vector(self, name: str, raw: dict[str, Any], keys: tuple[str, ...]) -> np.ndarray:
-        parts = [_part(raw, key, name) for key in keys]
-        if any(part.dtype.kind not in "fiub" for part in parts):
-            raise InputError(f"env.{name}", list(keys), "name keys with numbers")
-        return np.concatenate([part.astype(np.float32).ravel() for part in parts])
+        parts = []
+        for key in keys:
+            part = _part(raw, key, name)
+            if part.dtype.kind not in "fiub":
+                raise InputError(f"env.{name}", list(keys), "name keys with numbers")
+            parts.append(part.astype(np.float32).ravel())
+        return np.concatenate(parts)
 
 
 @EnvConfig.register_subclass("lerobot")
@@ -300,9 +311,11 @@ class LeRobotEnvironment(GymnasiumEnvironment):
                 raise InputError("env.name", config.name, hint)
         kind = LeRobotConfig.get_choice_class(config.name)
         names = kind.__dataclass_fields__
-        limit = {"episode_length": config.max_steps} if config.max_steps and "episode_length" in names else {}
+        settings = dict(config.kwargs)
+        if config.max_steps and "episode_length" in names:
+            settings["episode_length"] = config.max_steps
         try:
-            self._settings = kind(**config.kwargs | limit)
+            self._settings = kind(**settings)
         except (TypeError, ValueError) as error:
             hint = f"{error}; LeRobot's {config.name} has the fields {', '.join(names)}"
             raise InputError("env.kwargs", config.kwargs, hint) from error
@@ -316,8 +329,8 @@ class LeRobotEnvironment(GymnasiumEnvironment):
     def _processed(self, action: np.ndarray) -> np.ndarray:
         import torch
 
-        processed: np.ndarray = self._after({"action": torch.from_numpy(action[None])})["action"].numpy()
-        return processed[0]
+        processed = self._after({"action": torch.from_numpy(action[None])})
+        return np.asarray(processed["action"][0])
 
     def close(self) -> None:
         for suite in self._vectors.values():
@@ -344,16 +357,21 @@ class LeRobotEnvironment(GymnasiumEnvironment):
             if key == _STATE:
                 observation[key] = value[0].numpy().astype(np.float32)
             elif key.startswith(_IMAGE):
-                renamed = key == _IMAGE and self.config.camera
-                name = f"{_IMAGE}s.{self.config.camera}" if renamed else key
+                name = key
+                if key == _IMAGE and self.config.camera:
+                    name = f"{_IMAGE}s.{self.config.camera}"
                 # LeRobot has divided by 255; rounding brings every one of the 256 values back.
-                observation[name] = (value[0].permute(1, 2, 0) * 255).round().byte().numpy().copy()
+                image = (value[0].permute(1, 2, 0) * 255).round().byte()
+                observation[name] = image.numpy().copy()
         return observation
 
     def _instruction(self, task: str) -> str:
         env = self.environments[task].unwrapped
-        texts = [getattr(env, name, None) for name in ("task_description", "task")]
-        return next((text for text in texts if text and isinstance(text, str)), self.config.task)
+        for name in ("task_description", "task"):
+            text = getattr(env, name, None)
+            if text and isinstance(text, str):
+                return text
+        return self.config.task
 
 
 def _check_hub(config: LeRobotEnvConfig, hub_path: str | None) -> None:
@@ -375,7 +393,8 @@ def _single_envs(vectors: dict[str, dict[int, Any]]) -> dict[str, Any]:
     for suite, tasks in vectors.items():
         for number, vector in tasks.items():
             alone = len(vectors) == len(tasks) == 1
-            found[suite if alone else f"{suite}/{number}"] = vector.envs[0]
+            name = suite if alone else f"{suite}/{number}"
+            found[name] = vector.envs[0]
     return found
 
 
@@ -384,7 +403,9 @@ def _batched(raw: Any) -> Any:
     if isinstance(raw, dict):
         return {key: _batched(value) for key, value in raw.items()}
     array = np.asarray(raw)
-    return array[None] if array.dtype.kind in "fiub" else (raw,)
+    if array.dtype.kind not in "fiub":
+        return (raw,)
+    return array[None]
 
 
 def episode_limit(env: Any) -> int:
@@ -420,7 +441,8 @@ def flattened(raw: Any, prefix: str = "") -> dict[str, Any]:
         return {prefix: raw}
     flat: dict[str, Any] = {}
     for key, part in raw.items():
-        flat |= flattened(part, f"{prefix}.{key}" if prefix else str(key))
+        name = f"{prefix}.{key}" if prefix else str(key)
+        flat |= flattened(part, name)
     return flat
 
 

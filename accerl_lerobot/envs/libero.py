@@ -58,7 +58,11 @@ def _names() -> dict[str, list[str]]:
 @functools.cache
 def suites() -> dict[str, tuple[str, ...]]:
     """Tasks of each suite, ``suite/number``."""
-    return {suite: tuple(f"{suite}/{i}" for i in range(len(_names()[suite]))) for suite in LIMITS}
+    tasks = {}
+    for suite in LIMITS:
+        numbers = range(len(_names()[suite]))
+        tasks[suite] = tuple(f"{suite}/{number}" for number in numbers)
+    return tasks
 
 
 def task_file(task: str, folder: str, suffix: str) -> Path:
@@ -76,8 +80,9 @@ def instruction(task: str) -> str:
     """Text of a task, as LeRobot's environment and datasets have it."""
     name = bddl_file(task).stem
     _, scene, rest = name.partition("SCENE")
-    words = rest.partition("_")[2] if scene else name  # the scene has a number
-    return words.replace("_", " ")
+    if scene:  # it has a number
+        _, _, name = rest.partition("_")
+    return name.replace("_", " ")
 
 
 def recorded_states(task: str) -> np.ndarray:
@@ -90,7 +95,9 @@ def recorded_states(task: str) -> np.ndarray:
         opcodes = pickletools.genops(archive.read("archive/data.pkl"))
         texts = [argument for _, argument, _ in opcodes if isinstance(argument, str | bytes)]
     numbers = max(texts, key=len)
-    return np.frombuffer(numbers.encode("latin-1") if isinstance(numbers, str) else numbers, "<f8")
+    if isinstance(numbers, str):
+        numbers = numbers.encode("latin-1")
+    return np.frombuffer(numbers, "<f8")
 
 
 def assets_folder(given: str) -> Path:

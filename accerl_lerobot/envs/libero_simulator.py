@@ -96,10 +96,13 @@ class Simulator:
     def __init__(self, task: str, rendering: Literal["stock", "fast"], assets: str) -> None:
         self._mujoco = import_mujoco()
         self.env, self._bodies = _build(task, assets)
-        self.model, self.data = self.env.sim.model._model, self.env.sim.data._data
-        self._recorded = recorded_states(task).reshape(-1, 1 + self.model.nq + self.model.nv)
+        model = self.env.sim.model._model
+        data = self.env.sim.data._data
+        self.model = model
+        self.data = data
+        self._recorded = recorded_states(task).reshape(-1, 1 + model.nq + model.nv)
         if rendering == "fast":
-            _make_cheap(self.model)
+            _make_cheap(model)
         robot = self.env.robots[0]
         self._dofs = np.array(robot._ref_joint_vel_indexes)
         self._joints = np.array(robot._ref_joint_pos_indexes)
@@ -107,24 +110,23 @@ class Simulator:
         self._finger_dofs = np.array(robot._ref_gripper_joint_vel_indexes)
         self._motors = np.array(robot._ref_joint_actuator_indexes)
         self._grip_motors = np.array(robot._ref_joint_gripper_actuator_indexes)
-        low, high = self.model.actuator_ctrlrange[self._grip_motors].T
+        low, high = model.actuator_ctrlrange[self._grip_motors].T
         self._grip_centre = 0.5 * (high + low)
         self._grip_half = 0.5 * (high - low)
         self._site = robot.eef_site_id
-        self._hand = self.model.body(robot.robot_model.eef_name).id
-        self._mass = np.zeros((self.model.nv, self.model.nv))
-        self._jacobian = np.zeros((2, 3, self.model.nv))
+        self._hand = model.body(robot.robot_model.eef_name).id
+        self._mass = np.zeros((model.nv, model.nv))
+        self._jacobian = np.zeros((2, 3, model.nv))
         self._renderers: dict[tuple[int, int], Any] = {}
         self._visible = self._mujoco.MjvOption()
         self._visible.geomgroup[:2] = 0, 1  # visual meshes, not what collides
-        data = self.data
         self._position = data.site_xpos[self._site]
         self._rotation = data.site_xmat[self._site].reshape(3, 3)
         self._arm = Arm(
             self._jacobian, self._mass, data.qfrc_bias, data.qpos, data.qvel, self._position, self._rotation
         )  # fmt: skip
         # What is looked at: the data of the last reading of the sensors, without its velocities.
-        self._seen = self._mujoco.MjData(self.model)
+        self._seen = self._mujoco.MjData(model)
         self._fingers_seen = np.zeros(len(self._fingers))
 
     def reset(self, seed: int) -> None:
@@ -190,7 +192,8 @@ class Simulator:
             self._goal = self._new_goal(action)
         self._mujoco.mj_jacSite(self.model, self.data, *self._jacobian, self._site)
         self._mujoco.mj_fullM(self.model, self._mass, self.data.qM)
-        torques = _compiled_torques()(self._arm, Aim(*self._goal, self._rest, self._gains))
+        aim = Aim(*self._goal, self._rest, self._gains)
+        torques = _compiled_torques()(self._arm, aim)
         self.data.ctrl[self._motors] = np.clip(torques, *self._limits)
         self._grip = np.clip(self._grip + self._closing, -1.0, 1.0)
         self.data.ctrl[self._grip_motors] = self._grip_centre + self._grip_half * self._grip
@@ -199,10 +202,12 @@ class Simulator:
         """LeRobot's ``observation.state``, float32 (8,): hand's position and axis-angle, both fingers."""
         self._look()
         w, x, y, z = self._seen.xquat[self._hand].astype(np.float32)
-        w = np.clip(w, np.float32(-1), np.float32(1))
-        sine = np.sqrt(np.maximum(np.float32(1) - w * w, np.float32(0)))
-        axis = np.array([x, y, z]) / sine if sine > 1e-10 else np.zeros(3, np.float32)
-        turn = axis * (np.float32(2) * np.arccos(w))
+        w = np.clip(w, -1, 1)
+        sine = np.sqrt(np.maximum(1 - w * w, 0))
+        axis = np.zeros(3, np.float32)
+        if sine > 1e-10:
+            axis = np.array([x, y, z]) / sine
+        turn = axis * (2 * np.arccos(w))
         parts = (self._seen.site_xpos[self._site], turn, self._fingers_seen)
         return np.concatenate(parts).astype(np.float32)
 
@@ -215,15 +220,15 @@ class Simulator:
         data = self.data
         joints = self._joints
         dofs = self._dofs
-        arm = data.qpos[joints], data.qvel[dofs], data.site_xpos[self._site], data.xquat[self._hand]
-        fingers = data.qpos[self._fingers], data.qvel[self._finger_dofs]
+        arm = (data.qpos[joints], data.qvel[dofs], data.site_xpos[self._site], data.xquat[self._hand])
+        fingers = (data.qpos[self._fingers], data.qvel[self._finger_dofs])
         points = np.tile(self._position, (1 + MAX_OBJECTS, 1))
         openings = np.zeros(MAX_OBJECTS)
         for i, name in enumerate(self.env.obj_of_interest):
-            points[1 + i] = self.pose(name)[0]
+            points[1 + i] = self.position(name)
             openings[i] = self.opening(name)
-        pairs = np.triu_indices(len(points), 1)
-        vectors = (points[pairs[1]] - points[pairs[0]]).ravel()
+        first, second = np.triu_indices(len(points), 1)
+        vectors = (points[second] - points[first]).ravel()
         near = np.tanh(vectors / NEAR)
         return np.concatenate([*arm, *fingers, points[1:].ravel(), openings, vectors, near])
 
@@ -237,6 +242,10 @@ class Simulator:
         quaternion = np.zeros(4)
         self._mujoco.mju_mat2Quat(quaternion, self.data.site_xmat[site])
         return self.data.site_xpos[site].copy(), quaternion
+
+    def position(self, name: str) -> np.ndarray:
+        """Position (3,) of an object, a fixture or a region in the environment."""
+        return self.pose(name)[0]
 
     @property
     def hand(self) -> tuple[np.ndarray, np.ndarray]:
@@ -276,8 +285,11 @@ class Simulator:
         from robosuite.utils.control_utils import set_goal_orientation
 
         delta = self.env.robots[0].controller.scale_action(action[:6])
-        turned = set_goal_orientation(delta[3:], self._rotation) if delta[3:].any() else self._goal[1]
-        return self._position + delta[:3], turned
+        turn = delta[3:]
+        _, rotation = self._goal
+        if turn.any():
+            rotation = set_goal_orientation(turn, self._rotation)
+        return self._position + delta[:3], rotation
 
 
 @functools.cache
@@ -304,7 +316,9 @@ def operational_space_torques(arm: Arm, aim: Aim) -> np.ndarray:
     error[:3] = aim.position - arm.position
     for k in range(3):
         error[3:] += 0.5 * np.cross(arm.rotation[:, k], aim.rotation[:, k])
-    wanted = aim.gains[0] * error - aim.gains[1] * velocity
+    stiffness = aim.gains[0]
+    damping = aim.gains[1]
+    wanted = stiffness * error - damping * velocity
     weighed = np.linalg.solve(mass, joined.T)
     inertia = np.dot(joined, weighed)  # inverse of the hand's
     free = 10.0 * (aim.rest - qpos) - 2 * np.sqrt(10.0) * qvel
@@ -398,17 +412,19 @@ def _make_cheap(model: Any) -> None:
         count = int(model.mesh_facenum[mesh])
         if count <= MAX_FACES:
             continue
-        faces = model.mesh_face[at : at + count]
+        rows = slice(at, at + count)
+        faces = model.mesh_face[rows]
         first = int(model.mesh_vertadr[mesh])
         vertices = model.mesh_vert[first : first + int(model.mesh_vertnum[mesh])]
         kept, merged = _coarser_once(vertices.tobytes(), faces.tobytes())
-        corners = model.mesh_facetexcoord[at : at + count][kept] + model.mesh_texcoordadr[mesh]
+        corners = model.mesh_facetexcoord[rows][kept] + model.mesh_texcoordadr[mesh]
         if model.mesh_texcoordnum[mesh] == 3 * count:  # each corner has its own place in the texture
             places = model.mesh_texcoord[corners]
             model.mesh_texcoord[corners] = moved_texture(vertices[faces[kept]], vertices[merged], places)
+        left = slice(at, at + len(kept))
         for array in (model.mesh_facenormal, model.mesh_facetexcoord):
-            array[at : at + len(kept)] = array[at : at + count][kept]
-        model.mesh_face[at : at + len(kept)] = merged
+            array[left] = array[rows][kept]
+        model.mesh_face[left] = merged
         model.mesh_facenum[mesh] = len(kept)
 
 
@@ -416,7 +432,8 @@ def _make_cheap(model: Any) -> None:
 def _coarser_once(vertices: bytes, faces: bytes) -> tuple[np.ndarray, np.ndarray]:
     """`coarser` of a mesh, computed once in a process: the robot and most objects are in many scenes."""
     points = np.frombuffer(vertices, np.float32).reshape(-1, 3)
-    return coarser(points, np.frombuffer(faces, np.int32).reshape(-1, 3), MAX_FACES)
+    corners = np.frombuffer(faces, np.int32).reshape(-1, 3)
+    return coarser(points, corners, MAX_FACES)
 
 
 def coarser(vertices: np.ndarray, faces: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
@@ -428,12 +445,15 @@ def coarser(vertices: np.ndarray, faces: np.ndarray, most: int) -> tuple[np.ndar
     """
     extent = float(np.ptp(vertices, axis=0).max())
     for cells in (96, 64, 48, 36, 27, 20, 15, 11, 8, 6):
-        grid = np.floor((vertices - vertices.min(0)) / (extent / cells)).astype(np.int64)
+        side = extent / cells
+        grid = np.floor((vertices - vertices.min(0)) / side).astype(np.int64)
         _, cell = np.unique(grid @ np.array([1, 1000, 1000000]), return_inverse=True)
         counts = np.bincount(cell)
         means = np.stack([np.bincount(cell, axis) / counts for axis in vertices.T], 1)
-        order = np.lexsort((((vertices - means[cell]) ** 2).sum(1), cell))
-        middle = order[np.searchsorted(cell[order], np.arange(len(counts)))]
+        distance = ((vertices - means[cell]) ** 2).sum(1)
+        order = np.lexsort((distance, cell))
+        nearest = np.searchsorted(cell[order], np.arange(len(counts)))
+        middle = order[nearest]
         merged = middle[cell[faces]]
         a, b, c = merged.T
         kept = np.flatnonzero((a != b) & (b != c) & (c != a))
@@ -447,6 +467,9 @@ def moved_texture(before: np.ndarray, after: np.ndarray, places: np.ndarray) -> 
 
     `before` and `after` are the corners, (f, 3, 3); each face's own affine map is continued.
     """
-    edges = (before[:, 1:] - before[:, :1]).astype(np.float64)
-    slope = np.linalg.pinv(edges, rcond=1e-4) @ (places[:, 1:] - places[:, :1])
-    return np.clip(places[:, :1] + (after - before[:, :1]) @ slope, places.min(), places.max())
+    corner = before[:, :1]
+    place = places[:, :1]
+    edges = (before[:, 1:] - corner).astype(np.float64)
+    slope = np.linalg.pinv(edges, rcond=1e-4) @ (places[:, 1:] - place)
+    moved = place + (after - corner) @ slope
+    return np.clip(moved, places.min(), places.max())

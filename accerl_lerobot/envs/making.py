@@ -67,7 +67,9 @@ def make_environment(
         raise environment_error(config, error) from error
     if reward_model is not None and reward_model.path is not None:
         environment = JudgedEnvironment(environment, load_judge(reward_model))
-    return environment if history == 1 else HistoryEnvironment(environment, history)
+    if history > 1:
+        return HistoryEnvironment(environment, history)
+    return environment
 
 
 def environment_error(config: EnvConfig, error: Exception) -> InputError:
@@ -126,7 +128,8 @@ def load_judge(config: RewardModelConfig) -> Callable[[Observation], bool]:
     def succeeded(observation: Observation) -> bool:
         batch: dict[str, Any] = {TASK: [observation[TASK]]}
         for name, feature in settings.input_features.items():
-            value = torch.from_numpy(np.asarray(observation.get(name, np.zeros(0))))[None].float()
+            array = np.asarray(observation.get(name, np.zeros(0)))
+            value = torch.from_numpy(array)[None].float()
             if value.dim() == 4:
                 value = value.permute(0, 3, 1, 2) / 255
             shape = tuple(value.shape[1:])

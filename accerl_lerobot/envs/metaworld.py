@@ -85,9 +85,9 @@ class ShiftConfig(Section, section="env.shift"):
         model.geom_friction[:, 0] *= self.friction
         if self.start_range != 1:
             space = simulator._random_reset_space
-            centre, half = (space.high + space.low) / 2, (space.high - space.low) / 2
-            low, high = centre - self.start_range * half, centre + self.start_range * half
-            simulator._random_reset_space = Box(low, high, dtype=space.dtype)
+            centre = (space.high + space.low) / 2
+            half = self.start_range * ((space.high - space.low) / 2)
+            simulator._random_reset_space = Box(centre - half, centre + half, dtype=space.dtype)
 
 
 STATE_DIM = 4
@@ -152,7 +152,8 @@ class Simulator:
         import_mujoco()
         from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 
-        self.env = env = ALL_V3_ENVIRONMENTS[task]()
+        env = ALL_V3_ENVIRONMENTS[task]()
+        self.env = env
         # What `set_task` with a task of the MT1 benchmark does, without first sampling its 50 goals: the goal
         # is visible in the raw observation, and `seed` decides where things are.
         env._partially_observable = False
@@ -198,8 +199,9 @@ class Simulator:
         renderer = self._renderers[height, width]
         renderer.update_scene(self.env.data, camera=camera)
         image: np.ndarray = renderer.render()
-        # corner2 hangs upside down in MetaWorld's scene; LeRobot turns it, and so do its datasets.
-        return np.ascontiguousarray(image[::-1, ::-1]) if camera == "corner2" else image
+        if camera == "corner2":  # hangs upside down in MetaWorld's scene; LeRobot and its datasets turn it
+            return np.ascontiguousarray(image[::-1, ::-1])
+        return image
 
     def close(self) -> None:
         for renderer in self._renderers.values():
@@ -214,15 +216,20 @@ def touching_object(sim: Any, geom: int) -> bool:
     """
     contact = sim.data.contact
     force = sim.data.efc_force
-    pads = (sim.data.geom(name).id for name in ("leftpad_geom", "rightpad_geom"))
     of_object = (contact.geom == geom).any(1)
-    pressing = (of_object & (contact.geom == pad).any(1) for pad in pads)
-    return all(force[contact.efc_address[which]].sum() > 0 for which in pressing)
+    for name in ("leftpad_geom", "rightpad_geom"):
+        pad = sim.data.geom(name).id
+        pressing = of_object & (contact.geom == pad).any(1)
+        if not force[contact.efc_address[pressing]].sum() > 0:
+            return False
+    return True
 
 
 def draw_fast(model: Any) -> None:
     """Has MuJoCo draw no shadows and reflections, and without multisampling."""
-    model.vis.quality.offsamples = model.vis.quality.shadowsize = 0
+    quality = model.vis.quality
+    quality.offsamples = 0
+    quality.shadowsize = 0
     model.light_castshadow[:] = 0
     model.mat_reflectance[:] = 0
 

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-import collections
+from collections import deque
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -15,7 +15,8 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Observation
 
 CAMERA = "front"
-ACTION_DIM, STATE_DIM = 2, 4
+ACTION_DIM = 2
+STATE_DIM = 4
 INSTRUCTIONS = {"match": "Match the target", "mirror": "Mirror the target"}
 _SIGN = {"match": 1.0, "mirror": -1.0}
 _REACH = 0.8
@@ -51,7 +52,9 @@ class SimulatedConfig(EnvConfig):
 
     @property
     def state_size(self) -> int:
-        return STATE_DIM + 1 if self.environment_state else 0
+        if not self.environment_state:
+            return 0
+        return STATE_DIM + 1
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -74,7 +77,7 @@ class SimulatedEnvironment(EpisodeEnvironment):
         image = f"observation.images.{CAMERA}"
         self.spec = unit_spec(config, [image], INSTRUCTIONS.__getitem__, STATE_DIM, ACTION_DIM, fps=80)
         self._target: np.ndarray = np.zeros(ACTION_DIM, np.float32)
-        self._recent: collections.deque[np.ndarray] = collections.deque(maxlen=config.hold)
+        self._recent: deque[np.ndarray] = deque(maxlen=config.hold)
 
     @property
     def solution(self) -> np.ndarray:
@@ -90,8 +93,9 @@ class SimulatedEnvironment(EpisodeEnvironment):
         self._recent.append(action)
         distance = float(np.abs(self._mean() - self.solution).max())
         success = len(self._recent) == self.config.hold and distance <= self.config.tolerance
-        dense = self.config.reward == "dense"
-        return Step(success=success, ended=success and not dense, reward=1.0 - distance if dense else None)
+        if self.config.reward == "dense":
+            return Step(success=success, ended=False, reward=1.0 - distance)
+        return Step(success=success, ended=success)
 
     def render(self, height: int, width: int) -> np.ndarray:
         image = np.full((height, width, 3), 40, np.uint8)
@@ -100,7 +104,8 @@ class SimulatedEnvironment(EpisodeEnvironment):
         for channel, point in ((1, self._target), (0, self._mean())):
             row, column = np.rint((point + 1.0) / 2 * last).astype(int)  # −1 … 1 are the image's edges
             rows = slice(max(0, row - radius), row + radius + 1)
-            image[rows, max(0, column - radius) : column + radius + 1, channel] = 255
+            columns = slice(max(0, column - radius), column + radius + 1)
+            image[rows, columns, channel] = 255
         return image
 
     def _mean(self) -> np.ndarray:

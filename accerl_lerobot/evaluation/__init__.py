@@ -59,7 +59,8 @@ class Rate:
             raise ValueError(f"{self.successes} successes in {self.n} episodes")
         if self.n == 0:
             return Interval(0.0, 1.0)
-        return Interval(*map(float, binomtest(self.successes, self.n).proportion_ci(method="wilson")))
+        interval = binomtest(self.successes, self.n).proportion_ci(method="wilson")
+        return Interval(float(interval.low), float(interval.high))
 
     def __str__(self) -> str:
         if self.n == 0:
@@ -75,8 +76,10 @@ def rate_of(results: Sequence[EpisodeResult]) -> Rate:
 
 def by_task(results: Sequence[EpisodeResult]) -> dict[str, list[EpisodeResult]]:
     """Task → its episodes, sorted by task."""
-    tasks = sorted({result.plan.task for result in results})
-    return {task: [result for result in results if result.plan.task == task] for task in tasks}
+    episodes: dict[str, list[EpisodeResult]] = {}
+    for result in sorted(results, key=lambda result: result.plan.task):
+        episodes.setdefault(result.plan.task, []).append(result)
+    return episodes
 
 
 def summarise(results: Sequence[EpisodeResult]) -> dict[str, Any]:
@@ -109,9 +112,12 @@ def notes(results: Sequence[EpisodeResult]) -> list[str]:
 def table(summary: dict[str, Any], title: str) -> Table:
     """`summarise`'s numbers for the terminal."""
     out = Table("task", "success [95 % Wilson]", title=title)
-    rows = summary["tasks"] | ({"all": summary} if len(summary["tasks"]) > 1 else {})
+    rows = dict(summary["tasks"])
+    if len(rows) > 1:
+        rows["all"] = summary
     for name, entry in rows.items():
-        out.add_row(name, str(Rate(successes=round(entry["success"] * entry["n"]), n=entry["n"])))
+        n = entry["n"]
+        out.add_row(name, str(Rate(successes=round(entry["success"] * n), n=n)))
     return out
 
 
@@ -185,7 +191,8 @@ def success_curve(
         evaluations = sorted(evaluations, key=lambda e: e["env_steps"])
         x = [e["env_steps"] for e in evaluations]
         y = np.array([e["success"] for e in evaluations])
-        lengths = np.abs(np.array([e["ci95"] for e in evaluations]).T - y)  # below and above the rate
+        ends = np.array([e["ci95"] for e in evaluations]).T
+        lengths = np.abs(ends - y)  # below and above the rate
         label = "evaluation, 95 % Wilson"
         axes.errorbar(x, y, yerr=lengths, marker="o", capsize=3, color="C0", label=label)
         for e in (evaluations[0], evaluations[-1]):
@@ -210,9 +217,13 @@ def write_video(path: Path, rows: Sequence[Sequence[Sequence[np.ndarray]]], fps:
     )
     with writer:
         for i in range(length + fps):
-            lines = [_joined([clip[min(i, len(clip) - 1)] for clip in row], axis=1) for row in rows]
+            lines = []
+            for row in rows:
+                pictures = [clip[min(i, len(clip) - 1)] for clip in row]
+                lines.append(_joined(pictures, axis=1))
             picture = _joined(lines, axis=0)
-            writer.append_data(picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2])
+            height, width = picture.shape[:2]
+            writer.append_data(picture[: height // 2 * 2, : width // 2 * 2])
 
 
 @for_viewing("film")
@@ -224,22 +235,27 @@ def before_after(
     The frame of an episode that has ended is green for a success and red for a failure. Nothing is written
     when no episode was filmed. `before` and `after` are results of the same plans.
     """
-    halves = [
-        {result.plan.index: result for result in results if result.frames} for results in (before, after)
-    ]
-    both = sorted(halves[0].keys() & halves[1].keys())
+    first = _filmed(before)
+    second = _filmed(after)
+    both = sorted(first.keys() & second.keys())
     if not both:
         return
-    blank = np.full_like(halves[0][both[0]].frames[0], 255)
+    blank = np.full_like(first[both[0]].frames[0], 255)
     gap = blank[:, : 2 * GAP]
     columns = math.ceil(math.sqrt(len(both)))
     rows = []
     for start in range(0, len(both), columns):
         indices = both[start : start + columns]
-        left, right = ([_with_outcome(half[index]) for index in indices] for half in halves)
+        left = [_with_outcome(first[index]) for index in indices]
+        right = [_with_outcome(second[index]) for index in indices]
         missing = [[blank]] * (columns - len(indices))
         rows.append([*left, *missing, [gap], *right, *missing])
     write_video(path, rows, fps)
+
+
+def _filmed(results: Sequence[EpisodeResult]) -> dict[int, EpisodeResult]:
+    """Index in the evaluation → episode that was filmed."""
+    return {result.plan.index: result for result in results if result.frames}
 
 
 def _with_outcome(result: EpisodeResult) -> list[np.ndarray]:
@@ -247,7 +263,8 @@ def _with_outcome(result: EpisodeResult) -> list[np.ndarray]:
     last = result.frames[-1]
     ended = np.empty_like(last)
     ended[:] = (40, 160, 60) if result.success else (200, 40, 40)
-    ended[BORDER:-BORDER, BORDER:-BORDER] = last[BORDER:-BORDER, BORDER:-BORDER]
+    inner = slice(BORDER, -BORDER)
+    ended[inner, inner] = last[inner, inner]
     return [*result.frames, ended]
 
 

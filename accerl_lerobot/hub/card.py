@@ -36,12 +36,18 @@ from accerl_lerobot.envs.base import lerobot_eval_arguments
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import discovery
 
-POLICY, WORLD_MODEL, DATASET = "policy", "world model", "dataset"
+POLICY = "policy"
+WORLD_MODEL = "world model"
+DATASET = "dataset"
 
-CONFIG, WEIGHTS = "config.json", "model.safetensors"
-ADAPTER_CONFIG, ADAPTER = "adapter_config.json", "adapter_model.safetensors"
-INFO, CARD = "meta/info.json", "README.md"
-EVALUATION, VALIDATION = "evaluation.json", "validation.json"
+CONFIG = "config.json"
+WEIGHTS = "model.safetensors"
+ADAPTER_CONFIG = "adapter_config.json"
+ADAPTER = "adapter_model.safetensors"
+INFO = "meta/info.json"
+CARD = "README.md"
+EVALUATION = "evaluation.json"
+VALIDATION = "validation.json"
 RECORD = "accerl_pulled.json"  # file that a pull adds: the commit that the others are from
 FOLDER = "accerl_run"  # folder in which a policy or world model carries files of its run
 NEEDED = {
@@ -120,9 +126,8 @@ def recognise(folder: Path, field: str = "path") -> str:
     else:
         raise InputError(field, str(folder), _hint(folder))
     needed = list(NEEDED[artifact])
-    if (
-        artifact == POLICY and (folder / ADAPTER_CONFIG).is_file()
-    ):  # of LeRobot's PEFT training, whose policy is elsewhere
+    # LeRobot's PEFT training writes an adapter, whose policy is elsewhere.
+    if artifact == POLICY and (folder / ADAPTER_CONFIG).is_file():
         needed[needed.index(WEIGHTS)] = ADAPTER
     missing = [name for name in needed if not (folder / name).exists()]
     if missing:
@@ -153,28 +158,41 @@ def run_files(folder: Path, artifact: str, evaluation: str | None) -> dict[str, 
     `evaluation` is a folder or file of ``accerl eval``; one of another policy is refused.
     """
     files: dict[str, Path] = {}
-    place = folder.resolve()
-    carried = (folder / FOLDER).is_dir()
-    names: Collection[str] = ()
-    run = place.parent
-    if not carried and artifact == POLICY and run.parent.name == CHECKPOINTS:
-        step = run.name
-        run = run.parents[1]
-        is_last = step.isdigit() and int(step) == read_json(run / SUMMARY).get("updates")
-        names = KEPT[POLICY] if is_last else (RECIPE,)
-    elif not carried and artifact == WORLD_MODEL and (run / VALIDATION).is_file():
-        names = KEPT[WORLD_MODEL]
-    for name, path in safety.matching_files(run, names, safety.FileSource("path", str(folder))).items():
+    run, names = _kept(folder, artifact)
+    source = safety.FileSource("path", str(folder))
+    for name, path in safety.matching_files(run, names, source).items():
         files[f"{FOLDER}/{name}"] = path
     if evaluation is not None:
-        path = Path(evaluation).expanduser()
-        path = path / EVALUATION if path.is_dir() else path
-        policy = read_json(path).get("policy")
-        if policy is None or Path(policy).expanduser().resolve() != place:
-            hint = f"not an evaluation of {folder}; name the output_dir of accerl eval"
-            raise InputError("evaluation", str(path), hint)
-        files[f"{FOLDER}/{EVALUATION}"] = path
+        files[f"{FOLDER}/{EVALUATION}"] = _evaluation(folder, evaluation)
     return files
+
+
+def _kept(folder: Path, artifact: str) -> tuple[Path, Collection[str]]:
+    """Folder of the run that a folder lies in, and the names of the run's files that go with it."""
+    run = folder.resolve().parent
+    if (folder / FOLDER).is_dir():  # it carries files of its run already
+        return run, ()
+    if artifact == WORLD_MODEL and (run / VALIDATION).is_file():
+        return run, KEPT[WORLD_MODEL]
+    if artifact == POLICY and run.parent.name == CHECKPOINTS:
+        step = run.name
+        run = run.parents[1]
+        if step.isdigit() and int(step) == read_json(run / SUMMARY).get("updates"):
+            return run, KEPT[POLICY]
+        return run, (RECIPE,)
+    return run, ()
+
+
+def _evaluation(folder: Path, given: str) -> Path:
+    """The file that ``accerl eval`` wrote about the policy in a folder."""
+    path = Path(given).expanduser()
+    if path.is_dir():
+        path = path / EVALUATION
+    policy = read_json(path).get("policy")
+    if policy is None or Path(policy).expanduser().resolve() != folder.resolve():
+        hint = f"not an evaluation of {folder}; name the output_dir of accerl eval"
+        raise InputError("evaluation", str(path), hint)
+    return path
 
 
 def model_card(repo_id: str, artifact: str, folder: Path, files: Files) -> str:
@@ -182,7 +200,9 @@ def model_card(repo_id: str, artifact: str, folder: Path, files: Files) -> str:
     texts = {}
     for name in (RECIPE, SUMMARY, EVALUATION, VALIDATION):
         content = files.get(f"{FOLDER}/{name}", b"")
-        texts[name] = content.read_text() if isinstance(content, Path) else content.decode()
+        if isinstance(content, Path):
+            content = content.read_bytes()
+        texts[name] = content.decode()
     recipe = yaml.safe_load(texts[RECIPE]) or {}
     summary = json.loads(texts[SUMMARY] or "{}")
     config = read_json(folder / CONFIG)
@@ -191,6 +211,7 @@ def model_card(repo_id: str, artifact: str, folder: Path, files: Files) -> str:
     if summary:
         tags += ["reinforcement-learning", summary.get("algorithm")]
     local = repo_id.split("/")[1]
+    renames = (recipe.get("policy") or {}).get("rename_map") or {}
     card = ModelCard.from_template(
         ModelCardData(
             library_name="lerobot",
@@ -213,16 +234,21 @@ def model_card(repo_id: str, artifact: str, folder: Path, files: Files) -> str:
         recipe=texts[RECIPE],
         recipe_path=f"{local}/{FOLDER}/{RECIPE}",
         learns_online=bool(env),  # only runs of `accerl offline` have no environment
-        stock=lerobot_eval_command(local, config, env),
+        stock=lerobot_eval_command(local, config, env, renames),
         # With one of its own, LeRobot finds the backbone only once a pull has set its place.
         has_backbone=str(config.get("vlm_model_name") or "").startswith(("/", BACKBONE)),
     )
     return f"{card}\n"
 
 
-def lerobot_eval_command(policy: str, config: Mapping[str, Any], env: Mapping[str, Any]) -> str | None:
-    """Stock LeRobot's evaluation of a policy with this config.json in this environment of a recipe."""
-    stock = lerobot_eval_arguments(env)
+def lerobot_eval_command(
+    policy: str, config: Mapping[str, Any], env: Mapping[str, Any], renames: Mapping[str, str]
+) -> str | None:
+    """Stock LeRobot's evaluation of a policy with this config.json in this environment of a recipe.
+
+    `renames` is the recipe's ``policy.rename_map``.
+    """
+    stock = lerobot_eval_arguments(env, renames)
     if not stock:
         return None
     flags = [f"--policy.path={policy}", *discovery(config.get("type")), *stock]
@@ -246,12 +272,21 @@ def dataset_card(repo_id: str, folder: Path) -> str:
 
 def _datasets(recipe: Mapping[str, Any]) -> list[str]:
     """Datasets on the Hub; beside a folder the name is a label."""
-    sections = [recipe.get(name) or {} for name in ("dataset", "online")]
-    return [section["repo_id"] for section in sections if section.get("repo_id") and not section.get("root")]
+    names = []
+    for name in ("dataset", "online"):
+        section = recipe.get(name) or {}
+        if section.get("repo_id") and not section.get("root"):
+            names.append(section["repo_id"])
+    return names
 
 
 def _base_model(recipe: Mapping[str, Any]) -> str | None:
-    policy = (recipe.get("policy") or {}).get("path")
-    name = str(policy or (recipe.get("sft") or {}).get("init_path"))
-    is_on_hub = re.fullmatch(REPO_ID, name) and not name.startswith(f"{AWAY}/")
-    return name if is_on_hub else None
+    """The policy on the Hub that a run began with; a folder may look like one, such as ``outputs/door``."""
+    policy = recipe.get("policy") or {}
+    sft = recipe.get("sft") or {}
+    name = str(policy.get("path") or sft.get("init_path"))
+    if name.startswith(f"{AWAY}/") or Path(name).is_dir():
+        return None
+    if not re.fullmatch(REPO_ID, name):
+        return None
+    return name

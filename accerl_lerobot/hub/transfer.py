@@ -38,7 +38,23 @@ from huggingface_hub.utils import filter_repo_objects
 from accerl_lerobot.checkpoint import layout
 from accerl_lerobot.checkpoint.safety import FileSource, matching_files, unsafe_name
 from accerl_lerobot.errors import InputError, check_absent, expanded, make_folder, reading
-from accerl_lerobot.hub import card
+from accerl_lerobot.hub.card import (
+    CARD,
+    CONFIG,
+    CONTENTS,
+    DATASET,
+    MARK,
+    POLICY,
+    RECORD,
+    Files,
+    PullConfig,
+    PushConfig,
+    dataset_card,
+    model_card,
+    read_json,
+    recognise,
+    run_files,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -72,7 +88,9 @@ def hub_errors(repo_id: str, revision: str | None) -> Iterator[None]:
         hint = f"{repo_id} has no such commit, tag or branch"
         raise InputError("revision", revision, hint) from None
     except Exception as error:
-        code = error.response.status_code if isinstance(error, HfHubHTTPError) else 0
+        code = 0
+        if isinstance(error, HfHubHTTPError):
+            code = error.response.status_code
         if code == 401 and get_token() is None:  # so the Hub answers where there is nothing, or it is private
             code = 404
         lines = str(error).replace(get_token() or "<token>", "<token>").strip().splitlines()
@@ -81,13 +99,13 @@ def hub_errors(repo_id: str, revision: str | None) -> Iterator[None]:
         raise InputError("repo_id", repo_id, hint) from None  # the client's own words may hold a header
 
 
-def push(config: card.PushConfig) -> dict[str, Any]:
+def push(config: PushConfig) -> dict[str, Any]:
     """Pushes a folder; returns what was pushed and the new commit, as plain JSON.
 
     If it is refused, or fails, the repository is as before.
     """
     folder = expanded(config.path, "path")
-    artifact = card.recognise(folder)
+    artifact = recognise(folder)
     with reading("path", config.path, "a file of it, or of its run,"):
         files = stage(config, folder, artifact)
     if get_token() is None:
@@ -96,37 +114,37 @@ def push(config: card.PushConfig) -> dict[str, Any]:
         return _upload(config, artifact, files)
 
 
-def stage(config: card.PushConfig, folder: Path, artifact: str) -> card.Files:
+def stage(config: PushConfig, folder: Path, artifact: str) -> Files:
     """All files to upload, with a card and without paths of this machine."""
     source = FileSource("path", str(folder))
-    found: card.Files = {**matching_files(folder, (*card.CONTENTS[artifact], "LICENSE*"), source)}
-    if artifact == card.POLICY:
+    found: Files = {**matching_files(folder, (*CONTENTS[artifact], "LICENSE*"), source)}
+    if artifact == POLICY:
         _point_at_backbone(found, folder)
-    found |= card.run_files(folder, artifact, config.evaluation)
+    found |= run_files(folder, artifact, config.evaluation)
     files = {name: without_paths(name, content) for name, content in found.items()}
-    written = matching_files(folder, [card.CARD], source).get(card.CARD)
+    written = matching_files(folder, [CARD], source).get(CARD)
     if written is not None and not _is_ours(written.read_text()):
-        files[card.CARD] = written
-    elif artifact == card.DATASET:
-        files[card.CARD] = card.dataset_card(config.repo_id, folder).encode()
+        files[CARD] = written
+    elif artifact == DATASET:
+        files[CARD] = dataset_card(config.repo_id, folder).encode()
     else:
-        files[card.CARD] = card.model_card(config.repo_id, artifact, folder, files).encode()
+        files[CARD] = model_card(config.repo_id, artifact, folder, files).encode()
     return files
 
 
-def _point_at_backbone(files: card.Files, folder: Path) -> None:
+def _point_at_backbone(files: Files, folder: Path) -> None:
     """Makes a policy name the backbone beside it instead of one elsewhere on this machine."""
-    config = card.read_json(folder / card.CONFIG)
-    processor = card.read_json(folder / layout.PREPROCESSOR)
+    config = read_json(folder / CONFIG)
+    processor = read_json(folder / layout.PREPROCESSOR)
     for fields, key, place in layout.places_of_names(config, processor):
         named = fields.get(key) or ""
         if not Path(named).is_absolute():
             continue
         if not (folder / place).is_dir():
-            hint = f"put a copy into {layout.BACKBONE}/ beside {card.CONFIG}"
+            hint = f"put a copy into {layout.BACKBONE}/ beside {CONFIG}"
             raise InputError("path", str(folder), f"it needs {named}, which is not in it; {hint}")
         fields[key] = place
-        files[card.CONFIG] = _as_json(config)
+        files[CONFIG] = _as_json(config)
         files[layout.PREPROCESSOR] = _as_json(processor)
 
 
@@ -138,12 +156,16 @@ def without_paths(name: str, content: Path | bytes) -> Path | bytes:
     path = PurePosixPath(name)
     if path.suffix not in (".json", ".yaml") or path.name in VOCABULARIES:
         return content
-    data = content if isinstance(content, bytes) else content.read_bytes()
-    tree = yaml.safe_load(data) if path.suffix == ".yaml" else json.loads(data)
+    if isinstance(content, Path):
+        content = content.read_bytes()
+    is_yaml = path.suffix == ".yaml"
+    tree = yaml.safe_load(content) if is_yaml else json.loads(content)
     changed = _without_paths(tree)
     if changed == tree:
-        return data
-    return yaml.safe_dump(changed, sort_keys=False).encode() if path.suffix == ".yaml" else _as_json(changed)
+        return content
+    if is_yaml:
+        return yaml.safe_dump(changed, sort_keys=False).encode()
+    return _as_json(changed)
 
 
 def _without_paths(value: Any) -> Any:
@@ -154,7 +176,9 @@ def _without_paths(value: Any) -> Any:
         return tree
     if isinstance(value, list):
         return [_without_paths(below) for below in value]
-    match = PATH.fullmatch(value) if isinstance(value, str) else None
+    if not isinstance(value, str):
+        return value
+    match = PATH.fullmatch(value)
     if match is None:
         return value
     return f"{match[1] or ''}{layout.AWAY}/{PurePosixPath(value).name}"
@@ -166,13 +190,13 @@ def _as_json(tree: Any) -> bytes:
 
 def _is_ours(text: str) -> bool:
     """True for a card that a push has written, and an empty one."""
-    return card.MARK in text or not text.strip()
+    return MARK in text or not text.strip()
 
 
-def _upload(config: card.PushConfig, artifact: str, files: card.Files) -> dict[str, Any]:
+def _upload(config: PushConfig, artifact: str, files: Files) -> dict[str, Any]:
     api = HfApi()
     repo_id = config.repo_id
-    repo_type = "dataset" if artifact == card.DATASET else "model"
+    repo_type = "dataset" if artifact == DATASET else "model"
     where: dict[str, Any] = {"repo_id": repo_id, "repo_type": repo_type}
     try:
         before = api.repo_info(**where)
@@ -183,13 +207,13 @@ def _upload(config: card.PushConfig, artifact: str, files: card.Files) -> dict[s
         hint = "this repository is public: add --private=false, or choose another name"
         raise InputError("private", True, hint)
     listed = api.list_repo_files(revision=before.sha, **where)
-    if card.CARD in listed:
-        there = Path(hf_hub_download(filename=card.CARD, revision=before.sha, **where)).read_text()
-        ours = files[card.CARD]
-        if isinstance(ours, bytes) and not _is_ours(there):
+    if CARD in listed:
+        fetched = hf_hub_download(filename=CARD, revision=before.sha, **where)
+        ours = files[CARD]
+        if isinstance(ours, bytes) and not _is_ours(Path(fetched).read_text()):
             logger.warning("the README.md on the Hub is left as it is, somebody wrote it")
-            del files[card.CARD]
-    known = filter_repo_objects(sorted(listed), allow_patterns=list(card.CONTENTS[artifact]))
+            del files[CARD]
+    known = filter_repo_objects(sorted(listed), allow_patterns=list(CONTENTS[artifact]))
     stale = [name for name in known if name not in files]
     operations = [CommitOperationAdd(name, content) for name, content in files.items()]
     operations += [CommitOperationDelete(name, is_folder=False) for name in stale]
@@ -200,7 +224,9 @@ def _upload(config: card.PushConfig, artifact: str, files: card.Files) -> dict[s
         parent_commit=before.sha,
         **where,
     ).oid
-    if artifact == card.DATASET:
+    url = f"{api.endpoint}/{repo_id}"
+    if artifact == DATASET:
+        url = f"{api.endpoint}/datasets/{repo_id}"
         with contextlib.suppress(RevisionNotFoundError):
             api.delete_tag(tag=DATASET_TAG, **where)
         api.create_tag(tag=DATASET_TAG, revision=commit, **where)
@@ -211,16 +237,17 @@ def _upload(config: card.PushConfig, artifact: str, files: card.Files) -> dict[s
         "unchanged": commit == before.sha,
         "private": bool(before.private),
         "files": len(files),
-        "url": f"{api.endpoint}/{'datasets/' if artifact == card.DATASET else ''}{repo_id}",
+        "url": url,
     }
 
 
-def pull(config: card.PullConfig) -> dict[str, Any]:
+def pull(config: PullConfig) -> dict[str, Any]:
     """Pulls all files but Python's code; returns the commit and the content, as plain JSON.
 
     There is no new folder if it is refused.
     """
     repo_id = config.repo_id
+    source = FileSource("repo_id", repo_id)
     home = expanded(config.output_dir, "output_dir").absolute()
     check_absent(home)
     with hub_errors(repo_id, config.revision):
@@ -228,7 +255,7 @@ def pull(config: card.PullConfig) -> dict[str, Any]:
         for name in HfApi().list_repo_files(repo_id, repo_type=repo_type, revision=commit):
             why = unsafe_name(name)
             if why:
-                raise FileSource("repo_id", repo_id).refuse(name, f"not safe to write: {why}")
+                raise source.refuse(name, f"not safe to write: {why}")
         # Named after the commit, so that an interrupted pull resumes and no other one's files are in it.
         temporary = home.parent / f".pulling-{commit[:16]}-{home.name}"
         make_folder(temporary, "output_dir", again=True)
@@ -238,9 +265,9 @@ def pull(config: card.PullConfig) -> dict[str, Any]:
     shutil.rmtree(temporary / ".cache", ignore_errors=True)
     try:
         with reading("repo_id", repo_id, "one of its files"):
-            artifact = card.recognise(temporary, "repo_id")
-            layout.check_names(temporary, FileSource("repo_id", repo_id))
-            if artifact == card.POLICY:
+            artifact = recognise(temporary, "repo_id")
+            layout.check_names(temporary, source)
+            if artifact == POLICY:
                 layout.relocate(temporary, home)
     except InputError:
         shutil.rmtree(temporary)  # resuming would not make it better
@@ -253,12 +280,12 @@ def pull(config: card.PullConfig) -> dict[str, Any]:
         "commit": commit,
         "files": sum(path.is_file() for path in temporary.rglob("*")),
     }
-    (temporary / card.RECORD).write_text(json.dumps(record, indent=2) + "\n")
+    (temporary / RECORD).write_text(json.dumps(record, indent=2) + "\n")
     temporary.rename(home)
     return record | {"path": str(home)}
 
 
-def _resolved(config: card.PullConfig) -> tuple[Literal["model", "dataset"], str]:
+def _resolved(config: PullConfig) -> tuple[Literal["model", "dataset"], str]:
     """Repository type, and the commit that the revision resolves to now; a model goes before a dataset."""
     api = HfApi()
     try:

@@ -91,7 +91,7 @@ class Chart(NamedTuple):
             for name, (x, y, interval) in self.series.items():
                 axes.plot(x, y, label=name, marker="o" if len(x) < 20 else "")
                 if interval is not None:
-                    axes.fill_between(x, interval[0], interval[1], alpha=0.2)
+                    axes.fill_between(x, *interval, alpha=0.2)
             if self.limit is not None:
                 axes.axhline(self.limit, color="grey", linestyle="--")
             if self.share:
@@ -144,8 +144,14 @@ def one_run(run: Run, now: float) -> dict[str, Any]:
         if not run.offline:
             bound = lag_limits(decode(RunConfig, run.config))[0]
     success = {"while exploring": exploring(run), "evaluation": evaluated(run)}
-    imagined = over_updates(run.rollout, ("success_imagined", "success_exploring"), share=True)
+    imagined = []
+    if len(finite(run.rollout, "success_imagined")):
+        imagined = [over_updates(run.rollout, ("success_imagined", "success_exploring"), share=True)]
+    facts = _facts(run)
+    if bound is not None:
+        facts["bound of the lag"] = f"{bound} updates"
     changed = changed_fields(run.config)
+    verb = "offline" if run.offline else "train"
     blocks = [
         Block(
             "Success and staleness",
@@ -157,7 +163,7 @@ def one_run(run: Run, now: float) -> dict[str, Any]:
         ),
         Block("Evaluations", columns=("", "env steps", "task", "success", "n"), rows=_evaluations(run)),
         Block("Videos", videos=run.videos),
-        Block("Imagined rollouts", charts=[imagined] if len(finite(run.rollout, "success_imagined")) else []),
+        Block("Imagined rollouts", charts=imagined),
         Block("Time of each role while training", shares=_time_shares(run)),
         Block("Learning", charts=[over_updates(run.train, names) for names in LEARNING]),
         Block(
@@ -168,9 +174,9 @@ def one_run(run: Run, now: float) -> dict[str, Any]:
         ),
     ]
     return {
-        "about": f"accerl {'offline' if run.offline else 'train'} · {run.name} · {status(run, now)}",
+        "about": f"accerl {verb} · {run.name} · {status(run, now)}",
         "title": _headline(run),
-        "facts": _facts(run) | ({} if bound is None else {"bound of the lag": f"{bound} updates"}),
+        "facts": facts,
         "warnings": list(warnings(run, now)),
         "blocks": blocks,
     }
@@ -180,8 +186,11 @@ def comparison(runs: Sequence[Run], now: float) -> dict[str, Any]:
     """Values of a page about several runs. No winner is named."""
     names = [run.name for run in runs]
     each = {}
-    for name, run in zip(names, runs, strict=True):
-        each[name if names.count(name) == 1 else str(run.path)] = run
+    for run in runs:
+        name = run.name
+        if names.count(name) > 1:
+            name = str(run.path)
+        each[name] = run
     rows = []
     notes = []
     for name, run in each.items():
@@ -219,9 +228,11 @@ def comparison(runs: Sequence[Run], now: float) -> dict[str, Any]:
 def status(run: Run, now: float) -> str:
     if run.error:
         return "failed"
-    if run.result is None:
-        return "still going" if now - run.written < RECENT_S else "not finished"
-    return "finished"
+    if run.result is not None:
+        return "finished"
+    if now - run.written < RECENT_S:
+        return "still going"
+    return "not finished"
 
 
 def warnings(run: Run, now: float) -> Iterator[str]:
@@ -263,9 +274,14 @@ def _evaluations(run: Run) -> list[tuple[str, ...]]:
         if len(tasks) != 1:
             tasks["all"] = e
         for task, one in tasks.items():
-            success = rate(one["success"], one["ci95"])
-            rows.append((str(e.get("group")), number(e["env_steps"]), task, success, number(one["n"])))
+            steps = number(e["env_steps"])
+            rows.append((str(e.get("group")), steps, task, success_of(one), number(one["n"])))
     return rows
+
+
+def success_of(evaluation: Record) -> str:
+    """Success of an evaluation, or of a task in it, with its interval."""
+    return rate(evaluation["success"], evaluation["ci95"])
 
 
 def exploring(run: Run) -> Series:
@@ -307,21 +323,24 @@ def _headline(run: Run) -> str:
     made = int(newest(run.train, "update") or 0)
     if run.offline:
         losses = finite(run.train, "imitation_loss")
-        ends = " → ".join(number(loss) for loss in losses[[0, -1]]) if len(losses) else ABSENT
+        ends = ABSENT
+        if len(losses):
+            ends = f"{number(losses[0])} → {number(losses[-1])}"
         return f"{count(made, 'update')} on recorded episodes: imitation loss {ends}"
     if run.result is None:
         return f"{made} of {run.section('trainer').get('updates')} updates on {_tasks(run)}"
-    rates = [rate(e["success"], e["ci95"]) for e in (*run.before, *run.newest)]
+    rates = [success_of(evaluation) for evaluation in (*run.before, *run.newest)]
     return f"Success on {_tasks(run)}: {' → '.join(rates)}"
 
 
 def _tasks(run: Run) -> str:
     """The run's task, or how many it has."""
-    names = list(run.evaluations[-1].get("tasks") or ()) if run.evaluations else []
-    if len(names) > 1:
-        return count(len(names), "task")
+    for evaluation in run.evaluations[-1:]:
+        names = list(evaluation.get("tasks") or ())
+        if names:
+            return str(names[0]) if len(names) == 1 else count(len(names), "task")
     env = run.section("env")
-    return str(names[0] if names else env.get("task") or env.get("name") or env.get("type"))
+    return str(env.get("task") or env.get("name") or env.get("type"))
 
 
 def _facts(run: Run) -> dict[str, str]:
@@ -329,10 +348,17 @@ def _facts(run: Run) -> dict[str, str]:
     result = run.result or {}
     success = {}
     for name, ends in (("success before", run.before), ("success", run.newest)):
-        success[name] = rate(ends[0]["success"], ends[0]["ci95"]) if ends else ABSENT
+        success[name] = ABSENT
+        if ends:
+            success[name] = success_of(ends[0])
+    steps = result.get("env_steps")
     seen = exploring(run).x
-    steps = result.get("env_steps", seen[-1] if len(seen) else None)
+    if steps is None and len(seen):
+        steps = seen[-1]
+    mean_lag = None
     lags = finite(run.train, "lag_mean")
+    if len(lags):
+        mean_lag = float(lags.mean())
     return {
         **success,
         "algorithm": str(run.section("algorithm").get("type")),
@@ -340,6 +366,6 @@ def _facts(run: Run) -> dict[str, str]:
         "updates": number(result.get("updates", newest(run.train, "update"))),
         "episodes": number(result.get("episodes", newest(run.rollout, "episodes"))),
         "env steps": number(steps),
-        "mean lag": number(float(lags.mean()) if len(lags) else None, 2),
+        "mean lag": number(mean_lag, 2),
         "wall time": duration(result.get("wall_s", newest(run.train, "wall_s"))),
     }

@@ -67,7 +67,9 @@ class Run:
     def section(self, name: str) -> Record:
         """Section of its config; empty if another version wrote it without."""
         section = self.config.get(name)
-        return section if isinstance(section, dict) else {}
+        if not isinstance(section, dict):
+            return {}
+        return section
 
 
 def read_run(path: Path) -> Run:
@@ -80,8 +82,13 @@ def read_run(path: Path) -> Run:
     if not {"algorithm", "trainer"} <= config.keys():
         raise InputError("runs", str(path), f"no run in it: there is no {CONFIG} of accerl train")
     records, truncated = _records(path / METRICS)
+    result = None
+    if summary.is_file():
+        result = read_json(summary, source)
     written = max(file.stat().st_mtime for file in path.iterdir() if file.suffix != ".html")
-    failed = log.is_file() and log.stat().st_mtime >= written
+    error = ""
+    if log.is_file() and log.stat().st_mtime >= written:
+        error = log.read_text(errors="replace").strip().rpartition("\n")[2]
     return Run(
         path=path,
         config=config,
@@ -89,10 +96,10 @@ def read_run(path: Path) -> Run:
         train=records.get("train", []),
         rollout=records.get("rollout", []),
         evaluations=sorted(records.get("evaluation", []), key=lambda e: float(e["env_steps"])),
-        result=read_json(summary, source) if summary.is_file() else None,
+        result=result,
         truncated=truncated,
         written=written,
-        error=log.read_text(errors="replace").strip().rpartition("\n")[2] if failed else "",
+        error=error,
         videos=tuple(sorted(path.glob("*.mp4"))),
     )
 
@@ -100,7 +107,9 @@ def read_run(path: Path) -> Run:
 def _records(path: Path) -> tuple[dict[str, list[Record]], bool]:
     """Records by their kind, and whether the last line is incomplete."""
     records: dict[str, list[Record]] = {}
-    lines = path.read_bytes().splitlines() if path.is_file() else []
+    if not path.is_file():
+        return records, False
+    lines = path.read_bytes().splitlines()
     for number, text in enumerate(lines, 1):
         try:
             record = json.loads(text)
@@ -128,7 +137,9 @@ def finite(records: Sequence[Record], name: str) -> np.ndarray:
 def newest(records: Sequence[Record], name: str) -> float | None:
     """The last finite value of this number."""
     values = finite(records, name)
-    return float(values[-1]) if len(values) else None
+    if not len(values):
+        return None
+    return float(values[-1])
 
 
 def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -136,7 +147,10 @@ def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     fields: dict[str, Any] = {}
     for key, value in tree.items():
         name = f"{prefix}{key}"
-        fields |= flat(value, f"{name}.") if isinstance(value, dict) and value else {name: value}
+        if isinstance(value, dict) and value:
+            fields |= flat(value, f"{name}.")
+        else:
+            fields[name] = value
     return fields
 
 

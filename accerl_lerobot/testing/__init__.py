@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -51,14 +51,18 @@ def check_policy(policy: PolicyConfig | Path | str, observations: Sequence[Obser
     `policy` is a checkpoint's folder, or how to load it, and a small one: it decides some 20,000 times.
     `observations` are two or more, as the environment gives them.
     """
-    config = policy if isinstance(policy, PolicyConfig) else PolicyConfig(path=str(policy), device="cpu")
-    adapter = load_adapter(config)
+    if not isinstance(policy, PolicyConfig):
+        policy = PolicyConfig(path=str(policy), device="cpu")
+    adapter = load_adapter(policy)
     perturb(adapter, 0.1)  # heads start at zero, where only their output layers have a gradient
-    asked = [Request(observation=observations[i % len(observations)], noise_seed=i) for i in range(BATCH)]
+    asked = []
+    for i in range(BATCH):
+        observation = observations[i % len(observations)]
+        asked.append(Request(observation=observation, noise_seed=i))
     check_batches(adapter, asked, few=4)
     check_stock_sampler(adapter, asked)
     with tempfile.TemporaryDirectory() as folder:
-        check_saved(adapter, asked, config, Path(folder) / "pretrained_model")
+        check_saved(adapter, asked, policy, Path(folder) / "pretrained_model")
     check_importance(adapter, observations[0])
     decisions = adapter.decide(asked, 0)
     perturb(adapter, 0.02, seed=1)
@@ -82,19 +86,23 @@ def check_batches(adapter: PolicyAdapter, asked: Sequence[Request], few: int) ->
 
 def check_ratio_one(adapter: PolicyAdapter, asked: Sequence[Request], decisions: Sequence[Decision]) -> None:
     """ρ = 1 for weights that made the decisions, in batches of any size."""
-    off = (log_ratio(adapter, asked, decisions).exp() - 1).abs().max()
+    ratio = log_ratio(adapter, asked, decisions).exp()
+    off = (ratio - 1).abs().max()
     assert off <= TOLERANCE, f"at equal weights |ρ − 1| is {off:.2e}, above {TOLERANCE}"
 
 
 def check_alike(found: Sequence[Decision], expected: Sequence[Decision]) -> None:
     """Chunks and latents are equal but for rounding."""
-    mine, theirs = ({"chunk": _chunks(of)} | stored(of)[0] for of in (found, expected))
+    mine, _ = stored(found)
+    theirs, _ = stored(expected)
+    mine["chunk"] = _chunks(found)
+    theirs["chunk"] = _chunks(expected)
     for name, tensor in theirs.items():
-        exact = not tensor.is_floating_point()
         error = float((mine[name] - tensor).abs().max())
         size = float(tensor.abs().max())
+        most = TOLERANCE * size if tensor.is_floating_point() else 0
         where = f"{name} is off by {error:.2e} where the largest is {size:.2e}"
-        assert error <= (0 if exact else TOLERANCE * size), f"of two decisions on one request, {where}"
+        assert error <= most, f"of two decisions on one request, {where}"
 
 
 def check_stock_sampler(adapter: LeRobotAdapter, asked: Sequence[Request]) -> None:
@@ -136,12 +144,15 @@ def check_importance(adapter: PolicyAdapter, observation: Observation, samples: 
             break
     else:
         raise AssertionError(f"log ρ does not change by {MOVED} when the weights do")
-    weight = log_ratio(adapter, asked, before).double().exp()[:, None] - 1
-    old, new = (_chunks(decisions).double().flatten(1) for decisions in (before, adapter.decide(asked, 0)))
-    mean = old.mean(0)
-    apart = torch.cat([weight, weight * (old - mean) - (new - old)], 1)
+    ratio = log_ratio(adapter, asked, before).double().exp()
+    weight = ratio[:, None] - 1
+    old = _chunks(before).double().flatten(1)
+    new = _chunks(adapter.decide(asked, 0)).double().flatten(1)
+    weighted = weight * (old - old.mean(0))
+    apart = torch.cat([weight, weighted - (new - old)], 1)
     error = apart.std(0) / math.sqrt(samples)
-    worst = float((apart.mean(0).abs() / error.clamp(min=1e-12)).max())
+    deviations = apart.mean(0).abs() / error.clamp(min=1e-12)
+    worst = float(deviations.max())
     hint = "the log-prob is not that of the actions that are executed"
     assert worst <= DEVIATIONS, f"E_μ[ρ f(a)] and E_π[f(a)] are {worst:.1f} standard errors apart: {hint}"
 
@@ -171,12 +182,12 @@ def check_gradient(
         home = {k: named[k].detach().clone() for k in gradients}
         scores = []
         width = step / max(norm, 1)
-        for sign in (1, -1):
-            with torch.no_grad():
+        with torch.no_grad():
+            for sign in (1, -1):
                 for key, gradient in gradients.items():
                     named[key].copy_(home[key] + sign * width * gradient / norm)
-            scores.append(float(log_ratio(adapter, asked, decisions).double().sum()))
-        with torch.no_grad():
+                score = log_ratio(adapter, asked, decisions).double().sum()
+                scores.append(float(score))
             for key, value in home.items():
                 named[key].copy_(value)
         found = (scores[0] - scores[1]) / (2 * width)
@@ -196,8 +207,10 @@ def perturb(adapter: PolicyAdapter, scale: float, seed: int = 0) -> None:
 
 def stored(decisions: Sequence[Decision]) -> tuple[dict[str, Tensor], Tensor]:
     """(latents, log-probs (B, L)) of decisions, as a batch."""
-    latent = {k: torch.from_numpy(np.stack([d.latent[k] for d in decisions])) for k in decisions[0].latent}
-    return latent, torch.from_numpy(np.stack([d.log_prob for d in decisions]))
+    latent = {}
+    for name in decisions[0].latent:
+        latent[name] = _stacked(decision.latent[name] for decision in decisions)
+    return latent, _stacked(decision.log_prob for decision in decisions)
 
 
 def log_ratio(adapter: PolicyAdapter, asked: Sequence[Request], decisions: Sequence[Decision]) -> Tensor:
@@ -210,4 +223,8 @@ def log_ratio(adapter: PolicyAdapter, asked: Sequence[Request], decisions: Seque
 
 
 def _chunks(decisions: Sequence[Decision]) -> Tensor:
-    return torch.from_numpy(np.stack([d.chunk for d in decisions]))
+    return _stacked(decision.chunk for decision in decisions)
+
+
+def _stacked(rows: Iterable[np.ndarray]) -> Tensor:
+    return torch.from_numpy(np.stack(list(rows)))

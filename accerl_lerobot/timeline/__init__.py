@@ -74,7 +74,8 @@ class Clock:
         self._most_bytes = most_bytes
         self._lock = threading.Lock()
         self._state = RECOVERY
-        self._began = self._flushed = now()
+        self._began = now()
+        self._flushed = self._began
         self._point = f"{role_of(worker).split()[-1]}.timeline"
         folder.mkdir(parents=True, exist_ok=True)
         name = worker.replace(" ", "-")
@@ -136,7 +137,9 @@ class NoClock(Clock):
 
 def open_clock(folder: Path | None, worker: str) -> Clock:
     """The clock of a worker; one that records nothing where there is no folder of the timeline."""
-    return NoClock() if folder is None else Clock(folder, worker)
+    if folder is None:
+        return NoClock()
+    return Clock(folder, worker)
 
 
 Window = tuple[float, float]  # first and last second, since the timeline began
@@ -185,7 +188,9 @@ class Timeline:
             follows = False  # an interval of training, or a checkpoint after it
             for start, end, state in zip(row.starts / 1e9, row.ends / 1e9, row.states, strict=True):
                 if state == TRAINING:
-                    first = windows.pop()[0] if follows else float(start)
+                    first = float(start)
+                    if follows:
+                        first, _ = windows.pop()
                     windows.append((first, float(end)))
                 follows = state == TRAINING or (follows and state == CHECKPOINT)
         return windows or [(0.0, self.seconds)]
@@ -230,27 +235,34 @@ def _read_process(path: Path) -> Row:
     """The intervals of one process, by the nanoseconds of the calendar."""
     head, _, data = path.read_bytes().partition(b"\n")
     content = json.loads(head)
-    entries = np.frombuffer(data[: len(data) // 8 * 8], "<u8")  # a killed process leaves half an entry
-    ends = (entries >> np.uint64(BITS)).astype(np.int64) + content["wall_ns"]
-    starts = np.append(content["wall_ns"], ends[:-1])[: len(ends)]
-    states = np.append(RECOVERY, entries % 2**BITS)[: len(ends)].astype(np.uint8)
+    began = content["wall_ns"]
+    count = len(data) // 8  # a killed process leaves half an entry
+    entries = np.frombuffer(data, "<u8", count)
+    ends = (entries >> BITS).astype(np.int64) + began
+    starts = np.append(began, ends[:-1])[:count]
+    states = np.append(RECOVERY, entries % 2**BITS)[:count].astype(np.uint8)
     return Row(worker=content["worker"], starts=starts, ends=ends, states=states)
 
 
 def _whole_row(processes: list[Row]) -> Row:
     """All intervals of a worker; one that was being ended when the next process began is cut there."""
     starts = np.concatenate([row.starts for row in processes])
-    ends = np.concatenate([row.ends for row in processes])
-    states = np.concatenate([row.states for row in processes])
     order = np.argsort(starts, kind="stable")
-    next_starts = np.append(starts[order][1:], ends.max())
-    cut = np.minimum(ends[order], next_starts)
-    return Row(worker=processes[0].worker, starts=starts[order], ends=cut, states=states[order])
+    starts = starts[order]
+    ends = np.concatenate([row.ends for row in processes])[order]
+    states = np.concatenate([row.states for row in processes])[order]
+    next_starts = np.append(starts[1:], ends.max())
+    ends = np.minimum(ends, next_starts)
+    return Row(worker=processes[0].worker, starts=starts, ends=ends, states=states)
 
 
 def _place(row: Row) -> tuple[int, str, int]:
-    number = row.worker[len(row.role) :].strip()
-    return ROLES.index(row.role) if row.role in ROLES else len(ROLES), row.role, int(number or 0)
+    """Where the row stands: by role, then by number."""
+    number = row.worker.removeprefix(row.role).strip()
+    place = len(ROLES)
+    if row.role in ROLES:
+        place = ROLES.index(row.role)
+    return place, row.role, int(number or 0)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -70,7 +70,9 @@ class TDMPCStateConfig(StateModelConfig):
 
 def default_state_model(tells_state: bool) -> StateModelConfig:
     """The type of a run that names none; `tells_state`: the simulator's state is there to be read."""
-    return SimulatorStateConfig() if tells_state else LatentConfig()
+    if tells_state:
+        return SimulatorStateConfig()
+    return LatentConfig()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,6 +22,7 @@ from torch import Tensor, nn
 
 from accerl_lerobot.config.parsing import imported
 from accerl_lerobot.config.ranges import Range, Section
+from accerl_lerobot.experience import task_codes
 
 if TYPE_CHECKING:
     from accerl_lerobot.world_model.config import LearnableModelConfig
@@ -86,6 +87,12 @@ class Windows:
         """bool (B, R), True until the episode ended or achieved the task, that chunk included."""
         successes_before = self.success.cumsum(1) - self.success.long()
         return ((self.steps > 0) | self.success) & (successes_before == 0)
+
+    @property
+    def known_tasks(self) -> Tensor:
+        """float32 (N, 16), `task_codes` of the N chunks that are `known`."""
+        codes = torch.from_numpy(task_codes(self.tasks))
+        return codes.repeat_interleave(self.known.sum(1), 0)
 
 
 class LearnableWorldModel(nn.Module):

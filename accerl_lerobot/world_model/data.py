@@ -62,8 +62,10 @@ class Episode:
     @property
     def starts_before_success(self) -> int:
         """Number of frames that are followed by another and precede the success."""
+        if not self.success:
+            return self.starts
         shown = int(np.searchsorted(self.times, self.success_at, side="right"))
-        return min(self.starts, shown) if self.success else self.starts
+        return min(self.starts, shown)
 
     def __len__(self) -> int:
         """Env steps."""
@@ -109,10 +111,12 @@ def _window(episode: Episode, first: int, spec: WorldModelSpec, chunks: int) -> 
     size = spec.chunk
     before = spec.context - 1
     start = int(episode.times[first])
-    begins = start + size * np.arange(chunks)  # env step with which each chunk begins
-    boundaries = start + size * np.arange(-before, chunks + 1)
+    boundaries = start + size * np.arange(-before, chunks + 1)  # env steps between chunks
+    begins = boundaries[before:-1]
+    ends = boundaries[before + 1 :]
     latest = np.searchsorted(episode.times, boundaries, side="right") - 1
     shown = np.maximum(latest, 0)  # the first frame stands for those before the episode
+    times = episode.times[shown[before + 1 :]]
     last = len(episode) - 1
     executed = start + np.arange(size * chunks)
     action_dim = episode.actions.shape[1]
@@ -127,8 +131,8 @@ def _window(episode: Episode, first: int, spec: WorldModelSpec, chunks: int) -> 
         "first_robot": episode.state[0],
         "commanded_sum": episode.actions[:start].sum(0, dtype=np.float32),
         "actions": episode.actions[np.minimum(executed, last)].reshape(chunks, size, action_dim),
-        "steps": np.clip(episode.times[shown[before + 1 :]] - begins, 0, size),
-        "success": (begins <= episode.success_at) & (episode.success_at < begins + size),
+        "steps": np.clip(times - begins, 0, size),
+        "success": (begins <= episode.success_at) & (episode.success_at < ends),
     }
 
 
@@ -159,7 +163,9 @@ def resize(frames: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 def model_arrays(arrays: dict[str, np.ndarray], spec: WorldModelSpec) -> tuple[np.ndarray, np.ndarray]:
     """Frames uint8 (N, V, H, W, 3) and states float32 (N, S) of N observations."""
     frames = np.stack([resize(arrays[camera], spec.image_size) for camera in spec.cameras], 1)
-    state = arrays[STATE] if spec.state_dim else np.zeros((len(frames), 0))
+    state = np.zeros((len(frames), 0))
+    if spec.state_dim:
+        state = arrays[STATE]
     return frames, state.astype(np.float32)
 
 
@@ -171,7 +177,9 @@ def load_episodes(dataset: DatasetConfig, spec: WorldModelSpec, section: str = "
     with _named(section):
         meta = check_dataset(dataset, spec, section)
         with opened(dataset, meta) as data:
-            names = ["action", STATE] if spec.state_dim else ["action"]
+            names = ["action"]
+            if spec.state_dim:
+                names.append(STATE)
             vectors = {name: numbers(data, name, dataset) for name in names}
             episodes = {}
             for labels in read_labels(data, dataset):
@@ -195,7 +203,9 @@ def check_dataset(dataset: DatasetConfig, spec: WorldModelSpec, section: str = "
     """The metadata of a dataset; one that a world model of `spec` cannot be trained on is refused."""
     with _named(section):
         meta = open_metadata(dataset)
-        _check_metadata(meta, dataset.repo_id, spec)
+        why = _misfit(meta, spec)
+        if why is not None:
+            raise InputError("dataset.repo_id", dataset.repo_id, why)
     return meta
 
 
@@ -211,22 +221,19 @@ def _named(section: str) -> Iterator[None]:
         raise InputError(field, error.value, error.hint) from error
 
 
-def _check_metadata(meta: Any, name: str | None, spec: WorldModelSpec) -> None:
+def _misfit(meta: Any, spec: WorldModelSpec) -> str | None:
+    """Why a world model of `spec` cannot be trained on a dataset; None: it can."""
     shapes = {key: tuple(feature["shape"]) for key, feature in meta.features.items()}
-    missing = [camera for camera in spec.cameras if camera not in shapes]
-    if missing:
-        cameras = ", ".join(meta.camera_keys) or "no camera"
-        hint = f"no {missing[0]!r}: the dataset has {cameras}; choose env.camera accordingly"
-        raise InputError("dataset.repo_id", name, hint)
+    for camera in spec.cameras:
+        if camera not in shapes:
+            cameras = ", ".join(meta.camera_keys) or "no camera"
+            return f"no {camera!r}: the dataset has {cameras}; choose env.camera accordingly"
     for key, size in {"action": spec.action_dim, STATE: spec.state_dim}.items():
-        if size and shapes.get(key) != (size,):
-            hint = (
-                f"{key} has shape {shapes.get(key)}, the environment's has ({size},): it is another robot's"
-            )
-            raise InputError("dataset.repo_id", name, hint)
+        shape = shapes.get(key)
+        if size and shape != (size,):
+            return f"{key} has shape {shape}, the environment's has ({size},): it is another robot's"
     if not {SUCCESS, REWARD} & shapes.keys():
-        hint = f"no {SUCCESS}: record it, as accerl demos does, or add it to the dataset"
-        raise InputError("dataset.repo_id", name, hint)
+        return f"no {SUCCESS}: record it, as accerl demos does, or add it to the dataset"
     if meta.fps != spec.fps:
-        hint = f"{meta.fps} frames a second, and the environment makes {spec.fps} steps; record at its rate"
-        raise InputError("dataset.repo_id", name, hint)
+        return f"{meta.fps} frames a second, and the environment makes {spec.fps} steps; record at its rate"
+    return None

@@ -59,7 +59,8 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-CONFIG, WEIGHTS = "config.json", "model.safetensors"
+CONFIG = "config.json"
+WEIGHTS = "model.safetensors"
 LEARN = "imagination.learn.dataset"
 
 
@@ -93,8 +94,9 @@ class World(nn.Module):
     def succeeds(self, frames: np.ndarray, task: str) -> bool:
         """True if the frames, uint8 (V, H, W, 3), show the task achieved."""
         codes = torch.from_numpy(task_codes([task]))
-        probability = self.success.probabilities(torch.from_numpy(frames[None]), codes)
-        return bool(probability[0] > self.success.threshold)
+        batch = torch.from_numpy(frames[None])
+        [probability] = self.success.probabilities(batch, codes)
+        return bool(probability > self.success.threshold)
 
     def load(self, version: int, weights: dict[str, Any]) -> None:
         """Take over the weights of another world, between two chunks; episodes under way go on."""
@@ -107,11 +109,13 @@ def save_world(
 ) -> None:
     """Writes a new folder. `learnt` are keys of episodes; `failed_checks` None: it has not been checked."""
     directory.mkdir(parents=True)
+    if failed_checks is not None:
+        failed_checks = list(failed_checks)
     content = {
         "spec": asdict(world.model.spec),
         "model": draccus.encode(world.model.config, LearnableModelConfig),
         "learnt": sorted(learnt),
-        "failed_checks": None if failed_checks is None else list(failed_checks),
+        "failed_checks": failed_checks,
     }
     (directory / CONFIG).write_text(json.dumps(content, indent=2) + "\n")
     # Copies, as safetensors refuses tensors that share memory.
@@ -139,24 +143,27 @@ def load_world(directory: Path, package: str | None = None, *, section: str = ""
     content = read_content(directory, section)
     weights = safe_join(directory, WEIGHTS, origin)
     try:
+        spec = draccus.decode(WorldModelSpec, content.get("spec"))
+        config = draccus.decode(LearnableModelConfig, content.get("model"))
         with Unfilled():
-            spec = draccus.decode(WorldModelSpec, content.get("spec"))
-            world = World(new_model(spec, draccus.decode(LearnableModelConfig, content.get("model"))))
+            world = World(new_model(spec, config))
         world.load_state_dict(dict(read_tensors(weights, origin)))
     except Exception as error:  # the files may hold anything
         refusal = input_error(error)  # draccus wraps what a config refuses
+        if refusal is not None and refusal.field == origin.field:
+            raise refusal from error
         if refusal is not None:
-            other = origin.refuse(CONFIG, brief(refusal))
-            raise (refusal if refusal.field == origin.field else other) from error
+            raise origin.refuse(CONFIG, brief(refusal)) from error
         package = origin.field.removesuffix("path") + DISCOVER
-        hint = f"not a world model of accerl world-model ({brief(error)}); if its type is of another package"
-        hint += f", name that: {package}"
+        hint = f"not a world model of accerl world-model ({brief(error)}); "
+        hint += f"if its type is of another package, name that: {package}"
         raise InputError(origin.field, origin.value, hint) from error
     return world.requires_grad_(False).eval()
 
 
 def _origin(directory: Path, section: str) -> FileSource:
-    return FileSource(f"{section}.path" if section else "path", str(directory))
+    field = f"{section}.path" if section else "path"
+    return FileSource(field, str(directory))
 
 
 class ImaginedEnvironment(Environment):
@@ -173,7 +180,8 @@ class ImaginedEnvironment(Environment):
         self._world = world
         self._starts = starts
         self._task = ""
-        self._seed = self._steps = 0
+        self._seed = 0
+        self._steps = 0
         self._done = True
         self._frames = np.zeros((0, 0, 0, 3), np.uint8)
         self._state: State = {}
@@ -181,14 +189,14 @@ class ImaginedEnvironment(Environment):
     def reset(self, seed: int, task: str) -> Observation:
         _, first = start_of(self._starts, seed)
         arrays = {name: np.asarray(value)[None] for name, value in first.items() if name != TASK}
-        frames, robot = model_arrays(arrays, self._world.model.spec)
+        [frames], [robot] = model_arrays(arrays, self._world.model.spec)
         self._task = str(first[TASK])
         self._seed = seed
         self._steps = 0
         self._done = False
-        self._frames = frames[0]
-        self._state = self._world.begin(frames[0], robot[0], self._task)
-        return self._observation(robot[0])
+        self._frames = frames
+        self._state = self._world.begin(frames, robot, self._task)
+        return self._observation(robot)
 
     def step_chunk(self, actions: np.ndarray) -> ChunkResult:
         if self._done:
@@ -261,7 +269,8 @@ def check_imagination(config: RunConfig) -> None:
 
     policy = policy_to_be(config)
     imagination = config.imagination
-    if (reward := getattr(config.env, "reward", "success")) != "success":
+    reward = getattr(config.env, "reward", "success")
+    if reward != "success":
         hint = (
             "use success with imagination.environments: imagined episodes end with a success, and pay for it"
         )
@@ -270,23 +279,29 @@ def check_imagination(config: RunConfig) -> None:
         hint = "no policy reads it, and nothing imagined has it; leave it out, or imagination.environments"
         raise InputError("env.environment_state", getattr(config.env, "environment_state", None), hint)
     if policy.n_obs_steps > 1:
-        hint = "the policy looks back so many env steps, and only one frame per decision is imagined; use a"
-        raise InputError("policy.n_obs_steps", policy.n_obs_steps, f"{hint} policy with 1, or no imagination")
+        hint = (
+            "the policy looks back so many env steps, and only one frame per decision is imagined; use a "
+            "policy with 1, or no imagination"
+        )
+        raise InputError("policy.n_obs_steps", policy.n_obs_steps, hint)
     with closing(make_environment(config.env)) as environment:
         spec = environment.spec
         if imagination.path is None:
-            if imagination.expert_episodes:
-                make_expert(config.env, environment, spec.tasks[0])
+            for task in spec.tasks[: imagination.expert_episodes]:
+                make_expert(config.env, environment, task)
             return
     world = world_of(imagination)
     _check_fit(world.model.spec, spec, getattr(policy, "n_action_steps", 1))
     if imagination.learns and imagination.learn.dataset.repo_id is not None:
         check_dataset(imagination.learn.dataset, world.model.spec, LEARN)
     failed = read_content(world_path(imagination), "imagination").get("failed_checks")
-    if failed != []:
-        why = "was never checked" if failed is None else f"failed checks ({', '.join(map(str, failed))})"
-        text = "the world model of imagination.path=%s %s; train it longer or on more episodes"
-        logger.warning(text, imagination.path, why)
+    if failed == []:
+        return
+    why = "was never checked"
+    if failed is not None:
+        why = f"failed checks ({', '.join(map(str, failed))})"
+    text = "the world model of imagination.path=%s %s; train it longer or on more episodes"
+    logger.warning(text, imagination.path, why)
 
 
 def _check_fit(spec: WorldModelSpec, environment: EnvironmentSpec, executed: int) -> None:
@@ -294,17 +309,19 @@ def _check_fit(spec: WorldModelSpec, environment: EnvironmentSpec, executed: int
     decision."""
     field = "imagination.path"
     again = "train one of this environment"
-    if missing := [camera for camera in environment.images if camera not in spec.cameras]:
-        hint = f"the environment shows this camera, the world model {spec.cameras!r}; {again}"
-        raise InputError(field, missing[0], hint)
+    for camera in environment.images:
+        if camera not in spec.cameras:
+            hint = f"the environment shows this camera, the world model {spec.cameras!r}; {again}"
+            raise InputError(field, camera, hint)
     for name in ("state_dim", "action_dim", "fps"):
-        modelled, real = getattr(spec, name), getattr(environment, name)
+        modelled = getattr(spec, name)
+        real = getattr(environment, name)
         if modelled != real:
             hint = f"is the world model's {name}, and the environment's is {real}; {again}"
             raise InputError(field, modelled, hint)
-    unknown = [text for text in environment.instructions if spec.tasks and text not in spec.tasks]
-    if unknown:
-        raise InputError(field, unknown[0], f"the world model was trained on {spec.tasks!r}; {again}")
+    for text in environment.instructions:
+        if spec.tasks and text not in spec.tasks:
+            raise InputError(field, text, f"the world model was trained on {spec.tasks!r}; {again}")
     if spec.chunk != executed:
         hint = f"env steps per prediction, and the policy executes {executed} actions per decision"
         raise InputError(field, spec.chunk, f"{hint}; train one with world_model.chunk={executed}")

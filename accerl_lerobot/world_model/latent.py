@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from itertools import pairwise
 
 import numpy as np
 import torch
@@ -30,17 +29,23 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK_BITS, Observations, task_codes
 from accerl_lerobot.policies.features import STATE
 from accerl_lerobot.world_model.config import LatentConfig
-from accerl_lerobot.world_model.states import StateModel, StateSpec, Transitions
+from accerl_lerobot.world_model.states import StateModel, StateSpec, Transitions, fixed
 
 SIDE = 64  # pixels of the square that every image is resized to
 SHIFT = 3  # pixels of the random shift at most, in each direction
-CHANNELS, KERNELS, STRIDES = 32, (7, 5, 3, 3), (2, 2, 2, 1)
+CHANNELS = 32
+KERNELS = (7, 5, 3, 3)
+STRIDES = (2, 2, 2, 1)
 WIDTH = 256
 FOLLOW = 0.02  # share of the encoder that its slow copy takes over in a step
 TEMPERATURE = 0.1  # of the contrast
-CONTRAST, RETURN, INVERSE, CLONING = 0.1, 4.0, 0.3, 0.5  # weights of the losses; proprioception's is 1
+CONTRAST = 0.1  # weights of the losses; that of proprioception is 1
+RETURN = 4.0
+INVERSE = 0.3
+CLONING = 0.5
 SMALLEST_STD = 1e-3
-SMALLEST_PIXEL_STD, FARTHEST = 0.05, 5.0  # of a pixel's range, and in standard deviations
+SMALLEST_PIXEL_STD = 0.05  # of a pixel's range
+FARTHEST = 5.0  # standard deviations that a pixel may be from its mean
 PIXEL_RATE = 0.002  # share of the newest images in the pixels' means, at least
 
 
@@ -56,7 +61,8 @@ class Encoder(nn.Module):
         side = SIDE
         for kernel, stride in zip(KERNELS, STRIDES, strict=True):
             layers += [nn.Conv2d(channels, CHANNELS, kernel, stride), nn.SiLU()]
-            channels, side = CHANNELS, (side - kernel) // stride + 1
+            channels = CHANNELS
+            side = (side - kernel) // stride + 1
         layers[-1] = nn.Flatten()
         self.images = nn.Sequential(*layers)
         self.latent = network(CHANNELS * side**2, size, hidden=1)
@@ -77,24 +83,29 @@ class LatentModel(StateModel):
         if not spec.cameras:
             hint = "the policy reads no images; use simulator, or another algorithm"
             raise InputError("world_model.type", config.type, hint)
-        self.cameras, self.latents = tuple(spec.cameras), config.latents
-        self.size = config.latents + spec.state + 1
-        self.encoder = Encoder(sum(spec.cameras.values()), config.latents)
+        channels = sum(spec.cameras.values())
+        rows, dims = spec.chunk
+        chunk = rows * dims
+        seen = config.latents + spec.state
+        self.cameras = tuple(spec.cameras)
+        self.latents = config.latents
+        self.size = seen + 1
+        self.encoder = Encoder(channels, config.latents)
         self.slow = copy.deepcopy(self.encoder).requires_grad_(False)
-        seen, chunk = config.latents + spec.state, spec.chunk[0] * spec.chunk[1]
         self.dynamics = network(seen + chunk + TASK_BITS, seen, hidden=2)
         self.value = network(seen + 1 + TASK_BITS, 1, hidden=1)
         self.inverse = network(2 * seen, chunk, hidden=1)
         self.cloned = network(seen + TASK_BITS, chunk, hidden=1)
-        pixels = sum(spec.cameras.values()), SIDE, SIDE
-        self.pixel_mean = nn.Parameter(torch.zeros(pixels), requires_grad=False)
-        self.pixel_square = nn.Parameter(torch.ones(pixels), requires_grad=False)
-        self.batches = nn.Parameter(torch.zeros(()), requires_grad=False)  # that the two above are means of
-        self.mean = nn.Parameter(torch.zeros(spec.state), requires_grad=False)
-        self.std = nn.Parameter(torch.ones(spec.state), requires_grad=False)
+        pixels = channels, SIDE, SIDE
+        self.pixel_mean = fixed(torch.zeros(pixels))
+        self.pixel_square = fixed(torch.ones(pixels))
+        self.batches = fixed(torch.zeros(()))  # that the two above are means of
+        self.mean = fixed(torch.zeros(spec.state))
+        self.std = fixed(torch.ones(spec.state))
 
     def encode(self, observations: Observations, tasks: Sequence[str], elapsed: np.ndarray) -> Tensor:
-        latent = self.encoder(torch.cat(self._scaled(self._images(observations)), 1))
+        images = self._scaled(self._images(observations))
+        latent = self.encoder(torch.cat(images, 1))
         late = torch.from_numpy(elapsed.astype(np.float32))[:, None].to(latent)
         return torch.cat([latent, self._proprioception(observations), late], 1)
 
@@ -105,18 +116,18 @@ class LatentModel(StateModel):
         numbers = observations[STATE]
         numbers = numbers.reshape(len(numbers), -1)
         # In float64, or the rounding of a long sum would look like a spread.
+        std = numbers.std(0, dtype=np.float64).clip(SMALLEST_STD)
         self.mean.copy_(torch.from_numpy(numbers.mean(0, dtype=np.float64)))
-        self.std.copy_(torch.from_numpy(numbers.std(0, dtype=np.float64).clip(SMALLEST_STD)))
+        self.std.copy_(torch.from_numpy(std))
 
     def loss(self, transitions: Transitions) -> tuple[Tensor, dict[str, float]]:
         self._follow()
-        now, following = self._images(transitions.observations), self._images(transitions.following)
-        self._fit_pixels(torch.cat(now, 1))
-        now, following = self._scaled(now), self._scaled(following)
-        robot, robot_then = (
-            (self._proprioception(seen) - self.mean) / self.std
-            for seen in (transitions.observations, transitions.following)
-        )
+        images = self._images(transitions.observations)
+        self._fit_pixels(torch.cat(images, 1))
+        now = self._scaled(images)
+        following = self._scaled(self._images(transitions.following))
+        robot = self._robot(transitions.observations)
+        robot_then = self._robot(transitions.following)
         code = torch.from_numpy(task_codes(transitions.tasks)).to(robot)
         chunk = transitions.chunk.flatten(1)
 
@@ -131,8 +142,10 @@ class LatentModel(StateModel):
         proprioception = error.square().sum() / max(1, error.numel())
         value = self.value(torch.cat([seen, transitions.elapsed[:, None], code], 1))[:, 0]
         returns = (value - transitions.returns).square().mean()
-        inverse = (self.inverse(torch.cat([seen, seen_then], 1)) - chunk).square().mean()
-        distance = (self.cloned(torch.cat([seen, code], 1)) - chunk).square().mean(1)
+        between = self.inverse(torch.cat([seen, seen_then], 1))
+        inverse = (between - chunk).square().mean()
+        cloned = self.cloned(torch.cat([seen, code], 1))
+        distance = (cloned - chunk).square().mean(1)
         cloning = (distance * transitions.success).mean()
 
         loss = CONTRAST * contrast + proprioception + RETURN * returns + INVERSE * inverse + CLONING * cloning
@@ -160,21 +173,30 @@ class LatentModel(StateModel):
         variance = self.pixel_square - self.pixel_mean.square()
         std = variance.clamp(min=SMALLEST_PIXEL_STD**2).sqrt()
         channels = [images.shape[1] for images in cameras]
-        parts = zip(cameras, self.pixel_mean.split(channels), std.split(channels), strict=True)
-        return [((images - mean) / scale).clamp(-FARTHEST, FARTHEST) for images, mean, scale in parts]
+        means = self.pixel_mean.split(channels)
+        scaled = []
+        for images, mean, scale in zip(cameras, means, std.split(channels), strict=True):
+            deviations = (images - mean) / scale
+            scaled.append(deviations.clamp(-FARTHEST, FARTHEST))
+        return scaled
 
     def _images(self, observations: Observations) -> list[Tensor]:
         """Each camera's, float (B, C, 64, 64) in [−½, ½]; of several env steps the newest."""
         cameras = []
         for name in self.cameras:
             pixels = observations[name]
-            newest = pixels if pixels.ndim == 4 else pixels[:, -1]
-            image = torch.from_numpy(np.ascontiguousarray(newest)).to(self.mean.device)
+            if pixels.ndim == 5:
+                pixels = pixels[:, -1]
+            image = torch.from_numpy(np.ascontiguousarray(pixels)).to(self.mean.device)
             image = image.permute(0, 3, 1, 2).float()
             if image.shape[-2:] != (SIDE, SIDE):
                 image = functional.interpolate(image, (SIDE, SIDE), mode="area")
             cameras.append(image / 255 - 0.5)
         return cameras
+
+    def _robot(self, observations: Observations) -> Tensor:
+        """Proprioception in standard deviations from its mean, (B, numbers)."""
+        return (self._proprioception(observations) - self.mean) / self.std
 
     def _proprioception(self, observations: Observations) -> Tensor:
         if not len(self.mean):
@@ -185,11 +207,12 @@ class LatentModel(StateModel):
 
 def network(inputs: int, outputs: int, hidden: int) -> nn.Sequential:
     """Linear layers with LayerNorm and SiLU between them."""
-    sizes = [inputs, *[WIDTH] * hidden]
     layers: list[nn.Module] = []
-    for before, after in pairwise(sizes):
-        layers += [nn.Linear(before, after), nn.LayerNorm(after), nn.SiLU()]
-    return nn.Sequential(*layers, nn.Linear(sizes[-1], outputs))
+    size = inputs
+    for _ in range(hidden):
+        layers += [nn.Linear(size, WIDTH), nn.LayerNorm(WIDTH), nn.SiLU()]
+        size = WIDTH
+    return nn.Sequential(*layers, nn.Linear(size, outputs))
 
 
 def info_nce(predicted: Tensor, observed: Tensor) -> Tensor:
@@ -210,8 +233,7 @@ def shifted(images: Tensor) -> Tensor:
     height, width = images.shape[-2:]
     padded = functional.pad(images, (SHIFT,) * 4, mode="replicate")
     offsets = torch.randint(0, 2 * SHIFT + 1, (len(images), 2)).tolist()
-    moved = [
-        image[:, row : row + height, column : column + width]
-        for image, (row, column) in zip(padded, offsets, strict=True)
-    ]
+    moved = []
+    for image, (row, column) in zip(padded, offsets, strict=True):
+        moved.append(image[:, row : row + height, column : column + width])
     return torch.stack(moved)

@@ -45,19 +45,24 @@ MOST_UNFINISHED = 1024
 def episode_from_segments(segments: Sequence[Segment], spec: WorldModelSpec) -> Episode:
     """Joins the segments of a whole episode, in order; it has a frame per decision."""
     # A segment's first observation is the last one of the segment before.
-    parts = [{k: v[:-1] for k, v in segment.observations.items()} for segment in segments[:-1]]
-    parts.append(segments[-1].observations)
-    frames, robot = model_arrays({k: np.concatenate([part[k] for part in parts]) for k in parts[0]}, spec)
+    *others, last = segments
+    parts = [{name: rows[:-1] for name, rows in segment.observations.items()} for segment in others]
+    parts.append(last.observations)
+    observations = {name: np.concatenate([part[name] for part in parts]) for name in last.observations}
+    frames, robot = model_arrays(observations, spec)
     steps = np.concatenate([segment.steps for segment in segments])
     chunks = np.concatenate([segment.actions for segment in segments])
     actions = chunks[np.arange(chunks.shape[1]) < steps[:, None]]
+    success_at = -1
+    if last.success:
+        success_at = len(actions) - 1
     return Episode(
         frames=frames,
         times=np.concatenate([[0], np.cumsum(steps)]).astype(np.int64),
         state=robot,
         actions=actions,
-        success_at=len(actions) - 1 if segments[-1].success else -1,
-        task=segments[-1].task,
+        success_at=success_at,
+        task=last.task,
     )
 
 
@@ -116,15 +121,17 @@ class OnlineLearner:
         episode = episode_from_segments(ordered, self._trainer.world.model.spec)
         self._own.append(episode)
         self.learnt.add(episode.key)
-        most = MOST_PENDING * self.config.steps_per_episode
-        self.pending_steps = min(self.pending_steps + self.config.steps_per_episode, most)
+        more = self.config.steps_per_episode
+        self.pending_steps = min(self.pending_steps + more, MOST_PENDING * more)
 
     def step(self) -> dict[str, float]:
         """Makes one gradient step of both models."""
         self.pending_steps -= 1
-        parts = [part for part in (self._offline, list(self._own)) if part]
-        weights = np.concatenate([uniform(part) for part in parts]) / len(parts)
-        return self._trainer.step([episode for part in parts for episode in part], weights)
+        episodes = [*self._offline, *self._own]
+        weights = uniform(self._own)
+        if self._offline:
+            weights = np.concatenate([uniform(self._offline), weights]) / 2
+        return self._trainer.step(episodes, weights)
 
     def state(self) -> dict[str, Any]:
         """Copies all that `restore` needs."""
@@ -153,7 +160,7 @@ class OnlineLearner:
 def make_learner(config: RunConfig) -> OnlineLearner:
     """The learner of a run's world model, which starts at the saved one and goes on with its episodes."""
     imagination = config.imagination
-    dataset = config.imagination.learn.dataset
+    dataset = imagination.learn.dataset
     world = world_of(imagination)
     learnt = set(read_content(world_path(imagination), "imagination").get("learnt") or ())
     offline: list[Episode] = []
@@ -194,7 +201,7 @@ class OnlineLearningWorker:
         self._learning = threading.Lock()  # held by the call that makes the steps
         self._inbox: deque[Segment] = deque()
         self._failure: Exception | None = None
-        self._newest = self._learner.version, copied(self._learner.world)
+        self._newest = (self._learner.version, copied(self._learner.world))
         self._clock.enter(WAIT_IN)
 
     def ready(self) -> int:
@@ -221,9 +228,10 @@ class OnlineLearningWorker:
         while self._learner.pending_steps >= 1:
             fault_point("learning.step")
             with self._lock:
+                self._clock.enter(COMPUTE)  # a checkpoint may have been saved since the last step
                 self._learner.step()
         if self._learner.version > self._newest[0]:
-            self._newest = self._learner.version, copied(self._learner.world)
+            self._newest = (self._learner.version, copied(self._learner.world))
 
     def metrics(self) -> dict[str, float]:
         """Counts; ``version`` is that of `weights`."""

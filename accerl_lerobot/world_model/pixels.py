@@ -34,11 +34,11 @@ COARSE = 8  # side of the coarse view of the frame from which the robot's state 
 CONTEXT_NOISE = 0.02
 """Largest std of the noise on the context's frames in training, in units of [−1, 1]: imagined frames are
 never as clean as recorded ones."""
-HIDDEN, PLANES = 128, 8  # width of hidden layers; channels of the planes that tell the actions
+HIDDEN = 128  # width of hidden layers
+PLANES = 8  # channels of the planes that tell the actions
 GRID = 4  # side of the success model's last feature map
-NOISE, SHIFT = 0.03, 3
-"""Noise on frames in the success model's training, its largest std where 1 is white, and their largest shift
-in pixels."""
+NOISE = 0.03  # largest std of the noise on frames in the success model's training, where 1 is white
+SHIFT = 3  # their largest shift in pixels
 
 
 class PixelWorldModel(LearnableWorldModel):
@@ -49,26 +49,30 @@ class PixelWorldModel(LearnableWorldModel):
         channels = 3 * len(spec.cameras)
         robot = spec.state_dim
         action = spec.action_dim
-        numbers = spec.chunk * (action * spec.context + 1) + action + robot * (spec.context + 1) + TASK_BITS
+        of_actions = spec.chunk * (action * spec.context + 1) + action
+        of_robot = robot * (spec.context + 1)
+        numbers = of_actions + of_robot + TASK_BITS
         self.network = FrameNetwork(channels, (spec.context + 1) * channels, numbers, config.channels)
         self.motion = nn.Sequential(
             nn.Linear(numbers + channels * COARSE * COARSE, HIDDEN), nn.SiLU(),
             nn.Linear(HIDDEN, HIDDEN), nn.SiLU(),
             _zero(nn.Linear(HIDDEN, robot)),
         )  # fmt: skip
-        for name, size in {"robot": robot, "action": action, "motion": robot, "commanded": action}.items():
+        sizes = {"robot": robot, "action": action, "motion": robot, "commanded": action}
+        for name, size in sizes.items():
             self.register_buffer(f"{name}_mean", torch.zeros(size))
             self.register_buffer(f"{name}_std", torch.ones(size))
         self.register_buffer("change", torch.tensor(0.1))
 
     def fit_statistics(self, windows: Windows) -> None:
-        valid = windows.steps[:, 0] > 0
+        steps = windows.steps[:, 0]
+        valid = steps > 0
         state = windows.context.robot[:, -1]
         newest = windows.context.frames[:, -1]
         samples = {
             "robot": state,
             "motion": (windows.robot[:, 0] - state)[valid],
-            "action": windows.actions[:, 0][self._executed(windows.steps[:, 0])],
+            "action": windows.actions[:, 0][self._executed(steps)],
             "commanded": windows.context.commanded_sum,
         }
         for name, values in samples.items():
@@ -88,7 +92,9 @@ class PixelWorldModel(LearnableWorldModel):
     def loss(self, windows: Windows, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
         """Loss over every valid chunk; after the first, the model's own prediction is its input."""
         device = self.change.device
-        frames, robot, steps = (x.to(device) for x in (windows.frames, windows.robot, windows.steps))
+        frames = windows.frames.to(device)
+        robot = windows.robot.to(device)
+        steps = windows.steps.to(device)
         state = self.begin(windows.context, windows.tasks)
         images = []
         motions = []
@@ -96,22 +102,24 @@ class PixelWorldModel(LearnableWorldModel):
             executed = self._executed(steps[:, r])
             actions = windows.actions[:, r].to(device) * executed[..., None]
             numbers = self._numbers(state, actions, executed)
-            change = (_to_floats(frames[:, r]) - _to_floats(state["frames"][:, -1])) / self.change
-            images.append((self._change(state, numbers, generator) - change).square().mean((1, 2, 3)))
+            change = (_to_floats(frames[:, r]) - _newest_frames(state)) / self.change
+            error = self._change(state, numbers, generator) - change
+            images.append(error.square().mean((1, 2, 3)))
             motion = (robot[:, r] - state["robot"][:, -1] - self.motion_mean) / self.motion_std
-            motions.append((self._motion(state, numbers) - motion).square().sum(1) / max(1, motion.shape[1]))
+            error = self._motion(state, numbers) - motion
+            motions.append(error.square().sum(1) / max(1, motion.shape[1]))
             if r + 1 < steps.shape[1]:
                 state = self._predict(state, actions, executed).state
         weight = (steps > 0).float()
-        image, motion = (
-            (torch.stack(part, 1) * weight).sum() / weight.sum().clamp(min=1) for part in (images, motions)
-        )
+        count = weight.sum().clamp(min=1)
+        image = (torch.stack(images, 1) * weight).sum() / count
+        motion = (torch.stack(motions, 1) * weight).sum() / count
         return image + motion, {"image": image.item(), "state": motion.item()}
 
     @torch.no_grad()
     def _predict(self, state: State, actions: Tensor, executed: Tensor) -> Prediction:
         numbers = self._numbers(state, actions, executed)
-        image = _to_floats(state["frames"][:, -1]) + self.change * self._change(state, numbers)
+        image = _newest_frames(state) + self.change * self._change(state, numbers)
         pixels = ((image + 1) * 127.5).round().clamp(0, 255).byte()
         frames = pixels.unflatten(1, (-1, 3)).movedim(2, -1)
         motion = self.motion_mean + self.motion_std * self._motion(state, numbers)
@@ -131,13 +139,14 @@ class PixelWorldModel(LearnableWorldModel):
         frames = _to_floats(seen.flatten(1, 2))
         if generator is not None:
             level = CONTEXT_NOISE * torch.rand(len(frames), 1, 1, 1, generator=generator)
-            frames = frames + (level * torch.randn(frames.shape, generator=generator)).to(frames)
+            noise = level * torch.randn(frames.shape, generator=generator)
+            frames = frames + noise.to(frames)
         change: Tensor = self.network(frames, numbers)
         return change
 
     def _motion(self, state: State, numbers: Tensor) -> Tensor:
         """The robot's motion in usual motions, (B, S)."""
-        view = functional.adaptive_avg_pool2d(_to_floats(state["frames"][:, -1]), COARSE)
+        view = functional.adaptive_avg_pool2d(_newest_frames(state), COARSE)
         motion: Tensor = self.motion(torch.cat([numbers, view.flatten(1)], 1))
         return motion
 
@@ -148,13 +157,14 @@ class PixelWorldModel(LearnableWorldModel):
         No frame shows how fast the robot moves, nor how far it has still to go to where it is commanded.
         """
         robot = state["robot"]
+        newest = robot[:, -1]
         parts = [
             (actions - self.action_mean) / self.action_std * executed[..., None],
             executed.float(),
             (state["actions"] - self.action_mean) / self.action_std,
             (state["commanded_sum"] - self.commanded_mean) / self.commanded_std,
-            (robot[:, -1] - state["first_robot"]) / self.robot_std,
-            (robot[:, -1] - self.robot_mean) / self.robot_std,
+            (newest - state["first_robot"]) / self.robot_std,
+            (newest - self.robot_mean) / self.robot_std,
             (robot[:, 1:] - robot[:, :-1]) / self.motion_std,
             state[TASK],
         ]
@@ -183,16 +193,20 @@ class SuccessModel(nn.Module):
 
     def forward(self, images: Tensor, tasks: Tensor) -> Tensor:
         """Logits (B,), of images (B, V, 3, H, W) in [0, 1] and task codes (B, 16)."""
-        features = self.convolutions(2 * images.flatten(0, 1) - 1).unflatten(0, images.shape[:2])
+        features = self.convolutions(2 * images.flatten(0, 1) - 1)
+        features = features.unflatten(0, images.shape[:2])
         codes = tasks[:, None].expand(-1, images.shape[1], -1)
-        hidden = functional.silu(self.hidden(torch.cat([features, codes], 2))).mean(1)
-        return self.out(hidden)[:, 0]
+        hidden = self.hidden(torch.cat([features, codes], 2))
+        of_image = functional.silu(hidden).mean(1)
+        return self.out(of_image)[:, 0]
 
     @torch.no_grad()
     def probabilities(self, frames: Tensor, tasks: Tensor) -> Tensor:
         """float32 (N,) on the CPU, of frames uint8 (N, V, H, W, 3) and task codes (N, 16)."""
-        batches = zip(frames.split(256), tasks.split(256), strict=True)
-        parts = [torch.sigmoid(self(self._images(part), codes.to(self.threshold))) for part, codes in batches]
+        parts = []
+        for part, codes in zip(frames.split(256), tasks.split(256), strict=True):
+            logits = self(self._images(part), codes.to(self.threshold))
+            parts.append(torch.sigmoid(logits))
         return torch.cat(parts).cpu()
 
     def loss(self, frames: Tensor, tasks: Tensor, success: Tensor, generator: torch.Generator) -> Tensor:
@@ -203,11 +217,12 @@ class SuccessModel(nn.Module):
         y, x = torch.randint(2 * SHIFT + 1, (2,), generator=generator).tolist()
         padded = functional.pad(images.flatten(0, 1), (SHIFT,) * 4, mode="replicate")
         shifted = padded[..., y : y + height, x : x + width].unflatten(0, images.shape[:2])
-        light = 1 + 0.1 * torch.randn(len(images), 1, 1, 1, 1, generator=generator)
-        level = NOISE * torch.rand(len(images), 1, 1, 1, 1, generator=generator)
+        each = (len(images), 1, 1, 1, 1)
+        light = 1 + 0.1 * torch.randn(each, generator=generator)
+        level = NOISE * torch.rand(each, generator=generator)
         noise = level * torch.randn(images.shape, generator=generator)
-        augmented = (shifted * light.to(images) + noise.to(images)).clamp(0, 1)
-        logits = self(augmented, tasks.to(images))
+        augmented = shifted * light.to(images) + noise.to(images)
+        logits = self(augmented.clamp(0, 1), tasks.to(images))
         return functional.binary_cross_entropy_with_logits(logits, success.to(images))
 
     def _images(self, frames: Tensor) -> Tensor:
@@ -217,6 +232,11 @@ class SuccessModel(nn.Module):
 def _to_floats(frames: Tensor) -> Tensor:
     """uint8 (B, V, H, W, 3) to float32 (B, 3·V, H, W) in [−1, 1]."""
     return (frames.float() / 127.5 - 1).movedim(-1, 2).flatten(1, 2)
+
+
+def _newest_frames(state: State) -> Tensor:
+    """The newest frames of a state, float32 (B, 3·V, H, W) in [−1, 1]."""
+    return _to_floats(state["frames"][:, -1])
 
 
 class FrameNetwork(nn.Module):

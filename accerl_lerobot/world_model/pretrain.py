@@ -39,7 +39,6 @@ from accerl_lerobot.console import Console
 from accerl_lerobot.envs import EnvConfig, make_environment
 from accerl_lerobot.errors import InputError, expanded
 from accerl_lerobot.evaluation import write_video
-from accerl_lerobot.experience import task_codes
 from accerl_lerobot.metrics import plain
 from accerl_lerobot.policies.loading import resolve_device
 from accerl_lerobot.world_model.config import WorldModelConfig
@@ -60,10 +59,13 @@ if TYPE_CHECKING:
 LOG_EVERY = 20  # steps between two lines of training losses
 VALIDATION = "validation.json"
 BOUNDS = {"skill": 0.3, "sensitivity": 1.2, "auroc": 0.9}  # numbers that a world model must exceed
-MOST_WINDOWS, MOST_REPLAYS = 400, 200
+MOST_WINDOWS = 400
+MOST_REPLAYS = 200
 CHANGED = 16  # a pixel counts as changed if one of its colours differs by more, of 255
 FALSE_POSITIVES = 0.1  # largest share of failures that may pass for successes
-PREVIEWED, SCALE, FPS = 4, 3, 4  # episodes in the video, its enlargement, and its chunks per second
+PREVIEWED = 4  # episodes in the video
+SCALE = 3  # enlargement of the video
+FPS = 4  # chunks per second of the video
 
 
 def pretrain(
@@ -92,11 +94,10 @@ def pretrain(
     with console.stage("episodes"):
         episodes = load_episodes(dataset, spec)
     learnt, held_out = split_episodes(episodes, np.random.default_rng((seed, 0)))
-    if any({episode.success for episode in part} != {True, False} for part in (learnt, held_out)):
-        hint = (
-            "it needs at least two successes and two failures, to hold out one of each; record more episodes"
-        )
-        raise InputError("dataset.repo_id", dataset.repo_id, hint)
+    for part in (learnt, held_out):
+        if {episode.success for episode in part} != {True, False}:
+            hint = "it needs at least two successes and two failures, to hold out one of each; record more"
+            raise InputError("dataset.repo_id", dataset.repo_id, hint)
     spec = replace(spec, tasks=tuple(sorted({episode.task for episode in episodes})))
     started = time.monotonic()
     torch.manual_seed(seed)
@@ -157,8 +158,10 @@ def _validate(
 def show(found: dict[str, Any], directory: Path, console: Console) -> None:
     """Show people the outcome of a check."""
     for name, outcome in found["checks"].items():
-        verdict = "" if outcome["holds"] else ", FAILED"
-        console.say(f"{name} {outcome['value']:.2f}, to be above {outcome['above']:g}{verdict}")
+        line = f"{name} {outcome['value']:.2f}, to be above {outcome['above']:g}"
+        if not outcome["holds"]:
+            line += ", FAILED"
+        console.say(line)
     verdict = "passed" if found["passed"] else "FAILED"
     console.say(f"{verdict} on {found['episodes']} episodes; see {directory / 'preview.mp4'}")
 
@@ -177,16 +180,17 @@ def check(world: World, episodes: Sequence[Episode], seed: int = 0) -> dict[str,
         followed = np.flatnonzero(episode.times + chunk <= episode.times[-1])
         at += [WindowStart(e, int(frame)) for frame in followed]
     chosen = rng.permutation(len(at))[:MOST_WINDOWS]
-    values = {"skill": float("nan"), "sensitivity": float("nan")}
+    values = {"skill": np.nan, "sensitivity": np.nan}
     if len(chosen):
         windows = cut_windows(episodes, [at[i] for i in chosen], world.model.spec, 1)
         values = skill_and_sensitivity(world, windows)
-    scores, achieved = replay_scores(world, episodes[:MOST_REPLAYS])
+    replayed = sorted(rng.permutation(len(episodes))[:MOST_REPLAYS])  # of a merged dataset not its first part
+    scores, achieved = replay_scores(world, [episodes[i] for i in replayed])
     values["auroc"] = auroc(scores, achieved)
-    checks = {
-        name: {"value": value, "above": BOUNDS[name], "holds": value > BOUNDS[name]}  # NaN passes nothing
-        for name, value in values.items()
-    }
+    checks = {}
+    for name, value in values.items():
+        bound = BOUNDS[name]
+        checks[name] = {"value": value, "above": bound, "holds": value > bound}  # NaN passes nothing
     return {
         "passed": all(outcome["holds"] for outcome in checks.values()),
         "checks": checks,
@@ -203,12 +207,14 @@ def skill_and_sensitivity(world: World, windows: Windows) -> dict[str, float]:
     other = replace(windows, actions=windows.actions[donors(windows.episode)])
     predicted = replay(world.model, windows)[:, 0]
     misled = replay(world.model, other)[:, 0]
-    changed = (recorded.int() - newest.int()).abs().amax(-1) > CHANGED
+    difference = (recorded.int() - newest.int()).abs()
+    changed = difference.amax(-1) > CHANGED
     errors = squared_errors(predicted, recorded)
     copied = squared_errors(newest, recorded)
     misled_error = squared_errors(misled, recorded).mean()
     skill = 1 - errors[changed].mean() / copied[changed].mean()  # NaN where nothing changes
-    return {"skill": float(skill), "sensitivity": float(misled_error / errors.mean().clamp(min=1e-9))}
+    sensitivity = misled_error / errors.mean().clamp(min=1e-9)
+    return {"skill": float(skill), "sensitivity": float(sensitivity)}
 
 
 def squared_errors(frames: Tensor, target: Tensor) -> Tensor:
@@ -227,13 +233,12 @@ def donors(episode: Tensor) -> Tensor:
 
 def replay_scores(world: World, episodes: Sequence[Episode]) -> tuple[np.ndarray, np.ndarray]:
     """Highest P(success) in each episode's imagined replay, until it really ended, and the real outcome."""
-    windows = whole_windows(episodes, [WindowStart(e, 0) for e in range(len(episodes))], world)
+    at = [WindowStart(e, 0) for e in range(len(episodes))]
+    windows = whole_windows(episodes, at, world)
     known = windows.known
     frames = replay(world.model, windows)
-    codes = torch.from_numpy(task_codes(windows.tasks))
-    codes = codes[:, None].expand(-1, known.shape[1], -1)
     probabilities = torch.zeros(known.shape)
-    probabilities[known] = world.success.probabilities(frames[known], codes[known])
+    probabilities[known] = world.success.probabilities(frames[known], windows.known_tasks)
     return probabilities.amax(1).numpy(), windows.success.any(1).numpy()
 
 
@@ -248,27 +253,34 @@ def choose_threshold(scores: np.ndarray, achieved: np.ndarray) -> float:
     successes = scores[achieved]
     # Only thresholds just above a failure are worth trying.
     candidates = [0.5, *np.nextafter(failures[failures >= 0.5], np.inf, dtype=np.float32).tolist()]
-    allowed = [least for least in candidates if share_above(failures, least) <= FALSE_POSITIVES]
-    best = max(allowed, key=lambda least: share_above(successes, least) - share_above(failures, least))
+    margins = {}
+    for least in candidates:
+        false_positives = share_above(failures, least)
+        if false_positives <= FALSE_POSITIVES:
+            margins[least] = share_above(successes, least) - false_positives
+    best = max(margins, key=margins.__getitem__)
     return min(float(best), 1 - 1e-6)
 
 
 def share_above(scores: np.ndarray, threshold: float) -> float:
-    return float((scores > threshold).mean()) if len(scores) else 0.0
+    if not len(scores):
+        return 0.0
+    return float((scores > threshold).mean())
 
 
 def auroc(scores: np.ndarray, labels: np.ndarray) -> float:
     """Chance that a success scores above a failure, ties counting half; NaN without both."""
     difference = scores[labels][:, None] - scores[~labels]
     if not difference.size:
-        return float("nan")
+        return np.nan
     return float(((difference > 0) + 0.5 * (difference == 0)).mean())
 
 
 def preview(video: Path, world: World, episodes: Sequence[Episode]) -> None:
     """Films recorded episodes in the first row, and their imagined replays in the second."""
-    at = [WindowStart(e, 0) for e in range(min(PREVIEWED, len(episodes)))]
-    windows = whole_windows(episodes, at, world)
+    previewed = episodes[:PREVIEWED]
+    at = [WindowStart(e, 0) for e in range(len(previewed))]
+    windows = whole_windows(previewed, at, world)
     lines = []
     for frames in (windows.frames, replay(world.model, windows)):
         clips = frames.repeat_interleave(SCALE, 3).repeat_interleave(SCALE, 4)

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch.nn.utils import clip_grad_norm_
 
 from accerl_lerobot.checkpoint.tensors import copied, optimizer_state, restore_optimizer
 from accerl_lerobot.errors import MAX_NONFINITE, NonFiniteError
@@ -21,7 +22,8 @@ from accerl_lerobot.experience import Observations
 from accerl_lerobot.world_model.states import StateModel, Transitions
 
 BATCH = 64  # transitions of a step
-WEIGHT_DECAY, CLIP = 1e-4, 10.0
+WEIGHT_DECAY = 1e-4
+CLIP = 10.0  # largest norm of a gradient
 
 
 class StateLearner:
@@ -37,6 +39,7 @@ class StateLearner:
             learned, lr=model.learning_rate, weight_decay=WEIGHT_DECAY, fused=True
         )
         self.count = 0  # steps made
+        self._learned = learned
         self._skipped_in_a_row = 0
         self._made: list[dict[str, float]] = []
 
@@ -53,15 +56,17 @@ class StateLearner:
     def submit(self, transitions: Transitions, numbers: Observations) -> None:
         """Make a step on each `BATCH` of transitions; `numbers` are all that is remembered without images."""
         self.model.fit(numbers)
-        for part in np.split(np.arange(len(transitions.tasks)), len(transitions.tasks) // BATCH):
-            self._made.append(self._step(transitions.rows(part)))
+        transitions = transitions.to(self._learned[0].device)
+        for rows in np.arange(len(transitions.tasks)).reshape(-1, BATCH):
+            self._made.append(self._step(transitions.rows(rows)))
 
     def wait(self) -> None:
         """Wait until all that was submitted is made."""
 
     def collect(self) -> list[dict[str, float]]:
         """Parts of the loss in each step since the last call."""
-        made, self._made = self._made, []
+        made = self._made
+        self._made = []
         return made
 
     def publish(self, model: StateModel) -> None:
@@ -83,7 +88,7 @@ class StateLearner:
         loss, metrics = self.model.loss(transitions)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        norm = torch.nn.utils.clip_grad_norm_(self.optimizer.param_groups[0]["params"], CLIP)
+        norm = clip_grad_norm_(self._learned, CLIP)
         self.count += 1
         if math.isfinite(float(loss.detach()) + float(norm)):
             self.optimizer.step()

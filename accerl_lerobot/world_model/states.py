@@ -62,6 +62,12 @@ class Transitions(NamedTuple):
             success=self.success[chosen],
         )
 
+    def to(self, device: torch.device | str) -> Transitions:
+        """The same, with the tensors on a device."""
+        fields = self._asdict()
+        tensors = {name: value.to(device) for name, value in fields.items() if isinstance(value, Tensor)}
+        return self._replace(**tensors)
+
 
 class StateModel(nn.Module, ABC):
     """A model whose states critic and teacher see.
@@ -111,6 +117,11 @@ class SimulatorState(StateModel):
     def encode(self, observations: Observations, tasks: Sequence[str], elapsed: np.ndarray) -> Tensor:
         numbers = observations[ENVIRONMENT_STATE]
         return torch.from_numpy(numbers.reshape(len(numbers), -1).astype(np.float32))
+
+
+def fixed(values: Tensor) -> nn.Parameter:
+    """A parameter without gradient: numbers of a `StateModel` that are saved, and not learned by its loss."""
+    return nn.Parameter(values.detach().clone().float(), requires_grad=False)
 
 
 def can_learn(config: StateModelConfig) -> bool:

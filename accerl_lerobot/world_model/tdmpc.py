@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional
 
 from accerl_lerobot.errors import InputError
@@ -28,7 +28,7 @@ from accerl_lerobot.policies.loading import load_network
 from accerl_lerobot.policies.processing import IMAGES, Processing
 from accerl_lerobot.world_model.config import TDMPCStateConfig
 from accerl_lerobot.world_model.latent import shifted
-from accerl_lerobot.world_model.states import StateModel, StateSpec, Transitions
+from accerl_lerobot.world_model.states import StateModel, StateSpec, Transitions, fixed
 
 RETURN = 0.5  # weight of the return's squared error; consistency's is in the policy's own config
 SMALLEST_SCALE = 1e-6
@@ -42,6 +42,7 @@ class TDMPCModel(StateModel):
         policy, processing = _loaded(config)
         self.config = policy.config
         self.keeps_learning = config.learn
+        self.path = config.path
         self.image = next(iter(self.config.image_features), None)
         self.camera = _camera(spec, self.image, config)
         self.numbers = spec.state
@@ -55,20 +56,21 @@ class TDMPCModel(StateModel):
         self.slow.requires_grad_(False)
         # What it normalises by, measured: LeRobot's normalisations are all affine.
         with torch.no_grad():
-            zero, one = (processing.normalise(torch.full((1, 1, spec.chunk[1]), x))[0, 0] for x in (0.0, 1.0))
-            scale = one - zero
+            one = torch.ones(1, 1, spec.chunk[1])
+            zero = processing.normalise(torch.zeros_like(one))[0, 0]
+            scale = processing.normalise(one)[0, 0] - zero
             if spec.units is not None:  # of the policy's normalised actions
-                first, each = (torch.from_numpy(part) for part in spec.units)
+                first, each = map(torch.from_numpy, spec.units)
                 zero = zero + scale * first
                 scale = scale * each
-            self.action_zero = _fixed(zero)
-            self.action_scale = _fixed(scale)
+            self.action_zero = fixed(zero)
+            self.action_scale = fixed(scale)
             if self.numbers:
-                ends = np.stack([np.zeros(self.numbers, np.float32), np.ones(self.numbers, np.float32)])
+                ends = np.repeat(np.array([[0], [1]], np.float32), self.numbers, 1)
                 seen = {STATE: ends} | self._blank(2)
                 low, high = processing.prepare(seen, ["", ""])[STATE]
-                self.state_zero = _fixed(low)
-                self.state_scale = _fixed(high - low)
+                self.state_zero = fixed(low)
+                self.state_scale = fixed(high - low)
 
     @property
     def learns(self) -> bool:
@@ -89,12 +91,13 @@ class TDMPCModel(StateModel):
             target = self.slow(self._read(transitions.following, shift=True))
         latent = self.encoder(self._read(transitions.observations, shift=True))
         value = self.value(latent)[:, 0]
-        for action in (self.action_zero + self.action_scale * transitions.chunk).unbind(1):
+        actions = self.action_zero + self.action_scale * transitions.chunk
+        for action in actions.unbind(1):
             latent = self.dynamics(torch.cat([latent, action], 1))
         consistency = functional.mse_loss(latent, target)
         returns = functional.mse_loss(value, transitions.returns)
-        metrics = {"consistency": float(consistency.detach()), "return": float(returns.detach())}
-        return self.config.consistency_coeff * consistency + RETURN * returns, metrics
+        loss = self.config.consistency_coeff * consistency + RETURN * returns
+        return loss, {"consistency": float(consistency.detach()), "return": float(returns.detach())}
 
     def _read(self, observations: Observations, shift: bool = False) -> dict[str, Tensor]:
         """Inputs of TD-MPC's encoder."""
@@ -103,11 +106,22 @@ class TDMPCModel(StateModel):
         if self.image is not None:
             pixels = torch.from_numpy(np.ascontiguousarray(observations[self.camera])).to(device)
             images = pixels.permute(0, 3, 1, 2).float() / 255
-            batch[self.image] = shifted(images) if shift else images
+            self._check_images(images)
+            if shift:
+                images = shifted(images)
+            batch[self.image] = images
         if self.numbers:
             numbers = torch.from_numpy(observations[STATE]).to(device)
             batch[STATE] = self.state_zero + self.state_scale * numbers
         return batch
+
+    def _check_images(self, images: Tensor) -> None:
+        """Refuses images (B, C, H, W) of another size, which its encoder has no weights for."""
+        here = tuple(images.shape[1:])
+        there = self.config.image_features[self.image].shape
+        if here != there:
+            hint = f"its images have the shape {there}, the run's {here}; train it on these, or change env"
+            raise InputError("world_model.path", self.path, hint)
 
     def _blank(self, count: int) -> Observations:
         """Black images of TD-MPC's own name and size."""
@@ -126,32 +140,32 @@ def _loaded(config: TDMPCStateConfig) -> tuple[Any, Processing]:
     except InputError as error:
         field = error.field.replace("policy.", "world_model.", 1)
         raise InputError(field, error.value, error.hint) from error
-    if (kind := policy.config.type) != "tdmpc":
+    kind = policy.config.type
+    if kind != "tdmpc":
         raise InputError("world_model.path", config.path, f"its type is {kind}; give one of type tdmpc")
     return policy, processing
 
 
 def _camera(spec: StateSpec, image: str | None, config: TDMPCStateConfig) -> str:
     """The run's camera that TD-MPC sees: the one of its image's name, or the only one."""
-    if image is None or image in spec.cameras:
-        return image or ""
-    if len(spec.cameras) != 1:
-        has = ", ".join(name.removeprefix(IMAGES) for name in spec.cameras) or "none"
-        hint = f"it sees {image}, and the policy's cameras are {has}; train it on one of these names"
-        raise InputError("world_model.path", config.path, hint)
-    return next(iter(spec.cameras))
+    cameras = list(spec.cameras)
+    if image is None:
+        return ""
+    if image in cameras:
+        return image
+    if len(cameras) == 1:
+        return cameras[0]
+    has = ", ".join(name.removeprefix(IMAGES) for name in cameras) or "none"
+    hint = f"it sees {image}, and the policy's cameras are {has}; train it on one of these names"
+    raise InputError("world_model.path", config.path, hint)
 
 
 def _check_sizes(spec: StateSpec, lerobot_config: Any, config: TDMPCStateConfig) -> None:
-    state = lerobot_config.robot_state_feature
-    for what, its, ours in (
-        (STATE, state.shape[0] if state else 0, spec.state),
-        ("action", lerobot_config.action_feature.shape[0], spec.chunk[1]),
-    ):
+    """Refuses a TD-MPC of another robot."""
+    numbers = {STATE: spec.state, "action": spec.chunk[1]}
+    features = lerobot_config.input_features | lerobot_config.output_features
+    for name, ours in numbers.items():
+        its = features[name].shape[0] if name in features else 0
         if its != ours:
-            hint = f"{what} has {its} numbers there and {ours} here; train it on this robot's data"
+            hint = f"{name} has {its} numbers there and {ours} here; train it on this robot's data"
             raise InputError("world_model.path", config.path, hint)
-
-
-def _fixed(values: Tensor) -> nn.Parameter:
-    return nn.Parameter(values.detach().clone().float(), requires_grad=False)

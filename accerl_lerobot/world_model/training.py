@@ -17,22 +17,24 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.utils import clip_grad_norm_
 
 from accerl_lerobot.checkpoint.snapshot import kind
 from accerl_lerobot.checkpoint.tensors import copied, optimizer_state, restore_optimizer
-from accerl_lerobot.experience import task_codes
 from accerl_lerobot.world_model.contract import Windows, replay
 from accerl_lerobot.world_model.data import Episode, WindowStart, cut_windows
 from accerl_lerobot.world_model.imagined import World
 
-BATCH, CHUNKS = 16, 2  # windows per gradient step, and chunks of each of them
+BATCH = 16  # windows per gradient step
+CHUNKS = 2  # chunks of a window
 SUCCESS_BATCH = 32  # frames per gradient step of the success model, half of them successes
-WEIGHT_DECAY, GRAD_CLIP = 1e-2, 1.0
+WEIGHT_DECAY = 1e-2
+GRAD_CLIP = 1.0
 WARMUP = 50  # steps in which the learning rate rises
 AVERAGE = 0.99  # decay of the moving average of the weights
 STATISTICS_WINDOWS = 2048  # windows from which normalisation statistics are taken
-REPLAYED, REFRESH_EVERY = 48, 50
-"""Episodes that are replayed at a time for the success model; gradient steps until others are."""
+REPLAYED = 48  # episodes that are replayed at a time for the success model
+REFRESH_EVERY = 50  # gradient steps until others are
 
 
 @kind
@@ -73,7 +75,8 @@ class Trainer:
 
         The success model is left out while there are only successes, or only failures.
         """
-        loss, metrics = self.world.model.loss(self._draw(episodes, weights, BATCH), self._generator)
+        windows = self._draw(episodes, weights, BATCH)
+        loss, metrics = self.world.model.loss(windows, self._generator)
         if self._labelled is None or self.count % REFRESH_EVERY == 0:
             self._labelled = self._replayed(episodes, weights)
         if self._labelled is not None:
@@ -82,9 +85,9 @@ class Trainer:
             loss = loss + success_loss
         self._optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        parts = (self.world.model, self.world.success)
-        norms = [torch.nn.utils.clip_grad_norm_(part.parameters(), GRAD_CLIP).item() for part in parts]
-        if not math.isfinite(sum(norms)):
+        norm = clip_grad_norm_(self.world.model.parameters(), GRAD_CLIP).item()
+        success_norm = clip_grad_norm_(self.world.success.parameters(), GRAD_CLIP).item()
+        if not math.isfinite(norm + success_norm):
             raise FloatingPointError(
                 f"the world model's loss or gradient is not finite at step {self.count + 1}; "
                 "lower world_model.lr; in a run, use imagination.learn.steps_per_episode=0"
@@ -94,7 +97,7 @@ class Trainer:
         self._optimizer.step()
         self.count += 1
         self._average()
-        return metrics | {"loss": loss.item(), "grad_norm": norms[0]}
+        return metrics | {"loss": loss.item(), "grad_norm": norm}
 
     def state(self) -> dict[str, Any]:
         """Copies all that `restore` needs; see `snapshot`."""
@@ -121,7 +124,10 @@ class Trainer:
     def _draw(self, episodes: Sequence[Episode], weights: np.ndarray, count: int) -> Windows:
         """Windows that begin at frames of equal chance in episodes drawn by `weights`."""
         chosen = self.rng.choice(len(episodes), size=count, p=weights)
-        at = [WindowStart(int(e), int(self.rng.integers(episodes[e].starts))) for e in chosen]
+        at = []
+        for e in chosen.tolist():
+            frame = self.rng.integers(episodes[e].starts)
+            at.append(WindowStart(e, int(frame)))
         return cut_windows(episodes, at, self.world.model.spec, CHUNKS)
 
     def _replayed(self, episodes: Sequence[Episode], weights: np.ndarray) -> Labelled | None:
@@ -131,24 +137,25 @@ class Trainer:
         for of_outcome in (weights * succeeded, weights * ~succeeded):
             if not of_outcome.any():
                 return None
-            for e in self.rng.choice(len(episodes), size=REPLAYED // 2, p=of_outcome / of_outcome.sum()):
-                later = int(self.rng.integers(episodes[e].starts_before_success))
-                at.append(WindowStart(int(e), 0 if self.rng.random() < 0.5 else later))
+            chances = of_outcome / of_outcome.sum()
+            for e in self.rng.choice(len(episodes), size=REPLAYED // 2, p=chances).tolist():
+                frame = int(self.rng.integers(episodes[e].starts_before_success))
+                if self.rng.random() < 0.5:
+                    frame = 0
+                at.append(WindowStart(e, frame))
         windows = whole_windows(episodes, at, self.world)
         known = windows.known
-        codes = torch.from_numpy(task_codes(windows.tasks))
-        tasks = codes[:, None].expand(-1, known.shape[1], -1)[known]
         recorded = windows.frames[known]
         imagined = replay(self.serving.model, windows)[known]
         success = windows.success[known]
-        return Labelled(torch.cat([recorded, imagined]), tasks.repeat(2, 1), success.repeat(2))
+        return Labelled(torch.cat([recorded, imagined]), windows.known_tasks.repeat(2, 1), success.repeat(2))
 
     def _halves(self, labelled: Labelled) -> Labelled:
         """A batch of as many successes as failures."""
-        rows = [
-            self.rng.choice(of_outcome.nonzero()[:, 0].numpy(), SUCCESS_BATCH // 2)
-            for of_outcome in (labelled.success, ~labelled.success)
-        ]
+        rows = []
+        for of_outcome in (labelled.success, ~labelled.success):
+            candidates = of_outcome.nonzero()[:, 0].numpy()
+            rows.append(self.rng.choice(candidates, SUCCESS_BATCH // 2))
         chosen = torch.from_numpy(np.concatenate(rows))
         return Labelled(*(part[chosen] for part in labelled))
 
@@ -157,7 +164,8 @@ class Trainer:
         if self._steps is None:
             return self._lr * rising
         done = min(1.0, self.count / self._steps)
-        return self._lr * rising * (0.1 + 0.9 * 0.5 * (1 + math.cos(math.pi * done)))
+        falling = 0.1 + 0.9 * 0.5 * (1 + math.cos(math.pi * done))
+        return self._lr * rising * falling
 
     @torch.no_grad()
     def _average(self) -> None:

@@ -75,20 +75,16 @@ class WorldModelWorker:
         with self._lock:
             learner = self._learner
             assert learner is not None  # the trainer begins before it submits
-            self._clock.enter(COMPUTE)
-            fault_point("world_model.learn")
-            learner.submit(transitions, numbers)
-            self._clock.enter(WAIT_IN)
+            with self._clock.during(COMPUTE):
+                fault_point("world_model.learn")
+                learner.submit(transitions, numbers)
             return Learned(learner.collect(), learner.count, copied(learner.model))
 
     def state(self) -> dict[str, Any]:
         """The learner's `state`, between two calls of `learn`."""
-        with self._lock:
+        with self._lock, self._clock.during(CHECKPOINT):
             assert self._learner is not None
-            self._clock.enter(CHECKPOINT)
-            state = self._learner.state()
-            self._clock.enter(WAIT_IN)
-            return state
+            return self._learner.state()
 
 
 class RemoteStateLearner:
@@ -104,7 +100,8 @@ class RemoteStateLearner:
         self._actor = actor
         self._timeout_s = timeout_s
         self._first_steps = learner.model.first_steps
-        self._submitted = self._count = learner.count
+        self._submitted = learner.count
+        self._count = learner.count
         self._pending: deque[Any] = deque()  # calls without an answer, in their order
         self._since = 0.0  # when the worker began with the first of them, at the latest
         self._made: list[dict[str, float]] = []
@@ -129,6 +126,7 @@ class RemoteStateLearner:
         if not self._pending:
             self._since = time.monotonic()
         self._submitted += len(transitions.tasks) // BATCH
+        transitions = transitions.to("cpu")  # the worker may have no GPU, or another one
         self._pending.append(self._actor.learn.remote(transitions, numbers))
 
     def wait(self) -> None:

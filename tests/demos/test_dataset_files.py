@@ -6,17 +6,19 @@ from __future__ import annotations
 import io
 import json
 import shutil
+import weakref
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pytest
+import torch
 from PIL import Image
 
 from accerl_lerobot.checkpoint.safety import FileSource
 from accerl_lerobot.config.ranges import DatasetConfig
-from accerl_lerobot.demos.dataset_files import checked, open_metadata, opened, task_texts
+from accerl_lerobot.demos.dataset_files import checked, observations, open_metadata, opened, task_texts
 from accerl_lerobot.errors import InputError
 from tests.tiny_datasets import STEPS, rewrite, write_dataset
 
@@ -235,3 +237,20 @@ def test_depth_is_decoded(tmp_path: Path):
     )
     with opened(dataset, open_metadata(dataset)) as data:
         assert data[0]["observation.images.depth"].unique().tolist() == [700]
+
+
+def test_frames_are_kept_as_bytes():
+    """Of LeRobot's, which are four times as large, one is in memory at a time."""
+    alive: weakref.WeakSet[torch.Tensor] = weakref.WeakSet()
+
+    class Frames:
+        def __getitem__(self, row: int) -> dict[str, torch.Tensor]:
+            assert len(alive) <= 1
+            image = torch.full((3, 2, 4), row / 255)
+            alive.add(image)
+            return {CAMERA: image}
+
+    found = observations(Frames(), np.arange(5), {"action": np.arange(9)}, [CAMERA])
+    assert found["action"].tolist() == list(range(5))
+    assert found[CAMERA].shape == (5, 2, 4, 3) and found[CAMERA].dtype == np.uint8
+    assert found[CAMERA][:, 0, 0, 0].tolist() == list(range(5))

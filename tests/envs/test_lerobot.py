@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import importlib
+import json
+import shlex
 from pathlib import Path
 
 import gymnasium
@@ -67,9 +69,20 @@ def test_lerobots_limit_is_the_default(pusht: LeRobotEnvironment):
 def test_the_command_for_stock_lerobot_has_the_limit_and_needs_its_key():
     env = {"type": "lerobot", "name": "pusht", "kwargs": {"obs_type": "pixels"}, "max_steps": 9}
     assert {"--env.type=pusht", "--env.obs_type=pixels", "--env.episode_length=9"} < {
-        *lerobot_eval_arguments(env)
+        *lerobot_eval_arguments(env, {})
     }
-    assert lerobot_eval_arguments(env | {"success": "succeed"}) == []
+    assert lerobot_eval_arguments(env | {"success": "succeed"}, {}) == []
+
+
+def test_stock_lerobot_is_told_the_name_of_its_lone_camera():
+    env = {"type": "lerobot", "name": "pusht", "camera": "top"}
+    renames = {"observation.images.top": "observation.images.camera1"}
+    for given, expected in ((renames, "observation.images.camera1"), ({}, "observation.images.top")):
+        [text] = [text for text in lerobot_eval_arguments(env, given) if text.startswith("--rename_map=")]
+        [argument] = shlex.split(text)
+        named = json.loads(argument.removeprefix("--rename_map="))
+        assert named == given | {"observation.image": expected}
+    assert "rename_map" not in str(lerobot_eval_arguments(env | {"camera": ""}, {}))
 
 
 def test_images_are_what_the_environment_drew(pusht: LeRobotEnvironment):

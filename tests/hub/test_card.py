@@ -7,6 +7,7 @@ import shlex
 from pathlib import Path
 
 import pytest
+import yaml
 from huggingface_hub import ModelCard
 
 from accerl_lerobot.cli.verbs import CONFIGS
@@ -22,6 +23,13 @@ TINY = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
 def card_of(folder: Path, kind: str, **fields: str) -> str:
     files = stage(PushConfig(path=str(folder), repo_id="alice/door", **fields), folder, kind)
     return bytes(files["README.md"]).decode()
+
+
+def test_a_folder_is_no_base_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    run = write_run_folder(tmp_path / "run")
+    monkeypatch.chdir(tmp_path)
+    Path("lerobot/smolvla_base").mkdir(parents=True)
+    assert ModelCard(card_of(run / "checkpoints/last/pretrained_model", "policy")).data.base_model is None
 
 
 def test_metadata(tmp_path: Path):
@@ -80,6 +88,20 @@ def test_stock_lerobot_and_a_plugin_policy(tmp_path: Path, monkeypatch: pytest.M
     assert "lerobot-eval --policy.path=door" in text and '"task": "door-open-v3"' in text
     assert "--policy.discover_packages_path=lerobot_policy_smolvla_bins" in text
     assert "loads it from the Hub as well: `--policy.path=alice/door`" in text
+    assert "--rename_map" not in text
+
+
+def test_stock_lerobot_is_told_the_names_that_the_run_gave(tmp_path: Path):
+    run = write_run_folder(tmp_path / "run")
+    recipe = yaml.safe_load((run / "config.yaml").read_text())
+    recipe["policy"]["rename_map"] = {"observation.images.corner2": "observation.images.camera1"}
+    (run / "config.yaml").write_text(yaml.safe_dump(recipe))
+    [line] = [
+        line for line in card_of(run / "checkpoints/last/pretrained_model", "policy").splitlines()
+        if line.startswith("lerobot-eval")
+    ]  # fmt: skip
+    renames = '{"observation.images.corner2": "observation.images.camera1"}'
+    assert f"--rename_map={renames}" in shlex.split(line)
 
 
 def test_a_validation_is_reported(tmp_path: Path):

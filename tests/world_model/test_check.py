@@ -12,6 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from accerl_lerobot.world_model import pretrain
 from accerl_lerobot.world_model.contract import Context, LearnableWorldModel, Prediction, State
 from accerl_lerobot.world_model.pretrain import auroc, check, choose_threshold, donors, replay_scores
 from tests.world_model.test_pixels import SIZE, SPEC, K, dots, drawn, ending_on_the_right
@@ -67,6 +68,14 @@ def test_models_of_known_quality(kind: str):
         assert values["sensitivity"] == pytest.approx(1)
     if kind == "still":
         assert values["skill"] == 0 and values["auroc"] == 0.5, "where nothing moves nothing succeeds"
+
+
+def test_replays_are_of_all_parts_of_a_merged_dataset(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(pretrain, "MOST_REPLAYS", 12)
+    episodes = ending_on_the_right(dots(60, steps=30, seed=2))
+    sorted_by_outcome = sorted(episodes, key=lambda episode: episode.success)
+    assert not any(episode.success for episode in sorted_by_outcome[:12])
+    assert check(world("exact"), sorted_by_outcome)["checks"]["auroc"]["holds"]
 
 
 def test_an_exact_world_ends_as_reality_did():

@@ -8,6 +8,7 @@ import signal
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -23,6 +24,7 @@ from accerl_lerobot.trainer import worker as trainer_worker
 from accerl_lerobot.trainer.worker import TrainerWorker
 from accerl_lerobot.world_model import worker as module
 from accerl_lerobot.world_model.state_learner import BATCH, StateLearner
+from accerl_lerobot.world_model.states import Transitions
 from accerl_lerobot.world_model.worker import RemoteStateLearner, WorldModelWorker
 from tests.runs import polls, tiny_run
 from tests.world_model.small_latent import SmallLatentConfig
@@ -82,6 +84,28 @@ def test_steps_elsewhere_are_the_steps_that_would_be_made_here(calls: Calls):
     there.publish(other)
     assert all(torch.equal(a, b) for a, b in zip(one.parameters(), other.parameters(), strict=True))
     assert there.state()["count"] == 3
+
+
+class Elsewhere(Transitions):
+    """Transitions whose tensors are on a GPU that this machine does not have."""
+
+    def to(self, device: torch.device | str) -> Transitions:
+        moved.append(torch.device(device).type)
+        return Transitions(*self)
+
+    def rows(self, chosen: np.ndarray) -> Transitions:
+        raise AssertionError("its tensors are not where the model is")
+
+
+moved: list[str] = []
+
+
+def test_the_trainer_and_the_worker_may_be_on_different_devices(calls: Calls):
+    here, there = learners()
+    for learner in (here, there):
+        learner.submit(Elsewhere(*transitions(BATCH, seed=1)), NUMBERS)
+        learner.wait()
+    assert moved == ["cpu", "cpu"] and len(there.collect()) == 1
 
 
 def test_nobody_waits_while_steps_are_under_way_but_each_call_has_a_timeout(

@@ -15,6 +15,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.spaces import Box, Dict
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
@@ -38,13 +39,15 @@ class AccerlEnv(gym.Env):
         self._environment = make_environment(config)  # its simulator is built at the first reset
         spec = self._environment.spec
         self.task = task
-        self.task_description = dict(zip(spec.tasks, spec.instructions, strict=False)).get(task, "")
+        instructions = dict(zip(spec.tasks, spec.instructions, strict=False))
+        self.task_description = instructions.get(task, "")
         self.metadata = self.metadata | {"render_fps": spec.fps}
         self._max_episode_steps = spec.max_steps  # LeRobot's rollout asks for it under this name
-        images = {_camera(key): gym.spaces.Box(0, 255, size, np.uint8) for key, size in spec.images.items()}
-        state = gym.spaces.Box(-np.inf, np.inf, (spec.state_dim,), np.float32)
-        self.observation_space = gym.spaces.Dict({"pixels": gym.spaces.Dict(images), "agent_pos": state})
-        self.action_space = gym.spaces.Box(spec.action_low, spec.action_high, dtype=np.float32)
+        images = {_camera(key): Box(0, 255, size, np.uint8) for key, size in spec.images.items()}
+        state = Box(-np.inf, np.inf, (spec.state_dim,), np.float32)
+        pixels = Dict(images)
+        self.observation_space = Dict({"pixels": pixels, "agent_pos": state})
+        self.action_space = Box(spec.action_low, spec.action_high, dtype=np.float32)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
