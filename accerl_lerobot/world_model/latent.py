@@ -5,9 +5,10 @@
     images o'──random shift──► slow encoder ──► z'           InfoNCE against the batch's others
 
 A convolutional encoder as in TD-MPC2 (arXiv 2310.16828), contrasted with a slow copy of itself one decision
-later (InfoNCE, arXiv 1807.03748; the slow copy as in SPR, arXiv 2007.05929). Return, executed chunk and the
-chunks of successes are read off the state too, so that it holds what decides them. Without the random shift
-(DrQ-v2, arXiv 2107.09645) it recognises episodes by their pixels, and a critic on it judges no action.
+later (InfoNCE, arXiv 1807.03748; the slow copy as in SPR, arXiv 2007.05929). The executed chunk and the
+chunks of successes are read off the state too, so that it holds what decides them. The return is not: a critic
+finds the outcome of a remembered episode in such a state, and hardly judges the chunk. Without the random
+shift (DrQ-v2, arXiv 2107.09645) the state recognises episodes by their pixels.
 Each pixel is measured from its own mean, in its own standard deviations, so that a small object that moves
 on a still background is as loud as the robot's arm.
 
@@ -40,7 +41,6 @@ WIDTH = 256
 FOLLOW = 0.02  # share of the encoder that its slow copy takes over in a step
 TEMPERATURE = 0.1  # of the contrast
 CONTRAST = 0.1  # weights of the losses; that of proprioception is 1
-RETURN = 4.0
 INVERSE = 0.3
 CLONING = 0.5
 SMALLEST_STD = 1e-3
@@ -93,7 +93,6 @@ class LatentModel(StateModel):
         self.encoder = Encoder(channels, config.latents)
         self.slow = copy.deepcopy(self.encoder).requires_grad_(False)
         self.dynamics = network(seen + chunk + TASK_BITS, seen, hidden=2)
-        self.value = network(seen + 1 + TASK_BITS, 1, hidden=1)
         self.inverse = network(2 * seen, chunk, hidden=1)
         self.cloned = network(seen + TASK_BITS, chunk, hidden=1)
         pixels = channels, SIDE, SIDE
@@ -140,19 +139,19 @@ class LatentModel(StateModel):
         contrast = info_nce(predicted[:, : self.latents], latent_then)
         error = predicted[:, self.latents :] - robot_then
         proprioception = error.square().sum() / max(1, error.numel())
-        value = self.value(torch.cat([seen, transitions.elapsed[:, None], code], 1))[:, 0]
-        returns = (value - transitions.returns).square().mean()
         between = self.inverse(torch.cat([seen, seen_then], 1))
         inverse = (between - chunk).square().mean()
         cloned = self.cloned(torch.cat([seen, code], 1))
         distance = (cloned - chunk).square().mean(1)
         cloning = (distance * transitions.success).mean()
 
-        loss = CONTRAST * contrast + proprioception + RETURN * returns + INVERSE * inverse + CLONING * cloning
+        loss = CONTRAST * contrast + proprioception + INVERSE * inverse + CLONING * cloning
         metrics = {
-            "contrast": contrast, "proprioception": proprioception, "return": returns, "inverse": inverse,
+            "contrast": contrast,
+            "proprioception": proprioception,
+            "inverse": inverse,
             "cloning": cloning,
-        }  # fmt: skip
+        }
         return loss, {name: float(part.detach()) for name, part in metrics.items()}
 
     @torch.no_grad()
