@@ -6,9 +6,9 @@
 
 A convolutional encoder as in TD-MPC2 (arXiv 2310.16828), contrasted with a slow copy of itself one decision
 later (InfoNCE, arXiv 1807.03748; the slow copy as in SPR, arXiv 2007.05929). The executed chunk and the
-chunks of successes are read off the state too, so that it holds what decides them. The return is not: a critic
-finds the outcome of a remembered episode in such a state, and hardly judges the chunk. Without the random
-shift (DrQ-v2, arXiv 2107.09645) the state recognises episodes by their pixels.
+chunks of successes are read off the state too, so that it holds what decides them. The return is not: a
+critic finds the outcome of a remembered episode in such a state, and hardly judges the chunk. Without the
+random shift (DrQ-v2, arXiv 2107.09645) the state recognises episodes by their pixels.
 Each pixel is measured from its own mean, in its own standard deviations, so that a small object that moves
 on a still background is as loud as the robot's arm.
 
