@@ -25,7 +25,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Request
 
 Latent = dict[str, Tensor]
-"""What a family sampled for B decisions: tensors (B, ...) by name."""
+"""The tensors (B, ...) that a family sampled for B decisions, by name."""
 
 
 @dataclass(frozen=True, kw_only=True)

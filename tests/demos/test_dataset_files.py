@@ -240,7 +240,7 @@ def test_depth_is_decoded(tmp_path: Path):
 
 
 def test_frames_are_kept_as_bytes():
-    """Of LeRobot's, which are four times as large, one is in memory at a time."""
+    """One of LeRobot's frames, which are four times as large, is in memory at a time."""
     alive: weakref.WeakSet[torch.Tensor] = weakref.WeakSet()
 
     class Frames:

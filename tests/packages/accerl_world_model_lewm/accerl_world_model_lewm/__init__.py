@@ -38,5 +38,5 @@ class LeWMConfig(StateModelConfig):
     """Numbers of an embedding and of a token; a multiple of 64."""
     layers: Annotated[int, Range("[1, 100]")] = 4
     """Layers of the encoder."""
-    lr: Annotated[float, Range("(0, 1]")] = 5e-4
+    learning_rate: Annotated[float, Range("(0, 1]")] = 5e-4
     """Learning rate; that of the published models is 5e-5."""

@@ -47,7 +47,7 @@ class LeWMState(StateModel):
             raise InputError("world_model.image_size", config.image_size, hint)
         self.cameras, self.pixels, self.numbers = tuple(spec.cameras), config.image_size, spec.state
         self.size = config.width + spec.state + 1
-        self.learning_rate = config.lr
+        self.learning_rate = config.learning_rate
         width, actions = config.width, spec.chunk[0] * spec.chunk[1]
         vit = ViTConfig(
             image_size=config.image_size,
