@@ -121,7 +121,7 @@ class PolicyAdapter(nn.Module, ABC):
         return list(found.values())
 
     @abstractmethod
-    def trainable(self) -> dict[str, nn.Parameter]:
+    def trainable(self) -> dict[str, Tensor]:
         """Parameters that the trainer updates and publishes, and the teacher's buffers.
 
         The critic's begin with ``value_head.``, and the teacher's with ``teacher.``.
@@ -211,8 +211,8 @@ class PretrainedAdapter(PolicyAdapter):
             chunk = self.teacher.replace(chunk, requests)
         return self.processing.unnormalise(chunk).cpu().numpy()
 
-    def trainable(self) -> dict[str, nn.Parameter]:
-        named: dict[str, nn.Parameter] = {}
+    def trainable(self) -> dict[str, Tensor]:
+        named: dict[str, Tensor] = {}
         for part, module in self.parts.items():
             for name, parameter in module.named_parameters():
                 if parameter.requires_grad:

@@ -178,7 +178,10 @@ SIZES = (
     "max_state_dim", "max_action_dim", "num_train_timesteps", "max_decoding_steps", "tokenizer_max_length",
 )  # fmt: skip
 """Numbers of LeRobot's policy configs by which is divided or which are shapes: at least 1."""
-STEPS = ("num_steps", "num_inference_steps", "num_integration_steps", "num_denoising_steps")
+STEPS = (
+    "num_steps", "num_inference_steps", "num_integration_steps", "num_denoising_steps", "num_denoise_steps",
+    "num_inference_timesteps", "action_num_inference_steps",
+)  # fmt: skip
 """Names of LeRobot's policy configs for the number of denoising steps."""
 USES_HISTORY = ("diffusion",)  # types that read observations of ``n_obs_steps`` env steps; others read one
 

@@ -54,8 +54,10 @@ def tune(policy: Any, config: TuningConfig, backbone: str | None = None, idle: t
 def _inject(policy: Any, config: TuningConfig) -> None:
     from peft import LoraConfig, inject_adapter_in_model
 
-    defaults = policy._get_default_peft_targets() or {}
-    targets = config.targets or defaults.get("target_modules")
+    targets = config.targets
+    if targets is None:
+        defaults = policy._get_default_peft_targets() or {}
+        targets = defaults.get("target_modules")
     if targets is None:
         hint = f"LeRobot names no default for {policy.name}; give a regular expression of module names"
         raise InputError("policy.tuning.targets", None, hint)

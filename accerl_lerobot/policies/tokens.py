@@ -158,7 +158,7 @@ class TokenFamily(Family):
             difference += float((tokens != stock)[factors].sum())
         scored, _ = self.score(encoded, {"tokens": tokens})
         gap = (scored - acted)[factors].abs().max()
-        rounding = torch.finfo(encoded.features.dtype).eps ** 0.5
+        rounding = torch.finfo(acted.dtype).eps ** 0.5
         if not gap <= rounding:  # a NaN is not below: argmax finds a token among NaNs too
             difference += float(gap)
         return difference

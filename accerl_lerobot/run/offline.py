@@ -58,7 +58,6 @@ def learn_offline(config: OfflineRun, directory: Path, console: Console) -> dict
     counts = _remember(config, update, meta, shapes, console)
     losses = {"before": _imitation(update)}
     _learn(config, update, directory, console)
-    losses["after"] = _imitation(update)
 
     def write(folder: Path) -> int:
         adapter = update.adapter
@@ -69,6 +68,7 @@ def learn_offline(config: OfflineRun, directory: Path, console: Console) -> dict
 
     checkpoints = directory / layout.CHECKPOINTS
     layout.save_checkpoint(checkpoints, write)
+    losses["after"] = _imitation(update)
     summary: dict[str, Any] = counts | {
         "algorithm": algorithm.type,
         "updates": update.version,

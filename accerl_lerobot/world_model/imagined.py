@@ -34,6 +34,7 @@ from accerl_lerobot.envs import make_environment
 from accerl_lerobot.envs.base import ChunkResult, Environment, EnvironmentSpec, checked_actions
 from accerl_lerobot.errors import InputError, expanded
 from accerl_lerobot.experience import IMAGINED, TASK, Observation, task_codes
+from accerl_lerobot.policies.config import executed_rows
 from accerl_lerobot.policies.untrusted import Unfilled, input_error
 from accerl_lerobot.rollout.runner import Starts, start_of
 from accerl_lerobot.world_model.config import ImaginationConfig, LearnableModelConfig
@@ -291,7 +292,7 @@ def check_imagination(config: RunConfig) -> None:
                 make_expert(config.env, environment, task)
             return
     world = world_of(imagination)
-    _check_fit(world.model.spec, spec, getattr(policy, "n_action_steps", 1))
+    _check_fit(world.model.spec, spec, executed_rows(policy))
     if imagination.learns and imagination.learn.dataset.repo_id is not None:
         check_dataset(imagination.learn.dataset, world.model.spec, LEARN)
     failed = read_content(world_path(imagination), "imagination").get("failed_checks")

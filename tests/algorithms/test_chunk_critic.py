@@ -453,6 +453,7 @@ def test_teacher_and_policy_go_where_the_critic_leads(
         metrics = update.step(tried(rng, lambda up: (1 + up) / 2))
         assert bool(update.teacher.ready) == (update.version > 2)
     assert cast == {precision == "bf16"} and np.isfinite(list(metrics.values())).all()
+    assert first_action(update) > before
     if precision == "bf16":
         return
     state = update.tensor("state", np.arange(1))

@@ -42,6 +42,8 @@ class LeWMState(StateModel):
         super().__init__()
         if set(spec.cameras.values()) != {3}:
             raise InputError("world_model.type", config.type, "it sees colour images, and nothing else")
+        if config.width % HEAD:
+            raise InputError("world_model.width", config.width, f"use a multiple of {HEAD}")
         if config.image_size % config.patch_size:
             hint = f"use a multiple of world_model.patch_size={config.patch_size}"
             raise InputError("world_model.image_size", config.image_size, hint)
