@@ -152,7 +152,8 @@ def test_every_logged_number_is_explained(tiny_checkpoint: Path, monkeypatch: py
             engine.close()
         told |= told_here
     with_ray = {"wait_s", "update_s", "publish_s"}
-    assert explained("train") == (told - {"update"}) | with_ray
+    of_tdmpc = {"world_model_consistency", "world_model_return"}
+    assert explained("train") == (told - {"update"}) | with_ray | of_tdmpc
     rollout = progress.rollout.keys() | {f"replay_{k}" for k in progress.replay}
     served = Batcher(1, 0.0).counts | {"busy_share": 0.0, "version": 0.0}
     rollout |= {f"inference_{k}" for k in merge_metrics([served])}
