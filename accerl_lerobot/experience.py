@@ -119,9 +119,6 @@ def stack_observations(requests: Sequence[Request]) -> tuple[Observations, list[
 
 def task_codes(tasks: Sequence[str]) -> np.ndarray:
     """float32 (B, 16): ±1 for each of 16 bits of an instruction's hash, known without a list of all tasks."""
-    codes = np.empty((len(tasks), TASK_BITS), np.float32)
-    for code, task in zip(codes, tasks, strict=True):
-        digest = hashlib.sha256(task.encode()).digest()
-        bits = np.frombuffer(digest, np.uint8, TASK_BITS) & 1
-        code[:] = np.where(bits, 1.0, -1.0)
-    return codes
+    digests = [hashlib.sha256(task.encode()).digest()[:TASK_BITS] for task in tasks]
+    bits = np.frombuffer(b"".join(digests), np.uint8) & 1
+    return np.where(bits, 1.0, -1.0).astype(np.float32).reshape(len(tasks), TASK_BITS)
