@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 
 def in_parts(tensor: Tensor) -> bool:
@@ -87,3 +87,8 @@ def copied(module: torch.nn.Module) -> dict[str, torch.Tensor]:
     for name, tensor in module.state_dict().items():
         copies[name] = copy_of(tensor)
     return copies
+
+
+def fixed(values: Tensor) -> nn.Parameter:
+    """A float32 parameter without gradient: numbers that are saved and published, and not learned."""
+    return nn.Parameter(values.detach().clone().float(), requires_grad=False)

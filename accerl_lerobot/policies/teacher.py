@@ -18,6 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from accerl_lerobot.checkpoint.tensors import fixed
 from accerl_lerobot.experience import TASK_BITS, Observations, Request, stack_observations, task_codes
 from accerl_lerobot.policies.config import Load, PolicyConfig, executed_rows
 from accerl_lerobot.policies.features import STATE, policy_features
@@ -76,13 +77,13 @@ class Teacher(nn.Module):
         state = model.size + TASK_BITS
         rows, action_dim = chunk
         self.network = Ensemble(state, rows * action_dim, 1)
-        self.mean = nn.Parameter(torch.zeros(state), requires_grad=False)
-        self.std = nn.Parameter(torch.ones(state), requires_grad=False)
-        self.low = nn.Parameter(-torch.ones(action_dim), requires_grad=False)
+        self.mean = fixed(torch.zeros(state))
+        self.std = fixed(torch.ones(state))
+        self.low = fixed(-torch.ones(action_dim))
         """(A,), smallest action that it gives, in normalised units; with `high`, the range that was explored:
         beyond it the critic knows nothing."""
-        self.high = nn.Parameter(torch.ones(action_dim), requires_grad=False)
-        self.ready = nn.Parameter(torch.zeros(()), requires_grad=False)  # 1 once it may act
+        self.high = fixed(torch.ones(action_dim))
+        self.ready = fixed(torch.zeros(()))  # 1 once it may act
 
     @torch.no_grad()
     def states(self, observations: Observations, tasks: Sequence[str], elapsed: np.ndarray) -> Tensor:

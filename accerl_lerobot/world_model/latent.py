@@ -25,12 +25,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from accerl_lerobot.checkpoint.tensors import fixed
 from accerl_lerobot.config.machine import computes_bf16
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK_BITS, Observations, task_codes
 from accerl_lerobot.policies.features import STATE
 from accerl_lerobot.world_model.config import LatentConfig
-from accerl_lerobot.world_model.states import StateModel, StateSpec, Transitions, fixed
+from accerl_lerobot.world_model.states import StateModel, StateSpec, Transitions
 
 SIDE = 64  # pixels of the square that every image is resized to
 SHIFT = 3  # pixels of the random shift at most, in each direction

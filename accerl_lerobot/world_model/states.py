@@ -119,11 +119,6 @@ class SimulatorState(StateModel):
         return torch.from_numpy(numbers.reshape(len(numbers), -1).astype(np.float32))
 
 
-def fixed(values: Tensor) -> nn.Parameter:
-    """A parameter without gradient: numbers of a `StateModel` that are saved, and not learned by its loss."""
-    return nn.Parameter(values.detach().clone().float(), requires_grad=False)
-
-
 def can_learn(config: StateModelConfig) -> bool:
     """True if models of this type have a `loss`."""
     return getattr(imported(config.make), "loss", StateModel.loss) is not StateModel.loss

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from accerl_lerobot.checkpoint.tensors import fixed
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Observations
 from accerl_lerobot.policies.config import PolicyConfig
@@ -28,7 +29,7 @@ from accerl_lerobot.policies.loading import load_network
 from accerl_lerobot.policies.processing import IMAGES, Processing
 from accerl_lerobot.world_model.config import TDMPCStateConfig
 from accerl_lerobot.world_model.latent import shifted
-from accerl_lerobot.world_model.states import StateModel, StateSpec, Transitions, fixed
+from accerl_lerobot.world_model.states import StateModel, StateSpec, Transitions
 
 RETURN = 0.5  # weight of the return's squared error; consistency's is in the policy's own config
 SMALLEST_SCALE = 1e-6
