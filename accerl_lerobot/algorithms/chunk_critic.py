@@ -101,10 +101,11 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         self._unsubmitted = 0  # new decisions for which the world model has no steps yet
         # The teacher lies beside the policy's weights.
         self.networks: dict[str, nn.Module] = {"critic": self.critic, "slow": self.slow}
-        teacher = self.teacher.network
+        critic = self.critic.parameters()
+        teacher = self.teacher.network.parameters()
         self.optimizers = {
-            "critic": torch.optim.AdamW(self.critic.parameters(), lr=config.value_lr, weight_decay=1e-3),
-            "teacher": torch.optim.AdamW(teacher.parameters(), lr=TEACHER_LR, weight_decay=1e-4),
+            "critic": torch.optim.AdamW(critic, lr=config.value_lr, weight_decay=1e-3, fused=True),
+            "teacher": torch.optim.AdamW(teacher, lr=TEACHER_LR, weight_decay=1e-4, fused=True),
         }
         # Success of the last exploring episodes, by the network that acted in them.
         self._outcomes = {

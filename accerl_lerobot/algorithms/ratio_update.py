@@ -61,7 +61,9 @@ class BaseUpdate(ABC):
                 self._value.append(parameter)
             elif not name.startswith(TEACHER_PREFIX):
                 self._policy.append(parameter)
-        self.optimizer = torch.optim.AdamW(self._policy, lr=config.lr, betas=config.betas, weight_decay=0.0)
+        self.optimizer = torch.optim.AdamW(
+            self._policy, lr=config.lr, betas=config.betas, weight_decay=0.0, fused=True
+        )
 
     @abstractmethod
     def step(self, segments: Sequence[Segment]) -> Metrics:

@@ -170,7 +170,7 @@ class RunConfig(Section):
         if held_back and self.launch.engine != "local":
             hint = "weights are held back to study lag, in one process; use launch.engine=local, or 0"
             raise InputError("trainer.hold_back", held_back, hint)
-        if held_back >= self.replay.max_lag:
+        if held_back and held_back >= self.replay.max_lag:
             hint = f"use more than trainer.hold_back, {held_back}, or all is thrown away as too old"
             raise InputError("replay.max_lag", self.replay.max_lag, hint)
         counts = {"inference.workers": self.inference.workers, "trainer.ranks": self.trainer.ranks}
