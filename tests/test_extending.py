@@ -7,7 +7,6 @@ Each test begins where nobody has heard of them: who forgets to import the packa
 from __future__ import annotations
 
 import importlib
-import re
 import shutil
 import subprocess
 import sys
@@ -45,6 +44,7 @@ from tests.policies.checkpoints import write_policy
 from tests.runs import drive, pip_installed, tiny_run, trained
 
 SOURCE = Path(__file__).parent / "packages" / "lerobot_policy_mlp_flow"
+EXAMPLES = Path(__file__).parents[1] / "docs" / "examples"
 PACKAGE, POLICY, ALGORITHM = SOURCE.name, "mlp_flow", "cispo"
 FLAG = f"--policy.discover_packages_path={PACKAGE}"
 NAMED = [f"--algorithm.discover_packages_path={PACKAGE}.algorithm", f"--algorithm.type={ALGORITHM}"]
@@ -173,11 +173,8 @@ def test_help_knows_types_of_a_package_that_is_named(capsys: pytest.CaptureFixtu
     assert "algorithm.type=cispo: Settings of CISPO." in capsys.readouterr().out
 
 
-def test_the_off_policy_algorithm_of_the_page(tmp_path: Path, monkeypatch: Any, tiny_checkpoint: Path):
-    page = (Path(__file__).parents[1] / "docs" / "extending.md").read_text()
-    (code,) = (b for b in re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL) if "RWRUpdate" in b)
-    (tmp_path / "rwr.py").write_text(code)
-    monkeypatch.syspath_prepend(str(tmp_path))
+def test_the_off_policy_algorithm_of_the_page(monkeypatch: Any, tiny_checkpoint: Path):
+    monkeypatch.syspath_prepend(str(EXAMPLES))
     try:
         flags = ["--algorithm.discover_packages_path=rwr", "--algorithm.type=rwr"]
         algorithm = parse(RunConfig, ["--config_path=few_shot", *flags]).algorithm
@@ -193,11 +190,8 @@ def test_the_off_policy_algorithm_of_the_page(tmp_path: Path, monkeypatch: Any, 
         sys.modules.pop("rwr", None)
 
 
-def test_the_world_model_of_the_page(tmp_path: Path, monkeypatch: Any, tiny_checkpoint: Path):
-    page = (Path(__file__).parents[1] / "docs" / "world_model.md").read_text()
-    (code,) = (b for b in re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL) if "SmallPicture" in b)
-    (tmp_path / "small_picture.py").write_text(code)
-    monkeypatch.syspath_prepend(str(tmp_path))
+def test_the_world_model_of_the_page(monkeypatch: Any, tiny_checkpoint: Path):
+    monkeypatch.syspath_prepend(str(EXAMPLES))
     monkeypatch.setattr(chunk_critic, "FIRST_STEPS", 5)
     flags = ["--world_model.discover_packages_path=small_picture", "--world_model.type=small_picture"]
     try:
