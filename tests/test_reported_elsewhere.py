@@ -1,11 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Problems that users of other projects reported.
-
-Configs and paths of checkpoints: LeRobot 850, 888, 898, 1105, 1672, 1739, 2250, 3479, 4245. Datasets: LeRobot
-211, 933, 959, 1783, 1875, 2284, 3415, 3771, 4027, 4143, starVLA 285. Environments: LeRobot 470, Gymnasium 77
-and 453, RLinf 584. Starts and seeds: LeRobot 2850 and 4152, OpenVLA 342, Gym 2210, Grid2Op 331. Surroundings:
-Ray 6662, TinyZero 75. This file tests most of them.
-"""
+"""Situations of docs/reported_elsewhere.md: what other projects' users reported, tried here."""
 
 from __future__ import annotations
 
