@@ -290,7 +290,7 @@ def _load_parts(
         with refusing(source, f"its LeRobot processors did not load; {PROCESSORS_HINT}"):
             processing = load_processors(policy_config, folder, config.rename_map)
         with refusing(source, "its network cannot be built as its config.json says"), Unfilled():
-            policy = _build_network(policy_config)
+            policy = _build_network(policy_config, folder)
     unread: Sequence[str] = ()
     if model_class is not None:
         unread = model_class.unread
@@ -312,14 +312,19 @@ def _load_parts(
     return policy, processing
 
 
-def _build_network(policy_config: Any) -> Any:
-    """LeRobot's policy, without the backbone's weights, which its own file has, too."""
-    loads_backbone = getattr(policy_config, "load_vlm_weights", False)
-    if loads_backbone:
-        policy_config.load_vlm_weights = False
+def _build_network(policy_config: Any, folder: Path) -> Any:
+    """LeRobot's policy, without the backbone's weights, which its own file has, too.
+
+    Types differ in the field that says so: ``load_vlm_weights``, or ``pretrained_path``, which LeRobot's
+    command line sets to the checkpoint's `folder`.
+    """
+    values = {"pretrained_path": folder, "load_vlm_weights": False}
+    former = {name: getattr(policy_config, name) for name in values if hasattr(policy_config, name)}
+    for name in former:
+        setattr(policy_config, name, values[name])
     policy = get_policy_class(policy_config.type)(policy_config)
-    if loads_backbone:
-        policy.config.load_vlm_weights = True
+    for name, value in former.items():
+        setattr(policy.config, name, value)
     return policy
 
 

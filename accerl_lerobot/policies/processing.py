@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 from lerobot.policies.factory import make_pre_post_processors
-from torch import Tensor
+from torch import Tensor, nn
 
 from accerl_lerobot.checkpoint.layout import CONFIG_FOLDERS, PREPROCESSOR, STEP_FOLDERS
 from accerl_lerobot.checkpoint.safety import FileSource, read_tensors, tensor_shapes
@@ -41,6 +41,7 @@ class Processing:
     postprocessor: Any
     device: torch.device
     rename_map: dict[str, str]
+    width: int = 0  # of the actions that the postprocessor has statistics of; 0: it has none
 
     def prepare(self, observations: Observations, tasks: Sequence[str]) -> dict[str, Tensor]:
         """Normalised and tokenised observations."""
@@ -57,8 +58,12 @@ class Processing:
         return batch
 
     def unnormalise(self, chunk: Tensor) -> Tensor:
-        """(B, K, A) from normalised to environment units."""
-        return self.postprocessor(chunk)
+        """(B, K, A) from normalised to environment units.
+
+        A policy that pads its actions has statistics of the padding, too, which its postprocessor removes.
+        """
+        padding = max(0, self.width - chunk.shape[-1])
+        return self.postprocessor(nn.functional.pad(chunk, (0, padding)))
 
     def units(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         """Place of a normalised 0 in environment units, and length of a normalised 1, like `rows` (K, A)."""
@@ -102,7 +107,17 @@ def load_processors(policy_config: Any, folder: Path, rename_map: dict[str, str]
         if kind in STEP_FOLDERS:  # what is saved has the names that the checkpoint has
             option, _ = STEP_FOLDERS[kind]
             setattr(loaded, option, step["config"].get(option))
-    return Processing(pre, post, torch.device(device), rename_map)
+    return Processing(pre, post, torch.device(device), rename_map, _statistics_width(post))
+
+
+def _statistics_width(postprocessor: Any) -> int:
+    """Number of actions that a postprocessor has statistics of; 0 if it has none."""
+    names = [f"{ACTION}.{statistic}" for needed in STATISTICS.values() for statistic in needed]
+    widths = [0]
+    for step in postprocessor.steps:
+        state = step.state_dict()
+        widths += [state[name].shape[-1] for name in names if name in state]
+    return max(widths)
 
 
 def use_own_files(policy_config: Any, folder: Path, source: FileSource) -> None:
@@ -144,8 +159,11 @@ def correct_inputs(policy_config: Any, folder: Path, source: FileSource) -> None
         return
     seen: Shapes = {}
     renames: dict[str, str] = {}
+    padded = False
     for step in stored_steps(folder, PREPROCESSOR):
-        renames |= step.get("config", {}).get("rename_map", {})
+        options = step.get("config", {})
+        renames |= options.get("rename_map", {})
+        padded |= "max_state_dim" in options
         if step["registry_name"] in NORMALISERS and "state_file" in step:
             shapes = tensor_shapes(folder / step["state_file"], source)
             for key, (_, shape) in shapes.items():
@@ -156,7 +174,7 @@ def correct_inputs(policy_config: Any, folder: Path, source: FileSource) -> None
     if needed & seen.keys():
         for name in needed - seen.keys():
             del inputs[name]
-    if STATE in inputs and STATE in seen:
+    if STATE in inputs and STATE in seen and not padded:  # a padded state has statistics of the padding, too
         inputs[STATE] = replace(inputs[STATE], shape=seen[STATE])
 
 

@@ -132,7 +132,7 @@ def _save_backbone(lerobot_config: Any, preprocessor: Any, directory: Path) -> N
     target = directory / BACKBONE
     if source.is_absolute() and source.resolve() != target.resolve():
         wanted: tuple[str, ...] = BACKBONE_FILES
-        if lerobot_config.load_vlm_weights:  # otherwise the policy's own file holds them
+        if getattr(lerobot_config, "load_vlm_weights", True):  # else the policy's own file holds them
             wanted += BACKBONE_WEIGHTS
         target.mkdir(exist_ok=True)
         files = matching_files(source, wanted, FileSource("policy.path", str(source)))

@@ -187,7 +187,8 @@ class StockAdapter(PretrainedAdapter):
             # It computes a chunk at the first call, and takes one action after the other out of it.
             rows = [policy.select_action(dict(newest)) for _ in range(executed_rows(policy.config))]
             policy.reset()
-        return torch.stack(rows, 1).float()
+        action_dim = policy.config.action_feature.shape[0]
+        return torch.stack(rows, 1)[..., :action_dim].float()  # without padding
 
     def _frames(self, arrays: Observations) -> list[Observations]:
         """The env steps of an observation, oldest first."""

@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checkpoints of LeRobot's large vision-language-action policies with random weights of tiny size.
+
+Each backbone, with its tokeniser, is written beside the policy's folder.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from tests.policies.checkpoints import write_policy
+from tests.policies.tiny_pi import write_fast
+
+TEMPLATE = (
+    "{% for message in messages %}<|im_start|>{{ message['role'] }}\n"
+    "{% for part in message['content'] %}{% if part['type'] == 'image' %}"
+    "<|vision_start|><|image_pad|><|vision_end|>{% else %}{{ part['text'] }}{% endif %}{% endfor %}"
+    "<|im_end|>\n{% endfor %}"
+)
+"""Qwen-VL's chat template, without videos and tools."""
+MARKS = ("im_start", "im_end", "vision_start", "vision_end", "vision_pad", "image_pad", "video_pad")
+ROOM = 64  # tokens that a policy may add to a tokeniser
+WIDTH = 16
+
+
+def write_letters(folder: Path, *marks: str, **options: Any) -> Any:
+    """Saves a tokeniser of bytes and of `marks`, in the files of Qwen's."""
+    from tokenizers import pre_tokenizers
+    from transformers import Qwen2Tokenizer
+
+    letters = sorted(pre_tokenizers.ByteLevel.alphabet())
+    vocabulary = {token: i for i, token in enumerate([*letters, "<|endoftext|>"])}
+    tokenizer = Qwen2Tokenizer(vocab=vocabulary, merges=[], **options)
+    tokenizer.add_special_tokens({"additional_special_tokens": list(marks)})
+    tokenizer.save_pretrained(folder)
+    return tokenizer
+
+
+def write_qwen25_vl(folder: Path) -> Any:
+    """A Qwen2.5-VL of one layer with its processor; returns the model."""
+    import torch
+    from transformers import (
+        Qwen2_5_VLConfig,
+        Qwen2_5_VLForConditionalGeneration,
+        Qwen2_5_VLProcessor,
+        Qwen2VLImageProcessor,
+        Qwen2VLVideoProcessor,
+    )
+
+    tokenizer = write_letters(folder, *(f"<|{mark}|>" for mark in MARKS))
+    ids = {f"{mark}_token_id": tokenizer.convert_tokens_to_ids(f"<|{mark}|>") for mark in MARKS[2:]}
+    ids["image_token_id"], ids["video_token_id"] = ids.pop("image_pad_token_id"), ids.pop("video_pad_token_id")
+    text = {
+        "hidden_size": WIDTH, "intermediate_size": WIDTH, "num_hidden_layers": 1, "num_attention_heads": 2,
+        "num_key_value_heads": 1, "vocab_size": len(tokenizer) + ROOM, "max_position_embeddings": 4096,
+        "rope_parameters": {"rope_type": "default", "rope_theta": 10000.0, "mrope_section": [2, 1, 1]},
+    }  # fmt: skip
+    vision = {
+        "depth": 1, "hidden_size": WIDTH, "intermediate_size": WIDTH, "num_heads": 2, "out_hidden_size": WIDTH,
+        "window_size": 56, "fullatt_block_indexes": [0],
+    }  # fmt: skip
+    torch.manual_seed(0)
+    model = Qwen2_5_VLForConditionalGeneration(
+        Qwen2_5_VLConfig(text_config=text, vision_config=vision, dtype="float32", **ids)
+    )
+    model.save_pretrained(folder)
+    images = Qwen2VLImageProcessor(min_pixels=28 * 28, max_pixels=56 * 56)
+    Qwen2_5_VLProcessor(images, tokenizer, Qwen2VLVideoProcessor(), TEMPLATE).save_pretrained(folder)
+    return model
+
+
+def write_eo1(directory: Path, *, image: int = 64, **options: Any) -> Path:
+    """An EO1 on a tiny Qwen2.5-VL."""
+    backbone = directory.parent / f"{directory.name}-qwen"
+    write_qwen25_vl(backbone)
+    fields = {
+        "vlm_base": str(backbone), "image_min_pixels": 28 * 28, "image_max_pixels": 56 * 56,
+        "chunk_size": 4, "n_action_steps": 4, "max_state_dim": 4, "max_action_dim": 4,
+        "num_denoise_steps": 2, "num_action_layers": 2,
+    }  # fmt: skip
+    return write_policy(directory, "eo1", image=image, **(fields | options))
+
+
+def write_internvl(folder: Path, image: int) -> Any:
+    """An InternVL of one layer with its tokeniser; an image is a single token of it."""
+    import torch
+    from transformers import InternVLConfig, InternVLModel
+
+    tokenizer = write_letters(folder, "<img>", "</img>", "<IMG_CONTEXT>")
+    layers = {
+        "hidden_size": WIDTH, "intermediate_size": WIDTH, "num_hidden_layers": 1, "num_attention_heads": 2,
+    }  # fmt: skip
+    text = layers | {"model_type": "qwen2", "num_key_value_heads": 1, "vocab_size": len(tokenizer)}
+    vision = layers | {"image_size": (image, image), "patch_size": (image // 2, image // 2)}
+    torch.manual_seed(0)
+    config = InternVLConfig(
+        text_config=text,
+        vision_config=vision,
+        image_token_id=tokenizer.convert_tokens_to_ids("<IMG_CONTEXT>"),
+        image_seq_length=1,
+        downsample_ratio=0.5,
+        dtype="float32",
+    )
+    model = InternVLModel(config)
+    model.save_pretrained(folder)
+    return model
+
+
+def write_evo1(directory: Path, *, image: int = 64, **options: Any) -> Path:
+    """An EVO1 on a tiny InternVL, whose actions are wider than those that it executes."""
+    backbone = directory.parent / f"{directory.name}-internvl"
+    write_internvl(backbone, 28)
+    fields = {
+        "vlm_model_name": str(backbone), "vlm_num_layers": 1, "image_resolution": (28, 28), "max_views": 1,
+        "chunk_size": 4, "n_action_steps": 4, "max_state_dim": 6, "max_action_dim": 3, "embed_dim": WIDTH,
+        "hidden_dim": WIDTH, "state_hidden_dim": WIDTH, "num_heads": 2, "num_layers": 1,
+        "num_inference_timesteps": 2,
+    }  # fmt: skip
+    return write_policy(directory, "evo1", image=image, **(fields | options))
+
+
+def write_molmo(folder: Path, fast: Path, state_tokens: int) -> None:
+    """A MolmoAct2 model of one layer with its processor, an image being one token of it.
+
+    `fast` is written, too: its tokeniser of actions.
+    """
+    import torch
+    from lerobot.policies.molmoact2.molmoact2_hf_model.configuration_molmoact2 import MolmoAct2Config
+    from lerobot.policies.molmoact2.molmoact2_hf_model.modeling_molmoact2 import (
+        MolmoAct2ForConditionalGeneration,
+    )
+    from transformers import PreTrainedTokenizerFast
+
+    write_fast(fast)
+    count = len(PreTrainedTokenizerFast.from_pretrained(fast))
+    marks = {
+        "image_patch_id": "<im_patch>", "image_low_res_id": "<im_low>", "image_start_token_id": "<im_start>",
+        "low_res_image_start_token_id": "<low_res_im_start>", "frame_start_token_id": "<frame_start>",
+        "image_end_token_id": "<im_end>", "frame_end_token_id": "<frame_end>", "image_col_id": "<im_col>",
+        "action_output_token_id": "<action_output>", "action_start_token_id": "<action_start>",
+        "action_end_token_id": "<action_end>", "state_start_token_id": "<state_start>",
+        "state_end_token_id": "<state_end>",
+    }  # fmt: skip
+    states = [f"<state_{i}>" for i in range(state_tokens)]
+    actions = [f"<action_{i}>" for i in range(count)]
+    tokenizer = write_letters(
+        folder, "<|im_start|>", "<|im_end|>", *marks.values(), *states, *actions, padding_side="left"
+    )
+    ids = {name: tokenizer.convert_tokens_to_ids(mark) for name, mark in marks.items()}
+    heads = {"num_attention_heads": 2, "num_key_value_heads": 2, "head_dim": WIDTH // 2}
+    sizes = {"hidden_size": WIDTH, "intermediate_size": WIDTH}
+    torch.manual_seed(0)
+    config = MolmoAct2Config(
+        vit_config=heads | sizes | {
+            "num_hidden_layers": 1, "image_default_input_size": (28, 28), "image_num_pos": 4,
+        },
+        adapter_config=heads | sizes | {"vit_layers": (-1,), "text_hidden_size": WIDTH},
+        text_config=heads | sizes | {
+            "num_hidden_layers": 1, "vocab_size": len(tokenizer), "additional_vocab_size": 8,
+        },
+        action_expert_config={
+            "hidden_size": WIDTH, "num_layers": 1, "num_heads": 2, "ffn_multiple_of": 8,
+            "timestep_embed_dim": 8,
+        },
+        action_token_start_id=tokenizer.convert_tokens_to_ids(actions[0]), num_action_tokens=count,
+        state_token_start_id=tokenizer.convert_tokens_to_ids(states[0]), num_state_tokens=state_tokens,
+        eos_token_id=tokenizer.eos_token_id, **ids,
+    )  # fmt: skip
+    MolmoAct2ForConditionalGeneration(config).save_pretrained(folder)
+    images = {"size": {"height": 28, "width": 28}, "crop_mode": "resize"}
+    (folder / "processor_config.json").write_text(json.dumps({"image_processor": images}))
+
+
+def write_molmoact2(directory: Path, *, image: int = 64, **options: Any) -> Path:
+    """A MolmoAct2 with flow and tokens of actions."""
+    backbone = directory.parent / f"{directory.name}-molmo"
+    fast = backbone.with_name(f"{backbone.name}-fast")
+    write_molmo(backbone, fast, 4)
+    fields = {
+        "checkpoint_path": str(backbone), "discrete_action_tokenizer": str(fast), "num_state_tokens": 4,
+        "chunk_size": 4, "n_action_steps": 4, "inference_action_mode": "continuous", "max_sequence_length": 1024,
+        "num_flow_timesteps": 2, "num_inference_steps": 2, "model_dtype": "float32",
+    }  # fmt: skip
+    return write_policy(directory, "molmoact2", image=image, **(fields | options))
