@@ -56,13 +56,16 @@ def place(tensor: Tensor) -> tuple[object, ...]:
 
 
 def optimizer_state(optimizer: torch.optim.Optimizer) -> dict[int, dict[str, torch.Tensor]]:
-    """A copy on the CPU of an optimiser's state, by the number of the parameter; without learning rates."""
+    """A copy on the CPU of an optimiser's state, by the number of the parameter; without learning rates.
+
+    All of it is float32, which NumPy knows: of a parameter in bfloat16 it is in bfloat16.
+    """
     known: dict[int, dict[str, Any]] = optimizer.state_dict()["state"]
     copies: dict[int, dict[str, Tensor]] = {}
     for number, values in known.items():
         copies[number] = {}
         for name, value in values.items():
-            copies[number][name] = copy_of(torch.as_tensor(value))
+            copies[number][name] = copy_of(torch.as_tensor(value)).float()
     return copies
 
 

@@ -137,8 +137,8 @@ class PolicyConfig(Section, section="policy"):
     """cpu, cuda, or auto."""
     precision: Precision = "fp32"
     """fp32, or bf16: networks run in bfloat16 under autocast, weights and log-probs stay in fp32; auto: bf16
-    where the processor computes in it. A ``dtype`` in the checkpoint's LeRobot config is taken, and saved, as
-    float32: updates of RL are smaller than bfloat16 resolves."""
+    where the processor computes in it. Where a policy learns, a ``dtype`` in the checkpoint's LeRobot config is
+    taken, and saved, as float32: updates of RL are smaller than bfloat16 resolves."""
     sampler: SamplerConfig | None = None
     """How it explores. None: the first family of its policy type, with that family's defaults."""
     tuning: TuningConfig = field(default_factory=TuningConfig)
@@ -183,6 +183,8 @@ STEPS = (
     "num_inference_timesteps", "action_num_inference_steps",
 )  # fmt: skip
 """Names of LeRobot's policy configs for the number of denoising steps."""
+DTYPES = ("dtype", "model_dtype", "torch_dtype", "vlm_dtype")
+"""Names of LeRobot's policy configs for the type of the weights."""
 USES_HISTORY = ("diffusion",)  # types that read observations of ``n_obs_steps`` env steps; others read one
 
 
@@ -292,8 +294,12 @@ def predicted_rows(policy_config: Any) -> int:
     return sum(row >= 0 for row in policy_config.action_delta_indices or ())
 
 
-def override(policy_config: Any, config: PolicyConfig) -> None:
-    """Puts a run's choices of denoising steps, executed rows and precision into LeRobot's policy config."""
+def override(policy_config: Any, config: PolicyConfig, *, learns: bool = False) -> None:
+    """Puts a run's choices of denoising steps, executed rows and precision into LeRobot's policy config.
+
+    The weights of a policy that `learns`, or that has a likelihood, are float32 where its config has a field
+    for that; see `PolicyConfig.precision`.
+    """
     fixed: dict[str, Any] = {
         # The checkpoint has them; LeRobot would download torchvision's first, even when told to stay offline.
         "pretrained_backbone_weights": None,
@@ -302,8 +308,8 @@ def override(policy_config: Any, config: PolicyConfig) -> None:
     }
     if config.temporal_ensemble_coeff is None:
         fixed["temporal_ensemble_coeff"] = None
-    if policy_config.type in POLICIES:
-        fixed["dtype"] = "float32"  # see `PolicyConfig.precision`
+    if learns or policy_config.type in POLICIES:
+        fixed |= dict.fromkeys(DTYPES, "float32")
     for name, value in fixed.items():
         if hasattr(policy_config, name):
             setattr(policy_config, name, value)

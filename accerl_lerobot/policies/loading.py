@@ -173,7 +173,7 @@ def load_adapter(
     Raises:
         InputError: see `open_checkpoint` and `LeRobotAdapter.self_check`; or a file did not load.
     """
-    checkpoint = open_checkpoint(config)
+    checkpoint = open_checkpoint(config, learns=True)
     sampler = sampler_config(config, checkpoint.config.type)
     if isinstance(sampler, ChunkNoiseConfig):
         return _stock_adapter(checkpoint, config, sampler, dry_run, fine_tuned)
@@ -243,8 +243,8 @@ def pinned(config: PolicyConfig) -> PolicyConfig:
     return replace(config, revision=folder.name)
 
 
-def open_checkpoint(config: PolicyConfig) -> Checkpoint:
-    """Fetches and checks a checkpoint's files, and reads its config.
+def open_checkpoint(config: PolicyConfig, *, learns: bool = False) -> Checkpoint:
+    """Fetches and checks a checkpoint's files, and reads its config; for a policy that acts, or also `learns`.
 
     Raises:
         InputError: no checkpoint there, or one of a policy type that is not installed.
@@ -267,7 +267,7 @@ def open_checkpoint(config: PolicyConfig) -> Checkpoint:
         policy_config = PreTrainedConfig.from_pretrained(folder)
         correct_inputs(policy_config, folder, source)
     policy_config.device = str(resolve_device(config.device))
-    override(policy_config, config)
+    override(policy_config, config, learns=learns)
     check_observations(policy_config, "policy.n_obs_steps")
     use_own_files(policy_config, folder, source)
     return Checkpoint(folder, source, policy_config)

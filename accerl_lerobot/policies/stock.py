@@ -88,6 +88,16 @@ class StockAdapter(PretrainedAdapter):
             InputError: it answers the same question differently, or is trained on more than its chunks.
         """
         config = self.policy.config
+        trained = self.trainable().values()
+        coarse = [tensor for tensor in trained if tensor.dtype in (torch.bfloat16, torch.float16)]
+        if coarse:
+            logger.warning(
+                "%s: %d of its %d trained tensors are in 16 bits, whatever its config says: steps that are small "
+                "beside a weight are lost",
+                config.type,
+                len(coarse),
+                len(trained),
+            )
         later = [delta for delta in config.observation_delta_indices or () if delta > 0]
         if later or config.reward_delta_indices is not None:
             hint = "LeRobot trains it on what follows a chunk, rewards or observations, and not on chunks"
