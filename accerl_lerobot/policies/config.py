@@ -137,8 +137,8 @@ class PolicyConfig(Section, section="policy"):
     """cpu, cuda, or auto."""
     precision: Precision = "fp32"
     """fp32, or bf16: networks run in bfloat16 under autocast, weights and log-probs stay in fp32; auto: bf16
-    where the processor computes in it. Where a policy learns, a ``dtype`` in the checkpoint's LeRobot config is
-    taken, and saved, as float32: updates of RL are smaller than bfloat16 resolves."""
+    where the processor computes in it. Where a policy learns, a ``dtype`` in the checkpoint's LeRobot config
+    is taken, and saved, as float32: updates of RL are smaller than bfloat16 resolves."""
     sampler: SamplerConfig | None = None
     """How it explores. None: the first family of its policy type, with that family's defaults."""
     tuning: TuningConfig = field(default_factory=TuningConfig)

@@ -180,7 +180,8 @@ def load_adapter(
     model_class = _model_class(checkpoint)
     assert model_class is not None
     policy, processing = _load_parts(checkpoint, config, model_class, dry_run, fine_tuned)
-    with refusing(checkpoint.source, "it cannot act here"):
+    # Some tokenisers are loaded when the policy acts for the first time.
+    with refusing(checkpoint.source, "it cannot act here"), guarded("policy", config.trust_remote_code):
         model = model_class(policy)
         family = imported(sampler.family)(model, sampler)
         critic = ValueHead(model.width)
@@ -208,9 +209,10 @@ def _stock_adapter(
     policy, processing = _load_parts(checkpoint, config, model_class, dry_run, fine_tuned)
     precision = precision_on(processing.device, config.precision)
     adapter = StockAdapter(policy, processing, precision, sampler)
-    with refusing(checkpoint.source, "it cannot act here"):
+    # Some tokenisers and encoders are loaded when the policy acts for the first time.
+    with refusing(checkpoint.source, "it cannot act here"), guarded("policy", config.trust_remote_code):
         if sampler is None:
-            adapter.decide(adapter.example_requests(), 0)
+            adapter.try_out()
         else:
             backbone = None
             if model_class is not None:
@@ -244,7 +246,7 @@ def pinned(config: PolicyConfig) -> PolicyConfig:
 
 
 def open_checkpoint(config: PolicyConfig, *, learns: bool = False) -> Checkpoint:
-    """Fetches and checks a checkpoint's files, and reads its config; for a policy that acts, or also `learns`.
+    """Fetches and checks a checkpoint's files, and reads its config; `override` explains `learns`.
 
     Raises:
         InputError: no checkpoint there, or one of a policy type that is not installed.

@@ -26,7 +26,7 @@ from torch import Tensor, nn
 
 from accerl_lerobot.checkpoint.safety import brief
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import Decision, Observations, Request, stack_observations
+from accerl_lerobot.experience import TASK, Decision, Observations, Request, stack_observations
 from accerl_lerobot.policies.adapter import Evaluation, PretrainedAdapter
 from accerl_lerobot.policies.config import ChunkNoiseConfig, SamplerConfig, executed_rows
 from accerl_lerobot.policies.family import Latent
@@ -38,6 +38,7 @@ logger = logging.getLogger(__name__)
 
 EPISODES = 256  # episodes whose state is kept; the one that acted longest ago goes first
 NOISE = 6  # distinguishes the seeds of the noise on executed chunks
+REGISTERED = ("_parameters", "_buffers", "_modules")  # attributes of PyTorch's modules
 
 
 class StockAdapter(PretrainedAdapter):
@@ -54,6 +55,8 @@ class StockAdapter(PretrainedAdapter):
         self._sampler = sampler
         self.explores = sampler is not None
         self._takes_batches = True
+        self._one_at_a_time = False
+        self._acting: tuple[int, str] | None = None
         self._episodes: OrderedDict[tuple[int, str], Any] = OrderedDict()
 
     @property
@@ -69,6 +72,18 @@ class StockAdapter(PretrainedAdapter):
         if any(request.explore for request in requests):
             self._refuse()
         return [self._decide_step(request, version) for request in requests]
+
+    @torch.no_grad()
+    def try_out(self) -> None:
+        """Lets the policy act once, before any episode has a policy object of its own.
+
+        Some load a text encoder only then, which all episodes share from now on. Where acting leaves tensors
+        in the policy's networks, and `reset` removes them, the networks hold the state of one episode.
+        """
+        self._act(self.policy, self.example_requests()[0])
+        acted = tensors_kept(self.policy)
+        self.policy.reset()
+        self._one_at_a_time = acted > tensors_kept(self.policy)
 
     def imitate(self, observations: Observations, tasks: Sequence[str], chunk: Tensor) -> tuple[Tensor, None]:
         batch = self._training_batch(observations, tasks, chunk)
@@ -92,8 +107,8 @@ class StockAdapter(PretrainedAdapter):
         coarse = [tensor for tensor in trained if tensor.dtype in (torch.bfloat16, torch.float16)]
         if coarse:
             logger.warning(
-                "%s: %d of its %d trained tensors are in 16 bits, whatever its config says: steps that are small "
-                "beside a weight are lost",
+                "%s: %d of its %d trained tensors are in 16 bits, whatever its config says: steps that are "
+                "small beside a weight are lost",
                 config.type,
                 len(coarse),
                 len(trained),
@@ -138,25 +153,36 @@ class StockAdapter(PretrainedAdapter):
         raise InputError("policy.type", self.policy.config.type, hint)
 
     def _decide_step(self, request: Request, version: int) -> Decision:
+        action = self._act(self._policy_of(request), request)
+        return _decision(self.processing.unnormalise(action).cpu().numpy(), version)
+
+    def _act(self, policy: Any, request: Request) -> Tensor:
+        """(1, A) by LeRobot's `select_action`, in normalised units."""
         arrays, tasks = stack_observations([request])
-        policy = self._policy_of(request, tasks[0])
         # LeRobot's samplers draw from the global generator: here from the request's seed.
         with torch.random.fork_rng(), self.autocast():
             torch.manual_seed(request.noise_seed % 2**63)
-            action = policy.select_action(self.processing.prepare(arrays, tasks))
-        chunk = self.processing.unnormalise(action.float()).cpu().numpy()
-        return _decision(chunk, version)
+            action: Tensor = policy.select_action(self.processing.prepare(arrays, tasks))
+        return action.float()
 
-    def _policy_of(self, request: Request, task: str) -> Any:
-        """The policy object of the request's episode; new, and reset, if this is its first decision."""
-        episode = episode_of(request.noise_seed), task
-        if decision_of(request.noise_seed) == 0:  # the episode of a lost worker begins once more
+    def _policy_of(self, request: Request) -> Any:
+        """The policy object of the request's episode; new, and reset, if this is its first decision.
+
+        Raises:
+            InputError: the policy acts in one environment at a time, and another episode has begun.
+        """
+        episode = episode_of(request.noise_seed), str(request.observation[TASK])
+        begins = decision_of(request.noise_seed) == 0
+        if self._one_at_a_time and not begins and self._acting not in (None, episode):
+            why = "its networks hold the state of one episode, so it acts in one environment at a time"
+            hint = f"{why}; set rollout.workers=1 and rollout.environments=1"
+            raise InputError("policy.type", self.policy.config.type, hint)
+        self._acting = episode
+        if begins:  # the episode of a lost worker begins once more
             self._episodes.pop(episode, None)
         if episode not in self._episodes:
-            policy = self.policy
-            shared = [policy.config, *policy.modules(), *policy.parameters(), *policy.buffers()]
-            memo = {id(part): part for part in shared if part is not policy}
-            self._episodes[episode] = copy.deepcopy(policy, memo)
+            memo = {id(part): part for part in shared_parts(self.policy)}
+            self._episodes[episode] = copy.deepcopy(self.policy, memo)
             self._episodes[episode].reset()
         self._episodes.move_to_end(episode)
         if len(self._episodes) > EPISODES:
@@ -239,6 +265,40 @@ class StockAdapter(PretrainedAdapter):
                 batch[f"{key}_is_pad"] = no_pad
         prepared: dict[str, Any] = self.processing.preprocessor(batch)
         return prepared
+
+
+def shared_parts(policy: Any) -> list[Any]:
+    """All that the policy objects of different episodes share: config, networks and their weights.
+
+    Networks that PyTorch does not know as parts of the policy, as it keeps them in a dict, are among them.
+    """
+    parts = [policy.config]
+    for held in vars(policy).values():
+        values = held.values() if isinstance(held, dict) else [held]
+        for network in values:
+            if isinstance(network, nn.Module):
+                parts += [*network.modules(), *network.parameters(), *network.buffers()]
+    return [*parts, *policy.parameters(), *policy.buffers()]
+
+
+def tensors_kept(policy: Any) -> int:
+    """Number of tensors that a policy's networks keep beside their parameters and buffers."""
+    count = 0
+    for module in policy.modules():
+        if module is not policy:
+            kept = {name: value for name, value in vars(module).items() if name not in REGISTERED}
+            count += _count_tensors(kept)
+    return count
+
+
+def _count_tensors(value: Any) -> int:
+    if isinstance(value, Tensor):
+        return 1
+    if isinstance(value, dict):
+        value = list(value.values())
+    if isinstance(value, list | tuple):
+        return sum(map(_count_tensors, value))
+    return 0
 
 
 def _decision(chunk: np.ndarray, version: int) -> Decision:

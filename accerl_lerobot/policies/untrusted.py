@@ -108,6 +108,8 @@ def refusing(source: FileSource, what: str) -> Iterator[None]:
             raise
         if ours is not None:
             raise ours from error
+        if isinstance(error, ImportError):
+            what = "a package that it needs is missing"
         raise InputError(source.field, source.value, f"{what} ({reason(error)})") from error
 
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -28,6 +29,7 @@ def write_policy(
     the weights before they are saved; `fields` are of LeRobot's policy config.
     """
     import torch
+    from lerobot.configs.policies import PreTrainedConfig
     from lerobot.configs.types import FeatureType, PolicyFeature
     from lerobot.policies.factory import get_policy_class, make_policy_config, make_pre_post_processors
 
@@ -42,6 +44,9 @@ def write_policy(
         "device": "cpu",
         "push_to_hub": False,
     }
+    known = {field.name for field in dataclasses.fields(PreTrainedConfig.get_choice_class(kind))}
+    if "action_dim" in known:
+        options["action_dim"] = action_dim
     config = make_policy_config(kind, **options | fields)
     torch.manual_seed(seed)
     policy = get_policy_class(kind)(config)
