@@ -37,6 +37,17 @@ from tests.policies.checkpoints import (
 )
 from tests.policies.tiny import requests
 from tests.policies.tiny_pi import small, write_pi
+from tests.policies.tiny_vlms import (
+    wan_hub,
+    write_eo1,
+    write_evo1,
+    write_fastwam,
+    write_groot,
+    write_lingbot_va,
+    write_molmoact2,
+    write_vla_jepa,
+    write_wall_x,
+)
 from tests.tiny_datasets import record_dataset
 
 KINDS: dict[str, dict[str, Any]] = {
@@ -113,6 +124,33 @@ def test_it_acts_as_in_lerobot_s_loop_whatever_other_episodes_do(written: Any, k
             decision = found[step][which]
             np.testing.assert_array_equal(decision.chunk, expected)
             assert decision.chunk.shape == (1, 2) and decision.version == 3 and not decision.log_prob.any()
+
+
+@pytest.mark.parametrize("write", [write_vla_jepa, write_fastwam, write_lingbot_va])
+def test_what_is_trained_on_later_images_acts_as_in_lerobot_s_loop(
+    write: Callable[..., Path], tmp_path: Path
+):
+    from lerobot.configs.policies import PreTrainedConfig
+    from lerobot.policies.factory import get_policy_class
+
+    path = write(tmp_path / "policy", image=64)
+    with wan_hub(tmp_path / "wan"):
+        adapter = load_acting(PolicyConfig(path=str(path), device="cpu"))
+        stock = get_policy_class(PreTrainedConfig.from_pretrained(path).type).from_pretrained(path)
+        with pytest.raises(InputError, match="LeRobot trains it on what follows a chunk"):
+            learning(path)
+    for episode in (1, 2):
+        stock.reset()
+        for request in steps_of(episode, 14):
+            torch.manual_seed(request.noise_seed)
+            batch = adapter.processing.prepare(*stack_observations([request]))
+            expected = adapter.processing.postprocessor(stock.select_action(batch)).numpy()
+            np.testing.assert_array_equal(adapter.decide([request], 0)[0].chunk, expected)
+    if write is write_lingbot_va:
+        ended, *_ = steps_of(3, 1)
+        adapter.decide([ended], 0)
+        with pytest.raises(InputError, match="it acts in one environment at a time; set rollout.workers=1"):
+            adapter.decide([steps_of(2, 15)[-1]], 0)
 
 
 def test_an_episode_that_is_run_again_begins_anew(written: Any):
@@ -280,6 +318,10 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int, bool], 
     return record
 
 
+NEEDED = {write_wall_x: ("torchdiffeq", "qwen_vl_utils"), write_groot: ("tree",)}
+"""Packages that some of LeRobot's policies need and that this package does not."""
+
+
 @pytest.mark.parametrize(
     ("write", "algorithm"),
     [
@@ -290,7 +332,9 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int, bool], 
             for write, algorithm in (
                 (write_vqbet, "self_imitation"), (write_xvla, "chunk_critic"), (write_act, "self_imitation"),
                 (write_diffusion, "chunk_critic"), (write_smolvla, "self_imitation"),
-                (write_pi0, "chunk_critic"), (write_pi05, "self_imitation"),
+                (write_pi0, "chunk_critic"), (write_pi05, "self_imitation"), (write_eo1, "chunk_critic"),
+                (write_evo1, "self_imitation"), (write_molmoact2, "self_imitation"),
+                (write_wall_x, "self_imitation"), (write_groot, "chunk_critic"),
             )
         ),
     ],
@@ -306,6 +350,8 @@ def test_any_policy_learns_and_is_saved_for_stock_lerobot(
     from lerobot.configs.policies import PreTrainedConfig
     from lerobot.policies.factory import get_policy_class
 
+    for package in NEEDED.get(write, ()):
+        pytest.importorskip(package)
     monkeypatch.setattr(chunk_critic, "FIRST_STEPS", 5)
     monkeypatch.setattr(off_policy, "POLICY_BATCH", 8)
     size = 64 if write in (write_vqbet, write_multi_task_dit, write_xvla) else 32

@@ -9,17 +9,19 @@ import shutil
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from lerobot.processor import ProcessorStep, ProcessorStepRegistry
 from torch import nn
 
 from accerl_lerobot.checkpoint.layout import BACKBONE
 from accerl_lerobot.checkpoint.safety import FileSource
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.policies.config import ChunkNoiseConfig, PolicyConfig, SamplerConfig
 from accerl_lerobot.policies.loading import load_adapter
 from accerl_lerobot.policies.saving import save_pretrained
 from accerl_lerobot.policies.untrusted import Unfilled, check_checkpoint, guarded
@@ -211,6 +213,31 @@ def test_a_checkpoint_cannot_have_its_backbone_s_code_run(
     edit_config(path, vlm_model_name=theirs.name)
     with pytest.raises(InputError):
         load_adapter(PolicyConfig(path=str(path), device="cpu"))
+    assert not theirs.marker.exists()
+
+
+@dataclass
+class Late(ProcessorStep):
+    """A step that loads a model when it is called, as GR00T's loads its tokeniser."""
+
+    name: str = ""
+
+    def __call__(self, transition: Any) -> Any:
+        load(self.name, trust_remote_code=True)
+        return transition
+
+    def transform_features(self, features: Any) -> Any:
+        return features
+
+
+@pytest.mark.parametrize("sampler", [None, ChunkNoiseConfig()])
+def test_code_of_a_model_that_a_step_loads_when_it_is_called_is_refused(
+    theirs: Repository, copied: Path, sampler: SamplerConfig | None, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setitem(ProcessorStepRegistry._registry, "late", Late)
+    edit_steps(copied, lambda steps: steps.append({"registry_name": "late", "config": {"name": theirs.name}}))
+    with pytest.raises(InputError, match="^policy.trust_remote_code="):
+        load_adapter(PolicyConfig(path=str(copied), device="cpu", sampler=sampler))
     assert not theirs.marker.exists()
 
 
