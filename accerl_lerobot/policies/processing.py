@@ -169,12 +169,14 @@ def correct_inputs(policy_config: Any, folder: Path, source: FileSource) -> None
             for key, (_, shape) in shapes.items():
                 name = key.removesuffix(".mean")
                 seen[renames.get(name, name)] = shape
+            if padded:  # a state that a step before has padded has statistics of the padding, too
+                seen.pop(STATE, None)
     inputs = policy_config.input_features
     needed = cameras(policy_features(policy_config).shapes)
     if needed & seen.keys():
         for name in needed - seen.keys():
             del inputs[name]
-    if STATE in inputs and STATE in seen and not padded:  # a padded state has statistics of the padding, too
+    if STATE in inputs and STATE in seen:
         inputs[STATE] = replace(inputs[STATE], shape=seen[STATE])
 
 

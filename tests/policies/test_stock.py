@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -420,6 +421,38 @@ def test_a_type_that_is_missing_and_a_package_that_is_broken_are_two_lines(
     with pytest.raises(InputError, match=f"no such policy type here; {why}") as caught:
         load_acting(config)
     assert "\n" not in str(caught.value) and "lerobot_policy_theirs" not in sys.modules
+
+
+def test_a_package_that_a_type_needs_is_named(written: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    from lerobot.utils import import_utils
+
+    monkeypatch.setitem(import_utils._require_package_cache, "torchdiffeq", False)
+    path = shutil.copytree(written("act"), tmp_path / "policy")
+    config = json.loads((path / "config.json").read_text())
+    named = {name: config[name] for name in ("input_features", "output_features")}
+    (path / "config.json").write_text(json.dumps(named | {"type": "wall_x"}))
+    with pytest.raises(
+        InputError, match="a package that it needs is missing .'torchdiffeq' is requ"
+    ) as caught:
+        load_acting(PolicyConfig(path=str(path), device="cpu"))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_backbone_s_weights_that_the_checkpoint_has_are_not_wanted(tmp_path: Path):
+    path = write_eo1(tmp_path / "policy")
+    (tmp_path / "policy-qwen" / "model.safetensors").unlink()
+    adapter = load_acting(PolicyConfig(path=str(path), device="cpu"))
+    assert adapter.policy.config.pretrained_path is None
+
+
+def test_a_policy_that_learns_does_so_in_float32():
+    from lerobot.policies.factory import make_policy_config
+
+    config = make_policy_config("evo1", device="cpu")
+    override(config, PolicyConfig())
+    assert config.vlm_dtype == "bfloat16"
+    override(config, PolicyConfig(), learns=True)
+    assert config.vlm_dtype == "float32"
 
 
 def test_a_policy_that_takes_no_batch_decides_one_by_one(
