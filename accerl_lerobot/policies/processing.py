@@ -112,12 +112,12 @@ def load_processors(policy_config: Any, folder: Path, rename_map: dict[str, str]
 
 def _statistics_width(postprocessor: Any) -> int:
     """Number of actions that a postprocessor has statistics of; 0 if it has none."""
-    names = [f"{ACTION}.{statistic}" for needed in STATISTICS.values() for statistic in needed]
-    widths = [0]
+    width = 0
     for step in postprocessor.steps:
-        state = step.state_dict()
-        widths += [state[name].shape[-1] for name in names if name in state]
-    return max(widths)
+        for name, tensor in step.state_dict().items():
+            if name.startswith(ACTION):
+                width = max([width, *tensor.shape[-1:]])
+    return width
 
 
 def use_own_files(policy_config: Any, folder: Path, source: FileSource) -> None:

@@ -38,7 +38,6 @@ logger = logging.getLogger(__name__)
 
 EPISODES = 256  # episodes whose state is kept; the one that acted longest ago goes first
 NOISE = 6  # distinguishes the seeds of the noise on executed chunks
-REGISTERED = ("_parameters", "_buffers", "_modules")  # attributes of PyTorch's modules
 
 
 class StockAdapter(PretrainedAdapter):
@@ -56,7 +55,6 @@ class StockAdapter(PretrainedAdapter):
         self.explores = sampler is not None
         self._takes_batches = True
         self._one_at_a_time = False
-        self._acting: tuple[int, str] | None = None
         self._episodes: OrderedDict[tuple[int, str], Any] = OrderedDict()
 
     @property
@@ -80,10 +78,11 @@ class StockAdapter(PretrainedAdapter):
         Some load a text encoder only then, which all episodes share from now on. Where acting leaves tensors
         in the policy's networks, and `reset` removes them, the networks hold the state of one episode.
         """
+        networks = [vars(module) for module in self.policy.modules() if module is not self.policy]
         self._act(self.policy, self.example_requests()[0])
-        acted = tensors_kept(self.policy)
+        acted = tensors_in(networks)
         self.policy.reset()
-        self._one_at_a_time = acted > tensors_kept(self.policy)
+        self._one_at_a_time = acted > tensors_in(networks)
 
     def imitate(self, observations: Observations, tasks: Sequence[str], chunk: Tensor) -> tuple[Tensor, None]:
         batch = self._training_batch(observations, tasks, chunk)
@@ -103,15 +102,11 @@ class StockAdapter(PretrainedAdapter):
             InputError: it answers the same question differently, or is trained on more than its chunks.
         """
         config = self.policy.config
-        trained = self.trainable().values()
-        coarse = [tensor for tensor in trained if tensor.dtype in (torch.bfloat16, torch.float16)]
+        coarse = sum(tensor.dtype == torch.bfloat16 for tensor in self.trainable().values())
         if coarse:
+            why = "steps that are small beside a weight are lost"
             logger.warning(
-                "%s: %d of its %d trained tensors are in 16 bits, whatever its config says: steps that are "
-                "small beside a weight are lost",
-                config.type,
-                len(coarse),
-                len(trained),
+                "%s: LeRobot keeps %d of its trained tensors in bfloat16: %s", config.type, coarse, why
             )
         later = [delta for delta in config.observation_delta_indices or () if delta > 0]
         if later or config.reward_delta_indices is not None:
@@ -173,11 +168,11 @@ class StockAdapter(PretrainedAdapter):
         """
         episode = episode_of(request.noise_seed), str(request.observation[TASK])
         begins = decision_of(request.noise_seed) == 0
-        if self._one_at_a_time and not begins and self._acting not in (None, episode):
+        latest = next(reversed(self._episodes), episode)
+        if self._one_at_a_time and not begins and latest != episode:
             why = "its networks hold the state of one episode, so it acts in one environment at a time"
             hint = f"{why}; set rollout.workers=1 and rollout.environments=1"
             raise InputError("policy.type", self.policy.config.type, hint)
-        self._acting = episode
         if begins:  # the episode of a lost worker begins once more
             self._episodes.pop(episode, None)
         if episode not in self._episodes:
@@ -272,33 +267,21 @@ def shared_parts(policy: Any) -> list[Any]:
 
     Networks that PyTorch does not know as parts of the policy, as it keeps them in a dict, are among them.
     """
-    parts = [policy.config]
+    parts = [policy.config, *policy.parameters(), *policy.buffers()]
     for held in vars(policy).values():
-        values = held.values() if isinstance(held, dict) else [held]
-        for network in values:
+        for network in held.values() if isinstance(held, dict) else [held]:
             if isinstance(network, nn.Module):
-                parts += [*network.modules(), *network.parameters(), *network.buffers()]
-    return [*parts, *policy.parameters(), *policy.buffers()]
+                parts += network.modules()
+    return parts
 
 
-def tensors_kept(policy: Any) -> int:
-    """Number of tensors that a policy's networks keep beside their parameters and buffers."""
-    count = 0
-    for module in policy.modules():
-        if module is not policy:
-            kept = {name: value for name, value in vars(module).items() if name not in REGISTERED}
-            count += _count_tensors(kept)
-    return count
-
-
-def _count_tensors(value: Any) -> int:
-    if isinstance(value, Tensor):
-        return 1
+def tensors_in(value: Any) -> int:
+    """Number of tensors in nested dicts, lists and tuples."""
     if isinstance(value, dict):
         value = list(value.values())
     if isinstance(value, list | tuple):
-        return sum(map(_count_tensors, value))
-    return 0
+        return sum(map(tensors_in, value))
+    return isinstance(value, Tensor)
 
 
 def _decision(chunk: np.ndarray, version: int) -> Decision:
