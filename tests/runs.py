@@ -8,14 +8,15 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.table import Table
 
-from accerl_lerobot.algorithms import AlgorithmConfig, RatioConfig
+from accerl_lerobot.algorithms import AlgorithmConfig, ChunkCriticConfig, RatioConfig
 from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.engines.config import LaunchConfig, RunConfig
 from accerl_lerobot.engines.contract import Engine, Progress
@@ -25,6 +26,9 @@ from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.replay.buffer import ReplayConfig
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
 from accerl_lerobot.run.train import make_engine
+
+if TYPE_CHECKING:
+    from accerl_lerobot.engines.local import LocalEngine
 
 HANGS_S = 240.0
 ALGORITHMS = [
@@ -70,6 +74,17 @@ def tiny_run(checkpoint: Path, **sections: Any) -> RunConfig:
     return RunConfig(**{**defaults, **sections})
 
 
+def off_policy_run(checkpoint: Path, **sections: Any) -> RunConfig:
+    """The same for an algorithm that keeps whole episodes in its own memory: by default the chunk critic."""
+    sizes = {"capacity": 64, "min_decisions": 16, "max_unlearned_decisions": 32, "samples_per_insert": 1}
+    defaults: dict[str, Any] = {
+        "algorithm": ChunkCriticConfig(),
+        "rollout": RolloutConfig(environments=4, segment_length=4),
+        "replay": ReplayConfig(**sizes),
+    }
+    return tiny_run(checkpoint, **{**defaults, **sections})
+
+
 def polls(engine: Engine) -> Iterator[Progress]:
     """Polls again and again; a test that waits for minutes hangs."""
     deadline = time.monotonic() + HANGS_S
@@ -108,11 +123,24 @@ def until(engine: Engine, version: int) -> list[Progress]:
     return history
 
 
-def trained(config: RunConfig, tasks: tuple[str, ...]) -> list[dict[str, float]]:
-    """The metrics of all updates of a run, from making its engine to closing it."""
-    running = make_engine(config, tasks, history=1)
+def local_engine(
+    config: RunConfig, tasks: tuple[str, ...] = ("match",), state: Path | None = None
+) -> LocalEngine:
+    """The engine in one process, as a run makes it."""
+    local = replace(config, launch=replace(config.launch, engine="local"))
+    return make_engine(local, tasks, history=1, state=state)
+
+
+def trained(config: RunConfig) -> tuple[list[Progress], LocalEngine]:
+    """A run in one process from beginning to end: everything that was reported, and its engine."""
+    engine = local_engine(config)
     try:
-        running.train()
-        return [update for progress in drive(running) for update in progress.updates]
+        engine.train()
+        return drive(engine), engine
     finally:
-        running.close()
+        engine.close()
+
+
+def updates(history: Sequence[Progress]) -> list[dict[str, float]]:
+    """The metrics of all updates that were reported."""
+    return [update for progress in history for update in progress.updates]

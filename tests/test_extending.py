@@ -11,7 +11,6 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,23 +24,20 @@ from accerl_lerobot.algorithms import AlgorithmConfig, chunk_critic
 from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.algorithms.ratio_update import make_update
 from accerl_lerobot.config.parsing import parse
-from accerl_lerobot.engines.config import LaunchConfig, RunConfig
+from accerl_lerobot.engines.config import RunConfig
 from accerl_lerobot.envs import SimulatedConfig, make_environment
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Observation
 from accerl_lerobot.policies.config import PLUGINS, POLICIES, PolicyConfig
 from accerl_lerobot.policies.flow import FlowFamily
 from accerl_lerobot.policies.loading import dry_run_config, load_adapter
-from accerl_lerobot.replay.buffer import ReplayConfig
-from accerl_lerobot.rollout.runner import RolloutConfig
-from accerl_lerobot.run.train import make_engine
 from accerl_lerobot.testing import check_policy
 from accerl_lerobot.world_model.config import StateModelConfig
 from tests.algorithms.test_chunk_critic import episode
 from tests.envs.test_gym import GYM
 from tests.envs.test_gym import PACKAGE as REACH
 from tests.policies.checkpoints import write_policy
-from tests.runs import drive, pip_installed, tiny_run, trained
+from tests.runs import off_policy_run, pip_installed, tiny_run, trained, updates
 
 SOURCE = Path(__file__).parent / "packages" / "lerobot_policy_mlp_flow"
 EXAMPLES = Path(__file__).parents[1] / "docs" / "examples"
@@ -196,21 +192,13 @@ def test_the_world_model_of_the_page(monkeypatch: Any, tiny_checkpoint: Path):
     flags = ["--world_model.discover_packages_path=small_picture", "--world_model.type=small_picture"]
     try:
         chosen = parse(RunConfig, ["--config_path=few_shot", "--env.environment_state=false", *flags])
-        sections: Any = {
-            "algorithm": chosen.algorithm,
-            "world_model": chosen.world_model,
-            "rollout": RolloutConfig(environments=4, segment_length=4),
-            "replay": ReplayConfig(
-                capacity=64, min_decisions=16, max_unlearned_decisions=32, samples_per_insert=1
-            ),
-            "trainer": TrainerConfig(updates=4, batch_decisions=16, value_warmup_updates=2),
-        }
-        config = tiny_run(tiny_checkpoint, **sections)
-        engine: Any = make_engine(replace(config, launch=LaunchConfig(engine="local")), ("match",), history=1)
-        engine.train()
-        drive(engine)
-        engine.close()
-        memory = engine._update.memory
+        config = off_policy_run(
+            tiny_checkpoint,
+            world_model=chosen.world_model,
+            trainer=TrainerConfig(updates=4, batch_decisions=16, value_warmup_updates=2),
+        )
+        _, engine = trained(config)
+        memory: Any = engine._update.memory
         images = memory["observation.images.front"].reshape(-1, 4, 8, 4, 8, 3).mean((2, 4)) / 255
         expected = np.concatenate(
             [images.transpose(0, 3, 1, 2).reshape(-1, 48), memory["observation.state"]], 1
@@ -224,7 +212,7 @@ def test_the_world_model_of_the_page(monkeypatch: Any, tiny_checkpoint: Path):
 def test_it_trains_with_its_own_algorithm(checkpoint: Path):
     algorithm = parse(RunConfig, [*NAMED, "--algorithm.cap=1.5"]).algorithm
     config = tiny_run(checkpoint, policy=named(checkpoint), algorithm=algorithm)
-    made = trained(replace(config, launch=LaunchConfig(engine="local")), ("match",))
+    made = updates(trained(config)[0])
     assert len(made) == 12 and made[-1]["skipped"] == 0
     assert any(update["policy_loss"] != 0 for update in made)
 

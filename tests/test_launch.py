@@ -25,7 +25,7 @@ from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
 from accerl_lerobot.timeline import read_timeline
 from benchmarks.simulated_environment import LatencyConfig
 from tests.runs import collect, polls, tiny_run
-from tests.timeline.test_engines import adds_up, gaps
+from tests.timeline.folders import adds_up, gaps
 
 UPDATES = 24
 DURING = 8

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The one-process engine: every algorithm trains in it, acting and learning agree, and it closes."""
+"""The one-process engine: every algorithm trains in it, acting and learning agree, no time is left out."""
 
 from __future__ import annotations
 
@@ -11,34 +11,22 @@ import pytest
 
 from accerl_lerobot.algorithms import AlgorithmConfig
 from accerl_lerobot.algorithms.config import TrainerConfig
-from accerl_lerobot.engines.config import LaunchConfig, RunConfig
+from accerl_lerobot.engines.config import LaunchConfig
 from accerl_lerobot.engines.contract import Progress
-from accerl_lerobot.engines.local import LocalEngine
+from accerl_lerobot.timeline import read_timeline
 from benchmarks.simulated_environment import LatencyConfig
-from tests.runs import ALGORITHMS, drive, tiny_run
-
-
-def train(config: RunConfig) -> tuple[list[Progress], dict[str, np.ndarray]]:
-    engine = LocalEngine(config, ("match",))
-    engine.train()
-    history = drive(engine)
-    weights = engine._adapter.export_trainable()
-    engine.close()
-    return history, weights
-
-
-def updates(history: list[Progress]) -> list[dict[str, float]]:
-    return [update for progress in history for update in progress.updates]
+from tests.runs import ALGORITHMS, drive, local_engine, tiny_run, trained, updates
+from tests.timeline.folders import adds_up
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_every_algorithm_trains(name: str, tiny_checkpoint: Path):
     algorithm = AlgorithmConfig.get_choice_class(name)(level="chunk", kl_coef=0.1)
-    history, weights = train(tiny_run(tiny_checkpoint, algorithm=algorithm))
+    history, engine = trained(tiny_run(tiny_checkpoint, algorithm=algorithm))
     found = updates(history)
     assert len(found) == 12 and found[-1]["skipped"] == 0
     assert all(np.isfinite(value) for update in found for value in update.values())
-    assert all(np.isfinite(tensor).all() for tensor in weights.values())
+    assert all(np.isfinite(tensor).all() for tensor in engine._adapter.export_trainable().values())
 
 
 def test_acting_and_learning_agree_on_log_probs(tiny_checkpoint: Path):
@@ -46,7 +34,7 @@ def test_acting_and_learning_agree_on_log_probs(tiny_checkpoint: Path):
         updates=16, batch_decisions=16, lr=1e-3, warmup_updates=2, value_warmup_updates=2,
         probe_every=3,
     )  # fmt: skip
-    history, _ = train(tiny_run(tiny_checkpoint, trainer=trainer))
+    history, _ = trained(tiny_run(tiny_checkpoint, trainer=trainer))
     found = [u for u in updates(history) if "logprob/mismatch_max" in u]
     assert len(found) >= 3 and found[0]["update"] == 1
     assert max(u["logprob/mismatch_max"] for u in found) <= 1e-4
@@ -60,7 +48,7 @@ def test_weights_held_back_act_so_many_updates_late(tiny_checkpoint: Path):
         fields: dict[str, Any] = {"updates": 14, "batch_decisions": 16, "lr": 1e-3, "value_warmup_updates": 0}
         trainer = TrainerConfig(**fields, hold_back=hold_back, probe_every=4)
         launch = LaunchConfig(engine="local")
-        history, _ = train(tiny_run(tiny_checkpoint, trainer=trainer, launch=launch))
+        history, _ = trained(tiny_run(tiny_checkpoint, trainer=trainer, launch=launch))
         assert max(u.get("logprob/mismatch_max", 0.0) for u in updates(history)) < 1e-4
         return [u["lag_mean"] for u in updates(history)], history[-1]
 
@@ -70,19 +58,21 @@ def test_weights_held_back_act_so_many_updates_late(tiny_checkpoint: Path):
     assert end.inference["version"] == other_end.inference["version"] == 14, "the last weights act at once"
 
 
-def test_closing_does_not_hide_why_it_is_called(tiny_checkpoint: Path, caplog: pytest.LogCaptureFixture):
-    engine = LocalEngine(tiny_run(tiny_checkpoint), ("match",))
-
-    def close() -> None:
-        raise OSError("the renderer is gone")
-
-    engine._runner.close = close  # type: ignore[method-assign]
-    engine.close()
-    assert "the renderer is gone" in caplog.text
-
-
 def test_a_nan_from_the_world_is_counted_and_the_run_goes_on(tiny_checkpoint: Path):
     config = tiny_run(tiny_checkpoint, env=LatencyConfig(max_steps=16, nan_after=21))
-    history, _ = train(config)
+    history, _ = trained(config)
     assert history[-1].done and history[-1].rollout["dropped_nonfinite"] > 0
     assert history[-1].replay["dropped_nonfinite"] == 0, "the runner should have kept it from replay"
+
+
+def test_it_is_one_row_of_the_timeline(tiny_checkpoint: Path, tmp_path: Path):
+    engine = local_engine(tiny_run(tiny_checkpoint, output_dir=str(tmp_path)))
+    engine.train()
+    drive(engine)
+    engine.save(tmp_path / "saved")
+    engine.close()
+    assert (tmp_path / "episodes.jsonl").stat().st_size
+    timeline = read_timeline(tmp_path)
+    adds_up(timeline)
+    assert [row.worker for row in timeline.rows] == ["local"]
+    assert timeline.shares()["local"].keys() == {"recovery", "compute", "wait_in", "checkpoint"}

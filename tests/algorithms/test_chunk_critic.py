@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The off-policy chunk critic: its memory and networks against slow ones by hand, and a run that learns."""
+"""The off-policy algorithms: memory, weights and networks against slow ones by hand, and runs that learn."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -21,7 +23,7 @@ from accerl_lerobot.algorithms import (
 )
 from accerl_lerobot.algorithms.chunk_critic import ChunkCriticUpdate
 from accerl_lerobot.algorithms.config import TrainerConfig
-from accerl_lerobot.algorithms.off_policy import AWRUpdate, Memory, OffPolicyUpdate
+from accerl_lerobot.algorithms.off_policy import AWRUpdate, Memory, OffPolicyUpdate, weights
 from accerl_lerobot.algorithms.ratio_update import make_update
 from accerl_lerobot.envs import SimulatedConfig, make_environment
 from accerl_lerobot.errors import InputError, NonFiniteError
@@ -35,7 +37,6 @@ from accerl_lerobot.experience import (
     SegmentStart,
     stack_observations,
 )
-from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.config import FlowSamplerConfig, PolicyConfig
 from accerl_lerobot.policies.family import Encoded
 from accerl_lerobot.policies.flow import FlowFamily, FlowShape
@@ -45,12 +46,12 @@ from accerl_lerobot.replay.buffer import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.run.preflight import check_start
 from accerl_lerobot.seeds import noise_seed
-from accerl_lerobot.world_model.config import LatentConfig, SimulatorStateConfig
+from accerl_lerobot.world_model.config import LatentConfig, SimulatorStateConfig, StateModelConfig
 from accerl_lerobot.world_model.latent import LatentModel
 from accerl_lerobot.world_model.states import SimulatorState, StateSpec
 from tests.replay.segments import make_segment
 from tests.rounding import assert_close
-from tests.runs import tiny_run
+from tests.runs import off_policy_run
 
 GAMMA = 0.9
 ENV = SimulatedConfig(max_steps=16, environment_state=True)
@@ -88,10 +89,21 @@ def chunks(segment: Segment) -> np.ndarray:
     return np.zeros((len(segment), 4, 2), np.float32)
 
 
-def taught(checkpoint: Path) -> LeRobotAdapter:
-    """A policy and a teacher that sees one number and the task."""
-    config = PolicyConfig(path=str(checkpoint), device="cpu")
-    return with_teacher(load_adapter, SimulatorStateConfig(), 1, 0.5, config, noise=0.1)
+def learner(
+    path: Path,
+    algorithm: ChunkCriticConfig | None = None,
+    model: StateModelConfig | None = None,
+    **trainer: Any,
+) -> ChunkCriticUpdate:
+    """A learner on the state of a simulator that tells one number, or on the state of another `model`."""
+    numbers, model = int(model is None), model or SimulatorStateConfig()
+    policy = PolicyConfig(path=str(path), device="cpu")
+    adapter = with_teacher(load_adapter, model, numbers, 0.5, policy, noise=0.1)
+    config = TrainerConfig(**{"warmup_updates": 0, "value_warmup_updates": 0} | trainer)
+    return ChunkCriticUpdate(adapter, algorithm or ChunkCriticConfig(), config)
+
+
+latent_learner = partial(learner, model=LatentConfig(latents=4))
 
 
 def simulator(numbers: int) -> SimulatorState:
@@ -103,20 +115,6 @@ def state_of(teacher: Teacher, observation: Observation) -> torch.Tensor:
     """(1, S), at the beginning of an episode."""
     observations, tasks = stack_observations([Request(observation=observation, noise_seed=0)])
     return teacher.states(observations, tasks, np.zeros(1, np.float32))
-
-
-def latent_learner(path: Path) -> ChunkCriticUpdate:
-    """A learner on a latent state, of which the environment tells nothing."""
-    config = PolicyConfig(path=str(path), device="cpu")
-    adapter = with_teacher(load_adapter, LatentConfig(latents=4), 0, 0.5, config, noise=0.1)
-    return ChunkCriticUpdate(
-        adapter, ChunkCriticConfig(), TrainerConfig(warmup_updates=0, value_warmup_updates=0)
-    )
-
-
-def learner(path: Path, algorithm: ChunkCriticConfig | None = None, **trainer: Any) -> ChunkCriticUpdate:
-    config = TrainerConfig(**{"warmup_updates": 0, "value_warmup_updates": 0} | trainer)
-    return ChunkCriticUpdate(taught(path), algorithm or ChunkCriticConfig(), config)
 
 
 class TestMemory:
@@ -176,31 +174,13 @@ def slowly(ensemble: Ensemble, member: int, x: np.ndarray) -> np.ndarray:
     return h @ weights[-1] + biases[-1]
 
 
-def test_the_ensemble_equals_a_slow_one():
-    torch.manual_seed(0)
-    ensemble = Ensemble(inputs=11, outputs=2, members=3)
-    with torch.no_grad():
-        for bias in ensemble.biases:
-            bias.normal_()
-    x = torch.randn(5, 11)
-    for member in range(3):
-        expected = slowly(ensemble, member, x.numpy())
-        np.testing.assert_allclose(ensemble(x)[member].detach(), expected, rtol=1e-4, atol=1e-5)
-
-
-def test_a_teacher_keeps_to_its_range_and_scales_what_it_sees():
+def test_a_teacher_keeps_to_its_range():
     torch.manual_seed(0)
     teacher = Teacher(simulator(2), chunk=(3, 2), share=1.0, noise=0.0)
     with torch.no_grad():
         teacher.low.copy_(torch.tensor([-1.0, 2.0]))
         teacher.high.copy_(torch.tensor([0.0, 4.0]))
-        teacher.mean[:2] = torch.tensor([1.0, 2.0])
-        teacher.std[:2] = torch.tensor([0.5, 4.0])
         teacher.network.weights[-1].mul_(1000)
-    states = torch.zeros(2, 2 + TASK_BITS)
-    states[:, :2] = torch.tensor([[2.0, 2.0], [1.0, 99.0]])
-    scaled = teacher.scaled(states)
-    np.testing.assert_allclose(scaled[:, :2].detach(), [[2, 0], [0, 10]])
     chunk = teacher(100 * torch.randn(50, 2 + TASK_BITS)).detach()
     assert chunk.shape == (50, 3, 2)
     assert (chunk.amin((0, 1)) >= teacher.low).all() and (chunk.amax((0, 1)) <= teacher.high).all()
@@ -487,6 +467,60 @@ def awr(checkpoint: Path, algorithm: AWRConfig | None = None, **trainer: Any) ->
     return update
 
 
+def test_weights_by_hand():
+    advantage = torch.tensor([-1.0, 0.0, 0.5, 2.0, 1e6])
+    expected = [math.exp(-2), 1, math.exp(1), 20, 20]
+    np.testing.assert_allclose(weights(advantage, beta=0.5), expected, rtol=1e-6)
+    np.testing.assert_allclose(weights(advantage, beta=math.inf), 1)
+
+
+def test_a_step_weighs_each_row_by_its_advantage(tiny_checkpoint: Path):
+    """Two decisions with known returns, a critic that says 0, and imitation losses of 1 and 3."""
+    update = awr(tiny_checkpoint, AWRConfig(policy_steps=1.0, beta=0.5), lr=0.0, value_lr=0.0)
+    for value, reward in ((1.0, 0.0), (3.0, 1.0)):
+        update.remember(episode([reward], actions=np.full((1, 4, 2), value, np.float32)))
+    losses = update.adapter.processing.normalise(torch.tensor([1.0, 3.0])[:, None, None].expand(2, 4, 2))
+    update.adapter.family.imitation_loss = lambda encoded, chunk: (
+        chunk[:, 0, 0] + 0 * encoded.features.sum((1, 2))
+    )
+    rows = np.array([0, 1, 1])
+    for _ in range(2):
+        encoded = update.adapter.encode(*update.memory.observations(rows))
+        found = update.losses(rows, encoded, torch.tensor([1.0, 2.0, 3.0]))
+        square = 2 / 3  # the mean square of the returns 0, 1, 1 stays the same
+        weight = np.minimum(np.exp(np.array([0.0, 1.0, 1.0]) / math.sqrt(square) / 0.5), 20.0)
+        assert found["imitation_loss"].item() == pytest.approx(weight @ [1, 2, 3] / 3, rel=1e-5)
+        assert found["value_loss"].item() == pytest.approx(2 / 3)
+    metrics = update.learn(1)
+    low, high = float(losses[0, 0, 0]), float(losses[1, 0, 0])
+    assert min(low, 20 * high) < metrics["imitation_loss"] < max(low, 20 * high)
+
+
+def test_the_critic_learns_returns_and_leaves_the_policy_alone(tiny_checkpoint: Path):
+    update = awr(tiny_checkpoint, AWRConfig(policy_steps=1.0), lr=0.0, value_lr=3e-2)
+    before = update.adapter.export_trainable()
+    update.remember(episode([0.0, 0.0, 1.0]))
+    for _ in range(60):
+        metrics = update.learn(1)
+        update.version += 1
+    after = update.adapter.export_trainable()
+    changed = {name.split(".")[0] for name in before if not np.array_equal(before[name], after[name])}
+    assert changed == {"value_head"} and metrics["value_loss"] < 0.05
+
+
+def test_it_goes_where_returns_are_high(tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch):
+    """The return is how far the first action goes up; nothing counts as a success."""
+    monkeypatch.setattr(off_policy, "POLICY_BATCH", 32)
+    update = awr(tiny_checkpoint, AWRConfig(policy_steps=0.5, beta=0.3), value_lr=1e-2)
+    rng, before = np.random.default_rng(0), first_action(update)
+    for _ in range(6):
+        segments = tried(rng, lambda up: (1 + up) / 2)
+        for segment in segments:
+            segment.success = False
+        update.step(segments)
+    assert first_action(update) > before + 0.2
+
+
 @pytest.mark.parametrize("make", [learner, latent_learner, awr])
 def test_what_was_learnt_is_restored_to_the_last_bit(
     make: Callable[[Path], OffPolicyUpdate], tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
@@ -506,24 +540,6 @@ def test_what_was_learnt_is_restored_to_the_last_bit(
     assert steps(one, 1) == steps(other, 1)
     left, right = one.adapter.export_trainable(), other.adapter.export_trainable()
     assert all(np.array_equal(left[name], right[name]) for name in left)
-
-
-def test_self_imitation_goes_where_successes_are(tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch):
-    """Success is a chunk whose first action goes up; half of the chunks do, by chance."""
-    torch.manual_seed(0)
-    monkeypatch.setattr(off_policy, "POLICY_BATCH", 32)
-    update = imitator(tiny_checkpoint, policy_steps=0.5, lr=1e-3)
-    rng = np.random.default_rng(0)
-    for _ in range(6):
-        segments = tried(rng, lambda up: float(up > 0))
-        for segment in segments:
-            del segment.observations[ENVIRONMENT_STATE]
-        metrics = update.step(segments)
-        if update.version == 1:
-            first, before = metrics["imitation_loss"], first_action(update)
-    assert metrics["imitation_loss"] < first
-    after = first_action(update)  # the mean of successes is 0.5
-    assert after == pytest.approx(0.5, abs=0.2) and after > before + 0.1
 
 
 def test_a_step_imitates_successes_only(tiny_checkpoint: Path):
@@ -566,14 +582,6 @@ def test_what_is_not_finite_is_skipped_and_ends_the_run(tiny_checkpoint: Path):
     assert all(np.array_equal(before[name], after[name]) for name in before if name.startswith("policy."))
 
 
-SECTIONS: dict[str, Any] = {
-    "env": ENV,
-    "algorithm": ChunkCriticConfig(),
-    "rollout": RolloutConfig(environments=4, segment_length=4),
-    "replay": ReplayConfig(capacity=64, min_decisions=16, max_unlearned_decisions=32, samples_per_insert=1),
-}
-
-
 @pytest.mark.parametrize(
     ("sections", "message"),
     [
@@ -597,4 +605,4 @@ SECTIONS: dict[str, Any] = {
 def test_what_it_cannot_learn_from_is_refused(tiny_checkpoint: Path, sections: dict[str, Any], message: str):
     policy = PolicyConfig(path=str(tiny_checkpoint), device="cpu")
     with pytest.raises(InputError, match=message):
-        check_start(tiny_run(tiny_checkpoint, **SECTIONS | {"policy": policy} | sections))
+        check_start(off_policy_run(tiny_checkpoint, **{"env": ENV, "policy": policy} | sections))

@@ -27,9 +27,8 @@ from accerl_lerobot.policies.loading import load_adapter
 from accerl_lerobot.policies.teacher import with_teacher
 from accerl_lerobot.run.preflight import check_start
 from accerl_lerobot.world_model.config import SimulatorStateConfig
-from tests.algorithms.test_chunk_critic import SECTIONS
 from tests.replay.segments import make_segment
-from tests.runs import tiny_run
+from tests.runs import off_policy_run
 from tests.tiny_datasets import labels, record_dataset, write_dataset
 
 ENV = SimulatedConfig(max_steps=16, environment_state=True)
@@ -122,21 +121,11 @@ def test_of_a_long_dataset_only_a_part_is_read(
     assert len(read) == 2 and sum(map(len, read)) <= frames // K // 2 + 2
 
 
-def test_a_dataset_of_something_else_is_left_out(
-    dataset: DatasetConfig, like: Segment, caplog: pytest.LogCaptureFixture
-):
-    like = replace(like, actions=np.zeros((1, K, 7), np.float32))
-    with caplog.at_level(logging.WARNING):
-        assert not list(demonstrations(dataset, COST, like))
-    assert "does not join the memory: the dataset's action has shape" in caplog.text
-
-
 def test_the_memory_begins_with_them_and_is_restored_without(
     dataset: DatasetConfig, like: Segment, tiny_checkpoint: Path
 ):
-    load = partial(with_teacher, load_adapter, SimulatorStateConfig(), ENV.state_size, 0.5)
     policy = PolicyConfig(path=str(tiny_checkpoint), device="cpu")
-    adapter = load(policy)
+    adapter = with_teacher(load_adapter, SimulatorStateConfig(), ENV.state_size, 0.5, policy)
     adapter.demonstrations = partial(demonstrations, dataset, COST)
     config = TrainerConfig(value_warmup_updates=100)
     update = ChunkCriticUpdate(adapter, ChunkCriticConfig(), config)
@@ -151,8 +140,7 @@ def test_the_memory_begins_with_them_and_is_restored_without(
 def test_they_are_looked_at_before_the_run_begins(
     dataset: DatasetConfig, tiny_checkpoint: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ):
-    sections = SECTIONS | {"algorithm": ChunkCriticConfig(), "env": ENV, "dataset": dataset}
-    config = tiny_run(tiny_checkpoint, **sections)
+    config = off_policy_run(tiny_checkpoint, env=ENV, dataset=dataset)
     with caplog.at_level(logging.WARNING):
         check_start(config)
         assert "does not join" not in caplog.text

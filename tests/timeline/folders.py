@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Timelines that tests choose, and a clock that they turn."""
+"""Timelines that tests choose, a clock that they turn, and what is so of every timeline."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
 
-from accerl_lerobot.timeline import TIMELINE, Clock
+import numpy as np
+import pytest
+
+from accerl_lerobot.timeline import TIMELINE, Clock, Row, Timeline
 
 SECOND = 10**9
 UP = 10**15  # the monotonic clock's time when a test begins; the calendar shows twice that
@@ -39,3 +42,19 @@ def write_worker(run: Path, worker: str, spans: Iterable[tuple[int, float]], *, 
         clock.enter(state)
         hands.now += round(length * SECOND)
     clock.close()
+
+
+def adds_up(timeline: Timeline) -> None:
+    """A worker is in one state at a time, and every moment of its processes is in one."""
+    for row in timeline.rows:
+        whole = int(row.ends[-1] - row.starts[0] - gaps(row).sum())
+        assert row.spent((0.0, timeline.seconds + 1.0)).sum() == pytest.approx(whole, rel=1e-9) and whole > 0
+    for own in timeline.shares().values():
+        assert sum(own.values()) == pytest.approx(1.0)
+
+
+def gaps(row: Row) -> np.ndarray:
+    """Lengths of the times between two processes of a worker."""
+    between: np.ndarray = row.starts[1:] - row.ends[:-1]
+    assert (between >= 0).all()
+    return between[between > 0]
