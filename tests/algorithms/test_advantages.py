@@ -32,6 +32,7 @@ def batch() -> Batch:
     values = torch.randn(s, t, generator=generator, dtype=torch.float64)
     bootstrap = torch.randn(s, generator=generator, dtype=torch.float64)
     terminated = torch.arange(s) % 2 == 0
+    bootstrap[terminated] = torch.nan  # is not looked at
     lengths = torch.randint(1, t + 1, (s,), generator=generator)
     lengths[0] = t
     return rewards, values, bootstrap, terminated, lengths
@@ -46,34 +47,22 @@ def test_equals_the_oracle(gamma: float, lam: float) -> None:
         np.testing.assert_allclose(got.numpy(), want, atol=1e-12)
 
 
-def by_hand(terminated: bool) -> tuple[list[float], list[float]]:
-    advantages, returns = gae(
-        torch.tensor([[0.0, 1.0]]),
-        torch.tensor([[0.5, 0.25]]),
-        torch.tensor([2.0]),
-        torch.tensor([terminated]),
-        torch.tensor([2]),
-        gamma=0.5,
-        lam=0.5,
-    )
-    return advantages[0].tolist(), returns[0].tolist()
-
-
-def test_hand_computed_termination() -> None:
-    # δ_1 = 1 + 0 − 0.25 = 0.75; δ_0 = 0 + 0.5·0.25 − 0.5 = −0.375; Â_0 = −0.375 + 0.25·0.75 = −0.1875
-    assert by_hand(terminated=True) == ([-0.1875, 0.75], [0.3125, 1.0])
-
-
-def test_hand_computed_truncation_bootstraps_with_the_critic() -> None:
-    # δ_1 = 1 + 0.5·2 − 0.25 = 1.75; Â_0 = −0.375 + 0.25·1.75 = 0.0625
-    assert by_hand(terminated=False) == ([0.0625, 1.75], [0.5625, 2.0])
-
-
-def test_a_termination_ignores_even_a_nan_bootstrap() -> None:
-    rewards, values, bootstrap, terminated, lengths = batch()
-    bootstrap[terminated] = torch.nan
-    advantages, returns = gae(rewards, values, bootstrap, terminated, lengths, gamma=0.99, lam=0.95)
-    assert advantages.isfinite().all() and returns.isfinite().all()
+@pytest.mark.parametrize(
+    ("terminated", "advantages", "returns"),
+    [
+        # δ_1 = 1 + 0 − 0.25 = 0.75; δ_0 = 0 + 0.5·0.25 − 0.5 = −0.375; Â_0 = −0.375 + 0.25·0.75 = −0.1875
+        (True, [-0.1875, 0.75], [0.3125, 1.0]),
+        # δ_1 = 1 + 0.5·2 − 0.25 = 1.75; Â_0 = −0.375 + 0.25·1.75 = 0.0625
+        (False, [0.0625, 1.75], [0.5625, 2.0]),
+    ],
+)
+def test_termination_and_truncation_by_hand(
+    terminated: bool, advantages: list[float], returns: list[float]
+) -> None:
+    reward, value = torch.tensor([[0.0, 1.0]]), torch.tensor([[0.5, 0.25]])
+    ends = torch.tensor([2.0]), torch.tensor([terminated]), torch.tensor([2])
+    found = gae(reward, value, *ends, gamma=0.5, lam=0.5)
+    assert [row[0].tolist() for row in found] == [advantages, returns]
 
 
 def test_padding_is_never_looked_at() -> None:
@@ -86,12 +75,6 @@ def test_padding_is_never_looked_at() -> None:
     for got, want in zip(padded, expected, strict=True):
         assert torch.equal(got[:, :7], want)
         assert (got[padding] == 0).all()
-
-
-def test_no_gradient_leaves() -> None:
-    rewards, values, bootstrap, terminated, lengths = batch()
-    out = gae(rewards, values.requires_grad_(), bootstrap, terminated, lengths, gamma=0.99, lam=0.95)
-    assert not any(x.requires_grad for x in out)
 
 
 def test_parts_of_different_size_equal_the_whole() -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""GIPO and PPO: against the oracle, by hand, and what holds for both."""
+"""GIPO and PPO: against the oracle, by hand, and what holds for both; the KL and logged numbers by hand."""
 
 import math
 from dataclasses import replace
@@ -11,8 +11,13 @@ import pytest
 import torch
 
 from accerl_lerobot.algorithms import GIPOConfig, LossInputs, PPOConfig, RatioConfig
-from accerl_lerobot.algorithms.objective import LOG_RATIO_CLAMP
-from tests.algorithms.inputs import gradient, make_inputs, one
+from accerl_lerobot.algorithms.objective import (
+    KL_LINEAR_ABOVE,
+    LOG_RATIO_CLAMP,
+    kl_from_behaviour,
+    lag_metrics,
+    sample_metrics,
+)
 
 CONFIGS: list[RatioConfig] = [
     GIPOConfig(level="token", sigma=0.5, entropy_coef=0.01),
@@ -24,6 +29,47 @@ each_config = pytest.mark.parametrize("config", CONFIGS, ids=lambda c: f"{c.type
 each_algorithm = pytest.mark.parametrize(
     "config", [GIPOConfig(kl_coef=0.0), PPOConfig()], ids=lambda c: c.type
 )
+
+
+def make_inputs(
+    n: int = 12, factors: int = 3, spread: float = 0.4, seed: int = 0, **replace: Any
+) -> LossInputs:
+    """Random float64 batch; `spread` is the standard deviation of log ρ per factor."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    old = normal(n, factors)
+    fields: dict[str, Any] = {
+        "log_prob_old": old,
+        "log_prob_new": (old + spread * normal(n, factors)).requires_grad_(),
+        "advantage": normal(n),
+        "value": normal(n).requires_grad_(),
+        "returns": normal(n),
+        "entropy": normal(n).abs().requires_grad_(),
+    }
+    return LossInputs(**{**fields, **replace})
+
+
+def one(log_ratio: float, advantage: float) -> LossInputs:
+    """A single decision with one factor; log-probs are relative to μ's."""
+    zero = torch.zeros(1, dtype=torch.float64)
+    new = torch.tensor([[log_ratio]], dtype=torch.float64, requires_grad=True)
+    return LossInputs(
+        log_prob_new=new,
+        log_prob_old=torch.zeros(1, 1, dtype=torch.float64),
+        advantage=torch.tensor([advantage], dtype=torch.float64),
+        value=zero,
+        returns=zero,
+        entropy=zero,
+    )
+
+
+def gradient(inputs: LossInputs, loss: torch.Tensor) -> torch.Tensor:
+    """∂ loss / ∂ log π, (N, L)."""
+    (result,) = torch.autograd.grad(loss, inputs.log_prob_new, retain_graph=True)
+    return result
 
 
 Ragged = list[list[float]]
@@ -75,19 +121,12 @@ def ragged_factors(n: int, width: int) -> torch.Tensor:
 
 
 @each_config
-def test_equals_the_oracle(config: RatioConfig) -> None:
-    inputs = make_inputs()
+@pytest.mark.parametrize("factors", [None, ragged_factors(12, 6)], ids=["all", "some do not exist"])
+def test_equals_the_oracle(config: RatioConfig, factors: torch.Tensor | None) -> None:
+    inputs = replace(make_inputs(factors=6), factors=factors)
     output = config.loss(inputs)
     assert output.metrics["policy_loss"].item() == pytest.approx(policy_loss_of(inputs, config), abs=1e-12)
     assert output.loss.item() == pytest.approx(loss_of(inputs, config), abs=1e-12)
-
-
-@each_config
-@pytest.mark.parametrize("level", ["token", "chunk"])
-def test_equals_the_oracle_for_tokens_of_which_some_do_not_exist(config: RatioConfig, level: Any) -> None:
-    inputs = replace(make_inputs(factors=6), factors=ragged_factors(12, 6))
-    config = replace(config, level=level)
-    assert config.loss(inputs).loss.item() == pytest.approx(loss_of(inputs, config), abs=1e-12)
 
 
 def test_gipo_by_hand() -> None:
@@ -172,10 +211,98 @@ def test_absurd_ratios_stay_finite_in_float32(config: RatioConfig) -> None:
     assert gradient(inputs, output.loss).isfinite().all()
 
 
-def test_metrics_are_detached_scalars_under_the_same_names() -> None:
-    outputs = [config.loss(make_inputs()) for config in CONFIGS]
-    assert len({tuple(sorted(o.metrics)) for o in outputs}) == 1
-    for output in outputs:
-        assert output.loss.requires_grad
-        for metric in output.metrics.values():
-            assert metric.shape == () and metric.is_floating_point() and not metric.requires_grad
+@each_config
+def test_what_does_not_exist_is_never_looked_at(config: RatioConfig) -> None:
+    """NaN there changes neither loss nor metrics nor gradient."""
+    factors = torch.arange(4) < torch.tensor([4, 2, 3, 1, 4, 2, 3])[:, None]
+    clean = replace(make_inputs(n=7, factors=4), factors=factors)
+    names = ("log_prob_new", "log_prob_old")
+    holes = {n: getattr(clean, n).detach().masked_fill(~factors, torch.nan) for n in names}
+    holes["log_prob_new"].requires_grad_()
+    dirty = replace(clean, **holes)
+    expected, got = config.loss(clean), config.loss(dirty)
+    torch.testing.assert_close(got.loss, expected.loss)
+    for name, metric in expected.metrics.items():
+        torch.testing.assert_close(got.metrics[name], metric, msg=name)
+    slope = gradient(dirty, got.loss)
+    torch.testing.assert_close(slope, gradient(clean, expected.loss))
+    assert (slope[~factors] == 0).all() and (slope[factors] != 0).any()
+
+
+def test_kl_estimates_behaviour_to_policy_in_value_and_gradient() -> None:
+    """μ = N(0, 1), π = N(m, s): samples, KL(μ‖π) = log s + (1 + m²)/(2s²) − ½ and its slope m/s² in m."""
+    noise = torch.randn(200_000, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    mean = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
+    s = 1.2
+    policy = torch.distributions.Normal(mean, s)
+    logs = policy.log_prob(noise) - torch.distributions.Normal(0.0, 1.0).log_prob(noise)
+    kl = kl_from_behaviour(logs).mean()
+    assert kl.item() == pytest.approx(math.log(s) + (1 + 0.09) / (2 * s * s) - 0.5, rel=0.02)
+    (slope,) = torch.autograd.grad(kl, mean)
+    assert slope.item() == pytest.approx(0.3 / (s * s), rel=0.02)
+
+
+def test_kl_pulls_back_from_both_sides_with_a_bounded_slope() -> None:
+    far = [-50.0, -1.0, 0.0, 1.0, KL_LINEAR_ABOVE, 50.0]
+    logs = torch.tensor(far, dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(kl_from_behaviour(logs).sum(), logs)
+    edge = math.expm1(KL_LINEAR_ABOVE)
+    expected = [-1.0, math.expm1(-1.0), 0.0, math.expm1(1.0), edge, edge]
+    np.testing.assert_allclose(slope.numpy(), expected, atol=1e-12)
+
+
+def metrics_of(
+    log_ratio: list[float] = [0.0] * 4,
+    weight: list[float] = [1.0] * 4,
+    value: list[float] = [0.0] * 4,
+    returns: list[float] = [1.0] * 4,
+    keep: list[bool] = [True] * 4,
+    clip: tuple[float, float] = (0.2, 0.28),
+) -> dict[str, float]:
+    """Metrics of four decisions with a ratio each."""
+    samples = torch.tensor([log_ratio, weight, keep, value, returns], dtype=torch.float64).T
+    return {name: metric.item() for name, metric in sample_metrics(samples, clip).items()}
+
+
+@pytest.mark.parametrize(
+    ("weight", "expected"),
+    [([1.0] * 4, 1.0), ([1.0, 0, 0, 0], 0.25), ([3.0, 1, 3, 1], 16 / 20), ([0.0] * 4, 0.0)],
+)
+def test_effective_sample_size(weight: list[float], expected: float) -> None:
+    assert metrics_of(weight=weight)["ess"] == pytest.approx(expected)
+
+
+def test_shares_and_quantiles_are_of_the_ratios_that_exist() -> None:
+    logs = [math.log(rho) for rho in (0.7, 0.9, 1.2, 1.4)]
+    found = metrics_of(logs, weight=[0.0, 0.05, 1.0, 1.0])
+    assert (found["clip_fraction"], found["low_weight"]) == (0.5, 0.5)
+    assert found["log_ratio_p05"] == pytest.approx(np.quantile(logs, 0.05))
+    found = metrics_of(logs, weight=[0.0, 0.05, 1.0, 1.0], keep=[True, True, True, False])
+    assert (found["clip_fraction"], found["low_weight"]) == pytest.approx((1 / 3, 2 / 3))
+    assert found["log_ratio_p95"] == pytest.approx(np.quantile(logs[:3], 0.95))
+    assert found["approx_kl"] == pytest.approx(np.mean([math.exp(x) - 1 - x for x in logs[:3]]), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    # A constant offset is not variance.
+    [([0.0, 1, 2, 3], 1.0), ([5.0, 6, 7, 8], 1.0), ([0.0] * 4, 0.0), ([0.0, -1, -2, -3], -3.0)],
+)
+def test_explained_variance(value: list[float], expected: float) -> None:
+    assert metrics_of(value=value, returns=[0.0, 1, 2, 3])["explained_variance"] == expected
+    assert metrics_of(value=value)["explained_variance"] == 0.0
+
+
+def test_lag() -> None:
+    lag = lag_metrics(torch.tensor([10, 9, 7]), 12)
+    assert lag["lag_mean"] == pytest.approx((2 + 3 + 5) / 3) and lag["lag_max"] == 5.0
+    assert lag["lag_p95"] == pytest.approx(4.8)
+    assert lag_metrics(torch.tensor([3, 3]), 3)["lag_max"] == 0.0
+
+
+@each_algorithm
+def test_on_policy_batches_look_on_policy(config: RatioConfig) -> None:
+    metrics = {k: v.item() for k, v in config.loss(make_inputs(spread=0.0)).metrics.items()}
+    for name in ("approx_kl", "kl", "clip_fraction", "low_weight", "ratio_max_dev", "log_ratio_p50"):
+        assert metrics[name] == 0.0, name
+    assert metrics["ess"] == pytest.approx(1.0)

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -18,7 +17,6 @@ from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.algorithms.probe import Probe
 from accerl_lerobot.algorithms.ratio_update import RatioUpdate
 from accerl_lerobot.experience import Segment
-from accerl_lerobot.policies.adapter import Evaluation
 from tests.algorithms.linear import LinearAdapter, decided_by, make_segments
 
 CONFIG = TrainerConfig(
@@ -108,13 +106,7 @@ def test_decisions_are_scored_under_the_weights_that_made_them():
 def test_readings_come_every_so_many_updates():
     assert readings(make_update(), 10) == [1, 4, 7, 10]
     assert readings(make_update(replace(CONFIG, probe_every=1)), 4) == [1, 2, 3, 4]
-
-
-def test_nothing_is_probed_when_it_is_off_nor_after_the_last_update():
-    update = make_update(replace(CONFIG, probe_every=0))
-    assert readings(update, 4) == [] and not update._probe._copy
-    update = make_update(replace(CONFIG, updates=3))
-    assert readings(update, 3) == [1] and not update._probe._copy
+    assert readings(make_update(replace(CONFIG, probe_every=0)), 4) == [], "it is off"
 
 
 def test_a_version_that_never_acted_is_given_up_for_the_newest():
@@ -122,9 +114,9 @@ def test_a_version_that_never_acted_is_given_up_for_the_newest():
     later = [decided_by(update.adapter, make_segments((4, 4, 4), seed=i), 0) for i in range(2)]
     for segments in later:
         segments[0].version[:], segments[1].version[:], segments[2].version[:] = -3, -2, 1
-    assert read(update.step(later[0])) is None and update._probe._version == 0
+    assert read(update.step(later[0])) is None
     later[1][1].version[:] = 1  # now most of the batch is newer than version 0
-    assert read(update.step(later[1])) is None and update._probe._version == 2
+    assert read(update.step(later[1])) is None
     assert read(update.step(fresh(update))) == pytest.approx([0.0] * 3, abs=1e-4)
 
 
@@ -149,22 +141,19 @@ def test_measuring_changes_nothing_that_is_learnt():
     assert all(torch.equal(p, without.adapter.copy()[k]) for k, p in with_.adapter.copy().items())
 
 
-@pytest.mark.parametrize("broken", [False, True])
-def test_the_live_weights_are_back_in_their_own_memory(broken: bool, monkeypatch: pytest.MonkeyPatch):
+def test_the_live_weights_are_back_in_their_own_memory_whatever_happens(monkeypatch: pytest.MonkeyPatch):
     adapter, batch = LinearAdapter(), collate(make_segments(LENGTHS))
-    probe, evaluate = Probe(adapter, CONFIG), adapter.evaluate
+    probe = Probe(adapter, CONFIG)
     with torch.no_grad():
         adapter.weight.add_(0.3)
     before, place = adapter.copy(), adapter.weight.data_ptr()
 
-    def evaluated(*arguments: Any) -> Evaluation:
+    def evaluate(*_: Any) -> None:
         assert not torch.equal(adapter.weight, before["policy.weight"])
-        if broken:
-            raise MemoryError("too many rows")
-        return evaluate(*arguments)
+        raise MemoryError("too many rows")
 
-    monkeypatch.setattr(adapter, "evaluate", evaluated)
-    with pytest.raises(MemoryError) if broken else nullcontext():
-        assert probe.read(batch)
+    monkeypatch.setattr(adapter, "evaluate", evaluate)
+    with pytest.raises(MemoryError):
+        probe.read(batch)
     assert all(torch.equal(p, before[k]) for k, p in adapter.trainable().items())
     assert adapter.weight.data_ptr() == place and adapter.weight.grad is None
