@@ -25,8 +25,9 @@ from accerl_lerobot.engines.supervision import RolloutSlot, restore_rollouts, sa
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.replay.buffer import ReplayConfig
-from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutConfig
+from accerl_lerobot.rollout.runner import EpisodePlan, RolloutConfig
 from benchmarks.simulated_environment import LatencyConfig
+from tests.rollout.environments import ended
 from tests.runs import drive, tiny_run, until
 
 UPDATES, DURING = 40, 12
@@ -101,11 +102,7 @@ def test_the_rollout_workers_part_of_a_checkpoint(tmp_path: Path):
         return [RolloutSlot(i, None, config, ("match",)) for i in range(config.rollout.workers)]
 
     def report(*plans: EpisodePlan) -> Any:
-        ended = [
-            EpisodeResult(plan=plan, success=True, episode_return=0.0, steps=3, decisions=1, versions=(0, 0))
-            for plan in plans
-        ]
-        return SimpleNamespace(episodes=ended)
+        return SimpleNamespace(episodes=[ended(plan) for plan in plans])
 
     with pytest.raises(InputError, match=r"launch\.engine='ray': this run was in one process"):
         restore_rollouts(tmp_path, slots())

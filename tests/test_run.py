@@ -20,11 +20,12 @@ from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import warn_once
 from accerl_lerobot.evaluation import EvaluationConfig, evaluation_plans
 from accerl_lerobot.policies.config import PolicyConfig
-from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
+from accerl_lerobot.rollout.runner import EpisodePlan
 from accerl_lerobot.run import loop
 from accerl_lerobot.run import train as run
 from accerl_lerobot.run.loop import run_plans
 from accerl_lerobot.run.preflight import check_start
+from tests.rollout.environments import ended
 from tests.runs import tiny_run
 
 
@@ -203,7 +204,7 @@ class Scripted(Engine):
             version=self.version,
             done=self.version == self.config.trainer.updates,
             updates=updates,
-            episodes=[_succeeded(plan) for plan in ready],
+            episodes=[ended(plan) for plan in ready],
             rollout={"env_steps": self.steps, "decisions": 1.0},
         )
 
@@ -212,10 +213,6 @@ class Scripted(Engine):
 
     def close(self) -> None:
         self.closed = True
-
-
-def _succeeded(plan: EpisodePlan) -> EpisodeResult:
-    return EpisodeResult(plan=plan, success=True, episode_return=0.0, steps=3, decisions=1, versions=(0, 0))
 
 
 def scripted(monkeypatch: pytest.MonkeyPatch, config: RunConfig) -> Scripted:
@@ -256,7 +253,7 @@ def test_a_note_is_told_at_its_first_episode(
 ):
     warn_once.cache_clear()
     plan = evaluation_plans(("match",), 1, "eval")[0]
-    noted = replace(_succeeded(plan), note="env.success='won': no such key")
+    noted = replace(ended(plan), note="env.success='won': no such key")
     engine = Scripted(local_run(tiny_checkpoint, tmp_path))
     monkeypatch.setattr(engine, "poll", lambda: Progress(version=0, episodes=[noted, noted]))
     for _ in range(2):

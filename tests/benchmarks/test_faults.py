@@ -4,10 +4,6 @@
 from __future__ import annotations
 
 import json
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -21,43 +17,8 @@ from benchmarks.audit import audit_segments, audit_updates
 from benchmarks.fault_injection import POINTS
 from benchmarks.faults import BenchFaultsConfig, bench_faults
 from benchmarks.hits import ANYWHERE, FAULTS, places
-from benchmarks.victims import CLASSES, Victim, await_hit, descendants, hit, title
+from benchmarks.victims import CLASSES, Victim
 from tests.replay.segments import make_segment
-
-SLEEPS = """
-import subprocess, sys, time
-subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
-time.sleep(60)
-"""
-
-
-@pytest.fixture
-def sleeper():
-    process = subprocess.Popen([sys.executable, "-c", SLEEPS])
-    yield process
-    for pid in [*descendants(process.pid), process.pid]:
-        hit(pid, signal.SIGKILL)
-    process.wait()
-
-
-def below(pid: int) -> int:
-    """The one child of a process, once it is there."""
-    deadline = time.monotonic() + 30
-    while not (found := descendants(pid)):
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-    return found[0]
-
-
-def test_hits_are_proved(sleeper: subprocess.Popen):
-    child = below(sleeper.pid)
-    assert sys.executable.split("/")[-1] in title(child) and title(2**22 + 1) == ""
-    assert not await_hit(child, signal.SIGSTOP, timeout=0.05), "nothing has been done to it"
-    assert hit(child, signal.SIGSTOP) and await_hit(child, signal.SIGSTOP)
-    assert not await_hit(child, signal.SIGKILL, timeout=0.05)
-    assert hit(child, signal.SIGKILL) and await_hit(child, signal.SIGKILL)
-    assert descendants(sleeper.pid) == [], "a zombie is none"
-    assert not hit(2**22 + 1, signal.SIGKILL)
 
 
 def logged(folder: Path, updates: list[int], inserted: int) -> Victim:
@@ -73,21 +34,19 @@ def logged(folder: Path, updates: list[int], inserted: int) -> Victim:
     return victim
 
 
-def test_books_that_add_up(tmp_path: Path):
-    victim = logged(tmp_path / "run", [1, 2, 3, 4], 9)
-    found = audit_updates(victim.records())
-    assert found == {"updates": 4, "lost": 0, "doubled": 0, "books": True}
-    assert "there is none" in audit_segments(victim.folder)["saved"]
+@pytest.mark.parametrize(
+    ("updates", "inserted", "found"),
+    [
+        ([1, 2, 3, 4], 9, {"updates": 4, "lost": 0, "doubled": 0, "books": True}),
+        ([1, 2, 2, 5, 5, 5], 8, {"updates": 5, "lost": 2, "doubled": 3, "books": False}),
+    ],
+)
+def test_what_is_lost_or_doubled_is_found(updates: list[int], inserted: int, found: dict, tmp_path: Path):
+    assert audit_updates(logged(tmp_path / "run", updates, inserted).records()) == found
 
 
-def test_what_is_lost_or_doubled_is_found(tmp_path: Path):
-    found = audit_updates(logged(tmp_path / "run", [1, 2, 2, 5, 5, 5], 8).records())
-    assert found == {"updates": 5, "lost": 2, "doubled": 3, "books": False}
-
-
-@pytest.fixture
-def kept(tmp_path: Path) -> Path:
-    """A run's folder, with four segments in a checkpoint's replay and one that came later."""
+def test_segments_that_counted_are_in_the_journal_once(tmp_path: Path):
+    """Four segments are in a checkpoint's replay, and one came later."""
     run = tmp_path / "run"
     run.mkdir()
     journal = Journal(run / EPISODES)
@@ -104,13 +63,9 @@ def kept(tmp_path: Path) -> Path:
 
     save_checkpoint(run / CHECKPOINTS, write)
     replay.insert(make_segment("e"))
-    return run
-
-
-def test_segments_that_counted_are_in_the_journal_once(kept: Path):
-    found = audit_segments(kept)
+    found = audit_segments(run)
     assert found == {"saved": "000003", "segments": 4, "segments_lost": 0, "segments_doubled": 0}
-    assert not list(kept.glob(".*")), "nothing is left there"
+    assert not list(run.glob(".*")), "nothing is left there"
 
 
 def test_every_point_is_somewhere_that_a_target_can_be_hit():

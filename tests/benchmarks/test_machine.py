@@ -12,7 +12,7 @@ import pytest
 
 from accerl_lerobot.demos import backbone
 from accerl_lerobot.envs import EnvConfig, LiberoConfig, MetaWorldConfig
-from benchmarks import environment, latency
+from benchmarks import environment, gpu, latency, transport
 from benchmarks import policy as bench
 from benchmarks.environment import BenchEnvironmentConfig, bench_environment
 from benchmarks.latency import BenchLatencyConfig, bench_latency, described
@@ -88,7 +88,40 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bench, "lerobot_config", shrunk)
 
 
-def test_the_published_backbone_has_the_published_size(tmp_path: Path) -> None:
-    backbone.write_backbone(tmp_path / "b", sizes=bench.SMOLVLM2_500M)
-    text = json.loads((tmp_path / "b" / "config.json").read_text())["text_config"]
-    assert (text["hidden_size"], text["intermediate_size"], text["vocab_size"]) == (960, 2560, 49280)
+@pytest.mark.usefixtures("small")
+def test_it_measures_both_precisions_and_a_run_of_one_and_of_two_ranks(tmp_path, monkeypatch):
+    asked: list[tuple[str, ...]] = []
+
+    def run(config: gpu.BenchGpuConfig, folder: Path, more: tuple[str, ...]) -> dict[str, Any]:
+        asked.append(more)
+        return {"rl_s": 3.0, "ratio_max_dev": 1e-6}
+
+    monkeypatch.setattr(gpu, "_run", run)
+    config = gpu.BenchGpuConfig(output_dir=str(tmp_path), device="cpu", batch=2, repeats=1)
+    result = gpu.bench_gpu(config)
+    assert asked == [
+        ("--trainer.ranks=1", "--trainer.sharding=ddp"),
+        ("--trainer.ranks=2", "--trainer.sharding=zero2"),
+    ]
+    assert set(result["policies"]) == {"fp32", "bf16"}
+    for (precision, found), most in zip(result["policies"].items(), (1e-4, 30.0), strict=True):
+        assert 0 < found["parameters"]["trained"] < found["parameters"]["all"]
+        assert all(found["seconds"][part]["median"] > 0 for part in ("decide", "score", "update"))
+        assert 0 <= found["mismatch"]["mean"] <= found["mismatch"]["max"] <= most, precision
+    assert json.loads((tmp_path / "gpu.json").read_text()) == json.loads(json.dumps(result))
+    assert "sharding zero2" in printed(gpu.table(result))
+
+
+def test_all_arms_of_transport_in_turns(light_ray: None, tmp_path: Path):
+    folder = tmp_path / "transport"
+    config = transport.BenchTransportConfig(
+        sizes=("12 KB",), callers=(1, 2), calls=10, rounds=1, output_dir=str(folder)
+    )
+    result = transport.bench_transport(config)
+    assert json.loads((folder / "transport.json").read_text()) == json.loads(json.dumps(result))
+    found = {(row["callers"], row["arm"]): row for row in result["results"]}
+    assert list(found) == [(callers, arm) for callers in (1, 2) for arm in (transport.RAY, transport.SOCKET)]
+    for row in found.values():
+        assert len(row["p50_us"]["blocks"]) == len(row["calls_per_s"]["blocks"]) == 2
+        assert 0 < row["p50_us"]["min"] <= row["p50_us"]["median"] <= row["p99_us"]["max"]
+    assert "socket" in printed(transport.table(result))

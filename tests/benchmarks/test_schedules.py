@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from accerl_lerobot.console import Console
 from benchmarks import async_vs_sync
 from benchmarks.async_vs_sync import ARMS, BenchAsyncVsSyncConfig, bench_async_vs_sync
 from benchmarks.async_vs_sync import compare as compare_schedules
@@ -19,6 +18,7 @@ from benchmarks.machinery import MachineryConfig
 from benchmarks.scaling import BenchScalingConfig, bench_scaling
 from benchmarks.throughput import BenchThroughputConfig, Block, bench_throughput
 from benchmarks.throughput import table as throughput_table
+from tests.runs import printed
 
 
 def block(schedule: str, rate: float, processors: float = 0.2, waits: float = 0.5) -> Block:
@@ -88,11 +88,9 @@ def test_a_law_is_measured_forth_and_back_and_written(fake_engine: None, tmp_pat
     assert [b["schedule"] for b in law["blocks"]] == [*ARMS, *reversed(ARMS)]
     assert set(result["learning"]["success"]) == set(ARMS)
     assert json.loads((tmp_path / "async_vs_sync.json").read_text()) == json.loads(json.dumps(result))
-    text = (tmp_path / "async_vs_sync.md").read_text()
-    assert "S/S*" in text and "0.50 (drawers)" in text and "Success after 2 updates" in text
+    assert "0.50 (drawers)" in (tmp_path / "async_vs_sync.md").read_text()
     assert (tmp_path / "async_vs_sync.png").stat().st_size > 1000
-    with Console().rich.capture():
-        Console().rich.print(schedules_table(result))
+    assert "drawers" in printed(schedules_table(result))
 
 
 def test_scaling_is_measured_forth_and_back(fake_engine: None, tmp_path: Path):

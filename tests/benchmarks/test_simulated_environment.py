@@ -56,22 +56,3 @@ def test_a_trace_is_gone_through_from_some_moment_on_and_scaled(tmp_path: Path, 
             assert draws[(draws.index(1.0) + 1) % 3] == 2.0
         starts.add(draws[0])
     assert starts == {1.0, 2.0, 6.0}
-
-
-def test_it_crashes_on_request_and_counts_over_episodes():
-    environment = make_environment(LatencyConfig(crash_after=12, tolerance=1e-6))
-    environment.reset(0, "match")
-    environment.step_chunk(NO_ACTIONS)
-    environment.reset(1, "match")
-    with pytest.raises(RuntimeError, match="simulated crash after 12"):
-        environment.step_chunk(NO_ACTIONS)
-
-
-def test_one_nan_ends_the_episode_and_the_next_is_healthy():
-    environment = make_environment(LatencyConfig(nan_after=3))
-    environment.reset(0, "match")
-    result = environment.step_chunk(NO_ACTIONS)
-    assert result.info == {"nonfinite": 1.0} and result.truncated and result.steps == 3
-    assert np.isnan(result.observation["observation.state"]).all()
-    assert np.isfinite(environment.reset(1, "match")["observation.state"]).all()
-    assert not environment.step_chunk(NO_ACTIONS).info

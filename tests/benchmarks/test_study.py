@@ -11,7 +11,6 @@ import pytest
 import yaml
 
 from accerl_lerobot.engines.config import RunConfig, encode
-from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import Rate
 from accerl_lerobot.run import preflight
 from benchmarks import study
@@ -80,11 +79,6 @@ def test_a_mean_over_policies_is_as_unsure_as_they_differ():
     wilson = Rate(successes=15, n=30).interval()
     assert alike["ci95"] == [wilson.low, wilson.high], "chance alone would not make them so alike"
     assert together([{"success": 0.2, "n": 10}])["ci95"] == list(Rate(successes=2, n=10).interval())
-
-
-def test_an_arm_is_named_once():
-    with pytest.raises(InputError, match="arms=.*none of them twice"):
-        BenchStudyConfig(arms=("--seed=1", "--seed=1"))
 
 
 @pytest.mark.slow

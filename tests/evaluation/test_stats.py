@@ -1,15 +1,31 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Intervals against hand-computed numbers and simulation; summaries of episodes; the planned episodes."""
+"""Intervals against hand-computed numbers; summaries of episodes; the planned episodes; curve and film."""
 
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+from unittest.mock import MagicMock
 
+import imageio.v2 as imageio
+import numpy as np
 import pytest
 
-from accerl_lerobot.evaluation import FILM, Rate, evaluation_plans, summarise
-from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
+from accerl_lerobot import evaluation
+from accerl_lerobot.evaluation import (
+    FILM,
+    GAP,
+    Rate,
+    before_after,
+    evaluation_plans,
+    success_curve,
+    summarise,
+)  # fmt: skip
+from accerl_lerobot.rollout.runner import EpisodeResult
 from accerl_lerobot.seeds import DEMO_SEEDS, EVAL_SEEDS, TRAIN_SEEDS
+from tests.rollout.environments import ended, evaluate
 
 
 @pytest.mark.parametrize(
@@ -35,26 +51,14 @@ def test_knowing_nothing() -> None:
     assert math.isnan(nothing.value) and str(nothing) == "no episodes"
 
 
-def result(task: str, seed: int, success: bool, versions: tuple[int, int] = (3, 3)) -> EpisodeResult:
-    plan = EpisodePlan(task=task, seed=seed, explore=False)
-    return EpisodeResult(
-        plan=plan,
-        success=success,
-        episode_return=1.0 if success else -0.5,
-        steps=50 if success else 150,
-        decisions=15,
-        versions=versions,
-    )
-
-
-RESULTS = [
-    *(result("door", i, success=i < 8, versions=(3, 5)) for i in range(10)),
-    *(result("drawer", i, success=i < 1, versions=(2, 4)) for i in range(10)),
-]
-
-
 def test_a_summary_in_all_and_per_task() -> None:
-    summary = summarise(RESULTS)
+    results = []
+    for task, successes, versions in (("door", 8, (3, 5)), ("drawer", 1, (2, 4))):
+        for i in range(10):
+            won = i < successes
+            numbers = {"episode_return": 1.0 if won else -0.5, "steps": 50 if won else 150}
+            results.append(ended(evaluate(seed=i, task=task), success=won, versions=versions, **numbers))
+    summary = summarise(results)
     assert (summary["success"], summary["n"]) == (0.45, 20)
     # Wilson, 9 of 20: (p + z²/2n ± z √(p(1 − p)/n + z²/4n²)) / (1 + z²/n) with z = 1.959964
     assert summary["ci95"] == pytest.approx([0.258199, 0.657906], abs=1e-5)
@@ -82,3 +86,60 @@ def test_plans_are_never_trained_on_do_not_explore_and_are_filmed_first() -> Non
         assert plan.seed not in TRAIN_SEEDS and plan.seed not in DEMO_SEEDS
     assert [p.film for p in plans] == [FILM, FILM] + [None] * 48
     assert [p.index for p in plans] == list(range(50))
+
+
+def evaluated(env_steps: float, successes: int, n: int) -> dict[str, Any]:
+    ci95 = list(Rate(successes=successes, n=n).interval())
+    return {"env_steps": env_steps, "success": successes / n, "n": n, "ci95": ci95}
+
+
+def test_the_curve_shows_rates_with_their_intervals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    axes = MagicMock()
+    monkeypatch.setattr(evaluation, "drawing", lambda path: nullcontext(axes))
+    first, last = evaluated(0, 50, 100), evaluated(5000, 9, 10)
+    success_curve(tmp_path / "curve.png", [last, first], [(0, 0.2), (5000, 0.8)])
+    (x, y), lengths = axes.errorbar.call_args.args, axes.errorbar.call_args.kwargs["yerr"]
+    assert (x, y) == ([0, 5000], [0.5, 0.9])
+    np.testing.assert_allclose([y - lengths[0], y + lengths[1]], np.transpose([first["ci95"], last["ci95"]]))
+    assert axes.plot.call_args.args == ((0, 5000), (0.2, 0.8)), "success while exploring"
+
+
+def clip(frames: int, grey: int, side: int = 32) -> list[np.ndarray]:
+    return [np.full((side, side, 3), grey, np.uint8) for _ in range(frames)]
+
+
+def filmed(index: int, success: bool, frames: list[np.ndarray]) -> EpisodeResult:
+    return ended(evaluate(index=index), success=success, frames=frames)
+
+
+def test_before_beside_after_with_outcomes(tmp_path: Path) -> None:
+    grey = clip(3, 120, side=64)
+    before = [filmed(i, i == 0, grey) for i in (1, 0, 2)] + [filmed(3, True, [])]
+    after = [filmed(i, i != 2, grey) for i in range(4)]
+    before_after(tmp_path / "film.mp4", before, after, fps=4)
+    film = np.stack([*imageio.get_reader(tmp_path / "film.mp4")]).astype(int)
+    half = 2 * 64 + GAP
+    assert film.shape[1:3] == (half, 2 * half + 4 * GAP)
+
+    def edge(frame: int, row: int, column: int) -> str:
+        left = column % 2 * (64 + GAP) + column // 2 * (half + 4 * GAP)
+        red, green, _ = film[frame, row * (64 + GAP) + 61, left + 20 : left + 44].mean(0)
+        return "red" if red > green + 60 else "green" if green > red + 60 else "none"
+
+    assert [edge(0, r, c) for r in (0, 1) for c in range(4)] == ["none"] * 8
+    ends = [edge(-1, r, c) for r in (0, 1) for c in range(4)]
+    assert ends == ["green", "red", "green", "green", "red", "none", "red", "none"]
+    assert (film[:, 80:, 80:half] > 150).all(), "no fourth episode"
+
+
+def test_what_cannot_be_drawn_is_left_out_with_a_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    nowhere = tmp_path / "missing"
+    success_curve(nowhere / "curve.png", [evaluated(0, 1, 2)], [])
+    sizes = ([filmed(0, True, clip(1, 0, side))] for side in (32, 16))
+    before_after(tmp_path / "both.mp4", *sizes, fps=4)
+    starts = ("success_curve.png", "film (")
+    assert all(m.startswith(f"there is no {s}") for m, s in zip(caplog.messages, starts, strict=True))
+    before_after(tmp_path / "film.mp4", [], [], fps=4)
+    assert list(tmp_path.iterdir()) == [], "without frames there is no video"

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from accerl_lerobot.envs import ChunkResult, Environment, EnvironmentSpec
@@ -122,3 +124,9 @@ def explore(seed: int = 1, task: str = "push") -> EpisodePlan:
 
 def evaluate(seed: int = 1, index: int = 0, task: str = "push") -> EpisodePlan:
     return EpisodePlan(task=task, seed=seed, explore=False, index=index, group="eval")
+
+
+def ended(plan: EpisodePlan, **fields: Any) -> EpisodeResult:
+    """The result of a short episode that succeeded, unless `fields` say otherwise."""
+    defaults = {"success": True, "episode_return": 0.0, "steps": 3, "decisions": 1, "versions": (0, 0)}
+    return EpisodeResult(plan=plan, **defaults | fields)
