@@ -16,7 +16,6 @@ from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.engines.config import RunConfig, encode
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.evaluation import Rate
-from accerl_lerobot.world_model.config import ImaginationConfig
 
 EPISODES = 100
 """Episodes of each evaluation."""
@@ -33,11 +32,6 @@ def run_config(**fields: Any) -> RunConfig:
 def ppo(**fields: Any) -> RunConfig:
     """The same with another algorithm."""
     return run_config(algorithm=PPOConfig(), **fields)
-
-
-def imagining() -> RunConfig:
-    """The same with imagined rollouts."""
-    return run_config(imagination=ImaginationConfig(environments=4, path="somewhere"))
 
 
 def write_run(
@@ -118,13 +112,4 @@ def summary(config: RunConfig, evaluations: Sequence[dict[str, Any]], tasks: Seq
         **found, "env_steps": 100 * updates, "episodes": updates, "updates": updates, "wall_s": 75.0,
         "warm_start_s": 5.0, "rl_s": 60.0, "algorithm": config.algorithm.type, "seed": config.seed,
         "tasks": list(tasks),
-    }  # fmt: skip
-
-
-def imagined(success: float = 0.6) -> dict[str, Any]:
-    """Numbers of the workers where something is imagined."""
-    return {
-        "imagined_episodes": 100.0, "imagined_decisions": 700.0, "success_imagined": success,
-        "world_model_learn_episodes": 30.0, "world_model_learn_steps": 150.0, "world_model_version": 150.0,
-        "replay_trained_decisions": 400.0, "replay_trained_imagined": 300.0,
     }  # fmt: skip
