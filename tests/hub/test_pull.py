@@ -232,12 +232,3 @@ def test_places_that_nothing_reads_are_no_reason_to_refuse(hub, policy, pulled, 
     pulled()
     config = json.loads((tmp_path / "pulled" / "config.json").read_text())
     assert config["vlm_model_name"] == str(tmp_path / "pulled" / "backbone")
-
-
-def test_a_folder_that_is_there_is_not_touched(
-    hub: HubServer, policy: Path, tmp_path: Path, refused: Refusal
-):
-    (tmp_path / "pulled").mkdir()
-    (tmp_path / "pulled" / "mine").write_text("mine")
-    assert "the folder exists; choose another or remove it" in refused()
-    assert contents_of(tmp_path / "pulled") == {"mine": b"mine"} and hub.journal == []
