@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,8 @@ import yaml
 
 from accerl_lerobot import cli
 from accerl_lerobot.algorithms import GIPOConfig, PPOConfig
-from accerl_lerobot.cli.configs import DemosRun, EvalRun, SFTRun, WorldModelRun
+from accerl_lerobot.cli.configs import DemosRun, EvalRun, WorldModelRun
+from accerl_lerobot.config import parsing
 from accerl_lerobot.demos.backbone import BackboneConfig
 from accerl_lerobot.demos.sft import SFTConfig
 from accerl_lerobot.engines.config import DatasetConfig, RunConfig, decode, encode, parse
@@ -25,7 +27,7 @@ ROOT = Path(__file__).parents[1]
 RECIPE = """
 job_name: mine
 env: {type: simulated, task: mirror, image_size: 64}
-algorithm: {type: gipo, sigma: 0.5, gamma: 0.9}
+algorithm: {type: gipo, sigma: 0.5, gamma: 9e-1}
 trainer:
   lr: 3e-5
 """
@@ -51,47 +53,28 @@ class TestOverrides:
     def test_forms_of_naming_a_recipe(self, recipe: str, form: str) -> None:
         assert parse(RunConfig, [*form.format(recipe).split(), "--seed=3"]).job_name == "mine"
 
-    def test_a_value_may_follow_its_field(self) -> None:
-        config = parse(RunConfig, ["--seed", "4", "--trainer.lr", "1e-5"])
-        assert (config.seed, config.trainer.lr) == (4, 1e-5)
-
     def test_another_type_takes_what_it_knows(self, recipe: str) -> None:
-        """PPO beside GIPO on the same recipe: σ goes with the algorithm it belonged to."""
+        """σ goes with the algorithm it belonged to. YAML 1.1 takes 9e-1 for text."""
         assert parse(RunConfig, [recipe, "--algorithm.type=ppo"]).algorithm == PPOConfig(gamma=0.9)
         assert parse(RunConfig, [recipe, "--algorithm.type=gipo"]).algorithm.sigma == 0.5
         config = parse(RunConfig, [recipe, "--env.type=metaworld", "--env.task=door-open-v3"])
         assert config.env == MetaWorldConfig(task="door-open-v3", image_size=64)
 
-    def test_also_what_is_text_in_yaml(self, tmp_path: Path) -> None:
-        """YAML 1.1 takes 9e-1 for text."""
-        path = tmp_path / "recipe.yaml"
-        path.write_text("algorithm: {type: gipo, gamma: 9e-1}\n")
-        assert parse(RunConfig, [str(path), "--algorithm.type=ppo"]).algorithm == PPOConfig(gamma=0.9)
-
-    def test_but_a_field_of_another_type_is_refused(self, recipe: str) -> None:
-        with pytest.raises(InputError, match=r"algorithm.sigma=1: no such field"):
-            parse(RunConfig, [recipe, "--algorithm.type=ppo", "--algorithm.sigma=1"])
-
     def test_values_are_yaml(self) -> None:
-        arguments = ["--trainer.betas=[0.8, 0.9]", "--policy.rename_map={a: b}", "--resume=true"]
+        arguments = ["--seed", "4", "--resume=true", "--trainer.betas=[0.8, 0.9]"]
+        arguments += ["--policy.rename_map={a: b}"]
         config = parse(RunConfig, [*arguments, "--algorithm.sigma=.inf", "--job_name=a: b: c"])
         assert config.trainer.betas == (0.8, 0.9) and config.policy.rename_map == {"a": "b"}
-        assert config.resume is True and math.isinf(config.algorithm.sigma)
+        assert config.seed == 4 and config.resume is True and math.isinf(config.algorithm.sigma)
         assert config.job_name == "a: b: c"
         config = parse(RunConfig, ["--sft.policy.type=smolvla", "--sft.policy.chunk_size=7"])
         assert config.sft.policy == {"type": "smolvla", "chunk_size": 7}
 
-    def test_optional_rooms(self) -> None:
-        assert parse(RunConfig, []).sft.backbone is None
-        assert parse(RunConfig, ["--sft.backbone.hidden=64"]).sft.backbone.hidden == 64
-        assert parse(RunConfig, ["--sft.backbone=null"]).sft.backbone is None
-        assert parse(SFTRun, ["--env.type=simulated"]).env == SimulatedConfig()
-
-    def test_an_empty_room_is_all_defaults(self, tmp_path: Path) -> None:
-        (tmp_path / "r.yaml").write_text("trainer:\n  # lr: 1\nenv:\n")
+    @pytest.mark.parametrize("text", ["trainer:\n  # lr: 1\nenv:\n", "# nothing yet\n"])
+    def test_an_empty_section_is_all_defaults(self, text: str, tmp_path: Path) -> None:
+        (tmp_path / "r.yaml").write_text(text)
         assert parse(RunConfig, [str(tmp_path / "r.yaml")]) == RunConfig()
-        (tmp_path / "empty.yaml").write_text("# nothing yet\n")
-        assert parse(RunConfig, [str(tmp_path / "empty.yaml")]) == RunConfig()
+        assert parse(RunConfig, ["--sft.backbone=null"]) == RunConfig(), "an optional one"
 
     def test_verbs_take_their_rooms_from_a_run(self, recipe: str) -> None:
         config = parse(EvalRun, [recipe, "--evaluation.episodes=5"], recipe_class=RunConfig)
@@ -118,6 +101,7 @@ MISTAKES: list[tuple[list[str], str]] = [
     (["--trainer=3"], "trainer=3: a config section; use --trainer.field=value"),
     (["--trainer.betas=[1]"], "trainer.betas=[1]: use a list of 2, each a number"),
     (["--env.task=[a]"], "env.task=['a']: use text"),
+    (["--algorithm.type=ppo", "--algorithm.sigma=1"], "algorithm.sigma=1: no such field"),
     (["--algorithm.type=gippo"], "algorithm.type='gippo': did you mean gipo? Otherwise use one of awr, "),
     (["--env.type=mujoco"], "env.type='mujoco': use one of gym, lerobot, libero, metaworld, simulated"),
     (["--env.task=drawer-v3"], "env.task='drawer-v3': 'drawer-v3' is no task; did you mean"),
@@ -260,23 +244,23 @@ class TestPreflight:
         with pytest.raises(InputError, match="^sft.backbone=.*: act has no vision-language backbone"):
             check_sft_policy(SFTConfig(steps=1, policy={"type": "act"}, backbone=BackboneConfig()))
 
-    def test_refuses_to_look_back_where_lerobot_does_not_before_training_it(self) -> None:
-        policy: dict[str, Any] = {"type": "smolvla", "n_obs_steps": 2}
+    @pytest.mark.parametrize(
+        ("policy", "message"),
+        [
+            ({"type": "smolvla", "n_obs_steps": 2}, "sft.policy.n_obs_steps=2: only diffusion looks back"),
+            ({"type": "vqbet"}, "sft.policy.type='vqbet': algorithm.type=gipo needs exact likelihoods"),
+        ],
+    )
+    def test_refuses_before_training_it_what_cannot_be_improved(self, policy: dict, message: str) -> None:
         check_sft_policy(SFTConfig(steps=1, policy=policy))  # SFT alone could
-        with pytest.raises(InputError, match="^sft.policy.n_obs_steps=2: only diffusion looks back"):
+        with pytest.raises(InputError, match=f"^{message}"):
             check_start(RunConfig(sft=SFTConfig(steps=1, policy=policy)))
-        check_start(RunConfig(sft=SFTConfig(steps=1, policy={"type": "diffusion"})))
-
-    def test_refuses_a_policy_without_a_likelihood_before_training_it(self) -> None:
-        with pytest.raises(
-            InputError, match="sft.policy.type='vqbet': algorithm.type=gipo needs exact likelihoods"
-        ):
-            check_start(RunConfig(sft=SFTConfig(steps=1, policy={"type": "vqbet"})))
 
     def test_accepts(self, tiny_checkpoint: Path) -> None:
         policy = {"type": "smolvla", "chunk_size": 10, "n_action_steps": 10}
         check_start(RunConfig(sft=SFTConfig(steps=1, policy=policy)))
-        check_start(RunConfig(sft=SFTConfig(steps=1, policy=policy | {"type": "act"})))
+        for other in (policy | {"type": "act"}, {"type": "diffusion"}):
+            check_start(RunConfig(sft=SFTConfig(steps=1, policy=other)))
         check_start(parse(RunConfig, ["--env.type=simulated", f"--policy.path={tiny_checkpoint}"]))
         dataset = DatasetConfig(
             repo_id="accerl/metaworld_tiny", root=str(ROOT / "datasets" / "metaworld_tiny")
@@ -301,3 +285,17 @@ def test_the_world_model_of_a_run_is_not_that_of_pixels(tmp_path: Path):
 def test_the_state_is_the_simulators_where_it_is_told(told: str, expected: str):
     run = parse(RunConfig, ["--config_path=few_shot", f"--env.environment_state={told}"])
     assert run.world_model is None and run.state_model.type == expected
+
+
+@pytest.mark.parametrize("inside", ["", "checkpoints/000010", "checkpoints/000010/pretrained_model"])
+def test_a_run_s_folder_is_its_recipe(inside: str, tmp_path: Path) -> None:
+    for folder in (tmp_path, tmp_path / "checkpoints" / "000010"):
+        (folder / "pretrained_model").mkdir(parents=True)
+        (folder / "config.yaml").write_text(json.dumps({"seed": 7}))
+    assert parse(RunConfig, [f"--config_path={tmp_path / inside}"]).seed == 7
+    path, _ = parsing.read_arguments([f"--config_path={tmp_path / inside}"])
+    assert path is not None and path.name == "config.yaml"
+    assert path.parent == (tmp_path / inside if "pretrained" not in inside else (tmp_path / inside).parent)
+    (empty := tmp_path / "empty" / "empty").mkdir(parents=True)
+    with pytest.raises(InputError, match="a folder without config.yaml"):
+        parse(RunConfig, [f"--config_path={empty}"])

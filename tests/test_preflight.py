@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from accerl_lerobot import cli
 from accerl_lerobot.algorithms import AWRConfig
@@ -61,30 +62,23 @@ def test_an_environment_offers_what_a_policy_of_it_needs():
 @pytest.mark.parametrize(
     ("change", "rename_map", "message"),
     [
+        ({"observation.images.top": (3, 32, 32)}, {}, f"no observation.images.top .* offers {FRONT}; choose"),
         (
-            {"observation.images.top": (3, 32, 32)},
+            {FRONT: (3, 64, 64)},
             {},
-            "policy.path='x': no observation.images.top in the environment, which offers "
-            "observation.images.front; choose env.camera (env.images of gym), or map names with "
-            "policy.rename_map",
+            r"its observation.images.front is \(3, 64, 64\), but \(3, 32, 32\) in the",
         ),
-        ({FRONT: (3, 64, 64)}, {}, "its observation.images.front is (3, 64, 64), but (3, 32, 32) in the env"),
-        ({STATE: (6,)}, {}, "policy.path='x': its observation.state is (6,), but (4,) in the environment"),
-        ({"action": (7,)}, {}, "its action is (7,), but (2,) in the environment"),
-        (
-            {},
-            {"observation.images.frnt": FRONT},
-            "policy.rename_map='observation.images.frnt': the environment has no such feature; it offers "
-            "observation.images.front, observation.state",
-        ),
+        ({STATE: (6,)}, {}, r"^policy.path='x': its observation.state is \(6,\), but \(4,\) in the env"),
+        ({"action": (7,)}, {}, r"its action is \(7,\), but \(2,\) in the environment"),
+        ({}, {"a": FRONT}, f"^policy.rename_map='a': the environment has no such feature; it offers {FRONT}"),
         ({}, {FRONT: STATE}, "two features of the environment would be observation.state"),
     ],
 )
 def test_what_does_not_fit(change: dict, rename_map: dict, message: str):
     needed = replace(OFFERED, shapes=OFFERED.shapes | change)
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(InputError, match=message) as caught:
         check_features(needed, OFFERED, rename_map, "policy.path", "x")
-    assert message in str(caught.value) and "\n" not in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
 def test_another_rate_or_task():
@@ -148,31 +142,25 @@ def test_checkpoints_of_another_image_size(tmp_path: Path, capsys: pytest.Captur
     told = [*SIMULATED, f"--policy.path={path}", "--launch.engine=local", f"--output_dir={out}"]
     for verb, more in (("train", ["--sft.steps=0"]), ("eval", [])):
         line = refused(capsys, verb, *told, *more)
-        assert line.startswith(
-            f"accerl: policy.path='{path}': its {FRONT} is (3, 48, 48), but (3, 32, 32) in"
-        )
-        assert not out.exists()
+        assert f"its {FRONT} is (3, 48, 48), but (3, 32, 32) in" in line and not out.exists()
 
 
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
         ([*SIMULATED, *TINY], "no observation.images.corner2 in the environment, which offers " + FRONT),
-        (
-            [*TINY, *TINY_ENV[:1], "--env.task=push-v3"],
-            "dataset.repo_id='accerl/metaworld_tiny': no episode of",
-        ),
+        ([*TINY, *TINY_ENV[:1], "--env.task=push-v3"], "'accerl/metaworld_tiny': no episode of"),
         ([*TINY, *TINY_ENV, "--env.image_size=128"], "is (3, 64, 64), but (3, 128, 128) in the environment"),
     ],
 )
 def test_a_dataset_of_another_environment(
     arguments: list[str], line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """``accerl sft`` makes the same check."""
     pytest.importorskip("metaworld")
     out = tmp_path / "out"
-    first = ["train", "--sft.steps=1", ACT, f"--output_dir={out}"]
-    assert line in refused(capsys, *first, *arguments) and not out.exists()
+    for verb in ("train", "sft"):
+        first = [verb, "--sft.steps=1", ACT, f"--output_dir={out}"]
+        assert line in refused(capsys, *first, *arguments) and not out.exists()
 
 
 QUICK = ["train", str(ROOT / "recipes" / "quickstart.yaml")]
@@ -184,22 +172,14 @@ NO_GPU = "no CUDA device here; use cpu or auto"
     [
         ([*QUICK, "--policy.device=cuda"], f"policy.device='cuda': {NO_GPU}"),
         (["sft", *TINY, "--sft.steps=1", "--device=cuda"], f"device='cuda': {NO_GPU}"),
-        (
-            [*QUICK, "--wandb.enable=true"],
-            "wandb.enable=True: this machine is not logged in: run wandb login",
-        ),
+        ([*QUICK, "--wandb.enable=true"], "wandb.enable=True: this machine is not logged in"),
         (QUICK, "output_dir='{out}': "),
         (["demos", f"--config_path={QUICK[1]}"], "root='{out}': "),
     ],
 )
 def test_what_the_machine_lacks(
-    arguments: list[str],
-    line: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    arguments: list[str], line: str, tmp_path: Path, capsys: Any, monkeypatch: Any
 ):
-    import torch
     import wandb
 
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
@@ -216,8 +196,6 @@ def test_what_the_machine_lacks(
 
 
 def test_a_second_gpu_is_no_device_of_ray_s_workers(monkeypatch: pytest.MonkeyPatch):
-    import torch
-
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     config = RunConfig(policy=PolicyConfig(path="x", device="cuda:1"))
@@ -225,31 +203,13 @@ def test_a_second_gpu_is_no_device_of_ray_s_workers(monkeypatch: pytest.MonkeyPa
         check_device(config)
 
 
-@pytest.mark.parametrize(
-    ("env", "module", "line"),
-    [
-        (["--env.type=metaworld"], "metaworld", "env.type='metaworld': {}'accerl-lerobot[metaworld]'"),
-        (["--env.type=lerobot", "--env.name=pusht"], "gym_pusht", "env.name='pusht': {}'lerobot[pusht]'"),
-    ],
-)
-def test_a_simulator_that_is_not_installed(
-    env: list[str],
-    module: str,
-    line: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-):
-    import gymnasium
-
-    for name in [n for n in sys.modules if n.partition(".")[0] == module]:
+def test_a_simulator_that_is_not_installed(tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch):
+    for name in [n for n in sys.modules if n.partition(".")[0] == "metaworld"]:
         monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, module, None)  # an import of it fails, as if it was not there
-    for name in [n for n in gymnasium.registry if n.startswith(module)]:
-        monkeypatch.delitem(gymnasium.registry, name)
-    line = "accerl: " + line.format(f"the package {module} is not installed; pip install ")
+    monkeypatch.setitem(sys.modules, "metaworld", None)  # an import of it fails, as if it was not there
     out = tmp_path / "out"
-    assert refused(capsys, "train", *env, "--sft.steps=1", ACT, f"--output_dir={out}") == line
+    given = ["train", "--env.type=metaworld", "--sft.steps=1", ACT, f"--output_dir={out}"]
+    assert "env.type='metaworld': the package metaworld is not installed; pip" in refused(capsys, *given)
     assert not out.exists()
 
 
