@@ -59,24 +59,18 @@ class TestRecipe:
         assert "ok    recipe     resolves" in found
         assert "lag        at most" in found and "work " in found and "decisions" in found
 
-    def test_a_mistake_fails_with_its_line(self, capsys: pytest.CaptureFixture[str]) -> None:
-        assert cli.main(["doctor", str(QUICKSTART), "--env.type=x"]) == 1
-        out = capsys.readouterr().out
-        assert out.startswith(
-            "FAIL  recipe     env.type='x': use one of gym, lerobot, libero, metaworld, simulated"
-        )
-        assert "ok    python" in out and "1 of 2 checks failed" in out
-
     @pytest.mark.parametrize(
-        ("arguments", "words"),
+        ("arguments", "line"),
         [
-            ([str(QUICKSTART), "--output_dir=/"], "the folder exists"),
-            ([str(QUICKSTART), "--sft.policy.colour=red"], "LeRobot's smolvla has no such field"),
+            (["quickstart", "--env.type=x"], "env.type='x': use one of gym, lerobot, libero, metaworld"),
+            (["quickstart", "--output_dir=/"], "the folder exists"),
+            (["imagination", "--imagination.path=nowhere"], "imagination.path='nowhere': config.json: is"),
         ],
     )
-    def test_what_only_the_machine_or_lerobot_knows(self, arguments, words, capsys):
-        assert cli.main(["doctor", *arguments]) == 1
-        assert words in capsys.readouterr().out
+    def test_a_mistake_fails_with_its_line(self, arguments: list[str], line: str, capsys) -> None:
+        assert cli.main(["doctor", f"--config_path={arguments[0]}", arguments[1]]) == 1
+        out = capsys.readouterr().out
+        assert out.startswith("FAIL  recipe ") and line in out and "ok    python" in out
 
 
 @pytest.mark.parametrize(
@@ -141,11 +135,6 @@ class TestResources:
         ("sections", "name", "words"),
         [
             ({"rollout": {"workers": 4}}, "cores", ""),
-            (
-                {"rollout": {"workers": 5}, "inference": {"workers": 3}, "trainer": {"ranks": 2}},
-                "cores",
-                "4 for 5 rollout workers, 3 inference, 2 trainer: lower",
-            ),
             ({"rollout": {"workers": 4}}, "needs", ""),
             ({"rollout": {"workers": 5}}, "cores", "lower rollout.workers"),
             ({"trainer": {"num_threads": 8}}, "cores", "trainer.num_threads"),
@@ -179,29 +168,6 @@ class TestResources:
         assert pictures[1] - pictures[0] == pytest.approx(pictures[2] - pictures[1])
         assert each <= pictures[1] - pictures[0] < 1.1 * each
 
-    def test_lag_is_that_of_the_formula(self) -> None:
-        """⌊⌈r⌉ (max(unlearned, min) + 2·in_flight + capacity) / batch⌋ − 1; with Ray a pickup, a prefetch."""
-        replay = {
-            "capacity": 1024,
-            "max_unlearned_decisions": 256,
-            "min_decisions": 128,
-            "samples_per_insert": 2.0,
-        }
-        rollout = {"workers": 2, "environments": 4, "segment_length": 8}
-        trainer = {"batch_decisions": 128}
-        lag = checks(self.recipe(replay=replay, rollout=rollout, trainer=trainer))["lag"]
-        by_hand = 2 * (256 + 2 * 64 + 1024) // 128 - 1
-        assert lag.status == OK
-        assert lag.text == f"at most {by_hand + 2} updates with 64 decisions under way"
-        local = self.recipe(replay=replay, rollout=rollout, trainer=trainer, launch={"engine": "local"})
-        assert checks(local)["lag"].text.startswith(f"at most {by_hand} updates")
-
     def test_a_pace_that_would_waste_is_warned_about(self) -> None:
         lag = checks(self.recipe(replay={"max_lag": 3}))["lag"]
         assert lag.status == WARN and lag.text.startswith("at most 3 updates") and "thrown away" in lag.text
-
-
-def test_imagination_is_checked_where_there_is_any(capsys: pytest.CaptureFixture[str]) -> None:
-    recipe = str(QUICKSTART.with_name("imagination.yaml"))
-    assert doctor.main([recipe, "--imagination.path=nowhere"]) == 1
-    assert "FAIL  recipe     imagination.path='nowhere': config.json: is missing" in capsys.readouterr().out

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from accerl_lerobot.algorithms import ChunkCriticConfig, chunk_critic
+from accerl_lerobot.algorithms import chunk_critic
 from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE
 from accerl_lerobot.engines.config import LaunchConfig, RunConfig
@@ -20,11 +20,9 @@ from accerl_lerobot.engines.local import LocalEngine
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import evaluation_plans
-from accerl_lerobot.replay.buffer import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
-from accerl_lerobot.run.train import make_engine
 from accerl_lerobot.world_model.latent import LatentModel
-from tests.runs import drive, tiny_run, until
+from tests.runs import drive, local_engine, off_policy_run, tiny_run, until, updates
 
 CASES: dict[str, dict[str, Any]] = {
     "ratio": {},
@@ -33,13 +31,7 @@ CASES: dict[str, dict[str, Any]] = {
         "rollout": RolloutConfig(environments=4, segment_length=3, episodes=30),
         "trainer": {"hold_back": 3, "probe_every": 4},
     },
-    "chunk critic on a latent state": {
-        "rollout": RolloutConfig(environments=4, segment_length=4),
-        "replay": ReplayConfig(
-            capacity=64, min_decisions=16, max_unlearned_decisions=32, samples_per_insert=1
-        ),
-        "algorithm": ChunkCriticConfig(),
-    },
+    "chunk critic on a latent state": {},
 }
 
 
@@ -47,7 +39,8 @@ def config_of(checkpoint: Path, case: str) -> RunConfig:
     sections = dict(CASES[case])
     trainer: dict[str, Any] = {"updates": 12, "batch_decisions": 16, "lr": 1e-3, "advantage_memory": 0.5}
     sections["trainer"] = TrainerConfig(**trainer | {"warmup_updates": 2} | sections.pop("trainer", {}))
-    return tiny_run(checkpoint, seed=3, launch=LaunchConfig(engine="local"), **sections)
+    make = off_policy_run if "critic" in case else tiny_run
+    return make(checkpoint, seed=3, launch=LaunchConfig(engine="local"), **sections)
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -61,10 +54,8 @@ def few_first_steps() -> Iterator[None]:
 
 def begin(checkpoint: Path, case: str, state: Path | None = None) -> LocalEngine:
     """An engine that trains, from the beginning or from `state`."""
-    config = config_of(checkpoint, case)
     tasks = ("match", "mirror") if "tasks" in case else ("match",)
-    engine = make_engine(config, tasks, history=1, state=state)
-    assert isinstance(engine, LocalEngine)
+    engine = local_engine(config_of(checkpoint, case), tasks, state)
     if state is None:
         engine.plan(evaluation_plans(tasks, 9, "during"))  # some of them are under way when it is left
     engine.train()
@@ -78,7 +69,7 @@ def weights(engine: LocalEngine) -> dict[str, np.ndarray]:
 def told(history: list[Progress]) -> list[Any]:
     """All that a run says, and nothing of when it was asked."""
     episodes = [(e.plan, e.success, e.episode_return, e.versions) for p in history for e in p.episodes]
-    return [[u for p in history for u in p.updates], episodes, history[-1].rollout, history[-1].replay]
+    return [updates(history), episodes, history[-1].rollout, history[-1].replay]
 
 
 Whole = Callable[[str], tuple[list[Any], dict[str, np.ndarray]]]

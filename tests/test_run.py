@@ -4,9 +4,8 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 
@@ -17,47 +16,42 @@ from accerl_lerobot.engines.config import LaunchConfig, RunConfig
 from accerl_lerobot.engines.contract import Engine, Progress, Saved
 from accerl_lerobot.engines.stopping import WorkerError
 from accerl_lerobot.envs import SimulatedConfig
-from accerl_lerobot.errors import warn_once
-from accerl_lerobot.evaluation import EvaluationConfig, evaluation_plans
+from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.rollout.runner import EpisodePlan
 from accerl_lerobot.run import loop
 from accerl_lerobot.run import train as run
-from accerl_lerobot.run.loop import run_plans
-from accerl_lerobot.run.preflight import check_start
 from tests.rollout.environments import ended
 from tests.runs import tiny_run
 
 
-@dataclass
-class Finished:
+class Finished(NamedTuple):
     directory: Path
     summary: dict[str, Any]
 
 
-def local_run(checkpoint: Path, output_dir: Path | None, **sections: Any) -> RunConfig:
+def local_run(checkpoint: Path, output_dir: Path, **sections: Any) -> RunConfig:
     defaults: dict[str, Any] = {
         "env": SimulatedConfig(max_steps=12, tolerance=0.4),
         "evaluation": EvaluationConfig(episodes=8, every_updates=4, episodes_during=4, videos=1),
         "trainer": TrainerConfig(updates=12, batch_decisions=16, warmup_updates=2, value_warmup_updates=2),
         "launch": LaunchConfig(engine="local"),
-        "output_dir": None if output_dir is None else str(output_dir),
+        "output_dir": str(output_dir),
         "save_every_updates": 5,
     }
     return tiny_run(checkpoint, **{**defaults, **sections})
 
 
-def executed(config: RunConfig) -> tuple[Path, dict[str, Any]]:
-    """The folder and the summary of a run that has been done."""
+def executed(config: RunConfig) -> Finished:
+    """A run that has been done."""
     directory = Path(config.output_dir or "")
     directory.mkdir(exist_ok=True)
-    return directory, run.Run(config, directory, Console()).execute()
+    return Finished(directory, run.Run(config, directory, Console()).execute())
 
 
 @pytest.fixture(scope="module")
 def finished(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Finished:
-    config = local_run(tiny_checkpoint, tmp_path_factory.mktemp("outputs") / "run")
-    return Finished(*executed(config))
+    return executed(local_run(tiny_checkpoint, tmp_path_factory.mktemp("outputs") / "run"))
 
 
 def records(directory: Path, kind: str) -> list[dict[str, Any]]:
@@ -68,6 +62,10 @@ def records(directory: Path, kind: str) -> list[dict[str, Any]]:
 def test_the_summary_has_what_is_promised(finished: Finished):
     summary = json.loads((finished.directory / "summary.json").read_text())
     assert summary == finished.summary
+    assert {path.name for path in finished.directory.iterdir()} == {
+        "config.yaml", "metrics.jsonl", "tensorboard", "checkpoints", "success_curve.png", "summary.json",
+        "before_after.mp4", "episodes.jsonl", "timeline",
+    }  # fmt: skip
     for when in ("before", "after"):
         assert 0.0 <= summary[f"success_{when}"] <= 1.0 and summary[f"n_{when}"] == 8
         low, high = summary[f"ci95_{when}"]
@@ -107,14 +105,6 @@ def test_a_run_without_updates_measures_its_start(
     assert not [message for message in caplog.messages if "exploring episodes succeeded" in message]
 
 
-def test_the_run_directory_is_complete(finished: Finished):
-    assert {path.name for path in finished.directory.iterdir()} == {
-        "config.yaml", "metrics.jsonl", "tensorboard", "checkpoints", "success_curve.png", "summary.json",
-        "before_after.mp4", "episodes.jsonl", "timeline",
-    }  # fmt: skip
-    assert list((finished.directory / "tensorboard").iterdir())
-
-
 def test_every_update_is_logged_once_and_episodes_are_averaged_as_they_end(finished: Finished):
     train = records(finished.directory, "train")
     assert [r["update"] for r in train] == list(range(1, 13))
@@ -151,22 +141,6 @@ def test_checkpoints_load_again(finished: Finished):
         weights.append(load_adapter(policy).export_trainable())
     assert weights[0].keys() == weights[1].keys()
     assert any((weights[0][k] != weights[1][k]).any() for k in weights[0])
-
-
-def test_a_critic_s_warm_up_as_long_as_the_run_is_warned_about(
-    tiny_checkpoint: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-):
-    trainer = TrainerConfig(updates=2, batch_decisions=16, value_warmup_updates=2)
-    check_start(local_run(tiny_checkpoint, tmp_path / "run", trainer=trainer))
-    assert "the policy will not change" in caplog.text
-
-
-def test_without_a_name_the_folder_is_named_after_the_time(
-    tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.chdir(tmp_path)
-    path = run.make_output_dir(local_run(tiny_checkpoint, None, job_name="mine"))
-    assert path.is_dir() and path.parts[0] == "outputs" and path.name.endswith("_mine")
 
 
 class Scripted(Engine):
@@ -223,9 +197,7 @@ def scripted(monkeypatch: pytest.MonkeyPatch, config: RunConfig) -> Scripted:
 
 
 @pytest.mark.parametrize(("seconds", "versions"), [(1e-9, {0, 1, 2, 3}), (1e9, {0, 3})])
-def test_checkpoints_by_time(
-    seconds: float, versions: set[int], tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_checkpoints_by_time(seconds: float, versions: set[int], tiny_checkpoint, tmp_path, monkeypatch):
     trainer = TrainerConfig(updates=3, batch_decisions=16)
     config = local_run(tiny_checkpoint, tmp_path, trainer=trainer, save_every_updates=0, save_every_s=seconds)
     scripted(monkeypatch, config)
@@ -246,19 +218,6 @@ def test_an_evaluation_that_ends_after_training_is_not_lost(
     # What is stepped to evaluate after training is no experience that was learned from.
     assert summary["env_steps"] == found[-1]["env_steps"] == found[-2]["env_steps"] == 12 * 10
     assert engine.closed and (tmp_path / "checkpoints" / "last").is_symlink()
-
-
-def test_a_note_is_told_at_its_first_episode(
-    tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-):
-    warn_once.cache_clear()
-    plan = evaluation_plans(("match",), 1, "eval")[0]
-    noted = replace(ended(plan), note="env.success='won': no such key")
-    engine = Scripted(local_run(tiny_checkpoint, tmp_path))
-    monkeypatch.setattr(engine, "poll", lambda: Progress(version=0, episodes=[noted, noted]))
-    for _ in range(2):
-        run_plans(engine, 4, "eval", Console())
-    assert [r.getMessage() for r in caplog.records if r.levelname == "WARNING"] == [noted.note]
 
 
 def losing(monkeypatch: pytest.MonkeyPatch, config: RunConfig, lost_at: list[int]) -> list[Scripted]:
