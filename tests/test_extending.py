@@ -19,7 +19,7 @@ import pytest
 import torch
 from lerobot.configs.policies import PreTrainedConfig
 
-from accerl_lerobot import cli, load_policy
+from accerl_lerobot import load_policy
 from accerl_lerobot.algorithms import AlgorithmConfig, chunk_critic
 from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.algorithms.ratio_update import make_update
@@ -160,13 +160,6 @@ def test_a_file_alone_imports_no_package(checkpoint: Path, tmp_path: Path):
     assert PACKAGE not in sys.modules
     config = parse(RunConfig, [f"--config_path={recipe}", FLAG]).policy
     assert dry_run_config(config).type == POLICY
-
-
-def test_help_knows_types_of_a_package_that_is_named(capsys: pytest.CaptureFixture[str]):
-    assert cli.main(["train", "--help=algorithm"]) == 0
-    assert "cispo" not in capsys.readouterr().out
-    assert cli.main(["train", NAMED[0], "--help=algorithm"]) == 0
-    assert "algorithm.type=cispo: Settings of CISPO." in capsys.readouterr().out
 
 
 def test_the_off_policy_algorithm_of_the_page(monkeypatch: Any, tiny_checkpoint: Path):

@@ -18,6 +18,7 @@ import pytest
 import torch
 
 from accerl_lerobot.algorithms.config import TrainerConfig
+from accerl_lerobot.algorithms.ratio_update import RatioUpdate
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE, WORLD_MODEL
 from accerl_lerobot.console import Console
@@ -32,8 +33,7 @@ from accerl_lerobot.experience import IMAGINED, REAL, Segment
 from accerl_lerobot.rollout.runner import EpisodePlans, RolloutConfig
 from accerl_lerobot.rollout.worker import RolloutWorker
 from accerl_lerobot.run.train import Run
-from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TIMELINE, read_timeline
-from accerl_lerobot.world_model import online
+from accerl_lerobot.timeline import read_timeline
 from accerl_lerobot.world_model.config import (
     ImaginationConfig,
     LearnableModelConfig,
@@ -43,11 +43,10 @@ from accerl_lerobot.world_model.config import (
 from accerl_lerobot.world_model.contract import WorldModelSpec, new_model
 from accerl_lerobot.world_model.data import load_episodes
 from accerl_lerobot.world_model.imagined import World, check_imagination, load_world, read_content, save_world
-from accerl_lerobot.world_model.online import ONLINE, OnlineLearningWorker, make_learner
+from accerl_lerobot.world_model.online import ONLINE, make_learner
 from tests.policies.checkpoints import write_diffusion
-from tests.runs import drive, polls, tiny_run
+from tests.runs import drive, local_engine, polls, tiny_run, trained, updates
 from tests.tiny_datasets import one_process, record_dataset
-from tests.world_model.real_segments import real_episode
 
 # About half of all episodes succeed when it is acted at random.
 ENV = SimulatedConfig(max_steps=16, hold=8, tolerance=0.45)
@@ -88,23 +87,25 @@ def imagining(
     )
 
 
-def run_locally(config: RunConfig) -> tuple[list[Progress], list[list[Segment]], LocalEngine]:
+Played = tuple[list[Progress], list[list[Segment]], LocalEngine]
+
+
+def run_locally(config: RunConfig) -> Played:
     """A run in one process: what was reported, the batches that were learnt from, and the engine."""
-    engine = LocalEngine(config, ("match",))
     batches: list[list[Segment]] = []
-    step = engine._update.step
-    engine._update.step = lambda segments: batches.append(segments) or step(segments)  # type: ignore
-    engine.train()
-    history = drive(engine)
-    engine.close()
+    step = RatioUpdate.step
+
+    def noted(update: RatioUpdate, batch: list[Segment]) -> dict[str, float]:
+        batches.append(batch)
+        return step(update, batch)
+
+    with mock.patch.object(RatioUpdate, "step", noted):
+        history, engine = trained(config)
     return history, batches, engine
 
 
 def decisions(segments: list[Segment], source: str) -> int:
     return sum(len(s) for s in segments if s.source == source)
-
-
-Played = tuple[list[Progress], list[list[Segment]], LocalEngine]
 
 
 @pytest.fixture(scope="module")
@@ -142,7 +143,7 @@ def test_without_imagination_a_run_ends_when_its_episodes_are_used_up(tiny_check
 
 def test_two_runs_are_equal_to_the_last_bit(played: Played, tiny_checkpoint: Path, world_model: Path):
     again = run_locally(imagining(tiny_checkpoint, world_model))
-    one, other = ([u for p in history for u in p.updates] for history, _, _ in (played, again))
+    one, other = (updates(history) for history, _, _ in (played, again))
     assert len(one) == 12 and one == other
     assert played[0][-1].world_model == again[0][-1].world_model
     for key, tensor in played[2]._adapter.export_trainable().items():
@@ -159,7 +160,7 @@ def test_a_run_that_was_left_goes_on_as_if_it_had_not(
 
     def reported(history: list[Progress]) -> list[Any]:
         last = history[-1]
-        return [[u for p in history for u in p.updates], last.rollout, last.replay, last.world_model]
+        return [updates(history), last.rollout, last.replay, last.world_model]
 
     whole, _, expected = run_locally(config)
     first = LocalEngine(config, ("match",))
@@ -203,7 +204,7 @@ def test_it_runs_asynchronously(tiny_checkpoint: Path, world_model: Path, tmp_pa
         engine.close()
     last = history[-1]
     assert last.rollout["restarts"] == 1.0
-    assert last.version == n == len([u for p in history for u in p.updates])
+    assert last.version == n == len(updates(history))
     assert 0 < sum(e.plan.source == REAL for p in history for e in p.episodes) <= n, "it ends by its updates"
     assert last.world_model["learn_episodes"] > 0 and last.world_model["version"] > 0
     assert 0 < last.replay["trained_imagined"] < last.replay["trained_decisions"]
@@ -284,20 +285,6 @@ def test_it_goes_on_with_what_it_has_learned_from_and_never_with_what_was_held_o
         check_imagination(config)
 
 
-def test_a_checkpoint_between_two_steps_does_not_end_the_time_of_learning(
-    tiny_checkpoint: Path, world_model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    config = imagining(tiny_checkpoint, world_model, steps=2.0)
-    worker = OnlineLearningWorker(config, timeline=tmp_path / TIMELINE)
-    checkpoints = iter([tmp_path / "checkpoint"])
-    monkeypatch.setattr(online, "fault_point", lambda name: [worker.save(path) for path in checkpoints])
-    worker.learn(real_episode(1))
-    worker.metrics()
-    [row] = read_timeline(tmp_path).rows
-    states = row.states.tolist()
-    assert COMPUTE in states[states.index(CHECKPOINT) :]
-
-
 @pytest.mark.parametrize(
     ("failed", "told"), [(None, "was never checked"), (["auroc"], "failed checks (auroc)"), ([], None)]
 )
@@ -321,7 +308,7 @@ def test_a_world_model_of_another_package_imagines_and_goes_on_learning(
     sys.modules.pop(package)
     config = imagining(tiny_checkpoint, path, episodes=24)
     config = replace(config, imagination=replace(config.imagination, discover_packages_path=package))
-    running = LocalEngine(config, ("match",))
+    running = local_engine(config)
     running.train()
     last = drive(running)[-1]
     running.save(tmp_path / "saved")

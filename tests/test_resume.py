@@ -20,7 +20,6 @@ import yaml
 from accerl_lerobot.algorithms import SelfImitationConfig
 from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.cli import main
-from accerl_lerobot.console import Console
 from accerl_lerobot.demos import sft
 from accerl_lerobot.demos.record import DemosConfig
 from accerl_lerobot.engines.config import LaunchConfig, RunConfig, decode, encode
@@ -32,7 +31,6 @@ from accerl_lerobot.policies.config import GaussianSamplerConfig, PolicyConfig
 from accerl_lerobot.replay.buffer import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.run import preflight, resuming
-from accerl_lerobot.run import train as run_module
 from accerl_lerobot.run.resuming import resume_command
 from tests.policies.checkpoints import write_policy
 from tests.runs import tiny_run
@@ -323,11 +321,3 @@ def test_a_run_says_what_the_command_line_has_to_allow_again(tmp_path: Path):
     config = decode(RunConfig, {"algorithm": {"type": "ppo", "discover_packages_path": "mine.too"}})
     words = shlex.split(resume_command(tmp_path / "a run", config))
     assert words[4:] == ["--algorithm.discover_packages_path=mine.too"]
-
-
-def test_demonstrations_that_are_complete_are_not_recorded_again(tmp_path: Path, monkeypatch):
-    (tmp_path / "demos").mkdir()
-    monkeypatch.setattr(run_module, "record_demos", None)
-    monkeypatch.setattr(run_module, "fine_tune", lambda sft, dataset, *rest: Path(dataset.root) / "made")
-    config = run_module.warm_start(decode(RunConfig, {"env": {"type": "simulated"}}), tmp_path, Console())
-    assert config.policy.path == str(tmp_path / "demos" / "made")
