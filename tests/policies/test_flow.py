@@ -118,18 +118,3 @@ def test_not_exploring_is_the_stock_sampler_bit_for_bit(num_steps: int):
     assert torch.equal(mixed_log_prob[some], exploring_log_prob[some])
     assert not mixed_log_prob[~some].any()
     assert not torch.isclose(exploring[:, :2, :2], stock[:, :2, :2]).any()
-
-
-def test_gradient_against_finite_differences():
-    shape = sizes(3)
-    x0, eps = draws(shape, count=3)
-    latent = family(shape).sample(velocity, x0, eps, explore_all(x0)).latent
-
-    def score(rows: Tensor, dims: Tensor, shift: Tensor) -> Tensor:
-        def parametrised(x: Tensor, t: Tensor) -> Tensor:
-            return torch.tanh(rows @ x @ dims + t[:, None, None] * shift) + 0.2 * x
-
-        return family(shape).log_prob(parametrised, latent)
-
-    parameters = [torch.from_numpy(ROW_MIX), torch.from_numpy(DIM_MIX), torch.ones(4, dtype=torch.float64)]
-    assert torch.autograd.gradcheck(score, [p.clone().requires_grad_() for p in parameters], atol=1e-6)

@@ -17,16 +17,21 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from accerl_lerobot.checkpoint.layout import BACKBONE, PRETRAINED, displaced, save_checkpoint
-from accerl_lerobot.engines.config import RunConfig, parse
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import stack_observations
 from accerl_lerobot.policies.config import FlowSamplerConfig, PolicyConfig
-from accerl_lerobot.policies.loading import load_adapter, load_lerobot_config, precision_on, resolve_device
+from accerl_lerobot.policies.loading import (
+    dry_run_config,
+    load_adapter,
+    load_lerobot_config,
+    precision_on,
+    resolve_device,
+)
 from accerl_lerobot.policies.saving import save_pretrained
 from accerl_lerobot.testing import perturb
 from tests.hub_cache import cached_repo
 from tests.policies.checkpoints import edit_config, write_smolvla
-from tests.policies.tiny import adapter_at, requests
+from tests.policies.tiny import adapter_at, refused, requests
 from tests.policies.tiny_pi import ACTIONS, COMMIT, KINDS, PALIGEMMA, hub, write_pi
 
 MODELING = "lerobot.policies.pi0_fast.modeling_pi0_fast"
@@ -60,12 +65,6 @@ def edit_weights(path: Path, edit: Callable[[Tensors], object]) -> None:
     save_file(changed if isinstance(changed, dict) else tensors, path / "model.safetensors")
 
 
-def refused(path: Path, sentence: str, **options: object) -> None:
-    with pytest.raises(InputError, match=f"^{sentence}") as caught:
-        adapter_at(path, **options)
-    assert "\n" not in str(caught.value)
-
-
 @pytest.mark.parametrize(
     ("path", "sentence"),
     [
@@ -94,7 +93,7 @@ def test_a_config_of_something_else(damaged: Any, text: str | None, why: str):
     (path / "config.json").unlink()
     if text is not None:
         (path / "config.json").write_text(text)
-    refused(path, f"policy.path=.*{why}")
+    refused(path, f"^policy.path=.*{why}")
 
 
 @pytest.mark.parametrize(
@@ -117,15 +116,7 @@ def test_options_under_which_its_density_would_be_another(
 ):
     path = damaged(name)
     edit_config(path, **changes)
-    refused(path, sentence, **options)
-
-
-def test_averaging_over_chunks_is_switched_off_as_the_message_proposes(damaged: Any):
-    path = damaged("act")
-    edit_config(path, temporal_ensemble_coeff=0.1, n_action_steps=1)
-    arguments = [f"--policy.path={path}", "--policy.temporal_ensemble_coeff=null"]
-    config = parse(RunConfig, [*arguments, "--policy.n_action_steps=2"]).policy
-    assert load_adapter(config).policy.config.n_action_steps == 2
+    refused(path, f"^{sentence}", **options)
 
 
 def test_devices(monkeypatch: pytest.MonkeyPatch):
@@ -187,7 +178,7 @@ def test_weights_that_did_not_load_are_named(
 ):
     path = damaged(name)
     edit_weights(path, damage)
-    refused(path, f"policy.path=.*: .*{detail.replace('{key}', key)}")
+    refused(path, f"^policy.path=.*: .*{detail.replace('{key}', key)}")
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -210,13 +201,13 @@ def test_openpi_s_names_are_read_as_lerobot_reads_them(damaged: Any, name: str):
     edit_weights(path, as_openpi)
     assert decided(path) == expected
     edit_weights(path, lambda t: t.pop("action_in_proj.bias"))
-    refused(path, r"policy.path=.*1 missing \['model.action_in_proj.bias'\]")
+    refused(path, r"^policy.path=.*1 missing \['model.action_in_proj.bias'\]")
 
 
 def test_missing_processors(damaged: Any):
     path = damaged("act")
     (path / PROCESSOR).unlink()
-    refused(path, "policy.path=.*its LeRobot processors did not load; .*migrate_policy_normalization")
+    refused(path, "^policy.path=.*its LeRobot processors did not load; .*migrate_policy_normalization")
     assert locate("lerobot.processor.migrate_policy_normalization") is not None
 
 
@@ -254,7 +245,7 @@ def test_a_changed_lerobot_fails_at_load(
     if attribute.startswith("sample"):
         zeros = lambda self, tokens, **sizes: torch.zeros(len(tokens), 4, 2)  # noqa: E731
         monkeypatch.setattr(f"{MODELING}.PI0FastPolicy.detokenize_actions", zeros)
-    refused(written(name), "lerobot=.*does not fit LeRobot .*: it differs from its sampler by")
+    refused(written(name), "^lerobot=.*does not fit LeRobot .*: it differs from its sampler by")
 
 
 def test_a_moved_checkpoint_needs_nothing_from_where_it_was_made(tmp_path: Path):
@@ -282,7 +273,7 @@ def test_a_moved_checkpoint_needs_nothing_from_where_it_was_made(tmp_path: Path)
 def test_a_backbone_that_is_gone_is_named(tmp_path: Path):
     origin = write_smolvla(tmp_path / "origin" / PRETRAINED)
     shutil.rmtree(tmp_path / "origin" / f"{PRETRAINED}-backbone")
-    refused(origin, rf"policy.path=.*{PRETRAINED}-backbone, which is gone; put a copy into {BACKBONE}/")
+    refused(origin, rf"^policy.path=.*{PRETRAINED}-backbone, which is gone; put a copy into {BACKBONE}/")
 
 
 def test_a_checkpoint_on_the_hub_is_loaded_whole(
@@ -300,10 +291,9 @@ def test_a_checkpoint_on_the_hub_is_loaded_whole(
 
 
 def test_overridden_steps_are_used_and_saved(written: Any, tmp_path: Path):
-    for name in ("smolvla", "pi0"):
-        path = saved(written(name), tmp_path / name, num_steps=2, n_action_steps=2)
-        shape = adapter_at(path).family.shape
-        assert (shape.num_steps, shape.executed, shape.chunk_size) == (2, 2, 5)
+    path = saved(written("pi0"), tmp_path / "saved", num_steps=2, n_action_steps=2)
+    shape = adapter_at(path).family.shape
+    assert (shape.num_steps, shape.executed, shape.chunk_size) == (2, 2, 5)
 
 
 def test_names_of_the_environment_s_features_are_mapped(written: Any):
@@ -394,7 +384,7 @@ def test_lerobot_s_checkpoint_needs_the_hub_and_ours_does_not(
 ):
     original = write_pi(tmp_path / "original", name, num_steps=8, whole=False)
     assert not (original / BACKBONE).exists()
-    refused(original, "policy.path=.*its LeRobot processors did not load")
+    refused(original, "^policy.path=.*its LeRobot processors did not load")
     with hub(tmp_path / "original-hub"):
         marker = remote(tmp_path / "original-hub", monkeypatch)
         adapter = adapter_at(original)
@@ -411,3 +401,59 @@ def test_lerobot_s_checkpoint_needs_the_hub_and_ours_does_not(
     assert decided(tmp_path / "second") == expected
     assert named(tmp_path / "second") == {PALIGEMMA, ACTIONS}, "others find them where the original's were"
     assert not displaced(tmp_path / "second")
+
+
+def edit_statistics(path: Path, change: Callable[[Tensors], Tensors], which: str = "*normalizer") -> None:
+    """Changes the statistics of one kind, or both."""
+    for file in path.glob(f"*_{which}_processor.safetensors"):
+        save_file(change(load_file(file)), file)
+
+
+def under(prefix: str) -> Callable[[Tensors], Tensors]:
+    return lambda state: {prefix + name: value for name, value in state.items()}
+
+
+def put(name: str, value: torch.Tensor) -> Callable[[Tensors], Tensors]:
+    return lambda state: state | ({name: value} if name in state else {})
+
+
+def without(part: str) -> Callable[[Tensors], Tensors]:
+    return lambda state: {name: value for name, value in state.items() if part not in name}
+
+
+@pytest.mark.parametrize(
+    ("kind", "change", "which", "why"),
+    [
+        ("smolvla", under("so100.buffer."), "*normalizer",
+         "no mean and std of observation.state, .* it has so100.buffer.action, so100.buffer.observation"),
+        ("smolvla", under("so100.buffer."), "unnormalizer", "no mean and std of action, .*has so100.buffer"),
+        ("act", without("observation.state.std"), "normalizer", "no mean and std of observation.state"),
+        ("act", put("observation.state.std", torch.full((4,), torch.inf)), "normalizer", "NaN or infinity"),
+        ("act", put("observation.state.mean", torch.zeros(9)), "normalizer", "it cannot act here"),
+    ],
+)  # fmt: skip
+def test_statistics_that_do_not_fit_are_refused(damaged: Any, kind: str, change: Any, which: str, why: str):
+    path = damaged(kind)
+    edit_statistics(path, change, which)
+    why = f"^policy.path='.*{why}"
+    refused(path, why)
+    with pytest.raises(InputError, match=why):
+        dry_run_config(PolicyConfig(path=str(path), device="cpu"))
+
+
+def test_a_policy_that_is_to_be_fine_tuned_gets_new_statistics(damaged: Any):
+    path = damaged("smolvla")
+    edit_statistics(path, under("so100.buffer."))
+    config = PolicyConfig(path=str(path), device="cpu")
+    assert dry_run_config(config, fine_tuned=True).type == "smolvla"
+    with pytest.raises(InputError, match="sft.init_path"):
+        dry_run_config(config)
+
+
+def test_pictures_that_were_never_normalised_are_accepted_with_a_warning(damaged: Any, caplog: Any):
+    path = damaged("act")
+    edit_statistics(path, without("observation.images"))
+    adapter_at(path)
+    (warning,) = [record.getMessage() for record in caplog.records]
+    assert "no mean and std of observation.images.front" in warning
+    assert "pictures go in as they are" in warning

@@ -21,7 +21,7 @@ from accerl_lerobot.policies.loading import load_adapter, policy_sizes
 from accerl_lerobot.policies.saving import save_pretrained
 from accerl_lerobot.run.preflight import sft_policy
 from tests.policies.checkpoints import edit_config, write_smolvla
-from tests.policies.tiny import requests
+from tests.policies.tiny import refused, requests
 
 
 def stock_policy(folder: Path) -> Any:
@@ -86,12 +86,6 @@ def test_an_adapter_acts_as_in_lerobot_and_what_is_saved_of_it_does_too(adapted:
     assert not json.loads((tmp_path / "saved" / "config.json").read_text())["use_peft"]
     tuned = load_adapter(PolicyConfig(path=str(adapted), device="cpu", tuning=TuningConfig(mode="lora")))
     assert torch.allclose(chunk(tuned.policy, batch), expected, atol=1e-5)
-
-
-def refused(folder: Path, why: str) -> None:
-    with pytest.raises(InputError, match=why) as caught:
-        load_adapter(PolicyConfig(path=str(folder), device="cpu"))
-    assert "\n" not in str(caught.value)
 
 
 def test_an_adapter_without_its_policy_is_refused(copied: Path, tmp_path: Path):

@@ -11,8 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from torch import Tensor
 
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK, Request, Segment
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.config import PolicyConfig, SamplerConfig
@@ -57,6 +59,13 @@ def looking_back(count: int, *, explore: bool = True, image: int = 32) -> list[R
 
 def adapter_at(path: Path, sampler: SamplerConfig | None = None, **options: Any) -> LeRobotAdapter:
     return load_adapter(PolicyConfig(path=str(path), device="cpu", sampler=sampler, **options))
+
+
+def refused(path: Path, why: str, **options: Any) -> None:
+    """Asserts that a policy is not loaded, in one line."""
+    with pytest.raises(InputError, match=why) as caught:
+        adapter_at(path, **options)
+    assert "\n" not in str(caught.value)
 
 
 def as_segment(asked: Sequence[Request], adapter: LeRobotAdapter, length: int) -> Segment:
