@@ -200,18 +200,9 @@ def test_the_environment_has_its_own_limit():
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        (
-            {"fails": ValueError("the arm is broken")},
-            r"env\.kwargs=.*Odd-v0.*\(ValueError: the arm is broken\)",
-        ),
-        (
-            {"fails": RuntimeError("gladLoadGL error")},
-            r"MUJOCO_GL='.*': the environment cannot draw \(gladLoad",
-        ),
-        (
-            {"fails": ModuleNotFoundError("x", name="arms.left")},
-            r"env\.id='Odd-v0': the package arms is not installed",
-        ),
+        ({"fails": ValueError("it is broken")}, r"env\.kwargs=.*Odd-v0.*\(ValueError: it is broken\)"),
+        ({"fails": RuntimeError("gladLoadGL error")}, r"MUJOCO_GL='.*': the environment cannot draw"),
+        ({"fails": ModuleNotFoundError("x", name="arms.left")}, r"env\.id=.*: the package arms is not"),
         ({"fast": True}, r"env\.kwargs={'fast': True}: Odd-v0: the environment fails \(TypeError: .*'fast'"),
     ],
 )

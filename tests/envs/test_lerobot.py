@@ -8,7 +8,6 @@ import json
 import shlex
 from pathlib import Path
 
-import gymnasium
 import numpy as np
 import pytest
 
@@ -21,38 +20,12 @@ from tests.hub_cache import cached_repo
 pytest.importorskip("lerobot")
 
 
-class Scripted(gymnasium.Wrapper):
-    """Stands in for a simulator that succeeds at its third step."""
-
-    def __init__(self, env) -> None:
-        super().__init__(env)
-        self.count = 0
-
-    def reset(self, seed: int):
-        self.count = 0
-        return self.env.reset(seed=seed)
-
-    def step(self, action: np.ndarray):
-        self.count += 1
-        raw, _, _, _, info = self.env.step(action)
-        won = self.count >= 3
-        return raw, 0.5, won, False, info | {"is_success": won}
-
-
 @pytest.fixture
 def pusht():
     pytest.importorskip("gym_pusht")
     environment = LeRobotEnvironment(LeRobotEnvConfig(name="pusht", camera="top"))
     yield environment
     environment.close()
-
-
-def test_success_terminates_with_one_reward(pusht: LeRobotEnvironment):
-    pusht.environments["pusht"] = Scripted(pusht.environments["pusht"])
-    pusht.reset(0, "pusht")
-    result = pusht.step_chunk(np.full((5, 2), 256, np.float32))
-    assert result.terminated and result.success and "observation.state" in result.observation
-    assert result.rewards.tolist() == [0, 0, 1]
 
 
 def test_lerobots_limit_is_the_default(pusht: LeRobotEnvironment):

@@ -17,12 +17,9 @@ from accerl_lerobot.envs import LiberoConfig, libero, make_environment
 from accerl_lerobot.envs.graphics import import_mujoco
 from accerl_lerobot.envs.libero import bddl_file, instruction, recorded_states
 from accerl_lerobot.envs.libero_simulator import (
-    FPS,
-    TIMESTEP,
     Aim,
     Arm,
     LiberoEnvironment,
-    SensorClock,
     Simulator,
     coarser,
     moved_texture,
@@ -91,27 +88,6 @@ def test_what_is_said_where_meshes_are_missing(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(libero, "package", lambda: tmp_path)  # which has no assets/
     with pytest.raises(InputError, match=r"the Hub did not give them .*; hf download lerobot/libero-assets"):
         libero.assets_folder("")  # tests are offline
-
-
-@pytest.mark.parametrize("forced", [1, 2])
-def test_sensors_read_when_robosuites_do(forced: int):
-    from robosuite.utils.observables import Observable, sensor
-
-    read: list[int] = []
-
-    @sensor(modality="test")
-    def reading(cache: dict) -> np.ndarray:
-        read.append(1)
-        return np.zeros(2)
-
-    observable = Observable("test", reading, sampling_rate=FPS)
-    for _ in range(forced):
-        observable.update(TIMESTEP, {}, force=True)
-    clock = SensorClock(forced)
-    for _ in range(2000):
-        before = len(read)
-        observable.update(TIMESTEP, {})
-        assert clock.tick() == (len(read) > before)
 
 
 def test_torques_against_the_definition():

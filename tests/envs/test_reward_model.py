@@ -117,22 +117,9 @@ def test_a_run_learns_from_what_it_says(encoder: Path, tmp_path: Path):
     ("damage", "message"),
     [
         (lambda path: shutil.rmtree(path), r"^rollout\.reward_model\.path=.*no config\.json there"),
-        (
-            lambda path: None,
-            r"its observation\.images\.front is \(3, 128, 128\), the environment's \(3, 32, 32\)",
-        ),
-        (
-            lambda path: (path / "classifier_preprocessor.json").unlink(),
-            "it cannot be loaded as one of LeRobot's",
-        ),
-        (
-            lambda path: edit_config(path, type="sarm"),
-            "it cannot be loaded|looks at several observations at once",
-        ),
-        (
-            lambda path: edit_config(path, latent_dim=3),
-            "it cannot be loaded as one of LeRobot's reward models",
-        ),
+        (lambda path: None, r"front is \(3, 128, 128\), the environment's \(3, 32, 32\)"),
+        (lambda path: (path / "classifier_preprocessor.json").unlink(), "it cannot be loaded as one of"),
+        (lambda path: edit_config(path, type="sarm"), "it cannot be loaded|looks at several observations"),
     ],
 )
 def test_what_cannot_judge_is_refused_in_one_line(encoder: Path, tmp_path: Path, damage: Any, message: str):

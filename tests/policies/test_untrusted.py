@@ -102,9 +102,7 @@ def test_a_checkpoint_from_the_hub_names_no_folder_of_this_machine(copied: Path)
 
 def test_pickled_weights_are_not_read(copied: Path):
     (copied / "model.safetensors").rename(copied / "pytorch_model.bin")
-    refused(
-        copied, "^policy.path=.*model.safetensors: is missing; give a folder with the weights as safetensors"
-    )
+    refused(copied, "^policy.path=.*model.safetensors: is missing; give a folder with the weights")
 
 
 def test_attention_is_not_fetched_as_compiled_code(copied: Path):
