@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
-import importlib
 import json
+import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -15,8 +16,6 @@ from safetensors.torch import load_file, save_file
 from torch import nn
 
 from accerl_lerobot import cli
-from accerl_lerobot.cli.configs import WorldModelRun
-from accerl_lerobot.engines.config import parse
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.config import LearnableModelConfig
@@ -113,60 +112,32 @@ def test_a_model_of_another_package_is_learned_and_checked_by_naming_it(
     assert json.loads(capsys.readouterr().out)["checks"] == found["checks"]
 
 
-def test_its_fields_are_fields_of_the_command_line():
-    run = parse(WorldModelRun, [*NAMED, "--world_model.model.gain=2", "--world_model.image_size=18"])
-    assert run.world_model.model == importlib.import_module(PACKAGE).LinearModelConfig(gain=2.0)
-    with pytest.raises(InputError, match=r"^world_model.model.gain=0\.?0?: use a positive number"):
-        parse(WorldModelRun, [*NAMED, "--world_model.model.gain=0"])
-    with pytest.raises(
-        InputError, match="^world_model.model.channels=3: no such field; world_model.model has"
-    ):
-        parse(WorldModelRun, [*NAMED, "--world_model.model.channels=3"])
+def reconfigured(folder: Path, **changes: Any) -> None:
+    """Puts other values into a world model's ``config.json``."""
+    content = json.loads((folder / "config.json").read_text())
+    (folder / "config.json").write_text(json.dumps(content | changes))
+
+
+def not_finite(folder: Path) -> None:
+    tensors = load_file(folder / "model.safetensors")
+    save_file(tensors | {"model.change": tensors["model.change"] * torch.nan}, folder / "model.safetensors")
 
 
 @pytest.mark.parametrize(
     ("harm", "why"),
     [
-        ("nowhere", "config.json: is missing"),
-        ("config", "not a world model of accerl world-model"),
-        ("weights", "model.safetensors: not safetensors"),
-        ("size", "not a world model of accerl world-model"),
-        ("chunk", r"config.json: spec.chunk=0: use a whole number in \[1, "),
-        ("learnt", "config.json: learnt: not one of accerl world-model"),
-        ("nan", "model.safetensors: model.change holds NaN or infinity; train it again"),
+        (shutil.rmtree, "config.json: is missing"),
+        (lambda folder: reconfigured(folder, spec=1), "not a world model of accerl world-model"),
+        (lambda folder: reconfigured(folder, learnt=7), "config.json: learnt: not one of accerl world-model"),
+        (lambda folder: (folder / "model.safetensors").write_bytes(bytes(64)), "not safetensors"),
+        (not_finite, "model.safetensors: model.change holds NaN or infinity; train it again"),
     ],
 )
-def test_what_cannot_be_loaded(tmp_path: Path, harm: str, why: str):
-    folder = tmp_path / "w"
-    save_world(folder, World(model()))
-    content = json.loads((folder / "config.json").read_text())
-    if harm == "nowhere":
-        folder = tmp_path / "nowhere"
-    elif harm == "config":
-        content = {}
-    elif harm == "weights":
-        (folder / "model.safetensors").write_bytes(b"\x00" * 64)
-    elif harm == "learnt":
-        content["learnt"] = 7
-    elif harm == "nan":
-        tensors = load_file(folder / "model.safetensors")
-        tensors["model.change"] *= float("nan")
-        save_file(tensors, folder / "model.safetensors")
-    else:
-        content["spec"] |= {"action_dim": 7} if harm == "size" else {"chunk": 0}
-    if folder.exists():
-        (folder / "config.json").write_text(json.dumps(content))
+def test_what_cannot_be_loaded(tmp_path: Path, harm: Callable[[Path], object], why: str):
+    save_world(tmp_path / "w", World(model()))
+    harm(tmp_path / "w")
     with pytest.raises(InputError, match=f"^path=.*{why}"):
-        load_world(folder)
-
-
-def test_a_device_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    # The dataset is not there either, and is not looked for.
-    told = ["--dataset.repo_id=a/b", "--dataset.root=nowhere", f"--output_dir={tmp_path}/out", "--device=tpu"]
-    for verb in (["world-model", "--env.type=simulated"], ["world-model-eval", "--path=nowhere"]):
-        assert cli.main([*verb, *told]) == 2
-        assert "accerl: device='tpu': use auto, cpu, cuda" in capsys.readouterr().err
-        assert not (tmp_path / "out").exists()
+        load_world(tmp_path / "w")
 
 
 def test_it_is_saved_as_it_is_used(tmp_path: Path):

@@ -118,10 +118,6 @@ def test_what_does_not_fit_is_one_line(written: Path, tmp_path: Path):
     ):
         with pytest.raises(InputError, match=message):
             new_state_model(spec._replace(**change), TDMPCStateConfig(path=path))
-
-
-def test_images_of_another_size_are_one_line(written: Path):
-    spec = spec_of(written)
     made = new_state_model(spec, TDMPCStateConfig(path=str(written)))
     small = {CAMERA: np.zeros((1, 32, 32, 3), np.uint8), ROBOT: np.zeros((1, spec.state), np.float32)}
     with pytest.raises(InputError, match=r"world_model.path=.*\(3, 64, 64\), the run's \(3, 32, 32\)"):

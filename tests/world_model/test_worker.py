@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import signal
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +13,11 @@ import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot.algorithms import ChunkCriticConfig, chunk_critic
+from accerl_lerobot.algorithms import chunk_critic
 from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE
 from accerl_lerobot.engines.stopping import WorkerError
-from accerl_lerobot.replay.buffer import ReplayConfig
-from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.run.train import make_engine
 from accerl_lerobot.trainer import worker as trainer_worker
 from accerl_lerobot.trainer.worker import TrainerWorker
@@ -26,7 +25,7 @@ from accerl_lerobot.world_model import worker as module
 from accerl_lerobot.world_model.state_learner import BATCH, StateLearner
 from accerl_lerobot.world_model.states import Transitions
 from accerl_lerobot.world_model.worker import RemoteStateLearner, WorldModelWorker
-from tests.runs import polls, tiny_run
+from tests.runs import off_policy_run, polls
 from tests.world_model.small_latent import SmallLatentConfig
 from tests.world_model.test_latent import NUMBERS, model, transitions
 
@@ -140,17 +139,13 @@ def test_a_run_on_a_state_that_another_process_learns(
     tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(trainer_worker, "TrainerWorker", HastyTrainer)
-    config = tiny_run(
+    config = off_policy_run(
         tiny_checkpoint,
         output_dir=str(tmp_path),
-        rollout=RolloutConfig(environments=4, segment_length=4),
-        replay=ReplayConfig(
-            capacity=64, min_decisions=16, max_unlearned_decisions=32, samples_per_insert=1, max_lag=200
-        ),
-        algorithm=ChunkCriticConfig(),
         world_model=SmallLatentConfig(),
         trainer=TrainerConfig(updates=400, batch_decisions=16, value_warmup_updates=4),
     )
+    config = replace(config, replay=replace(config.replay, max_lag=200))
     engine = make_engine(config, ("match",), history=1)
     try:
         engine.train()
