@@ -99,7 +99,7 @@ def test_the_curve_shows_rates_with_their_intervals(tmp_path: Path, monkeypatch:
     first, last = evaluated(0, 50, 100), evaluated(5000, 9, 10)
     success_curve(tmp_path / "curve.png", [last, first], [(0, 0.2), (5000, 0.8)])
     (x, y), lengths = axes.errorbar.call_args.args, axes.errorbar.call_args.kwargs["yerr"]
-    assert (x, y) == ([0, 5000], [0.5, 0.9])
+    np.testing.assert_array_equal([x, y], [[0, 5000], [0.5, 0.9]])
     np.testing.assert_allclose([y - lengths[0], y + lengths[1]], np.transpose([first["ci95"], last["ci95"]]))
     assert axes.plot.call_args.args == ((0, 5000), (0.2, 0.8)), "success while exploring"
 
@@ -117,7 +117,7 @@ def test_before_beside_after_with_outcomes(tmp_path: Path) -> None:
     before = [filmed(i, i == 0, grey) for i in (1, 0, 2)] + [filmed(3, True, [])]
     after = [filmed(i, i != 2, grey) for i in range(4)]
     before_after(tmp_path / "film.mp4", before, after, fps=4)
-    film = np.stack([*imageio.get_reader(tmp_path / "film.mp4")]).astype(int)
+    film = np.stack([np.asarray(each, int) for each in imageio.get_reader(tmp_path / "film.mp4")])
     half = 2 * 64 + GAP
     assert film.shape[1:3] == (half, 2 * half + 4 * GAP)
 

@@ -24,6 +24,7 @@ from accerl_lerobot.policies.loading import (
     dry_run_config,
     load_adapter,
     load_lerobot_config,
+    pinned,
     precision_on,
     resolve_device,
 )
@@ -286,6 +287,7 @@ def test_a_checkpoint_on_the_hub_is_loaded_whole(
     path = saved(written("smolvla"), cached_repo(tmp_path / "hub", "me/policy", "abc"))
     edit_config(path, vlm_model_name="/on/another/machine")
     assert decided("me/policy") == decided(path)
+    assert pinned(PolicyConfig(path="me/policy")).revision == "abc"
     with pytest.raises(InputError, match="not loadable from the Hub"):
         load_adapter(PolicyConfig(path="me/policy", revision="v9", device="cpu"))
 
