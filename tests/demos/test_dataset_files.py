@@ -6,19 +6,17 @@ from __future__ import annotations
 import io
 import json
 import shutil
-import weakref
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pytest
-import torch
 from PIL import Image
 
 from accerl_lerobot.checkpoint.safety import FileSource
 from accerl_lerobot.config.ranges import DatasetConfig
-from accerl_lerobot.demos.dataset_files import checked, observations, open_metadata, opened, task_texts
+from accerl_lerobot.demos.dataset_files import checked, open_metadata, opened, task_texts
 from accerl_lerobot.errors import InputError
 from tests.tiny_datasets import STEPS, rewrite, write_dataset
 
@@ -35,21 +33,16 @@ def copied(tmp_path: Path) -> Path:
     return Path(shutil.copytree(ROOT, tmp_path / "dataset"))
 
 
-def info() -> dict[str, Any]:
-    content: dict[str, Any] = json.loads((ROOT / "meta/info.json").read_text())
-    return content
-
-
 def edit(root: Path, **changes: Any) -> None:
-    (root / "meta/info.json").write_text(json.dumps(info() | changes))
+    file = root / "meta/info.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | changes))
 
 
-def refused(root: Path, why: str) -> str:
+def refused(root: Path, why: str) -> None:
     """By the very call that every verb makes; LeRobot must not have read a byte of it."""
     with pytest.raises(InputError, match=f"^dataset.root='.*': .*{why}") as caught:
         open_metadata(DatasetConfig(repo_id="a/b", root=str(root)))
     assert "\n" not in str(caught.value)
-    return str(caught.value)
 
 
 def test_datasets_that_are_not_there(tmp_path: Path):
@@ -64,33 +57,22 @@ def test_datasets_that_are_not_there(tmp_path: Path):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("version", ["v1.6", "v2.1"])
-def test_another_format_version(copied: Path, version: str):
-    edit(copied, codebase_version=version)
+def test_another_format_version(copied: Path):
+    edit(copied, codebase_version="v2.1")
     with pytest.raises(InputError, match="^dataset.repo_id='a/b': its format is not v3.0.* convert with: "):
         open_metadata(DatasetConfig(repo_id="a/b", root=str(copied)))
 
 
 @pytest.mark.parametrize(
-    ("key", "template"),
-    [
-        ("data_path", "../../{chunk_index}/{file_index}.parquet"),
-        ("data_path", "{chunk_index:999999999}"),
-        ("data_path", "{chunk_index"),
-        ("video_path", "{video_key[0]}"),
-    ],
-)
-def test_templates(copied: Path, key: str, template: str):
-    edit(copied, **{key: template})
-    refused(copied, f"meta/info.json: {key}: ")
-
-
-@pytest.mark.parametrize(
     ("changes", "why"),
     [
+        ({"data_path": "../../{chunk_index}/{file_index}.parquet"}, "meta/info.json: data_path: "),
+        ({"data_path": "{chunk_index:999999999}"}, "meta/info.json: data_path: "),
+        ({"data_path": "{chunk_index"}, "meta/info.json: data_path: "),
+        ({"video_path": "{video_key[0]}"}, "meta/info.json: video_path: "),
         ({"chunks_size": 0}, "chunks_size must be positive"),
         ({"features": {"../../x": {"dtype": "float32", "shape": [4]}}}, "cannot be part of a path"),
-        ({"total_episodes": 0, "total_tasks": 0, "total_frames": 365}, "it has no episodes, or no tasks"),
+        ({"total_episodes": 0, "total_tasks": 0}, "it has no episodes, or no tasks"),
     ],
 )
 def test_what_info_may_say(copied: Path, changes: dict[str, Any], why: str):
@@ -237,20 +219,3 @@ def test_depth_is_decoded(tmp_path: Path):
     )
     with opened(dataset, open_metadata(dataset)) as data:
         assert data[0]["observation.images.depth"].unique().tolist() == [700]
-
-
-def test_frames_are_kept_as_bytes():
-    """One of LeRobot's frames, which are four times as large, is in memory at a time."""
-    alive: weakref.WeakSet[torch.Tensor] = weakref.WeakSet()
-
-    class Frames:
-        def __getitem__(self, row: int) -> dict[str, torch.Tensor]:
-            assert len(alive) <= 1
-            image = torch.full((3, 2, 4), row / 255)
-            alive.add(image)
-            return {CAMERA: image}
-
-    found = observations(Frames(), np.arange(5), {"action": np.arange(9)}, [CAMERA])
-    assert found["action"].tolist() == list(range(5))
-    assert found[CAMERA].shape == (5, 2, 4, 3) and found[CAMERA].dtype == np.uint8
-    assert found[CAMERA][:, 0, 0, 0].tolist() == list(range(5))

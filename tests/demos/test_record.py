@@ -133,12 +133,6 @@ def test_an_expert_that_cannot_succeed_is_reported_and_leaves_nothing(tmp_path: 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_existing_folder_is_never_touched(tmp_path: Path):
-    (tmp_path / "mine").mkdir()
-    with pytest.raises(InputError, match="^root=.*the folder exists"):
-        record_demos(SimulatedConfig(), DemosConfig(), str(tmp_path / "mine"))
-
-
 def test_replaying_its_actions_gives_its_frames():
     draccus = pytest.importorskip("draccus")
     pytest.importorskip("metaworld")

@@ -22,14 +22,9 @@ from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos import guarded_train, sft
 from accerl_lerobot.demos.backbone import BackboneConfig
 from accerl_lerobot.demos.sft import ANSWER, SFTConfig, picked, run_sft, sft_command
-from accerl_lerobot.engines.config import RunConfig
-from accerl_lerobot.envs import MetaWorldConfig, SimulatedConfig
+from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import PolicyConfig
-from accerl_lerobot.policies.features import policy_features
-from accerl_lerobot.policies.loading import dry_run_config
-from accerl_lerobot.run.preflight import check_start
-from tests.policies.checkpoints import edit_config, write_smolvla
 from tests.policies.tiny import adapter_at
 from tests.rounding import assert_close
 from tests.tiny_datasets import record_dataset
@@ -92,36 +87,6 @@ def test_a_chunk_is_read_without_decoding_its_images(episodes: list[int] | None,
     monkeypatch.setattr(DatasetReader, "_query_hf_dataset", guarded_train.query_rows)
     assert all(equal(dataset[index], item) for index, item in zip(indices, stock, strict=True))
     assert len(decoded) == len(indices) * len(dataset.meta.camera_keys)
-
-
-@pytest.mark.slow
-def test_what_lerobot_fine_tunes_from_another_robot_s_policy_is_taken_for_what_it_is(tmp_path: Path):
-    """Three cameras, six joints and six actions before, one, four and four afterwards."""
-    start = write_smolvla(
-        tmp_path / "base",
-        camera="observation.images.camera1",
-        state_dim=6,
-        action_dim=6,
-        padded_dim=8,
-        max_state_dim=8,
-    )
-    inputs = json.loads((start / "config.json").read_text())["input_features"]
-    inputs |= {f"observation.images.camera{i}": inputs["observation.images.camera1"] for i in (2, 3)}
-    edit_config(start, input_features=inputs)
-    rename = json.dumps({CAMERA: "observation.images.camera1"})
-    config = SFTConfig(steps=1, batch_size=4, init_path=str(start), extra_args=[f"--rename_map={rename}"])
-    environment = MetaWorldConfig(task="drawer-open-v3", image_size=64)
-    policy = PolicyConfig(path=None, device="cpu", rename_map=json.loads(rename))
-    run = RunConfig(env=environment, sft=config, dataset=LOCAL, policy=policy)
-    check_start(run)
-    tuned = replace(policy, path=str(run_sft(config, LOCAL, tmp_path / "sft", seed=0)))
-    assert len(json.loads((Path(tuned.path) / "config.json").read_text())["input_features"]) == 4
-    needed = policy_features(dry_run_config(tuned)).shapes
-    assert {name: len(shape) for name, shape in needed.items()} == {
-        "observation.images.camera1": 3, "observation.state": 1, "action": 1,
-    }  # fmt: skip
-    assert needed["observation.state"] == needed["action"] == (4,)
-    check_start(replace(run, policy=tuned, sft=SFTConfig()))
 
 
 class TestPick:
@@ -264,7 +229,6 @@ def test_a_preset_gets_only_what_it_has(tmp_path: Path, kind: str, schedule: set
 
 def test_a_moved_checkpoint_is_started_from_a_copy(tiny_checkpoint, tmp_path, monkeypatch):
     from accerl_lerobot.checkpoint.layout import relocate
-    from accerl_lerobot.policies.config import PolicyConfig
     from accerl_lerobot.policies.saving import save_pretrained
 
     start = tmp_path / "start"
