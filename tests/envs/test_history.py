@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An environment that looks back, against the same environment stepped one action at a time."""
+"""The simulated environment, and one that looks back, against the same one stepped one action at a time."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import pytest
 
 from accerl_lerobot.envs import Environment, SimulatedConfig, make_environment
 from accerl_lerobot.envs.base import ChunkResult
+from accerl_lerobot.envs.simulated import SimulatedEnvironment
 from accerl_lerobot.experience import TASK, Observation
 
 STATE, IMAGE = "observation.state", "observation.images.front"
@@ -76,3 +77,25 @@ def test_a_termination_inside_a_chunk_ends_it():
     result = environment.step_chunk(np.zeros((5, 2), np.float32))
     assert result.terminated and result.success and result.steps == len(results)
     same(result.observation, seen[-2:])
+
+
+def held(environment: SimulatedEnvironment, count: int = 10) -> np.ndarray:
+    return np.repeat(environment.solution[None], count, 0)
+
+
+@pytest.mark.parametrize("task", ["match", "mirror"])
+def test_holding_the_solution_succeeds_at_once(task: str):
+    environment = SimulatedEnvironment(SimulatedConfig(task="match,mirror", hold=4))
+    state = environment.reset(0, task)["observation.state"]
+    assert np.array_equal(environment.solution, state[:2] if task == "match" else -state[:2])
+    result = environment.step_chunk(held(environment))
+    assert result.terminated and result.success and result.steps == 4
+    assert result.rewards.tolist() == [0, 0, 0, 1]
+    assert np.array_equal(result.observation["observation.state"][2:4], environment.solution)
+
+
+def test_with_dense_rewards_no_success_ends_the_episode():
+    environment = SimulatedEnvironment(SimulatedConfig(reward="dense", max_steps=20))
+    environment.reset(0, "match")
+    results = [environment.step_chunk(held(environment)) for _ in range(2)]
+    assert results[-1].truncated and results[-1].success and results[-1].rewards.min() > 0.99

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages over sockets: the promises at the top of `transport.connection`, over Unix sockets and TCP."""
+"""Messages over sockets: the promises at the top of `transport.connection`; which weights replicas get."""
 
 from __future__ import annotations
 
@@ -9,16 +9,26 @@ import signal
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from concurrent.futures import Future
 from typing import Any
 
 import numpy as np
 import pytest
 
 from accerl_lerobot.experience import Decision, Request
-from accerl_lerobot.transport import connection
-from accerl_lerobot.transport.connection import Address, Client, PendingRequest, Server, ServiceStoppedError
+from accerl_lerobot.transport import connection, weights
+from accerl_lerobot.transport.connection import (
+    Address,
+    Client,
+    PendingRequest,
+    ReconnectingClient,
+    Server,
+    ServiceStoppedError,
+)
+from accerl_lerobot.transport.weights import Tensors, WeightPublisher
 from tests.replay.segments import make_segment
+from tests.transport.played import PlayedClient
 
 LONG_S = 120.0
 HOSTS = [pytest.param(None, id="unix"), pytest.param("127.0.0.1", id="tcp")]
@@ -258,13 +268,102 @@ def test_a_message_is_as_old_as_its_sender_says_if_that_can_be(monkeypatch: pyte
     server.close()
 
 
-def test_threads_of_the_same_process_wake_it():
-    server = Server(lambda request: None)
-    wake: Callable[[], None] = server.wake
-    threading.Timer(0.05, wake).start()
-    started = time.monotonic()
-    server.poll(LONG_S)
-    for _ in range(100_000):
-        server.wake()  # never waits
-    assert time.monotonic() - started < LONG_S
-    server.close()
+class MortalService:
+    """Answers when the test says so; may be away, or die while it is asked."""
+
+    def __init__(self) -> None:
+        self.held: list[tuple[str, Future[Any]]] = []
+        self.state = "there"
+
+    def become(self, state: str) -> None:
+        self.state = state
+        if state != "there":
+            for _, future in self.held:
+                future.set_exception(ServiceStoppedError("the service has stopped"))
+            self.held.clear()
+
+    def connect(self, timeout_s: float = 0.0) -> Any:
+        if self.state == "away":
+            raise ServiceStoppedError("nobody listens there")
+        return PlayedClient("inference", self._take)
+
+    def answer(self, number: int = 0) -> None:
+        message, future = self.held.pop(number)
+        future.set_result(f"answer to {message}")
+
+    def _take(self, message: str) -> Future[Any]:
+        if self.state == "dying":
+            raise ServiceStoppedError("it dies")
+        self.held.append((message, Future()))
+        return self.held[-1][1]
+
+
+@pytest.fixture(autouse=True)
+def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connection, "RETRY_S", 0.0)
+
+
+@pytest.mark.parametrize("lost", ["away", "dying"])
+def test_what_was_not_answered_is_asked_again_in_order_and_under_the_same_ticket(lost: str):
+    service = MortalService()
+    client = ReconnectingClient(service)
+    a, b, c = (client.send(name) for name in "abc")
+    service.answer(1)
+    assert client.done(60.0) == [(b, "answer to b")]
+    service.become(lost)
+    assert client.done(0.0) == []
+    d = client.send("d")  # while nobody is there
+    assert client.done(0.0) == [] and not service.held
+    service.become("there")
+    assert client.done(0.0) == [] and [message for message, _ in service.held] == ["a", "c", "d"]
+    for _ in range(3):
+        service.answer()
+    assert sorted(client.done(60.0)) == [(a, "answer to a"), (c, "answer to c"), (d, "answer to d")]
+
+
+def test_a_service_that_was_away_at_first_is_asked_when_it_is_there():
+    service = MortalService()
+    service.become("away")
+    client = ReconnectingClient(service)
+    ticket = client.send("early")
+    assert client.done(0.0) == []
+    service.become("there")
+    client.done(0.0)
+    service.answer()
+    assert client.done(60.0) == [(ticket, "answer to early")]
+
+
+def copied(tensors: Tensors) -> Tensors:
+    """Copies as Ray's object store would have made them."""
+    return {name: tensor.copy() for name, tensor in tensors.items()}
+
+
+def test_a_replica_gets_the_newest_set_and_skips_those_before():
+    publisher, tensor = WeightPublisher(["inference"], copied), np.zeros(3)
+    for version in range(5):
+        tensor[:] = version
+        publisher.publish(version, {"w": tensor})
+    tensor[:] = -1
+    version, (newest,) = publisher.newer_than("inference", -1)
+    assert version == 4 and (newest["w"] == 4).all()
+
+
+def test_a_replica_waits_for_newer_weights_but_not_for_ever(monkeypatch: pytest.MonkeyPatch):
+    publisher = WeightPublisher(["inference"], copied)
+    threading.Timer(0.05, publisher.publish, (3, {})).start()
+    assert publisher.newer_than("inference", -1) == (3, [{}])
+    monkeypatch.setattr(weights, "ASK_S", 0.01)
+    assert publisher.newer_than("inference", 3) == (3, [])
+
+
+def test_flush_waits_until_each_replica_has_applied_the_newest(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(weights, "ASK_S", 0.0)
+    publisher = WeightPublisher(["inference 0", "inference 1"], copied)
+    publisher.flush(30)
+    publisher.publish(1, {})
+    publisher.newer_than("inference 0", 1)
+    publisher.newer_than("inference 1", 0)
+    with pytest.raises(TimeoutError, match=r"weights not applied within 0\.1 s by inference 1"):
+        publisher.flush(0.1)
+    threading.Timer(0.05, publisher.newer_than, ("inference 1", 1)).start()
+    publisher.flush(30)
