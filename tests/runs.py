@@ -4,11 +4,12 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,6 +23,7 @@ from accerl_lerobot.engines.config import LaunchConfig, RunConfig
 from accerl_lerobot.engines.contract import Engine, Progress
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.evaluation import EvaluationConfig
+from accerl_lerobot.metrics import METRICS
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.replay.buffer import ReplayConfig
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
@@ -144,3 +146,22 @@ def trained(config: RunConfig) -> tuple[list[Progress], LocalEngine]:
 def updates(history: Sequence[Progress]) -> list[dict[str, float]]:
     """The metrics of all updates that were reported."""
     return [update for progress in history for update in progress.updates]
+
+
+def records(run: Path, kind: str = "") -> list[dict[str, Any]]:
+    """The lines of a run's ``metrics.jsonl``, or those of a kind; all that JSON does not know is an error."""
+
+    def constant(name: str) -> None:
+        raise AssertionError(f"{name} is not JSON")
+
+    lines = (run / METRICS).read_text().splitlines()
+    found = [json.loads(line, parse_constant=constant) for line in lines]
+    return [record for record in found if not kind or record["kind"] == kind]
+
+
+def eventually(happened: Callable[[], Any], seconds: float = 120.0) -> bool:
+    """True once something comes about, on a machine that may be busy."""
+    deadline = time.monotonic() + seconds
+    while not (done := happened()) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return bool(done)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A checkpoint is there whole or not at all, ``last`` points at a whole one; trees come out as they went in."""
+"""A checkpoint is there whole or not at all, ``last`` points at a whole one; trees come out as they go in."""
 
 from __future__ import annotations
 

@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import psutil
@@ -17,6 +16,7 @@ import pytest
 
 from accerl_lerobot import guardian
 from accerl_lerobot.demos.record import simulators
+from tests.runs import eventually
 
 PARENT = """
 import multiprocessing, os, signal, subprocess, sys, time
@@ -45,14 +45,6 @@ if __name__ == "__main__":
 """
 
 
-def until(there: Callable[[], bool], seconds: float = 120.0) -> bool:
-    """True once something comes about, on a machine that may be busy."""
-    deadline = time.monotonic() + seconds
-    while not (done := there()) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    return done
-
-
 def below(mark: str) -> list[psutil.Process]:
     """Processes that have a mark in their environment."""
     found = []
@@ -73,8 +65,8 @@ def test_nothing_is_left_however_a_process_ends(how: str, tmp_path: Path):
     command = [sys.executable, str(program), str(folder), str(note), how]
     done = subprocess.run(command, capture_output=True, text=True, timeout=240)  # waits for the guardian, too
     semaphore, mark = note.read_text().rsplit(" ", 1)
-    assert until(lambda: not below(mark) and not folder.exists())
-    assert until(lambda: not Path(f"/dev/shm/sem.{semaphore.strip('/')}").exists())
+    assert eventually(lambda: not below(mark) and not folder.exists())
+    assert eventually(lambda: not Path(f"/dev/shm/sem.{semaphore.strip('/')}").exists())
     said = "accerl: the process was killed; begin again"
     assert done.stderr.splitlines().count(said) == (how != "return")
 
@@ -97,6 +89,6 @@ def test_simulators_end_at_once_when_their_parent_is_interrupted():
     with pytest.raises(KeyboardInterrupt), simulators(1, int) as pool:
         assert pool.submit(signal.getsignal, signal.SIGINT).result() is signal.SIG_IGN
         late = pool.submit(time.sleep, 3600)
-        assert until(late.running)
+        assert eventually(late.running)
         raise KeyboardInterrupt
     assert late.done()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs over two nodes: what is refused, that one ends right, and that it outlives the second node."""
+"""Runs over two nodes: that one ends right, and that it outlives the second node."""
 
 from __future__ import annotations
 

@@ -1,15 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The asynchronous engine with a trainer of two ranks, everything real: LeRobot's SmolVLA, Ray, gloo, FSDP2.
-
-The run is saved, and loses a rank that hangs.
-"""
+"""The asynchronous engine with a trainer of two ranks, all of it real: LeRobot's SmolVLA, Ray, gloo, FSDP2."""
 
 from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Iterator
-from dataclasses import dataclass
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -26,8 +22,6 @@ from accerl_lerobot.engines.stopping import WorkerError
 from tests.runs import drive, polls, tiny_run
 from tests.test_ray_session import LOOPBACK, listening
 
-pytestmark = pytest.mark.slow
-
 UPDATES = 6
 TWO = TrainerConfig(
     updates=1000, batch_decisions=16, warmup_updates=0, value_warmup_updates=1, probe_every=3,
@@ -35,75 +29,35 @@ TWO = TrainerConfig(
 )  # fmt: skip
 
 
-@dataclass
-class Story:
-    """Events of the run with two ranks."""
-
-    saved: Path
-    version: int
-    updates: list[dict[str, float]]
-    served: int  # version of the weights that inference had
-    error: str
-    addresses: set[str]  # at which its processes accepted connections
-
-
-def probes(updates: list[dict[str, float]]) -> list[float]:
-    """Differences between acting and learning, where they were measured."""
-    return [u["logprob/mismatch_max"] for u in updates if "logprob/mismatch_max" in u]
-
-
-@pytest.fixture(scope="module")
-def story(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Story]:
+@pytest.mark.slow
+def test_a_run_with_two_ranks_is_saved_and_loses_a_rank_that_hangs(tiny_checkpoint: Path, tmp_path: Path):
     config = tiny_run(tiny_checkpoint, trainer=TWO, launch=LaunchConfig(stall_s=25.0))
-    directory = tmp_path_factory.mktemp("saved")
-    engine = RayEngine(config, ("match",))
-    try:
+    with closing(RayEngine(config, ("match",))) as engine:
         pids = engine.pids()
         engine.train()
         updates: list[dict[str, float]] = []
         for progress in polls(engine):
             updates += progress.updates
-            heard = progress.inference.get("version", 0.0) > 0
-            if progress.version >= UPDATES and heard and len(probes(updates)) >= 2:
+            served = int(progress.inference.get("version", 0.0))
+            probes = [u["logprob/mismatch_max"] for u in updates if "logprob/mismatch_max" in u]
+            if progress.version >= UPDATES and served > 0 and len(probes) >= 2:
                 break
-        saved, addresses = engine.save(directory), set(listening())
-        served = int(progress.inference["version"])
+        saved, addresses = engine.save(tmp_path), set(listening())
         os.kill(pids["trainer rank 1"], signal.SIGSTOP)
-        with pytest.raises(WorkerError) as lost:
+        with pytest.raises(WorkerError, match=r"^trainer worker failed for good:"):
             drive(engine)
-        updates += saved.updates
-        yield Story(directory, saved.version, updates, served, str(lost.value), addresses)
-    finally:
-        engine.close()
+    assert addresses and addresses <= LOOPBACK
+    updates += saved.updates
+    assert [u["update"] for u in updates[: saved.version]] == [i + 1.0 for i in range(saved.version)]
+    assert 0 < served <= saved.version
+    assert all(np.isfinite(u["loss"]) and u["value_grad_norm"] > 0 and not u["skipped"] for u in updates)
+    assert [u["grad_norm"] > 0 for u in updates] == [False] + [True] * (len(updates) - 1)
+    assert max(probes) <= 1e-4, "decisions were made by whole weights that had been in parts"
 
-
-def test_two_ranks_train_and_publish(story: Story):
-    assert [u["update"] for u in story.updates[: story.version]] == [i + 1.0 for i in range(story.version)]
-    assert 0 < story.served <= story.version
-    assert all(
-        np.isfinite(u["loss"]) and u["value_grad_norm"] > 0 and u["skipped"] == 0 for u in story.updates
-    )
-    assert [u["grad_norm"] > 0 for u in story.updates] == [False] + [True] * (len(story.updates) - 1)
-
-
-def test_acting_and_learning_in_parts_agree(story: Story):
-    """Decisions were made by whole weights that had been in parts when they were published."""
-    assert max(probes(story.updates)) <= 1e-4
-
-
-def test_the_checkpoint_is_whole_and_has_moved(story: Story, tiny_checkpoint: Path):
     before = load_file(tiny_checkpoint / "model.safetensors")
-    after = load_file(story.saved / PRETRAINED / "model.safetensors")
+    after = load_file(tmp_path / PRETRAINED / "model.safetensors")
     assert {k: t.shape for k, t in after.items()} == {k: t.shape for k, t in before.items()}
     assert any(not torch.equal(after[k], before[k]) for k in before)
-    trained = snapshot.load(story.saved / TRAINING_STATE / WEIGHTS)
+    trained = snapshot.load(tmp_path / TRAINING_STATE / WEIGHTS)
     named = {k.removeprefix("policy."): v for k, v in trained.items() if k.startswith("policy.")}
     assert all(np.array_equal(after[k].numpy(), named[k]) for k in after if k in named) and len(named) > 20
-
-
-def test_ranks_listen_on_the_loopback_interface_only(story: Story):
-    assert story.addresses and story.addresses <= LOOPBACK
-
-
-def test_a_rank_that_hangs_ends_the_trainer(story: Story):
-    assert story.error.startswith("trainer worker failed for good:")

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import sys
 import time
@@ -22,19 +21,11 @@ from accerl_lerobot.engines.config import RunConfig, parse
 from accerl_lerobot.inference.batcher import Batcher, merge_metrics
 from accerl_lerobot.metrics import MetricsLog, WandBConfig
 from accerl_lerobot.run.loop import Loop
-from accerl_lerobot.run.train import make_engine
 from accerl_lerobot.timeline import ROLES, STATES
 from accerl_lerobot.world_model.latent import LatentModel
+from tests.runs import local_engine, records
 
 ROOT = Path(__file__).parents[1]
-
-
-def lines(directory: Path) -> list[dict[str, Any]]:
-    def constant(name: str) -> None:
-        raise AssertionError(f"{name} is not JSON")
-
-    text = (directory / "metrics.jsonl").read_text().splitlines()
-    return [json.loads(line, parse_constant=constant) for line in text]
 
 
 def events(directory: Path) -> dict[str, list[tuple[int, float]]]:
@@ -50,10 +41,10 @@ def events(directory: Path) -> dict[str, list[tuple[int, float]]]:
 def test_each_record_is_a_line_and_an_event(tmp_path: Path) -> None:
     log = MetricsLog(tmp_path, WandBConfig(), {})
     log.write("train", 1, {"loss": 0.5, "decisions": 128})
-    assert len(lines(tmp_path)) == 1, "on disk at once"
+    assert len(records(tmp_path)) == 1, "on disk at once"
     log.write("train", 2, {"loss": 0.25, "decisions": 130})
     log.close()
-    first, second = lines(tmp_path)
+    first, second = records(tmp_path)
     assert first | {"wall_s": 0} == {
         "kind": "train", "wall_s": 0, "update": 1, "loss": 0.5, "decisions": 128
     }  # fmt: skip
@@ -72,7 +63,7 @@ def test_what_json_does_not_know(tmp_path: Path) -> None:
     }  # fmt: skip
     log.write("evaluation", 7, values)
     log.close()
-    (record,) = lines(tmp_path)
+    (record,) = records(tmp_path)
     assert record["nan"] is None and record["inf"] is None
     assert (record["single"], record["whole"], record["yes"]) == (0.5, 3, True)
     assert record["tasks"] == {"a": {"ci95": [None, 1.0]}} and record["name"] == "during-1"
@@ -111,7 +102,7 @@ def test_a_tracker_that_fails_ends_nothing(
     log.write("train", 1, {"loss": 1.0})
     log.write("train", 2, {"loss": 0.5})
     log.close()
-    assert [line["loss"] for line in lines(tmp_path)] == [1.0, 0.5] and fails.call_count == 3
+    assert [line["loss"] for line in records(tmp_path)] == [1.0, 0.5] and fails.call_count == 3
     assert [m for m in caplog.messages if "the server is away" in m] == caplog.messages[:1]
 
 
@@ -137,8 +128,7 @@ def test_every_logged_number_is_explained(tiny_checkpoint: Path, monkeypatch: py
     ]  # fmt: skip
     told: set[str] = set()
     for more in (off_policy, []):
-        config = parse(RunConfig, arguments + more)
-        engine = make_engine(config, ("match",), history=1)
+        engine = local_engine(parse(RunConfig, arguments + more))
         try:
             engine.train()
             told_here: set[str] = set()

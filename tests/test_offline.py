@@ -17,11 +17,10 @@ from accerl_lerobot.cli import main
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos.dataset_files import read_labels
 from accerl_lerobot.envs import SimulatedConfig
-from accerl_lerobot.metrics import METRICS
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.loading import load_adapter
 from accerl_lerobot.world_model.latent import LatentModel
-from tests.runs import replacing
+from tests.runs import records, replacing
 from tests.tiny_datasets import record_dataset
 
 
@@ -59,8 +58,7 @@ def test_the_checkpoint_does_more_of_what_succeeded(algorithm, tiny_checkpoint, 
     before, after = (summary["imitation_loss"][when] for when in ("before", "after"))
     assert after["successes"] < 0.8 * before["successes"]
     assert after["successes"] - before["successes"] < after["failures"] - before["failures"]
-    kinds = [json.loads(line)["kind"] for line in (out / METRICS).read_text().splitlines()]
-    assert kinds == ["train"] * 2
+    assert [record["kind"] for record in records(out)] == ["train"] * 2
     last = out / "checkpoints" / "last" / "pretrained_model"
     assert summary["policy"] == str(last) and f"policy {last}\n" in said
     assert "; 8 episodes; " in said and "imitation loss of successes " in said, said
@@ -137,7 +135,7 @@ def test_the_chunk_critic_learns_from_recorded_episodes(
     summary = json.loads(capsys.readouterr().out)
     before, after = (summary["imitation_loss"][when]["successes"] for when in ("before", "after"))
     assert after < 0.9 * before
-    records = [json.loads(line) for line in (out / METRICS).read_text().splitlines()]
-    assert all("explained_variance" in record for record in records)
-    assert ("world_model_contrast" in records[-1]) == (model == "latent")
+    found = records(out)
+    assert all("explained_variance" in record for record in found)
+    assert ("world_model_contrast" in found[-1]) == (model == "latent")
     load_adapter(PolicyConfig(path=summary["policy"], device="cpu"))

@@ -33,6 +33,7 @@ from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.run import preflight, resuming
 from accerl_lerobot.run.resuming import resume_command
 from tests.policies.checkpoints import write_policy
+from tests.runs import records as logged
 from tests.runs import tiny_run
 from tests.tiny_datasets import one_process
 
@@ -58,8 +59,7 @@ def recipe(folder: Path, checkpoint: Path, **sections: Any) -> Path:
 
 def records(run: Path) -> list[dict[str, Any]]:
     """All that was logged, but how long it took."""
-    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-    return [{k: v for k, v in line.items() if k not in TIMES} for line in lines]
+    return [{k: v for k, v in record.items() if k not in TIMES} for record in logged(run)]
 
 
 def summary(run: Path) -> dict[str, Any]:

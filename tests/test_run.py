@@ -22,7 +22,7 @@ from accerl_lerobot.rollout.runner import EpisodePlan
 from accerl_lerobot.run import loop
 from accerl_lerobot.run import train as run
 from tests.rollout.environments import ended
-from tests.runs import tiny_run
+from tests.runs import records, tiny_run
 
 
 class Finished(NamedTuple):
@@ -52,11 +52,6 @@ def executed(config: RunConfig) -> Finished:
 @pytest.fixture(scope="module")
 def finished(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Finished:
     return executed(local_run(tiny_checkpoint, tmp_path_factory.mktemp("outputs") / "run"))
-
-
-def records(directory: Path, kind: str) -> list[dict[str, Any]]:
-    lines = [json.loads(line) for line in (directory / "metrics.jsonl").read_text().splitlines()]
-    return [line for line in lines if line["kind"] == kind]
 
 
 def test_the_summary_has_what_is_promised(finished: Finished):

@@ -11,14 +11,11 @@ import numpy as np
 import pytest
 
 from accerl_lerobot.demos import backbone
-from accerl_lerobot.envs import EnvConfig, LiberoConfig, MetaWorldConfig
-from benchmarks import environment, gpu, latency, transport
+from benchmarks import gpu, latency, transport
 from benchmarks import policy as bench
-from benchmarks.environment import BenchEnvironmentConfig, bench_environment
 from benchmarks.latency import BenchLatencyConfig, bench_latency, described
 from benchmarks.policy import BenchPolicyConfig
 from benchmarks.simulated_environment import LatencyConfig, read_trace
-from tests.envs.libero_assets import ASSETS, needs_assets
 from tests.runs import printed
 
 
@@ -46,31 +43,6 @@ def test_a_world_of_known_durations_is_timed(tmp_path: Path):
     assert len(trace.decisions) == result["decision_ms"]["n"] == 10
     assert len(trace.resets) == result["reset_ms"]["n"] == 5
     assert latency.table(result).row_count == 2
-
-
-LIBERO = LiberoConfig(task="libero_object/0", image_size=64, rendering="fast", assets=ASSETS)
-
-
-@pytest.mark.parametrize(
-    ("env", "least"),
-    [
-        pytest.param(MetaWorldConfig(), 10, id="metaworld"),
-        pytest.param(LIBERO, 3, marks=needs_assets, id="libero"),
-    ],
-)
-@pytest.mark.slow
-def test_three_arms_in_turns(env: EnvConfig, least: float):
-    pytest.importorskip("metaworld")
-    result = bench_environment(BenchEnvironmentConfig(env=env, seconds=0.3, rounds=1, chunk=5))
-    assert json.loads(json.dumps(result)) == result
-    arms = result["arms"]
-    for rates in arms.values():
-        assert len(rates["env_steps_per_s"]["blocks"]) == 2
-        assert rates["env_steps_per_s"]["min"] <= rates["env_steps_per_s"]["median"]
-    ours = arms["ours"]
-    assert ours["env_steps_per_s"]["median"] == pytest.approx(5 * ours["decisions_per_s"]["median"], rel=0.1)
-    assert result["ratio"]["min"] > least, "the whole point of our own environment"
-    assert "stock" in printed(environment.table(result))
 
 
 @pytest.fixture

@@ -16,8 +16,7 @@ from benchmarks.async_vs_sync import compare as compare_schedules
 from benchmarks.async_vs_sync import table as schedules_table
 from benchmarks.machinery import MachineryConfig
 from benchmarks.scaling import BenchScalingConfig, bench_scaling
-from benchmarks.throughput import BenchThroughputConfig, Block, bench_throughput
-from benchmarks.throughput import table as throughput_table
+from benchmarks.throughput import Block
 from tests.runs import printed
 
 
@@ -110,23 +109,3 @@ def test_an_engine_is_measured_and_learns(light_ray: None, monkeypatch: pytest.M
     assert blocks[ARMS.index("synchronous")].batch_size == 2.0, "in lock step both environments ask at once"
     monkeypatch.setattr(async_vs_sync, "TRIALS", 4)
     assert 0 <= async_vs_sync.success(2, "synchronous", 0) <= 1
-
-
-@pytest.mark.slow
-def test_a_recipe_is_measured_under_two_schedules(tiny_checkpoint: Path, tmp_path: Path):
-    recipe = tmp_path / "recipe.yaml"
-    recipe.write_text(
-        "env: {type: simulated, max_steps: 16}\n"
-        "rollout: {workers: 1, environments: 4, segment_length: 3}\n"
-        "replay: {capacity: 64, min_decisions: 16, max_unlearned_decisions: 32, samples_per_insert: 2.0}\n"
-        "trainer: {updates: 12, batch_decisions: 16, warmup_updates: 0, value_warmup_updates: 0}\n"
-    )
-    config = BenchThroughputConfig(
-        recipe=str(recipe), policy_path=str(tiny_checkpoint), schedules=("asynchronous", "synchronous"),
-        seconds=1.0, rounds=1,
-    )  # fmt: skip
-    result = bench_throughput(config)
-    assert [len(found["blocks"]) for found in result["schedules"].values()] == [2, 2]
-    assert all(found["decisions_per_s"]["min"] > 0 for found in result["schedules"].values())
-    shown = throughput_table(result)
-    assert shown.row_count == 2

@@ -18,15 +18,13 @@ from lerobot.rewards import RewardClassifierConfig, make_reward_pre_post_process
 from lerobot.rewards.classifier.modeling_classifier import Classifier
 from transformers import ResNetConfig, ResNetModel
 
-from accerl_lerobot.engines.config import LaunchConfig
 from accerl_lerobot.envs import JudgedEnvironment, RewardModelConfig, SimulatedConfig, make_environment
 from accerl_lerobot.envs.making import load_judge
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.run.preflight import check_environment, check_start
-from accerl_lerobot.run.train import make_engine
 from tests.policies.checkpoints import edit_config, write_smolvla
-from tests.runs import collect, tiny_run
+from tests.runs import collect, local_engine, tiny_run
 
 CAMERA = "observation.images.front"
 ENV = SimulatedConfig(image_size=128, max_steps=16)
@@ -105,9 +103,9 @@ def test_a_run_learns_from_what_it_says(encoder: Path, tmp_path: Path):
     checkpoint = write_smolvla(tmp_path / "policy", image=128)
     model = RewardModelConfig(path=str(tmp_path / "always"))
     rollout = RolloutConfig(environments=2, segment_length=3, reward_model=model)
-    config = tiny_run(checkpoint, env=ENV, rollout=rollout, launch=LaunchConfig(engine="local"))
+    config = tiny_run(checkpoint, env=ENV, rollout=rollout)
     check_start(config)
-    with closing(make_engine(config, ("match",), history=1)) as engine:
+    with closing(local_engine(config)) as engine:
         engine.train()
         results = collect(engine, "train", 4)
     assert all(result.success and result.decisions == 1 for result in results)

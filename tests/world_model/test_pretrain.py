@@ -21,7 +21,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.config import LearnableModelConfig
 from accerl_lerobot.world_model.imagined import World, load_world, read_content, save_world
 from accerl_lerobot.world_model.training import Trainer, uniform
-from tests.runs import replacing
+from tests.runs import records, replacing
 from tests.tiny_datasets import record_dataset
 from tests.world_model.test_pixels import dots, model
 
@@ -73,7 +73,7 @@ def test_from_a_dataset_to_a_check_and_another_check(
     }  # fmt: skip
     assert found["learnt"] + found["episodes"] == 12
     assert set(found["checks"]) == {"skill", "sensitivity", "auroc"}
-    losses = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+    losses = records(out)
     assert [line["step"] for line in losses] == [20] and {"image", "state", "success"} <= losses[0].keys()
     assert all(name in stderr for name in found["checks"]) and "FAILED on 2 episodes; see" in stderr
     world, content = load_world(out / "world_model"), read_content(out / "world_model")
@@ -100,7 +100,7 @@ def test_a_model_of_another_package_is_learned_and_checked_by_naming_it(
     out = tmp_path / "out"
     cli.main(arguments(demos, out, *NAMED, "--world_model.steps=300", "--world_model.lr=0.03"))
     found = json.loads(capsys.readouterr().out)
-    losses = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+    losses = records(out)
     assert 0 < losses[-1]["motion"] < 0.5, "in usual motions; of one that knows nothing it is 1 or more"
     assert not found["checks"]["skill"]["holds"], "its pictures never change"
     told = ["world-model-eval", f"--path={out / 'world_model'}", "--dataset.repo_id=a/b", "--device=cpu"]
