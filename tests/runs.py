@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import subprocess
@@ -13,9 +12,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-from rich.console import Console
-from rich.table import Table
 
 from accerl_lerobot.algorithms import AlgorithmConfig, ChunkCriticConfig, RatioConfig
 from accerl_lerobot.algorithms.config import TrainerConfig
@@ -51,13 +47,6 @@ def replacing(arguments: list[str], *more: str) -> list[str]:
     """A command line in which `more` replaces flags of the same names."""
     names = {argument.partition("=")[0] for argument in more}
     return [a for a in arguments if a.partition("=")[0] not in names] + list(more)
-
-
-def printed(table: Table) -> str:
-    """A table as a wide terminal shows it."""
-    console = Console(width=200, record=True, file=io.StringIO())
-    console.print(table)
-    return console.export_text()
 
 
 def tiny_run(checkpoint: Path, **sections: Any) -> RunConfig:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The asynchronous engine with a trainer of two ranks, all of it real: LeRobot's SmolVLA, Ray, gloo, FSDP2."""
+"""The asynchronous engine with a trainer of two ranks, all of it real: SmolVLA, Ray, gloo, FSDP2."""
 
 from __future__ import annotations
 

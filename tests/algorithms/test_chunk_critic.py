@@ -22,8 +22,8 @@ from accerl_lerobot.algorithms import (
     off_policy,
 )
 from accerl_lerobot.algorithms.chunk_critic import ChunkCriticUpdate
-from accerl_lerobot.algorithms.config import TrainerConfig
-from accerl_lerobot.algorithms.off_policy import AWRUpdate, Memory, OffPolicyUpdate, weights
+from accerl_lerobot.algorithms.config import OffPolicyConfig, TrainerConfig
+from accerl_lerobot.algorithms.off_policy import Memory, OffPolicyUpdate, weights
 from accerl_lerobot.algorithms.ratio_update import make_update
 from accerl_lerobot.envs import SimulatedConfig, make_environment
 from accerl_lerobot.errors import InputError, NonFiniteError
@@ -104,6 +104,14 @@ def learner(
 
 
 latent_learner = partial(learner, model=LatentConfig(latents=4))
+
+
+def learning(path: Path, algorithm: OffPolicyConfig, **trainer: Any) -> Any:
+    """An update without a teacher."""
+    torch.manual_seed(0)  # of the critic
+    adapter = load_adapter(PolicyConfig(path=str(path), device="cpu"))
+    config = TrainerConfig(**{"warmup_updates": 0, "value_warmup_updates": 0} | trainer)
+    return make_update(adapter, algorithm, config)
 
 
 def simulator(numbers: int) -> SimulatorState:
@@ -391,12 +399,6 @@ def test_imitation_is_flow_matching():
         torch.testing.assert_close(loss, torch.full((64,), off), atol=1e-3, rtol=1e-3)
 
 
-def imitator(checkpoint: Path, policy_steps: float, **trainer: Any) -> OffPolicyUpdate:
-    adapter = load_adapter(PolicyConfig(path=str(checkpoint), device="cpu"))
-    config = TrainerConfig(warmup_updates=0, value_warmup_updates=0, **trainer)
-    return OffPolicyUpdate(adapter, SelfImitationConfig(policy_steps=policy_steps), config)
-
-
 def tried(rng: np.random.Generator, reward: Callable[[float], float]) -> list[Segment]:
     """32 episodes of one random chunk; the reward is of its first action."""
     actions = rng.uniform(-1, 1, (32, 1, 4, 2)).astype(np.float32)
@@ -445,7 +447,9 @@ def test_teacher_and_policy_go_where_the_critic_leads(
 def test_blocks_that_forget_compute_again_and_learn_the_same(tiny_checkpoint: Path):
     counts, weights = [], []
     for forget in (False, True):
-        update = imitator(tiny_checkpoint, 1.0, activation_checkpointing=forget)
+        update = learning(
+            tiny_checkpoint, SelfImitationConfig(policy_steps=1.0), activation_checkpointing=forget
+        )
         calls: list[None] = []
         for module in update.adapter.policy.modules():
             module.register_forward_hook(lambda *_, calls=calls: calls.append(None))
@@ -458,15 +462,6 @@ def test_blocks_that_forget_compute_again_and_learn_the_same(tiny_checkpoint: Pa
         assert_close(mine, weights[1][name])
 
 
-def awr(checkpoint: Path, algorithm: AWRConfig | None = None, **trainer: Any) -> AWRUpdate:
-    torch.manual_seed(0)  # of the critic
-    adapter = load_adapter(PolicyConfig(path=str(checkpoint), device="cpu"))
-    config = TrainerConfig(**{"warmup_updates": 0, "value_warmup_updates": 0, "lr": 1e-3} | trainer)
-    update = make_update(adapter, algorithm or AWRConfig(), config)
-    assert isinstance(update, AWRUpdate)
-    return update
-
-
 def test_weights_by_hand():
     advantage = torch.tensor([-1.0, 0.0, 0.5, 2.0, 1e6])
     expected = [math.exp(-2), 1, math.exp(1), 20, 20]
@@ -476,7 +471,7 @@ def test_weights_by_hand():
 
 def test_a_step_weighs_each_row_by_its_advantage(tiny_checkpoint: Path):
     """Two decisions with known returns, a critic that says 0, and imitation losses of 1 and 3."""
-    update = awr(tiny_checkpoint, AWRConfig(policy_steps=1.0, beta=0.5), lr=0.0, value_lr=0.0)
+    update = learning(tiny_checkpoint, AWRConfig(policy_steps=1.0, beta=0.5), lr=0.0, value_lr=0.0)
     for value, reward in ((1.0, 0.0), (3.0, 1.0)):
         update.remember(episode([reward], actions=np.full((1, 4, 2), value, np.float32)))
     losses = update.adapter.processing.normalise(torch.tensor([1.0, 3.0])[:, None, None].expand(2, 4, 2))
@@ -497,7 +492,7 @@ def test_a_step_weighs_each_row_by_its_advantage(tiny_checkpoint: Path):
 
 
 def test_the_critic_learns_returns_and_leaves_the_policy_alone(tiny_checkpoint: Path):
-    update = awr(tiny_checkpoint, AWRConfig(policy_steps=1.0), lr=0.0, value_lr=3e-2)
+    update = learning(tiny_checkpoint, AWRConfig(policy_steps=1.0), lr=0.0, value_lr=3e-2)
     before = update.adapter.export_trainable()
     update.remember(episode([0.0, 0.0, 1.0]))
     for _ in range(60):
@@ -511,7 +506,7 @@ def test_the_critic_learns_returns_and_leaves_the_policy_alone(tiny_checkpoint: 
 def test_it_goes_where_returns_are_high(tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch):
     """The return is how far the first action goes up; nothing counts as a success."""
     monkeypatch.setattr(off_policy, "POLICY_BATCH", 32)
-    update = awr(tiny_checkpoint, AWRConfig(policy_steps=0.5, beta=0.3), value_lr=1e-2)
+    update = learning(tiny_checkpoint, AWRConfig(policy_steps=0.5, beta=0.3), lr=1e-3, value_lr=1e-2)
     rng, before = np.random.default_rng(0), first_action(update)
     for _ in range(6):
         segments = tried(rng, lambda up: (1 + up) / 2)
@@ -521,7 +516,7 @@ def test_it_goes_where_returns_are_high(tiny_checkpoint: Path, monkeypatch: pyte
     assert first_action(update) > before + 0.2
 
 
-@pytest.mark.parametrize("make", [learner, latent_learner, awr])
+@pytest.mark.parametrize("make", [learner, latent_learner, partial(learning, algorithm=AWRConfig())])
 def test_what_was_learnt_is_restored_to_the_last_bit(
     make: Callable[[Path], OffPolicyUpdate], tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -544,7 +539,7 @@ def test_what_was_learnt_is_restored_to_the_last_bit(
 
 def test_a_step_imitates_successes_only(tiny_checkpoint: Path):
     """The loss of a step equals the family's, averaged over those rows of its batch that succeeded."""
-    update = imitator(tiny_checkpoint, policy_steps=0.25, lr=0.0)
+    update = learning(tiny_checkpoint, SelfImitationConfig(policy_steps=0.25), lr=0.0)
     adapter = update.adapter
     adapter.family.imitation_loss = lambda encoded, chunk: chunk[:, 0, 0] + 0 * encoded.features.sum((1, 2))
     segments = []
@@ -559,7 +554,7 @@ def test_a_step_imitates_successes_only(tiny_checkpoint: Path):
 def test_less_memory_gives_the_same_step(tiny_checkpoint: Path):
     def step(**options: Any) -> tuple[dict[str, float], dict[str, np.ndarray]]:
         torch.manual_seed(0)
-        update = imitator(tiny_checkpoint, policy_steps=0.25, lr=1e-3, **options)
+        update = learning(tiny_checkpoint, SelfImitationConfig(policy_steps=0.25), lr=1e-3, **options)
         update.adapter.family.imitation_loss = lambda encoded, _: encoded.features.square().mean((1, 2))
         segment = episode([0.0, 0.0, 0.0, 1.0])
         segment.observations["observation.state"][:, 0] = np.arange(5)

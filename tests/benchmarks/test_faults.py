@@ -1,20 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The bench of faults: what it says of a run's books, and that it hits what it says."""
+"""Faults: orders are carried out once, and the books of a run that was hit."""
 
 from __future__ import annotations
 
 import json
+import os
+import re
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+import accerl_lerobot
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import CHECKPOINTS, TRAINING_STATE, save_checkpoint
 from accerl_lerobot.replay.buffer import Replay, ReplayConfig
 from accerl_lerobot.replay.journal import EPISODES, Journal
+from benchmarks import fault_injection
 from benchmarks.audit import audit_segments, audit_updates
-from benchmarks.fault_injection import POINTS
+from benchmarks.fault_injection import CRASHES, POINTS, FaultError, handle, inject, proof
 from benchmarks.faults import BenchFaultsConfig, bench_faults
 from benchmarks.hits import ANYWHERE, FAULTS, places
 from benchmarks.victims import CLASSES, Victim
@@ -93,3 +97,41 @@ def test_a_run_of_time_survives_what_is_done_to_it(tmp_path: Path):
     assert run["books"] and run["segments"] > 0
     written = json.loads((root / "faults.json").read_text())
     assert written["hits"] == result["hits"]
+
+
+@pytest.fixture
+def orders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """This process looks for orders here."""
+    monkeypatch.setattr(fault_injection, "_orders", fault_injection._Orders(tmp_path))
+    return tmp_path
+
+
+def test_it_happens_at_the_visit_that_was_ordered_and_once(orders: Path):
+    taken = inject(orders, "1", "replay.insert", "exception", at=3)
+    handle("replay.insert")
+    handle("replay.insert")
+    assert proof(taken) is None
+    with pytest.raises(FaultError, match=r"replay\.insert"):
+        handle("replay.insert")
+    said = proof(taken)
+    assert said is not None and said["pid"] == os.getpid() and said["point"] == "replay.insert"
+    handle("replay.insert")
+    inject(orders, "2", "replay.insert", "exception")
+    with pytest.raises(FaultError):  # visits are counted from the order on
+        handle("replay.insert")
+
+
+def test_what_is_not_finite_may_last(orders: Path):
+    inject(orders, "1", "trainer.loss", "nan", at=2, times=3)
+    assert [handle("trainer.loss") for _ in range(6)] == [False, True, True, True, False, False]
+
+
+def test_every_point_is_in_the_code_once_and_no_other_is():
+    found = [
+        point
+        for path in Path(accerl_lerobot.__file__).parent.rglob("*.py")
+        for point in re.findall(r'\bfault_point\("([a-z.]+)"', path.read_text())
+    ]
+    # Every worker's timeline is written by the same line.
+    assert sorted(found) == sorted(point for point in POINTS if not point.endswith(".timeline"))
+    assert all(set(faults) <= {*CRASHES, "nan", "full", "torn"} for faults in POINTS.values())
