@@ -23,7 +23,6 @@ from accerl_lerobot.timeline import (
     TRAINING,
     WAIT_IN,
     WAIT_OUT,
-    NoClock,
     Row,
     TimelineConfig,
     open_clock,
@@ -128,14 +127,6 @@ def test_a_damaged_file_is_named(tmp_path: Path, head: bytes) -> None:
         read_timeline(tmp_path)
 
 
-def test_without_a_folder_nothing_is_recorded() -> None:
-    clock = open_clock(None, "trainer")
-    assert isinstance(clock, NoClock)
-    with clock.during(COMPUTE):
-        clock.beat()
-    clock.close()
-
-
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
     """Ten seconds; the driver trains from the second to the eighth, with a checkpoint in between."""
@@ -163,16 +154,6 @@ def test_shares_of_a_part(run: Path) -> None:
     assert timeline.shares(timeline.training())["trainer"] == pytest.approx({"wait_in": 0.5, "compute": 0.5})
 
 
-def test_a_resumed_run_has_trained_twice(run: Path) -> None:
-    write_worker(run, "driver", [(RECOVERY, 5), (CHECKPOINT, 1), (RECOVERY, 1), (TRAINING, 3)], at_s=100)
-    write_worker(run, "trainer", [(RECOVERY, 6), (COMPUTE, 4)], at_s=100)
-    timeline = read_timeline(run)
-    assert timeline.training() == [(2.0, 8.0), (107.0, 110.0)]
-    assert timeline.shares(timeline.training())["trainer"] == pytest.approx(
-        {"wait_in": 3 / 9, "compute": 6 / 9}
-    )
-
-
 def test_a_worker_that_was_started_again_is_one_row_with_a_gap(tmp_path: Path) -> None:
     write_worker(tmp_path, "rollout 3", [(COMPUTE, 2)])
     write_worker(tmp_path, "rollout 3", [(RECOVERY, 1), (COMPUTE, 1)], at_s=4)
@@ -184,22 +165,6 @@ def test_a_worker_that_was_started_again_is_one_row_with_a_gap(tmp_path: Path) -
     write_worker(tmp_path, "rollout 3", [(COMPUTE, 1)], at_s=5.5)
     (row,) = read_timeline(tmp_path).rows
     assert (row.starts[1:] >= row.ends[:-1]).all() and row.ends[-1] == 6.5 * SECOND
-
-
-def test_workers_are_in_order(tmp_path: Path) -> None:
-    for worker in ("trainer", "rollout 10", "world-model learning", "rollout 9", "driver", "someone new"):
-        write_worker(tmp_path, worker, [(COMPUTE, 1)])
-    names = [row.worker for row in read_timeline(tmp_path).rows]
-    assert names == ["driver", "rollout 9", "rollout 10", "trainer", "world-model learning", "someone new"]
-
-
-def test_a_folder_without_a_run_and_a_run_without_a_timeline(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    (tmp_path / "empty").mkdir()
-    said = {"nowhere": "no such folder", "file": "a file", "empty": "no timeline in it"}
-    for name, text in said.items():
-        with pytest.raises(InputError, match=f"^runs='[^']*{name}': .*{text}"):
-            read_timeline(tmp_path / name)
 
 
 def test_a_trace_that_perfetto_shows(run: Path, tmp_path: Path, monkeypatch, capsys) -> None:
