@@ -7,11 +7,9 @@ import importlib.metadata
 import math
 import os
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
-import torch
 from safetensors import safe_open
 
 from accerl_lerobot import cli
@@ -121,15 +119,6 @@ class TestResources:
         monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(4)), raising=False)
         for module in (engine_sizes, doctor):
             monkeypatch.setattr(module, "memory_gib", lambda entry: 16.0)
-
-    def test_a_policy_is_compared_with_its_gpu(self, monkeypatch: pytest.MonkeyPatch, tiny_checkpoint: Path):
-        properties = SimpleNamespace(total_memory=2**20)
-        monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-        monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
-        monkeypatch.setattr(torch.cuda, "get_device_properties", lambda _: properties)
-        config = self.recipe(policy={"path": str(tiny_checkpoint), "device": "cuda"})
-        (check,) = doctor.gpu_memory(config)
-        assert check.status == WARN and "policy.tuning.mode=lora" in check.text
 
     @pytest.mark.parametrize(
         ("sections", "name", "words"),

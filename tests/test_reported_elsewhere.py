@@ -12,10 +12,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from accerl_lerobot.cli import main
-from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos.dataset_files import open_metadata, opened
 from accerl_lerobot.engines.config import RunConfig, parse
 from accerl_lerobot.envs import SimulatedConfig, make_environment
@@ -25,7 +23,7 @@ from accerl_lerobot.policies.features import check_features, env_features, polic
 from accerl_lerobot.policies.loading import load_lerobot_config
 from tests.policies.checkpoints import edit_config, write_smolvla
 from tests.policies.tiny import adapter_at, requests
-from tests.tiny_datasets import ACTION, FEATURES, FPS, FRONT, IMAGE, STATE, labels, rewrite, write_dataset
+from tests.tiny_datasets import ACTION, FPS, FRONT, IMAGE, STATE, labels, rewrite, write_dataset
 
 
 def test_a_recipe_from_windows_names_a_policy(tiny_checkpoint: Path, tmp_path: Path):
@@ -69,54 +67,30 @@ def test_a_policy_that_reads_an_instruction_warns_of_none(
         assert ("name it in env.task" in caplog.text) is warned
 
 
-def test_episodes_whose_borders_contradict_the_rows_are_refused(tmp_path: Path):
+def with_column(table: pa.Table, name: str, values: Any) -> pa.Table:
+    return table.set_column(table.schema.get_field_index(name), name, pa.array(values))
+
+
+def move_border(table: pa.Table) -> pa.Table:
+    return with_column(with_column(table, "dataset_to_index", [8, 12]), "dataset_from_index", [0, 8])
+
+
+def delay(table: pa.Table) -> pa.Table:
+    stamps = table.column("timestamp").to_numpy().copy()
+    stamps[2] += 1 / FPS
+    return with_column(table, "timestamp", stamps)
+
+
+@pytest.mark.parametrize(
+    ("file", "change", "message"),
+    [
+        ("meta/episodes", move_border, "data: row 6: by meta/episodes it is of another episode"),
+        ("data", delay, "data: row 2: its timestamp is not frame_index / 80"),
+    ],
+)
+def test_rows_that_contradict_the_metadata_are_refused(file: str, change: Any, message: str, tmp_path: Path):
     dataset = write_dataset(tmp_path / "data")
-
-    def move_border(table: pa.Table) -> pa.Table:
-        for name, values in (("dataset_to_index", [8, 12]), ("dataset_from_index", [0, 8])):
-            table = table.set_column(table.schema.get_field_index(name), name, pa.array(values))
-        return table
-
-    rewrite(tmp_path / "data/meta/episodes/chunk-000/file-000.parquet", move_border)
-    message = "data: row 6: by meta/episodes it is of another episode"
-    with pytest.raises(InputError, match=message), opened(dataset, open_metadata(dataset)):
-        pass
-
-
-def write_videos(root: Path) -> DatasetConfig:
-    """Two episodes of six frames of one grey each, with a file of videos for each episode."""
-    data = LeRobotDataset.create(
-        "a/b",
-        fps=FPS,
-        root=root,
-        features=FEATURES | {FRONT: IMAGE | {"dtype": "video"}},
-        video_files_size_in_mb=0.0001,  # type: ignore[arg-type]
-    )
-    for episode in range(2):
-        for step in range(6):
-            grey = np.full((32, 32, 3), 100 * episode + 15 * step + 10, np.uint8)
-            numbers = {STATE: np.zeros(4, np.float32), ACTION: np.zeros(2, np.float32)}
-            data.add_frame({FRONT: grey, "task": "Match the target", **numbers})
-        data.save_episode()
-    data.finalize()
-    return DatasetConfig(repo_id="a/b", root=str(root))
-
-
-def test_videos_in_several_files_and_timestamps_off_the_rate(tmp_path: Path):
-    dataset = write_videos(tmp_path / "data")
-    assert len(list((tmp_path / "data/videos").rglob("*.mp4"))) == 2
-    with opened(dataset, open_metadata(dataset)) as data:
-        greys = [255 * float(data[row][FRONT].mean()) for row in range(12)]
-    np.testing.assert_allclose(greys, [100 * (row // 6) + 15 * (row % 6) + 10 for row in range(12)], atol=6)
-
-    def delay(table: pa.Table) -> pa.Table:
-        stamps = table.column("timestamp").to_numpy().copy()
-        stamps[2] += 1 / FPS  # where the video has a frame, another one
-        column = table.schema.get_field_index("timestamp")
-        return table.set_column(column, "timestamp", pa.array(stamps))
-
-    rewrite(tmp_path / "data/data/chunk-000/file-000.parquet", delay)
-    message = "data: row 2: its timestamp is not frame_index / 80"
+    rewrite(tmp_path / "data" / file / "chunk-000/file-000.parquet", change)
     with pytest.raises(InputError, match=message), opened(dataset, open_metadata(dataset)):
         pass
 

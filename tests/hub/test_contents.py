@@ -246,15 +246,3 @@ def test_commands_in_the_card_are_commands(tmp_path: Path, kind: str):
     for line in commands:
         _, verb, *arguments = shlex.split(line)
         parse(CONFIGS[verb], [a for a in arguments if "config.yaml" not in a], recipe_class=RunConfig)
-
-
-def test_a_validation_is_reported(tmp_path: Path):
-    write_json(tmp_path / "world_model" / "config.json", {"spec": {}, "model": {}})
-    checks = {
-        "auroc": {"value": 0.97123, "above": 0.9, "holds": True},
-        "recall": {"value": 0.1, "holds": False},
-    }
-    write_json(tmp_path / "validation.json", {"passed": False, "checks": checks})
-    text = card_of(tmp_path / "world_model", "world model")
-    assert "**It failed validation**" in text and "| auroc | 0.9712 | yes |" in text
-    assert "| recall | 0.1 | no |" in text

@@ -316,23 +316,6 @@ def test_no_place_of_this_machine_is_named_by_a_world_model_or_dataset(hub: Fake
     assert "meta/info.json: data_path" in pull_refused(name="alice/data")
 
 
-def test_places_that_nothing_reads_are_no_reason_to_refuse(hub, policy, pushed, pulled, tmp_path):
-    pushed(policy)
-    config = json.loads((policy / "config.json").read_text()) | {"vlm_model_name": "/gone/backbone"}
-    elsewhere = {"dataset": {"root": "/data/mine"}, "output_dir": "/data/out"}
-    backbone = {"_name_or_path": "/gone/smolvlm", "text_config": {"_name_or_path": "/gone"}}
-    files = {
-        "config.json": config | {"pretrained_path": "/gone/pretrained"},
-        "train_config.json": elsewhere,
-        "backbone/config.json": backbone,
-        "backbone/tokenizer_config.json": {"name_or_path": "/gone", "pad_token": "/", "eos_token": "</s>"},
-    }
-    hub.plant(NAME, {name: json.dumps(content).encode() for name, content in files.items()})
-    pulled()
-    config = json.loads((tmp_path / "pulled" / "config.json").read_text())
-    assert config["vlm_model_name"] == str(tmp_path / "pulled" / "backbone")
-
-
 def test_a_policy_comes_back_as_it_was_and_loads(hub, tiny_checkpoint, tmp_path, pushed, pulled):
     """The last checkpoint of a run, with a critic and a backbone of its own; the run is moved meanwhile."""
     from lerobot.policies.factory import get_policy_class, make_pre_post_processors
