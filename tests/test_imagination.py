@@ -22,12 +22,10 @@ from accerl_lerobot.algorithms.ratio_update import RatioUpdate
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE, WORLD_MODEL
 from accerl_lerobot.console import Console
-from accerl_lerobot.demos import record
-from accerl_lerobot.demos.record import Expert, simulated_expert
 from accerl_lerobot.engines.config import DatasetConfig, RunConfig
 from accerl_lerobot.engines.contract import Progress
 from accerl_lerobot.engines.local import LocalEngine
-from accerl_lerobot.envs import Environment, SimulatedConfig, make_environment
+from accerl_lerobot.envs import SimulatedConfig, make_environment
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, REAL, Segment
 from accerl_lerobot.rollout.runner import EpisodePlans, RolloutConfig
@@ -246,22 +244,6 @@ def test_what_does_not_fit_is_refused_before_the_run_begins(
             check_imagination(changed)
     with pytest.raises(InputError, match=r"rollout\.episodes=2: use at least 4: each rollout worker needs"):
         replace(config, rollout=replace(config.rollout, workers=4, episodes=2))
-
-
-def test_each_task_that_play_records_has_an_expert(
-    tiny_checkpoint: Path, world_model: Path, monkeypatch: pytest.MonkeyPatch
-):
-    def only_match(environment: Environment, task: str) -> Expert:
-        if task != "match":
-            raise InputError("env.task", task, "no expert")
-        return simulated_expert(environment, task)
-
-    monkeypatch.setattr(record, "simulated_expert", only_match)
-    config = imagining(tiny_checkpoint, world_model)
-    config = replace(config, env=replace(ENV, task="match,mirror"))
-    check_imagination(replace(config, imagination=ImaginationConfig(environments=1, expert_episodes=1)))
-    with pytest.raises(InputError, match="env.task='mirror': no expert"):
-        check_imagination(replace(config, imagination=ImaginationConfig(environments=1)))
 
 
 def test_it_goes_on_with_what_it_has_learned_from_and_never_with_what_was_held_out(

@@ -66,31 +66,34 @@ def made(request: pytest.FixtureRequest, folder: Path) -> tuple[str, list[dict[s
 
 
 def assert_same(results: list[dict[str, Any]], expected: dict[str, Any], name: str) -> None:
-    """The first rank has the weights where each keeps a part; all have the metrics."""
+    """The first rank has the weights where each keeps a part; all have the metrics of the last updates."""
     for key, tensor in expected["weights"].items():
         assert_close(results[0]["weights"][key], tensor)
     for result in results:
-        assert_same_metrics(result["metrics"], expected["metrics"], name)
-
-
-def assert_same_metrics(found: list[dict[str, float]], expected: list[dict[str, float]], name: str) -> None:
-    assert len(found) == len(expected)
-    for update, (mine, theirs) in enumerate(zip(found, expected, strict=True)):
-        assert mine.keys() == theirs.keys()
-        uneven = OF_RATIOS if name == "counted" else ()
-        for key in mine.keys() - {*OF_A_PART, *uneven}:
-            close = pytest.approx(theirs[key], rel=TOLERANCE, abs=TOLERANCE, nan_ok=True)
-            assert mine[key] == close, f"{name}, update {update}: {key}"
+        found = result["metrics"]
+        for update, (mine, theirs) in enumerate(zip(found, expected["metrics"][-len(found) :], strict=True)):
+            assert mine.keys() == theirs.keys()
+            for key in mine.keys() - {*OF_A_PART, *(OF_RATIOS if name == "counted" else ())}:
+                close = pytest.approx(theirs[key], rel=TOLERANCE, abs=TOLERANCE, nan_ok=True)
+                assert mine[key] == close, f"{name}, update {update}: {key}"
 
 
 @pytest.mark.slow
-def test_ranks_make_the_updates_of_one(made: Any, alone: dict[str, dict[str, Any]]):
+def test_ranks_make_the_updates_of_one_and_go_on_from_each_other(made: Any, alone: dict[str, dict[str, Any]]):
     name, results = made
-    before = sharded.cases()[name].adapter().export_trainable()
-    expected = alone[name]
+    case, expected = sharded.cases()[name], alone[name]
+    before = case.adapter().export_trainable()
     moved = [np.abs(expected["weights"][key] - tensor).max() for key, tensor in before.items()]
     assert max(moved) > 1e-2, "the case teaches nothing"
+    assert len(results[0]["metrics"]) == len(expected["metrics"])
     assert_same(results, expected, name)
+    resumed = [result["resumed"] for result in results]
+    saved = results[0]["half"]
+    assert saved["update"].keys() == expected["half"]["update"].keys()
+    resumed.append(sharded.run(case, sharded.config_of(case, "ddp", 1), saved))
+    assert {len(result["metrics"]) for result in resumed} == {len(expected["metrics"]) // 2}
+    assert_same(resumed[:-1], expected, name)
+    assert_same(resumed[-1:], expected, name)
 
 
 @pytest.mark.slow
@@ -98,8 +101,8 @@ def test_ranks_know_the_same_to_the_last_bit(made: Any):
     """So that none of them skips an update that another makes."""
     first, *others = made[1]
     for other in others:
-        assert [list(m) for m in first["metrics"]] == [list(m) for m in other["metrics"]]
         for mine, theirs in zip(first["metrics"], other["metrics"], strict=True):
+            assert list(mine) == list(theirs)
             np.testing.assert_array_equal(list(mine.values()), list(theirs.values()))
         for key, tensor in other["weights"].items():
             if tensor.size:  # else its part has gone to the first
@@ -107,32 +110,11 @@ def test_ranks_know_the_same_to_the_last_bit(made: Any):
 
 
 @pytest.mark.slow
-def test_ranks_go_on_from_the_checkpoint_of_one(made: Any, alone: dict[str, dict[str, Any]]):
-    name, results = made
-    expected = alone[name]
-    resumed = [result["resumed"] for result in results]
-    half = len(expected["metrics"]) - len(resumed[0]["metrics"])
-    assert half > 0
-    assert_same(resumed, expected | {"metrics": expected["metrics"][half:]}, name)
-
-
-@pytest.mark.slow
-def test_one_goes_on_from_the_checkpoint_of_ranks(made: Any, alone: dict[str, dict[str, Any]]):
-    name, results = made
-    case, expected = sharded.cases()[name], alone[name]
-    saved = results[0]["half"]
-    assert saved["update"].keys() == expected["half"]["update"].keys()
-    resumed = sharded.run(case, sharded.config_of(case, "ddp", 1), saved)
-    half = len(expected["metrics"]) - len(resumed["metrics"])
-    assert_same([resumed], expected | {"metrics": expected["metrics"][half:]}, name)
-
-
-@pytest.mark.slow
 def test_the_cases_meet_what_they_are_for(alone: dict[str, dict[str, Any]]):
     assert alone["broken"]["metrics"][-1]["skipped"] == 2
-    assert any("logprob/mismatch_mean" in metrics for metrics in alone["whole"]["metrics"])
     assert min(metrics["decisions"] for metrics in alone["few"]["metrics"]) == 1, "three ranks, one decision"
     whole = alone["whole"]["metrics"]
+    assert any("logprob/mismatch_mean" in metrics for metrics in whole)
     assert all(metrics["value_grad_norm"] > 0.05 for metrics in whole), "clipped"
     assert all(metrics["grad_norm"] > 0.05 for metrics in whole[1:]), "clipped, once the policy learns"
 
