@@ -25,11 +25,10 @@ from accerl_lerobot.console import Console
 from accerl_lerobot.engines.config import DatasetConfig, RunConfig
 from accerl_lerobot.engines.contract import Progress
 from accerl_lerobot.engines.local import LocalEngine
-from accerl_lerobot.envs import SimulatedConfig, make_environment
+from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, REAL, Segment
-from accerl_lerobot.rollout.runner import EpisodePlans, RolloutConfig
-from accerl_lerobot.rollout.worker import RolloutWorker
+from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.run.train import Run
 from accerl_lerobot.timeline import read_timeline
 from accerl_lerobot.world_model.config import (
@@ -213,18 +212,6 @@ def test_it_runs_asynchronously(tiny_checkpoint: Path, world_model: Path, tmp_pa
     assert {"compute", "wait_in"} <= spent["world-model learning"].keys()
     saved = snapshot.load(tmp_path / "saved" / TRAINING_STATE / ONLINE)
     assert saved["trainer"]["count"] >= last.world_model["learn_steps"]
-
-
-def test_a_process_that_takes_anothers_place_imagines_from_its_episodes(world_model: Path):
-    """Although its real episodes have all been played, and it has seen none of them."""
-    imagination = ImaginationConfig(environments=1, path=str(world_model))
-    worker = RolloutWorker(ENV, RolloutConfig(environments=1), imagination=imagination)
-    worker.ready(EpisodePlans(("match",), 0, budget=0), [("match", 5)])
-    worker.report(True, [])
-    plan = worker._next(IMAGINED)
-    assert worker._next(REAL) is None and plan is not None and plan.task == "match"
-    first, real = worker._environments[1].reset(plan.seed, "match"), make_environment(ENV).reset(5, "match")
-    assert np.array_equal(first["observation.images.front"], real["observation.images.front"])
 
 
 def test_what_does_not_fit_is_refused_before_the_run_begins(

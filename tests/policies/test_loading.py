@@ -4,8 +4,11 @@
 from __future__ import annotations
 
 import json
+import os
 import pickle
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +23,7 @@ from accerl_lerobot.checkpoint.layout import BACKBONE, PRETRAINED, displaced, sa
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import stack_observations
 from accerl_lerobot.policies.config import FlowSamplerConfig, PolicyConfig
+from accerl_lerobot.policies.deferred import OURS
 from accerl_lerobot.policies.loading import (
     dry_run_config,
     load_adapter,
@@ -459,3 +463,27 @@ def test_pictures_that_were_never_normalised_are_accepted_with_a_warning(damaged
     (warning,) = [record.getMessage() for record in caplog.records]
     assert "no mean and std of observation.images.front" in warning
     assert "pictures go in as they are" in warning
+
+
+CODE = """
+import sys
+from accerl_lerobot.policies.config import PolicyConfig, register_policies
+from accerl_lerobot.policies.loading import load_adapter
+
+load_adapter(PolicyConfig(path=sys.argv[1], device="cpu"))  # as trainer and inference begin
+loaded = [n for n in ("smolvla", "act", "groot") if f"lerobot.policies.{n}.processor_{n}" in sys.modules]
+assert loaded == ["smolvla"], loaded
+from lerobot.configs.policies import PreTrainedConfig
+assert {"smolvla", "act", "groot"} <= set(PreTrainedConfig.get_known_choices())
+from lerobot.policies.factory import get_policy_class
+from lerobot.policies.act import ACTPolicy
+assert get_policy_class("act") is ACTPolicy
+register_policies("of another package")
+assert "lerobot.policies.groot.processor_groot" in sys.modules
+"""
+
+
+@pytest.mark.slow
+def test_one_policy_is_imported_without_the_others(tiny_checkpoint: Path):
+    command = [sys.executable, "-c", CODE, str(tiny_checkpoint)]
+    subprocess.run(command, check=True, timeout=300, env=os.environ | {OURS: "1"})

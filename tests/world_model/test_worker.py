@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import os
 import signal
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +22,12 @@ from accerl_lerobot.run.train import make_engine
 from accerl_lerobot.trainer import worker as trainer_worker
 from accerl_lerobot.trainer.worker import TrainerWorker
 from accerl_lerobot.world_model import worker as module
+from accerl_lerobot.world_model.config import LatentConfig, StateModelConfig
+from accerl_lerobot.world_model.latent import LatentModel
 from accerl_lerobot.world_model.state_learner import BATCH, StateLearner
 from accerl_lerobot.world_model.states import Transitions
 from accerl_lerobot.world_model.worker import RemoteStateLearner, WorldModelWorker
 from tests.runs import off_policy_run, polls
-from tests.world_model.small_latent import SmallLatentConfig
 from tests.world_model.test_latent import NUMBERS, model, transitions
 
 
@@ -124,6 +125,18 @@ def test_nobody_waits_while_steps_are_under_way_but_each_call_has_a_timeout(
         there.collect()
     there.wait()
     assert len(there.collect()) == 1 and not there.busy
+
+
+@StateModelConfig.register_subclass("small_latent")
+@dataclass(frozen=True, kw_only=True)
+class SmallLatentConfig(LatentConfig):
+    make = "tests.world_model.test_worker:SmallLatent"
+
+    latents: int = 8
+
+
+class SmallLatent(LatentModel):
+    first_steps = 20
 
 
 class HastyTrainer(TrainerWorker):
