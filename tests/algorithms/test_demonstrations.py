@@ -93,6 +93,7 @@ def test_decisions_are_the_frames_from_every_step_on(dataset: DatasetConfig, lik
         ({"next.success": [0, 0, 1, 1, 1, 1]}, 3, [0, 0, 1], True),
         ({"next.success": [1] * 6}, 6, [0, 0, 0, 0, 0, 1], True),  # the episode's label, at every frame
         ({"next.success": [0] * 6}, 6, [0] * 6, False),
+        ({"next.success": [0, 1, 0, 0, 0, 0]}, 2, [0, 1], True),
         ({"next.success": [0, 1, 1, 1, 1, 1], "next.reward": [-1, -2, 0, 0, 0, 0]}, 2, [-1, -2], True),
         ({"next.reward": [0, 0, 0, 1, 1, 1]}, 4, [0, 0, 0, 1], True),
         ({"next.reward": [0] * 6}, 6, [0] * 6, False),

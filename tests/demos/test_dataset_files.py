@@ -24,7 +24,6 @@ from accerl_lerobot.demos.dataset_files import (
     opened,
     read_labels,
     step_of_reward,
-    step_of_success,
     task_texts,
 )
 from accerl_lerobot.demos.sft import picked
@@ -235,20 +234,6 @@ def test_depth_is_decoded(tmp_path: Path):
 
 
 SUCCESS, REWARD = "next.success", "next.reward"
-
-
-@pytest.mark.parametrize(
-    ("flags", "step"),
-    [
-        ([0, 0, 1, 1], 2),
-        ([0, 1, 0, 0], 1),
-        ([1, 1, 1, 1], 3),  # the episode's label, at every frame
-        ([1, 0, 0, 0], 0),
-        ([0, 0, 0, 0], -1),
-    ],
-)
-def test_the_step_of_success(flags: list[int], step: int):
-    assert step_of_success(np.array(flags)) == step
 
 
 @pytest.mark.parametrize(

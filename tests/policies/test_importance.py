@@ -40,17 +40,23 @@ class Case(NamedTuple):
     """That of μ, (B,)."""
 
 
-def network(size: int, pi: bool) -> Callable[[Tensor, Any], Tensor]:
-    """A nonlinear mix of `size` entries, each of which hangs on every other."""
+def mixture(size: int, pi: bool) -> tuple[Tensor, Tensor]:
+    """Weights and biases of a mix of `size` entries, each of which hangs on every other."""
     base, other = torch.Generator().manual_seed(7), torch.Generator().manual_seed(8)
     mix, added = 0.3 * torch.randn(size, size, generator=base), torch.zeros(size)
     mix[:2] = torch.tensor([0.3] + [0.8] * (size - 1))
     if pi:
         mix += 0.1 * torch.randn(size, size, generator=other)
         added = torch.tensor([-0.2] + [0.6] * (size - 1))
+    return mix, added
+
+
+def network(size: int, pi: bool) -> Callable[[Tensor, Any], Tensor]:
+    mix, added = mixture(size, pi)
 
     def predict(x: Tensor, t: Any) -> Tensor:
-        return (torch.tanh(x.flatten(1) @ mix.T + 0.3 * torch.as_tensor(t).view(-1, 1)) + added).view(x.shape)
+        mixed = x.flatten(1) @ mix.T.to(x) + 0.3 * torch.as_tensor(t).view(-1, 1).to(x)
+        return (torch.tanh(mixed) + added.to(x)).view(x.shape)
 
     return predict
 
@@ -168,105 +174,60 @@ def test_the_learned_std_of_a_gaussian_does_not_shape_the_features():
 
 
 STD = 0.3
-CONFIG = FlowSamplerConfig(noise_level=STD)
-ROW_MIX = np.array([[0.2, -0.5, 0.3], [0.4, 0.1, -0.2], [-0.3, 0.6, 0.5]])
-DIM_MIX = np.array(
-    [[0.5, 0.8, -0.4, 0.3], [-0.6, 0.2, 0.7, -0.9], [0.9, -0.5, 0.1, 0.4], [0.2, 0.7, -0.8, 0.6]]
-)
 
 
-def sizes(num_steps: int) -> FlowShape:
-    """Three rows of which two are executed, two real dims and two padded ones."""
-    return FlowShape(num_steps=num_steps, chunk_size=3, executed=2, padded_dim=4, action_dim=2)
+def flow_of(num_steps: int, dtype: torch.dtype = torch.float64) -> tuple[FlowFamily, Tensor, Tensor]:
+    """Three rows of which two are executed, two real dims and two padded ones; noise of six decisions."""
+    shape = FlowShape(num_steps=num_steps, chunk_size=3, executed=2, padded_dim=4, action_dim=2)
+    generator = torch.Generator().manual_seed(num_steps)
+    x0, eps = (torch.randn(6, 3, 4, generator=generator, dtype=dtype) for _ in range(2))
+    return FlowFamily(SimpleNamespace(shape=shape), FlowSamplerConfig(noise_level=STD)), x0, eps
 
 
-def family(shape: FlowShape, config: FlowSamplerConfig = CONFIG) -> FlowFamily:
-    return FlowFamily(SimpleNamespace(shape=shape), config)
-
-
-def velocity(x: Tensor, t: Tensor) -> Tensor:
-    """Every entry feeds back into every other, padded ones and rows that are not executed included."""
-    rows, dims = torch.from_numpy(ROW_MIX).to(x), torch.from_numpy(DIM_MIX).to(x)
-    return torch.tanh(rows @ x @ dims + t[:, None, None]) + 0.3 * x
-
-
-def slow_velocity(x: np.ndarray, t: float) -> np.ndarray:
-    return np.tanh(ROW_MIX @ x @ DIM_MIX + t) + 0.3 * x
-
-
-def slow_integrate(x0: np.ndarray, shape: FlowShape) -> np.ndarray:
-    """(B, K, D) from initial noise (B, K, D)."""
-    n = shape.num_steps
+def slow_integrate(x0: np.ndarray, num_steps: int) -> np.ndarray:
+    """(B, K, D) from initial noise (B, K, D), one decision at a time."""
+    mix, added = (part.double().numpy() for part in mixture(12, MU))
     result = np.zeros(x0.shape)
     for b in range(len(x0)):
-        x = x0[b].astype(np.float64)
-        for k in range(n):
-            x = x - slow_velocity(x, (n - k) / n) / n
-        result[b] = x
+        x = x0[b].ravel()
+        for k in range(num_steps):
+            x = x - (np.tanh(mix @ x + 0.3 * (num_steps - k) / num_steps) + added) / num_steps
+        result[b] = x.reshape(x0[b].shape)
     return result
-
-
-def slow_log_prob(x0: np.ndarray, x: np.ndarray, shape: FlowShape) -> np.ndarray:
-    """(B,) log-density of x (B, K, D) given the initial noise x0 (B, K, D)."""
-    means = slow_integrate(x0, shape)
-    result = np.zeros(len(x0))
-    for b in range(len(x0)):
-        for row in range(shape.executed):
-            for dim in range(shape.action_dim):
-                z = (float(x[b, row, dim]) - means[b, row, dim]) / STD
-                result[b] += -0.5 * z**2 - math.log(STD * math.sqrt(2 * math.pi))
-    return result
-
-
-def draws(shape: FlowShape, count: int = 6, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
-    generator = torch.Generator().manual_seed(shape.num_steps)
-    size = (count, shape.chunk_size, shape.padded_dim)
-    x0, eps = (torch.randn(size, generator=generator, dtype=dtype) for _ in range(2))
-    return x0, eps
-
-
-def explore_all(x0: Tensor) -> Tensor:
-    return torch.ones(len(x0), dtype=torch.bool)
-
-
-def plain_ode(x: Tensor, num_steps: int) -> Tensor:
-    """LeRobot's loop."""
-    dt = -1.0 / num_steps
-    for step in range(num_steps):
-        x = x + dt * velocity(x, torch.tensor(1.0 + step * dt).to(x).expand(len(x)))
-    return x
 
 
 @pytest.mark.parametrize("num_steps", [1, 2, 3, 4])
-def test_the_action_and_its_density_are_the_oracle_s(num_steps: int):
-    shape = sizes(num_steps)
-    x0, eps = draws(shape)
-    flow = family(shape)
-    _, latent, log_prob = flow.sample(velocity, x0, eps, explore_all(x0))
-    x = latent["path"][:, 1]
-    expected = slow_log_prob(x0.numpy(), x.numpy(), shape)
-    mean = slow_integrate(x0.numpy(), shape)
-    assert np.allclose(x.numpy(), mean + STD * eps.numpy(), atol=1e-12)
-    assert log_prob.shape == (6, shape.executed)
-    assert np.allclose(log_prob.sum(1), expected, atol=1e-10)
+def test_the_flow_s_action_and_its_density_are_the_oracle_s(num_steps: int):
+    flow, x0, eps = flow_of(num_steps)
+    velocity = network(12, MU)
+    _, latent, log_prob = flow.sample(velocity, x0, eps, torch.ones(6, dtype=torch.bool))
+    x, mean = latent["path"][:, 1].numpy(), slow_integrate(x0.numpy(), num_steps)
+    expected = np.zeros(6)
+    for b in range(6):
+        for row in range(2):
+            for dim in range(2):
+                z = (x[b, row, dim] - mean[b, row, dim]) / STD
+                expected[b] += -0.5 * z**2 - math.log(STD * math.sqrt(2 * math.pi))
+    assert np.allclose(x, mean + STD * eps.numpy(), atol=1e-12)
+    assert log_prob.shape == (6, 2) and np.allclose(log_prob.sum(1), expected, atol=1e-10)
     assert torch.allclose(flow.log_prob(velocity, latent), log_prob, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("num_steps", [1, 2, 3, 4])
-def test_not_exploring_is_the_stock_sampler_bit_for_bit(num_steps: int):
-    shape = sizes(num_steps)
-    x0, eps = draws(shape, dtype=torch.float32)
-    stock = plain_ode(x0, num_steps)
-    still, everyone = torch.zeros(6, dtype=torch.bool), explore_all(x0)
+def test_a_flow_that_does_not_explore_is_the_stock_sampler_bit_for_bit(num_steps: int):
+    flow, x0, eps = flow_of(num_steps, torch.float32)
+    velocity, stock, dt = network(12, MU), x0, -1.0 / num_steps
+    for step in range(num_steps):  # LeRobot's loop
+        stock = stock + dt * velocity(stock, torch.tensor(1.0 + step * dt).expand(6))
 
-    def sample(explore: Tensor) -> tuple[Tensor, Tensor]:
-        _, latent, log_prob = family(shape).sample(velocity, x0, eps, explore)
+    def sample(*explore: bool) -> tuple[Tensor, Tensor]:
+        _, latent, log_prob = flow.sample(velocity, x0, eps, torch.tensor(explore))
         return latent["path"][:, 1], log_prob
 
-    x, log_prob = sample(still)
+    x, log_prob = sample(*[False] * 6)
     assert torch.equal(x, stock) and not log_prob.any()
     some = torch.tensor([True, False, False, True, False, True])
-    (mixed, mixed_log_prob), (exploring, exploring_log_prob) = sample(some), sample(everyone)
+    (mixed, mixed_log_prob), (exploring, exploring_log_prob) = sample(*some), sample(*[True] * 6)
     assert torch.equal(mixed[~some], stock[~some]) and torch.equal(mixed[some], exploring[some])
     assert torch.equal(mixed_log_prob[some], exploring_log_prob[some])
     assert not mixed_log_prob[~some].any()

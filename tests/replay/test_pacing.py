@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pacing under thousands of random and hostile steps: never stuck, over-used, or staler than stated."""
 
-import math
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import Any
@@ -11,7 +10,7 @@ import pytest
 
 from accerl_lerobot.engines.config import lag_limits
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.replay.buffer import Replay, ReplayConfig, draws_for, lag_bound
+from accerl_lerobot.replay.buffer import Replay, ReplayConfig, lag_bound
 from accerl_lerobot.rollout.runner import RolloutConfig
 from tests.replay.segments import assert_books_balance, make_segment
 
@@ -42,18 +41,6 @@ def test_one_side_may_always_move_in_every_state() -> None:
                 assert replay.may_insert() or replay.may_sample(batch)
     with pytest.raises(InputError, match=r"replay\.max_unlearned_decisions=12"):
         config.check(batch_decisions=13, segment_decisions=4)
-
-
-@pytest.mark.parametrize("rate", [1.0, 1.1, 1.5, 2.0, 3.9])
-def test_entitlement_averages_to_the_rate_and_never_exceeds_it(rate: float) -> None:
-    rng = np.random.default_rng(0)
-    carry, inserted, granted = 0.0, 0, 0
-    for _ in range(5000):
-        n = int(rng.integers(1, 17))
-        draws, carry = draws_for(rate, n, carry)
-        assert draws in (math.floor(rate), math.ceil(rate)) and -1e-6 < carry < 16 + 1e-6
-        inserted, granted = inserted + n, granted + draws * n
-        assert -1e-6 < rate * inserted - granted < 16 + 1e-6
 
 
 def test_a_pace_that_could_stall_or_waste_is_refused() -> None:

@@ -7,7 +7,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,8 +17,6 @@ from accerl_lerobot.experience import Decision, Request, Segment
 from accerl_lerobot.rollout import worker as module
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodePlans, EpisodeResult, RolloutConfig
 from accerl_lerobot.rollout.worker import MAX_PENDING, RolloutWorker
-from accerl_lerobot.transport import connection
-from accerl_lerobot.transport.connection import ServiceStoppedError
 from tests.rollout.environments import evaluate
 from tests.runs import HANGS_S
 from tests.transport.played import played
@@ -46,7 +43,6 @@ class Stage:
         self.over = False
         self.held: list[tuple[Future[list[Decision]], int]] | None = None
         self.failure: BaseException | None = None
-        self.decision: Callable[[Request], Decision] = a_decision
         self._insert = insert
         self.thread = threading.Thread(target=self._run, daemon=True)
         self.thread.start()
@@ -86,7 +82,7 @@ class Stage:
         if self.held is not None and not requests[0].explore:
             self.held.append((Future(), len(requests)))
             return self.held[-1][0]
-        return [self.decision(request) for request in requests]
+        return [a_decision() for _ in requests]
 
     def hold(self) -> None:
         """Lets evaluation decisions wait until `release`."""
@@ -106,15 +102,9 @@ class Stage:
             self.failure = error
 
 
-def a_decision(request: Request | None = None) -> Decision:
+def a_decision() -> Decision:
     zeros = np.zeros((4, 2), np.float32)
     return Decision(chunk=zeros, latent={"x": zeros}, log_prob=np.zeros(4, np.float32), version=0)
-
-
-def drawn(request: Request) -> Decision:
-    """A decision that depends on its request alone."""
-    chunk = np.random.default_rng(request.noise_seed).uniform(-1, 1, (4, 2)).astype(np.float32)
-    return replace(a_decision(), chunk=chunk)
 
 
 @pytest.fixture
@@ -177,28 +167,6 @@ def test_an_insert_that_fails_ends_the_worker(stage):
     one.order(True)
     one.thread.join(timeout=HANGS_S)
     assert isinstance(one.failure, OSError)
-
-
-def test_a_worker_outlives_its_inference_and_plays_what_it_would_have_played(
-    stage, monkeypatch: pytest.MonkeyPatch
-):
-    """Decisions are of their requests alone; the service is lost with requests under way, and comes back."""
-    monkeypatch.setattr(connection, "RETRY_S", 0.05)
-    played_out = []
-    for lost in (False, True):
-        one = stage(lambda segments: True)
-        one.decision = drawn
-        if lost:
-            one.hold()
-        one.order(False, planned(12))
-        if lost:
-            one.until(lambda one=one: len(one.held or []) >= 2, training=False)
-            lost_requests, one.held = one.held, None
-            lost_requests[0][0].set_exception(ServiceStoppedError("the forward pass fell over"))
-        one.until(lambda one=one: len(one.evaluated) == 12, training=False)
-        results = sorted(one.evaluated, key=lambda result: result.plan.index)
-        played_out.append([(r.plan, r.success, r.episode_return, r.decisions) for r in results])
-    assert played_out[0] == played_out[1]
 
 
 @pytest.mark.parametrize("in_environment", [True, False])
