@@ -24,7 +24,7 @@ from accerl_lerobot.cli import verbs
 from accerl_lerobot.console import Console
 from accerl_lerobot.engines.config import LaunchConfig, encode
 from accerl_lerobot.engines.stopping import WorkerError
-from accerl_lerobot.errors import InputError, kept_traceback, one_line
+from accerl_lerobot.errors import InputError
 
 if TYPE_CHECKING:
     from accerl_lerobot.run.train import Run
@@ -122,15 +122,6 @@ def test_control_characters_are_escaped_where_a_message_becomes_a_line(error, mo
     err = capsys.readouterr().err
     assert all(character.isprintable() or character == "\n" for character in err)
     assert err.count("\\x1b[2J") == 5 + isinstance(error, InputError) and "\\u202e" in err
-
-
-def test_an_error_in_a_run_leaves_its_traceback_in_the_folder(tmp_path: Path) -> None:
-    with pytest.raises(ZeroDivisionError) as caught, kept_traceback(tmp_path):
-        raise ZeroDivisionError("by zero")
-    assert one_line(caught.value) == f"ZeroDivisionError: by zero; the traceback is in {tmp_path}/error.log"
-    assert "in test_an_error_in_a_run" in (tmp_path / "error.log").read_text()
-    with pytest.raises(InputError), kept_traceback(tmp_path / "no_such_folder"):
-        raise InputError("seed", 1, "use another")
 
 
 def test_a_reader_that_has_gone_ends_the_command_quietly() -> None:

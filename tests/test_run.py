@@ -17,7 +17,6 @@ from accerl_lerobot.engines.contract import Engine, Progress, Saved
 from accerl_lerobot.engines.stopping import WorkerError
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.evaluation import EvaluationConfig
-from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.rollout.runner import EpisodePlan
 from accerl_lerobot.run import loop
 from accerl_lerobot.run import train as run
@@ -119,23 +118,6 @@ def test_evaluations_are_logged_in_order_with_the_weights_they_used(finished: Fi
     assert all(0 < r["version_min"] <= r["version_max"] <= 12 for r in found[1:3])
     steps = [r["env_steps"] for r in found]
     assert steps == sorted(steps) and steps[-1] == finished.summary["env_steps"]
-
-
-def test_checkpoints_load_again(finished: Finished):
-    from accerl_lerobot.policies.loading import load_adapter
-
-    checkpoints = finished.directory / "checkpoints"
-    names = sorted(path.name for path in checkpoints.iterdir() if not path.is_symlink())
-    assert names == ["000000", "000005", "000010", "000012"]
-    assert (checkpoints / "last").resolve().name == "000012"
-    step = json.loads((checkpoints / "000010" / "training_state" / "training_step.json").read_text())
-    assert step["step"] == 10
-    weights = []
-    for name in ("000005", "last"):
-        policy = PolicyConfig(path=str(checkpoints / name / "pretrained_model"), device="cpu")
-        weights.append(load_adapter(policy).export_trainable())
-    assert weights[0].keys() == weights[1].keys()
-    assert any((weights[0][k] != weights[1][k]).any() for k in weights[0])
 
 
 class Scripted(Engine):
