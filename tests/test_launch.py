@@ -99,7 +99,6 @@ def story(
                 told.history.append(replace(progress, updates=saved.updates, episodes=[]))
         engine.plan(evaluation_plans(("match",), 6, "after"))
         told.after = collect(engine, "after", 6)
-        engine.save(told.directory / "end")
         yield told
     finally:
         engine.close()

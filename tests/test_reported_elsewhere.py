@@ -89,7 +89,7 @@ def delay(table: pa.Table) -> pa.Table:
     ],
 )
 def test_rows_that_contradict_the_metadata_are_refused(file: str, change: Any, message: str, tmp_path: Path):
-    dataset = write_dataset(tmp_path / "data")
+    dataset = write_dataset(tmp_path / "data", more={FRONT: IMAGE | {"dtype": "video"}})
     rewrite(tmp_path / "data" / file / "chunk-000/file-000.parquet", change)
     with pytest.raises(InputError, match=message), opened(dataset, open_metadata(dataset)):
         pass

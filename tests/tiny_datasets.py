@@ -46,8 +46,9 @@ def write_dataset(
     `more` are further features, `values` gives those that are not random.
     """
     features = {name: f for name, f in FEATURES.items() if name not in without} | (more or {})
+    videos = any(feature["dtype"] == "video" for feature in features.values())
     dataset = LeRobotDataset.create(
-        "a/b", fps=fps, features=features, root=root, use_videos=False, video_backend="pyav"
+        "a/b", fps=fps, features=features, root=root, use_videos=videos, video_backend="pyav"
     )
     rng = np.random.default_rng(0)
     for episode, task in enumerate(tasks):
