@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import re
 import sys
-import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,7 +15,6 @@ import pytest
 from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
 
 from accerl_lerobot.algorithms import chunk_critic
-from accerl_lerobot.console import Console
 from accerl_lerobot.engines.config import RunConfig, parse
 from accerl_lerobot.inference.batcher import Batcher, merge_metrics
 from accerl_lerobot.metrics import MetricsLog, WandBConfig
@@ -150,19 +148,3 @@ def test_the_summary_is_explained() -> None:
     whens = {f"{name}_{when}" for name in ("success", "n", "ci95", "tasks") for when in ("before", "after")}
     text = (ROOT / "docs" / "metrics.md").read_text().split("## `summary.json`")[1]
     assert whens <= logged and logged - whens == set(re.findall(r"`([a-z_0-9]+)`", text)) - whens
-
-
-def test_progress_without_a_terminal_is_lines_with_the_time_left(capsys, monkeypatch):
-    monkeypatch.setattr("accerl_lerobot.console.PLAIN_EVERY_S", -1.0)
-    console = Console()
-    console.say("success [not markup]")
-    with console.stage("RL", total=500) as stage:
-        stage.update(100, "resumed at 100")
-        time.sleep(1.0)
-        stage.update(200, "and a second later")
-        stage.update(500)
-    out, err = capsys.readouterr()
-    assert out == "" and "RL …" in err and "success [not markup]" in err
-    assert "RL 100/500 (20%) · resumed at 100" in err
-    assert re.search(r"RL 200/500 \(40%\) · 0:00:0\d left · and a second later", err)
-    assert "RL 500/500 (100%)\n" in err

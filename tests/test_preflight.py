@@ -93,14 +93,6 @@ def test_another_rate_or_task():
     check_features(replace(OFFERED, fps=5), labelled, {}, "dataset.repo_id", "x")
 
 
-def test_other_tasks_and_instructions_are_warned_about(caplog: pytest.LogCaptureFixture):
-    both = env_features(make_environment(SimulatedConfig(task="match,mirror")).spec)
-    check_features(OFFERED, both, {}, "dataset.repo_id", "x")
-    assert "no episode of 'Mirror the target'" in caplog.text
-    check_features(replace(OFFERED, tasks=("match the target.",)), OFFERED, {}, "dataset.repo_id", "x")
-    assert "the environment's instruction is 'Match the target', and the dataset's 'match" in caplog.text
-
-
 def test_renamed_and_empty_cameras():
     top = with_shape(with_shape(OFFERED, FRONT, None), "observation.images.top", (3, 32, 32))
     check_features(top, OFFERED, {FRONT: "observation.images.top"}, "policy.path", "x")

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-import re
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ import yaml
 from accerl_lerobot.engines.config import encode
 from accerl_lerobot.envs import make_environment
 from accerl_lerobot.evaluation import Rate
-from benchmarks import async_vs_sync, simulated_environment, third_party
+from benchmarks import async_vs_sync, simulated_environment
 from benchmarks.async_vs_sync import ARMS
 from benchmarks.async_vs_sync import compare as compare_schedules
 from benchmarks.latency import described
@@ -22,7 +21,6 @@ from benchmarks.machinery import MachineryConfig
 from benchmarks.simulated_environment import LatencyConfig, read_trace
 from benchmarks.study import BenchStudyConfig, bench_study, together
 from benchmarks.tables import mean_interval
-from benchmarks.third_party import words
 from benchmarks.throughput import Block
 from tests.runs import tiny_run
 
@@ -109,22 +107,6 @@ def test_durations_by_hand():
     assert found["mean"] == pytest.approx(20.0) and found["longest"] == 50.0 and found["n"] == 4
     assert found["p50"] == pytest.approx(10.0) and found["p95"] == pytest.approx(10 + 0.85 * 40)
     assert found["cv"] == pytest.approx(np.sqrt(3) * 10 / 20)
-
-
-TABLE = yaml.safe_load(Path(third_party.__file__).with_suffix(".yaml").read_text())
-
-
-def test_every_situation_is_a_command_of_ours(tmp_path: Path):
-    for situation in TABLE["situations"]:
-        arguments = words(situation["command"], TABLE["texts"], tmp_path)
-        names = [argument.partition("=")[0] for argument in arguments]
-        assert arguments[0] in ("eval", "train", "demos") and len(set(names)) == len(names), arguments
-        assert situation.get("policy") in (None, *TABLE["policies"])
-        for pattern in ("prints", "not_prints"):
-            re.compile(situation.get(pattern, ""))
-    assert words("demos --root={folder}/x '--env.task=a b'", {}, Path("/r")) == [
-        "demos", "--root=/r/x", "--env.task=a b",
-    ]  # fmt: skip
 
 
 NO_ACTIONS = np.zeros((10, 2), np.float32)

@@ -20,7 +20,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos import guarded_train, sft
-from accerl_lerobot.demos.backbone import SPECIAL_TOKENS, BackboneConfig, Sizes, write_backbone
+from accerl_lerobot.demos.backbone import BackboneConfig, write_backbone
 from accerl_lerobot.demos.sft import ANSWER, SFTConfig, picked, run_sft, sft_command
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
@@ -268,15 +268,3 @@ def test_instructions_are_few_tokens_and_others_still_encode(tmp_path: Path):
     for text in (*TEXTS, "Öffne die Tür 🚪", "pick\tup\n"):
         for tokenizer in (learned, plain):
             assert tokenizer.decode(tokenizer(text).input_ids) == text
-
-
-def test_the_vocabulary_is_bounded_and_ids_are_those_of_the_config(tmp_path: Path):
-    from transformers import AutoConfig
-
-    many = [f"Task number {i} of a benchmark: {i * 7919}" for i in range(200)]
-    directory = write_backbone(tmp_path / "backbone", many, Sizes(vocabulary=300))
-    tokenizer, config = tokenizer_of(directory), AutoConfig.from_pretrained(directory)
-    assert len(tokenizer) == config.text_config.vocab_size <= 300
-    assert config.image_token_id == tokenizer.convert_tokens_to_ids("<image>")
-    assert config.pad_token_id == tokenizer.pad_token_id
-    assert all(len(tokenizer(token).input_ids) == 1 for token in SPECIAL_TOKENS)

@@ -95,13 +95,6 @@ def test_one_commit_that_holds_everything(hub: FakeHub, policy: Path, pushed: Ve
     assert all(files[path.name] == path.read_bytes() for path in policy.iterdir())
 
 
-def test_the_same_again_is_no_commit(hub: FakeHub, policy: Path, pushed: Verb):
-    first = pushed(policy)
-    again = pushed(policy)
-    assert again["commit"] == first["commit"] and again["unchanged"] and not first["unchanged"]
-    assert len(hub.repo(NAME).commits) == 2
-
-
 @pytest.mark.parametrize(
     ("fault", "words"),
     [
@@ -169,19 +162,6 @@ def test_a_dataset_is_tagged_where_lerobot_looks(hub, tmp_path, pushed, push_ref
     assert first["unchanged"] and repo.tags == {"v3.0": first["commit"]}
     write_json(dataset / "meta" / "more.json", {"origin": str(tmp_path)})
     assert repo.tags == {"v3.0": pushed(dataset)["commit"]} != {"v3.0": first["commit"]}
-
-
-def test_what_comes_is_what_went(hub, policy, tmp_path, pushed, pulled):
-    pushed(policy)
-    found = pulled()
-    came = contents_of(tmp_path / "pulled")
-    assert came.keys() - contents_of(policy).keys() == {"README.md", "accerl_pulled.json"}
-    assert {n: came[n] for n in contents_of(policy)} == contents_of(policy)
-    assert found["files"] == len(contents_of(policy)) + 1, "the card"
-    hub.plant(NAME, {"README.md": b"# edited on the Hub", "demo.gif": b"GIF"})
-    pulled(to="edited")
-    assert (tmp_path / "edited" / "README.md").read_bytes() == b"# edited on the Hub"
-    assert list(tmp_path.glob(".*")) == []
 
 
 def test_branches_tags_and_commits_are_pinned(hub, policy, tmp_path, pushed, pulled, pull_refused):
@@ -345,10 +325,15 @@ def test_a_policy_comes_back_as_it_was_and_loads(hub, tiny_checkpoint, tmp_path,
     assert pushed(came)["unchanged"], "there and back changes nothing"
 
 
-def test_a_dataset_comes_back_as_it_was(hub: FakeHub, tmp_path: Path, pushed: Verb, pulled: Verb):
+def test_a_dataset_comes_back_as_it_was_and_is_pushed_once(hub, tmp_path, pushed, pulled):
     pushed(TINY)
-    pulled()
-    assert contents_of(TINY).items() <= contents_of(tmp_path / "pulled").items()
+    hub.plant(NAME, {"README.md": b"# edited on the Hub", "demo.gif": b"GIF"}, repo_type="dataset")
+    found = pulled()
+    came = contents_of(tmp_path / "pulled")
+    assert contents_of(TINY).items() <= came.items() and came["README.md"] == b"# edited on the Hub"
+    assert found["files"] == len(came) - 1, "the record"
+    commits = len(hub.repo(NAME, "dataset").commits)
+    assert pushed(tmp_path / "pulled")["unchanged"] and len(hub.repo(NAME, "dataset").commits) == commits
 
 
 def test_a_world_model_brings_its_success_model(hub: FakeHub, tmp_path: Path, pushed: Verb, pulled: Verb):
