@@ -222,24 +222,26 @@ def losing(monkeypatch: pytest.MonkeyPatch, config: RunConfig, lost_at: list[int
 
 
 @pytest.mark.parametrize(
-    ("lost_at", "most", "times"),
+    ("lost_at", "most", "every", "times"),
     [
-        ([7, 11, 11], 3, [1, 1, 2]),  # the checkpoints after updates 5 and 10; 10 is gone on from twice
-        ([6, 7, 8, 9], 1, [1, 1, 1, 1]),  # a run that gets further each time is not stuck
-        ([7, 7, 7, 7], 2, None),  # a worker that is lost again and again ends the run
+        ([7, 11, 11], 3, 5, [1, 1, 2]),  # the checkpoints after updates 5 and 10; 10 is gone on from twice
+        ([6, 7, 8, 9], 1, 5, [1, 1, 1, 1]),  # a run that gets further each time is not stuck
+        ([7, 7, 7], 2, 5, None),  # a worker that is lost again and again ends the run
+        ([7], 2, 0, None),  # without a checkpoint there is nothing to go on from
     ],
 )
 def test_after_the_loss_of_a_worker_the_run_goes_on_from_its_last_checkpoint(
-    lost_at: list[int], most: int, times: list[int] | None, tiny_checkpoint: Path, tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+    lost_at: list[int], most: int, every: int, times: list[int] | None, tiny_checkpoint: Path,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
 ):  # fmt: skip
     launch = LaunchConfig(engine="local", max_restarts=most)
-    config = local_run(tiny_checkpoint, tmp_path, launch=launch)
+    saves: dict[str, Any] = {"save_every_updates": every, "save_every_s": 0.0}
+    config = local_run(tiny_checkpoint, tmp_path, launch=launch, **saves)
     made = losing(monkeypatch, config, lost_at)
     if times is None:
         with pytest.raises(WorkerError, match="Killed"):
             executed(config)
-        assert len(made) == most + 1 and all(engine.closed for engine in made)
+        assert len(made) == len(lost_at) and all(engine.closed for engine in made)
         return
     _, summary = executed(config)
     assert len(made) == len(lost_at) + 1 and all(engine.closed for engine in made)
@@ -250,16 +252,6 @@ def test_after_the_loss_of_a_worker_the_run_goes_on_from_its_last_checkpoint(
         f"({n} of {most} times)" in line for n, line in zip(times, said.split("Killed")[1:], strict=True)
     )
     assert summary["updates"] == 12 and 0 < summary["wall_s"] < 60
-
-
-def test_without_a_checkpoint_there_is_nothing_to_go_on_from(
-    tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    config = local_run(tiny_checkpoint, tmp_path, save_every_updates=0, save_every_s=0.0)
-    made = losing(monkeypatch, config, [7])
-    with pytest.raises(WorkerError, match="Killed"):
-        executed(config)
-    assert len(made) == 1 and made[0].closed
 
 
 @pytest.mark.parametrize("error", [RuntimeError("inference worker failed for good"), KeyboardInterrupt()])

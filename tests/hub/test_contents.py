@@ -181,11 +181,8 @@ def test_paths_in_json_and_yaml(tmp_path: Path, suffix: str):
     assert yaml.safe_load(bytes(data)) == wanted
 
 
-@pytest.mark.parametrize("indent", [None, 1, 4])
-def test_what_has_no_paths_keeps_every_byte(indent: int | None):
-    data = json.dumps(
-        {"b": 1e-5, "a": "é", "url": "http://a/b/c"}, indent=indent, ensure_ascii=False
-    ).encode()
+def test_what_has_no_paths_keeps_every_byte():
+    data = '{"b": 1e-5,\n  "a": "é", "url": "http://a/b/c"}'.encode()
     assert without_paths("config.json", data) is data
     assert without_paths("backbone/tokenizer.json", b'["/a/b/c"]') == b'["/a/b/c"]', "a vocabulary"
 

@@ -182,11 +182,12 @@ def test_a_segment_is_a_stretch_of_experience():
     assert not episode_from_segments(real_episode(1), SPEC).success
 
 
-def test_steps_are_pending_for_each_episode_up_to_a_limit():
+def test_steps_are_pending_for_each_real_episode_up_to_a_limit():
     made = learner()
     for segment in episodes(*[False] * 20):
         made.add(segment)
         made.add(segment)  # as one that is drawn twice
+        made.add(replace(segment, source=IMAGINED, origin=segment.origin._replace(task="imagined")))
     assert len(made._own) == 20 and made.pending_steps == 2 * online.MOST_PENDING
 
 
@@ -204,13 +205,6 @@ def test_episodes_are_put_together_from_their_segments():
     whole = episode_from_segments(real_episode(1), SPEC)
     for name in ("frames", "times", "state", "actions"):
         assert np.array_equal(getattr(made._own[0], name), getattr(whole, name))
-
-
-def test_imagined_segments_are_left_out():
-    [segment] = real_episode(1)
-    made = learner()
-    made.add(replace(segment, source=IMAGINED))
-    assert not made._own
 
 
 def test_what_never_ends_is_forgotten(monkeypatch: pytest.MonkeyPatch):
