@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The layout of the Hub's cache, as after a download."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 

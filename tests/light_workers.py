@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Workers that start in no time because they hold no policy."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import logging

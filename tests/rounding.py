@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Comparison of float32 numbers, whose last digits depend on the CPU and on the batch size."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

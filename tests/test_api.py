@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The Python interface does what the command line does, and gives objects."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A checkpoint is there whole or not at all, ``last`` points at a whole one; trees come out as they go in."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

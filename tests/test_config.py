@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recipes and overrides into configs; every mistake is one line with field, value and hint, exit code 2."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The doctor: right about this machine, and right about machines that lack something."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import math
 import os

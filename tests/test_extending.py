@@ -4,8 +4,6 @@
 Each test begins where nobody has heard of them: who forgets to import the package fails.
 """
 
-from __future__ import annotations
-
 import importlib
 import shutil
 import subprocess

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whatever ends a process, nothing that it has started is left; signals are noted, or heeded at once."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

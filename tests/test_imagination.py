@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Runs in which rollout workers step imagined environments too, through either engine."""
 
-from __future__ import annotations
-
 import importlib
 import itertools
 import os

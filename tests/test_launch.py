@@ -5,8 +5,6 @@ At rate 0 every policy is the same policy, so whatever happens to weights, obser
 way through the processes must leave every importance ratio at 1.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 from collections.abc import Iterator

@@ -5,8 +5,6 @@ Which weights decide does not matter here, so inference and trainer are stand-in
 and replay are real. The run with everything real is in ``test_launch.py``.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 from collections.abc import Callable

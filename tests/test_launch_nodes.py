@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Runs over two nodes: that one ends right, and that it outlives the second node."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The asynchronous engine with a trainer of two ranks, all of it real: SmolVLA, Ray, gloo, FSDP2."""
 
-from __future__ import annotations
-
 import os
 import signal
 from contextlib import closing

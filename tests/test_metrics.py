@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A run's numbers on disk: one JSON object a line, the same in TensorBoard, nothing JSON cannot hold."""
 
-from __future__ import annotations
-
 import re
 import sys
 from pathlib import Path

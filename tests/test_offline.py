@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``accerl offline``: recorded episodes in, a LeRobot checkpoint out."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

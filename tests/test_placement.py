@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which worker goes where, on made-up clusters."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A run whose parts do not fit, or that lacks something here, is refused in one line before any work."""
 
-from __future__ import annotations
-
 import shutil
 import sys
 from collections import namedtuple

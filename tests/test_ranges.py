@@ -4,8 +4,6 @@
 Tests of single configs add nothing to this; rules between several fields are in one table, `RULES`.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import typing

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A private Ray is closed to others and ends with the run; a cluster is joined with the user's token."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import socket

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Situations of docs/reported_elsewhere.md: what other projects' users reported, tried here."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace

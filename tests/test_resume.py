@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A run that was stopped, or killed, and gone on with by its command line."""
 
-from __future__ import annotations
-
 import json
 import os
 import shlex

@@ -5,8 +5,6 @@ Inference and trainer are stand-ins that start at once, and the trainer writes d
 and replay are real. The run with everything real is in ``test_resume.py``.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace

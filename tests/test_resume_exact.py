@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The engine in one process; a run that was left is the run that was never left, to the last bit."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Iterator
 from pathlib import Path

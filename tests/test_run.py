@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A run from its command to its summary, in one process."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any, NamedTuple

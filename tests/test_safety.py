@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Names, sizes and headers from outside; no line of the package runs what it should not; no secrets."""
 
-from __future__ import annotations
-
 import ast
 import os
 import random

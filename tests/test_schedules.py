@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Schedules: who waits for whom, on paper and in a run."""
 
-from __future__ import annotations
-
 import functools
 from collections import Counter
 from typing import Any

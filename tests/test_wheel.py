@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The wheel holds all that a run outside of the repository needs."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Small LeRobotDatasets that fit ``env.type=simulated``, and changes of their files."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path

@@ -6,8 +6,6 @@ second node is a Ray node like any other: a raylet, an object store, workers. Me
 machines.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import time

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A policy of a few numbers, and segments it could have made."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

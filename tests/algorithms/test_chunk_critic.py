@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The off-policy algorithms: memory, weights and networks against slow ones by hand, and runs that learn."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from functools import partial

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Demonstrations in an off-policy learner's memory, against the dataset's frames."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import replace
 from functools import partial

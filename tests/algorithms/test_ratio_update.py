@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """One update, on a policy small enough to compute by hand; the mismatch between acting and learning."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

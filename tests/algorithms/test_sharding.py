@@ -5,8 +5,6 @@ Ranks are processes that talk through gloo on the loopback, one group of 2 and o
 PyTorch's collectives are real, so is FSDP2.
 """
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

@@ -5,8 +5,6 @@ Small, offline, on LeRobot's own classes, see `tests.policies.cases`. One group 
 each imports LeRobot.
 """
 
-from __future__ import annotations
-
 import logging
 from pathlib import Path
 from typing import Any, NamedTuple

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Faults: orders are carried out once, and the books of a run that was hit."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

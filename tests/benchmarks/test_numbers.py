@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Numbers of benchmarks by hand, small runs of them, and an environment that is as slow as asked."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

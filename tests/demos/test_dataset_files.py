@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Hostile files of a dataset; labels and instructions of its episodes, which all verbs read by one reader."""
 
-from __future__ import annotations
-
 import io
 import json
 import shutil

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """LeRobot's trainer runs no code that comes with a tokeniser, a policy or a dataset."""
 
-from __future__ import annotations
-
 import json
 import logging
 import shutil

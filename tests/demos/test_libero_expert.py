@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """LIBERO's scripted experts: they solve their tasks, in equal episodes for equal seeds."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recording is deterministic, complete and readable by LeRobot; a run's episodes are replayed, exported."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

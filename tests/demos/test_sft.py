@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Warm start: LeRobot's own trainer in a process of its own, its items from memory, and a random backbone."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where tests find LIBERO's meshes, which are not part of this repository."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 from pathlib import Path

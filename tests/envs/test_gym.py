@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A Gymnasium environment of somebody else's package is named on the command line, and trained in."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The simulated environment, and one that looks back, against the same one stepped one action at a time."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Both directions: LeRobot's environments as our environments, ours as LeRobot's."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import shlex

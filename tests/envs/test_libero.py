@@ -2,8 +2,6 @@
 """LIBERO: LeRobot's environment, physics and pictures; starts from the seed; coarser meshes that look the
 same."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 from collections.abc import Iterator

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """MetaWorld: same environment as LeRobot's, cheaper; success, termination, divergence, tasks."""
 
-from __future__ import annotations
-
 import sys
 
 import numpy as np

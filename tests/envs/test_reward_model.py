@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """LeRobot's reward models telling success in place of the environment."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from contextlib import closing

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Deployment shift: each field changes what it names and nothing else."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Seeds, intervals and summaries by hand; planned episodes; curve and film."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from contextlib import nullcontext

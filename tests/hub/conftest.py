@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A Hub in memory, and this process as one of its clients."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

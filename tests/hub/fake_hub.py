@@ -6,8 +6,6 @@ A commit appears whole or not at all. A call fails once as `faults` says:
     hub.faults["create_commit"] = refused(412)
 """
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import dataclass, field
 from pathlib import Path

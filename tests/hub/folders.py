@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Folders that look like what is pushed, written in no time; nothing in them could be loaded."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path

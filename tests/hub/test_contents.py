@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A folder's type by its files, the files that go to the Hub without paths of this machine, and the card."""
 
-from __future__ import annotations
-
 import json
 import shlex
 import shutil

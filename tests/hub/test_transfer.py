@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A push is one commit or none, a pull a checked folder or none; a refusal is one line without a token."""
 
-from __future__ import annotations
-
 import inspect
 import json
 import shutil

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The inference service on an event loop of the test's own; dynamic batching with the test's own clock."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import random

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every policy type, small, offline, on LeRobot's own classes: what `test_contract` runs its tests on."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Checkpoints of LeRobot's small policies, written offline with random weights."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from collections.abc import Callable

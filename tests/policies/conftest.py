@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Small networks for π0 and its kin, and one checkpoint of each case."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The contract of every policy type and sampler: what acts and what re-scores are one policy, LeRobot's."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 from collections.abc import Callable

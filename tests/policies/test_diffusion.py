@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Diffusion beside the contract: LeRobot's schedulers to the bit, and policies that look back."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

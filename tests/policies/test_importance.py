@@ -5,8 +5,6 @@
 `test_tokens` has the same for tokens, by enumeration.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from functools import partial

@@ -5,8 +5,6 @@
 middle, so their return rises and not their success.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path

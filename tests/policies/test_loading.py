@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Loading refuses what is not the checkpoint; what is saved needs nothing from where it was made."""
 
-from __future__ import annotations
-
 import json
 import os
 import pickle

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """π0, π0.5 and π0-FAST beside the contract: caches, layouts, decoding, precision."""
 
-from __future__ import annotations
-
 import copy
 from pathlib import Path
 

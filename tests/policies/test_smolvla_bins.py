@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The package ``lerobot_policy_smolvla_bins``: network, loss, and the way through LeRobot's own commands."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

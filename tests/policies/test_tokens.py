@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The tokens family against a slow oracle, on two models small enough to enumerate what they can say."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections import Counter

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Trained parameters: LeRobot's choice, everything, the expert, low-rank adapters, and LeRobot's adapters."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Untrusted checkpoints: hostile files, and code and pickles that come with a model."""
 
-from __future__ import annotations
-
 import json
 import pickle
 import shutil

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Observations for tiny policies, and stored decisions as the trainer sees them."""
 
-from __future__ import annotations
-
 import math
 import pickle
 from collections.abc import Sequence

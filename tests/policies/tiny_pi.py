@@ -7,8 +7,6 @@ everything else is LeRobot's own code. A policy is built from its config wheneve
 active then, too.
 """
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import json

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Small segments for the replay tests, and what is so of every store."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

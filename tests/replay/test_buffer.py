@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The store: order, bounds, age, and books that balance; the journal of real episodes on disk."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

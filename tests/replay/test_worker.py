@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The door between collecting and learning: who waits, and who lets whom through."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Awaitable, Callable
 from dataclasses import replace

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``accerl report``: its page tells a run's facts and nothing else, and cannot be turned against a reader."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """An environment that follows a script, and decisions made of nothing."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

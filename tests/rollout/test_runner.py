@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Environments between decisions: what becomes a segment, what becomes a result."""
 
-from __future__ import annotations
-
 import pickle
 from dataclasses import replace
 from types import SimpleNamespace

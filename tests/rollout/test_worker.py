@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The rollout process's loop, with inference and replay played by the test."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Iterator

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Timelines that tests choose, a clock that they turn, and what is so of every timeline."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """States exclude each other, leave no time out, and are on disk as they were; shares of roles; the trace."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import random

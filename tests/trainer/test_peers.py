@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """How the first rank deals with the others: real Ray actors that do what they are told, fail, die or hang."""
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Callable, Iterator

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The trainer process's loop, with replay and the readers played by the test."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A service that a test plays, so that a worker's loop runs in the test's own process."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from typing import Any

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages over sockets: the promises at the top of `transport.connection`; which weights replicas get."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import signal

@@ -4,8 +4,6 @@
 ``--world_model.discover_packages_path=tests.world_model.linear_world --world_model.model.type=linear``
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Windows whose numbers are known by hand, and LeRobotDatasets as episodes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace

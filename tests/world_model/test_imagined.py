@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """An imagined environment, on a world whose every number is known; a world model that learns in a run."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The latent state: its loss against a slow one by hand, what it reads, how it learns and is restored."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The networks on an environment of one dot that goes where it is told, their training and their check."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Sequence
 from dataclasses import replace

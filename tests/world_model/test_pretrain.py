@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """accerl world-model from a dataset to its check, saved and loaded again; of our model and of another's."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import sys

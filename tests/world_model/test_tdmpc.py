@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """LeRobot's TD-MPC as a world model that critic and teacher stand on."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

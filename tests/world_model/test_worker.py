@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The world-model process in the asynchronous engine: it learns, and is missed when it dies."""
 
-from __future__ import annotations
-
 import os
 import signal
 from dataclasses import dataclass, replace
