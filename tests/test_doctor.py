@@ -17,7 +17,7 @@ from accerl_lerobot.engines.config import RunConfig, decode
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.loading import policy_sizes
 from accerl_lerobot.run import sizes as engine_sizes
-from accerl_lerobot.run.sizes import check_memory, memory_parts_gib, observation_bytes, policy_gib
+from accerl_lerobot.run.sizes import check_memory, policy_gib
 
 QUICKSTART = Path(__file__).parents[1] / "recipes" / "quickstart.yaml"
 
@@ -147,13 +147,6 @@ class TestResources:
         monkeypatch.setattr(engine_sizes, "memory_gib", lambda entry: 0.99 * need)
         with pytest.raises(InputError, match="^policy.path=.*its weights take 0.0 GiB in the processes"):
             check_memory(config)
-
-    def test_a_policy_that_looks_back_keeps_more_pictures(self) -> None:
-        config = self.recipe(replay={"capacity": 10_000})
-        pictures = [sum(memory_parts_gib(config, history).values()) for history in (1, 2, 3)]
-        each = 10_000 * observation_bytes(config) / 2**30
-        assert pictures[1] - pictures[0] == pytest.approx(pictures[2] - pictures[1])
-        assert each <= pictures[1] - pictures[0] < 1.1 * each
 
     def test_a_pace_that_would_waste_is_warned_about(self) -> None:
         lag = checks(self.recipe(replay={"max_lag": 3}))["lag"]

@@ -19,15 +19,13 @@ from accerl_lerobot import cli
 from accerl_lerobot.algorithms import PPOConfig
 from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.console import Console, count, duration, number, percent, rate
-from accerl_lerobot.demos.backbone import BackboneConfig
-from accerl_lerobot.demos.sft import SFTConfig
 from accerl_lerobot.engines.config import LaunchConfig, RunConfig, encode
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import EvaluationConfig, Rate
 from accerl_lerobot.report import ReportConfig, write_report
 from accerl_lerobot.report.page import Chart, Series, evaluated, exploring
-from accerl_lerobot.report.read import changed_fields, differences, read_run
+from accerl_lerobot.report.read import read_run
 from accerl_lerobot.run import train as run
 from tests.runs import tiny_run
 
@@ -219,6 +217,10 @@ def test_numbers_of_a_known_run(tmp_path: Path) -> None:
     # The 1000 env steps of the evaluation before are not experience; the first 24 episodes say nothing.
     assert exploring(run).x.tolist() == [100.0 * i for i in range(25, 41)]
     assert "mean lag 3.5" in seen.text and "bound of the lag 39 updates" in seen.text
+    assert (
+        "env.hold 4 – env.tolerance 0.25 – env.reward success – trainer.updates 40 1000 All of it"
+        in seen.text
+    )
 
 
 def test_what_went_wrong_is_said(tmp_path: Path) -> None:
@@ -249,7 +251,10 @@ def test_runs_side_by_side(tmp_path: Path) -> None:
     assert f"{a} 40 % [31, 50] 90 % [83, 94] gipo 0 40 40 4,000 3.5" in text
     assert f"{b} 30 % [22, 40] 60 % [50, 69] ppo 1 40 40 4,000 3.5" in text
     assert "c 40 % [31, 50] – gipo" in text and "c: The run is still going" in text
-    assert "algorithm.type gipo ppo gipo" in text and "replay.capacity" not in text
+    recipes = (
+        "seed 0 1 0 algorithm.type gipo ppo gipo algorithm.kl_coef 0.1 0.0 0.1 algorithm.sigma 1.0 – 1.0"
+    )
+    assert f"{recipes} algorithm.clip_low – 0.2 – algorithm.clip_high – 0.28 – Made by" in text
 
 
 def test_text_of_a_run_is_text(tmp_path: Path) -> None:
@@ -375,17 +380,3 @@ def test_damaged_files_are_named(tmp_path: Path, name: str, content: bytes, said
     with pytest.raises(InputError, match=said) as caught:
         read_run(folder)
     assert name in str(caught.value) and "\n" not in str(caught.value)
-
-
-def test_fields_that_differ() -> None:
-    assert changed_fields(encode(RunConfig())) == []
-    sft = SFTConfig(steps=5, backbone=BackboneConfig(hidden=8))
-    changed = dict(changed_fields(encode(RunConfig(algorithm=PPOConfig(clip_high=0.3), sft=sft))))
-    assert changed["algorithm.type"][0] == "ppo" and changed["algorithm.clip_high"][0] == 0.3
-    assert changed["sft.backbone.hidden"][0] == 8 and "algorithm.gamma" not in changed
-    a, b = (encode(run_config(seed=seed)) for seed in (1, 2))
-    b["algorithm"] = {"type": "ppo"}
-    b["output_dir"] = "elsewhere"
-    rows = dict(differences([a, b]))
-    assert rows["seed"] == [1, 2] and rows["algorithm.type"] == ["gipo", "ppo"]
-    assert rows["algorithm.sigma"] == [1.0, "–"] and "output_dir" not in rows
