@@ -327,8 +327,8 @@ def test_a_dataset_comes_back_as_it_was_and_is_pushed_once(hub, tmp_path, pushed
     pushed(TINY)
     hub.plant(NAME, {"README.md": b"# edited on the Hub", "demo.gif": b"GIF"}, repo_type="dataset")
     found = pulled()
-    came = contents_of(tmp_path / "pulled")
-    assert contents_of(TINY).items() <= came.items() and came["README.md"] == b"# edited on the Hub"
+    came, edited = contents_of(tmp_path / "pulled"), {"README.md": b"# edited on the Hub"}
+    assert (contents_of(TINY) | edited).items() <= came.items()
     assert found["files"] == len(came) - 1, "the record"
     commits = len(hub.repo(NAME, "dataset").commits)
     assert pushed(tmp_path / "pulled")["unchanged"] and len(hub.repo(NAME, "dataset").commits) == commits
