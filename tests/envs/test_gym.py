@@ -101,7 +101,7 @@ def test_the_environment_keeps_its_wrappers_but_not_its_time_limit():
 
 
 class Odd(gymnasium.Env):
-    """A point that says more than is read of it, and succeeds at its third step."""
+    """A point that says more than is read of it, reward and end as arrays of one number."""
 
     metadata = {"render_modes": ["rgb_array"]}
     action_space = spaces.Box(-1, 1, (1,), np.float32)
@@ -132,7 +132,7 @@ class Odd(gymnasium.Env):
     def step(self, action: np.ndarray) -> Any:
         self.steps += 1
         info = {} if self.told is None else {key: value(self.steps) for key, value in self.told.items()}
-        return self.seen(), float("nan"), self.steps == 5, False, info
+        return self.seen(), np.array([np.nan]), np.array([self.steps == 5]), False, info
 
     def seen(self) -> dict[str, Any]:
         depth, ragged = np.full((4, 4), np.inf, np.float32), [[1.0], [1.0, 2.0]]
@@ -167,6 +167,7 @@ def test_success_is_read_by_its_key(key: str, told: dict[str, Any]):
     assert missed.note.startswith("env.success='is_success': the environment's info has no such key")
     assert key in missed.note and "--env.success= to take terminated for success" in missed.note
     assert ended(odd(kwargs={"told": told}), steps=2).note == "", "the episode goes on"
+    assert np.isnan(ended(odd(reward="env", kwargs={"told": told})).rewards).all(), "the reward is read"
     assert "it has no keys" in ended(odd()).note
 
 
