@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Folders that look like what is pushed, written in no time; nothing in them could be loaded."""
 
+from __future__ import annotations
+
 import json
 import os
 from pathlib import Path
@@ -11,7 +13,7 @@ import pytest
 import yaml
 
 from accerl_lerobot import cli
-from tests.hub.fake_hub import NOBODY, READER, STRANGER, WRITER
+from tests.hub_server import NOBODY, READER, STRANGER, WRITER
 
 TOKENS = (WRITER, READER, STRANGER, NOBODY)
 SUMMARY = {
@@ -24,14 +26,14 @@ SUMMARY = {
 }  # fmt: skip
 
 
-def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """The one line of a command that is refused; no token is in all that it has said."""
+def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[str, str]:
+    """The one line of a command that is refused, and all that it has said."""
     capsys.readouterr()
     assert cli.main(list(arguments)) == 2
     out, err = capsys.readouterr()
     (line,) = [line for line in err.splitlines() if line.startswith("accerl: ")]
     assert out == "" and "Traceback" not in err and not any(token in err for token in TOKENS)
-    return line
+    return line, err
 
 
 def write_json(path: Path, content: Any) -> None:

@@ -1,26 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A folder's type by its files, the files that go to the Hub without paths of this machine, and the card."""
+"""A folder's type by its files, the files that go to the Hub without paths of this machine, and their run."""
+
+from __future__ import annotations
 
 import json
-import shlex
 import shutil
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
-from huggingface_hub import ModelCard
 
-from accerl_lerobot.cli.verbs import CONFIGS
-from accerl_lerobot.engines.config import RunConfig, parse
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.hub.card import Files, PullConfig, PushConfig, recognise, run_files
 from accerl_lerobot.hub.transfer import stage, without_paths
-from accerl_lerobot.policies.config import PLUGINS
 from tests.hub.folders import SUMMARY, write_json, write_policy_folder, write_run_folder
 
 TINY = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
-LAST = "checkpoints/last/pretrained_model"
 TOKENIZER = {"registry_name": "tokenizer_processor", "config": {"tokenizer_name": "x"}}
 
 
@@ -30,12 +25,6 @@ def test_kinds(tmp_path: Path):
     write_json(tmp_path / "environment" / "config.json", {"spec": {}, "model": {}})
     (tmp_path / "environment" / "model.safetensors").write_bytes(b"x")
     assert recognise(tmp_path / "environment") == "world model"
-    run = write_run_folder(tmp_path / "run")
-    with pytest.raises(InputError, match="name the folder checkpoints/last/pretrained_model in it"):
-        recognise(run)
-    write_json(tmp_path / "success_model" / "config.json", {"type": "success_pairs"})
-    with pytest.raises(InputError, match="neither a policy, a world model nor a LeRobotDataset"):
-        recognise(tmp_path / "success_model")
 
 
 @pytest.mark.parametrize(
@@ -55,6 +44,26 @@ def test_an_incomplete_folder_says_what_it_lacks(tmp_path: Path, artifact: str, 
 
 def copy_dataset(folder: Path) -> Path:
     return Path(shutil.copytree(TINY, folder))
+
+
+def test_folders_one_above_say_which_below(tmp_path: Path):
+    run = write_run_folder(tmp_path / "run")
+    with pytest.raises(InputError, match="name the folder checkpoints/last/pretrained_model in it"):
+        recognise(run)
+    with pytest.raises(InputError, match="name the folder pretrained_model in it"):
+        recognise(run / "checkpoints" / "000012")
+    (tmp_path / "tuned" / "sft" / "checkpoints" / "last" / "pretrained_model").mkdir(parents=True)
+    with pytest.raises(InputError, match="name the folder sft/checkpoints/last/pretrained_model in it"):
+        recognise(tmp_path / "tuned")
+    (tmp_path / "learnt" / "world_model").mkdir(parents=True)
+    with pytest.raises(InputError, match="name the folder world_model in it"):
+        recognise(tmp_path / "learnt")
+    write_json(tmp_path / "success_model" / "config.json", {"type": "success_pairs"})
+    for folder in (tmp_path / "success_model", tmp_path):
+        with pytest.raises(InputError, match="neither a policy, a world model nor a LeRobotDataset"):
+            recognise(folder)
+    with pytest.raises(InputError, match="no such folder"):
+        recognise(tmp_path / "nowhere")
 
 
 @pytest.mark.parametrize("name", [None, "", "door", "a/b/c", "../x/y", "a/b c", "https://x/y"])
@@ -94,7 +103,7 @@ def test_an_adapter_brings_its_own_weights(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    "name", ["config.json", "backbone", "backbone/tokenizer.json", "README.md", "accerl_run"]
+    "name", ["config.json", "accerl.json", "backbone", "backbone/tokenizer.json", "README.md", "accerl_run"]
 )
 def test_no_link_that_leads_out_is_pushed(tmp_path: Path, name: str):
     secret = tmp_path / "secret"
@@ -147,8 +156,6 @@ def test_an_evaluation_is_of_this_policy_or_refused(tmp_path: Path):
     found = {"success": 0.5, "n": 10, "ci95": [0.2366, 0.7634], "tasks": {}, "policy": str(policy)}
     write_json(tmp_path / "eval" / "evaluation.json", found)
     assert "accerl_run/evaluation.json" in run_files(policy, "policy", str(tmp_path / "eval"))
-    text = card_of(policy, "policy", evaluation=str(tmp_path / "eval"))
-    assert "| accerl eval | all tasks | 50.0% | 10 | 23.7% to 76.3% |" in text
     other = run / "checkpoints" / "000012" / "pretrained_model"
     for folder, evaluation in ((other, tmp_path / "eval"), (policy, tmp_path)):
         with pytest.raises(InputError, match="not an evaluation of "):
@@ -179,57 +186,10 @@ def test_paths_in_json_and_yaml(tmp_path: Path, suffix: str):
     assert yaml.safe_load(bytes(data)) == wanted
 
 
-def test_what_has_no_paths_keeps_every_byte():
-    data = '{"b": 1e-5,\n  "a": "é", "url": "http://a/b/c"}'.encode()
+@pytest.mark.parametrize("indent", [None, 1, 4])
+def test_what_has_no_paths_keeps_every_byte(indent: int | None):
+    data = json.dumps(
+        {"b": 1e-5, "a": "é", "url": "http://a/b/c"}, indent=indent, ensure_ascii=False
+    ).encode()
     assert without_paths("config.json", data) is data
     assert without_paths("backbone/tokenizer.json", b'["/a/b/c"]') == b'["/a/b/c"]', "a vocabulary"
-
-
-def card_of(folder: Path, kind: str, **fields: str) -> str:
-    files = stage(PushConfig(path=str(folder), repo_id="alice/door", **fields), folder, kind)
-    return bytes(files["README.md"]).decode()
-
-
-def test_metadata_and_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    last = write_run_folder(tmp_path / "run") / LAST
-    card = ModelCard(card_of(last, "policy"))
-    assert card.data.library_name == "lerobot" and card.data.pipeline_tag == "robotics"
-    assert card.data.tags[2:] == ["act", "metaworld", "reinforcement-learning", "gipo"]
-    assert card.data.base_model == "lerobot/smolvla_base"
-    assert card.data.datasets is None, "the dataset was a folder, its name a label"
-    assert "| before RL | match | 25.0% | 40 | 14.2% to 40.2% |" in card.text
-    assert "| after RL | match | 75.0% | 40 | 59.8% to 85.8% |" in card.text
-    assert 'src="accerl_run/before_after.mp4"' in card.text and str(tmp_path) not in card.text
-    monkeypatch.chdir(tmp_path)
-    Path("lerobot/smolvla_base").mkdir(parents=True)
-    assert ModelCard(card_of(last, "policy")).data.base_model is None, "a folder is none"
-
-
-def test_stock_lerobot_is_told_the_plugin_and_the_names_that_the_run_gave(tmp_path: Path, monkeypatch: Any):
-    monkeypatch.setitem(PLUGINS, "smolvla_bins", "lerobot_policy_smolvla_bins")
-    run = write_run_folder(tmp_path / "run", type="smolvla_bins", vlm_model_name="org/vlm")
-    recipe = yaml.safe_load((run / "config.yaml").read_text())
-    recipe["policy"]["rename_map"] = {"observation.images.corner2": "observation.images.camera1"}
-    (run / "config.yaml").write_text(yaml.safe_dump(recipe))
-    lines = card_of(run / LAST, "policy").splitlines()
-    [command] = [shlex.split(line) for line in lines if line.startswith("lerobot-eval")]
-    assert "--policy.path=door" in command
-    assert "--policy.discover_packages_path=lerobot_policy_smolvla_bins" in command
-    assert '--rename_map={"observation.images.corner2": "observation.images.camera1"}' in command
-
-
-@pytest.mark.parametrize("kind", ["policy", "world model"])
-def test_commands_in_the_card_are_commands(tmp_path: Path, kind: str):
-    folder = write_run_folder(tmp_path / "run")
-    if kind == "policy":
-        folder = folder / "checkpoints" / "last" / "pretrained_model"
-    else:
-        write_json(folder / "config.json", {"spec": {}, "model": {}})
-    text = card_of(folder, kind).split("```bash\n")
-    commands = [
-        line for block in text[1:] for line in block.split("```")[0].splitlines() if line[:7] == "accerl "
-    ]
-    assert any(line.startswith("accerl pull --repo_id=alice/door") for line in commands)
-    for line in commands:
-        _, verb, *arguments = shlex.split(line)
-        parse(CONFIGS[verb], [a for a in arguments if "config.yaml" not in a], recipe_class=RunConfig)

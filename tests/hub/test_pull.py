@@ -1,0 +1,243 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A pull is a whole folder that was checked, or none; what the server says is not taken on trust."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from accerl_lerobot import cli
+from accerl_lerobot.checkpoint.layout import check_names
+from accerl_lerobot.checkpoint.safety import FileSource
+from accerl_lerobot.errors import InputError
+from tests.hub.folders import refusal, write_json, write_policy_folder
+from tests.hub_server import STRANGER, Fault, HubServer
+
+NAME = "alice/door"
+Files = dict[str, bytes]
+Pull = Callable[..., dict[str, Any]]
+Refusal = Callable[..., str]
+
+
+@pytest.fixture
+def policy(hub: HubServer, tmp_path: Path) -> Path:
+    """Has been pushed."""
+    folder = write_policy_folder(tmp_path / "policy")
+    assert cli.main(["push", f"--path={folder}", f"--repo_id={NAME}"]) == 0
+    hub.journal.clear()
+    return folder
+
+
+@pytest.fixture
+def pulled(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Pull:
+    def do(*more: str, to: str = "pulled") -> dict[str, Any]:
+        capsys.readouterr()
+        assert cli.main(["pull", f"--repo_id={NAME}", f"--output_dir={tmp_path / to}", *more]) == 0
+        found: dict[str, Any] = json.loads(capsys.readouterr().out)
+        return found
+
+    return do
+
+
+@pytest.fixture
+def refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Refusal:
+    """The one line of a pull that is refused; there is no folder then, and nothing else new."""
+
+    def our_paths() -> set[Path]:
+        tops = [top for top in tmp_path.iterdir() if top.name not in ("cache", "hub")]
+        return {
+            path for top in tops if not top.name.startswith(".pulling-") for path in (top, *top.rglob("*"))
+        }
+
+    def do(*more: str, name: str = NAME) -> str:
+        before = our_paths()
+        line, _ = refusal(capsys, "pull", f"--repo_id={name}", f"--output_dir={tmp_path / 'pulled'}", *more)
+        assert our_paths() == before
+        return line
+
+    return do
+
+
+def contents_of(folder: Path) -> Files:
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def test_what_comes_is_what_went(hub: HubServer, policy: Path, tmp_path: Path, pulled: Pull):
+    found = pulled()
+    came = contents_of(tmp_path / "pulled")
+    assert came.keys() - contents_of(policy).keys() == {"README.md", "accerl_pulled.json"}
+    assert {n: came[n] for n in contents_of(policy)} == contents_of(policy)
+    assert found["files"] == len(contents_of(policy)) + 1, "the card"
+    hub.plant(NAME, {"README.md": b"# edited on the Hub", "demo.gif": b"GIF"})
+    pulled(to="edited")
+    assert (tmp_path / "edited" / "README.md").read_bytes() == b"# edited on the Hub"
+    assert list(tmp_path.glob(".*")) == []
+
+
+def test_branches_tags_and_commits_are_pinned(hub, policy, tmp_path, pulled, refused):
+    first = hub.repo(NAME).branches["main"]
+    hub.repo(NAME).tags["best"] = hub.repo(NAME).branches["dev"] = first
+    write_policy_folder(policy, seed=1)
+    assert cli.main(["push", f"--path={policy}", f"--repo_id={NAME}"]) == 0
+    second = hub.repo(NAME).branches["main"]
+    wanted = {None: second, "main": second, "best": first, "dev": first, first: first}
+    for i, (revision, commit) in enumerate(wanted.items()):
+        found = pulled(*([f"--revision={revision}"] if revision else []), to=f"to {i}")
+        record = json.loads((tmp_path / f"to {i}" / "accerl_pulled.json").read_text())
+        assert found["commit"] == record["commit"] == commit and record["revision"] == revision
+        same = (
+            contents_of(tmp_path / f"to {i}")["model.safetensors"]
+            == (policy / "model.safetensors").read_bytes()
+        )
+        assert same == (commit == second)
+    assert "has no such commit, tag or branch" in refused("--revision=other")
+    assert "has no such commit, tag or branch" in refused(f"--revision={'0' * 40}")
+
+
+@pytest.mark.parametrize(
+    "name", ["../escaped", "a/../../escaped", "/tmp/escaped-from-a-pull", "a\\..\\b", "C:/escaped"]
+)
+def test_names_that_lead_elsewhere(hub: HubServer, policy: Path, refused: Refusal, name: str, tmp_path: Path):
+    hub.plant(NAME, {name: b"evil"})
+    assert "not safe to write" in refused()
+    assert not [path for method, path, _ in hub.journal if "/resolve/" in path], "nothing was fetched"
+    assert not Path("/tmp/escaped-from-a-pull").exists() and list(tmp_path.glob(".pulling-*")) == []
+
+
+@pytest.mark.parametrize(
+    ("planted", "words"),
+    [
+        ({"policy_preprocessor.json": b"[1]"}, "policy_preprocessor.json: a mapping is wanted"),
+        ({"config.json": b"[]"}, "neither a policy"),
+    ],
+)
+def test_what_is_no_artifact_is_refused(hub, policy, refused, tmp_path, planted, words):
+    hub.plant(NAME, {"backbone/config.json": b"{}"} | planted)
+    assert words in refused()
+    assert list(tmp_path.glob(".pulling-*")) == [], "resuming would not make it better"
+
+
+def test_code_that_a_recipe_could_name_does_not_come(hub, policy, pulled, tmp_path):
+    files = {
+        "evil.py": b"raise SystemExit",
+        "deep/er/x.so": b"\x7fELF",
+        ".git/config": b"",
+        "notes.txt": b"py",
+    }
+    hub.plant(NAME, files)
+    pulled()
+    came = {path.name for path in (tmp_path / "pulled").rglob("*")}
+    assert "notes.txt" in came and not {"evil.py", "x.so", ".git"} & came
+
+
+def test_a_cut_download_goes_on(hub: HubServer, policy: Path, refused: Refusal, pulled: Pull, tmp_path: Path):
+    hub.faults.append(Fault("GET", "/model.safetensors", cut_after=0, times=6))
+    line = refused()
+    assert "run the same command again" in line and not (tmp_path / "pulled").exists()
+    hub.faults.clear()
+    fetched = {p for m, p, s in hub.journal if m == "GET" and s == 200 and "/resolve/" in p}
+    hub.journal.clear()
+    pulled()
+    again = {p for m, p, s in hub.journal if m == "GET" and s == 200 and "/resolve/" in p}
+    assert fetched and not fetched & again, "what had come is not fetched again"
+    assert (
+        contents_of(tmp_path / "pulled")["model.safetensors"] == (policy / "model.safetensors").read_bytes()
+    )
+
+
+def test_names_that_two_have_or_nobody(hub, policy, refused, pulled, monkeypatch):
+    hub.plant(NAME, {"meta/info.json": b"{}"}, repo_type="dataset")
+    assert pulled(to="other")["kind"] == "policy"
+    monkeypatch.setenv("HF_TOKEN", STRANGER)
+    assert "it is not there, or private" in refused(name="alice/nowhere")
+    monkeypatch.delenv("HF_TOKEN")
+    assert "it is not there, or private: mind the spelling, or log in" in refused(name="alice/nowhere")
+
+
+ARENA = f"them/arena@{'0123456789' * 4}"
+
+
+def test_no_recipe_that_was_pulled_lets_code_run(hub, policy, pulled, tmp_path, capsys):
+    recipe = (
+        "env: {type: lerobot, name: isaaclab_arena, trust_remote_code: true,\n"
+        f"  kwargs: {{hub_path: '{ARENA}'}}}}\npolicy: {{path: a/b}}\nsft: {{steps: 0}}\n"
+        "launch: {address: 'them:6379', placement: {rollout: all}}\n"
+    )
+    hub.plant(NAME, {"accerl_run/config.yaml": recipe.encode()})
+    pulled()
+    capsys.readouterr()
+    run = tmp_path / "pulled" / "accerl_run"
+    (run / ".lock").touch()
+    (run / "episodes.jsonl").touch()
+    for verb in (["train"], ["train", "--resume=true"], ["eval"], ["doctor"]):
+        assert cli.main([*verb, f"--config_path={run / 'config.yaml'}"]) in (1, 2)
+        assert "a file cannot allow this, only the command line can" in "".join(capsys.readouterr())
+    assert cli.main(["export", f"--path={run}", f"--root={tmp_path / 'set'}"]) == 2
+    assert f"add --env.trust_remote_code=true --env.kwargs.hub_path={ARENA}" in capsys.readouterr().err
+
+
+STEP = {"registry_name": "tokenizer_processor", "config": {"tokenizer_name": "SECRET"}}
+
+
+@pytest.mark.parametrize(
+    ("file", "content"),
+    [
+        ("config.json", {"type": "smolvla", "n_obs_steps": 1, "vlm_model_name": "SECRET"}),
+        ("policy_preprocessor.json", {"steps": [STEP]}),
+        ("adapter_config.json", {"peft_type": "LORA", "base_model_name_or_path": "SECRET"}),
+        ("backbone/tokenizer_config.json", {"vocab_file": "SECRET"}),
+        ("accerl_run/config.yaml", {"dataset": {"repo_id": "a/b", "root": "SECRET"}}),
+        ("accerl_run/config.yaml", {"policy": {"path": "SECRET"}}),
+    ],
+)
+def test_no_place_of_this_machine_is_named(hub, policy, refused, tmp_path, monkeypatch, file, content):
+    (tmp_path / "hub" / "secret").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "hub")
+    names = [str(tmp_path / "hub" / "secret"), "~/secret", "../secret"]
+    for name in names:
+        write_json(policy / file, json.loads(json.dumps(content).replace("SECRET", name)))
+        with pytest.raises(InputError, match=f"{file}: .* is a place on this machine"):
+            check_names(policy, FileSource("policy.path", "theirs"))
+    hub.plant(NAME, {file: (policy / file).read_bytes(), "adapter_model.safetensors": b"x"})
+    assert f"{file}: " in (line := refused()) and "is a place on this machine" in line
+
+
+def test_no_place_of_this_machine_is_named_by_a_world_model_or_dataset(hub: HubServer, refused: Refusal):
+    environment = {"spec": {}, "model": {"type": "theirs", "backbone": "/etc/ssl"}}
+    hub.plant(
+        "alice/environment", {"config.json": json.dumps(environment).encode(), "model.safetensors": b"x"}
+    )
+    assert "config.json: backbone: '/etc/ssl' is a place" in refused(name="alice/environment")
+    info = {"codebase_version": "v3.0", "data_path": "../{chunk_index}/{file_index}.parquet"}
+    files = {"meta/info.json": json.dumps(info).encode(), "meta/episodes/x": b"", "data/x": b""}
+    hub.plant("alice/data", files | {"meta/tasks.parquet": b""}, repo_type="dataset")
+    assert "meta/info.json: data_path" in refused(name="alice/data")
+
+
+def test_places_that_nothing_reads_are_no_reason_to_refuse(hub, policy, pulled, tmp_path):
+    config = json.loads((policy / "config.json").read_text()) | {"vlm_model_name": "/gone/backbone"}
+    elsewhere = {"dataset": {"root": "/data/mine"}, "output_dir": "/data/out"}
+    backbone = {"_name_or_path": "/gone/smolvlm", "text_config": {"_name_or_path": "/gone"}}
+    files = {
+        "config.json": config | {"pretrained_path": "/gone/pretrained"},
+        "train_config.json": elsewhere,
+        "backbone/config.json": backbone,
+        "backbone/tokenizer_config.json": {"name_or_path": "/gone", "pad_token": "/", "eos_token": "</s>"},
+    }
+    hub.plant(NAME, {name: json.dumps(content).encode() for name, content in files.items()})
+    pulled()
+    config = json.loads((tmp_path / "pulled" / "config.json").read_text())
+    assert config["vlm_model_name"] == str(tmp_path / "pulled" / "backbone")
+
+
+def test_a_folder_that_is_there_is_not_touched(
+    hub: HubServer, policy: Path, tmp_path: Path, refused: Refusal
+):
+    (tmp_path / "pulled").mkdir()
+    (tmp_path / "pulled" / "mine").write_text("mine")
+    assert "the folder exists; choose another or remove it" in refused()
+    assert contents_of(tmp_path / "pulled") == {"mine": b"mine"} and hub.journal == []
