@@ -4,12 +4,14 @@
 import io
 import json
 import shutil
+import weakref
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pytest
+import torch
 from PIL import Image
 
 from accerl_lerobot.algorithms.demonstrations import recorded
@@ -18,6 +20,7 @@ from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos.dataset_files import (
     EpisodeLabels,
     checked,
+    observations,
     open_metadata,
     opened,
     read_labels,
@@ -313,3 +316,20 @@ def test_an_instruction_that_changes_is_refused_where_one_is_read(tmp_path: Path
         read(dataset)
     with opened(dataset, open_metadata(dataset)) as data:  # SFT reads it where it stands
         assert [data[i]["task"] for i in (STEPS + 2, STEPS + 3)] == ["go", "stop"]
+
+
+def test_frames_are_kept_as_bytes():
+    """One of LeRobot's frames, which are four times as large, is in memory at a time."""
+    alive: weakref.WeakSet[torch.Tensor] = weakref.WeakSet()
+
+    class Frames:
+        def __getitem__(self, row: int) -> dict[str, torch.Tensor]:
+            assert len(alive) <= 1
+            image = torch.full((3, 2, 4), row / 255)
+            alive.add(image)
+            return {CAMERA: image}
+
+    found = observations(Frames(), np.arange(5), {"action": np.arange(9)}, [CAMERA])
+    assert found["action"].tolist() == list(range(5))
+    assert found[CAMERA].shape == (5, 2, 4, 3) and found[CAMERA].dtype == np.uint8
+    assert found[CAMERA][:, 0, 0, 0].tolist() == list(range(5))
