@@ -25,6 +25,7 @@ from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE
 from accerl_lerobot.metrics import MetricsLog, plain
+from accerl_lerobot.run.adapter import make_adapter
 from accerl_lerobot.world_model.config import SimulatorStateConfig, default_state_model
 
 if TYPE_CHECKING:
@@ -54,7 +55,10 @@ def learn_offline(config: OfflineRun, directory: Path, console: Console) -> dict
     algorithm = replace(config.algorithm, policy_steps=1.0)
     if isinstance(algorithm, ChunkCriticConfig):
         algorithm = replace(algorithm, critic_steps=algorithm.critic_steps or 1.0)
-    update: Any = make_update(_adapter(config, shapes), algorithm, config.trainer)
+    model = config.world_model or default_state_model(ENVIRONMENT_STATE in shapes)
+    numbers = math.prod(shapes.get(ENVIRONMENT_STATE, (0,)))
+    adapter = make_adapter(algorithm, model, numbers, None, None, config.policy)
+    update: Any = make_update(adapter, algorithm, config.trainer)
     counts = _remember(config, update, meta, shapes, console)
     losses = {"before": _imitation(update)}
     _learn(config, update, directory, console)
@@ -99,18 +103,6 @@ def _learn(config: OfflineRun, update: Any, directory: Path, console: Console) -
                 loss = means.get("imitation_loss", math.nan)
                 stage.update(update.version, f"imitation loss {loss:.4f}")
                 recent = {}
-
-
-def _adapter(config: OfflineRun, shapes: dict[str, tuple[int, ...]]) -> Any:
-    """The policy; with the teacher of `ChunkCriticConfig`, which labels and never acts here."""
-    from accerl_lerobot.policies.loading import load_adapter
-    from accerl_lerobot.policies.teacher import with_teacher
-
-    if not isinstance(config.algorithm, ChunkCriticConfig):
-        return load_adapter(config.policy)
-    model = config.world_model or default_state_model(ENVIRONMENT_STATE in shapes)
-    numbers = math.prod(shapes.get(ENVIRONMENT_STATE, (0,)))
-    return with_teacher(load_adapter, model, numbers, config.algorithm.teacher_episodes, config.policy)
 
 
 def _check(config: OfflineRun, policy: Any, meta: Any) -> dict[str, tuple[int, ...]]:

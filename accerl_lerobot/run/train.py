@@ -131,9 +131,9 @@ def make_engine(
     load: Load | None = None,
 ) -> Engine:
     """The engine that ``launch.engine`` names; see `RayEngine` for the arguments."""
-    load = functools.partial(
-        make_adapter, config, demonstrations_of(config), history * config.env.state_size, load
-    )
+    numbers = history * config.env.state_size
+    remembered = demonstrations_of(config)
+    load = functools.partial(make_adapter, config.algorithm, config.state_model, numbers, remembered, load)
     if config.launch.engine == "local":
         from accerl_lerobot.engines.local import LocalEngine
 
