@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The OpenGL that environments draw with where there is no display.
+"""Drawing with MuJoCo, and the OpenGL that environments draw with where there is no display.
 
 MuJoCo and dm_control read ``MUJOCO_GL`` once, when they are imported, so `start_graphics` is called before an
 environment's package is imported.
@@ -19,6 +19,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
 from typing import Any
+
+import numpy as np
 
 from accerl_lerobot.errors import InputError, causes
 
@@ -86,13 +88,45 @@ def drawing_error(error: BaseException) -> InputError | None:
     return InputError("MUJOCO_GL", given, f"the environment cannot draw ({about[:160]}); {HINT}")
 
 
-def new_renderer(model: Any, height: int, width: int) -> Any:
-    """A `mujoco.Renderer` whose framebuffer is exactly (height, width)."""
-    model.vis.global_.offheight = height
-    model.vis.global_.offwidth = width
-    renderer = import_mujoco().Renderer(model, height, width)
-    close_at_exit(renderer)
-    return renderer
+class Renderers:
+    """Draws a MuJoCo model; keeps one `mujoco.Renderer` for each size of image."""
+
+    def __init__(self, model: Any) -> None:
+        self._model = model
+        self._by_size: dict[tuple[int, int], Any] = {}
+
+    def draw(self, height: int, width: int, *scene: Any) -> np.ndarray:
+        """Image, uint8 (height, width, 3); `scene` are arguments of ``Renderer.update_scene``."""
+        if (height, width) not in self._by_size:
+            # The framebuffer is exactly as large as the image.
+            self._model.vis.global_.offheight = height
+            self._model.vis.global_.offwidth = width
+            created = import_mujoco().Renderer(self._model, height, width)
+            close_at_exit(created)
+            self._by_size[height, width] = created
+        renderer = self._by_size[height, width]
+        renderer.update_scene(*scene)
+        return renderer.render()
+
+    def close(self) -> None:
+        for renderer in self._by_size.values():
+            renderer.close()
+
+
+def draw_fast(model: Any) -> None:
+    """Has MuJoCo draw no shadows and reflections, and without multisampling."""
+    quality = model.vis.quality
+    quality.offsamples = 0
+    quality.shadowsize = 0
+    model.light_castshadow[:] = 0
+    model.mat_reflectance[:] = 0
+
+
+def diverged(data: Any) -> bool:
+    """True if MuJoCo met non-finite numbers in this episode and silently reset itself."""
+    warning = import_mujoco().mjtWarning
+    bad = (warning.mjWARN_BADQPOS, warning.mjWARN_BADQVEL, warning.mjWARN_BADQACC)
+    return any(data.warning.number[kind] for kind in bad)
 
 
 def close_at_exit(drawing: Any) -> None:

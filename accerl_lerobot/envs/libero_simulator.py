@@ -21,7 +21,7 @@ import numpy as np
 
 from accerl_lerobot.checkpoint.safety import brief
 from accerl_lerobot.envs.base import SuiteEnvironment, unit_spec
-from accerl_lerobot.envs.graphics import import_mujoco, new_renderer
+from accerl_lerobot.envs.graphics import Renderers, diverged, draw_fast, import_mujoco
 from accerl_lerobot.envs.libero import (
     FETCH,
     LEROBOT_NAMES,
@@ -32,7 +32,6 @@ from accerl_lerobot.envs.libero import (
     load_libero,
     recorded_states,
 )  # fmt: skip
-from accerl_lerobot.envs.metaworld import diverged, draw_fast
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.seeds import EVAL_SEEDS
 
@@ -117,7 +116,7 @@ class Simulator:
         self._hand = model.body(robot.robot_model.eef_name).id
         self._mass = np.zeros((model.nv, model.nv))
         self._jacobian = np.zeros((2, 3, model.nv))
-        self._renderers: dict[tuple[int, int], Any] = {}
+        self._renderers = Renderers(model)
         self._visible = self._mujoco.MjvOption()
         self._visible.geomgroup[:2] = 0, 1  # visual meshes, not what collides
         self._position = data.site_xpos[self._site]
@@ -262,15 +261,11 @@ class Simulator:
     def render(self, camera: str, height: int, width: int) -> np.ndarray:
         """Frame of a camera, uint8 (height, width, 3), turned as LeRobot's datasets have it."""
         self._look()
-        if (height, width) not in self._renderers:
-            self._renderers[height, width] = new_renderer(self.model, height, width)
-        renderer = self._renderers[height, width]
-        renderer.update_scene(self._seen, camera, self._visible)
-        return np.ascontiguousarray(renderer.render()[:, ::-1])
+        image = self._renderers.draw(height, width, self._seen, camera, self._visible)
+        return np.ascontiguousarray(image[:, ::-1])
 
     def close(self) -> None:
-        for renderer in self._renderers.values():
-            renderer.close()
+        self._renderers.close()
         self.env.close()
 
     def _look(self) -> None:

@@ -20,7 +20,7 @@ import numpy as np
 
 from accerl_lerobot.config.ranges import Positive, Range, Section
 from accerl_lerobot.envs.base import EnvConfig, SuiteConfig, SuiteEnvironment, unit_spec
-from accerl_lerobot.envs.graphics import import_mujoco, new_renderer
+from accerl_lerobot.envs.graphics import Renderers, diverged, draw_fast, import_mujoco
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -167,7 +167,7 @@ class Simulator:
         config.shift.apply(env, config.cameras)
         env.touching_object = functools.partial(touching_object, env)
         self._delay = config.shift.action_delay
-        self._renderers: dict[tuple[int, int], Any] = {}
+        self._renderers = Renderers(env.model)
 
     def reset(self, seed: int) -> None:
         """To the start that `seed` stands for."""
@@ -194,18 +194,13 @@ class Simulator:
 
     def render(self, camera: str, height: int, width: int) -> np.ndarray:
         """Frame of a camera, uint8 (height, width, 3)."""
-        if (height, width) not in self._renderers:
-            self._renderers[height, width] = new_renderer(self.env.model, height, width)
-        renderer = self._renderers[height, width]
-        renderer.update_scene(self.env.data, camera=camera)
-        image: np.ndarray = renderer.render()
+        image = self._renderers.draw(height, width, self.env.data, camera)
         if camera == "corner2":  # hangs upside down in MetaWorld's scene; LeRobot and its datasets turn it
             return np.ascontiguousarray(image[::-1, ::-1])
         return image
 
     def close(self) -> None:
-        for renderer in self._renderers.values():
-            renderer.close()
+        self._renderers.close()
         self.env.close()
 
 
@@ -223,19 +218,3 @@ def touching_object(sim: Any, geom: int) -> bool:
         if not force[contact.efc_address[pressing]].sum() > 0:
             return False
     return True
-
-
-def draw_fast(model: Any) -> None:
-    """Has MuJoCo draw no shadows and reflections, and without multisampling."""
-    quality = model.vis.quality
-    quality.offsamples = 0
-    quality.shadowsize = 0
-    model.light_castshadow[:] = 0
-    model.mat_reflectance[:] = 0
-
-
-def diverged(data: Any) -> bool:
-    """True if MuJoCo met non-finite numbers in this episode and silently reset itself."""
-    warning = import_mujoco().mjtWarning
-    bad = (warning.mjWARN_BADQPOS, warning.mjWARN_BADQVEL, warning.mjWARN_BADQACC)
-    return any(data.warning.number[kind] for kind in bad)
