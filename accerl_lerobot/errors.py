@@ -12,6 +12,7 @@ import contextlib
 import errno
 import functools
 import logging
+import math
 import os
 import re
 import traceback
@@ -35,6 +36,26 @@ MAX_NONFINITE = 5  # steps in a row with a non-finite loss or gradient that are 
 
 class NonFiniteError(RuntimeError):
     """Too many steps in a row had a non-finite loss or gradient."""
+
+
+def step_if_finite(optimizer: Any, step: str, loss: float, norm: float, in_a_row: int, hint: str) -> int:
+    """Makes a step unless its loss or its gradient's norm is not finite; returns the steps in a row left out.
+
+    `step` names the step in the error, and `in_a_row` are the steps that were left out before it.
+
+    Raises:
+        NonFiniteError: `MAX_NONFINITE` steps in a row are left out.
+    """
+    if math.isfinite(loss + norm):
+        optimizer.step()
+        return 0
+    in_a_row += 1
+    if in_a_row >= MAX_NONFINITE:
+        raise NonFiniteError(
+            f"{in_a_row} steps in a row had a non-finite loss or gradient (the last one, {step}: "
+            f"loss {loss:g}, gradient norm {norm:g}); {hint}"
+        )
+    return in_a_row
 
 
 class InputError(ValueError):

@@ -28,7 +28,7 @@ from accerl_lerobot.algorithms import ChunkCriticConfig
 from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.algorithms.off_policy import OffPolicyUpdate, drawn, mean
 from accerl_lerobot.checkpoint.snapshot import State
-from accerl_lerobot.checkpoint.tensors import copied, optimizer_state, restore_optimizer
+from accerl_lerobot.checkpoint.tensors import copied, follow, optimizer_state, restore_optimizer
 from accerl_lerobot.experience import Metrics, Segment
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.family import Encoded, pooled
@@ -321,9 +321,8 @@ class ChunkCriticUpdate(OffPolicyUpdate):
             q = self.critic(self.teacher.scaled(state), chunk)
         loss = (q - target).square().mean(1).sum()
         norm = self._descend("critic", loss, clip=math.inf)
+        follow(self.slow, self.critic, TAU)
         with torch.no_grad():
-            for slow, fast in zip(self.slow.parameters(), self.critic.parameters(), strict=True):
-                slow.lerp_(fast, TAU)
             q = q.mean(0)
             spread = returns.var().clamp(min=1e-8)
             unexplained = (returns - q).var() / spread

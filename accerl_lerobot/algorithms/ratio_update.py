@@ -31,7 +31,7 @@ from accerl_lerobot.algorithms.ranks import Part
 from accerl_lerobot.checkpoint.snapshot import State
 from accerl_lerobot.checkpoint.tensors import in_parts, optimizer_state, restore_optimizer
 from accerl_lerobot.config.parsing import imported
-from accerl_lerobot.errors import MAX_NONFINITE, NonFiniteError
+from accerl_lerobot.errors import step_if_finite
 from accerl_lerobot.experience import Metrics, Observations, Segment
 from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.policies.adapter import Evaluation, PolicyAdapter
@@ -96,20 +96,13 @@ class BaseUpdate(ABC):
         """Makes a step, unless its loss or its gradient's norm is not finite; those are counted.
 
         Raises:
-            NonFiniteError: `MAX_NONFINITE` of them since the policy's last step.
+            NonFiniteError: `errors.MAX_NONFINITE` of them since the policy's last step.
         """
-        if math.isfinite(loss + norm):
-            optimizer.step()
-            if optimizer is self.optimizer:
-                self._skipped_in_a_row = 0
-            return
-        self.skipped += 1
-        self._skipped_in_a_row += 1
-        if self._skipped_in_a_row >= MAX_NONFINITE:
-            raise NonFiniteError(
-                f"{self._skipped_in_a_row} steps in a row had a non-finite loss or gradient (the last one, "
-                f"{step}: loss {loss:g}, gradient norm {norm:g}); lower trainer.lr or trainer.value_lr"
-            )
+        self.skipped += not math.isfinite(loss + norm)
+        hint = "lower trainer.lr or trainer.value_lr"
+        in_a_row = step_if_finite(optimizer, step, loss, norm, self._skipped_in_a_row, hint)
+        if in_a_row or optimizer is self.optimizer:
+            self._skipped_in_a_row = in_a_row
 
 
 class RatioUpdate(BaseUpdate):

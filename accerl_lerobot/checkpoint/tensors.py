@@ -95,3 +95,10 @@ def copied(module: torch.nn.Module) -> dict[str, torch.Tensor]:
 def fixed(values: Tensor) -> nn.Parameter:
     """A float32 parameter without gradient: numbers that are saved and published, and not learned."""
     return nn.Parameter(values.detach().clone().float(), requires_grad=False)
+
+
+@torch.no_grad()
+def follow(slow: nn.Module, fast: nn.Module, share: float) -> None:
+    """Moves the parameters of a slow copy by this share of the way to those of `fast`."""
+    for target, source in zip(slow.parameters(), fast.parameters(), strict=True):
+        target.lerp_(source, share)

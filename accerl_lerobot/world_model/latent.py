@@ -25,7 +25,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from accerl_lerobot.checkpoint.tensors import fixed
+from accerl_lerobot.checkpoint.tensors import fixed, follow
 from accerl_lerobot.config.machine import computes_bf16
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK_BITS, Observations, task_codes
@@ -121,7 +121,7 @@ class LatentModel(StateModel):
         self.std.copy_(torch.from_numpy(std))
 
     def loss(self, transitions: Transitions) -> tuple[Tensor, dict[str, float]]:
-        self._follow()
+        follow(self.slow, self.encoder, FOLLOW)
         images = self._images(transitions.observations)
         self._fit_pixels(torch.cat(images, 1))
         now = self._scaled(images)
@@ -154,11 +154,6 @@ class LatentModel(StateModel):
             "cloning": cloning,
         }
         return loss, {name: float(part.detach()) for name, part in metrics.items()}
-
-    @torch.no_grad()
-    def _follow(self) -> None:
-        for slow, fast in zip(self.slow.parameters(), self.encoder.parameters(), strict=True):
-            slow.lerp_(fast, FOLLOW)
 
     @torch.no_grad()
     def _fit_pixels(self, images: Tensor) -> None:

@@ -9,7 +9,6 @@ its own.
 from __future__ import annotations
 
 import copy
-import math
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ import torch
 from torch.nn.utils import clip_grad_norm_
 
 from accerl_lerobot.checkpoint.tensors import copied, optimizer_state, restore_optimizer
-from accerl_lerobot.errors import MAX_NONFINITE, NonFiniteError
+from accerl_lerobot.errors import step_if_finite
 from accerl_lerobot.experience import Observations
 from accerl_lerobot.world_model.states import StateModel, Transitions
 
@@ -90,12 +89,12 @@ class StateLearner:
         loss.backward()
         norm = clip_grad_norm_(self._learned, CLIP)
         self.count += 1
-        if math.isfinite(float(loss.detach()) + float(norm)):
-            self.optimizer.step()
-            self._skipped_in_a_row = 0
-            return metrics
-        self._skipped_in_a_row += 1
-        if self._skipped_in_a_row >= MAX_NONFINITE:
-            hint = "look at the observations and actions of the run, or name another world_model.type"
-            raise NonFiniteError(f"{MAX_NONFINITE} steps of the world model in a row were not finite; {hint}")
+        self._skipped_in_a_row = step_if_finite(
+            self.optimizer,
+            "a step of the world model",
+            float(loss.detach()),
+            float(norm),
+            self._skipped_in_a_row,
+            "look at the observations and actions of the run, or name another world_model.type",
+        )
         return metrics

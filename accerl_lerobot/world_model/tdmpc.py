@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from accerl_lerobot.checkpoint.tensors import fixed
+from accerl_lerobot.checkpoint.tensors import fixed, follow
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Observations
 from accerl_lerobot.policies.config import PolicyConfig
@@ -86,9 +86,8 @@ class TDMPCModel(StateModel):
         return torch.cat([latent, numbers, late], 1)
 
     def loss(self, transitions: Transitions) -> tuple[Tensor, dict[str, float]]:
+        follow(self.slow, self.encoder, 1 - self.config.target_model_momentum)
         with torch.no_grad():
-            for slow, fast in zip(self.slow.parameters(), self.encoder.parameters(), strict=True):
-                slow.lerp_(fast, 1 - self.config.target_model_momentum)
             target = self.slow(self._read(transitions.following, shift=True))
         latent = self.encoder(self._read(transitions.observations, shift=True))
         value = self.value(latent)[:, 0]
