@@ -22,7 +22,7 @@ import re
 import shlex
 import sys
 import typing
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -163,9 +163,9 @@ def consents(tree: Any, given: Any = None) -> dict[str, Any]:
 
     Fields that the command line sets as well, in `given`, are left out.
     """
-    allowed = dict(_leaves(given))
+    allowed = dict(leaves(given, lists=True))
     found = {}
-    for name, value in _leaves(tree):
+    for name, value in leaves(tree, lists=True):
         key = name.rpartition(".")[2]
         if key in CONSENT and value not in UNSET and name not in allowed:
             found[name] = value
@@ -178,14 +178,18 @@ def consent_flags(consented: dict[str, Any]) -> str:
     return shlex.join(flags)
 
 
-def _leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted name and value of everything in a tree; of a field in `CONSENT`, all below it is its value."""
-    if path.rpartition(".")[2] in CONSENT or not isinstance(tree, (dict, list)):
+def leaves(tree: Any, path: str = "", lists: bool = False) -> Iterator[tuple[str, Any]]:
+    """Dotted name and value of everything in nested mappings, and in lists if so asked.
+
+    An empty mapping or list is a value, and so is everything below a field in `CONSENT`.
+    """
+    nested = isinstance(tree, Mapping) or (lists and isinstance(tree, list))
+    if not nested or not tree or path.rpartition(".")[2] in CONSENT:
         yield path, tree
         return
-    entries = tree.items() if isinstance(tree, dict) else enumerate(tree)
+    entries = tree.items() if isinstance(tree, Mapping) else enumerate(tree)
     for key, value in entries:
-        yield from _leaves(value, f"{path}.{key}".removeprefix("."))
+        yield from leaves(value, f"{path}.{key}".removeprefix("."), lists)
 
 
 def as_text(value: Any) -> str:
@@ -509,7 +513,7 @@ def _unknown(place: tuple[str, ...], value: Any, names: list[str], whole: type[A
     """The error for a field that a config does not have. It names similar fields, or all of the section."""
     *path, key = place
     name = ".".join(place)
-    for flag, leaf in _leaves(value, name):
+    for flag, leaf in leaves(value, name):
         if flag in OF_LEROBOT:
             return InputError(flag, leaf, f"the name is LeRobot's; {OF_LEROBOT[flag]}")
     near = [".".join((*path, other)) for other in difflib.get_close_matches(key, names, n=3)]

@@ -14,13 +14,12 @@ import functools
 import io
 import re
 from abc import abstractmethod
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
-from accerl_lerobot.config.parsing import PLUGINS, import_plugins
+from accerl_lerobot.config.parsing import PLUGINS, import_plugins, leaves
 from accerl_lerobot.config.ranges import Range
 from accerl_lerobot.envs.base import (
     IS_SUCCESS,
@@ -118,7 +117,7 @@ class GymnasiumEnvironment(EpisodeEnvironment):
         self._raw, reward, ended, cut, info = self._returned("step", step)
         success = bool(ended)
         if self.config.success:
-            told = flattened(info)
+            told = dict(leaves(info))
             self._info_keys |= told.keys()
             success = bool(np.any(told.get(self.config.success, False)))
         return Step(
@@ -230,7 +229,7 @@ class GymEnvironment(GymnasiumEnvironment):
         return self._spec(observation, fps, [config.task])
 
     def _observe(self) -> Observation:
-        raw = flattened(self._raw)
+        raw = dict(leaves(self._raw))
         config = self.config
         state = self._vector("state", raw, config.state or ("",))
         observation: Observation = {TASK: config.task, _STATE: state}
@@ -433,17 +432,6 @@ def resized(frame: np.ndarray, height: int, width: int) -> np.ndarray:
     from PIL import Image
 
     return np.asarray(Image.fromarray(frame).resize((width, height), Image.Resampling.BILINEAR))
-
-
-def flattened(raw: Any, prefix: str = "") -> dict[str, Any]:
-    """Values of a nested mapping by their dotted keys; a value that is no mapping has the key ""."""
-    if not isinstance(raw, Mapping):
-        return {prefix: raw}
-    flat: dict[str, Any] = {}
-    for key, part in raw.items():
-        name = f"{prefix}.{key}" if prefix else str(key)
-        flat |= flattened(part, name)
-    return flat
 
 
 def _part(raw: dict[str, Any], key: str, name: str) -> np.ndarray:

@@ -19,7 +19,7 @@ import numpy as np
 
 from accerl_lerobot.checkpoint.layout import CONFIG, SUMMARY
 from accerl_lerobot.checkpoint.safety import FileSource, check_folder, read_json
-from accerl_lerobot.config.parsing import encode, read_recipe
+from accerl_lerobot.config.parsing import encode, leaves, read_recipe
 from accerl_lerobot.console import ABSENT
 from accerl_lerobot.engines.config import RunConfig
 from accerl_lerobot.errors import ERROR_LOG, InputError
@@ -142,21 +142,9 @@ def newest(records: Sequence[Record], name: str) -> float | None:
     return float(values[-1])
 
 
-def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """A tree of sections as dotted fields; an empty mapping is a value."""
-    fields: dict[str, Any] = {}
-    for key, value in tree.items():
-        name = f"{prefix}{key}"
-        if isinstance(value, dict) and value:
-            fields |= flat(value, f"{name}.")
-        else:
-            fields[name] = value
-    return fields
-
-
 def differences(trees: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[Any]]]:
     """Fields in which configs differ, with the value of each; a dash where one does not have it."""
-    flats = [flat(tree) for tree in trees]
+    flats = [dict(leaves(tree)) for tree in trees]
     names: dict[str, Any] = {}
     for fields in flats:
         names |= fields
@@ -170,5 +158,5 @@ def differences(trees: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[Any]
 
 def changed_fields(tree: Mapping[str, Any]) -> list[tuple[str, list[Any]]]:
     """Fields of a config that differ from the defaults, with value and default."""
-    fields = flat(tree)
+    fields = dict(leaves(tree))
     return [row for row in differences([tree, encode(RunConfig())]) if row[0] in fields]
