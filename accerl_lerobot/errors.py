@@ -74,12 +74,15 @@ class InputError(ValueError):
         super().__init__(field, value, hint)
 
     def __str__(self) -> str:
-        value = repr(self.value)
-        if len(value) > LONGEST:
-            value = f"{value[: LONGEST - 1]}…"
+        value = shortened(repr(self.value), LONGEST)
         text = f"{self.field}={value}: {self.hint}"
         line = " ".join(text.split())
         return TOKEN.sub("<token>", printable(line))
+
+
+def shortened(text: str, length: int = 80) -> str:
+    """A text cut off after so many characters."""
+    return text if len(text) <= length else f"{text[: length - 1]}…"
 
 
 def printable(text: str, keep: str = "") -> str:
@@ -207,8 +210,11 @@ def last_exception(text: str) -> str:
     return " ".join(words.split())
 
 
-def in_one_line(error: BaseException) -> str:
-    """Type and text of an error in one line: of a long text its beginning, and the exception at its end."""
+def in_one_line(error: BaseException, length: int = 300) -> str:
+    """Type and text of an error in one line of so many characters at most.
+
+    Of a text of several lines it has the first one, and the exception at its end.
+    """
     cause = getattr(error, "cause", error)  # Ray's errors carry a traceback as their text
     if not isinstance(cause, BaseException):
         cause = error
@@ -217,14 +223,15 @@ def in_one_line(error: BaseException) -> str:
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     if not lines:
         return name
-    if len(lines) == 1:
-        return f"{name}: {lines[0]}"
-    return f"{name}: {lines[0]} … {last_exception(text)}"
+    words = f"{name}: {lines[0]}"
+    if len(lines) > 1:
+        words += f" … {last_exception(text)}"
+    return shortened(words, length)
 
 
 def one_line(error: BaseException) -> str:
     """An unexpected error in one line, with its traceback's place or how to see it."""
-    text = in_one_line(error)[:MOST_SHOWN]
+    text = in_one_line(error, MOST_SHOWN)
     notes = getattr(error, "__notes__", ()) or ("ACCERL_LOG=DEBUG shows the traceback",)
     words = "; ".join([TOKEN.sub("<token>", text), *notes])
     line = " ".join(words.split())
@@ -294,7 +301,7 @@ def error_as_json(error: BaseException) -> dict[str, Any]:
     """An exception as plain values: the `InputError` in its chain, or its type and text in one line."""
     refused = next((link for link in causes(error) if isinstance(link, InputError)), None)
     if refused is None:
-        return {"error": in_one_line(error)[:LONGEST_HANDED]}
+        return {"error": in_one_line(error, LONGEST_HANDED)}
     value = None
     if refused.value is not None:
         value = str(refused.value)[:LONGEST_HANDED]

@@ -23,8 +23,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from accerl_lerobot.checkpoint.safety import FileSource, brief, leads_out, read_json, safe_join, texts_in
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.checkpoint.safety import FileSource, leads_out, read_json, safe_join, texts_in
+from accerl_lerobot.errors import InputError, in_one_line
 from accerl_lerobot.fault_points import fault_point
 
 PRETRAINED, TRAINING_STATE, WORLD_MODEL = "pretrained_model", "training_state", "world_model"
@@ -180,7 +180,7 @@ def defect(directory: Path) -> str | None:
     except InputError as error:
         return f"its {MANIFEST} is broken ({error.hint})"
     except Exception as error:  # it may hold anything
-        return f"its {MANIFEST} is broken ({brief(error)})"
+        return f"its {MANIFEST} is broken ({in_one_line(error)})"
     return None
 
 

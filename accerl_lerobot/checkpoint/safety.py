@@ -20,7 +20,7 @@ from typing import Any
 import yaml
 from safetensors import SafetensorError, safe_open
 
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.errors import InputError, in_one_line, shortened
 
 _INSIDE = re.compile(r"(?![~/]|[A-Za-z]:)[^\\\x00-\x1f\x7f\ud800-\udfff]+")
 _ABSOLUTE = re.compile(r"(~[^/\s]*)?/[\w.]|[A-Za-z]:[\\/]|file:|~$")
@@ -41,7 +41,7 @@ class FileSource:
 
     def refuse(self, file: str, why: str) -> InputError:
         """The error to raise: a file or a key in it, and what is wrong and what to do."""
-        return InputError(self.field, self.value, f"{_shown(file)}: {why}")
+        return InputError(self.field, self.value, f"{shortened(file)}: {why}")
 
 
 def safe_join(root: Path, name: object, origin: FileSource) -> Path:
@@ -120,7 +120,7 @@ def check_folder(folder: Path, origin: FileSource) -> None:
 def check_name(name: object, what: str, origin: FileSource) -> None:
     """Refuses a name, such as a camera's, that cannot be one part of a path."""
     if unsafe_name(name) or "/" in str(name):
-        raise origin.refuse(what, f"the name {_shown(str(name))!r} cannot be part of a path")
+        raise origin.refuse(what, f"the name {shortened(str(name))!r} cannot be part of a path")
 
 
 def read_json(path: Path, origin: FileSource) -> dict[str, Any]:
@@ -133,7 +133,7 @@ def read_json(path: Path, origin: FileSource) -> dict[str, Any]:
         raise origin.refuse(path.name, "is missing; give the whole folder") from error
     except (OSError, RecursionError, ValueError, yaml.YAMLError) as error:
         language = "YAML" if is_yaml else "JSON"
-        raise origin.refuse(path.name, f"not good {language} ({brief(error)})") from error
+        raise origin.refuse(path.name, f"not good {language} ({in_one_line(error)})") from error
     if not isinstance(content, dict):
         raise origin.refuse(path.name, f"a mapping is wanted, not {type(content).__name__}")
     return content
@@ -146,7 +146,7 @@ def opened(path: Path, origin: FileSource, framework: str = "np") -> Iterator[An
         with safe_open(path, framework) as file:
             yield file
     except (OSError, SafetensorError) as error:
-        raise origin.refuse(path.name, f"not safetensors ({brief(error)}); get it again") from error
+        raise origin.refuse(path.name, f"not safetensors ({in_one_line(error)}); get it again") from error
 
 
 def tensor_shapes(path: Path, origin: FileSource) -> dict[str, tuple[str, tuple[int, ...]]]:
@@ -168,7 +168,7 @@ def read_tensors(path: Path, origin: FileSource) -> Iterator[tuple[str, Any]]:
         for name in file.keys():  # noqa: SIM118
             tensor = file.get_tensor(name)
             if not _finite(tensor):
-                raise origin.refuse(path.name, f"{_shown(name)} holds NaN or infinity; train it again")
+                raise origin.refuse(path.name, f"{shortened(name)} holds NaN or infinity; train it again")
             yield name, tensor
 
 
@@ -182,12 +182,6 @@ def _finite(tensor: Any) -> bool:
     return math.isfinite(least) and math.isfinite(most)
 
 
-def brief(error: BaseException, length: int = 160) -> str:
-    """An error's words on one line, cut off after so many characters."""
-    text = " ".join(str(error).split()) or type(error).__name__
-    return _shown(text, length)
-
-
 def unsafe_name(name: object) -> str:
     """The reason why a name must not be joined to a folder; empty if it may."""
     if not isinstance(name, str) or not _INSIDE.fullmatch(name):
@@ -196,8 +190,3 @@ def unsafe_name(name: object) -> str:
     if ".." in parts or not parts:
         return "it leads out of the folder"
     return ""
-
-
-def _shown(text: str, length: int = 80) -> str:
-    """A text cut off after so many characters."""
-    return text if len(text) <= length else f"{text[: length - 1]}…"

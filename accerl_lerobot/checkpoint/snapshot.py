@@ -18,8 +18,7 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
-from accerl_lerobot.checkpoint.safety import brief
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.errors import InputError, in_one_line
 
 MARK = "$"  # key of a JSON object that stands for something JSON does not know
 _KINDS: dict[str, type[Any]] = {}
@@ -56,7 +55,7 @@ def load(path: Path) -> Any:
         arrays = load_file(path.with_suffix(".safetensors"))
         return from_json(tree, arrays)
     except (OSError, ValueError, KeyError, TypeError, RecursionError, SafetensorError) as error:
-        hint = f"not a state that accerl has saved ({brief(error)}); resume from another checkpoint"
+        hint = f"not a state that accerl has saved ({in_one_line(error)}); resume from another checkpoint"
         raise InputError("checkpoint", str(file), hint) from error
 
 

@@ -30,9 +30,8 @@ import draccus
 import yaml
 
 from accerl_lerobot.checkpoint.layout import CONFIG
-from accerl_lerobot.checkpoint.safety import brief
 from accerl_lerobot.config.ranges import annotations_of, defaults_of, fits, is_optional, is_union
-from accerl_lerobot.errors import InputError, expanded
+from accerl_lerobot.errors import InputError, expanded, in_one_line
 
 DISCOVER = "discover_packages_path"
 """LeRobot's name for the field that names a package whose import registers new types."""
@@ -97,7 +96,7 @@ def discover(package: str | None, section: str = "") -> None:
         importlib.import_module(package)
     except (Exception, SystemExit) as error:  # it is somebody's code, which may do anything
         field = f"{section}.{DISCOVER}" if section else DISCOVER
-        why = f"cannot be imported ({type(error).__name__}: {brief(error)})"
+        why = f"cannot be imported ({in_one_line(error)})"
         hint = "install it, or name the folder that it is in: PYTHONPATH=FOLDER accerl …"
         raise InputError(field, package, f"{why}; {hint}") from error
 
@@ -114,7 +113,7 @@ def import_plugins(*prefixes: str) -> dict[str, str]:
             try:
                 importlib.import_module(package)
             except (Exception, SystemExit) as error:  # it is somebody's code, which may do anything
-                why = f"{type(error).__name__}: {brief(error)}"
+                why = in_one_line(error)
                 broken[package] = f"{package} is installed and cannot be imported ({why})"
     return broken
 

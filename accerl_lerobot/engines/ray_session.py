@@ -139,7 +139,7 @@ def _join(address: str) -> None:
         environment = {"env_vars": forwarded_environment()}
         ray.init(address=address, log_to_driver=False, configure_logging=False, runtime_env=environment)
     except (RuntimeError, OSError, ValueError, AuthenticationError) as error:
-        reason = in_one_line(error.__cause__ or error)[:300]
+        reason = in_one_line(error.__cause__ or error)
         hint = f"this process cannot join it; is it what ray start --head printed? {reason}"
         raise InputError("launch.address", address, hint) from error
 

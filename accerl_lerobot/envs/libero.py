@@ -22,10 +22,9 @@ from unittest.mock import patch
 
 import numpy as np
 
-from accerl_lerobot.checkpoint.safety import brief
 from accerl_lerobot.config.ranges import Range
 from accerl_lerobot.envs.base import EnvConfig, SuiteConfig
-from accerl_lerobot.errors import InputError, expanded
+from accerl_lerobot.errors import InputError, expanded, in_one_line
 
 ASSETS = "lerobot/libero-assets"
 FETCH = f"hf download {ASSETS} --repo-type=dataset --local-dir=FOLDER, and name the folder"
@@ -119,7 +118,7 @@ def assets_folder(given: str) -> Path:
     try:
         return Path(snapshot_download(ASSETS, repo_type="dataset"))
     except Exception as error:
-        why = f"LIBERO's meshes are not installed, and the Hub did not give them ({brief(error)})"
+        why = f"LIBERO's meshes are not installed, and the Hub did not give them ({in_one_line(error)})"
         raise InputError("env.assets", given, f"{why}; {FETCH}") from error
 
 

@@ -19,7 +19,6 @@ from unittest.mock import patch
 
 import numpy as np
 
-from accerl_lerobot.checkpoint.safety import brief
 from accerl_lerobot.envs.base import SuiteEnvironment, unit_spec
 from accerl_lerobot.envs.graphics import Renderers, diverged, draw_fast, import_mujoco
 from accerl_lerobot.envs.libero import (
@@ -32,7 +31,7 @@ from accerl_lerobot.envs.libero import (
     load_libero,
     recorded_states,
 )  # fmt: skip
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.errors import InputError, in_one_line
 from accerl_lerobot.seeds import EVAL_SEEDS
 
 FPS = 20
@@ -390,8 +389,8 @@ def _build(task: str, assets: str) -> tuple[Any, list[np.ndarray]]:
             with patch.object(MjSim, "from_xml_string", smaller):
                 env = _placed(lambda: liberos_own(task).env, 0)
         except (OSError, ValueError) as error:
-            why = f"the scene of {task} does not load ({brief(error)}); if the folder is incomplete, {FETCH}"
-            raise InputError("env.assets", assets, why) from error
+            why = f"the scene of {task} does not load ({in_one_line(error)})"
+            raise InputError("env.assets", assets, f"{why}; if the folder is incomplete, {FETCH}") from error
     env.hard_reset = False  # the scene is always the same: no need to compile it anew for each episode
     return env, bodies
 

@@ -18,7 +18,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from accerl_lerobot.checkpoint.safety import FileSource, brief
+from accerl_lerobot.checkpoint.safety import FileSource
 from accerl_lerobot.config.parsing import PLUGINS, discover, import_plugins, imported
 from accerl_lerobot.config.ranges import Commit, Range, Section
 from accerl_lerobot.envs.base import (
@@ -29,7 +29,7 @@ from accerl_lerobot.envs.base import (
     WrappedEnvironment,
 )
 from accerl_lerobot.envs.graphics import drawing_error, start_graphics
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.errors import InputError, in_one_line
 from accerl_lerobot.experience import TASK, Observation
 
 REWARD_MODEL = "rollout.reward_model"
@@ -88,7 +88,7 @@ def environment_error(config: EnvConfig, error: Exception) -> InputError:
         if value in (metadata(package).get_all("Provides-Extra") or ()):
             hint += f"; pip install '{package}[{value}]'"
         return InputError(field, value, hint)
-    hint = f"the environment fails ({type(error).__name__}: {brief(error)}); ACCERL_LOG=DEBUG shows where"
+    hint = f"the environment fails ({in_one_line(error)}); ACCERL_LOG=DEBUG shows where"
     kwargs = getattr(config, "kwargs", None)
     if kwargs:
         return InputError("env.kwargs", kwargs, f"{value}: {hint}")

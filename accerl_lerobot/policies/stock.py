@@ -24,8 +24,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from accerl_lerobot.checkpoint.safety import brief
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.errors import InputError, in_one_line
 from accerl_lerobot.experience import TASK, Decision, Observations, Request, stack_observations
 from accerl_lerobot.policies.adapter import Evaluation, PretrainedAdapter
 from accerl_lerobot.policies.config import ChunkNoiseConfig, SamplerConfig, executed_rows
@@ -123,7 +122,7 @@ class StockAdapter(PretrainedAdapter):
                 self._chunk(requests)
         except Exception as error:  # a policy of another package, which may fail in any way
             self._takes_batches = False
-            reason = f"{type(error).__name__}: {brief(error)}"
+            reason = in_one_line(error)
             logger.warning(
                 "%s policies decide for one environment at a time, which takes as many calls as there are "
                 "environments: a batch of two fails (%s)",

@@ -23,8 +23,8 @@ from torch import nn
 from torch.overrides import TorchFunctionMode
 
 from accerl_lerobot.checkpoint.layout import BACKBONE, PREPROCESSOR, check_names
-from accerl_lerobot.checkpoint.safety import FileSource, brief, check_folder, read_json, safe_join, texts_in
-from accerl_lerobot.errors import InputError, causes, expanded
+from accerl_lerobot.checkpoint.safety import FileSource, check_folder, read_json, safe_join, texts_in
+from accerl_lerobot.errors import InputError, causes, expanded, in_one_line
 
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
 ADAPTER_CONFIG, ADAPTER = "adapter_config.json", "adapter_model.safetensors"
@@ -50,7 +50,7 @@ def fetched_checkpoint(path: str, revision: str | None, field: str) -> Path:
             fetched = snapshot_download(path, revision=revision, allow_patterns=list(FILES))
             folder = Path(fetched)
         except (OSError, ValueError) as error:
-            hint = f"not a directory here and not loadable from the Hub ({brief(error)})"
+            hint = f"not a directory here and not loadable from the Hub ({in_one_line(error)})"
             raise InputError(field, path, hint) from error
     if not (folder / CONFIG).is_file():
         raise InputError(field, path, "no config.json there; give the folder named pretrained_model")
@@ -110,7 +110,10 @@ def refusing(source: FileSource, what: str) -> Iterator[None]:
             raise ours from error
         if isinstance(error, ImportError):
             what = "a package that it needs is missing"
-        raise InputError(source.field, source.value, f"{what} ({reason(error)})") from error
+        first = error  # draccus wraps the error that tells why
+        if isinstance(error, draccus.utils.DraccusException):
+            *_, first = causes(error)
+        raise InputError(source.field, source.value, f"{what} ({in_one_line(first)})") from error
 
 
 @contextlib.contextmanager
@@ -178,10 +181,3 @@ class Unfilled(TorchFunctionMode):
 def input_error(error: BaseException) -> InputError | None:
     """The `InputError` that another error wraps, if there is one."""
     return next((link for link in causes(error) if isinstance(link, InputError)), None)
-
-
-def reason(error: BaseException) -> str:
-    """An error's words; of one that draccus wraps, those of the error itself."""
-    if isinstance(error, draccus.utils.DraccusException):
-        error = list(causes(error))[-1]
-    return brief(error, 400)

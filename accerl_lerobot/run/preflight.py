@@ -20,7 +20,6 @@ import draccus
 import numpy as np
 
 from accerl_lerobot.algorithms import AWRConfig, ChunkCriticConfig, OffPolicyConfig, RatioConfig
-from accerl_lerobot.checkpoint.safety import brief
 from accerl_lerobot.envs import (
     EnvConfig,
     EnvironmentSpec,
@@ -359,7 +358,7 @@ def check_sft_policy(config: SFTConfig) -> Any:
         return draccus.decode(PreTrainedConfig.get_choice_class(kind), {"device": "cpu"} | fields)
     except draccus.utils.DraccusException as error:
         chain: list[Any] = list(causes(error))
-        hint = f"LeRobot says: {brief(chain[-1])}"
+        hint = f"LeRobot says: {chain[-1]}"
         for link in chain:
             if getattr(link, "key_path", ()):
                 name = link.key_path[0]

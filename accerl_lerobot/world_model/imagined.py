@@ -27,12 +27,12 @@ import torch
 from safetensors.torch import save_file
 from torch import nn
 
-from accerl_lerobot.checkpoint.safety import FileSource, brief, read_json, read_tensors, safe_join
+from accerl_lerobot.checkpoint.safety import FileSource, read_json, read_tensors, safe_join
 from accerl_lerobot.config.parsing import DISCOVER, discover
 from accerl_lerobot.demos.record import make_expert
 from accerl_lerobot.envs import make_environment
 from accerl_lerobot.envs.base import ChunkResult, Environment, EnvironmentSpec, checked_actions
-from accerl_lerobot.errors import InputError, expanded
+from accerl_lerobot.errors import InputError, expanded, in_one_line
 from accerl_lerobot.experience import IMAGINED, TASK, Observation, task_codes
 from accerl_lerobot.policies.config import executed_rows
 from accerl_lerobot.policies.untrusted import Unfilled, input_error
@@ -154,9 +154,9 @@ def load_world(directory: Path, package: str | None = None, *, section: str = ""
         if refusal is not None and refusal.field == origin.field:
             raise refusal from error
         if refusal is not None:
-            raise origin.refuse(CONFIG, brief(refusal)) from error
+            raise origin.refuse(CONFIG, str(refusal)) from error
         package = origin.field.removesuffix("path") + DISCOVER
-        hint = f"not a world model of accerl world-model ({brief(error)}); "
+        hint = f"not a world model of accerl world-model ({in_one_line(error)}); "
         hint += f"if its type is of another package, name that: {package}"
         raise InputError(origin.field, origin.value, hint) from error
     return world.requires_grad_(False).eval()

@@ -432,7 +432,7 @@ def test_a_package_that_a_type_needs_is_named(written: Any, tmp_path: Path, monk
     named = {name: config[name] for name in ("input_features", "output_features")}
     (path / "config.json").write_text(json.dumps(named | {"type": "wall_x"}))
     with pytest.raises(
-        InputError, match="a package that it needs is missing .'torchdiffeq' is requ"
+        InputError, match="a package that it needs is missing .ImportError: 'torchdiffeq' is"
     ) as caught:
         load_acting(PolicyConfig(path=str(path), device="cpu"))
     assert "\n" not in str(caught.value)
