@@ -9,10 +9,13 @@ Runs are in the single-process engine, each on one thread, where lag is what set
 else the machine is doing. Finished runs are kept: the same command continues a study that was stopped, and
 adds seeds, arms or settings to one that is finished. Another recipe, `updates` or `episodes` needs another
 folder.
+
+``--trainer.hold_back=N``, in an arm or a setting, has the acting policy use weights that are N updates old.
 """
 
 from __future__ import annotations
 
+import functools
 import itertools
 import json
 import os
@@ -21,27 +24,46 @@ import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
+from unittest.mock import patch
 
+import numpy as np
 import yaml
 from rich.table import Table
 
-from accerl_lerobot.checkpoint.layout import CHECKPOINTS, CONFIG, DEMOS, LAST, PRETRAINED, SUMMARY
+from accerl_lerobot import cli
+from accerl_lerobot.checkpoint import snapshot
+from accerl_lerobot.checkpoint.layout import (
+    CHECKPOINTS,
+    CONFIG,
+    DEMOS,
+    LAST,
+    PRETRAINED,
+    SUMMARY,
+    TRAINING_STATE,
+)
 from accerl_lerobot.config.ranges import Range, Section, Seed, Steps
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.record import REPO_ID
+from accerl_lerobot.engines import local
 from accerl_lerobot.engines.config import RunConfig, encode, parse
+from accerl_lerobot.engines.contract import Progress, Saved
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import Rate, drawing
+from accerl_lerobot.experience import Decision, Request
+from accerl_lerobot.policies.config import Load, loader
 from benchmarks.tables import as_markdown, as_table, last_words, mean_interval, named, output_folder, write
 
 NOTE = "intervals are 95 %, over policies where there are several"
 NUMBERS = ("episodes_explored", "env_steps", "updates", "lag_mean", "rl_s")
 """Fields of a run's summary that a study keeps."""
 ALL = "all starts"
+HOLD_BACK = "--trainer.hold_back="
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,6 +111,21 @@ class Cell(NamedTuple):
         """Folder of the run that makes its SFT policy."""
         return _folder("start", self.start, f"seed{self.seed}")
 
+    @property
+    def options(self) -> list[str]:
+        """Options of its setting and arm, `HOLD_BACK` included."""
+        return [*shlex.split(self.setting), *shlex.split(self.arm)]
+
+    @property
+    def hold_back(self) -> int:
+        """Updates by which the weights of its acting policy are held back."""
+        updates = [word.removeprefix(HOLD_BACK) for word in self.options if word.startswith(HOLD_BACK)]
+        if not updates:
+            return 0
+        if not updates[-1].isdecimal():
+            raise InputError("trainer.hold_back", updates[-1], "use a number of updates, 0 or more")
+        return int(updates[-1])
+
 
 def _folder(*parts: str) -> str:
     words = "-".join(part.replace("--", "") for part in parts if part)
@@ -109,15 +146,17 @@ def bench_study(config: BenchStudyConfig) -> dict[str, Any]:
     cells = [Cell(*choice) for choice in choices]
     starts = {}
     runs = {}
+    held_back = {}
     for cell in cells:
         made = root / cell.start_folder
         if made not in starts:
             starts[made] = _start(config, cell, made)
         runs[root / cell.folder] = _run(config, cell, starts[made], made, root / cell.folder)
+        held_back[root / cell.folder] = cell.hold_back
     for folder, start in starts.items():
         check_start(replace(start, resume=folder.exists()))  # a run that is there is resumed
-    _do("SFT policies", starts, config.jobs, console)
-    _do("cells", runs, config.jobs, console)
+    _do("SFT policies", starts, {}, config.jobs, console)
+    _do("cells", runs, held_back, config.jobs, console)
     rows = [_row(root, cell) for cell in cells]
     result = {"config": asdict(config), "cells": rows, "groups": groups(config, rows)}
     write(root, "study", result, markdown(result), draw)
@@ -136,7 +175,7 @@ def _start(config: BenchStudyConfig, cell: Cell, folder: Path) -> RunConfig:
 
 def _run(config: BenchStudyConfig, cell: Cell, start: RunConfig, made: Path, folder: Path) -> RunConfig:
     """A cell's run; `made` is the folder of the run that makes its SFT policy."""
-    options = [*shlex.split(cell.setting), *shlex.split(cell.arm)]
+    options = [option for option in cell.options if not option.startswith(HOLD_BACK)]
     if config.updates is not None:
         options.append(f"--trainer.updates={config.updates}")
     if start.policy.revision is not None:
@@ -146,7 +185,11 @@ def _run(config: BenchStudyConfig, cell: Cell, start: RunConfig, made: Path, fol
         options += ["--sft.steps=0", f"--policy.path={checkpoint}"]
         if start.dataset.repo_id is None:
             options += [f"--dataset.repo_id={REPO_ID}", f"--dataset.root={made / DEMOS}"]
-    return _parsed(config, cell, folder, options)
+    run = _parsed(config, cell, folder, options)
+    if cell.hold_back >= run.replay.max_lag:
+        hint = f"use more than trainer.hold_back, {cell.hold_back}, or all is thrown away as too old"
+        raise InputError("replay.max_lag", run.replay.max_lag, hint)
+    return run
 
 
 def _parsed(config: BenchStudyConfig, cell: Cell, folder: Path, options: list[str]) -> RunConfig:
@@ -166,9 +209,15 @@ def _parsed(config: BenchStudyConfig, cell: Cell, folder: Path, options: list[st
     return run
 
 
-def _do(name: str, runs: dict[Path, RunConfig], jobs: int, console: Console) -> None:
+def _do(
+    name: str, runs: dict[Path, RunConfig], held_back: Mapping[Path, int], jobs: int, console: Console
+) -> None:
     """Does the runs that have no summary yet, some at a time."""
-    missing = [(folder, run) for folder, run in runs.items() if not (folder / SUMMARY).is_file()]
+    missing = [
+        (folder, run, held_back.get(folder, 0))
+        for folder, run in runs.items()
+        if not (folder / SUMMARY).is_file()
+    ]
     done = len(runs) - len(missing)
     with console.stage(name, total=len(runs)) as stage, ThreadPoolExecutor(jobs) as pool:
         stage.update(done)
@@ -177,9 +226,10 @@ def _do(name: str, runs: dict[Path, RunConfig], jobs: int, console: Console) -> 
             stage.update(done)
 
 
-def train(folder: Path, config: RunConfig) -> None:
-    """Runs ``accerl train``; resumes a run that was stopped."""
-    command = [sys.executable, "-m", "accerl_lerobot.cli", "train"]
+def train(folder: Path, config: RunConfig, hold_back: int) -> None:
+    """Runs ``accerl train``, with `main` if weights are held back; resumes a run that was stopped."""
+    program = ["benchmarks.study", str(hold_back)] if hold_back else ["accerl_lerobot.cli"]
+    command = [sys.executable, "-m", *program, "train"]
     if (folder / CHECKPOINTS).is_dir():
         command += ["--resume=true", f"--config_path={folder / CONFIG}"]
     else:
@@ -193,6 +243,64 @@ def train(folder: Path, config: RunConfig) -> None:
         done = subprocess.run(command, stdout=out, stderr=out, env=environment, check=False)
     if done.returncode:
         raise RuntimeError(f"the run {folder.name} failed, see {log}:\n{last_words(log)}")
+
+
+class HeldBackEngine(local.LocalEngine):
+    """The engine of one process, whose acting policy has weights that are `hold_back` updates old."""
+
+    def __init__(
+        self,
+        hold_back: int,
+        config: RunConfig,
+        tasks: tuple[str, ...],
+        history: int = 1,
+        state: Path | None = None,
+        load: Load | None = None,
+    ) -> None:
+        self._hold_back = hold_back
+        self._held_back: deque[tuple[int, dict[str, np.ndarray]]] = deque()
+        self._acting_version = 0
+        super().__init__(config, tasks, history, load=load)
+        self._acting = loader(load)(config.policy)
+        self._acting.load_trainable(self._adapter.export_trainable())
+        if state is not None:
+            self._restore(state)
+
+    def poll(self) -> Progress:
+        progress = super().poll()
+        version = self._update.version
+        if progress.updates:
+            self._held_back.append((version, self._adapter.export_trainable()))
+        due = version - self._hold_back
+        if not self._exploring:  # the last weights act at once
+            due = version
+        while self._held_back and self._held_back[0][0] <= due:
+            self._acting_version, weights = self._held_back.popleft()
+            self._acting.load_trainable(weights)
+        return replace(progress, inference={"version": float(self._acting_version)})
+
+    def save(self, directory: Path) -> Saved:
+        saved = super().save(directory)
+        acting = {"version": self._acting_version, "weights": self._acting.export_trainable()}
+        state = {"acting": acting, "waiting": list(self._held_back)}
+        snapshot.save(directory / TRAINING_STATE / "held_back", state)
+        return saved
+
+    def _restore(self, directory: Path) -> None:
+        state = snapshot.load(directory / "held_back")
+        self._acting_version = state["acting"]["version"]
+        self._acting.load_trainable(state["acting"]["weights"])
+        self._held_back.extend(state["waiting"])
+        super()._restore(directory)
+
+    def _decide(self, requests: list[Request]) -> list[Decision]:
+        return self._acting.decide(requests, self._acting_version)
+
+
+def main(hold_back: int, arguments: list[str]) -> int:
+    """Runs ``accerl`` with `arguments`, and holds weights back if its engine is that of one process."""
+    with patch.object(local, "LocalEngine", functools.partial(HeldBackEngine, hold_back)):
+        return cli.main(arguments)
 
 
 def _row(root: Path, cell: Cell) -> dict[str, Any]:
@@ -286,3 +394,7 @@ def draw(path: Path, result: dict[str, Any]) -> None:
         axes.set_xticks(range(len(places)), [" ".join(place) for place in places], rotation=20, ha="right")
         axes.set(ylabel="success", ylim=(-0.02, 1.02))
         axes.legend()
+
+
+if __name__ == "__main__":
+    sys.exit(main(int(sys.argv[1]), sys.argv[2:]))

@@ -103,11 +103,6 @@ MISTAKES: list[tuple[list[str], str]] = [
     (["--algorithm.type=gippo"], "algorithm.type='gippo': did you mean gipo? Otherwise use one of awr, "),
     (["--env.type=mujoco"], "env.type='mujoco': use one of gym, lerobot, libero, metaworld, simulated"),
     (["--env.task=drawer-v3"], "env.task='drawer-v3': 'drawer-v3' is no task; did you mean"),
-    (["--trainer.hold_back=5"], "trainer.hold_back=5: weights are held back to study lag"),
-    (
-        ["--launch.engine=local", "--trainer.hold_back=50"],
-        "replay.max_lag=50: use more than trainer.hold_back, 50, or all is",
-    ),
     (
         ["--replay.max_unlearned_decisions=3"],
         "replay.max_unlearned_decisions=3: use at least one batch, 128, or both sides wait for each other",

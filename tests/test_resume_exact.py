@@ -27,10 +27,10 @@ from tests.timeline.folders import adds_up
 
 CASES: dict[str, dict[str, Any]] = {
     "ratio": {},
-    "held back, counted episodes, several tasks": {
+    "counted episodes, several tasks": {
         "env": SimulatedConfig(max_steps=16, task="match,mirror"),
         "rollout": RolloutConfig(environments=4, segment_length=3, episodes=30),
-        "trainer": {"hold_back": 3, "probe_every": 4},
+        "trainer": {"probe_every": 4},
     },
     "chunk critic on a latent state": {},
 }

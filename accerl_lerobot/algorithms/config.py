@@ -165,9 +165,6 @@ class TrainerConfig(Section, section="trainer"):
     """Largest gradient norm of the policy and, in algorithms with a likelihood ratio, of the critic head,
     each by itself."""
     betas: tuple[Annotated[float, Range("[0, 1)")], Annotated[float, Range("[0, 1)")]] = (0.9, 0.95)
-    hold_back: Steps = 0
-    """Updates by which the acting policy's weights are held back: lag on purpose, to study it with
-    ``launch.engine=local``; 0: none."""
     probe_every: Steps = 25
     """Updates between two measurements of the mismatch between acting and learning; 0: none. While it waits
     for one, the trainer holds a copy of the policy's weights."""

@@ -166,13 +166,6 @@ class RunConfig(Section):
             raise InputError("world_model.type", self.world_model.type, no_use_for_states(self.algorithm))
         if isinstance(self.algorithm, OffPolicyConfig):
             self._check_off_policy()
-        held_back = self.trainer.hold_back
-        if held_back and self.launch.engine != "local":
-            hint = "weights are held back to study lag, in one process; use launch.engine=local, or 0"
-            raise InputError("trainer.hold_back", held_back, hint)
-        if held_back and held_back >= self.replay.max_lag:
-            hint = f"use more than trainer.hold_back, {held_back}, or all is thrown away as too old"
-            raise InputError("replay.max_lag", self.replay.max_lag, hint)
         counts = {"inference.workers": self.inference.workers, "trainer.ranks": self.trainer.ranks}
         for name, count in counts.items():
             if count > 1 and self.launch.engine == "local":
@@ -217,7 +210,7 @@ def lag_limits(config: RunConfig) -> tuple[int, int]:
     counts = {
         "batch_decisions": config.trainer.batch_decisions,
         "in_flight": rollout.workers * environments * rollout.segment_length,
-        "pickup": early + config.trainer.hold_back,
+        "pickup": early,
         "prefetch": early,
     }
     unlimited = replace(config.replay, max_lag=10**9)

@@ -2,8 +2,7 @@
 """The engine in one process, without Ray: the same parts, called in turn, deterministic for a seed.
 
 Every poll all environments, real and imagined, get a decision and step it, and there is one update, as
-the pace allows. For tests and debugging. Weights reach the acting policy at once, so the lag comes from
-replay alone, unless `trainer.hold_back` asks for more.
+the pace allows. For tests and debugging. The trainer's own policy acts, so lag comes from replay alone.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from accerl_lerobot.engines.config import RunConfig
 from accerl_lerobot.engines.contract import Engine, Progress, Saved
 from accerl_lerobot.envs import make_environment
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import REAL, Request, Segment
+from accerl_lerobot.experience import REAL, Decision, Request, Segment
 from accerl_lerobot.policies.config import Load, loader
 from accerl_lerobot.replay.buffer import Replay
 from accerl_lerobot.replay.journal import EPISODES, Journal
@@ -35,7 +34,7 @@ from accerl_lerobot.rollout.runner import (
     Starts,
 )
 from accerl_lerobot.seeds import global_generators, restore_global_generators
-from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, WEIGHT_SYNC, open_clock
+from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, open_clock
 
 logger = logging.getLogger(__name__)
 
@@ -63,12 +62,6 @@ class LocalEngine(Engine):
         self._config = config
         self._adapter = loader(load)(config.policy)
         self._update = make_update(self._adapter, config.algorithm, config.trainer)
-        self._held_back: deque[tuple[int, Any]] = deque()  # versions and weights that do not act yet
-        self._acting = self._adapter
-        self._acting_version = 0
-        if config.trainer.hold_back:
-            self._acting = loader(load)(config.policy)
-            self._acting.load_trainable(self._adapter.export_trainable())
         journal = None if config.folder is None else Journal(config.folder / EPISODES)
         self._replay = Replay(config.replay, journal)
         self._rng = np.random.default_rng(config.seed)
@@ -120,7 +113,6 @@ class LocalEngine(Engine):
                 metrics = self._update.step(segments)
                 metrics["update"] = float(self._update.version)
                 updates.append(metrics)
-                self._publish()
         self._clock.enter(WAIT_IN)
         episodes = self._episodes
         self._episodes = []
@@ -133,7 +125,7 @@ class LocalEngine(Engine):
             rollout={k: float(v) for k, v in asdict(self._runner.counters).items()},
             replay=self._replay.metrics(),
             world_model={} if learner is None else learner.metrics(),
-            inference={"version": float(self._acting_version)},
+            inference={"version": float(self._update.version)},
         )
 
     def save(self, directory: Path) -> Saved:
@@ -143,12 +135,9 @@ class LocalEngine(Engine):
         snapshot.save(state / WEIGHTS, self._adapter.export_trainable())
         snapshot.save(state / "trainer", self._update.state())
         snapshot.save(state / "replay", self._replay.state())
-        acting = None if self._acting is self._adapter else self._acting.export_trainable()
         engine = {
             "generators": global_generators(),
             "rng": self._rng,
-            "acting": (self._acting_version, acting),
-            "held_back": list(self._held_back),
             "outbox": list(self._outbox),
             "plans": self._plans.state(),
             "runner": self._runner.state(),
@@ -173,10 +162,6 @@ class LocalEngine(Engine):
         self._replay.restore(snapshot.load(directory / "replay"))
         engine = snapshot.load(directory / LOCAL)
         self._rng = engine["rng"]
-        self._acting_version, acting = engine["acting"]
-        if acting is not None:
-            self._acting.load_trainable(acting)
-        self._held_back.extend(engine["held_back"])
         self._outbox.extend(engine["outbox"])
         self._plans.restore(engine["plans"])
         self._runner.restore(engine["runner"])
@@ -222,9 +207,12 @@ class LocalEngine(Engine):
             if request is not None and (may_explore or not request.explore):
                 due[slot] = request
         if due:
-            decisions = self._acting.decide(list(due.values()), self._acting_version)
+            decisions = self._decide(list(due.values()))
             for slot, decision in zip(due, decisions, strict=True):
                 runner.advance(slot, decision)
+
+    def _decide(self, requests: list[Request]) -> list[Decision]:
+        return self._adapter.decide(requests, self._update.version)
 
     def _learn_world(self) -> None:
         """One gradient step of the world model, if one is due; its environments use it once none is."""
@@ -234,22 +222,6 @@ class LocalEngine(Engine):
         learner.step()
         if learner.pending_steps < 1:
             self._world.load(learner.version, learner.world.state_dict())
-
-    def _publish(self) -> None:
-        """Give weights to the acting policy, which is the trainer's own unless they are delayed."""
-        version = self._update.version
-        updates = self._config.trainer.updates
-        if self._acting is self._adapter:
-            self._acting_version = version
-            return
-        self._clock.enter(WEIGHT_SYNC)
-        self._held_back.append((version, self._adapter.export_trainable()))
-        due = version - self._config.trainer.hold_back
-        if version == updates or not self._exploring:
-            due = version
-        while self._held_back and self._held_back[0][0] <= due:
-            self._acting_version, weights = self._held_back.popleft()
-            self._acting.load_trainable(weights)
 
     def _store(self) -> None:
         while self._outbox and self._replay.may_insert():

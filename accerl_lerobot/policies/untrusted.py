@@ -110,7 +110,7 @@ def refusing(source: FileSource, what: str) -> Iterator[None]:
             raise ours from error
         if isinstance(error, ImportError):
             what = "a package that it needs is missing"
-        first = error  # draccus wraps the error that tells why
+        first: BaseException = error  # draccus wraps the error that tells why
         if isinstance(error, draccus.utils.DraccusException):
             *_, first = causes(error)
         raise InputError(source.field, source.value, f"{what} ({in_one_line(first)})") from error

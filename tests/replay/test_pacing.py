@@ -62,12 +62,12 @@ def test_lag_bound_by_hand() -> None:
     capped = replace(CONFIG, max_lag=9)
     assert lag_bound(capped, **arguments) == 9
     sections = {
-        "trainer": SimpleNamespace(batch_decisions=8, hold_back=4),
+        "trainer": SimpleNamespace(batch_decisions=8),
         "rollout": RolloutConfig(environments=1, segment_length=4),
         "imagination": SimpleNamespace(environments=2),
     }
     config: Any = SimpleNamespace(replay=capped, launch=SimpleNamespace(engine="local"), **sections)
-    assert lag_limits(config) == (9, 4 + 37)
+    assert lag_limits(config) == (9, 37)
 
 
 @dataclass(kw_only=True)
