@@ -34,9 +34,8 @@ from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.family import Encoded, pooled
 from accerl_lerobot.policies.stock import StockAdapter
 from accerl_lerobot.policies.teacher import Ensemble, Teacher
-from accerl_lerobot.world_model.state_learner import BATCH as TRANSITIONS
-from accerl_lerobot.world_model.state_learner import StateLearner
-from accerl_lerobot.world_model.states import Transitions
+from accerl_lerobot.world_model.states import BATCH as TRANSITIONS
+from accerl_lerobot.world_model.states import StateLearner, Transitions
 
 if TYPE_CHECKING:
     from accerl_lerobot.world_model.worker import RemoteStateLearner

@@ -24,8 +24,7 @@ from accerl_lerobot.checkpoint.tensors import copied
 from accerl_lerobot.experience import Observations
 from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, open_clock
-from accerl_lerobot.world_model.state_learner import BATCH, StateLearner
-from accerl_lerobot.world_model.states import StateModel, Transitions
+from accerl_lerobot.world_model.states import BATCH, StateLearner, StateModel, Transitions
 
 WORLD_MODEL_WORKER = "world model"
 

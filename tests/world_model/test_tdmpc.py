@@ -12,8 +12,7 @@ from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model import tdmpc
 from accerl_lerobot.world_model.config import TDMPCStateConfig
-from accerl_lerobot.world_model.state_learner import StateLearner
-from accerl_lerobot.world_model.states import StateSpec, Transitions, new_state_model
+from accerl_lerobot.world_model.states import StateLearner, StateSpec, Transitions, new_state_model
 from accerl_lerobot.world_model.tdmpc import TDMPCModel
 from tests.policies.checkpoints import write_policy
 from tests.policies.test_stock import KINDS
