@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot.algorithms.advantages import decision_mask, gae, moments, normalise
+from accerl_lerobot.algorithms.ratio_update import decision_mask, gae, moments, normalise
 from tests.rounding import assert_close
 
 Batch = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
