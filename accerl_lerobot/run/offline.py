@@ -141,8 +141,8 @@ def _remember(
     config: OfflineRun, update: Any, meta: Any, shapes: dict[str, tuple[int, ...]], console: Console
 ) -> dict[str, Any]:
     """Fill the memory from the dataset; returns the numbers of its episodes, successes and decisions."""
-    from accerl_lerobot.algorithms.demonstrations import recorded
     from accerl_lerobot.policies.config import executed_rows
+    from accerl_lerobot.run.adapter import recorded
 
     algorithm: Any = config.algorithm
     chunk = executed_rows(update.adapter.policy.config)

@@ -211,8 +211,8 @@ def check_state_model(config: RunConfig, policy: Any, decisions: int) -> None:
 
 def _check_remembered(config: RunConfig, spec: EnvironmentSpec, meta: Any, history: int) -> None:
     """Compare a dataset that joins the memory with the environment, or warn that it does not join."""
-    from accerl_lerobot.algorithms.demonstrations import unlike
     from accerl_lerobot.demos.dataset_files import numbers, opened, read_labels
+    from accerl_lerobot.run.adapter import unlike
 
     dataset = config.dataset
     about = ("dataset.repo_id", dataset.repo_id)

@@ -11,10 +11,8 @@ import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from accerl_lerobot.algorithms import ChunkCriticConfig
-from accerl_lerobot.algorithms import demonstrations as module
 from accerl_lerobot.algorithms.chunk_critic import ChunkCriticUpdate
 from accerl_lerobot.algorithms.config import TrainerConfig
-from accerl_lerobot.algorithms.demonstrations import demonstrations, recorded
 from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos.dataset_files import open_metadata
 from accerl_lerobot.envs import SimulatedConfig, make_environment
@@ -23,6 +21,8 @@ from accerl_lerobot.experience import ENVIRONMENT_STATE, Segment, SegmentStart
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.loading import load_adapter
 from accerl_lerobot.policies.teacher import with_teacher
+from accerl_lerobot.run import adapter as module
+from accerl_lerobot.run.adapter import demonstrations, recorded
 from accerl_lerobot.run.preflight import check_start
 from accerl_lerobot.world_model.config import SimulatorStateConfig
 from tests.replay.segments import make_segment
