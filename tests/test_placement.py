@@ -10,7 +10,7 @@ import torch
 from accerl_lerobot.algorithms.config import TrainerConfig
 from accerl_lerobot.console import Console
 from accerl_lerobot.engines.config import LaunchConfig, RunConfig
-from accerl_lerobot.engines.placement import Placement
+from accerl_lerobot.engines.ray_session import Placement
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.policies.config import PolicyConfig

@@ -30,7 +30,7 @@ PACKAGE = ROOT / "accerl_lerobot"
 HEADER = "# SPDX-License-Identifier: Apache-2.0\n"
 LONGEST_FILE = 600
 MOST_EXPRESSIONS, MOST_FILES = 66_900, 126
-ENGINE = {"placement.py", "ray_engine.py", "ray_session.py", "supervision.py"}
+ENGINE = {"ray_engine.py", "ray_session.py", "supervision.py"}
 SHELLS = ENGINE | {"doctor.py", "worker.py", "online.py", "peers.py", "connection.py"}
 """Files that may import Ray; all others are testable without it."""
 DISTRIBUTED = {"ranks.py", "tensors.py"}

@@ -159,7 +159,7 @@ def recipe(arguments: list[str]) -> Iterator[Check]:
     from accerl_lerobot.engines.config import RunConfig, parse
 
     config: RunConfig = parse(RunConfig, arguments)
-    from accerl_lerobot.engines.placement import check_placement
+    from accerl_lerobot.engines.ray_session import check_placement
     from accerl_lerobot.run.preflight import check_start
     from accerl_lerobot.world_model.imagined import check_imagination
 

@@ -38,7 +38,7 @@ from accerl_lerobot.demos.record import REPO_ID, record_demos
 from accerl_lerobot.engines import ray_session
 from accerl_lerobot.engines.config import RunConfig, encode, parse
 from accerl_lerobot.engines.contract import Engine
-from accerl_lerobot.engines.placement import check_placement
+from accerl_lerobot.engines.ray_session import check_placement
 from accerl_lerobot.engines.stopping import StoppedError, Stopping, WorkerError, handled
 from accerl_lerobot.errors import (
     InputError,
