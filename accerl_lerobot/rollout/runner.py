@@ -19,8 +19,8 @@ import numpy as np
 
 from accerl_lerobot.checkpoint.snapshot import kind
 from accerl_lerobot.config.ranges import NonNegative, Range, Section, Steps
+from accerl_lerobot.envs import JudgedEnvironment, RewardModelConfig
 from accerl_lerobot.envs.base import ChunkResult, Environment
-from accerl_lerobot.envs.making import JudgedEnvironment, RewardModelConfig
 from accerl_lerobot.errors import InputError, for_viewing, warn_once
 from accerl_lerobot.experience import (
     IMAGINED,
